@@ -1,0 +1,89 @@
+"""Checks at public boundaries; each names the caller's variable, what it expected, what it got and the remedy."""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.errors import OutputError, ThermoxelsError, explain
+
+
+def check_positive(
+    name: str, value: float, remedy: str, error: type[ThermoxelsError] = ThermoxelsError
+) -> float:
+    """Return `value` if it is a finite number above zero, else raise `error`."""
+    if not (isinstance(value, (int, float, np.number)) and math.isfinite(value) and value > 0):
+        raise error(explain(name, expected="a finite number above 0", got=repr(value), remedy=remedy))
+    return float(value)
+
+
+def check_finite(
+    name: str, array: npt.NDArray, remedy: str, error: type[ThermoxelsError] = ThermoxelsError
+) -> npt.NDArray:
+    """Return `array` if every entry is finite, else raise `error` with the count of bad entries."""
+    bad = int(np.size(array) - np.count_nonzero(np.isfinite(array)))
+    if bad:
+        raise error(
+            explain(name, expected="finite numbers only", got=f"{bad} of {array.size} NaN or infinite", remedy=remedy)
+        )
+    return array
+
+
+def check_shape(
+    name: str,
+    array: npt.NDArray,
+    shape: Sequence[int | None],
+    remedy: str,
+    error: type[ThermoxelsError] = ThermoxelsError,
+) -> npt.NDArray:
+    """Return `array` if its shape matches `shape` (None matches any length), else raise `error`."""
+    fits = len(array.shape) == len(shape) and all(want in (None, got) for want, got in zip(shape, array.shape))
+    if not fits:
+        wanted = "(" + ", ".join("n" if s is None else str(s) for s in shape) + ")"
+        raise error(explain(name, expected=f"shape {wanted}", got=tuple(array.shape), remedy=remedy))
+    return array
+
+
+def writable_folder(path: Path | str) -> Path:
+    """Make `path` a folder that can be written to, or raise `OutputError`.
+
+    The proof is a temporary file written and removed again, because permission bits lie (root, network drives).
+    """
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as problem:
+        raise OutputError(
+            explain(
+                "output folder",
+                expected=f"a folder that can be written to at {folder}",
+                got=problem.strerror or str(problem),
+                remedy="Choose another folder or change its permissions.",
+            )
+        ) from problem
+    return folder
+
+
+@contextmanager
+def replace_when_done(path: Path | str) -> Iterator[Path]:
+    """Give a temporary path beside `path`; rename it to `path` only if the block ends without an error.
+
+    The temporary name keeps the suffix, because writers choose their format by it. An interrupted write leaves
+    the old file or none.
+    """
+    final = Path(path)
+    temporary = final.with_name(f".{final.stem}.{os.getpid()}.part{final.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, final)
+    finally:
+        temporary.unlink(missing_ok=True)

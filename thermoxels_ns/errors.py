@@ -1,0 +1,46 @@
+"""Errors a user can act on.
+
+Every message says four things: the name of what is wrong, what was expected, what was got, and the
+remedy. `ThermoxelsError` is the one type a command line catches; the subclasses let code tell them apart.
+"""
+
+
+class ThermoxelsError(Exception):
+    """Base of all errors that are the input's, not the program's."""
+
+
+class SceneError(ThermoxelsError, ValueError):
+    """A scene folder, its json, its images or its cameras cannot be used."""
+
+
+class ThermalFileError(SceneError):
+    """A thermal file cannot be read as temperatures."""
+
+
+class CheckpointError(ThermoxelsError, ValueError):
+    """A checkpoint does not fit the model that is asked to load it."""
+
+
+class PruningError(ThermoxelsError, RuntimeError):
+    """Pruning would remove a part of the scene that rays see."""
+
+
+class MeshError(ThermoxelsError, ValueError):
+    """No valid mesh can be cut from the density field."""
+
+
+class HeatError(ThermoxelsError, ValueError):
+    """A heat problem is not well posed or its solver did not converge."""
+
+
+class OutputError(ThermoxelsError, OSError):
+    """A result cannot be written where it was asked for."""
+
+
+def explain(name: str, *, expected: str, got: object, remedy: str) -> str:
+    """Put the four parts of an error message into one sentence order.
+
+    >>> explain("metres_per_unit", expected="a number above 0", got=-1, remedy="Pass --metres-per-unit 1.")
+    'metres_per_unit: expected a number above 0, got -1. Pass --metres-per-unit 1.'
+    """
+    return f"{name}: expected {expected}, got {got}. {remedy}"

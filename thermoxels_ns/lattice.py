@@ -1,0 +1,128 @@
+"""The corner lattice: the one place where index <-> world is written.
+
+Values live on voxel corners. Corner (i, j, k) sits at ``lo + (i, j, k) * voxel_size``; N corners along an axis
+span N - 1 voxels. Flat corner index: ``(i * ny + j) * nz + k`` (C order), and the same rule for cells.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.errors import ThermoxelsError, explain
+
+CORNER_OFFSETS: npt.NDArray[np.int64] = np.array(
+    [[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1], [1, 0, 0], [1, 0, 1], [1, 1, 0], [1, 1, 1]], dtype=np.int64
+)
+"""Offsets of a voxel's eight corners, shape (8, 3), in C order: corner c is (c >> 2 & 1, c >> 1 & 1, c & 1)."""
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """A regular lattice of cubic voxels with values on their corners."""
+
+    lo: tuple[float, float, float]
+    """World position of corner (0, 0, 0)."""
+    voxel_size: float
+    """Edge length of a voxel, world units."""
+    shape: tuple[int, int, int]
+    """Number of corners along x, y, z; at least 2 each."""
+
+    def __post_init__(self) -> None:
+        if not (all(math.isfinite(v) for v in self.lo) and math.isfinite(self.voxel_size) and self.voxel_size > 0):
+            raise ThermoxelsError(
+                explain(
+                    "lattice",
+                    expected="a finite origin and a voxel size above 0",
+                    got=f"lo {self.lo}, voxel size {self.voxel_size}",
+                    remedy="Check the scene box: its sides must be longer than 0.",
+                )
+            )
+        if len(self.shape) != 3 or min(self.shape) < 2:
+            raise ThermoxelsError(
+                explain(
+                    "lattice shape",
+                    expected="at least 2 corners along each axis",
+                    got=self.shape,
+                    remedy="Raise the resolution or check the scene box.",
+                )
+            )
+
+    @classmethod
+    def covering(cls, box_lo: npt.ArrayLike, box_hi: npt.ArrayLike, resolution: int) -> Lattice:
+        """Cover a box with `resolution` voxels along its longest side.
+
+        The other sides get as many voxels as it takes; what they exceed the box by is shared between both ends.
+
+        >>> Lattice.covering((0, 0, 0), (2, 1, 0.9), 4)
+        Lattice(lo=(0.0, 0.0, -0.05), voxel_size=0.5, shape=(5, 3, 3))
+        """
+        lo, hi = np.asarray(box_lo, dtype=np.float64), np.asarray(box_hi, dtype=np.float64)
+        size = hi - lo
+        if resolution < 1 or not np.all(np.isfinite(size)) or not np.all(size > 0):
+            raise ThermoxelsError(
+                explain(
+                    "scene box",
+                    expected="three finite sides longer than 0 and a resolution of at least 1",
+                    got=f"sides {size.tolist()}, resolution {resolution}",
+                    remedy="Correct the scene box or the camera poses it comes from.",
+                )
+            )
+        h = float(size.max()) / resolution
+        cells = np.maximum(np.ceil(size / h - 1e-6).astype(int), 1)
+        start = np.round(0.5 * (lo + hi) - 0.5 * cells * h, 12)
+        return cls(
+            (float(start[0]), float(start[1]), float(start[2])),
+            h,
+            (int(cells[0]) + 1, int(cells[1]) + 1, int(cells[2]) + 1),
+        )
+
+    def refined(self, factor: int) -> Lattice:
+        """Split every voxel into `factor`^3; every old corner is a corner of the new lattice."""
+        nx, ny, nz = ((n - 1) * factor + 1 for n in self.shape)
+        return Lattice(self.lo, self.voxel_size / factor, (nx, ny, nz))
+
+    @property
+    def hi(self) -> tuple[float, float, float]:
+        """World position of the last corner."""
+        x, y, z = (lo + (n - 1) * self.voxel_size for lo, n in zip(self.lo, self.shape))
+        return (x, y, z)
+
+    @property
+    def cell_shape(self) -> tuple[int, int, int]:
+        """Number of voxels along x, y, z."""
+        nx, ny, nz = self.shape
+        return (nx - 1, ny - 1, nz - 1)
+
+    @property
+    def num_corners(self) -> int:
+        """Number of corners."""
+        return self.shape[0] * self.shape[1] * self.shape[2]
+
+    def index_to_world(self, index: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """Map (fractional) corner indices (..., 3) to world positions (..., 3)."""
+        return np.asarray(self.lo) + np.asarray(index, dtype=np.float64) * self.voxel_size
+
+    def world_to_index(self, point: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """Map world positions (..., 3) to fractional corner indices (..., 3)."""
+        return (np.asarray(point, dtype=np.float64) - np.asarray(self.lo)) / self.voxel_size
+
+    def corner_positions(self) -> npt.NDArray[np.float64]:
+        """World positions of all corners, shape (nx, ny, nz, 3)."""
+        return self.index_to_world(np.stack(np.meshgrid(*map(np.arange, self.shape), indexing="ij"), axis=-1))
+
+    def cell_centres(self) -> npt.NDArray[np.float64]:
+        """World positions of all voxel centres, shape (nx-1, ny-1, nz-1, 3)."""
+        cells = np.stack(np.meshgrid(*map(np.arange, self.cell_shape), indexing="ij"), axis=-1)
+        return self.index_to_world(cells + 0.5)
+
+    def corner_to_cell_mean(self, values: npt.NDArray) -> npt.NDArray:
+        """Trilinear value at voxel centres: the mean of each voxel's eight corners, shape `cell_shape`."""
+        total = np.zeros(self.cell_shape, dtype=np.result_type(values.dtype, np.float32))
+        for dx, dy, dz in CORNER_OFFSETS:
+            nx, ny, nz = self.cell_shape
+            total += values[dx : dx + nx, dy : dy + ny, dz : dz + nz]
+        return total / 8.0

@@ -1,0 +1,82 @@
+"""Units: degrees Celsius for people, kelvin for the heat solver, [0, 1] for the optimiser."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+import torch
+
+from thermoxels_ns.errors import ThermoxelsError, explain
+
+ZERO_CELSIUS_K = 273.15
+"""0 degrees Celsius in kelvin (exact, BIPM)."""
+
+_SMALLEST_SPAN_K = 1e-3
+_CONSTANT_SCENE_SPAN_K = 1.0
+
+Numbers = TypeVar("Numbers", float, np.ndarray, torch.Tensor)
+
+
+def celsius_to_kelvin(temperature_c: Numbers) -> Numbers:
+    """Convert degrees Celsius to kelvin.
+
+    >>> celsius_to_kelvin(20.0)
+    293.15
+    """
+    return temperature_c + ZERO_CELSIUS_K
+
+
+def kelvin_to_celsius(temperature_k: Numbers) -> Numbers:
+    """Convert kelvin to degrees Celsius."""
+    return temperature_k - ZERO_CELSIUS_K
+
+
+@dataclass(frozen=True)
+class TemperatureRange:
+    """The span of a scene's temperatures, [degrees Celsius], that normalised values 0 and 1 stand for."""
+
+    min_c: float
+    max_c: float
+
+    def __post_init__(self) -> None:
+        finite = np.isfinite(self.min_c) and np.isfinite(self.max_c)
+        if not finite or self.max_c - self.min_c < _SMALLEST_SPAN_K:
+            raise ThermoxelsError(
+                explain(
+                    "temperature range",
+                    expected=f"finite bounds at least {_SMALLEST_SPAN_K} K apart",
+                    got=f"{self.min_c} to {self.max_c} C",
+                    remedy="Use TemperatureRange.spanning, which widens the range of a constant image.",
+                )
+            )
+
+    @classmethod
+    def spanning(cls, min_c: float, max_c: float) -> TemperatureRange:
+        """Make a range from the data's extremes; a constant scene gets 1 K around its value (which becomes 0.5).
+
+        >>> TemperatureRange.spanning(20.0, 20.0)
+        TemperatureRange(min_c=19.5, max_c=20.5)
+        """
+        if np.isfinite(min_c) and np.isfinite(max_c) and abs(max_c - min_c) < _SMALLEST_SPAN_K:
+            middle = 0.5 * (min_c + max_c)
+            return cls(middle - 0.5 * _CONSTANT_SCENE_SPAN_K, middle + 0.5 * _CONSTANT_SCENE_SPAN_K)
+        return cls(float(min_c), float(max_c))
+
+    @property
+    def span_k(self) -> float:
+        """Width of the range, [K]."""
+        return self.max_c - self.min_c
+
+    def normalise(self, temperature_c: Numbers) -> Numbers:
+        """Map degrees Celsius to normalised temperature; values outside the range leave [0, 1]."""
+        return (temperature_c - self.min_c) / self.span_k
+
+    def to_celsius(self, thermal: Numbers) -> Numbers:
+        """Map normalised temperature to degrees Celsius.
+
+        >>> TemperatureRange(10.0, 30.0).to_celsius(0.25)
+        15.0
+        """
+        return thermal * self.span_k + self.min_c
