@@ -1,0 +1,1 @@
+"""Heat conduction on a tetrahedral mesh, in SI units."""

@@ -1,0 +1,1 @@
+"""The voxel field: density, colour and temperature on lattice corners, and the background."""

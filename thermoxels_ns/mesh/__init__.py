@@ -1,0 +1,1 @@
+"""From a density lattice to a tetrahedral mesh: numpy in, numpy out."""

@@ -1,0 +1,1 @@
+"""Ray sampling and compositing; knows fields only as callables."""

@@ -1,0 +1,9 @@
+"""Which photographs a ray belongs to: RGB, thermal, or both where a pair shares one camera.
+
+A training batch is one `RayBundle` whose ``metadata["stream"]`` holds these bits per ray, shape (n, 1), uint8.
+"""
+
+RGB_STREAM = 1
+"""The ray carries a colour target."""
+THERMAL_STREAM = 2
+"""The ray carries a temperature target."""
