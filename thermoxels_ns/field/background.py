@@ -1,0 +1,60 @@
+"""What a ray sees that leaves the box: a sphere image for colour, a low-order sky for temperature.
+
+Either is built only where a scene calls for it; the model decides (`backdrop.py`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from thermoxels_ns.field.harmonics import harmonics_with_unit_mean, num_coefficients
+
+
+class SphereImage(nn.Module):
+    """Colour at infinity as an equirectangular image around the z axis, bilinear, in logits.
+
+    Args:
+        height: Rows from the +z pole to the -z pole; there are twice as many columns.
+    """
+
+    def __init__(self, height: int = 32):
+        super().__init__()
+        self.image = nn.Parameter(torch.zeros(height, 2 * height, 3))
+
+    def forward(self, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Colour in [0, 1] seen along unit directions."""
+        height, width, _ = self.image.shape
+        x, y, z = directions.unbind(-1)
+        column = (torch.atan2(y, x) / (2 * math.pi) + 0.5) * width - 0.5
+        row = (torch.acos(z.clamp(-1, 1)) / math.pi * height - 0.5).clamp(0, height - 1)
+        left, top = column.floor(), row.floor().clamp(max=height - 2)
+        s, t = (column - left)[:, None], (row - top)[:, None]
+        j0, i0 = left.long() % width, top.long()
+        j1, i1 = (j0 + 1) % width, i0 + 1
+        upper = torch.lerp(self.image[i0, j0], self.image[i0, j1], s)
+        lower = torch.lerp(self.image[i1, j0], self.image[i1, j1], s)
+        return torch.sigmoid(torch.lerp(upper, lower, t))
+
+
+class SkyTemperature(nn.Module):
+    """Normalised temperature at infinity as spherical harmonics of low degree.
+
+    Args:
+        degree: 0 (one temperature) to 2.
+        start: Start value in every direction.
+    """
+
+    def __init__(self, degree: int = 2, start: float = 0.0):
+        super().__init__()
+        self.degree = degree
+        self.coefficients = nn.Parameter(torch.zeros(num_coefficients(degree)))
+        with torch.no_grad():
+            self.coefficients[0] = start
+
+    def forward(self, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
+        """Normalised temperature seen along unit directions."""
+        return (harmonics_with_unit_mean(directions, self.degree) @ self.coefficients)[:, None]

@@ -1,0 +1,170 @@
+"""Density, colour and temperature on lattice corners, and which voxels are kept."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from thermoxels_ns.field.harmonics import harmonics, harmonics_with_unit_mean, num_coefficients
+from thermoxels_ns.field.interpolation import TrilinearPoints, interpolate
+from thermoxels_ns.lattice import CORNER_OFFSETS, Lattice
+
+DensityActivation = Literal["relu", "softplus", "exp"]
+
+
+def activate_density(raw: Tensor, kind: DensityActivation) -> Tensor:
+    """Map interpolated raw density to density >= 0, [1 / world unit], after interpolation.
+
+    `relu` is the paper's (Plenoxels'): density itself is trilinear. `softplus` (DVGO, Sun et al. 2022) and `exp`
+    (Instant-NGP) let one voxel hold a sharp surface; `exp` is limited to e^15, opaque at any resolution.
+    """
+    if kind == "relu":
+        return F.relu(raw)
+    if kind == "softplus":
+        return F.softplus(raw)
+    return torch.exp(raw.clamp(max=15.0))
+
+
+def raw_density(density: float, kind: DensityActivation) -> float:
+    """The raw value that `activate_density` maps to `density`, [1 / world unit], above 0.
+
+    >>> round(raw_density(0.1, "softplus"), 4)
+    -2.2522
+    """
+    value = torch.tensor(density, dtype=torch.float64)
+    if kind == "relu":
+        return float(value)
+    return float(torch.log(torch.expm1(value)) if kind == "softplus" else torch.log(value))
+
+
+class VoxelGrid(nn.Module):
+    """The parameters of the field, one row per lattice corner.
+
+    Parameters keep their identity when the lattice changes (refinement, loading a checkpoint): only their data
+    are exchanged, so that optimisers built on them stay valid.
+
+    Args:
+        lattice: Start lattice.
+        sh_degree: Degree of the colour harmonics; None: no colour.
+        temperature_degree: Degree of the temperature harmonics; 0: the same from all directions (the paper).
+        start_density: Start density everywhere, [1 / world unit]; near-transparent.
+        activation: Density activation.
+    """
+
+    lo: Tensor
+    voxel_size: Tensor
+    corner_shape: Tensor
+    kept: Tensor
+
+    def __init__(
+        self,
+        lattice: Lattice,
+        sh_degree: int | None = 2,
+        temperature_degree: int = 0,
+        start_density: float = 0.1,
+        activation: DensityActivation = "relu",
+    ):
+        super().__init__()
+        self.sh_degree, self.temperature_degree, self.activation = sh_degree, temperature_degree, activation
+        n = lattice.num_corners
+        self.density = nn.Parameter(torch.full((n, 1), raw_density(start_density, activation)))
+        channels = 0 if sh_degree is None else 3 * num_coefficients(sh_degree)
+        self.sh = nn.Parameter(torch.zeros(n, channels)) if channels else None
+        temperature = torch.zeros(n, num_coefficients(temperature_degree))
+        temperature[:, 0] = 0.5
+        self.temperature = nn.Parameter(temperature)
+        self.register_buffer("lo", torch.tensor(lattice.lo, dtype=torch.float64))
+        self.register_buffer("voxel_size", torch.tensor(lattice.voxel_size, dtype=torch.float64))
+        self.register_buffer("corner_shape", torch.tensor(lattice.shape))
+        self.register_buffer("kept", torch.ones(lattice.cell_shape, dtype=torch.bool))
+        self._lattice = lattice
+
+    @property
+    def lattice(self) -> Lattice:
+        """The corner lattice the rows belong to."""
+        return self._lattice
+
+    def row_parameters(self) -> dict[str, nn.Parameter]:
+        """The parameters that have one row per corner, by name."""
+        rows = {"density": self.density, "sh": self.sh, "temperature": self.temperature}
+        return {name: p for name, p in rows.items() if p is not None}
+
+    def replace_lattice(self, lattice: Lattice, rows: dict[str, Tensor], kept: Bool[Tensor, "x y z"]) -> None:
+        """Exchange the lattice, the rows of every parameter and the kept voxels, keeping parameter identity."""
+        for name, parameter in self.row_parameters().items():
+            parameter.data = rows[name].to(parameter.device, parameter.dtype).contiguous()
+            parameter.grad = None
+        device = self.lo.device
+        self._lattice = lattice
+        self.lo = torch.tensor(lattice.lo, dtype=torch.float64, device=device)
+        self.voxel_size = torch.tensor(lattice.voxel_size, dtype=torch.float64, device=device)
+        self.corner_shape = torch.tensor(lattice.shape, device=device)
+        self.kept = kept.to(device)
+
+    def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs):
+        """Take over the checkpoint's lattice before its rows are copied."""
+        names = ("lo", "voxel_size", "corner_shape", "kept")
+        if all(prefix + name in state_dict for name in names):
+            lo, size, shape, kept = (state_dict[prefix + name] for name in names)
+            nx, ny, nz = (int(n) for n in shape)
+            x, y, z = (float(v) for v in lo)
+            lattice = Lattice((x, y, z), float(size), (nx, ny, nz))
+            rows = {
+                name: state_dict[prefix + name]
+                for name in self.row_parameters()
+                if prefix + name in state_dict and state_dict[prefix + name].shape[1:] == getattr(self, name).shape[1:]
+            }
+            if len(rows) == len(self.row_parameters()):
+                self.replace_lattice(lattice, {k: v.clone() for k, v in rows.items()}, kept.clone())
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+    def locate(self, points: Float[Tensor, "n 3"]) -> TrilinearPoints:
+        """Find the voxels and trilinear weights of world positions."""
+        return TrilinearPoints(self._lattice, points)
+
+    def density_at(self, at: TrilinearPoints) -> Float[Tensor, " n"]:
+        """Density, [1 / world unit], >= 0."""
+        return activate_density(interpolate(self.density, at)[:, 0], self.activation)
+
+    def rgb_at(self, at: TrilinearPoints, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Colour in [0, 1] seen along unit directions: the sigmoid of the interpolated harmonics."""
+        assert self.sh is not None and self.sh_degree is not None, "this grid has no colour"
+        coefficients = interpolate(self.sh, at).view(len(directions), 3, -1)
+        return torch.sigmoid((coefficients * harmonics(directions, self.sh_degree)[:, None]).sum(-1))
+
+    def thermal_at(self, at: TrilinearPoints, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
+        """Normalised temperature; the first coefficient is its mean over directions."""
+        coefficients = interpolate(self.temperature, at)
+        if self.temperature_degree == 0:
+            return coefficients
+        basis = harmonics_with_unit_mean(directions, self.temperature_degree)
+        return (coefficients * basis).sum(-1, keepdim=True)
+
+    def in_kept_voxel(self, points: Float[Tensor, "... 3"]) -> Bool[Tensor, "..."]:
+        """Whether world positions lie in a kept voxel; outside the lattice none is kept."""
+        cells = ((points - self.lo.to(points.dtype)) / self.voxel_size.to(points.dtype)).floor().long()
+        limit = torch.tensor(self.kept.shape, device=points.device)
+        # A point on the last face belongs to the last voxel.
+        flush = (cells == limit) & (points <= torch.tensor(self._lattice.hi, device=points.device, dtype=points.dtype))
+        cells = torch.where(flush, limit - 1, cells)
+        inside = ((cells >= 0) & (cells < limit)).all(-1)
+        x, y, z = torch.minimum(cells.clamp(min=0), limit - 1).unbind(-1)
+        return inside & self.kept[x, y, z]
+
+    def kept_corners(self) -> Bool[Tensor, "x y z"]:
+        """Corners of kept voxels, shape of the lattice."""
+        corners = torch.zeros(self._lattice.shape, dtype=torch.bool, device=self.kept.device)
+        nx, ny, nz = self.kept.shape
+        for dx, dy, dz in CORNER_OFFSETS.tolist():
+            corners[dx : dx + nx, dy : dy + ny, dz : dz + nz] |= self.kept
+        return corners
+
+    @torch.no_grad()
+    def corner_density(self) -> Float[Tensor, "x y z"]:
+        """Density at every corner, 0 at corners of no kept voxel."""
+        density = activate_density(self.density[:, 0], self.activation).view(self._lattice.shape)
+        return torch.where(self.kept_corners(), density, torch.zeros_like(density))

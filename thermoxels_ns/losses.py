@@ -1,0 +1,88 @@
+"""Loss terms: the paper's eq. 3 and 4, Plenoxels' sparsity and beta terms, and distortion. All plain torch.
+
+Each is a mean, so weights mean the same for every batch size and resolution. The model computes only those whose
+weight is not 0.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def rgb_loss(predicted: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
+    """Mean squared error of colour (paper, eq. 3)."""
+    return torch.mean((predicted - target) ** 2)
+
+
+def thermal_loss(
+    predicted: Float[Tensor, "n 1"], target: Float[Tensor, "n 1"], l2_share: float = 0.5
+) -> Float[Tensor, ""]:
+    """lambda L2 + (1 - lambda) L1 of normalised temperature (paper, eq. 4, lambda = 1/2)."""
+    error = predicted - target
+    return l2_share * torch.mean(error**2) + (1.0 - l2_share) * torch.mean(error.abs())
+
+
+def total_variation(block: Float[Tensor, "x y z c"], smallest: float = 1e-10) -> Float[Tensor, ""]:
+    """Mean over corners and channels of sqrt(dx^2 + dy^2 + dz^2), differences between neighbours (Plenoxels, eq. 4).
+
+    Args:
+        block: Corner values; at least 2 along each axis.
+        smallest: Added under the root so that its gradient is finite where the field is flat.
+    """
+    here = block[:-1, :-1, :-1]
+    dx, dy, dz = block[1:, :-1, :-1] - here, block[:-1, 1:, :-1] - here, block[:-1, :-1, 1:] - here
+    return torch.mean(torch.sqrt(dx * dx + dy * dy + dz * dz + smallest))
+
+
+def random_block(
+    rows: Float[Tensor, "corners c"], shape: tuple[int, int, int], share: float, generator: torch.Generator
+) -> Float[Tensor, "x y z c"]:
+    """A contiguous slab of the lattice, about `share` of it, at a random place along the first axis."""
+    thickness = min(shape[0], max(2, math.ceil(share * shape[0]) + 1))
+    first = int(torch.randint(shape[0] - thickness + 1, (), generator=generator))
+    plane = shape[1] * shape[2]
+    return rows[first * plane : (first + thickness) * plane].view(thickness, shape[1], shape[2], -1)
+
+
+def sparsity_loss(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> Float[Tensor, ""]:
+    """Cauchy sparsity: mean over rays of sum_i log(1 + 2 s_i^2) over real steps (Plenoxels, eq. 5; SNeRG)."""
+    terms = torch.log1p(2.0 * density.clamp(max=1e9) ** 2)
+    return torch.sum(torch.where(deltas > 0, terms, torch.zeros_like(terms))) / density.shape[0]
+
+
+def beta_loss(accumulation: Float[Tensor, " rays"], guard: float = 1e-3) -> Float[Tensor, ""]:
+    """Push rays to be opaque or empty: mean of log(A + guard) + log(1 - A + guard) (Neural Volumes; Plenoxels).
+
+    Shifted so that a fully decided ray costs 0.
+    """
+    decided = math.log(guard) + math.log(1.0 + guard)
+    return torch.mean(torch.log(accumulation + guard) + torch.log(1.0 - accumulation + guard)) - decided
+
+
+def distortion_loss(
+    weights: Float[Tensor, "rays steps"],
+    t: Float[Tensor, "rays steps"],
+    deltas: Float[Tensor, "rays steps"],
+    scale: float,
+) -> Float[Tensor, ""]:
+    """Gather each ray's weight in one short interval (mip-NeRF 360, eq. 15, in the O(n) form of DVGOv2, eq. 6-7).
+
+    sum_ij w_i w_j |t_i - t_j| + 1/3 sum_i w_i^2 d_i, mean over rays, lengths divided by `scale`.
+
+    Args:
+        weights: Weights of the steps.
+        t: Step middles, ascending along each ray.
+        deltas: Step lengths.
+        scale: Length that counts as 1, world units (the diagonal of the box).
+    """
+    t, deltas = t / scale, deltas / scale
+    moment = weights * t
+    weight_before = torch.cumsum(weights, -1) - weights
+    moment_before = torch.cumsum(moment, -1) - moment
+    between = 2.0 * torch.sum(weights * (t * weight_before - moment_before), -1)
+    within = torch.sum(weights**2 * deltas, -1) / 3.0
+    return torch.mean(between + within)

@@ -1,0 +1,149 @@
+"""The volume rendering sum of the paper (eq. 1 and 2), in plain torch: the reference for every faster version."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from thermoxels_ns.errors import ThermoxelsError, explain
+from thermoxels_ns.render.sampling import RaySteps
+
+OPAQUE_OPTICAL_DEPTH = 100.0
+"""Optical depth of one step from which it counts as opaque: exp(-100) is 0 in float32, 4e-44 in float64."""
+
+RowsFn = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class RayWeights:
+    """What density makes of a ray's steps."""
+
+    weights: Float[Tensor, "rays steps"]
+    """Share of the pixel that each step fills."""
+    transmittance: Float[Tensor, " rays"]
+    """Share of the background that is left behind the last step."""
+    accumulation: Float[Tensor, " rays"]
+    """1 - transmittance, with all digits when it is small."""
+
+
+@dataclass(frozen=True)
+class Composite:
+    """What a bundle of rays sees."""
+
+    rgb: Float[Tensor, "rays 3"] | None
+    """Colour in [0, 1]; None if no colour was asked for."""
+    thermal: Float[Tensor, "rays 1"] | None
+    """Normalised temperature; None if none was asked for."""
+    accumulation: Float[Tensor, " rays"]
+    """Opacity of the whole ray, in [0, 1]."""
+    depth: Float[Tensor, " rays"]
+    """Expected distance of what was hit, world units; infinite where nothing was."""
+
+
+def ray_weights(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> RayWeights:
+    """Turn densities into weights: w_i = exp(-sum_{j<i} s_j d_j) (1 - exp(-s_i d_i)) (paper, eq. 1).
+
+    Optical depths are summed, never multiplied as transmittances, so that deep rays keep their digits;
+    1 - exp(-x) is computed as -expm1(-x), so that vanishing density keeps its value and its gradient; an
+    infinite density is opaque, also over a tiny step.
+
+    Args:
+        density: >= 0, may be infinite, [1 / world unit].
+        deltas: Step lengths, [world unit]; a step of length 0 has no weight whatever its density.
+
+    Returns:
+        Weights and what is left for the background; they sum to 1.
+
+    Raises:
+        ThermoxelsError: A density is NaN.
+    """
+    if torch.isnan(density).any():
+        raise ThermoxelsError(
+            explain(
+                "density",
+                expected="numbers >= 0",
+                got=f"{int(torch.isnan(density).sum())} NaN",
+                remedy="Lower the density learning rate and resume from the last checkpoint.",
+            )
+        )
+    optical_depth = torch.where(
+        deltas > 0, (density * deltas).clamp(min=0.0, max=OPAQUE_OPTICAL_DEPTH), torch.zeros_like(deltas)
+    )
+    total = torch.cumsum(optical_depth, dim=-1)
+    before = torch.cat((torch.zeros_like(total[:, :1]), total[:, :-1]), dim=-1)
+    return RayWeights(
+        weights=torch.exp(-before) * -torch.expm1(-optical_depth),
+        transmittance=torch.exp(-total[:, -1]),
+        accumulation=-torch.expm1(-total[:, -1]),
+    )
+
+
+def composite(
+    steps: RaySteps,
+    along: RayWeights,
+    rgb_at: RowsFn | None = None,
+    thermal_at: RowsFn | None = None,
+    rgb_rays: Bool[Tensor, " rays"] | None = None,
+    thermal_rays: Bool[Tensor, " rays"] | None = None,
+    background_rgb: Tensor | None = None,
+    background_thermal: Tensor | None = None,
+    thermal_moves_density: bool = False,
+    smallest_weight: float = 0.0,
+) -> Composite:
+    """Sum colour and temperature along rays (paper, eq. 1 and 2): C = sum_i w_i c_i + (1 - sum_i w_i) c_background.
+
+    Appearance is asked for only at steps whose weight exceeds `smallest_weight` on rays that want it.
+
+    Args:
+        steps: Samples.
+        along: Their weights.
+        rgb_at: Maps the flat indices (into rays x steps) of samples to colours (n, 3); None: no colour.
+        thermal_at: Maps flat indices of samples to normalised temperatures (n, 1); None: no temperature.
+        rgb_rays: Rays that want colour; None: all. The others get 0.
+        thermal_rays: Rays that want temperature; None: all. The others get 0.
+        background_rgb: Colour at infinity, (rays, 3) or (3,); None: black.
+        background_thermal: Normalised temperature at infinity, (rays, 1) or (1,); None: 0, the scene's minimum.
+        thermal_moves_density: Let the thermal sum carry gradients into the weights (off: temperature never
+            moves geometry).
+        smallest_weight: Steps of at most this weight add no colour and no temperature; the error of a pixel is
+            at most `smallest_weight` times its number of steps. 0 is exact.
+
+    Returns:
+        The composite; a ray that misses is exactly its background, with depth infinite.
+    """
+    accumulation = along.accumulation
+    expected = (along.weights * steps.t).sum(-1)
+    depth = torch.where(accumulation > 0, expected / accumulation.clamp(min=1e-30), torch.full_like(expected, torch.inf))
+    thermal_weights = along.weights if thermal_moves_density else along.weights.detach()
+    thermal_left = along.transmittance if thermal_moves_density else along.transmittance.detach()
+    rgb = _sum_rows(along.weights, along.transmittance, rgb_at, rgb_rays, background_rgb, 3, smallest_weight)
+    thermal = _sum_rows(thermal_weights, thermal_left, thermal_at, thermal_rays, background_thermal, 1, smallest_weight)
+    return Composite(rgb=rgb, thermal=thermal, accumulation=accumulation, depth=depth)
+
+
+def _sum_rows(
+    weights: Tensor,
+    left: Tensor,
+    rows_at: RowsFn | None,
+    rays: Tensor | None,
+    background: Tensor | None,
+    channels: int,
+    smallest_weight: float,
+) -> Tensor | None:
+    if rows_at is None:
+        return None
+    num_rays, num_steps = weights.shape
+    wanted = weights.detach() > smallest_weight
+    if rays is not None:
+        wanted &= rays[:, None]
+    flat = wanted.flatten().nonzero()[:, 0]
+    rows = rows_at(flat) * weights.flatten()[flat][:, None]
+    total = rows.new_zeros((num_rays, channels)).index_add(0, flat // num_steps, rows)
+    if background is not None:
+        behind = left[:, None] * background
+        total = total + (behind if rays is None else behind * rays[:, None])
+    return total
