@@ -1,0 +1,112 @@
+"""Files that other programs read."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pyvista as pv
+
+from thermoxels_ns.errors import MeshError, OutputError
+from thermoxels_ns.mesh.files import write_summary, write_vtu
+
+
+def test_mesh_round_trips_through_pyvista(tmp_path, box_mesh):
+    path = tmp_path / "new" / "mesh.vtu"
+    flux = np.arange(3.0 * len(box_mesh.points_m)).reshape(-1, 3)
+    write_vtu(path, box_mesh, {"flux_w_m2": flux})
+    grid = pv.read(path)
+    assert isinstance(grid, pv.UnstructuredGrid)
+    assert grid.points.dtype == np.float64
+    assert np.array_equal(grid.points, box_mesh.points_m)
+    assert np.array_equal(grid.cells_dict[pv.CellType.TETRA], box_mesh.tets)
+    assert np.array_equal(grid.point_data["temperature_c"], box_mesh.temperature_c)
+    assert np.array_equal(grid.point_data["temperature_k"], box_mesh.temperature_c + 273.15)
+    assert grid.point_data["observed"].dtype == np.uint8
+    assert np.array_equal(grid.point_data["observed"], box_mesh.observed)
+    assert 0 < grid.point_data["observed"].sum() < grid.n_points
+    assert np.array_equal(grid.point_data["flux_w_m2"], flux)
+    assert np.array_equal(grid.cell_data["region"], box_mesh.region)
+    assert grid.volume == pytest.approx(3.0)
+    assert [p.name for p in path.parent.iterdir()] == ["mesh.vtu"]
+
+
+def test_temperature_of_a_later_step_replaces_the_meshs_own(tmp_path, box_mesh):
+    later = box_mesh.temperature_c + 1.0
+    write_vtu(tmp_path / "step.vtu", box_mesh, temperature_c=later)
+    grid = pv.read(tmp_path / "step.vtu")
+    assert np.array_equal(grid.point_data["temperature_c"], later)
+    assert np.array_equal(grid.point_data["temperature_k"], later + 273.15)
+
+
+def test_same_mesh_same_bytes(tmp_path, box_mesh):
+    for name in ("a.vtu", "b.vtu"):
+        write_vtu(tmp_path / name, box_mesh)
+    assert (tmp_path / "a.vtu").read_bytes() == (tmp_path / "b.vtu").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ({"heat": np.zeros(3)}, r"point_data\['heat'\]: expected shape"),
+        ({"heat": np.full(60, np.nan)}, r"point_data\['heat'\]: expected finite"),
+        ({"temperature_c": np.zeros(60)}, "expected names other than"),
+    ],
+)
+def test_bad_point_data_leaves_the_old_file(tmp_path, box_mesh, data, message):
+    path = tmp_path / "mesh.vtu"
+    path.write_text("old")
+    with pytest.raises(MeshError, match=message):
+        write_vtu(path, box_mesh, data)
+    assert path.read_text() == "old"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_unwritable_places_are_named(tmp_path, box_mesh):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="output folder"):
+        write_vtu(tmp_path / "file" / "mesh.vtu", box_mesh)
+    with pytest.raises(OutputError, match="output folder"):
+        write_summary(tmp_path / "file" / "summary.json", {})
+    with pytest.raises(OutputError, match=r"ends in \.vtu"):
+        write_vtu(tmp_path / "mesh.stl", box_mesh)
+
+
+def test_summary_keeps_order_and_converts_numpy(tmp_path):
+    path = tmp_path / "summary.json"
+    write_summary(
+        path,
+        {
+            "volume_m3": np.float32(0.5),
+            "counts": {"tets": np.int64(6), "whole": np.bool_(True)},
+            "bounds_m": np.array([[0.0, 1.0], [2.0, 3.0]]),
+            "source": Path("run/config.yml"),
+            "sizes": (3, 2),
+            "unknown": None,
+            "unit": "°C",
+        },
+    )
+    text = path.read_text(encoding="utf-8")
+    read = json.loads(text)
+    assert list(read) == ["volume_m3", "counts", "bounds_m", "source", "sizes", "unknown", "unit"]
+    assert read["counts"] == {"tets": 6, "whole": True}
+    assert read["bounds_m"] == [[0.0, 1.0], [2.0, 3.0]]
+    assert read["source"] == "run/config.yml"
+    assert '\n  "volume_m3": 0.5' in text
+    assert "°C" in text
+
+
+@pytest.mark.parametrize(
+    ("summary", "message"),
+    [
+        ({"a": {"b": [1.0, float("nan")]}}, r"summary\.a\.b\[1\]: expected a finite number, got nan"),
+        ({"a": np.array([np.inf])}, r"summary\.a\[0\]: expected a finite number"),
+        ({"a": {1, 2}}, r"summary\.a: expected text.*got set"),
+    ],
+)
+def test_summary_refuses_what_json_lacks(tmp_path, summary, message):
+    with pytest.raises(MeshError, match=message):
+        write_summary(tmp_path / "summary.json", summary)
+    assert not list(tmp_path.iterdir())

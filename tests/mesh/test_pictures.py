@@ -1,0 +1,101 @@
+"""Pictures: what is drawn, where and in which colours."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from thermoxels_ns.errors import MeshError, OutputError
+from thermoxels_ns.mesh.pictures import _view_axes, picture_of_mesh
+
+SIZE = (400, 300)
+
+
+def pixels(path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB")).astype(int)
+
+
+def stage(image: np.ndarray) -> np.ndarray:
+    """The part of the picture where the mesh is drawn."""
+    return image[int(0.09 * SIZE[1]) : int(0.845 * SIZE[1]), int(0.03 * SIZE[0]) : int(0.81 * SIZE[0])]
+
+
+def test_mesh_is_in_the_picture_as_a_whole(tmp_path, box_mesh):
+    path = tmp_path / "mesh.png"
+    picture_of_mesh(path, box_mesh, title="Before", window_size=SIZE)
+    image = pixels(path)
+    assert image.shape == (SIZE[1], SIZE[0], 3)
+    for border in (image[:3], image[-3:], image[:, :3], image[:, -3:]):
+        assert np.all(border == 255)
+    drawn = np.any(stage(image) < 230, axis=-1)
+    rows, columns = np.flatnonzero(drawn.any(axis=1)), np.flatnonzero(drawn.any(axis=0))
+    # Fills the stage along one direction at least, and is centred in it.
+    fills = max(np.ptp(rows) / (0.74 * SIZE[1]), np.ptp(columns) / (0.76 * SIZE[0]))
+    assert 0.95 < fills < 1.03
+    assert np.any(image[:, int(0.85 * SIZE[0]) :] < 100)  # colour bar
+    assert [p.name for p in tmp_path.iterdir()] == ["mesh.png"]
+
+
+def test_hot_is_bright_and_the_colour_limits_are_used(tmp_path, box_mesh):
+    levels = []
+    for temperature in (0.0, 50.0, 100.0):
+        same = np.full(len(box_mesh.points_m), temperature)
+        picture_of_mesh(tmp_path / "t.png", box_mesh, same, clim=(0.0, 100.0), window_size=SIZE)
+        inside = stage(pixels(tmp_path / "t.png"))
+        levels.append(np.median(inside[np.any(inside < 230, axis=-1)].sum(axis=-1)))
+    assert levels[0] < levels[1] - 60 < levels[2] - 120
+
+
+def test_unobserved_surface_is_grey(tmp_path, box_mesh):
+    half = replace(box_mesh, observed=box_mesh.points_m[:, 0] < 0.1)
+    shares = []
+    for grey in (False, True):
+        picture_of_mesh(tmp_path / "g.png", half, grey_unobserved=grey, window_size=SIZE, view_direction=(1, 0.5, -0.5))
+        inside = stage(pixels(tmp_path / "g.png"))
+        body = inside[np.any(inside < 230, axis=-1)]
+        shares.append(np.mean(np.ptp(body, axis=-1) < 8))
+    assert shares[0] < 0.1 < 0.3 < shares[1]
+
+
+def test_all_unobserved_is_all_grey(tmp_path, box_mesh):
+    nowhere = replace(box_mesh, observed=np.zeros_like(box_mesh.observed))
+    picture_of_mesh(tmp_path / "g.png", nowhere, grey_unobserved=True, window_size=SIZE)
+    inside = stage(pixels(tmp_path / "g.png"))
+    assert np.all(np.ptp(inside, axis=-1) < 8)
+    assert np.mean(inside < 230) > 0.1
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, -2), (0.3, -0.5, 0.2)])
+def test_up_points_up_and_the_camera_looks_down_on_the_mesh(up):
+    right, picture_up, towards_camera = _view_axes(up, None)
+    axes = np.stack([right, picture_up, towards_camera])
+    assert np.allclose(axes @ axes.T, np.eye(3))
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+    assert np.dot(up, right) == pytest.approx(0.0, abs=1e-12)
+    assert np.dot(up, picture_up) > 0
+    assert np.dot(up, towards_camera) > 0
+
+
+def test_view_direction_points_from_the_camera_to_the_mesh():
+    _, _, towards_camera = _view_axes((0, 0, 1), (2.0, 0.0, 0.0))
+    assert towards_camera.tolist() == [-1.0, 0.0, 0.0]
+    right, up, towards_camera = _view_axes((0, 0, 1), (0.0, 0.0, -1.0))  # straight down: up is free
+    assert np.allclose(np.cross(right, up), towards_camera)
+
+
+def test_bad_input_is_refused(tmp_path, box_mesh):
+    with pytest.raises(MeshError, match="temperature_c: expected shape"):
+        picture_of_mesh(tmp_path / "a.png", box_mesh, np.zeros(3))
+    with pytest.raises(MeshError, match="temperature_c: expected finite"):
+        picture_of_mesh(tmp_path / "a.png", box_mesh, np.full(60, np.nan))
+    with pytest.raises(MeshError, match="up: expected three finite numbers"):
+        picture_of_mesh(tmp_path / "a.png", box_mesh, up=(0, 0, 0))
+    with pytest.raises(MeshError, match="clim"):
+        picture_of_mesh(tmp_path / "a.png", box_mesh, clim=(0.0, np.nan))
+    with pytest.raises(OutputError, match=r"ends in \.png"):
+        picture_of_mesh(tmp_path / "a.bmp", box_mesh)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,121 @@
+"""The mesh check finds each kind of damage."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.errors import MeshError
+from thermoxels_ns.mesh.quality import check_mesh, dihedral_range_deg, facet_areas, facet_normals, signed_volumes
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
+
+CORNER_TET = np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 4]])
+
+
+def mesh_from(points: np.ndarray, tets: np.ndarray) -> TetMesh:
+    facets = boundary_facets(tets)
+    ones = np.ones(len(points))
+    zeros = np.zeros(len(facets), dtype=np.int64)
+    return TetMesh(points, tets, ones, ones > 0, facets, zeros, np.zeros(len(tets), dtype=np.int64))
+
+
+def test_volume_area_and_normal_by_hand():
+    tet = np.array([[0, 1, 2, 3]])
+    assert signed_volumes(CORNER_TET, tet).tolist() == [4.0]
+    assert signed_volumes(CORNER_TET, tet[:, [0, 2, 1, 3]]).tolist() == [-4.0]
+    base = np.array([[0, 2, 1]])
+    assert facet_areas(CORNER_TET, base).tolist() == [3.0]
+    assert facet_normals(CORNER_TET, base).tolist() == [[0.0, 0.0, -1.0]]
+
+
+def test_dihedral_angles_of_the_regular_tetrahedron():
+    points = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    low, high = dihedral_range_deg(points, np.array([[0, 1, 2, 3]]))
+    assert low == pytest.approx(np.degrees(np.arccos(1 / 3)))
+    assert high == pytest.approx(np.degrees(np.arccos(1 / 3)))
+
+
+def test_a_valid_mesh_passes(box_mesh):
+    quality = check_mesh(box_mesh)
+    assert quality.volume_m3 == pytest.approx(1.5 * 2.0 * 1.0)
+    assert quality.area_m2 == pytest.approx(2 * (1.5 * 2 + 1.5 * 1 + 2 * 1))
+    assert (quality.num_nodes, quality.num_tets) == (60, 144)
+    assert quality.num_box_facets == quality.num_facets
+
+
+def test_turned_over_tetrahedron(box_mesh):
+    tets = box_mesh.tets.copy()
+    tets[5] = tets[5, [1, 0, 2, 3]]
+    with pytest.raises(MeshError, match="1 of 144 at or below 0, the first is 5"):
+        check_mesh(replace(box_mesh, tets=tets))
+
+
+def test_flat_tetrahedron():
+    points = CORNER_TET.copy()
+    points[3] = [1.0, 1.0, 0.0]
+    with pytest.raises(MeshError, match="volumes above 0"):
+        check_mesh(mesh_from(points, np.array([[0, 1, 2, 3]])))
+
+
+def test_face_with_three_owners():
+    points = np.vstack([CORNER_TET, [[0.0, 0.0, 5.0], [0.0, 0.0, -1.0]]])
+    tets = np.array([[0, 1, 2, 3], [0, 1, 2, 4], [0, 2, 1, 5]])
+    with pytest.raises(MeshError, match="1 faces shared by more"):
+        check_mesh(mesh_from(points, tets))
+
+
+def test_missing_turned_or_extra_boundary_triangle(box_mesh):
+    flipped = box_mesh.facets.copy()
+    flipped[3] = flipped[3, ::-1]
+    for facets in (box_mesh.facets[1:], flipped, np.vstack([box_mesh.facets, box_mesh.facets[:1]])):
+        bad = replace(box_mesh, facets=facets, facet_tags=np.zeros(len(facets), dtype=np.int64))
+        with pytest.raises(MeshError, match="mesh facets"):
+            check_mesh(bad)
+
+
+def test_rotated_node_order_of_a_triangle_is_fine(box_mesh):
+    check_mesh(replace(box_mesh, facets=np.roll(box_mesh.facets, 1, axis=1)[::-1].copy()))
+
+
+def test_diagonals_that_do_not_match_are_found():
+    # Two voxels side by side; the second is mirrored, so its diagonals on the shared face cross the first's.
+    corners, tets = kuhn_tets(np.ones((2, 1, 1), dtype=bool))
+    mirrored = {tuple(c): n for n, c in enumerate(corners.tolist())}
+    second = [[mirrored[(x, 1 - y, z)] for x, y, z in corners[t].tolist()] for t in tets[6:]]
+    crossed = np.vstack([tets[:6], np.array(second)[:, [0, 2, 1, 3]]])
+    points = corners.astype(float)
+    check_mesh(mesh_from(points, tets))
+    assert np.all(signed_volumes(points, crossed) > 0)
+    with pytest.raises(MeshError, match="a crack"):
+        check_mesh(mesh_from(points, crossed))
+
+
+def test_two_nodes_at_one_place_are_a_crack_too(box_mesh):
+    # Give the last tetrahedron nodes of its own.
+    points = np.vstack([box_mesh.points_m, box_mesh.points_m[box_mesh.tets[-1]]])
+    tets = box_mesh.tets.copy()
+    tets[-1] = np.arange(4) + len(box_mesh.points_m)
+    with pytest.raises(MeshError, match="nodes at the place of another"):
+        check_mesh(mesh_from(points, tets))
+
+
+def test_unused_node(box_mesh):
+    mesh = mesh_from(np.vstack([box_mesh.points_m, [[9.0, 9.0, 9.0]]]), box_mesh.tets)
+    with pytest.raises(MeshError, match="1 that belong to none"):
+        check_mesh(mesh)
+
+
+def test_numbers_out_of_range_nan_shapes_and_emptiness(box_mesh):
+    with pytest.raises(MeshError, match="node numbers from 0 to 59"):
+        check_mesh(replace(box_mesh, tets=box_mesh.tets + 1))
+    hot = box_mesh.temperature_c.copy()
+    hot[0] = np.nan
+    with pytest.raises(MeshError, match="mesh temperature_c: expected finite"):
+        check_mesh(replace(box_mesh, temperature_c=hot))
+    with pytest.raises(MeshError, match="mesh region: expected shape"):
+        check_mesh(replace(box_mesh, region=box_mesh.region[1:]))
+    with pytest.raises(MeshError, match="at least one tetrahedron"):
+        check_mesh(replace(box_mesh, tets=box_mesh.tets[:0], region=box_mesh.region[:0]))

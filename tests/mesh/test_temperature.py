@@ -1,0 +1,143 @@
+"""Harmonic extension of measured temperatures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.errors import MeshError
+from thermoxels_ns.mesh import temperature
+from thermoxels_ns.mesh.temperature import extend_harmonically
+from thermoxels_ns.mesh.voxel_tets import kuhn_tets, lattice_edges
+
+
+@pytest.fixture(params=["direct", "conjugate gradients"])
+def both_solvers(request, monkeypatch):
+    monkeypatch.setattr(temperature, "_DIRECT_SOLVE_UNKNOWNS", 10**9 if request.param == "direct" else 0)
+
+
+@pytest.mark.usefixtures("both_solvers")
+def test_linear_field_is_reproduced_from_the_boundary_of_a_box():
+    cells = np.ones((7, 5, 9), dtype=bool)
+    corners, _ = kuhn_tets(cells)
+    exact = 20.0 + corners @ np.array([3.0, -1.0, 0.5])
+    observed = np.any((corners == 0) | (corners == np.array(cells.shape)), axis=1)
+    edges, weights = lattice_edges(cells)
+    for edge_weights in (None, weights):
+        filled = extend_harmonically(edges, np.where(observed, exact, -273.0), observed, edge_weights)
+        assert np.array_equal(filled[observed], exact[observed])
+        assert np.abs(filled - exact).max() < 1e-8
+
+
+@pytest.mark.usefixtures("both_solvers")
+def test_linear_field_is_reproduced_from_two_end_faces():
+    # The insulated sides have weaker edges; with one weight per voxel around an edge the flux stays one-dimensional.
+    cells = np.ones((8, 3, 2), dtype=bool)
+    corners, _ = kuhn_tets(cells)
+    exact = 10.0 + 2.5 * corners[:, 0]
+    observed = (corners[:, 0] == 0) | (corners[:, 0] == 8)
+    edges, weights = lattice_edges(cells)
+    filled = extend_harmonically(edges, np.where(observed, exact, 99.0), observed, weights)
+    assert np.abs(filled - exact).max() < 1e-8
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.usefixtures("both_solvers")
+def test_maximum_principle_on_random_bodies(random_cells, seed):
+    cells = random_cells(seed)
+    edges, weights = lattice_edges(cells)
+    num_nodes = len(kuhn_tets(cells)[0])
+    random = np.random.default_rng(seed)
+    measured = random.normal(20.0, 30.0, num_nodes)
+    observed = random.random(num_nodes) < 0.5
+    parts = temperature.connected_components(
+        temperature.sparse.coo_array((weights, tuple(edges.T)), shape=(num_nodes, num_nodes)), directed=False
+    )[1]
+    for part in range(parts.max() + 1):  # every body needs a measurement
+        observed[np.flatnonzero(parts == part)[0]] = True
+    filled = extend_harmonically(edges, np.where(observed, measured, 1e6), observed, weights)
+    assert np.array_equal(filled[observed], measured[observed])
+    for part in range(parts.max() + 1):
+        inside = parts == part
+        assert filled[inside].min() >= measured[inside & observed].min()
+        assert filled[inside].max() <= measured[inside & observed].max()
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.usefixtures("both_solvers")
+def test_filled_nodes_are_the_weighted_mean_of_their_neighbours(seed):
+    cells = np.random.default_rng(seed).random((5, 5, 5)) < 0.9
+    edges, weights = lattice_edges(cells)
+    num_nodes = len(kuhn_tets(cells)[0])
+    observed = np.random.default_rng(seed + 100).random(num_nodes) < 0.7
+    measured = np.random.default_rng(seed + 200).normal(size=num_nodes)
+    filled = extend_harmonically(edges, measured, observed, weights)
+    total, weight = np.zeros(num_nodes), np.zeros(num_nodes)
+    for (i, j), w in zip(edges, weights):
+        total[i] += w * filled[j]
+        total[j] += w * filled[i]
+        weight[i] += w
+        weight[j] += w
+    assert np.abs(total / weight - filled)[~observed].max() < 1e-7
+
+
+@pytest.mark.usefixtures("both_solvers")
+def test_constant_stays_exactly_constant():
+    edges, weights = lattice_edges(np.ones((4, 4, 4), dtype=bool))
+    observed = np.zeros(125, dtype=bool)
+    observed[[3, 77]] = True
+    assert np.all(extend_harmonically(edges, np.full(125, 21.37), observed, weights) == 21.37)
+
+
+def test_one_measured_node_is_enough():
+    edges, _ = lattice_edges(np.ones((2, 2, 2), dtype=bool))
+    observed = np.arange(27) == 13
+    assert np.all(extend_harmonically(edges, np.full(27, -5.0), observed) == -5.0)
+
+
+def test_all_measured_is_returned_unchanged():
+    edges, _ = lattice_edges(np.ones((1, 1, 1), dtype=bool))
+    values = np.arange(8.0)
+    assert np.array_equal(extend_harmonically(edges, values, np.ones(8, dtype=bool)), values)
+
+
+def test_value_of_an_unobserved_node_is_never_read():
+    edges, _ = lattice_edges(np.ones((2, 1, 1), dtype=bool))
+    observed = np.arange(12) < 4
+    filled = extend_harmonically(edges, np.where(observed, 20.0, np.nan), observed)
+    assert np.all(filled == 20.0)
+
+
+def test_body_without_measurement_is_named():
+    cells = np.array([True, False, True])[:, None, None]
+    edges, _ = lattice_edges(cells)
+    observed = np.arange(16) < 8
+    with pytest.raises(MeshError, match=r"none in 1 of 2 parts: part 1 \(8 nodes, the first is node 8\)"):
+        extend_harmonically(edges, np.full(16, 20.0), observed)
+
+
+def test_heat_does_not_jump_a_gap():
+    cells = np.array([True, False, True])[:, None, None]
+    edges, _ = lattice_edges(cells)
+    observed = np.isin(np.arange(16), [0, 15])
+    filled = extend_harmonically(edges, np.where(np.arange(16) < 8, 10.0, 50.0), observed)
+    assert filled.tolist() == [10.0] * 8 + [50.0] * 8
+
+
+def test_nan_measurement_and_wrong_shapes_are_refused():
+    edges = np.array([[0, 1]])
+    with pytest.raises(MeshError, match="observed temperatures: expected finite"):
+        extend_harmonically(edges, np.array([np.nan, 1.0]), np.array([True, False]))
+    with pytest.raises(MeshError, match="observed: expected shape"):
+        extend_harmonically(edges, np.array([1.0, 1.0]), np.array([True]))
+    with pytest.raises(MeshError, match="edge_weights: expected shape"):
+        extend_harmonically(edges, np.array([1.0, 1.0]), np.array([True, False]), np.ones(3))
+
+
+def test_a_solver_that_fails_is_reported(monkeypatch):
+    monkeypatch.setattr(temperature, "_DIRECT_SOLVE_UNKNOWNS", 0)
+    monkeypatch.setattr(temperature, "cg", lambda matrix, load, **_: (np.zeros_like(load), 1))
+    with pytest.raises(MeshError, match=r"relative residual of at most 1e-09, got 1 with 1 unobserved"):
+        extend_harmonically(
+            np.array([[0, 1], [1, 2], [1, 3]]), np.array([10.0, 0.0, 30.0, 40.0]), np.array([True, False, True, True])
+        )

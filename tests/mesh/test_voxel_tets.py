@@ -1,0 +1,175 @@
+"""Six conforming tetrahedra per voxel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.errors import MeshError
+from thermoxels_ns.mesh.quality import check_mesh, facet_areas, signed_volumes
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
+from thermoxels_ns.mesh.voxel_tets import boundary_facets, boundary_tags, count_facets, kuhn_tets, lattice_edges
+
+
+def exposed_faces(cells: np.ndarray) -> int:
+    """Number of voxel faces between solid and empty, by plain loops."""
+    padded = np.pad(cells, 1)
+    return sum(
+        not padded[tuple(np.add(cell, step))]
+        for cell in np.argwhere(padded)
+        for step in ([1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1])
+    )
+
+
+def pattern(name: str) -> np.ndarray:
+    cells = np.zeros((3, 3, 3), dtype=bool)
+    cells[1, 1, 1] = True
+    if name == "sharing an edge":
+        cells[2, 2, 1] = True
+    elif name == "sharing a corner":
+        cells[2, 2, 2] = True
+    elif name == "sharing a face":
+        cells[1, 2, 1] = True
+    elif name == "checkerboard":
+        cells = np.indices((4, 3, 5)).sum(axis=0) % 2 == 0
+    elif name == "full":
+        cells[:] = True
+    elif name == "hollow":
+        cells = ~cells
+    return cells
+
+
+PATTERNS = ["single", "sharing a face", "sharing an edge", "sharing a corner", "checkerboard", "full", "hollow"]
+
+
+@pytest.mark.parametrize("name", PATTERNS)
+def test_volume_area_and_validity(mesh_of_cells, name):
+    cells = pattern(name)
+    quality = check_mesh(mesh_of_cells(cells, voxel_size=0.5))
+    assert quality.num_tets == 6 * cells.sum()
+    assert quality.volume_m3 == pytest.approx(cells.sum() * 0.5**3, rel=1e-14)
+    assert quality.num_facets == 2 * exposed_faces(cells)
+    assert quality.area_m2 == pytest.approx(exposed_faces(cells) * 0.5**2, rel=1e-14)
+    assert quality.min_tet_volume_m3 == pytest.approx(0.5**3 / 6, rel=1e-14)
+    assert (quality.min_dihedral_deg, quality.max_dihedral_deg) == pytest.approx((45.0, 90.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "edges"), [("single", 0), ("sharing a face", 0), ("sharing an edge", 1), ("sharing a corner", 0)]
+)
+def test_non_manifold_edges_are_counted(mesh_of_cells, name, edges):
+    assert check_mesh(mesh_of_cells(pattern(name))).num_non_manifold_edges == edges
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_random_carved_blocks_are_valid(mesh_of_cells, random_cells, seed):
+    cells = random_cells(seed)
+    quality = check_mesh(mesh_of_cells(cells, voxel_size=0.25))
+    assert quality.volume_m3 == pytest.approx(cells.sum() * 0.25**3, rel=1e-13)
+    assert quality.area_m2 == pytest.approx(exposed_faces(cells) * 0.25**2, rel=1e-13)
+
+
+def test_single_voxel_by_hand():
+    corners, tets = kuhn_tets(np.ones((1, 1, 1), dtype=bool))
+    assert corners.tolist() == np.argwhere(np.ones((2, 2, 2))).tolist()
+    assert (corners.dtype, tets.dtype) == (np.int64, np.int64)
+    assert sorted(sorted(t) for t in tets.tolist()) == [
+        [0, 1, 3, 7],
+        [0, 1, 5, 7],
+        [0, 2, 3, 7],
+        [0, 2, 6, 7],
+        [0, 4, 5, 7],
+        [0, 4, 6, 7],
+    ]
+    assert np.allclose(signed_volumes(corners.astype(float), tets), 1 / 6)
+
+
+def test_nodes_are_the_used_corners_only():
+    cells = np.zeros((5, 4, 3), dtype=bool)
+    cells[3, 2, 1] = True
+    corners, tets = kuhn_tets(cells)
+    assert corners.min(axis=0).tolist() == [3, 2, 1]
+    assert corners.max(axis=0).tolist() == [4, 3, 2]
+    assert np.unique(tets).tolist() == list(range(8))
+
+
+def test_boundary_of_one_tetrahedron_points_outwards():
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    facets = boundary_facets(np.array([[0, 1, 2, 3]]))
+    normals = np.cross(points[facets[:, 1]] - points[facets[:, 0]], points[facets[:, 2]] - points[facets[:, 0]])
+    outward = points[facets].mean(axis=1) - points.mean(axis=0)
+    assert len(facets) == 4
+    assert np.all(np.einsum("ij,ij->i", normals, outward) > 0)
+
+
+def test_boundary_does_not_depend_on_the_order_of_tets():
+    _, tets = kuhn_tets(pattern("hollow"))
+    shuffled = tets[np.random.default_rng(1).permutation(len(tets))]
+    assert np.array_equal(boundary_facets(tets), boundary_facets(shuffled))
+
+
+def test_divergence_theorem_on_a_carved_block(mesh_of_cells, random_cells):
+    mesh = mesh_of_cells(random_cells(7))
+    a, b, c = (mesh.points_m[mesh.facets[:, n]] for n in range(3))
+    enclosed = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
+    assert enclosed == pytest.approx(signed_volumes(mesh.points_m, mesh.tets).sum(), rel=1e-12)
+
+
+def test_interior_faces_are_shared_by_two():
+    _, tets = kuhn_tets(pattern("full"))
+    _, uses = count_facets(tets)
+    assert np.count_nonzero(uses == 1) == 2 * 54
+    assert np.count_nonzero(uses == 2) == (4 * 6 * 27 - 2 * 54) // 2
+    assert uses.max() == 2
+
+
+def test_box_facets_are_those_on_the_lattice_border(mesh_of_cells):
+    cells = np.zeros((3, 3, 3), dtype=bool)
+    cells[1:, 1, 1] = True  # touches the box at x = 3 with one voxel face
+    mesh = mesh_of_cells(cells, voxel_size=1.0)
+    box = mesh.facet_tags == FACET_BOX
+    assert np.all(mesh.points_m[mesh.facets[box]][:, :, 0] == 3.0)
+    assert facet_areas(mesh.points_m, mesh.facets[box]).sum() == pytest.approx(1.0)
+    assert np.count_nonzero(mesh.facet_tags == FACET_SURFACE) == len(mesh.facets) - 2
+
+
+def test_triangle_with_nodes_on_two_sides_of_the_box_is_no_cut():
+    corners = np.array([[0, 1, 1], [1, 0, 1], [1, 1, 0], [0, 2, 2]])
+    facets = np.array([[0, 1, 2], [0, 3, 1]])
+    assert boundary_tags(facets, corners, (5, 5, 5)).tolist() == [FACET_SURFACE, FACET_SURFACE]
+
+
+def test_full_lattice_is_cut_all_around(mesh_of_cells):
+    assert np.all(mesh_of_cells(pattern("full")).facet_tags == FACET_BOX)
+
+
+def test_edges_of_one_voxel():
+    edges, num_voxels = lattice_edges(np.ones((1, 1, 1), dtype=bool))
+    corners, _ = kuhn_tets(np.ones((1, 1, 1), dtype=bool))
+    assert len(edges) == 12
+    assert np.all(num_voxels == 1)
+    assert np.all(np.abs(corners[edges[:, 0]] - corners[edges[:, 1]]).sum(axis=1) == 1)
+
+
+def test_edges_do_not_bridge_a_gap():
+    cells = np.array([True, False, True])[:, None, None]
+    edges, _ = lattice_edges(cells)
+    corners, _ = kuhn_tets(cells)
+    assert len(edges) == 24
+    assert set(map(tuple, corners[edges].min(axis=1)[:, :1])) == {(0,), (1,), (2,), (3,)}
+    pairs = np.sort(corners[edges][:, :, 0], axis=1)
+    assert [1, 2] not in pairs.tolist()
+
+
+def test_voxels_around_an_edge_are_counted():
+    edges, num_voxels = lattice_edges(np.ones((2, 2, 2), dtype=bool))
+    assert len(edges) == 54
+    assert np.bincount(num_voxels).tolist() == [0, 24, 24, 0, 6]
+
+
+@pytest.mark.parametrize(
+    "bad", [np.zeros((2, 2, 2), dtype=bool), np.ones((2, 2), dtype=bool), np.ones((2, 2, 2)), np.ones((0, 2, 2), bool)]
+)
+def test_what_is_no_body_is_refused(bad):
+    with pytest.raises(MeshError, match="solid voxels: expected a three-dimensional boolean array"):
+        kuhn_tets(bad)

@@ -1,0 +1,149 @@
+"""Write meshes and summaries to files that other programs read."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.checks import check_finite, check_shape, replace_when_done, writable_folder
+from thermoxels_ns.errors import MeshError, OutputError, explain
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.units import celsius_to_kelvin
+
+_OWN_ARRAYS = ("temperature_c", "temperature_k", "observed")
+
+
+def write_vtu(
+    path: Path | str,
+    mesh: TetMesh,
+    point_data: Mapping[str, npt.NDArray] | None = None,
+    *,
+    temperature_c: npt.NDArray[np.floating] | None = None,
+) -> None:
+    """Write a mesh as a VTK unstructured grid (.vtu, read by ParaView, pyvista and meshio).
+
+    Point arrays: `temperature_c` [degrees Celsius], `temperature_k` [K], `observed` (1: measured, 0: extended). Cell
+    array: `region`.
+
+    Args:
+        path: File to write, ending in .vtu; its folder is made if need be.
+        mesh: The mesh.
+        point_data: More arrays to write, one row per node.
+        temperature_c: Temperatures to write in place of the mesh's own, shape (n,), for a step of a heat simulation.
+
+    Raises:
+        MeshError: An array does not fit the mesh, is not finite, or takes a name that is in use.
+        OutputError: The file cannot be written.
+    """
+    import pyvista as pv
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
+
+    path = Path(path)
+    if path.suffix != ".vtu":
+        raise OutputError(
+            explain("mesh file", expected="a name that ends in .vtu", got=path.name, remedy="Rename the file.")
+        )
+    num_nodes = len(mesh.points_m)
+    remedy = "Pass one finite value per mesh node."
+    temperature = np.asarray(mesh.temperature_c if temperature_c is None else temperature_c, dtype=np.float64)
+    check_shape("temperature_c", temperature, (num_nodes,), remedy, MeshError)
+    check_finite("temperature_c", temperature, remedy, MeshError)
+    arrays = {
+        "temperature_c": temperature,
+        "temperature_k": celsius_to_kelvin(temperature),
+        "observed": mesh.observed.astype(np.uint8),
+    }
+    for name, values in (point_data or {}).items():
+        values = np.asarray(values)
+        if name in _OWN_ARRAYS:
+            raise MeshError(
+                explain("point_data", expected=f"names other than {_OWN_ARRAYS}", got=repr(name), remedy="Rename it.")
+            )
+        check_shape(f"point_data[{name!r}]", values, (num_nodes, *values.shape[1:]), remedy, MeshError)
+        arrays[name] = check_finite(f"point_data[{name!r}]", values, remedy, MeshError)
+
+    grid = pv.UnstructuredGrid({pv.CellType.TETRA: mesh.tets}, np.asarray(mesh.points_m, dtype=np.float64))
+    for name, values in arrays.items():
+        grid.point_data[name] = values
+    grid.cell_data["region"] = mesh.region
+    grid.set_active_scalars("temperature_c")
+
+    writable_folder(path.parent)
+    with replace_when_done(path) as temporary:
+        writer = vtkXMLUnstructuredGridWriter()
+        writer.SetFileName(str(temporary))
+        writer.SetInputData(grid)
+        if not writer.Write() or writer.GetErrorCode() or not temporary.is_file():
+            raise OutputError(
+                explain(
+                    "mesh file",
+                    expected=f"to write {path}",
+                    got=f"VTK error {writer.GetErrorCode()}",
+                    remedy="Check the free space and the permissions of the folder.",
+                )
+            )
+
+
+def write_summary(path: Path | str, summary: Mapping[str, Any]) -> None:
+    """Write figures as indented json, in the order given.
+
+    Numpy numbers and arrays and paths are converted; other types are refused.
+
+    Args:
+        path: File to write; its folder is made if need be.
+        summary: Names and values, nested as you like.
+
+    Raises:
+        MeshError: A number is NaN or infinite (json has neither), or a value has no place in json; the message names
+            it.
+        OutputError: The file cannot be written.
+    """
+    text = json.dumps(_plain("summary", summary), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    path = Path(path)
+    writable_folder(path.parent)
+    with replace_when_done(path) as temporary:
+        try:
+            temporary.write_text(text, encoding="utf-8")
+        except OSError as problem:
+            raise OutputError(
+                explain(
+                    "summary file",
+                    expected=f"to write {path}",
+                    got=problem.strerror or str(problem),
+                    remedy="Check the free space and the permissions of the folder.",
+                )
+            ) from problem
+
+
+def _plain(name: str, value: Any) -> Any:
+    """Turn `value` into what json knows; `name` says where it is if it cannot be."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(f"{name}.{key}", entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(name, value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(f"{name}[{n}]", entry) for n, entry in enumerate(value)]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        raise MeshError(
+            explain(name, expected="a finite number", got=value, remedy="Leave it out, or write None for 'unknown'.")
+        )
+    if value is None or isinstance(value, (str, bool, int, float)):
+        return value
+    raise MeshError(
+        explain(
+            name,
+            expected="text, a number, a list, a mapping, a path or None",
+            got=type(value).__name__,
+            remedy="Convert it before writing.",
+        )
+    )

@@ -1,0 +1,268 @@
+"""Pictures of a mesh coloured by temperature, drawn without a screen."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.checks import check_finite, check_shape, replace_when_done, writable_folder
+from thermoxels_ns.errors import MeshError, OutputError, explain
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+if TYPE_CHECKING:
+    import pyvista as pv
+    from matplotlib.colors import ListedColormap
+
+# The part of the picture that the mesh may fill, as (left, bottom, right, top) shares of width and height: the title
+# is above, the colour bar to the right, the axes and the size below.
+_STAGE = (0.04, 0.16, 0.80, 0.90)
+_GREY = "#b8b8b8"
+_INK = "#202020"
+_BAR_TITLE = "temperature [\N{DEGREE SIGN}C]"
+_DARKEST = 0.1
+"""Share of the colour map left out at its dark end, where shading could not be told from cold."""
+
+
+def picture_of_mesh(
+    path: Path | str,
+    mesh: TetMesh,
+    temperature_c: npt.NDArray[np.floating] | None = None,
+    *,
+    title: str = "",
+    clim: tuple[float, float] | None = None,
+    up: Sequence[float] = (0.0, 0.0, 1.0),
+    view_direction: Sequence[float] | None = None,
+    grey_unobserved: bool = False,
+    show_edges: bool = False,
+    length_unit: str = "m",
+    window_size: tuple[int, int] = (1200, 900),
+) -> None:
+    """Draw the surface of a mesh, coloured by temperature, as a PNG with a white background.
+
+    Parallel projection, framed so that the whole mesh is in the picture beside its colour bar.
+
+    Args:
+        path: File to write, ending in .png; its folder is made if need be.
+        mesh: The mesh.
+        temperature_c: Nodal temperatures to show, shape (n,), [degrees Celsius]; the mesh's own if left out.
+        title: Text above the picture.
+        clim: Temperatures at the ends of the colour bar, [degrees Celsius]; the data's extremes if left out.
+        up: Direction that points up in the picture, in mesh coordinates.
+        view_direction: Direction from the camera to the mesh; obliquely from above if left out.
+        grey_unobserved: Draw triangles with a node that no thermal ray saw in grey.
+        show_edges: Draw the triangles' edges.
+        length_unit: Name of the unit of the node positions, written below the picture.
+        window_size: Width and height, [pixels].
+
+    Raises:
+        MeshError: An array does not fit the mesh, or the directions do not span a view.
+        OutputError: The file cannot be written.
+    """
+    import pyvista as pv
+
+    path = Path(path)
+    if path.suffix != ".png":
+        raise OutputError(
+            explain("picture", expected="a name that ends in .png", got=path.name, remedy="Rename the file.")
+        )
+    values = np.asarray(mesh.temperature_c if temperature_c is None else temperature_c, dtype=np.float64)
+    remedy = "Pass one finite temperature per mesh node."
+    check_shape("temperature_c", values, (len(mesh.points_m),), remedy, MeshError)
+    check_finite("temperature_c", values, remedy, MeshError)
+    right, true_up, towards_camera = _view_axes(up, view_direction)
+    low, high = _colour_limits(values[np.unique(mesh.facets)] if clim is None else np.asarray(clim, dtype=np.float64))
+
+    unseen = ~mesh.observed[mesh.facets].all(axis=1) if grey_unobserved else np.zeros(len(mesh.facets), dtype=bool)
+    folder = writable_folder(path.parent)
+    with _quiet_vtk(), replace_when_done(folder / path.name) as temporary:
+        plotter = pv.Plotter(off_screen=True, window_size=list(window_size), lighting="none")
+        try:
+            plotter.renderer.set_background("white")
+            _add_lights(plotter, right, true_up, towards_camera)
+            font = _font_file()
+            edges = {"show_edges": show_edges, "edge_color": _INK, "line_width": 0.5, "edge_opacity": 0.4}
+            matter = {"ambient": 0.62, "diffuse": 0.45, "specular": 0.0, "smooth_shading": False}
+            if not unseen.all():
+                surface = pv.PolyData.from_regular_faces(mesh.points_m, mesh.facets[~unseen])
+                surface.point_data["temperature_c"] = values
+                plotter.add_mesh(
+                    surface,
+                    scalars="temperature_c",
+                    cmap=_colour_map(),
+                    clim=(low, high),
+                    show_scalar_bar=False,
+                    **edges,
+                    **matter,
+                )
+                _add_colour_bar(plotter, font, high - low)
+            if unseen.any():
+                surface = pv.PolyData.from_regular_faces(mesh.points_m, mesh.facets[unseen])
+                plotter.add_mesh(surface, color=_GREY, **edges, **matter)
+            _add_words(plotter, mesh, title, font, length_unit, unseen=bool(unseen.any()))
+            _frame(plotter, mesh.points_m[np.unique(mesh.facets)], right, true_up, towards_camera)
+            plotter.screenshot(str(temporary), return_img=False)
+        finally:
+            plotter.close()
+
+
+def _view_axes(
+    up: Sequence[float], view_direction: Sequence[float] | None
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Unit vectors of the picture: right, up, and from the mesh to the camera."""
+    upwards = _unit("up", up)
+    if view_direction is None:
+        side = _unit("up", np.cross(np.roll(np.eye(3)[np.argmax(np.abs(upwards))], 2), upwards))
+        towards_camera = _unit("view", 0.85 * side + 0.6 * np.cross(upwards, side) + 0.65 * upwards)
+    else:
+        towards_camera = -_unit("view_direction", view_direction)
+    right = np.cross(upwards, towards_camera)
+    if np.linalg.norm(right) < 1e-6:
+        # Looking along the up axis: any direction across it is as good as another.
+        right = np.cross(np.eye(3)[np.argmin(np.abs(towards_camera))], towards_camera)
+    right = _unit("right", right)
+    return right, np.cross(towards_camera, right), towards_camera
+
+
+def _unit(name: str, vector: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    array = np.asarray(vector, dtype=np.float64)
+    length = float(np.linalg.norm(array))
+    if array.shape != (3,) or not np.isfinite(length) or length == 0.0:
+        raise MeshError(
+            explain(name, expected="three finite numbers, not all 0", got=vector, remedy="Pass for instance (0, 0, 1).")
+        )
+    return array / length
+
+
+def _colour_limits(values: npt.NDArray[np.float64]) -> tuple[float, float]:
+    """Ends of the colour bar; a constant temperature gets 1 K around it."""
+    low, high = float(values.min()), float(values.max())
+    if not (np.isfinite(low) and np.isfinite(high)):
+        raise MeshError(explain("clim", expected="finite temperatures", got=(low, high), remedy="Leave clim out."))
+    return (low, high) if high - low > 1e-3 else (low - 0.5, high + 0.5)
+
+
+def _colour_map() -> ListedColormap:
+    """Inferno (perceptually uniform, readable in grey) without its black end."""
+    import matplotlib
+    from matplotlib.colors import ListedColormap
+
+    return ListedColormap(matplotlib.colormaps["inferno"](np.linspace(_DARKEST, 1.0, 256)))
+
+
+def _font_file() -> str:
+    """DejaVu Sans, which comes with matplotlib and has every sign the pictures need."""
+    import matplotlib
+
+    return str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf")
+
+
+def _add_colour_bar(plotter: pv.Plotter, font: str, span: float) -> None:
+    import pyvista as pv
+
+    height = plotter.window_size[1]
+    decimals = 1 if span > 2.0 else 2
+    bar = plotter.add_scalar_bar(  # pyright: ignore[reportCallIssue]  (pyvista wraps it without self)
+        title=_BAR_TITLE,
+        vertical=True,
+        position_x=0.86,
+        position_y=0.2,
+        width=0.06,
+        height=0.6,
+        title_font_size=round(height / 50),
+        label_font_size=round(height / 50),
+        n_labels=5,
+        # VTK 9.6 went from printf's to Python's way of writing formats.
+        fmt=f"{{:.{decimals}f}}" if pv.vtk_version_info >= (9, 6) else f"%.{decimals}f",
+        color=_INK,
+        unconstrained_font_size=True,
+        render=False,
+    )
+    bar.SetVerticalTitleSeparation(round(height / 45))
+    for words in (bar.GetTitleTextProperty(), bar.GetLabelTextProperty()):
+        words.SetFontFamily(4)  # VTK_FONT_FILE
+        words.SetFontFile(font)
+
+
+def _add_lights(plotter: pv.Plotter, right: npt.NDArray, up: npt.NDArray, towards_camera: npt.NDArray) -> None:
+    """Three soft parallel lights, so that faces of different direction differ while colours stay readable."""
+    import pyvista as pv
+
+    for direction, strength in (
+        (towards_camera + 0.6 * up - 0.5 * right, 0.75),
+        (towards_camera + 0.2 * up + 1.2 * right, 0.35),
+        (up, 0.25),
+    ):
+        light = pv.Light(position=tuple(direction), focal_point=(0, 0, 0), intensity=strength, light_type="scene light")
+        light.positional = False
+        plotter.add_light(light)
+
+
+def _add_words(plotter: pv.Plotter, mesh: TetMesh, title: str, font: str, length_unit: str, *, unseen: bool) -> None:
+    """Title, size of the mesh, axes, and what grey means."""
+    height = plotter.window_size[1]
+    if title:
+        plotter.add_text(
+            title, position=(0.04, 0.925), viewport=True, font_size=round(height / 60), color=_INK, font_file=font
+        )
+    size = mesh.points_m.max(axis=0) - mesh.points_m.min(axis=0)
+    words = f"{size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} {length_unit}, {len(mesh.tets):,} tetrahedra"
+    if unseen:
+        words += "; grey: no thermal ray"
+    plotter.add_text(
+        words, position=(0.17, 0.04), viewport=True, font_size=round(height / 90), color=_INK, font_file=font
+    )
+    plotter.renderer.add_axes(viewport=(0.0, 0.0, 0.15, 0.155), line_width=3, color=_INK)
+
+
+def _frame(
+    plotter: pv.Plotter,
+    points: npt.NDArray[np.float64],
+    right: npt.NDArray,
+    up: npt.NDArray,
+    towards_camera: npt.NDArray,
+) -> None:
+    """Point a parallel camera so that `points` just fill the stage."""
+    width, height = plotter.window_size
+    left, bottom, stage_right, top = _STAGE
+    across, along = points @ right, points @ up
+    depth = points @ towards_camera
+    view_height = max(np.ptp(along) / (top - bottom), np.ptp(across) / (stage_right - left) * height / width, 1e-12)
+    # The stage's centre is off the picture's centre; shift the focal point the other way.
+    shift_x = (0.5 * (left + stage_right) - 0.5) * view_height * width / height
+    shift_y = (0.5 * (bottom + top) - 0.5) * view_height
+    focus = (
+        (0.5 * (across.min() + across.max()) - shift_x) * right
+        + (0.5 * (along.min() + along.max()) - shift_y) * up
+        + 0.5 * (depth.min() + depth.max()) * towards_camera
+    )
+    distance = 2.0 * view_height + float(np.ptp(depth))
+    camera = plotter.camera
+    camera.focal_point = tuple(focus)
+    camera.position = tuple(focus + distance * towards_camera)
+    camera.up = tuple(up)
+    camera.enable_parallel_projection()
+    camera.parallel_scale = 0.5 * view_height
+    plotter.camera_set = True
+    plotter.reset_camera_clipping_range()
+
+
+@contextmanager
+def _quiet_vtk() -> Iterator[None]:
+    """Without a display VTK draws in software and warns that it found no X server, which nobody needs to read."""
+    from vtkmodules.vtkCommonCore import vtkLogger
+
+    if os.environ.get("DISPLAY"):
+        yield
+        return
+    before = vtkLogger.GetCurrentVerbosityCutoff()
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
+    try:
+        yield
+    finally:
+        vtkLogger.SetStderrVerbosity(before)

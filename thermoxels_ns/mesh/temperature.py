@@ -1,0 +1,125 @@
+"""Temperatures for the nodes that no thermal ray saw: the smoothest field that agrees with those it did see."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage, sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import cg, spsolve
+
+from thermoxels_ns.checks import check_finite, check_shape
+from thermoxels_ns.errors import MeshError, explain
+
+MIN_OBSERVED_WEIGHT = 0.01
+"""A node counts as measured if thermal rays, all together, gave it at least a hundredth of one fully absorbed ray.
+Less is leakage through a surface or the tail of an interpolation, and its temperature is mostly the starting value."""
+
+_DIRECT_SOLVE_UNKNOWNS = 4000
+_RELATIVE_RESIDUAL = 1e-9
+
+
+def extend_harmonically(
+    edges: npt.NDArray[np.int64],
+    temperature_c: npt.NDArray[np.floating],
+    observed: npt.NDArray[np.bool_],
+    edge_weights: npt.NDArray | None = None,
+) -> npt.NDArray[np.float64]:
+    """Fill in the temperature of unobserved nodes by the graph Laplace equation.
+
+    Observed nodes keep their value. Every other node i solves sum_j w_ij (T_i - T_j) = 0 over its edges: steady heat
+    conduction in an insulated body. The matrix is an M-matrix, so the maximum principle holds: no filled-in value
+    leaves the observed range of its connected part. What rounding adds beyond it is clipped.
+
+    Args:
+        edges: Node pairs, shape (e, 2), each edge once.
+        temperature_c: Nodal temperatures, shape (n,), [degrees Celsius]; read at observed nodes only.
+        observed: True where a node's temperature is a measurement, shape (n,).
+        edge_weights: Conductance of each edge, shape (e,), above 0; equal if left out. The number of solid voxels
+            around an edge (`voxel_tets.lattice_edges`) gives uniform conductivity in the voxels.
+
+    Returns:
+        Temperature of every node, shape (n,), [degrees Celsius].
+
+    Raises:
+        MeshError: A connected part has no observed node, or the solver did not converge.
+
+    >>> chain = np.array([[0, 1], [1, 2]])
+    >>> extend_harmonically(chain, np.array([10.0, -99.0, 30.0]), np.array([True, False, True])).tolist()
+    [10.0, 20.0, 30.0]
+    """
+    num_nodes = len(temperature_c)
+    observed = np.asarray(observed, dtype=bool)
+    remedy = "Pass one entry per mesh node or edge."
+    check_shape("observed", observed, (num_nodes,), remedy, MeshError)
+    check_shape("edges", edges, (None, 2), remedy, MeshError)
+    weights = np.ones(len(edges)) if edge_weights is None else np.asarray(edge_weights, dtype=np.float64)
+    check_shape("edge_weights", weights, (len(edges),), remedy, MeshError)
+    temperature = np.where(observed, np.asarray(temperature_c, dtype=np.float64), 0.0)
+    check_finite(
+        "observed temperatures", temperature, "The checkpoint is damaged; resume from an earlier one.", MeshError
+    )
+    if observed.all():
+        return temperature
+
+    start, end = edges[:, 0], edges[:, 1]
+    links = sparse.coo_array((weights, (start, end)), shape=(num_nodes, num_nodes)).tocsr()
+    links = (links + links.T).tocsr()
+    parts = _parts_with_measurement(links, observed)
+
+    free = np.flatnonzero(~observed)
+    fixed = np.flatnonzero(observed)
+    middle = 0.5 * (temperature[fixed].min() + temperature[fixed].max())
+    rows = links[free]
+    degree = np.asarray(rows.sum(axis=1)).ravel()
+    matrix = (sparse.diags_array(degree) - rows[:, free]).tocsr()
+    load = rows[:, fixed] @ (temperature[fixed] - middle)
+    temperature[free] = middle + _solve(matrix, load, degree)
+
+    labels = np.arange(parts.max() + 1)
+    low = np.asarray(ndimage.minimum(temperature[fixed], parts[fixed], labels))
+    high = np.asarray(ndimage.maximum(temperature[fixed], parts[fixed], labels))
+    temperature[free] = np.clip(temperature[free], low[parts[free]], high[parts[free]])
+    return temperature
+
+
+def _parts_with_measurement(links: sparse.csr_array, observed: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+    """Connected part of every node, shape (n,); raise if a part has no observed node."""
+    count, parts = connected_components(links, directed=False)
+    measured = np.bincount(parts[observed], minlength=count)
+    blind = np.flatnonzero(measured == 0)
+    if len(blind):
+        sizes = np.bincount(parts, minlength=count)
+        shown = ", ".join(
+            f"part {p} ({sizes[p]} nodes, the first is node {int(np.argmax(parts == p))})" for p in blind[:3]
+        )
+        raise MeshError(
+            explain(
+                "observed temperatures",
+                expected="at least one node seen by a thermal ray in each connected part of the mesh",
+                got=f"none in {len(blind)} of {count} parts: {shown}{', ...' if len(blind) > 3 else ''}",
+                remedy="Keep only the largest component, train with thermal images that show this part, "
+                "or lower min_observed_weight.",
+            )
+        )
+    return parts.astype(np.int64)
+
+
+def _solve(matrix: sparse.csr_array, load: npt.NDArray, degree: npt.NDArray) -> npt.NDArray[np.float64]:
+    """Solve the symmetric positive definite system: directly if small, else conjugate gradients with Jacobi."""
+    if len(load) <= _DIRECT_SOLVE_UNKNOWNS:
+        solution = np.asarray(spsolve(matrix.tocsc(), load)).reshape(-1)
+    else:
+        solution, _ = cg(matrix, load, rtol=0.01 * _RELATIVE_RESIDUAL, atol=0.0, M=sparse.diags_array(1.0 / degree))
+    residual = float(np.linalg.norm(load - matrix @ solution))
+    scale = float(np.linalg.norm(load)) or 1.0
+    if not residual <= _RELATIVE_RESIDUAL * scale:
+        raise MeshError(
+            explain(
+                "harmonic extension of the temperature",
+                expected=f"a relative residual of at most {_RELATIVE_RESIDUAL:g}",
+                got=f"{residual / scale:.3g} with {len(load)} unobserved nodes",
+                remedy="Lower the resolution of the mesh or min_observed_weight, so that more nodes are measured.",
+            )
+        )
+    return solution

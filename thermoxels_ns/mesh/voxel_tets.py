@@ -1,0 +1,163 @@
+"""Six conforming tetrahedra per voxel, their boundary and the lattice edges they hang on."""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.errors import MeshError, explain
+from thermoxels_ns.lattice import CORNER_OFFSETS
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
+
+OUTWARD_FACES: npt.NDArray[np.int64] = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
+"""Faces of a positively oriented tetrahedron; face f lies opposite node f, its right-hand normal points outwards."""
+
+
+def _kuhn_pattern() -> npt.NDArray[np.int64]:
+    """Voxel corners of the six tetrahedra around the main diagonal, shape (6, 4), positively oriented.
+
+    Each permutation (a, b, c) of the axes is a path 000 -> e_a -> e_a + e_b -> 111 along voxel edges (Kuhn 1960,
+    Freudenthal 1942); its determinant is the permutation's sign.
+    """
+    bit = (4, 2, 1)
+    pattern = []
+    for a, b, _ in permutations(range(3)):
+        even = (b - a) % 3 == 1
+        first, second = bit[a], bit[a] + bit[b]
+        pattern.append([0, first, second, 7] if even else [0, second, first, 7])
+    return np.array(pattern, dtype=np.int64)
+
+
+KUHN_PATTERN = _kuhn_pattern()
+
+
+def kuhn_tets(cells: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Cut every solid voxel into six tetrahedra that share its main diagonal.
+
+    The diagonal has the same direction in every voxel, so the triangles on a face shared by two voxels coincide: the
+    mesh conforms. All dihedral angles are 45, 60 or 90 degrees, which keeps the heat equation's maximum principle.
+
+    Args:
+        cells: True where a voxel is solid, shape (nx-1, ny-1, nz-1).
+
+    Returns:
+        corner_indices: Lattice indices (i, j, k) of the used corners in C order, shape (n, 3).
+        tets: Rows of `corner_indices`, shape (6 * solid voxels, 4), positively oriented.
+
+    >>> corners, tets = kuhn_tets(np.ones((1, 1, 1), dtype=bool))
+    >>> corners.shape, tets.shape
+    ((8, 3), (6, 4))
+    """
+    cells = _as_cells(cells)
+    number = _node_numbers(cells)
+    strides = np.array([number.shape[1] * number.shape[2], number.shape[2], 1], dtype=np.int64)
+    corners = (np.argwhere(cells) @ strides)[:, None] + CORNER_OFFSETS @ strides
+    tets = number.ravel()[corners][:, KUHN_PATTERN].reshape(-1, 4)
+    return np.argwhere(number >= 0).astype(np.int64), tets
+
+
+def lattice_edges(cells: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Edges of the solid voxels, numbered like the nodes of `kuhn_tets`.
+
+    Two used corners across an empty gap are no edge, even if they are lattice neighbours.
+
+    Args:
+        cells: True where a voxel is solid, shape (nx-1, ny-1, nz-1).
+
+    Returns:
+        edges: Node pairs, shape (e, 2), each edge once.
+        num_voxels: Solid voxels around each edge, 1 to 4, shape (e,).
+    """
+    cells = _as_cells(cells)
+    number = _node_numbers(cells)
+    edges, counts = [], []
+    for axis in range(3):
+        around = cells.astype(np.int64)
+        for other in {0, 1, 2} - {axis}:
+            width = [(0, 0)] * 3
+            width[other] = (1, 1)
+            padded = np.pad(around, width)
+            lower = np.take(padded, range(padded.shape[other] - 1), axis=other)
+            around = lower + np.take(padded, range(1, padded.shape[other]), axis=other)
+        start = np.argwhere(around > 0)
+        end = start.copy()
+        end[:, axis] += 1
+        edges.append(np.stack([number[tuple(start.T)], number[tuple(end.T)]], axis=-1))
+        counts.append(around[around > 0])
+    return np.concatenate(edges), np.concatenate(counts)
+
+
+def boundary_facets(tets: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Triangles that belong to exactly one tetrahedron, right-hand normal outwards.
+
+    Args:
+        tets: Node indices of positively oriented tetrahedra, shape (t, 4).
+
+    Returns:
+        Node indices, shape (f, 3), ordered by their sorted node numbers.
+    """
+    faces, uses = count_facets(tets)
+    return faces[uses == 1]
+
+
+def count_facets(tets: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """All different triangles of a mesh, and how many tetrahedra own each.
+
+    Returns:
+        faces: Node indices, shape (f, 3), oriented outwards from one owner, ordered by their sorted node numbers.
+        uses: Number of owners, shape (f,); 1 on the boundary, 2 inside a conforming mesh.
+    """
+    faces = np.asarray(tets, dtype=np.int64)[:, OUTWARD_FACES].reshape(-1, 3)
+    if len(faces) == 0:
+        return faces, np.zeros(0, dtype=np.int64)
+    key = np.sort(faces, axis=1)
+    order = np.lexsort((key[:, 2], key[:, 1], key[:, 0]))
+    key = key[order]
+    first = np.flatnonzero(np.concatenate([[True], np.any(key[1:] != key[:-1], axis=1)]))
+    return faces[order[first]], np.diff(np.append(first, len(key)))
+
+
+def boundary_tags(
+    facets: npt.NDArray[np.int64], corner_indices: npt.NDArray[np.int64], lattice_shape: tuple[int, int, int]
+) -> npt.NDArray[np.int64]:
+    """Tell triangles where the scene box cuts the solid from the solid's own surface.
+
+    Args:
+        facets: Boundary triangles, shape (f, 3).
+        corner_indices: Lattice index of each node, shape (n, 3).
+        lattice_shape: Number of corners along x, y, z.
+
+    Returns:
+        `FACET_BOX` where all three nodes lie on one side of the lattice, else `FACET_SURFACE`; shape (f,).
+    """
+    index = corner_indices[facets]
+    low = np.all(index == 0, axis=1)
+    high = np.all(index == np.array(lattice_shape) - 1, axis=1)
+    return np.where(np.logical_or(low, high).any(axis=1), FACET_BOX, FACET_SURFACE).astype(np.int64)
+
+
+def _as_cells(cells: npt.NDArray) -> npt.NDArray[np.bool_]:
+    cells = np.asarray(cells)
+    if cells.ndim != 3 or cells.dtype != np.bool_ or not cells.any():
+        raise MeshError(
+            explain(
+                "solid voxels",
+                expected="a three-dimensional boolean array with at least one True",
+                got=f"{cells.dtype} array of shape {cells.shape} with {np.count_nonzero(cells)} solid voxels",
+                remedy="Lower the density threshold or percentile so that some voxels are solid.",
+            )
+        )
+    return cells
+
+
+def _node_numbers(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+    """Node number of every lattice corner in C order, -1 where no solid voxel touches it; shape = cells + 1."""
+    nx, ny, nz = cells.shape
+    used = np.zeros((nx + 1, ny + 1, nz + 1), dtype=bool)
+    for dx, dy, dz in CORNER_OFFSETS:
+        used[dx : dx + nx, dy : dy + ny, dz : dz + nz] |= cells
+    number = np.cumsum(used.ravel(), dtype=np.int64).reshape(used.shape) - 1
+    number[~used] = -1
+    return number
