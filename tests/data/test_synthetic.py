@@ -1,0 +1,212 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from thermoxels_ns.data.raycast import render_view
+from thermoxels_ns.data.synthetic import load_truth, make_scene, write_scene
+from thermoxels_ns.errors import OutputError, SceneError
+
+SMALL = {"num_train": 3, "num_eval": 2, "width": 40, "height": 30, "progress": False}
+
+
+def transforms(folder: Path) -> dict:
+    return json.loads((folder / "transforms.json").read_text())
+
+
+def all_bytes(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def png_to_celsius(folder: Path, frame: dict) -> np.ndarray:
+    bounds = json.loads((folder / "temperature_bounds.json").read_text())
+    lowest, highest = bounds["absolute_min_temperature"], bounds["absolute_max_temperature"]
+    counts = np.asarray(Image.open(folder / frame["thermal_file_path"])).astype(np.float64)
+    return lowest + counts / 65535 * (highest - lowest)
+
+
+def test_layout_is_that_of_thermoscenes(tmp_path: Path) -> None:
+    scene = make_scene("hot-object")
+    assert write_scene(scene, tmp_path / "made" / "here", **SMALL) == tmp_path / "made" / "here"
+    folder = tmp_path / "made" / "here"
+    names = [f"frame_{kind}_{n:05d}" for kind, count in (("train", 3), ("eval", 2)) for n in range(1, count + 1)]
+    assert set(all_bytes(folder)) == {
+        "transforms.json",
+        "temperature_bounds.json",
+        *(f"{sub}/{name}.png" for sub in ("images", "thermal") for name in names),
+    }
+    content = transforms(folder)
+    assert (content["w"], content["h"], content["camera_model"]) == (40, 30, "OPENCV")
+    assert [content[k] for k in ("k1", "k2", "p1", "p2")] == [0.0] * 4
+    assert [content[k] for k in ("fl_x", "fl_y", "cx", "cy")] == [40.0, 40.0, 20.0, 15.0]
+    assert content["scene_box"] == [list(c) for c in scene.scene_box]
+    assert [f["file_path"] for f in content["frames"]] == [f"images/{n}.png" for n in names]
+    assert [f["thermal_file_path"] for f in content["frames"]] == [f"thermal/{n}.png" for n in names]
+    assert "thermal_camera" not in content and "thermal_unit" not in content
+    train, held_out = scene.poses(3, 2)
+    np.testing.assert_array_equal([f["transform_matrix"] for f in content["frames"]], [*train, *held_out])
+
+
+@pytest.mark.parametrize("name", ["hot-object", "house-corner", "sphere"])
+def test_sixteen_bit_png_round_trip(tmp_path: Path, name: str) -> None:
+    scene = make_scene(name)
+    write_scene(scene, tmp_path, **SMALL)
+    for frame in transforms(tmp_path)["frames"]:
+        view = render_view(scene, np.array(frame["transform_matrix"]), scene.camera(40, 30))
+        assert np.abs(png_to_celsius(tmp_path, frame) - view.temperature_c).max() < 1e-3
+        rgb = np.asarray(Image.open(tmp_path / frame["file_path"]))
+        assert rgb.shape == (30, 40, 3)
+        assert np.abs(rgb / 255.0 - view.rgb).max() <= 0.5 / 255.0 + 1e-6
+
+
+def test_tiff_counts_have_a_linear_unit(tmp_path: Path) -> None:
+    scene = make_scene("house-corner")
+    write_scene(scene, tmp_path, thermal_format="tiff", **SMALL)
+    content = transforms(tmp_path)
+    frame = content["frames"][0]
+    counts = np.asarray(Image.open(tmp_path / frame["thermal_file_path"]))
+    assert frame["thermal_file_path"].endswith(".tiff") and counts.dtype == np.uint16
+    celsius = counts * content["thermal_unit"]["celsius_per_count"] + content["thermal_unit"]["celsius_offset"]
+    view = render_view(scene, np.array(frame["transform_matrix"]), scene.camera(40, 30))
+    assert np.abs(celsius - view.temperature_c).max() <= 0.005 + 1e-9
+
+
+def test_npy_holds_celsius_and_thermal_images_may_be_smaller(tmp_path: Path) -> None:
+    scene = make_scene("sphere")
+    write_scene(scene, tmp_path, thermal_format="npy", thermal_width=20, **SMALL)
+    frame = transforms(tmp_path)["frames"][1]
+    celsius = np.load(tmp_path / frame["thermal_file_path"])
+    assert celsius.dtype == np.float32 and celsius.shape == (15, 20)
+    view = render_view(scene, np.array(frame["transform_matrix"]), scene.camera(20, 15))
+    np.testing.assert_allclose(celsius, view.temperature_c, rtol=1e-6)
+
+
+def test_own_thermal_camera_is_a_rigid_offset_with_its_own_lens(tmp_path: Path) -> None:
+    scene = make_scene("hot-object")
+    write_scene(scene, tmp_path, own_thermal_camera=True, thermal_width=30, **SMALL)
+    content = transforms(tmp_path)
+    thermal = content["thermal_camera"]
+    assert set(thermal) == {"camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"}
+    assert (thermal["w"], thermal["h"]) == (30, 24)
+    assert thermal["cx"] != 15.0
+    offsets = [
+        np.linalg.inv(f["transform_matrix"]) @ np.array(f["thermal_transform_matrix"]) for f in content["frames"]
+    ]
+    np.testing.assert_allclose(offsets, np.broadcast_to(offsets[0], (5, 4, 4)), atol=1e-12)
+    np.testing.assert_allclose(offsets[0][:3, :3] @ offsets[0][:3, :3].T, np.eye(3), atol=1e-12)
+    assert 0.005 < np.linalg.norm(offsets[0][:3, 3]) < 0.1
+    # The picture is the one that the written pose and intrinsics predict; the bounds give its unit.
+    frame = content["frames"][0]
+    camera = dataclasses.replace(scene.camera(30, 24), **{k: thermal[k] for k in ("fl_x", "fl_y", "cx", "cy")})
+    view = render_view(scene, np.array(frame["thermal_transform_matrix"]), camera)
+    assert np.abs(png_to_celsius(tmp_path, frame) - view.temperature_c).max() < 1e-3
+    assert "thermal_unit" not in content
+
+
+@pytest.mark.real_data
+def test_own_thermal_camera_has_the_keys_of_real_data(tmp_path: Path, shared_data: Path) -> None:
+    real = json.loads((shared_data / "arco" / "transforms.json").read_text())
+    write_scene(make_scene("sphere"), tmp_path, own_thermal_camera=True, thermal_format="tiff", **SMALL)
+    made = transforms(tmp_path)
+    assert set(made["thermal_camera"]) == set(real["thermal_camera"])
+    assert set(made["thermal_unit"]) == set(real["thermal_unit"])
+    assert set(made["frames"][0]) == set(real["frames"][0])
+
+
+def test_noise_and_drift_have_the_size_asked_for_and_are_not_clipped(tmp_path: Path) -> None:
+    scene = make_scene("sphere")
+    write_scene(
+        scene, tmp_path, num_train=8, num_eval=0, width=40, height=30, noise_k=0.5, drift_k=2.0, seed=3, progress=False
+    )
+    content = transforms(tmp_path)
+    drifts = content["truth"]["drift_k"]
+    assert 0.8 < np.std(drifts) < 4.0
+    for frame, drift in zip(content["frames"], drifts):
+        view = render_view(scene, np.array(frame["transform_matrix"]), scene.camera(40, 30))
+        error = png_to_celsius(tmp_path, frame) - view.temperature_c
+        assert error.mean() == pytest.approx(drift, abs=0.06)
+        assert error.std() == pytest.approx(0.5, rel=0.1)
+        counts = np.asarray(Image.open(tmp_path / frame["thermal_file_path"]))
+        assert counts.min() > 0 and counts.max() < 65535
+
+
+def test_same_seed_same_bytes(tmp_path: Path) -> None:
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        write_scene(make_scene("sphere"), tmp_path / name, noise_k=0.1, drift_k=0.1, seed=seed, **SMALL)
+    assert all_bytes(tmp_path / "a") == all_bytes(tmp_path / "b")
+    assert all_bytes(tmp_path / "a") != all_bytes(tmp_path / "c")
+
+
+def test_truth_comes_back_from_the_folder(tmp_path: Path) -> None:
+    write_scene(make_scene("house-corner"), tmp_path, **SMALL)
+    truth = load_truth(tmp_path)
+    assert truth is not None and truth.name == "house-corner"
+    assert truth.area_m2 == make_scene("house-corner").area_m2
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ('{"truth": {"synthetic_scene": "castle"}}', "hot-object, house-corner, sphere, got 'castle'"),
+        ('{"truth": {"seed": 1}}', "synthetic_scene"),
+        ('{"truth": ', "readable json"),
+        ("[1, 2]", "json object"),
+        (None, "readable json"),
+    ],
+)
+def test_bad_truth_is_an_error(tmp_path: Path, text: str | None, match: str) -> None:
+    if text is not None:
+        (tmp_path / "transforms.json").write_text(text)
+    with pytest.raises(SceneError, match=match):
+        load_truth(tmp_path)
+
+
+def test_real_photographs_have_no_truth_and_are_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "transforms.json").write_text('{"frames": []}')
+    assert load_truth(tmp_path) is None
+    with pytest.raises(SceneError, match="describes other photographs"):
+        write_scene(make_scene("sphere"), tmp_path, **SMALL)
+    assert (tmp_path / "transforms.json").read_text() == '{"frames": []}'
+
+
+def test_an_interrupted_write_leaves_no_scene_that_loads(tmp_path: Path) -> None:
+    scene = make_scene("sphere")
+    write_scene(scene, tmp_path, **SMALL)
+
+    def broken(points: np.ndarray) -> np.ndarray:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_scene(dataclasses.replace(scene, surface_temperature_c=broken), tmp_path, **SMALL)
+    assert not (tmp_path / "transforms.json").exists()
+    assert not [p for p in tmp_path.rglob("*") if ".part" in p.name]
+    write_scene(scene, tmp_path, **SMALL)
+    assert len(transforms(tmp_path)["frames"]) == 5
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"thermal_width": 7}, "thermal_width.*aspect 40:30"),
+        ({"thermal_format": "jpeg"}, "thermal_format.*png16"),
+        ({"noise_k": -1.0}, "noise_k"),
+        ({"drift_k": float("nan")}, "drift_k"),
+        ({"num_train": 0}, "number of views"),
+        ({"width": 0}, "width.*at least 1"),
+    ],
+)
+def test_bad_options_say_what_is_wrong_and_write_nothing(tmp_path: Path, options: dict, match: str) -> None:
+    with pytest.raises(SceneError, match=match):
+        write_scene(make_scene("sphere"), tmp_path / "new", **{**SMALL, **options})
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_folder_that_is_a_file_is_an_output_error(tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(OutputError):
+        write_scene(make_scene("sphere"), tmp_path / "taken", **SMALL)

@@ -1,0 +1,239 @@
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.data.pinhole import CameraRing, PinholeCamera, look_at, ring_poses
+from thermoxels_ns.data.raycast import render_view, visible_surface_points
+from thermoxels_ns.data.synthetic_scenes import SCENE_NAMES, make_scene
+from thermoxels_ns.errors import SceneError
+
+
+@pytest.fixture(params=SCENE_NAMES)
+def scene(request: pytest.FixtureRequest):
+    return make_scene(request.param)
+
+
+def test_unknown_scene_lists_the_names() -> None:
+    with pytest.raises(SceneError, match="hot-object, house-corner, sphere"):
+        make_scene("castle")
+
+
+def test_solid_lies_in_the_scene_box_with_room_for_two_voxels(scene) -> None:
+    lo, hi = np.array(scene.scene_box)
+    voxel = (hi - lo).max() / 64
+    solid_lo, solid_hi = np.array(scene.solid.bounds)
+    assert (solid_lo - lo >= 2 * voxel).all() and (hi - solid_hi >= 2 * voxel).all()
+
+
+def test_temperatures_stay_within_the_bounds(scene) -> None:
+    lowest, highest = scene.temperature_bounds_c
+    points, _ = scene.surface_points(20_000)
+    surface = scene.surface_temperature_c(points)
+    directions = np.random.default_rng(0).standard_normal((5000, 3))
+    directions = np.concatenate([directions / np.linalg.norm(directions, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
+    sky = scene.background_temperature_c(directions)
+    assert min(surface.min(), sky.min()) >= lowest and max(surface.max(), sky.max()) <= highest
+    assert max(surface.max(), sky.max()) - min(surface.min(), sky.min()) > 0.9 * (highest - lowest)
+
+
+def test_exact_sizes() -> None:
+    assert make_scene("sphere").area_m2 == pytest.approx(np.pi)
+    assert make_scene("sphere").volume_m3 == pytest.approx(np.pi / 6)
+    hot = make_scene("hot-object")
+    table, lower, upper, ball = 1.0 * 0.8 * 0.08, 0.34 * 0.32 * 0.14, 0.18 * 0.32 * 0.14, 4 / 3 * np.pi * 0.12**3
+    assert hot.volume_m3 == pytest.approx(table + lower + upper + ball)
+    sides = 2 * 0.08 * 1.8 + 2 * 0.14 * (0.34 + 0.32) + 2 * 0.14 * (0.18 + 0.32)
+    assert hot.area_m2 == pytest.approx(2 * 1.0 * 0.8 + sides + 4 * np.pi * 0.12**2)
+    house = make_scene("house-corner")
+    panes = [(1.2, 1.1), (1.4, 1.1), (1.1, 1.7), (0.9, 1.1), (1.1, 2.1), (1.3, 1.1), (1.8, 1.2), (0.9, 1.2)]
+    recesses = 0.35 * sum(w * h for w, h in panes)
+    ground, building, roof, balcony = 7.6 * 7.1 * 0.45, 6 * 5 * 5.0, 6.6 * 5.6 * 0.35, 3.0 * 1.3 * 0.35
+    assert house.volume_m3 == pytest.approx(ground + building + roof + balcony - recesses)
+
+
+def test_temperatures_tell_the_parts_apart() -> None:
+    hot = make_scene("hot-object").surface_temperature_c
+    block, ball, table = hot([[-0.36, 0, 0.05], [0.24, -0.04, 0.24], [0.48, 0.38, 0.0]])
+    assert block > 65 and 45 < ball < 55 and 18.5 < table < 21
+    house = make_scene("house-corner").surface_temperature_c
+    pane, wall, bridge, fin_tip = house([[-1.8, -2.15, 1.4], [-2.8, -2.5, 1.0], [-2.8, -2.5, 2.625], [0, -3.8, 2.6]])
+    assert pane == pytest.approx(14.0) and wall == pytest.approx(5.0, abs=0.5)
+    assert bridge > wall + 2.5 and fin_tip < 3.0
+    sky = make_scene("house-corner").background_temperature_c
+    np.testing.assert_allclose(sky([[0, 0, 1.0], [1.0, 0, 0]]), [-20.0, 0.0], atol=0.5)
+    np.testing.assert_allclose(make_scene("sphere").surface_temperature_c([[0, 0, -0.5], [0.3, 0.4, 0]]), [20.0, 30.0])
+
+
+def test_temperature_is_continuous_over_the_reveals_of_a_window() -> None:
+    x = np.linspace(-2.55, -2.25, 20_001)
+    plane = np.stack([x, np.full_like(x, -2.5), np.full_like(x, 1.5)], axis=1)
+    into = np.stack([np.full(20_001, -2.4), np.linspace(-2.5, -2.15, 20_001), np.full(20_001, 1.5)], axis=1)
+    for line in (plane, into):
+        assert np.abs(np.diff(make_scene("house-corner").surface_temperature_c(line))).max() < 5e-3
+
+
+def test_every_view_frames_the_scene_from_outside(scene) -> None:
+    camera = scene.camera(320, 240)
+    points, _ = scene.surface_points(5000)
+    for pose in np.concatenate(scene.poses(42, 6)):
+        pixel, inside = camera.project(pose, points)
+        assert inside.all() and not scene.contains(pose[None, :3, 3])[0]
+        assert np.ptp(pixel, axis=0).max() > 0.4 * 320
+
+
+@pytest.mark.parametrize(("num_train", "num_eval"), [(42, 6), (1, 1), (2, 3), (7, 0), (4, 9)])
+def test_no_evaluation_view_repeats_a_view(scene, num_train: int, num_eval: int) -> None:
+    train, held_out = scene.poses(num_train, num_eval)
+    assert train.shape == (num_train, 4, 4) and held_out.shape == (num_eval, 4, 4)
+    positions = np.concatenate([train, held_out])[:, :3, 3]
+    size = np.subtract(*scene.scene_box[::-1]).max()
+    assert all(np.linalg.norm(a - b) > 0.02 * size for a, b in itertools.combinations(positions, 2))
+
+
+def test_evaluation_views_stand_half_way_between_training_views() -> None:
+    ring = CameraRing((1.0, 2.0, 0.0), 3.0, 1.5)
+    train, held_out = ring_poses([ring], 8, 4)
+    azimuth = np.sort(np.degrees(np.arctan2(train[:, 1, 3] - 2.0, train[:, 0, 3] - 1.0)) % 360)
+    np.testing.assert_allclose(np.diff(azimuth), 45.0)
+    between = np.degrees(np.arctan2(held_out[:, 1, 3] - 2.0, held_out[:, 0, 3] - 1.0)) % 360
+    np.testing.assert_allclose((between - azimuth[0]) % 45.0, 22.5)
+    arc = dataclasses.replace(ring, start_deg=0.0, span_deg=90.0)
+    train, held_out = ring_poses([arc], 5, 2)
+    azimuths = [np.degrees(np.arctan2(p[:, 1, 3] - 2.0, p[:, 0, 3] - 1.0)) for p in (train, held_out)]
+    assert azimuths[0].min() < azimuths[1].min() and azimuths[1].max() < azimuths[0].max() <= 90.0
+
+
+def test_look_at_points_the_view_axis_at_the_target() -> None:
+    pose = look_at((3.0, -2.0, 1.0), (0.5, 0.25, 0.5))
+    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-15)
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
+    assert pose[2, 0] == pytest.approx(0.0) and pose[2, 1] > 0.9
+    pixel, inside = PinholeCamera(40, 30, 50.0, 50.0, 18.0, 16.0).project(pose, [[0.5, 0.25, 0.5], [6.0, -4.0, 1.5]])
+    np.testing.assert_allclose(pixel[0], [18.0, 16.0])
+    assert inside.tolist() == [True, False]
+    with pytest.raises(SceneError, match="not vertical"):
+        look_at((0, 0, 2), (0, 0, 0))
+
+
+def test_rays_go_through_the_pixels_they_project_to() -> None:
+    camera, pose = PinholeCamera(7, 5, 9.0, 8.0, 3.2, 2.6), look_at((1.0, 2.0, 3.0), (0.0, 0.1, 0.2))
+    for samples in (1, 3):
+        directions = camera.directions(pose, samples)
+        assert directions.shape == (5, 7, samples**2, 3)
+        pixel, _ = camera.project(pose, pose[:3, 3] + 2.5 * directions.reshape(-1, 3))
+        rows, columns = np.mgrid[:5, :7]
+        centres = np.stack([columns + 0.5, rows + 0.5], axis=-1)
+        np.testing.assert_allclose(pixel.reshape(5, 7, samples**2, 2).mean(axis=2), centres, atol=1e-12)
+        np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1.0)
+
+
+def test_constant_temperature_renders_constant(scene) -> None:
+    constant = dataclasses.replace(
+        scene,
+        surface_temperature_c=lambda points: np.full(len(points), 20.0),
+        background_temperature_c=lambda directions: np.full(len(directions), 20.0),
+    )
+    view = render_view(constant, scene.poses(4, 0)[0][1], scene.camera(60, 45))
+    np.testing.assert_array_equal(view.temperature_c, 20.0)
+
+
+def test_sphere_depth_and_temperature_are_analytic() -> None:
+    scene, camera = make_scene("sphere"), make_scene("sphere").camera(81, 61)
+    view = render_view(scene, look_at((0.0, -2.0, 0.0), (0.0, 0.0, 0.0)), camera, samples_per_axis=1)
+    column, row = np.meshgrid(np.arange(81) + 0.5 - camera.cx, np.arange(61) + 0.5 - camera.cy)
+    squared = (column**2 + row**2) / camera.fl_x**2
+    cosine = 1.0 / np.sqrt(1.0 + squared)
+    reach = 0.25 - 4.0 * (1.0 - cosine**2)
+    with np.errstate(invalid="ignore"):
+        depth = np.where(reach >= 0, 2.0 * cosine - np.sqrt(reach), np.inf)
+    np.testing.assert_array_equal(view.hit, reach >= 0)
+    np.testing.assert_allclose(view.depth_m, depth, rtol=1e-12)
+    z = -row / camera.fl_y * cosine * np.where(view.hit, view.depth_m, 0.0)
+    np.testing.assert_allclose(view.temperature_c, np.where(view.hit, 30.0 + 20.0 * z, 10.0), atol=1e-9)
+
+
+def test_supersampling_is_the_mean_of_a_finer_image(scene) -> None:
+    pose = scene.poses(3, 0)[0][1]
+    coarse = render_view(scene, pose, scene.camera(20, 15), samples_per_axis=2)
+    fine = render_view(scene, pose, scene.camera(40, 30), samples_per_axis=1)
+    np.testing.assert_allclose(
+        coarse.temperature_c, fine.temperature_c.reshape(15, 2, 20, 2).mean(axis=(1, 3)), rtol=1e-9, atol=1e-9
+    )
+    np.testing.assert_allclose(coarse.rgb, fine.rgb.reshape(15, 2, 20, 2, 3).mean(axis=(1, 3)), atol=1e-5)
+    assert (coarse.hit == np.isfinite(coarse.depth_m)).all()
+
+
+def test_images_do_not_depend_on_how_rays_are_chunked(scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    pose, camera = scene.poses(3, 0)[0][0], scene.camera(32, 24)
+    whole = render_view(scene, pose, camera)
+    monkeypatch.setattr("thermoxels_ns.data.raycast._RAYS_PER_CHUNK", 101)
+    monkeypatch.setattr("thermoxels_ns.data.solids._RAYS_PER_CHUNK", 37)
+    parts = render_view(scene, pose, camera)
+    np.testing.assert_allclose(parts.rgb, whole.rgb, atol=1e-6)
+    np.testing.assert_array_equal(parts.depth_m, whole.depth_m)
+    np.testing.assert_allclose(parts.temperature_c, whole.temperature_c, rtol=1e-12)
+
+
+def test_colours_are_textured_within_range_and_smoother_than_two_voxels(scene) -> None:
+    points, normals = scene.surface_points(4000)
+    colour = scene.colour(points, normals)
+    assert colour.shape == (4000, 3) and colour.min() >= 0.0 and colour.max() <= 1.0
+    up = normals[:, 2] > 0.7
+    assert colour[up].std(axis=0).min() > 0.05
+    # A hundredth of a voxel along the surface changes little; two voxels change about as much as anything does.
+    voxel = np.subtract(*scene.scene_box[::-1]).max() / 64
+    along = np.cross(normals, [0.31, 0.55, 0.77])
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    near = np.abs(scene.colour(points + 0.01 * voxel * along, normals) - colour).mean()
+    far = np.abs(scene.colour(points + 2.0 * voxel * along, normals) - colour).mean()
+    assert near < 0.02 and near < 0.05 * far and far > 0.03
+
+
+def test_a_camera_inside_the_solid_is_an_error() -> None:
+    scene = make_scene("house-corner")
+    pose = look_at((0.0, 0.0, 1.0), (3.0, 0.0, 1.5))
+    with pytest.raises(SceneError, match="inside it"):
+        render_view(scene, pose, scene.camera(8, 6))
+    with pytest.raises(SceneError, match="inside it"):
+        visible_surface_points(scene, [pose], scene.camera(8, 6), *scene.surface_points(10))
+
+
+def test_cameras_above_the_table_never_see_its_bottom() -> None:
+    scene = make_scene("hot-object")
+    train, _ = scene.poses(42, 6)
+    points, normals = scene.surface_points(4000)
+    seen = visible_surface_points(scene, train, scene.camera(320, 240), points, normals)
+    bottom = normals[:, 2] < -0.999
+    assert not seen[bottom & (points[:, 2] < -0.07)].any()
+    top_free = (normals[:, 2] > 0.999) & (points[:, 2] > 0.2)
+    assert seen[top_free].all()
+    assert 0.5 < seen.mean() < 0.75
+
+
+def test_visible_points_are_those_the_depth_image_shows(scene) -> None:
+    train, _ = scene.poses(3, 0)
+    camera = scene.camera(320, 240)
+    points, normals = scene.surface_points(1500)
+    seen = visible_surface_points(scene, train[:1], camera, points, normals, min_views=1)
+    pixel, inside = camera.project(train[0], points)
+    assert inside.all()
+    depth = render_view(scene, train[0], camera, samples_per_axis=1).depth_m
+    column, row = np.floor(pixel).astype(int).T
+    distance = np.linalg.norm(points - train[0][:3, 3], axis=1)
+    size = np.subtract(*scene.scene_box[::-1]).max()
+    by_image = distance < depth[row, column] + 0.01 * size
+    assert (seen == by_image).mean() > 0.95
+
+
+def test_visibility_counts_views() -> None:
+    scene, camera = make_scene("sphere"), make_scene("sphere").camera(64, 48)
+    poses = [look_at(p, (0, 0, 0)) for p in ((2, 0, 0.1), (0, 2, 0.1), (2, 0.1, 0))]
+    points = np.array([[0.5, 0, 0], [0, 0.5, 0], [-0.5, 0, 0], [0.3, 0.4, 0.0]])
+    counts = sum(
+        visible_surface_points(scene, poses, camera, points, points / 0.5, min_views=n).astype(int) for n in (1, 2, 3)
+    )
+    np.testing.assert_array_equal(counts, [2, 1, 0, 3])

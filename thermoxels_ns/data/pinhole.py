@@ -1,0 +1,163 @@
+"""Pinhole cameras and the rings they are placed on. Poses are camera to world, x right, y up, z back (OpenGL)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.errors import SceneError, explain
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """Intrinsics of a camera without distortion; the centre of the top left pixel is at (0.5, 0.5)."""
+
+    width: int
+    """Image width [pixels]."""
+    height: int
+    """Image height [pixels]."""
+    fl_x: float
+    """Focal length along x [pixels]."""
+    fl_y: float
+    """Focal length along y [pixels]."""
+    cx: float
+    """Principal point, x [pixels]."""
+    cy: float
+    """Principal point, y [pixels]."""
+
+    def __post_init__(self) -> None:
+        lengths = (self.fl_x, self.fl_y)
+        if min(self.width, self.height) < 1 or not all(math.isfinite(f) and f > 0 for f in lengths):
+            raise SceneError(
+                explain(
+                    "camera",
+                    expected="at least one pixel and focal lengths above 0",
+                    got=f"{self.width} x {self.height} pixels, focal lengths {lengths}",
+                    remedy="Correct the intrinsics.",
+                )
+            )
+
+    def directions(self, pose: npt.ArrayLike, samples_per_axis: int = 1) -> FloatArray:
+        """Unit ray directions in the world through a regular grid of points in every pixel.
+
+        Args:
+            pose: Camera to world, shape (3, 4) or (4, 4).
+            samples_per_axis: Grid points per pixel along each axis; 1 is the pixel's centre.
+
+        Returns:
+            Directions, shape (height, width, samples_per_axis ** 2, 3).
+        """
+        s = samples_per_axis
+        x = (np.arange(self.width * s) + 0.5) / s
+        y = (np.arange(self.height * s) + 0.5) / s
+        local = np.empty((self.height * s, self.width * s, 3))
+        local[..., 0] = (x - self.cx) / self.fl_x
+        local[..., 1] = -(y[:, None] - self.cy) / self.fl_y
+        local[..., 2] = -1.0
+        local /= np.sqrt(np.einsum("ijk,ijk->ij", local, local))[..., None]
+        world = local @ np.asarray(pose, dtype=np.float64)[:3, :3].T
+        blocks = world.reshape(self.height, s, self.width, s, 3).transpose(0, 2, 1, 3, 4)
+        return np.ascontiguousarray(blocks).reshape(self.height, self.width, s * s, 3)
+
+    def project(self, pose: npt.ArrayLike, points: npt.ArrayLike) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+        """Project world points (n, 3).
+
+        Returns:
+            Pixel positions (n, 2), NaN behind the camera, and which points lie within the image (n,).
+        """
+        pose = np.asarray(pose, dtype=np.float64)
+        local = (np.asarray(points, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3]
+        depth = -local[:, 2]
+        ahead = depth > 0.0
+        scale = np.divide(1.0, depth, out=np.full(len(depth), np.nan), where=ahead)
+        pixel = np.stack([self.cx + self.fl_x * local[:, 0] * scale, self.cy - self.fl_y * local[:, 1] * scale], axis=1)
+        inside = ahead & np.all((pixel >= 0.0) & (pixel <= (self.width, self.height)), axis=1)
+        return pixel, inside
+
+
+def look_at(position: npt.ArrayLike, target: npt.ArrayLike) -> FloatArray:
+    """Pose (4, 4) of a camera that looks from `position` to `target` with world z up in its image."""
+    position = np.asarray(position, dtype=np.float64)
+    back = position - np.asarray(target, dtype=np.float64)
+    right = np.cross((0.0, 0.0, 1.0), back)
+    if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(back):
+        raise SceneError(
+            explain(
+                "camera",
+                expected="a view direction that is not vertical",
+                got=f"position {position.tolist()}, target {np.asarray(target).tolist()}",
+                remedy="Move the camera to the side.",
+            )
+        )
+    right /= np.linalg.norm(right)
+    back /= np.linalg.norm(back)
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, np.cross(back, right), back, position
+    return pose
+
+
+@dataclass(frozen=True)
+class CameraRing:
+    """A horizontal circle, or a part of one, of cameras that look at one point."""
+
+    target: tuple[float, float, float]
+    """Point that all cameras look at and the axis goes through [m]."""
+    radius_m: float
+    """Horizontal distance from the axis [m]."""
+    height_m: float
+    """z of the cameras [m]."""
+    start_deg: float = 0.0
+    """Azimuth where the arc begins, counted from x towards y [degrees]."""
+    span_deg: float = 360.0
+    """Length of the arc [degrees]; 360 closes the ring."""
+
+    def pose(self, share: float) -> FloatArray:
+        """Pose (4, 4) at a share of the arc, 0 to 1."""
+        azimuth = math.radians(self.start_deg + self.span_deg * share)
+        x = self.target[0] + self.radius_m * math.cos(azimuth)
+        y = self.target[1] + self.radius_m * math.sin(azimuth)
+        return look_at((x, y, self.height_m), self.target)
+
+
+def ring_poses(rings: Sequence[CameraRing], num_train: int, num_eval: int) -> tuple[FloatArray, FloatArray]:
+    """Spread training cameras evenly over rings and put evaluation cameras half-way between neighbours.
+
+    Cameras go to the rings in turn; each ring starts a fraction of a step later than the one before, so that
+    cameras of different rings do not stand above each other.
+
+    Args:
+        rings: At least one ring.
+        num_train: Number of training cameras, at least 1.
+        num_eval: Number of evaluation cameras; more than there are gaps share a gap evenly.
+
+    Returns:
+        Training poses (num_train, 4, 4) and evaluation poses (num_eval, 4, 4).
+    """
+    if num_train < 1 or num_eval < 0:
+        raise SceneError(
+            explain(
+                "number of views",
+                expected="at least 1 for training and at least 0 for evaluation",
+                got=f"{num_train} and {num_eval}",
+                remedy="Raise num_train or num_eval.",
+            )
+        )
+    used = rings[: min(len(rings), num_train)]
+    train, held_out = [np.eye(4)] * num_train, [np.eye(4)] * num_eval
+    for number, ring in enumerate(used):
+        slots, wanted = len(range(number, num_train, len(used))), len(range(number, num_eval, len(used)))
+        phase = 0.25 + 0.5 * (number + 0.5) / len(used)
+        gaps = slots if ring.span_deg >= 360.0 else max(slots - 1, 1)
+        for slot in range(slots):
+            train[number + slot * len(used)] = ring.pose((slot + phase) / slots)
+        chosen = [int((q + 0.5) * gaps / wanted) for q in range(wanted)]
+        for q, gap in enumerate(chosen):
+            within = (chosen[:q].count(gap) + 1) / (chosen.count(gap) + 1)
+            held_out[number + q * len(used)] = ring.pose((gap + phase + within) / slots)
+    return np.array(train), np.array(held_out).reshape(-1, 4, 4)

@@ -1,0 +1,137 @@
+"""Photographs and thermal images of a synthetic scene by exact ray casting, and which surface they see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.data.pinhole import PinholeCamera
+from thermoxels_ns.data.scene_truth import SyntheticScene
+from thermoxels_ns.errors import SceneError, explain
+
+FloatArray = npt.NDArray[np.float64]
+
+_VISIBLE_TOLERANCE = 1e-7
+_GRAZING_COSINE = 1e-6
+_RAYS_PER_CHUNK = 16_384  # about what stays in a processor's cache
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedView:
+    """What one camera sees."""
+
+    rgb: npt.NDArray[np.float32]
+    """Mean colour of each pixel's samples, 0 to 1, shape (height, width, 3)."""
+    temperature_c: FloatArray
+    """Mean temperature of each pixel's samples [degrees Celsius], shape (height, width)."""
+    depth_m: FloatArray
+    """Distance along the ray through the pixel's centre [m], infinite for background, shape (height, width)."""
+    hit: npt.NDArray[np.bool_]
+    """Whether the ray through the pixel's centre meets the solid, shape (height, width)."""
+
+
+def render_view(
+    scene: SyntheticScene, pose: npt.ArrayLike, camera: PinholeCamera, samples_per_axis: int = 2
+) -> RenderedView:
+    """Render both bands of one view.
+
+    Args:
+        scene: What to look at.
+        pose: Camera to world, x right, y up, z back, shape (3, 4) or (4, 4) [m].
+        camera: Intrinsics; pixel centres lie at +0.5.
+        samples_per_axis: Every pixel is the mean over a regular grid of this many rays along each axis.
+
+    Returns:
+        Colour and temperature averaged over the samples; depth and hit of the pixel's centre.
+
+    Raises:
+        SceneError: The camera stands inside the solid.
+    """
+    pose = np.asarray(pose, dtype=np.float64)
+    origin = _position_outside(scene, pose)
+    shape = (camera.height, camera.width)
+    directions = camera.directions(pose, samples_per_axis)
+    rgb, temperature_c, distance = _look(scene, origin, directions.reshape(-1, 3))
+    if samples_per_axis > 1:
+        distance = scene.solid.intersect(origin, camera.directions(pose).reshape(-1, 3)).distance
+    depth = distance.reshape(shape)
+    return RenderedView(
+        rgb.reshape(*shape, -1, 3).mean(axis=2),
+        temperature_c.reshape(*shape, -1).mean(axis=2),
+        depth,
+        np.isfinite(depth),
+    )
+
+
+def visible_surface_points(
+    scene: SyntheticScene,
+    poses: npt.ArrayLike,
+    camera: PinholeCamera,
+    points: npt.ArrayLike,
+    normals: npt.ArrayLike,
+    min_views: int = 3,
+) -> npt.NDArray[np.bool_]:
+    """Find the surface points that several cameras see.
+
+    A camera sees a point if the point lies in its image, faces it and is the first hit of the ray towards it.
+
+    Args:
+        scene: The scene the points belong to.
+        poses: Cameras to world, shape (c, 3, 4) or (c, 4, 4).
+        camera: Intrinsics all poses share.
+        points: Points on the surface [m], shape (n, 3).
+        normals: Outward normals at the points, shape (n, 3).
+        min_views: Cameras that must see a point.
+
+    Returns:
+        Which points enough cameras see, shape (n,).
+    """
+    points, normals = np.asarray(points, dtype=np.float64), np.asarray(normals, dtype=np.float64)
+    views = np.zeros(len(points), dtype=np.int64)
+    for pose in np.asarray(poses, dtype=np.float64):
+        origin = _position_outside(scene, pose)
+        ray = points - origin
+        distance = np.linalg.norm(ray, axis=1)
+        _, candidate = camera.project(pose, points)
+        candidate &= np.einsum("ij,ij->i", ray, normals) < -_GRAZING_COSINE * distance
+        index = np.flatnonzero(candidate)
+        # Unnormalised directions: a free line of sight hits at 1.
+        first = scene.solid.intersect(origin, ray[index]).distance
+        views[index[first >= 1.0 - _VISIBLE_TOLERANCE]] += 1
+    return views >= min_views
+
+
+def _look(
+    scene: SyntheticScene, origin: FloatArray, directions: FloatArray
+) -> tuple[npt.NDArray[np.float32], FloatArray, FloatArray]:
+    """Colour (n, 3), temperature (n,) and distance (n,) along rays from one origin."""
+    rgb = np.empty((len(directions), 3), dtype=np.float32)
+    temperature_c = np.empty(len(directions))
+    distance = np.empty(len(directions))
+    for start in range(0, len(directions), _RAYS_PER_CHUNK):
+        part = slice(start, start + _RAYS_PER_CHUNK)
+        hits = scene.solid.intersect(origin, directions[part])
+        distance[part] = hits.distance
+        met, missed = start + np.flatnonzero(hits.hit), start + np.flatnonzero(~hits.hit)
+        points = origin + distance[met, None] * directions[met]
+        rgb[met] = scene.colour(points, hits.normal[hits.hit])
+        rgb[missed] = scene.background_rgb(directions[missed])
+        temperature_c[met] = scene.surface_temperature_c(points)
+        temperature_c[missed] = scene.background_temperature_c(directions[missed])
+    return rgb, temperature_c, distance
+
+
+def _position_outside(scene: SyntheticScene, pose: FloatArray) -> FloatArray:
+    origin = pose[:3, 3]
+    if float(scene.signed_distance(origin[None])[0]) < 0.0:
+        raise SceneError(
+            explain(
+                "camera position",
+                expected=f"a point outside the solid of scene {scene.name}",
+                got=f"{origin.tolist()}, which is inside it",
+                remedy="Move the camera out of the solid.",
+            )
+        )
+    return origin

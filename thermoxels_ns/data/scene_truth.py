@@ -1,0 +1,74 @@
+"""The exact description of a synthetic scene: shape, colour, temperature, surroundings and camera positions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.data.pinhole import CameraRing, PinholeCamera, ring_poses
+from thermoxels_ns.data.solids import Box, Solid
+
+FloatArray = npt.NDArray[np.float64]
+RgbFunction = Callable[..., npt.NDArray[np.float32]]
+
+_ASPECT = 4.0 / 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class SyntheticScene:
+    """A scene whose every answer is exact. Lengths in metres, temperatures in degrees Celsius, z up."""
+
+    name: str
+    """Name in the registry."""
+    solid: Solid
+    """Everything that is not air."""
+    scene_box: Box
+    """Lower and upper corner of the box to reconstruct [m]; the solid lies inside it."""
+    temperature_bounds_c: tuple[float, float]
+    """No surface and no background is colder than the first or hotter than the second."""
+    colour: RgbFunction
+    """(points (n, 3), normals (n, 3)) to red, green, blue in [0, 1] (n, 3)."""
+    surface_temperature_c: Callable[[npt.ArrayLike], FloatArray]
+    """Points (n, 3) to temperatures (n,); the same from every direction. Off the surface it continues smoothly."""
+    background_rgb: RgbFunction
+    """Unit directions (n, 3), away from the camera, to red, green, blue in [0, 1] (n, 3)."""
+    background_temperature_c: Callable[[npt.ArrayLike], FloatArray]
+    """Unit directions (n, 3), away from the camera, to apparent temperatures (n,)."""
+    rings: tuple[CameraRing, ...]
+    """Where the photographs are taken from."""
+    focal_share: float
+    """Focal length over the image width, for a 4:3 image."""
+
+    @property
+    def area_m2(self) -> float:
+        """Exact area of the surface [m2]."""
+        return self.solid.area
+
+    @property
+    def volume_m3(self) -> float:
+        """Exact volume of the solid [m3]."""
+        return self.solid.volume
+
+    def contains(self, points: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Which of the points (n, 3) lie in the solid or on its surface."""
+        return self.solid.contains(points)
+
+    def signed_distance(self, points: npt.ArrayLike) -> FloatArray:
+        """Distance of the points (n, 3) to the surface [m], negative inside."""
+        return self.solid.signed_distance(points)
+
+    def surface_points(self, count: int, seed: int = 0) -> tuple[FloatArray, FloatArray]:
+        """Draw points uniformly by area: positions (count, 3) and outward normals (count, 3)."""
+        return self.solid.surface_points(count, seed)
+
+    def camera(self, width: int, height: int) -> PinholeCamera:
+        """Camera of the given image size [pixels] that frames the scene in every view of the rings."""
+        focal = self.focal_share * min(float(width), height * _ASPECT)
+        return PinholeCamera(width, height, focal, focal, 0.5 * width, 0.5 * height)
+
+    def poses(self, num_train: int, num_eval: int) -> tuple[FloatArray, FloatArray]:
+        """Training (num_train, 4, 4) and held-out evaluation poses (num_eval, 4, 4), camera to world (OpenGL)."""
+        return ring_poses(self.rings, num_train, num_eval)

@@ -1,0 +1,116 @@
+"""Procedural colour in space: smooth noise at several scales, none finer than a voxel field can hold."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.data.solids import Box
+
+_SPACINGS_VOXELS = (2.0, 4.0, 10.0)
+_AMPLITUDES = (0.45, 0.55, 0.5)
+_REFERENCE_RESOLUTION = 64
+# Brightness first, then two colour differences; columns are the noise channels.
+_CHANNELS_TO_RGB = np.array([[0.8, 0.3, 0.0], [0.8, -0.1, 0.25], [0.8, -0.15, -0.3]], dtype=np.float32)
+
+RgbArray = npt.NDArray[np.float32]
+
+
+class SolidTexture:
+    """Value noise in three channels, defined at every point of space.
+
+    Random values on cubic lattices, interpolated with a smoothstep, are added at three scales. The finest lattice
+    is two voxels wide when 64 voxels span the box's longest side, so a voxel field of that size can hold it. The
+    pattern does not repeat within the box.
+    """
+
+    def __init__(self, box: Box, seed: int) -> None:
+        """Draw the lattices.
+
+        Args:
+            box: Lower and upper corner of the scene [m].
+            seed: Seed of the pattern.
+        """
+        draw = np.random.default_rng(seed)
+        self._lo = np.asarray(box[0], dtype=np.float64)
+        voxel = float(np.subtract(box[1], box[0]).max()) / _REFERENCE_RESOLUTION
+        self._octaves: list[tuple[float, float, int, RgbArray]] = []
+        for spacing, amplitude in zip(_SPACINGS_VOXELS, _AMPLITUDES):
+            size = int(np.ceil(_REFERENCE_RESOLUTION / spacing)) + 4
+            values = draw.uniform(-1.0, 1.0, (size**3, 3)).astype(np.float32)
+            self._octaves.append((spacing * voxel, amplitude, size, values))
+
+    def __call__(self, points: npt.ArrayLike) -> RgbArray:
+        """Colour deviation at points (n, 3) [m]: red, green and blue around 0, mostly within -1 to 1."""
+        relative = np.asarray(points, dtype=np.float64) - self._lo
+        noise = np.zeros((len(relative), 3), dtype=np.float32)
+        for spacing, amplitude, size, values in self._octaves:
+            position = (relative / spacing).T
+            corner = np.floor(position)
+            share = (position - corner).astype(np.float32)
+            share = share * share * (3.0 - 2.0 * share)
+            cell = corner.astype(np.int64)
+            (x0, y0, z0), (x1, y1, z1) = cell % size, (cell + 1) % size
+            (fx, fy, fz) = share
+            for i, wx in ((x0, 1.0 - fx), (x1, fx)):
+                for j, wy in ((y0, 1.0 - fy), (y1, fy)):
+                    column, weight = (i * size + j) * size, amplitude * wx * wy
+                    noise += values[column + z0] * (weight * (1.0 - fz))[:, None]
+                    noise += values[column + z1] * (weight * fz)[:, None]
+        return noise @ _CHANNELS_TO_RGB.T
+
+
+@dataclass(frozen=True)
+class Paint:
+    """A base colour and how strongly the texture shows on it."""
+
+    base: tuple[float, float, float]
+    """Red, green, blue, 0 to 1."""
+    contrast: float = 0.22
+    """Weight of the texture, 0 to about 0.4."""
+
+
+@dataclass(frozen=True)
+class SunLight:
+    """Lambert shading by one distant light and an ambient part; there are no shadows."""
+
+    towards: tuple[float, float, float] = (0.45, -0.6, 0.66)
+    """Direction to the light, any length."""
+    ambient: float = 0.62
+    """Brightness of a surface that faces away from the light; one that faces it has 1."""
+
+    def brightness(self, normals: npt.ArrayLike) -> RgbArray:
+        """Brightness of surfaces with unit normals (n, 3), shape (n, 1)."""
+        sun = np.asarray(self.towards) / np.linalg.norm(self.towards)
+        facing = np.maximum(np.asarray(normals) @ sun, 0.0)
+        return (self.ambient + (1.0 - self.ambient) * facing).astype(np.float32)[:, None]
+
+
+def painted(
+    points: npt.ArrayLike,
+    normals: npt.ArrayLike,
+    part: npt.NDArray[np.integer],
+    paints: Sequence[Paint],
+    texture: SolidTexture,
+    light: SunLight,
+) -> RgbArray:
+    """Colour of surface points: base colour plus texture, times the brightness of the light.
+
+    Args:
+        points: Positions [m], shape (n, 3).
+        normals: Outward unit normals, shape (n, 3).
+        part: Index into `paints` for each point, shape (n,).
+        paints: Colour of each part.
+        texture: Pattern in space.
+        light: Shading.
+
+    Returns:
+        Red, green, blue in [0, 1], shape (n, 3).
+    """
+    base = np.array([p.base for p in paints], dtype=np.float32)[part]
+    contrast = np.array([p.contrast for p in paints], dtype=np.float32)[part]
+    colour = (base + contrast[:, None] * texture(points)) * light.brightness(normals)
+    return np.clip(colour, 0.0, 1.0).astype(np.float32, copy=False)

@@ -1,0 +1,316 @@
+"""Write a synthetic scene as a folder of photographs and thermal images, and get its truth back from the folder.
+
+The layout is that of ThermoScenes: ``images/``, ``thermal/``, ``transforms.json`` and ``temperature_bounds.json``,
+with ``frame_train_`` and ``frame_eval_`` names. The scene box and the name of the truth are added to the json.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+from rich.progress import track
+
+from thermoxels_ns.checks import replace_when_done, writable_folder
+from thermoxels_ns.data.pinhole import PinholeCamera
+from thermoxels_ns.data.raycast import RenderedView, render_view, visible_surface_points
+from thermoxels_ns.data.scene_truth import SyntheticScene
+from thermoxels_ns.data.synthetic_scenes import SCENE_NAMES, make_scene
+from thermoxels_ns.errors import SceneError, explain
+
+__all__ = [
+    "SCENE_NAMES",
+    "SyntheticScene",
+    "ThermalFormat",
+    "load_truth",
+    "make_scene",
+    "visible_surface_points",
+    "write_scene",
+]
+
+ThermalFormat = Literal["png16", "tiff", "npy"]
+"""16-bit PNG that spans the temperature bounds; uint16 TIFF of centikelvin counts; float32 numpy in Celsius."""
+
+FloatArray = npt.NDArray[np.float64]
+
+_SUFFIXES = {"png16": ".png", "tiff": ".tiff", "npy": ".npy"}
+_LARGEST_COUNT = 65535
+_CENTIKELVIN = {"celsius_per_count": 0.01, "celsius_offset": -273.15}
+_NOISE_SIGMAS = 6.0
+# The second camera: what its lens and mounting differ by from the first. About 1 degree and a few centimetres.
+_THERMAL_ASPECT, _THERMAL_ZOOM, _THERMAL_CENTRE_SHIFT = 0.8, 0.95, (-0.012, 0.008)
+_RIG_ROTATION_RAD = (0.005, -0.018, 0.003)
+_RIG_SHIFT_SHARE = (0.02, 0.004, 0.006)
+
+
+def write_scene(
+    scene: SyntheticScene,
+    folder: Path | str,
+    num_train: int = 42,
+    num_eval: int = 6,
+    width: int = 320,
+    height: int = 240,
+    thermal_width: int | None = None,
+    thermal_format: ThermalFormat = "png16",
+    noise_k: float = 0.0,
+    drift_k: float = 0.0,
+    seed: int = 0,
+    own_thermal_camera: bool = False,
+    progress: bool = True,
+) -> Path:
+    """Photograph a scene in both bands and write the folder; ``transforms.json`` comes last.
+
+    Args:
+        scene: What to photograph.
+        folder: Where to write; made if absent. A folder that holds a scene which is not synthetic is refused.
+        num_train: Number of training views.
+        num_eval: Number of held-out views, half-way between training views.
+        width: Width of the photographs [pixels].
+        height: Height of the photographs [pixels].
+        thermal_width: Width of the thermal images [pixels]. None: that of the photographs, or half of it for a
+            camera of their own. The height follows: the photographs' aspect, or 5:4 for a camera of their own.
+        thermal_format: How temperatures are stored; the unit of TIFF counts is written under ``thermal_unit``.
+        noise_k: Standard deviation of independent Gaussian noise in every thermal pixel [K].
+        drift_k: Standard deviation of one temperature offset per thermal image [K].
+        seed: Seed of noise and drift. The same seed writes the same bytes.
+        own_thermal_camera: Take the thermal images with a second camera beside the first, with its own lens. Its
+            intrinsics and poses are written under ``thermal_camera`` and ``thermal_transform_matrix``.
+        progress: Show a progress bar.
+
+    Returns:
+        The folder.
+
+    Raises:
+        SceneError: An option is out of range, or the folder holds somebody else's scene.
+        OutputError: The folder cannot be written to.
+    """
+    thermal_size = _thermal_size(width, height, thermal_width, own_thermal_camera)
+    _check_options(thermal_format, noise_k, drift_k)
+    camera = scene.camera(width, height)
+    thermal_camera = _second_camera(scene, *thermal_size) if own_thermal_camera else scene.camera(*thermal_size)
+    train, held_out = scene.poses(num_train, num_eval)
+    names = [f"frame_train_{i + 1:05d}" for i in range(num_train)] + [
+        f"frame_eval_{i + 1:05d}" for i in range(num_eval)
+    ]
+    poses = np.concatenate([train, held_out])
+    thermal_poses = poses @ _second_camera_offset(scene) if own_thermal_camera else poses
+    drifts = drift_k * np.random.default_rng([seed, 0]).standard_normal(len(poses))
+    bounds = _bounds_with_errors(scene, drifts, noise_k)
+    unit = _count_unit(thermal_format, bounds)
+
+    target = _prepared_folder(folder)
+    frames: list[dict[str, Any]] = []
+    for number in track(range(len(names)), description=f"Photographing {scene.name}", disable=not progress):
+        name, pose, thermal_pose = names[number], poses[number], thermal_poses[number]
+        view = render_view(scene, pose, camera)
+        thermal_view = view
+        if thermal_camera != camera or own_thermal_camera:
+            thermal_view = render_view(scene, thermal_pose, thermal_camera)
+        measured_c = _measured(thermal_view, float(drifts[number]), noise_k, np.random.default_rng([seed, 1, number]))
+        frame: dict[str, Any] = {
+            "file_path": f"images/{name}.png",
+            "thermal_file_path": f"thermal/{name}{_SUFFIXES[thermal_format]}",
+            "transform_matrix": pose.tolist(),
+        }
+        if own_thermal_camera:
+            frame["thermal_transform_matrix"] = thermal_pose.tolist()
+        with replace_when_done(target / frame["file_path"]) as path:
+            Image.fromarray(np.round(view.rgb * 255.0).astype(np.uint8)).save(path)
+        with replace_when_done(target / frame["thermal_file_path"]) as path:
+            _save_thermal(path, measured_c, unit)
+        frames.append(frame)
+
+    _write_json(
+        target / "temperature_bounds.json",
+        {"absolute_min_temperature": bounds[0], "absolute_max_temperature": bounds[1]},
+    )
+    transforms: dict[str, Any] = _intrinsics(camera)
+    if own_thermal_camera:
+        transforms["thermal_camera"] = _intrinsics(thermal_camera)
+    if thermal_format == "tiff":  # a 16-bit PNG has its unit in the bounds, and count 0 is a temperature there
+        transforms["thermal_unit"] = unit
+    transforms["scene_box"] = [list(corner) for corner in scene.scene_box]
+    transforms["truth"] = {"synthetic_scene": scene.name, "seed": seed, "noise_k": noise_k, "drift_k": drifts.tolist()}
+    transforms["frames"] = frames
+    _write_json(target / "transforms.json", transforms)
+    return target
+
+
+def load_truth(scene_folder: Path | str) -> SyntheticScene | None:
+    """Get the exact scene that a folder was written from.
+
+    Args:
+        scene_folder: A scene folder with a ``transforms.json``.
+
+    Returns:
+        The scene, or None for a folder of real photographs (no ``truth`` in the json).
+
+    Raises:
+        SceneError: The json is missing or unreadable, or names a scene that does not exist.
+    """
+    truth = _read_transforms(Path(scene_folder) / "transforms.json").get("truth")
+    if truth is None:
+        return None
+    if not (isinstance(truth, dict) and isinstance(truth.get("synthetic_scene"), str)):
+        raise SceneError(
+            explain(
+                "transforms.json: truth",
+                expected='an object with the text "synthetic_scene"',
+                got=json.dumps(truth),
+                remedy="Write the scene again, or remove the key for real photographs.",
+            )
+        )
+    return make_scene(truth["synthetic_scene"])
+
+
+def _thermal_size(width: int, height: int, thermal_width: int | None, own_camera: bool) -> tuple[int, int]:
+    """Width and height of the thermal images; one camera for both bands needs the same aspect exactly."""
+    for name, value in (("width", width), ("height", height), ("thermal_width", thermal_width)):
+        if value is not None and value < 1:
+            raise SceneError(explain(name, expected="at least 1 pixel", got=value, remedy=f"Raise {name}."))
+    if own_camera:
+        chosen = thermal_width or max(width // 2, 1)
+        return chosen, max(round(chosen * _THERMAL_ASPECT), 1)
+    chosen = thermal_width or width
+    if height * chosen % width:
+        raise SceneError(
+            explain(
+                "thermal_width",
+                expected=f"a width that keeps the aspect {width}:{height} in whole pixels",
+                got=f"{chosen}, for a height of {height * chosen / width:.2f}",
+                remedy=f"Pass a divisor of {width} such as {width // 2}, or give the thermal images their own camera.",
+            )
+        )
+    return chosen, height * chosen // width
+
+
+def _check_options(thermal_format: str, noise_k: float, drift_k: float) -> None:
+    if thermal_format not in get_args(ThermalFormat):
+        raise SceneError(
+            explain(
+                "thermal_format",
+                expected=f"one of {', '.join(get_args(ThermalFormat))}",
+                got=repr(thermal_format),
+                remedy="Choose one of these formats.",
+            )
+        )
+    for name, value in (("noise_k", noise_k), ("drift_k", drift_k)):
+        if not (np.isfinite(value) and value >= 0.0):
+            raise SceneError(explain(name, expected="a finite number of at least 0", got=value, remedy="Pass 0."))
+
+
+def _prepared_folder(folder: Path | str) -> Path:
+    """Make the folders and take away the json of an earlier synthetic scene, so that no half-written one loads."""
+    target = writable_folder(folder)
+    old = target / "transforms.json"
+    if old.exists():
+        if _read_transforms(old).get("truth") is None:
+            raise SceneError(
+                explain(
+                    "output folder",
+                    expected="an empty folder or one with an earlier synthetic scene",
+                    got=f"{target}, whose transforms.json describes other photographs",
+                    remedy="Choose another folder.",
+                )
+            )
+        old.unlink()
+    for name in ("images", "thermal"):
+        writable_folder(target / name)
+    return target
+
+
+def _second_camera(scene: SyntheticScene, width: int, height: int) -> PinholeCamera:
+    """Intrinsics of the thermal camera: a slightly different field of view and an off-centre principal point."""
+    plain = scene.camera(width, height)
+    dx, dy = _THERMAL_CENTRE_SHIFT
+    focal = plain.fl_x * _THERMAL_ZOOM
+    return PinholeCamera(width, height, focal, focal, plain.cx + dx * width, plain.cy + dy * width)
+
+
+def _second_camera_offset(scene: SyntheticScene) -> FloatArray:
+    """Pose (4, 4) of the thermal camera in the frame of the first one; the shift is a share of the scene's size."""
+    x, y, z = _RIG_ROTATION_RAD
+    turn_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
+    turn_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
+    turn_z = np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]])
+    offset = np.eye(4)
+    offset[:3, :3] = turn_z @ turn_y @ turn_x
+    offset[:3, 3] = np.multiply(_RIG_SHIFT_SHARE, np.subtract(scene.scene_box[1], scene.scene_box[0]).max())
+    return offset
+
+
+def _bounds_with_errors(scene: SyntheticScene, drifts: FloatArray, noise_k: float) -> tuple[float, float]:
+    """Temperature bounds that the drifting, noisy images stay within [degrees Celsius]."""
+    lowest, highest = scene.temperature_bounds_c
+    margin = _NOISE_SIGMAS * noise_k
+    return lowest + min(float(drifts.min()), 0.0) - margin, highest + max(float(drifts.max()), 0.0) + margin
+
+
+def _count_unit(thermal_format: ThermalFormat, bounds: tuple[float, float]) -> dict[str, float] | None:
+    """How counts become degrees: Celsius = count * celsius_per_count + celsius_offset; None for floats."""
+    if thermal_format == "npy":
+        return None
+    if thermal_format == "tiff":
+        return dict(_CENTIKELVIN)
+    return {"celsius_per_count": (bounds[1] - bounds[0]) / _LARGEST_COUNT, "celsius_offset": bounds[0]}
+
+
+def _measured(view: RenderedView, drift_k: float, noise_k: float, draw: np.random.Generator) -> FloatArray:
+    """What the thermal camera reports: the true temperature plus its drift and noise."""
+    noise = noise_k * draw.standard_normal(view.temperature_c.shape) if noise_k > 0.0 else 0.0
+    return view.temperature_c + drift_k + noise
+
+
+def _save_thermal(path: Path, temperature_c: FloatArray, unit: dict[str, float] | None) -> None:
+    if unit is None:
+        np.save(path, temperature_c.astype(np.float32))
+        return
+    counts = np.round((temperature_c - unit["celsius_offset"]) / unit["celsius_per_count"])
+    Image.fromarray(np.clip(counts, 0, _LARGEST_COUNT).astype(np.uint16)).save(path)
+
+
+def _intrinsics(camera: PinholeCamera) -> dict[str, Any]:
+    distortion = dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
+    return {
+        "camera_model": "OPENCV",
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fl_x,
+        "fl_y": camera.fl_y,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        **distortion,
+    }
+
+
+def _read_transforms(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text())
+    except (OSError, ValueError) as problem:
+        raise SceneError(
+            explain(
+                "transforms.json",
+                expected=f"a readable json file at {path}",
+                got=str(problem),
+                remedy="Check the scene folder, or write the scene again.",
+            )
+        ) from problem
+    if not isinstance(content, dict):
+        raise SceneError(
+            explain(
+                "transforms.json",
+                expected="a json object",
+                got=type(content).__name__,
+                remedy="Check the scene folder, or write the scene again.",
+            )
+        )
+    return content
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    with replace_when_done(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1) + "\n")

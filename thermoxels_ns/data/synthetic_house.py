@@ -1,0 +1,152 @@
+"""The synthetic scene `house-corner`: a heated building seen from outside under a cold sky."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.data.pinhole import CameraRing
+from thermoxels_ns.data.rectangles import distance_to_box
+from thermoxels_ns.data.scene_truth import SyntheticScene
+from thermoxels_ns.data.solid_texture import Paint, SolidTexture, SunLight, painted
+from thermoxels_ns.data.solids import Box, BoxSolid
+
+FloatArray = npt.NDArray[np.float64]
+
+_BOX: Box = ((-3.7, -4.6, -0.8), (4.7, 3.3, 5.8))
+_GROUND: Box = ((-3.3, -4.2, -0.45), (4.3, 2.9, 0.0))
+_BUILDING: Box = ((-3.0, -2.5, 0.0), (3.0, 2.5, 5.0))
+_ROOF: Box = ((-3.3, -2.8, 5.0), (3.3, 2.8, 5.35))
+_BALCONY: Box = ((-1.6, -3.8, 2.45), (1.4, -2.5, 2.8))
+
+_FRONT_Y, _SIDE_X = _BUILDING[0][1], _BUILDING[1][0]
+_RECESS_M = 0.35
+_PANE_M = 0.10
+
+# Openings in the wall plane: (along the wall from, to), (z from, to), temperature of the pane [C], paint.
+_GLASS, _DOOR = 4, 5
+_FRONT_OPENINGS = (
+    ((-2.4, -1.2), (0.9, 2.0), 14.0, _GLASS),
+    ((0.9, 2.3), (0.9, 2.0), 13.0, _GLASS),
+    ((-1.1, 0.0), (2.8, 4.5), 14.5, _GLASS),
+    ((1.6, 2.5), (3.3, 4.4), 12.0, _GLASS),
+)
+_SIDE_OPENINGS = (
+    ((-1.7, -0.6), (0.0, 2.1), 9.0, _DOOR),
+    ((0.5, 1.8), (0.9, 2.0), 13.5, _GLASS),
+    ((-1.6, 0.2), (3.2, 4.4), 14.0, _GLASS),
+    ((1.0, 1.9), (3.2, 4.4), 12.5, _GLASS),
+)
+
+_WALL_C, _BRIDGE_K = 5.0, 3.0
+_BRIDGE_Z, _BRIDGE_WIDTH_M = 0.5 * (_BALCONY[0][2] + _BALCONY[1][2]), 0.35
+_AIR_C, _SKY_DROP_K = 0.0, 20.0
+_HORIZON_BLEND = 0.08
+
+
+def _openings() -> tuple[list[Box], list[Box], list[float], list[int]]:
+    """Boxes cut out of the walls, the panes behind them, the panes' temperatures [C] and paints."""
+    cut: list[Box] = []
+    pane: list[Box] = []
+    temperature_c, paint = [], []
+    for (a, b), (z0, z1), degrees, kind in _FRONT_OPENINGS:
+        back = _FRONT_Y + _RECESS_M
+        cut.append(((a, _FRONT_Y, z0), (b, back, z1)))
+        pane.append(((a, back, z0), (b, back + _PANE_M, z1)))
+        temperature_c.append(degrees)
+        paint.append(kind)
+    for (a, b), (z0, z1), degrees, kind in _SIDE_OPENINGS:
+        back = _SIDE_X - _RECESS_M
+        cut.append(((back, a, z0), (_SIDE_X, b, z1)))
+        pane.append(((back - _PANE_M, a, z0), (back, b, z1)))
+        temperature_c.append(degrees)
+        paint.append(kind)
+    return cut, pane, temperature_c, paint
+
+
+def house_corner() -> SyntheticScene:
+    """Build the house: recessed warm windows, a door, a balcony slab, a roof, ground around, sky above.
+
+    The wall is 5 C, the panes 12 to 14.5 C with a smooth fall over the reveals, the storey slab shows as a band
+    3 K warmer, the balcony cools like a fin towards the air, and the sky falls from 0 C at the horizon to -20 C
+    at the zenith.
+    """
+    cut, panes, panes_c, pane_paints = _openings()
+    texture, light = SolidTexture(_BOX, seed=7), SunLight(towards=(0.75, -0.45, 0.5))
+    paints = (
+        Paint((0.74, 0.64, 0.47), 0.22),  # plaster
+        Paint((0.36, 0.42, 0.27), 0.24),  # grass
+        Paint((0.45, 0.27, 0.24), 0.20),  # roof
+        Paint((0.58, 0.58, 0.57), 0.22),  # balcony
+        Paint((0.22, 0.30, 0.40), 0.16),  # glass
+        Paint((0.42, 0.22, 0.14), 0.18),  # door
+    )
+
+    def part(points: npt.ArrayLike, normals: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        inner = np.asarray(points) - 1e-4 * np.asarray(normals)
+        x, y, z = np.ascontiguousarray(inner.T)
+        number = np.zeros(len(x), dtype=np.int64)
+        number[z < 0.0] = 1
+        number[z > _BUILDING[1][2]] = 2
+        number[(y < _FRONT_Y) & (z > 0.0) & (z < _BUILDING[1][2])] = 3
+        for (lo, hi), kind in zip(panes, pane_paints):
+            inside = (x > lo[0]) & (x < hi[0]) & (y > lo[1]) & (y < hi[1]) & (z > lo[2]) & (z < hi[2])
+            number[inside] = kind
+        return number
+
+    def temperature_c(points: npt.ArrayLike) -> FloatArray:
+        points = np.asarray(points, dtype=np.float64)
+        z = points[:, 2]
+        lift = (z - _BRIDGE_Z) / _BRIDGE_WIDTH_M
+        degrees = _WALL_C + 0.3 * (z - 2.5) / 2.5 + _BRIDGE_K * np.exp(-lift * lift)
+        for (lo, hi), pane_c in zip(panes, panes_c):
+            near = np.ones(len(points), dtype=bool)
+            for axis in range(3):
+                near &= np.abs(points[:, axis] - 0.5 * (lo[axis] + hi[axis])) < 0.5 * (hi[axis] - lo[axis]) + _RECESS_M
+            share = np.maximum(1.0 - distance_to_box(points[near], lo, hi) / _RECESS_M, 0.0)
+            degrees[near] += (pane_c - degrees[near]) * share * share * (3.0 - 2.0 * share)
+        from_house = distance_to_box(points, *_BUILDING)
+        fin_c = _AIR_C + 1.0 + (_WALL_C + _BRIDGE_K - 1.0) * np.exp(-from_house / 0.6)
+        ground_c = _AIR_C + 1.5 + 2.5 * np.exp(-from_house / 0.7)
+        roof_c = 3.0 - 2.0 * np.minimum(from_house / 0.6, 1.0)
+        outside = from_house > 1e-6
+        distances = [np.where(outside, distance_to_box(points, *b), np.inf) for b in (_BALCONY, _GROUND, _ROOF)]
+        nearest = np.argmin([from_house, *distances], axis=0)
+        return np.choose(nearest, [degrees, fin_c, ground_c, roof_c])
+
+    return SyntheticScene(
+        name="house-corner",
+        solid=BoxSolid((_GROUND, _BUILDING, _ROOF, _BALCONY), removed=cut),
+        scene_box=_BOX,
+        temperature_bounds_c=(_AIR_C - _SKY_DROP_K, 15.0),
+        colour=lambda points, normals: painted(points, normals, part(points, normals), paints, texture, light),
+        surface_temperature_c=temperature_c,
+        background_rgb=_sky_rgb,
+        background_temperature_c=_sky_temperature_c,
+        rings=tuple(
+            CameraRing((0.4, -0.7, aim), radius, height, start_deg=-145.0, span_deg=200.0)
+            for aim, radius, height in ((2.4, 11.8, 1.7), (1.7, 12.1, 4.8), (1.3, 11.6, 9.0))
+        ),
+        focal_share=0.86,
+    )
+
+
+def _rise(z: FloatArray) -> FloatArray:
+    """Height above the horizon, max(z, 0) with a smooth bend: (z + b)^2 / 4b within b of it, and 1 at the zenith."""
+    b = _HORIZON_BLEND
+    return np.where(z > b, z, np.square(np.maximum(z + b, 0.0)) / (4.0 * b))
+
+
+def _sky_temperature_c(directions: npt.ArrayLike) -> FloatArray:
+    """0 C at the horizon, -20 C at the zenith, linear in the sine of the elevation; far ground up to 2 C below."""
+    z = np.asarray(directions, dtype=np.float64)[:, 2]
+    return _AIR_C - _SKY_DROP_K * _rise(z) + 2.0 * _rise(-z)
+
+
+def _sky_rgb(directions: npt.ArrayLike) -> npt.NDArray[np.float32]:
+    """Pale haze at the horizon, blue above, grey green below."""
+    z = np.asarray(directions, dtype=np.float64)[:, 2:]
+    haze, blue, ground = (0.82, 0.86, 0.90), (0.26, 0.45, 0.80), (0.46, 0.48, 0.40)
+    up, down = _rise(z), np.minimum(3.0 * _rise(-z), 1.0)
+    colour = haze + np.subtract(blue, haze) * up + np.subtract(ground, haze) * down
+    return np.clip(colour, 0.0, 1.0).astype(np.float32)

@@ -1,0 +1,127 @@
+"""The synthetic scenes by name: a hot object on a table, a heated house corner, a sphere."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.data.pinhole import CameraRing
+from thermoxels_ns.data.rectangles import distance_to_box
+from thermoxels_ns.data.scene_truth import SyntheticScene
+from thermoxels_ns.data.solid_texture import Paint, SolidTexture, SunLight, painted
+from thermoxels_ns.data.solids import Box, BoxSolid, SolidUnion, Sphere
+from thermoxels_ns.data.synthetic_house import house_corner
+from thermoxels_ns.errors import SceneError, explain
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def _hot_object() -> SyntheticScene:
+    """Build a stepped hot block and a hot ball on a table, in a room of even temperature."""
+    table: Box = ((-0.5, -0.4, -0.08), (0.5, 0.4, 0.0))
+    lower: Box = ((-0.36, -0.2, 0.0), (-0.02, 0.12, 0.14))
+    upper: Box = ((-0.36, -0.2, 0.14), (-0.18, 0.12, 0.28))
+    ball = Sphere((0.24, -0.04, 0.12), 0.12)
+    box: Box = ((-0.55, -0.45, -0.14), (0.55, 0.45, 0.34))
+    room_c = 18.0
+    texture, light = SolidTexture(box, seed=11), SunLight()
+    paints = (Paint((0.62, 0.47, 0.31), 0.26), Paint((0.30, 0.50, 0.62), 0.28), Paint((0.78, 0.34, 0.28), 0.26))
+
+    def part(points: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """Number of the nearest part: 0 table, 1 block, 2 ball."""
+        block = np.minimum(distance_to_box(points, *lower), distance_to_box(points, *upper))
+        ball_distance = np.maximum(ball.signed_distance(points), 0.0)
+        return np.argmin([distance_to_box(points, *table), block, ball_distance], axis=0)
+
+    def temperature_c(points: npt.ArrayLike) -> FloatArray:
+        points = np.asarray(points, dtype=np.float64)
+        x, z = points[:, 0], points[:, 2]
+        which = part(points)
+        from_block = distance_to_box(points, *lower) / 0.10
+        from_contact = (np.hypot(x - ball.centre[0], points[:, 1] - ball.centre[1])) / 0.09
+        table_c = 20.5 - 3.0 * x + 10.0 * np.exp(-from_block * from_block) + 7.0 * np.exp(-(from_contact**2))
+        block_c = 68.0 - 25.0 * z
+        ball_c = 52.0 - 40.0 * (z - ball.centre[2])
+        return np.choose(which, [table_c, block_c, ball_c])
+
+    return SyntheticScene(
+        name="hot-object",
+        solid=SolidUnion((BoxSolid((table, lower, upper)), ball)),
+        scene_box=box,
+        temperature_bounds_c=(room_c, 70.0),
+        colour=lambda points, normals: painted(points, normals, part(points), paints, texture, light),
+        surface_temperature_c=temperature_c,
+        background_rgb=_room_rgb,
+        background_temperature_c=lambda directions: np.full(len(np.asarray(directions)), room_c),
+        rings=(
+            CameraRing((0.0, 0.0, 0.05), 1.45, 0.36),
+            CameraRing((0.0, 0.0, -0.02), 1.34, 0.80),
+            CameraRing((0.0, 0.0, -0.07), 1.03, 1.38),
+        ),
+        focal_share=1.0,
+    )
+
+
+def _sphere() -> SyntheticScene:
+    """Build one textured ball whose temperature is linear in height, before a uniform background."""
+    ball = Sphere((0.0, 0.0, 0.0), 0.5)
+    box: Box = ((-0.6, -0.6, -0.6), (0.6, 0.6, 0.6))
+    texture, light = SolidTexture(box, seed=23), SunLight(ambient=0.75)
+    paints = (Paint((0.66, 0.60, 0.50), 0.32),)
+
+    def colour(points: npt.ArrayLike, normals: npt.ArrayLike) -> npt.NDArray[np.float32]:
+        part = np.zeros(len(np.asarray(points)), dtype=np.int64)
+        return painted(points, normals, part, paints, texture, light)
+
+    return SyntheticScene(
+        name="sphere",
+        solid=ball,
+        scene_box=box,
+        temperature_bounds_c=(10.0, 40.0),
+        colour=colour,
+        surface_temperature_c=lambda points: np.clip(30.0 + 20.0 * np.asarray(points)[:, 2], 20.0, 40.0),
+        background_rgb=lambda directions: np.full((len(np.asarray(directions)), 3), 0.75, dtype=np.float32),
+        background_temperature_c=lambda directions: np.full(len(np.asarray(directions)), 10.0),
+        rings=(
+            CameraRing((0.0, 0.0, 0.0), 1.75, -0.75),
+            CameraRing((0.0, 0.0, 0.0), 1.90, 0.15),
+            CameraRing((0.0, 0.0, 0.0), 1.60, 1.05),
+        ),
+        focal_share=1.15,
+    )
+
+
+def _room_rgb(directions: npt.ArrayLike) -> npt.NDArray[np.float32]:
+    """Light grey walls, a little warmer to one side and darker below."""
+    x, y, z = np.asarray(directions, dtype=np.float32).T
+    return np.stack([0.74 + 0.04 * x + 0.06 * z, 0.73 + 0.07 * z, 0.72 + 0.03 * y + 0.08 * z], axis=1)
+
+
+_BUILDERS = {"hot-object": _hot_object, "house-corner": house_corner, "sphere": _sphere}
+
+SCENE_NAMES = tuple(_BUILDERS)
+"""Names that `make_scene` knows."""
+
+
+@cache
+def make_scene(name: str) -> SyntheticScene:
+    """Make a synthetic scene by its name.
+
+    Raises:
+        SceneError: No scene has that name; the message lists those there are.
+
+    >>> make_scene("sphere").temperature_bounds_c
+    (10.0, 40.0)
+    """
+    if name not in _BUILDERS:
+        raise SceneError(
+            explain(
+                "synthetic scene",
+                expected=f"one of {', '.join(_BUILDERS)}",
+                got=repr(name),
+                remedy="Choose one of these names.",
+            )
+        )
+    return _BUILDERS[name]()
