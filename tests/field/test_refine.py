@@ -29,13 +29,23 @@ def test_refinement_changes_nothing_that_a_ray_can_see(activation, factor):
     points, directions = points_inside(grid), torch.nn.functional.normalize(torch.randn(300, 3), dim=-1)
     at = grid.locate(points)
     before = grid.density_at(at), grid.rgb_at(at, directions), grid.thermal_at(at, directions)
-    identity = id(grid.density)
     refine(grid, factor)
-    assert grid.lattice.cell_shape == (8 * factor, 8 * factor, 4 * factor) and id(grid.density) == identity
+    assert grid.lattice.cell_shape == (8 * factor, 8 * factor, 4 * factor)
     at = grid.locate(points)
     after = grid.density_at(at), grid.rgb_at(at, directions), grid.thermal_at(at, directions)
     for old, new in zip(before, after):
         torch.testing.assert_close(old, new, atol=2e-5, rtol=2e-5)
+
+
+def test_refinement_while_an_old_graph_is_alive():
+    grid = random_grid()
+    loss = grid.density_at(grid.locate(points_inside(grid))).sum()
+    loss.backward()
+    refine(grid, 2)
+    fresh = grid.density_at(grid.locate(points_inside(grid))).sum()
+    fresh.backward()
+    assert grid.density.grad is not None and grid.density.grad.shape == grid.density.shape
+    assert float(loss) == pytest.approx(float(fresh), rel=1e-5)
 
 
 def test_refinement_keeps_the_children_of_kept_voxels():
@@ -97,3 +107,9 @@ def test_checkpoint_of_a_finer_lattice_loads_into_a_coarse_grid_with_the_same_pa
     assert torch.equal(coarse.density, fine.density) and torch.equal(coarse.kept, fine.kept)
     at = coarse.locate(points_inside(coarse))
     assert torch.equal(coarse.density_at(at), fine.density_at(at))
+
+
+def test_a_query_without_points_gives_no_rows():
+    grid = random_grid()
+    at = grid.locate(torch.zeros(0, 3))
+    assert grid.rgb_at(at, torch.zeros(0, 3)).shape == (0, 3) and grid.thermal_at(at, torch.zeros(0, 3)).shape == (0, 1)

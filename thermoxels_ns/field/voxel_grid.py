@@ -44,8 +44,8 @@ def raw_density(density: float, kind: DensityActivation) -> float:
 class VoxelGrid(nn.Module):
     """The parameters of the field, one row per lattice corner.
 
-    Parameters keep their identity when the lattice changes (refinement, loading a checkpoint): only their data
-    are exchanged, so that optimisers built on them stay valid.
+    Refinement makes new parameters (autograd remembers the shape of a leaf), so optimisers must be pointed to them.
+    Loading a checkpoint exchanges only the data: optimisers that were built before stay valid.
 
     Args:
         lattice: Start lattice.
@@ -93,11 +93,23 @@ class VoxelGrid(nn.Module):
         rows = {"density": self.density, "sh": self.sh, "temperature": self.temperature}
         return {name: p for name, p in rows.items() if p is not None}
 
-    def replace_lattice(self, lattice: Lattice, rows: dict[str, Tensor], kept: Bool[Tensor, "x y z"]) -> None:
-        """Exchange the lattice, the rows of every parameter and the kept voxels, keeping parameter identity."""
+    def replace_lattice(
+        self, lattice: Lattice, rows: dict[str, Tensor], kept: Bool[Tensor, "x y z"], keep_identity: bool = False
+    ) -> None:
+        """Exchange the lattice, the rows of every parameter and the kept voxels.
+
+        Args:
+            lattice: New lattice.
+            rows: New rows by parameter name.
+            kept: New kept voxels.
+            keep_identity: Exchange the data of the parameters that exist; only while no graph uses them.
+        """
         for name, parameter in self.row_parameters().items():
-            parameter.data = rows[name].to(parameter.device, parameter.dtype).contiguous()
-            parameter.grad = None
+            data = rows[name].to(parameter.device, parameter.dtype).contiguous()
+            if keep_identity:
+                parameter.data, parameter.grad = data, None
+            else:
+                setattr(self, name, nn.Parameter(data))
         device = self.lo.device
         self._lattice = lattice
         self.lo = torch.tensor(lattice.lo, dtype=torch.float64, device=device)
@@ -119,7 +131,7 @@ class VoxelGrid(nn.Module):
                 if prefix + name in state_dict and state_dict[prefix + name].shape[1:] == getattr(self, name).shape[1:]
             }
             if len(rows) == len(self.row_parameters()):
-                self.replace_lattice(lattice, {k: v.clone() for k, v in rows.items()}, kept.clone())
+                self.replace_lattice(lattice, {k: v.clone() for k, v in rows.items()}, kept.clone(), keep_identity=True)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     def locate(self, points: Float[Tensor, "n 3"]) -> TrilinearPoints:
@@ -133,7 +145,7 @@ class VoxelGrid(nn.Module):
     def rgb_at(self, at: TrilinearPoints, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Colour in [0, 1] seen along unit directions: the sigmoid of the interpolated harmonics."""
         assert self.sh is not None and self.sh_degree is not None, "this grid has no colour"
-        coefficients = interpolate(self.sh, at).view(len(directions), 3, -1)
+        coefficients = interpolate(self.sh, at).view(len(directions), 3, num_coefficients(self.sh_degree))
         return torch.sigmoid((coefficients * harmonics(directions, self.sh_degree)[:, None]).sum(-1))
 
     def thermal_at(self, at: TrilinearPoints, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:

@@ -1,0 +1,66 @@
+"""The methods nerfstudio finds through our entry points. Must import on any machine and load nothing heavy."""
+
+from __future__ import annotations
+
+import torch
+from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.engine.optimizers import OptimizerConfig
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from thermoxels_ns import nerfstudio_bridge
+from thermoxels_ns.data.thermal_datamanager import ThermalDataManagerConfig
+from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
+from thermoxels_ns.model_config import ThermoxelsModelConfig
+from thermoxels_ns.optim import FusedAdamConfig, RMSpropConfig
+from thermoxels_ns.pipeline import ThermoxelsPipelineConfig
+from thermoxels_ns.presets import read_preset, with_overrides
+from thermoxels_ns.trainer import ThermoxelsTrainerConfig
+
+nerfstudio_bridge.install()
+
+ITERATIONS = 1500
+
+
+def _group(lr: float, lr_final: float, optimizer: type[OptimizerConfig]) -> dict:
+    return {
+        "optimizer": optimizer(lr=lr),
+        "scheduler": ExponentialDecaySchedulerConfig(lr_final=lr_final, max_steps=ITERATIONS),
+    }
+
+
+def _trainer(optimizer: type[OptimizerConfig] = FusedAdamConfig) -> ThermoxelsTrainerConfig:
+    return ThermoxelsTrainerConfig(
+        method_name="thermoxels",
+        max_num_iterations=ITERATIONS,
+        steps_per_save=500,
+        steps_per_eval_batch=0,
+        steps_per_eval_image=0,
+        steps_per_eval_all_images=0,
+        mixed_precision=False,
+        machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
+        pipeline=ThermoxelsPipelineConfig(
+            datamanager=ThermalDataManagerConfig(dataparser=ThermalDataParserConfig()), model=ThermoxelsModelConfig()
+        ),
+        optimizers={
+            "density": _group(0.1, 0.02, optimizer),
+            "sh": _group(0.05, 0.005, optimizer),
+            "temperature": _group(0.02, 0.002, optimizer),
+            "background": _group(0.05, 0.005, optimizer),
+            "thermal_offset": _group(0.002, 0.0002, optimizer),
+        },
+        viewer=ViewerConfig(quit_on_train_completion=True),
+        vis="viewer",
+    )
+
+
+def _preset(name: str, optimizer: type[OptimizerConfig] = FusedAdamConfig) -> MethodSpecification:
+    content = read_preset(name)
+    description = content.pop("description")
+    return MethodSpecification(with_overrides(_trainer(optimizer), content, name), description)
+
+
+thermoxels = MethodSpecification(_trainer(), "RGB and thermal photographs to a voxel model that heat can be solved on.")
+thermoxels_paper = _preset("thermoxels-paper", RMSpropConfig)
+thermoxels_arco = _preset("thermoxels-arco")
+plenoxels_t = _preset("plenoxels-t")

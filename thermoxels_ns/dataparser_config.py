@@ -1,0 +1,14 @@
+"""The dataparser that nerfstudio finds through our entry point.
+
+Apart from `config.py`, because nerfstudio discovers dataparsers while its own datamanagers are half imported.
+"""
+
+from __future__ import annotations
+
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+
+from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
+
+thermal_data = DataParserSpecification(
+    config=ThermalDataParserConfig(), description="Paired RGB and thermal photographs (ThermoScenes layout)."
+)

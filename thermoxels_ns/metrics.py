@@ -1,0 +1,120 @@
+"""Image metrics: how well a rendered photograph matches a held-out one, in decibels, structure and degrees."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+_SMALLEST_MSE = 1e-10
+_HSSIM_WINDOW = 4
+_HSSIM_C2 = 9e-4  # (0.03 x data range 1)^2
+
+
+def psnr(predicted: Tensor, target: Tensor, valid: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio of values in [0, 1], [dB]; at most 100 (identical images)."""
+    squared = (predicted - target) ** 2
+    mse = squared.mean() if valid is None else squared[valid].mean()
+    return float(-10.0 * torch.log10(mse.clamp(min=_SMALLEST_MSE)))
+
+
+def ssim(predicted: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> float:
+    """Structural similarity (Wang et al. 2004, Gaussian window of 11 pixels or the largest that fits)."""
+    side = min(11, *predicted.shape[:2])
+    side -= 1 - side % 2
+    value = structural_similarity_index_measure(
+        predicted.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None], data_range=1.0, kernel_size=side
+    )
+    return float(value)  # type: ignore[arg-type]
+
+
+def hssim(predicted: Float[Tensor, "h w 1"], target: Float[Tensor, "h w 1"]) -> float:
+    """Heat-based structural similarity (arXiv 2403.10340), as the Thermoxels paper reports it.
+
+    Mean over disjoint 4 x 4 windows of (2 cov + C2) / (var_p + var_t + C2), C2 = 9e-4; 1 where both are flat.
+    """
+
+    def window_mean(image: Tensor) -> Tensor:
+        return F.avg_pool2d(image.permute(2, 0, 1)[None], min(_HSSIM_WINDOW, *image.shape[:2]))
+
+    mean_p, mean_t = window_mean(predicted), window_mean(target)
+    var_p = window_mean(predicted**2) - mean_p**2
+    var_t = window_mean(target**2) - mean_t**2
+    covariance = window_mean(predicted * target) - mean_p * mean_t
+    return float(((2 * covariance + _HSSIM_C2) / (var_p + var_t + _HSSIM_C2)).mean())
+
+
+def hot_region(temperature_c: Float[Tensor, "h w 1"], valid: Bool[Tensor, "h w 1"]) -> Bool[Tensor, "h w 1"]:
+    """The hot side of Otsu's threshold (Otsu 1979) over the valid pixels; all valid pixels if the image is flat."""
+    values = temperature_c[valid]
+    if values.numel() == 0 or float(values.max() - values.min()) < 1e-6:
+        return valid
+    low, span = values.min(), values.max() - values.min()
+    grey = ((values - low) / span * 255).round().to(torch.uint8).cpu().numpy()
+    threshold, _ = cv2.threshold(np.ascontiguousarray(grey[:, None]), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    return valid & ((temperature_c - low) / span * 255 > threshold)
+
+
+def _mean_abs(error: Tensor, where: Tensor) -> float:
+    return float(error[where].abs().mean()) if bool(where.any()) else float("nan")
+
+
+def thermal_metrics(
+    predicted: Float[Tensor, "h w 1"],
+    target: Float[Tensor, "h w 1"],
+    valid: Bool[Tensor, "h w 1"],
+    accumulation: Float[Tensor, "h w 1"],
+    span_k: float,
+) -> dict[str, float]:
+    """All thermal metrics of one image.
+
+    Args:
+        predicted: Rendered normalised temperature.
+        target: Measured normalised temperature.
+        valid: Pixels that were measured.
+        accumulation: Opacity of the rendered rays.
+        span_k: Width of the temperature range, [K].
+
+    Returns:
+        `thermal_psnr`, `thermal_ssim`, `thermal_hssim` of normalised images (pixels that are not valid are equal in
+        both), and mean absolute errors in kelvin (the size of a degree Celsius): `thermal_mae_c` over all valid
+        pixels; `thermal_mae_hit_c` where opacity exceeds one half; `thermal_mae_roi_c` in the hot region;
+        `thermal_mae_debiased_c` with the image's mean difference removed first. NaN where no pixel qualifies.
+    """
+    filled_p = torch.where(valid, predicted.clamp(0, 1), torch.zeros_like(predicted))
+    filled_t = torch.where(valid, target, torch.zeros_like(target))
+    error_k = (predicted - target) * span_k
+    bias = error_k[valid].mean() if bool(valid.any()) else error_k.new_zeros(())
+    return {
+        "thermal_psnr": psnr(filled_p, filled_t, valid) if bool(valid.any()) else float("nan"),
+        "thermal_ssim": ssim(filled_p, filled_t),
+        "thermal_hssim": hssim(filled_p, filled_t),
+        "thermal_mae_c": _mean_abs(error_k, valid),
+        "thermal_mae_hit_c": _mean_abs(error_k, valid & (accumulation > 0.5)),
+        "thermal_mae_roi_c": _mean_abs(error_k, hot_region(target, valid)),
+        "thermal_mae_debiased_c": _mean_abs(error_k - bias, valid),
+    }
+
+
+def lpips_available() -> bool:
+    """Whether the optional package for LPIPS is installed (`pip install thermoxels-ns[lpips]`)."""
+    return importlib.util.find_spec("lpips") is not None
+
+
+def lpips(predicted: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> float:
+    """Learned perceptual distance (Zhang et al. 2018, AlexNet); its package fetches weights on first use."""
+    import lpips as package  # type: ignore[import-not-found]
+
+    def prepare(image: Tensor) -> Tensor:
+        return image.permute(2, 0, 1)[None].cpu() * 2 - 1
+
+    if not hasattr(lpips, "network"):
+        lpips.network = package.LPIPS(net="alex", verbose=False)  # type: ignore[attr-defined]
+    with torch.no_grad():
+        return float(lpips.network(prepare(predicted), prepare(target)))  # type: ignore[attr-defined]

@@ -1,0 +1,290 @@
+"""The nerfstudio model: a voxel field rendered for colour and temperature, with its losses and metrics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
+from nerfstudio.models.base_model import Model
+from nerfstudio.utils import colormaps
+from torch import Tensor, nn
+
+from thermoxels_ns import losses
+from thermoxels_ns.coarse_to_fine import coarse_to_fine_callbacks
+from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.field.background import SkyTemperature, SphereImage
+from thermoxels_ns.field.field import VoxelField
+from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.metrics import lpips, lpips_available, psnr, ssim, thermal_metrics
+from thermoxels_ns.model_config import ThermoxelsModelConfig
+from thermoxels_ns.ray_statistics import corner_weight
+from thermoxels_ns.render.compositing import Composite, composite
+from thermoxels_ns.render.march import March, march
+from thermoxels_ns.snapshot import GridSnapshot
+from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
+from thermoxels_ns.units import TemperatureRange
+
+
+class ThermoxelsModel(Model):
+    """A voxel grid with density, colour and temperature on its corners, learned from RGB and thermal rays."""
+
+    config: ThermoxelsModelConfig
+    temperature_bounds_c: Tensor
+    backdrop_on: Tensor
+
+    def populate_modules(self) -> None:
+        """Build the field, the background and what belongs to single images."""
+        super().populate_modules()
+        config = self.config
+        torch.manual_seed(config.seed)
+        config.refinements()
+        self.loss_weights = config.loss_weights()
+        temperature_range = (self.kwargs.get("metadata") or {}).get("temperature_range")
+        if not isinstance(temperature_range, TemperatureRange):
+            raise SceneError(
+                explain(
+                    "scene",
+                    expected="thermal images with a temperature range",
+                    got="none",
+                    remedy="Use the dataparser thermal-data.",
+                )
+            )
+        self.register_buffer(
+            "temperature_bounds_c", torch.tensor([temperature_range.min_c, temperature_range.max_c], dtype=torch.float64)
+        )
+        box = self.scene_box.aabb.double().numpy()
+        self.field = VoxelField(
+            Lattice.covering(box[0], box[1], config.resolutions[0]),
+            config.sh_degree,
+            config.temperature_degree,
+            config.start_density,
+            config.density_activation,
+        )
+        wants_rgb = config.sh_degree is not None and config.background != "off"
+        self.background_rgb = SphereImage(config.background_height) if wants_rgb else None
+        self.background_thermal = SkyTemperature() if config.thermal_background != "minimum" else None
+        # Whether the colour and the thermal background take part; what "auto" decided is kept in the checkpoint.
+        self.register_buffer("backdrop_on", torch.tensor([wants_rgb, self.background_thermal is not None]))
+        self.thermal_offset = nn.Parameter(torch.zeros(self.num_train_data)) if config.per_image_offset else None
+        self.step = 0
+
+    @property
+    def grid(self):
+        """The voxel grid."""
+        return self.field.grid
+
+    @property
+    def temperature_range(self) -> TemperatureRange:
+        """What normalised temperatures 0 and 1 stand for; part of the checkpoint."""
+        low, high = self.temperature_bounds_c.tolist()
+        return TemperatureRange(low, high)
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Parameters by optimiser: density, sh, temperature, background, thermal_offset (those that exist)."""
+        groups = {name: [parameter] for name, parameter in self.grid.row_parameters().items()}
+        backdrop = [p for m in (self.background_rgb, self.background_thermal) if m is not None for p in m.parameters()]
+        if backdrop:
+            groups["background"] = backdrop
+        if self.thermal_offset is not None:
+            groups["thermal_offset"] = [self.thermal_offset]
+        return groups
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Refinement, pruning and the decision about the background."""
+        return coarse_to_fine_callbacks(self, training_callback_attributes)
+
+    def update_to_step(self, step: int) -> None:
+        """Tell the model which step it is at (schedules, random blocks)."""
+        self.step = step
+
+    def march_rays(self, origins: Tensor, directions: Tensor) -> March:
+        """Sample rays through the kept voxels and weigh the samples."""
+        grid = self.grid
+        skip = bool(grid.kept.all())
+        return march(
+            origins,
+            directions,
+            grid.lattice,
+            lambda positions: grid.density_at(grid.locate(positions)),
+            None if skip else grid.in_kept_voxel,
+            self.config.steps_per_voxel,
+            self.config.near_plane,
+        )
+
+    def composite_march(
+        self, marched: March, directions: Tensor, rgb_rays: Tensor | None, thermal_rays: Tensor | None
+    ) -> Composite:
+        """Colour and temperature of marched rays; None as a mask means all rays."""
+        grid = self.grid
+        at = grid.locate(marched.positions)
+
+        def rows(query):
+            def rows_at(flat: Tensor) -> Tensor:
+                return query(at.select(marched.active_index(flat)), directions[marched.rays_of(flat)])
+
+            return rows_at
+
+        rgb_on, thermal_on = self.backdrop_on.tolist()
+        has_rgb = grid.sh is not None and (rgb_rays is None or bool(rgb_rays.any()))
+        has_thermal = thermal_rays is None or bool(thermal_rays.any())
+        backdrop_rgb = self.background_rgb(directions) if self.background_rgb is not None and rgb_on else None
+        sky = self.background_thermal
+        return composite(
+            marched.steps,
+            marched.along,
+            rows(grid.rgb_at) if has_rgb else None,
+            rows(grid.thermal_at) if has_thermal else None,
+            rgb_rays,
+            thermal_rays,
+            backdrop_rgb,
+            sky(directions) if sky is not None and thermal_on else None,
+            self.config.thermal_density_gradient,
+            self.config.smallest_weight,
+        )
+
+    def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
+        """Render rays: rgb, thermal (normalised), temperature_c, depth, accumulation.
+
+        In training, rays carry their stream (see `streams.py`) and only what a stream needs is rendered.
+        """
+        origins, directions = ray_bundle.origins, ray_bundle.directions
+        marched = self.march_rays(origins, directions)
+        if not self.training:
+            return self._image_outputs(self.composite_march(marched, directions, None, None), marched)
+        stream = ray_bundle.metadata["stream"][:, 0]
+        rgb_rays, thermal_rays = (stream & RGB_STREAM) > 0, (stream & THERMAL_STREAM) > 0
+        seen = self.composite_march(marched, directions, rgb_rays, thermal_rays)
+        thermal = seen.thermal
+        if self.thermal_offset is not None and thermal is not None and ray_bundle.camera_indices is not None:
+            offset = self.thermal_offset - self.thermal_offset.mean()
+            thermal = thermal + offset[ray_bundle.camera_indices[:, 0]][:, None]
+        return {
+            "rgb": seen.rgb,
+            "thermal": thermal,
+            "accumulation": seen.accumulation[:, None],
+            "rgb_rays": rgb_rays,
+            "thermal_rays": thermal_rays,
+            "march": marched,
+        }
+
+    def _image_outputs(self, seen: Composite, marched: March) -> dict[str, Tensor]:
+        assert seen.thermal is not None
+        rgb = seen.rgb if seen.rgb is not None else seen.thermal.expand(-1, 3)
+        # A ray that hits nothing is drawn at the far side of the box: image writers cannot show infinity.
+        lattice = self.grid.lattice
+        diagonal = float(torch.linalg.norm(torch.tensor(lattice.hi) - torch.tensor(lattice.lo)))
+        far = float(marched.steps.t.amax()) if marched.steps.t.numel() else diagonal
+        return {
+            "rgb": rgb.clamp(0, 1),
+            "thermal": seen.thermal,
+            "temperature_c": self.temperature_range.to_celsius(seen.thermal),
+            "depth": seen.depth.clamp(max=max(far, diagonal))[:, None],
+            "accumulation": seen.accumulation[:, None],
+        }
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
+    ) -> dict[str, Tensor]:
+        """The weighted loss terms; those of weight 0 are not computed."""
+        weights, marched, terms = self.loss_weights, outputs["march"], {}
+        if weights.rgb and outputs["rgb"] is not None:
+            chosen = outputs["rgb_rays"]
+            terms["rgb_loss"] = weights.rgb * losses.rgb_loss(outputs["rgb"][chosen], batch["image"][chosen])
+        if weights.thermal and outputs["thermal"] is not None:
+            chosen = outputs["thermal_rays"]
+            terms["thermal_loss"] = weights.thermal * losses.thermal_loss(
+                outputs["thermal"][chosen], batch["thermal"][chosen], self.config.thermal_l2_share
+            )
+        if not self.training:
+            return terms
+        terms |= self._variation_terms()
+        if weights.sparsity:
+            terms["sparsity_loss"] = weights.sparsity * losses.sparsity_loss(marched.density, marched.steps.deltas)
+        if weights.beta:
+            terms["beta_loss"] = weights.beta * losses.beta_loss(marched.along.accumulation)
+        first, last = self.config.distortion_ramp
+        ramp = min(1.0, max(0.0, (self.step - first) / max(1, last - first)))
+        if weights.distortion and ramp > 0:
+            steps = marched.steps
+            terms["distortion_loss"] = (weights.distortion * ramp) * losses.distortion_loss(
+                marched.along.weights, steps.t, steps.deltas, scale=2.0
+            )
+        return terms
+
+    def _variation_terms(self) -> dict[str, Tensor]:
+        weights, grid = self.loss_weights, self.grid
+        generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
+        terms = {}
+        for name, parameter in grid.row_parameters().items():
+            weight = getattr(weights, f"tv_{name}")
+            if weight:
+                block = losses.random_block(parameter, grid.lattice.shape, self.config.tv_share, generator)
+                terms[f"tv_{name}_loss"] = weight * losses.total_variation(block)
+        return terms
+
+    @torch.no_grad()
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
+        """PSNR and temperature error of the batch."""
+        metrics = {}
+        if outputs["rgb"] is not None:
+            chosen = outputs["rgb_rays"]
+            metrics["psnr"] = torch.tensor(psnr(outputs["rgb"][chosen], batch["image"][chosen]))
+        if outputs["thermal"] is not None:
+            chosen = outputs["thermal_rays"]
+            error = (outputs["thermal"][chosen] - batch["thermal"][chosen]).abs().mean()
+            metrics["thermal_mae_c"] = error * self.temperature_range.span_k
+        return metrics
+
+    @torch.no_grad()
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Any]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Metrics of one held-out frame, and pictures with the measured image left of the rendered one.
+
+        Where the thermal camera is its own, the thermal image is rendered from it.
+        """
+        metrics: dict[str, float] = {}
+        images: dict[str, Tensor] = {}
+        if self.grid.sh is not None:
+            target, predicted = batch["image"][..., :3].to(self.device), outputs["rgb"]
+            metrics |= {"psnr": psnr(predicted, target), "ssim": ssim(predicted, target)}
+            if lpips_available():
+                metrics["lpips"] = lpips(predicted, target)
+            images["img"] = torch.cat((target, predicted), dim=1)
+        seen = outputs
+        if batch.get("thermal_camera") is not None:
+            seen = self.get_outputs_for_camera(batch["thermal_camera"].to(self.device))
+        thermal, valid = batch["thermal"].to(self.device), batch["thermal_valid"].to(self.device)
+        metrics |= thermal_metrics(seen["thermal"], thermal, valid, seen["accumulation"], self.temperature_range.span_k)
+        images["thermal"] = colormaps.apply_float_colormap(
+            torch.cat((thermal, seen["thermal"].clamp(0, 1)), dim=1), "inferno"
+        )
+        images["accumulation"] = colormaps.apply_colormap(outputs["accumulation"])
+        images["depth"] = colormaps.apply_depth_colormap(outputs["depth"], accumulation=outputs["accumulation"])
+        return metrics, images
+
+    @torch.no_grad()
+    def grid_snapshot(self, thermal_rays: Iterable[RayBundle]) -> GridSnapshot:
+        """The trained field for the mesher.
+
+        Args:
+            thermal_rays: Thermal training rays; the weight they give each corner tells which temperatures were
+                measured.
+
+        Returns:
+            Density, temperature and observed weight on the corners.
+        """
+        grid, shape = self.grid, self.grid.lattice.shape
+        observed = corner_weight(self, thermal_rays)
+        temperature_c = self.temperature_range.to_celsius(grid.temperature[:, 0].double())
+        return GridSnapshot(
+            grid.lattice,
+            grid.corner_density().float().cpu().numpy(),
+            temperature_c.view(shape).float().cpu().numpy(),
+            observed.view(shape).float().cpu().numpy(),
+        )

@@ -1,0 +1,163 @@
+"""Settings of the model: every field is an option of ``ns-train thermoxels --pipeline.model.*``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Literal, Optional
+
+from nerfstudio.models.base_model import ModelConfig
+
+from thermoxels_ns.errors import ThermoxelsError, explain
+from thermoxels_ns.field.voxel_grid import DensityActivation
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weight of each loss term; a term of weight 0 is not computed."""
+
+    rgb: float
+    """Mean squared error of colour (paper, eq. 3)."""
+    thermal: float
+    """lambda L2 + (1 - lambda) L1 of temperature (paper, eq. 4)."""
+    tv_density: float
+    """Total variation of the stored density."""
+    tv_sh: float
+    """Total variation of the colour harmonics."""
+    tv_temperature: float
+    """Total variation of temperature."""
+    sparsity: float
+    """Cauchy sparsity of density along rays."""
+    beta: float
+    """Push rays to be opaque or empty."""
+    distortion: float
+    """Gather each ray's weight in one short interval."""
+
+
+LOSS_RECIPES: Mapping[str, LossWeights] = {
+    # Tuned on the synthetic scenes: what meshes need (opaque solids, empty air) at no cost to the images.
+    "default": LossWeights(
+        rgb=1.0,
+        thermal=1.0,
+        tv_density=1e-4,
+        tv_sh=1e-3,
+        tv_temperature=1e-3,
+        sparsity=0.0,
+        beta=0.0,
+        distortion=1e-2,
+    ),
+    # The published training configuration of the original code (TV, sparsity and beta as there).
+    "paper": LossWeights(
+        rgb=1.0,
+        thermal=1.0,
+        tv_density=5e-3,
+        tv_sh=5e-2,
+        tv_temperature=1e-6,
+        sparsity=1e-11,
+        beta=1e-5,
+        distortion=0.0,
+    ),
+}
+
+
+@dataclass
+class ThermoxelsModelConfig(ModelConfig):
+    """Settings of the voxel model."""
+
+    _target: type = field(default_factory=lambda: _model_class())
+    enable_collider: bool = False
+    """Rays are cut by the lattice itself; nerfstudio's collider is not used."""
+    eval_num_rays_per_chunk: int = 8192
+    """Rays rendered at once for a whole image."""
+
+    resolutions: tuple[int, ...] = (32, 64)
+    """Voxels along the longest side of the scene box, coarse to fine; each a multiple of the one before."""
+    refine_at: tuple[int, ...] = (400,)
+    """Steps at which the next resolution begins; one fewer than resolutions."""
+    prune_at: tuple[int, ...] = (800,)
+    """Further steps at which voxels that no ray gives weight to are dropped (done at every refinement too)."""
+    prune_threshold: float = 0.01
+    """A voxel stays if some training ray gave it more than this share of a pixel. 0 switches pruning off."""
+    prune_dilation: int = 1
+    """Voxels kept around those, so that surfaces can still move."""
+
+    sh_degree: Optional[int] = 2
+    """Degree of the view-dependent colour, 0 to 2. None: no colour (thermal images alone)."""
+    temperature_degree: int = 0
+    """Degree of view-dependent temperature; 0 (the paper): surfaces look equally warm from all sides."""
+    density_activation: DensityActivation = "exp"
+    """Maps interpolated values to density: relu is the paper's; exp and softplus hold a sharp surface in one voxel."""
+    start_density: float = 0.1
+    """Density everywhere at the start, per world unit in a scene of size 2: near-transparent, or floaters form."""
+    thermal_density_gradient: bool = False
+    """Let thermal images move the geometry (off: temperature is painted on what the RGB images show)."""
+    steps_per_voxel: float = 2.0
+    """Samples per voxel edge along a ray (the paper: 2)."""
+    near_plane: float = 0.0
+    """Distance before each camera that stays empty, in scene units (the scene box is 2 long)."""
+    smallest_weight: float = 1e-5
+    """Samples that fill less than this share of a pixel add no colour or temperature. 0 is exact and slower."""
+
+    background: Literal["auto", "on", "off"] = "auto"
+    """Colour behind the box as a sphere image. auto: dropped at the first refinement if no ray leaves unsaturated."""
+    background_height: int = 32
+    """Rows of the sphere image."""
+    thermal_background: Literal["auto", "minimum", "learned"] = "auto"
+    """Temperature behind the box: the scene's minimum (the paper), or a learned low-order sky."""
+
+    recipe: Literal["default", "paper"] = "default"
+    """Set of loss weights; paper: the published one."""
+    loss_overrides: dict[str, float] = field(default_factory=dict)
+    """Loss weights that replace the recipe's, by name: rgb, thermal, tv_density, tv_sh, tv_temperature, sparsity,
+    beta, distortion."""
+    thermal_l2_share: float = 0.5
+    """lambda of the paper's eq. 4."""
+    distortion_ramp: tuple[int, int] = (200, 800)
+    """Steps over which the distortion term grows from nothing to its weight."""
+    tv_share: float = 0.1
+    """Share of the lattice that each step's total variation looks at."""
+    per_image_offset: bool = False
+    """Learn one temperature offset per thermal image (mean zero), for cameras whose reading drifts."""
+    seed: int = 0
+    """Seed of everything random in the model."""
+
+    def loss_weights(self) -> LossWeights:
+        """The recipe's weights with the overrides in place."""
+        base = LOSS_RECIPES[self.recipe]
+        known = {f.name: getattr(base, f.name) for f in fields(base)}
+        for name in self.loss_overrides:
+            if name not in known:
+                raise ThermoxelsError(
+                    explain(
+                        f"loss_overrides.{name}",
+                        expected="one of " + ", ".join(known),
+                        got=name,
+                        remedy="Correct the name.",
+                    )
+                )
+        return LossWeights(**{**known, **self.loss_overrides})
+
+    def refinements(self) -> dict[int, int]:
+        """Step -> factor by which voxels are split there.
+
+        Raises:
+            ThermoxelsError: Resolutions that are not multiples, or a wrong number of steps.
+        """
+        pairs = list(zip(self.resolutions, self.resolutions[1:]))
+        increasing = all(b % a == 0 and b > a for a, b in pairs) and sorted(set(self.refine_at)) == list(self.refine_at)
+        if not self.resolutions or len(self.refine_at) != len(pairs) or not increasing:
+            raise ThermoxelsError(
+                explain(
+                    "resolutions and refine_at",
+                    expected="resolutions that are multiples of each other and one ascending step fewer",
+                    got=f"{self.resolutions} at steps {self.refine_at}",
+                    remedy="For example --pipeline.model.resolutions 32 64 128 --pipeline.model.refine-at 400 800.",
+                )
+            )
+        return {step: b // a for step, (a, b) in zip(self.refine_at, pairs)}
+
+
+def _model_class() -> type:
+    from thermoxels_ns.model import ThermoxelsModel
+
+    return ThermoxelsModel

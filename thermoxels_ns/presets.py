@@ -1,0 +1,74 @@
+"""Presets: small yaml files that hold only what differs from a base configuration."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from thermoxels_ns.errors import ThermoxelsError, explain
+
+Config = TypeVar("Config")
+
+
+def preset_folder() -> Path:
+    """The folder of the presets: inside an installed package, or beside it in a source checkout."""
+    package = Path(__file__).resolve().parent
+    installed = package / "configs"
+    return installed if installed.is_dir() else package.parent / "configs"
+
+
+def read_preset(name: str) -> dict[str, Any]:
+    """Read ``configs/<name>.yaml``.
+
+    Raises:
+        ThermoxelsError: There is no such preset, or it is not a mapping.
+    """
+    path = preset_folder() / f"{name}.yaml"
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in preset_folder().glob("*.yaml"))) or "none"
+        raise ThermoxelsError(explain("preset", expected=f"one of {known}", got=name, remedy="Correct the name."))
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    if not isinstance(content, dict):
+        raise ThermoxelsError(
+            explain(str(path.name), expected="a mapping", got=type(content).__name__, remedy="Write key: value lines.")
+        )
+    return content
+
+
+def with_overrides(config: Config, overrides: Mapping[str, Any], name: str = "preset") -> Config:
+    """A copy of a (nested) dataclass with some fields replaced; the original is not touched.
+
+    Args:
+        config: A dataclass instance, or a dict of such.
+        overrides: Nested mapping of field names to values. Lists replace tuples as tuples.
+        name: Where the overrides come from, for messages.
+
+    Raises:
+        ThermoxelsError: A name that the configuration does not have, or a value of another kind.
+    """
+    if isinstance(config, Mapping):
+        fields = dict(config)
+    elif dataclasses.is_dataclass(config) and not isinstance(config, type):
+        fields = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
+    else:
+        raise ThermoxelsError(
+            explain(name, expected="a single value", got="a mapping", remedy="Remove the nested keys.")
+        )
+    changed = {}
+    for key, value in overrides.items():
+        if key not in fields:
+            raise ThermoxelsError(
+                explain(f"{name}.{key}", expected=f"one of {', '.join(sorted(fields))}", got=key, remedy="Correct it.")
+            )
+        old = fields[key]
+        if isinstance(value, Mapping) and (dataclasses.is_dataclass(old) or (isinstance(old, Mapping) and old)):
+            changed[key] = with_overrides(old, value, f"{name}.{key}")
+        else:
+            changed[key] = tuple(value) if isinstance(old, tuple) and isinstance(value, list) else value
+    if isinstance(config, Mapping):
+        return {**fields, **changed}  # type: ignore[return-value]
+    return dataclasses.replace(config, **changed)  # type: ignore[type-var]
