@@ -15,9 +15,7 @@ import numpy.typing as npt
 from thermoxels_ns.errors import OutputError, ThermoxelsError, explain
 
 
-def check_positive(
-    name: str, value: float, remedy: str, error: type[ThermoxelsError] = ThermoxelsError
-) -> float:
+def check_positive(name: str, value: float, remedy: str, error: type[ThermoxelsError] = ThermoxelsError) -> float:
     """Return `value` if it is a finite number above zero, else raise `error`."""
     if not (isinstance(value, (int, float, np.number)) and math.isfinite(value) and value > 0):
         raise error(explain(name, expected="a finite number above 0", got=repr(value), remedy=remedy))

@@ -23,9 +23,7 @@ RAYS_PER_IMAGE = 4096
 """Training rays per image that statistics look at."""
 
 
-def coarse_to_fine_callbacks(
-    model: ThermoxelsModel, attributes: TrainingCallbackAttributes
-) -> list[TrainingCallback]:
+def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
     """The callbacks of one training run, in the order in which they act at a step."""
     before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
     factors = model.config.refinements()
@@ -58,9 +56,7 @@ def coarse_to_fine_callbacks(
 def prune_by_rays(model: ThermoxelsModel, datamanager):
     """Drop the voxels to which no training ray of either stream gives weight."""
     weights = voxel_weights(model, datamanager.training_rays(RGB_STREAM | THERMAL_STREAM, RAYS_PER_IMAGE))
-    return prune(
-        model.grid, weights.largest, weights.total, model.config.prune_threshold, model.config.prune_dilation
-    )
+    return prune(model.grid, weights.largest, weights.total, model.config.prune_threshold, model.config.prune_dilation)
 
 
 @torch.no_grad()

@@ -43,7 +43,7 @@ def _trainer(optimizer: type[OptimizerConfig] = FusedAdamConfig) -> ThermoxelsTr
             datamanager=ThermalDataManagerConfig(dataparser=ThermalDataParserConfig()), model=ThermoxelsModelConfig()
         ),
         optimizers={
-            "density": _group(0.1, 0.02, optimizer),
+            "density": _group(0.3, 0.03, optimizer),
             "sh": _group(0.05, 0.005, optimizer),
             "temperature": _group(0.02, 0.002, optimizer),
             "background": _group(0.05, 0.005, optimizer),

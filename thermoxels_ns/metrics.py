@@ -25,11 +25,14 @@ def psnr(predicted: Tensor, target: Tensor, valid: Tensor | None = None) -> floa
 
 
 def ssim(predicted: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> float:
-    """Structural similarity (Wang et al. 2004, Gaussian window of 11 pixels or the largest that fits)."""
+    """Structural similarity (Wang et al. 2004): Gaussian window of 11 pixels, on smaller images a box that fits."""
     side = min(11, *predicted.shape[:2])
-    side -= 1 - side % 2
     value = structural_similarity_index_measure(
-        predicted.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None], data_range=1.0, kernel_size=side
+        predicted.permute(2, 0, 1)[None],
+        target.permute(2, 0, 1)[None],
+        data_range=1.0,
+        gaussian_kernel=side == 11,
+        kernel_size=side - (1 - side % 2),
     )
     return float(value)  # type: ignore[arg-type]
 
@@ -56,9 +59,10 @@ def hot_region(temperature_c: Float[Tensor, "h w 1"], valid: Bool[Tensor, "h w 1
     if values.numel() == 0 or float(values.max() - values.min()) < 1e-6:
         return valid
     low, span = values.min(), values.max() - values.min()
-    grey = ((values - low) / span * 255).round().to(torch.uint8).cpu().numpy()
-    threshold, _ = cv2.threshold(np.ascontiguousarray(grey[:, None]), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-    return valid & ((temperature_c - low) / span * 255 > threshold)
+    grey = ((temperature_c - low) / span * 255).round()
+    levels = np.ascontiguousarray(grey[valid].to(torch.uint8).cpu().numpy()[:, None])
+    threshold, _ = cv2.threshold(levels, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    return valid & (grey > threshold)
 
 
 def _mean_abs(error: Tensor, where: Tensor) -> float:

@@ -53,7 +53,8 @@ class ThermoxelsModel(Model):
                 )
             )
         self.register_buffer(
-            "temperature_bounds_c", torch.tensor([temperature_range.min_c, temperature_range.max_c], dtype=torch.float64)
+            "temperature_bounds_c",
+            torch.tensor([temperature_range.min_c, temperature_range.max_c], dtype=torch.float64),
         )
         box = self.scene_box.aabb.double().numpy()
         self.field = VoxelField(

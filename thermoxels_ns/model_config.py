@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Literal, Optional
+from typing import Literal
 
 from nerfstudio.models.base_model import ModelConfig
 
@@ -81,7 +81,7 @@ class ThermoxelsModelConfig(ModelConfig):
     prune_dilation: int = 1
     """Voxels kept around those, so that surfaces can still move."""
 
-    sh_degree: Optional[int] = 2
+    sh_degree: int | None = 2
     """Degree of the view-dependent colour, 0 to 2. None: no colour (thermal images alone)."""
     temperature_degree: int = 0
     """Degree of view-dependent temperature; 0 (the paper): surfaces look equally warm from all sides."""

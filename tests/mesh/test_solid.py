@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.errors import MeshError
+from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.mesh.solid import SolidSelection, fill_enclosed, select_solid
+from thermoxels_ns.snapshot import GridSnapshot
 
 
 def cells_along_x(values: list[float]) -> np.ndarray:
@@ -77,7 +79,7 @@ def test_empty_names_threshold_maximum_and_remedy(snapshot_of):
     with pytest.raises(MeshError, match=r"threshold 9.*highest density.*is 3\..*--density-threshold"):
         select_solid(snapshot_of(np.full((3, 3, 3), 3.0)), SolidSelection(density_threshold=9.0))
     with pytest.raises(MeshError, match="none of 8; the highest density"):
-        select_solid(snapshot_of(np.zeros((3, 3, 3))), SolidSelection())
+        select_solid(snapshot_of(np.zeros((3, 3, 3))), SolidSelection(density_percentile=90.0))
 
 
 def test_largest_component_and_what_was_removed(snapshot_of):
@@ -141,3 +143,15 @@ def test_fill_enclosed_of_nothing_is_nothing():
 def test_bad_selection_is_refused(bad):
     with pytest.raises(MeshError, match=next(iter(bad))):
         SolidSelection(**bad)
+
+
+def test_default_is_one_optical_depth_per_voxel_at_any_resolution():
+    """Solid where density x voxel size >= 1, so the same field gives the same body on a finer lattice."""
+    for voxel in (0.5, 0.125):
+        lattice = Lattice((0.0, 0.0, 0.0), voxel, (3, 2, 2))
+        density = np.full((3, 2, 2), 1.002 / voxel, dtype=np.float32)
+        density[0] = 0.9 / voxel  # the first voxel's centre is at 0.951
+        snapshot = GridSnapshot(lattice, density, np.zeros_like(density), np.ones_like(density))
+        assert select_solid(snapshot, SolidSelection()).cells[:, 0, 0].tolist() == [False, True]
+    with pytest.raises(MeshError, match="lower --voxel-optical-depth"):
+        select_solid(snapshot, SolidSelection(voxel_optical_depth=1.1))

@@ -42,7 +42,9 @@ def test_matches_the_double_loop(dtype, tolerance):
     rgb = torch.rand(rays, steps, 3, generator=generator, dtype=torch.float64)
     thermal = torch.rand(rays, steps, generator=generator, dtype=torch.float64)
     background_rgb, background_thermal = [0.2, 0.4, 0.9], 0.3
-    expected = double_loop(*(x.tolist() for x in (density, deltas, rgb, thermal, t)), background_rgb, background_thermal)
+    expected = double_loop(
+        *(x.tolist() for x in (density, deltas, rgb, thermal, t)), background_rgb, background_thermal
+    )
 
     seen = composite(
         RaySteps(t.to(dtype), deltas.to(dtype)),
@@ -54,7 +56,9 @@ def test_matches_the_double_loop(dtype, tolerance):
     )
     assert seen.rgb is not None and seen.thermal is not None
     for r, (colour, temperature, opacity, distance) in enumerate(expected):
-        torch.testing.assert_close(seen.rgb[r].double(), torch.tensor(colour, dtype=torch.float64), atol=tolerance, rtol=0)
+        torch.testing.assert_close(
+            seen.rgb[r].double(), torch.tensor(colour, dtype=torch.float64), atol=tolerance, rtol=0
+        )
         assert abs(float(seen.thermal[r]) - temperature) < tolerance
         assert abs(float(seen.accumulation[r]) - opacity) < tolerance
         assert abs(float(seen.depth[r]) - distance) < 20 * tolerance

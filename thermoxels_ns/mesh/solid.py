@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from thermoxels_ns.checks import check_positive
 from thermoxels_ns.errors import MeshError, explain
 from thermoxels_ns.snapshot import GridSnapshot
 
@@ -16,18 +17,24 @@ from thermoxels_ns.snapshot import GridSnapshot
 class SolidSelection:
     """How solid voxels are told from empty ones."""
 
-    density_percentile: float = 90.0
+    voxel_optical_depth: float = 1.0
+    """Voxels in which density times edge length is at least this are solid: at 1, light that crosses one loses 63 %."""
+    density_percentile: float | None = None
     """Percentile p of the density over all voxels of the box, 0 to 100: the (100 - p) % densest voxels are solid, as in
-    the Thermoxels paper. Raise it if empty space turns solid, lower it if walls have holes."""
+    the Thermoxels paper. Overrides the optical depth. Raise it if empty space turns solid, lower it if walls have
+    holes."""
     density_threshold: float | None = None
-    """Voxels at least this dense are solid, [1 / world unit of the trained scene]. Overrides the percentile."""
+    """Voxels at least this dense are solid, [1 / world unit of the trained scene]. Overrides both."""
     largest_component: bool = True
     """Keep only the largest body whose voxels touch by faces; the rest are mostly floaters."""
     fill_cavities: bool = False
     """Make empty space solid where it has no way out through voxel faces. Off by default: a room is a cavity too."""
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.density_percentile) and 0.0 <= self.density_percentile <= 100.0):
+        check_positive("voxel_optical_depth", self.voxel_optical_depth, "Pass --voxel-optical-depth 1.", MeshError)
+        if self.density_percentile is not None and not (
+            np.isfinite(self.density_percentile) and 0.0 <= self.density_percentile <= 100.0
+        ):
             raise MeshError(
                 explain(
                     "density_percentile",
@@ -44,7 +51,7 @@ class SolidSelection:
                     "density_threshold",
                     expected="a finite number of at least 0, [1 / world unit]",
                     got=self.density_threshold,
-                    remedy="Leave it out to select by --density-percentile.",
+                    remedy="Leave it out to select by --voxel-optical-depth.",
                 )
             )
 
@@ -86,6 +93,9 @@ def select_solid(snapshot: GridSnapshot, selection: SolidSelection) -> SolidCell
     if selection.density_threshold is not None:
         threshold = float(selection.density_threshold)
         cells = (density >= threshold) & (density > 0.0)
+    elif selection.density_percentile is None:
+        threshold = selection.voxel_optical_depth / snapshot.lattice.voxel_size
+        cells = density >= threshold
     else:
         threshold = float(np.percentile(density, selection.density_percentile))
         cells = _densest(density, threshold, selection.density_percentile)
@@ -95,7 +105,7 @@ def select_solid(snapshot: GridSnapshot, selection: SolidSelection) -> SolidCell
                 "solid voxels",
                 expected=f"at least one voxel with density above 0 and at least the threshold {threshold:.6g}",
                 got=f"none of {cells.size}; the highest density at a voxel centre is {density.max():.6g}",
-                remedy="Train longer, or lower --density-threshold or --density-percentile.",
+                remedy="Train longer, or lower --voxel-optical-depth, --density-threshold or --density-percentile.",
             )
         )
 

@@ -117,7 +117,9 @@ def composite(
     """
     accumulation = along.accumulation
     expected = (along.weights * steps.t).sum(-1)
-    depth = torch.where(accumulation > 0, expected / accumulation.clamp(min=1e-30), torch.full_like(expected, torch.inf))
+    depth = torch.where(
+        accumulation > 0, expected / accumulation.clamp(min=1e-30), torch.full_like(expected, torch.inf)
+    )
     thermal_weights = along.weights if thermal_moves_density else along.weights.detach()
     thermal_left = along.transmittance if thermal_moves_density else along.transmittance.detach()
     rgb = _sum_rows(along.weights, along.transmittance, rgb_at, rgb_rays, background_rgb, 3, smallest_weight)

@@ -1,0 +1,73 @@
+"""Units, checks and the rename-when-done rule."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+import torch
+
+from thermoxels_ns.checks import check_finite, check_positive, check_shape, replace_when_done, writable_folder
+from thermoxels_ns.errors import MeshError, OutputError, ThermoxelsError
+from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.snapshot import GridSnapshot
+from thermoxels_ns.units import TemperatureRange, celsius_to_kelvin, kelvin_to_celsius
+
+
+def test_range_round_trip_for_floats_arrays_and_tensors():
+    span = TemperatureRange(-20.0, 60.0)
+    for value in (13.37, np.array([1.0, 2.0]), torch.tensor([5.0, -3.0], dtype=torch.float64)):
+        np.testing.assert_allclose(span.to_celsius(span.normalise(value)), value, rtol=1e-12)
+    assert span.normalise(-20.0) == 0.0 and span.normalise(60.0) == 1.0
+    assert kelvin_to_celsius(celsius_to_kelvin(21.5)) == pytest.approx(21.5)
+
+
+def test_constant_scene_has_a_range_and_sits_in_its_middle():
+    assert TemperatureRange.spanning(20.0, 20.0).normalise(20.0) == 0.5
+
+
+@pytest.mark.parametrize("bounds", [(20.0, 20.0), (30.0, 20.0), (float("nan"), 1.0), (0.0, float("inf"))])
+def test_impossible_ranges_are_refused(bounds):
+    with pytest.raises(ThermoxelsError, match="temperature range: expected finite bounds"):
+        TemperatureRange(*bounds)
+
+
+def test_checks_name_what_is_wrong():
+    with pytest.raises(ThermoxelsError, match=r"speed: expected a finite number above 0, got -1\.0\. Go forward\."):
+        check_positive("speed", -1.0, "Go forward.")
+    with pytest.raises(MeshError, match="2 of 3 NaN or infinite"):
+        check_finite("field", np.array([1.0, np.nan, np.inf]), "Mend it.", MeshError)
+    with pytest.raises(MeshError, match=r"shape \(n, 3\), got \(4, 2\)"):
+        check_shape("points", np.zeros((4, 2)), (None, 3), "Transpose it.", MeshError)
+    assert check_positive("x", 2, "") == 2.0
+
+
+def test_interrupted_write_leaves_the_old_file_and_no_rubbish(tmp_path):
+    target = tmp_path / "mesh.vtu"
+    target.write_text("old")
+    with pytest.raises(KeyboardInterrupt), replace_when_done(target) as temporary:
+        assert temporary.suffix == ".vtu"
+        temporary.write_text("half")
+        raise KeyboardInterrupt
+    assert target.read_text() == "old" and os.listdir(tmp_path) == ["mesh.vtu"]
+    with replace_when_done(target) as temporary:
+        temporary.write_text("new")
+    assert target.read_text() == "new" and os.listdir(tmp_path) == ["mesh.vtu"]
+
+
+def test_folder_that_cannot_be_made_is_refused(tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("in the way")
+    with pytest.raises(OutputError, match="output folder: expected a folder that can be written to"):
+        writable_folder(blocked / "sub")
+    assert writable_folder(tmp_path / "a" / "b").is_dir()
+
+
+def test_snapshot_refuses_nan_and_wrong_shapes():
+    lattice = Lattice((0.0, 0.0, 0.0), 1.0, (2, 2, 2))
+    good, bad = np.zeros((2, 2, 2), np.float32), np.full((2, 2, 2), np.nan, np.float32)
+    with pytest.raises(MeshError, match="density: expected finite numbers only, got 8 of 8"):
+        GridSnapshot(lattice, bad, good, good)
+    with pytest.raises(MeshError, match="temperature_c: expected shape"):
+        GridSnapshot(lattice, good, good[:1], good)

@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+import math
+import sys
+import types
+
+import pytest
+import torch
+
+from thermoxels_ns import metrics
+
+
+def images(h=48, w=64):
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(h, w, 1, generator=generator)
+    return target, torch.ones(h, w, 1, dtype=torch.bool), torch.ones(h, w, 1)
+
+
+def test_perfect_image():
+    target, valid, opaque = images()
+    result = metrics.thermal_metrics(target, target, valid, opaque, span_k=40.0)
+    assert result["thermal_psnr"] == pytest.approx(100.0)
+    assert result["thermal_ssim"] == pytest.approx(1.0) and result["thermal_hssim"] == pytest.approx(1.0)
+    assert all(result[f"thermal_mae_{k}"] == 0.0 for k in ("c", "hit_c", "roi_c", "debiased_c"))
+
+
+def test_constant_shift_is_an_error_in_degrees_that_debiasing_removes():
+    target, valid, opaque = images()
+    result = metrics.thermal_metrics(target + 0.05, target, valid, opaque, span_k=40.0)
+    assert result["thermal_mae_c"] == pytest.approx(2.0, rel=1e-5)
+    assert result["thermal_mae_debiased_c"] == pytest.approx(0.0, abs=1e-5)
+
+
+def test_only_valid_and_hit_pixels_count():
+    target, valid, opaque = images()
+    predicted = target.clone()
+    predicted[:10] += 0.5  # wrong where nothing was measured
+    predicted[10:20] += 0.1  # wrong where nothing was hit
+    valid[:10], opaque[10:20] = False, 0.2
+    result = metrics.thermal_metrics(predicted, target, valid, opaque, span_k=10.0)
+    assert result["thermal_mae_hit_c"] == 0.0
+    assert result["thermal_mae_c"] == pytest.approx(10 / 38, rel=1e-5)
+
+
+def test_hot_region_is_the_hot_side():
+    temperature = torch.full((20, 20, 1), 10.0)
+    temperature[5:9, 5:9] = 60.0
+    temperature += torch.linspace(0, 1, 20)[:, None, None]
+    valid = torch.ones_like(temperature, dtype=torch.bool)
+    assert torch.equal(metrics.hot_region(temperature, valid), temperature > 30)
+
+
+def test_flat_images_and_images_without_a_valid_pixel_give_no_nan_where_a_number_exists():
+    flat = torch.full((16, 16, 1), 0.5)
+    every, opaque = torch.ones_like(flat, dtype=torch.bool), torch.ones_like(flat)
+    result = metrics.thermal_metrics(flat, flat, every, opaque, 1.0)
+    assert result["thermal_hssim"] == pytest.approx(1.0) and all(map(math.isfinite, result.values()))
+    nothing = metrics.thermal_metrics(flat, flat, ~every, opaque, 1.0)
+    assert math.isnan(nothing["thermal_mae_c"]) and math.isnan(nothing["thermal_psnr"])
+
+
+def test_hssim_against_one_window_by_hand():
+    predicted = torch.arange(16.0).view(4, 4, 1) / 16
+    target = predicted * 0.5
+    variance = float(predicted.var(unbiased=False))
+    expected = (2 * 0.5 * variance + 9e-4) / (variance * 1.25 + 9e-4)
+    assert metrics.hssim(predicted, target) == pytest.approx(expected, rel=1e-5)
+
+
+def test_psnr_of_a_known_error():
+    target = torch.zeros(4, 4, 3)
+    assert metrics.psnr(target + 0.1, target) == pytest.approx(20.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("size", [(3, 5), (10, 64), (11, 11)])
+def test_ssim_of_small_images(size):
+    image = torch.rand(*size, 3)
+    assert metrics.ssim(image, image) == pytest.approx(1.0)
+
+
+def test_lpips_is_asked_only_when_installed(monkeypatch):
+    """With a stand-in for the optional package: images are handed over as (1, 3, h, w) in [-1, 1]."""
+    seen = []
+
+    class Network:
+        def __init__(self, net, verbose):
+            assert net == "alex" and not verbose
+
+        def __call__(self, a, b):
+            seen.append((a.shape, float(a.min()), float(b.max())))
+            return torch.tensor(0.25)
+
+    monkeypatch.setitem(sys.modules, "lpips", types.SimpleNamespace(LPIPS=Network))
+    monkeypatch.setattr(metrics.lpips, "network", Network("alex", False), raising=False)
+    assert metrics.lpips(torch.zeros(8, 8, 3), torch.ones(8, 8, 3)) == 0.25
+    assert seen == [((1, 3, 8, 8), -1.0, 1.0)]
