@@ -1,0 +1,295 @@
+"""Batches: the right rays, the right targets, the same again for the same step."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
+from nerfstudio.scripts.render import _disable_datamanager_setup
+from PIL import Image
+
+from thermoxels_ns.data.camera_rays import CameraRays
+from thermoxels_ns.data.thermal_datamanager import ThermalDataManager, ThermalDataManagerConfig
+from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
+from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
+
+DISTORTION = {"k1": 0.08, "k2": -0.02, "p1": 0.003, "p2": -0.002}
+
+
+def manager(data: Path, mode: str = "val", parser: dict | None = None, **options) -> ThermalDataManager:
+    config = ThermalDataManagerConfig(dataparser=ThermalDataParserConfig(data=data, **(parser or {})), **options)
+    return config.setup(device="cpu", test_mode=mode)
+
+
+def all_rays(cameras) -> dict[str, torch.Tensor]:
+    """nerfstudio's rays of every pixel of every camera, flat."""
+    bundles = [cameras.generate_rays(index, keep_shape=True).flatten() for index in range(len(cameras))]
+    return {
+        name: torch.cat([getattr(b, name) for b in bundles]) for name in ("origins", "directions", "pixel_area")
+    } | {"camera_indices": torch.cat([torch.full((len(b), 1), i) for i, b in enumerate(bundles)])}
+
+
+def nearest_pixel(bundle, reference) -> torch.Tensor:
+    """Which of the reference rays each ray is."""
+    keys = torch.cat([reference["origins"], reference["directions"]], dim=1)
+    distances = torch.cdist(torch.cat([bundle.origins, bundle.directions], dim=1).double(), keys.double())
+    assert float(distances.amin(1).max()) < 1e-5
+    return distances.argmin(1)
+
+
+def check_rays(bundle, reference) -> torch.Tensor:
+    pixels = nearest_pixel(bundle, reference)
+    for name in ("origins", "directions", "pixel_area"):
+        torch.testing.assert_close(getattr(bundle, name), reference[name][pixels], atol=2e-6, rtol=2e-3)
+    assert torch.equal(bundle.camera_indices, reference["camera_indices"][pixels])
+    assert bundle.camera_indices.dtype == torch.int64
+    torch.testing.assert_close(bundle.directions.norm(dim=1), torch.ones(len(bundle)))
+    return pixels
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
+def test_shared_camera_one_ray_carries_both_targets(scene_folder, model):
+    scene = scene_folder(distortion=DISTORTION, camera_model=model)
+    served = manager(scene.path, train_num_rays_per_batch=700)
+    bundle, batch = served.next_train(3)
+    assert bundle.shape == (700,) and served.get_train_rays_per_batch() == 700
+    assert (bundle.metadata["stream"] == RGB_STREAM | THERMAL_STREAM).all()
+    assert bundle.metadata["stream"].dtype == torch.uint8 and bundle.metadata["stream"].shape == (700, 1)
+    pixels = check_rays(bundle, all_rays(served.train_dataset.cameras)).numpy()
+    names = [path.name for path in served.train_dataset.image_filenames]
+    colours = np.concatenate([np.asarray(Image.open(scene.path / "images" / n)).reshape(-1, 3) for n in names])
+    np.testing.assert_allclose(batch["image"].numpy(), colours[pixels] / 255.0, atol=1e-6)
+    counts = np.concatenate([c.ravel() for c, n in zip(scene.counts, scene.names) if f"{n}.png" in names])
+    # 16 bits: every count is told from its neighbours.
+    assert np.abs(batch["thermal"][:, 0].numpy() - counts[pixels] / 65535.0).max() < 0.25 / 65535.0
+    assert len(np.unique(pixels)) > 500 and len(torch.unique(bundle.camera_indices)) == len(names)
+
+
+def test_own_thermal_camera_gives_a_second_stream(scene_folder):
+    scene = scene_folder(own_camera=True, thermal_size=(12, 10), distortion=DISTORTION)
+    served = manager(scene.path, train_num_rays_per_batch=300, thermal_num_rays_per_batch=200)
+    bundle, batch = served.next_train(0)
+    stream = bundle.metadata["stream"][:, 0]
+    assert (stream[:300] == RGB_STREAM).all() and (stream[300:] == THERMAL_STREAM).all() and len(stream) == 500
+    assert served.get_train_rays_per_batch() == 500
+    check_rays(bundle[:300], all_rays(served.train_dataset.cameras))
+    pixels = check_rays(bundle[300:], all_rays(served.train_dataset.metadata["thermal_cameras"])).numpy()
+    counts = np.concatenate([c.ravel() for c, n in zip(scene.counts, scene.names) if "train" in n])
+    np.testing.assert_allclose(batch["thermal"][300:, 0].numpy(), counts[pixels] / 65535.0, atol=4e-6)
+    assert not batch["thermal"][:300].any() and not batch["image"][300:].any() and batch["image"][:300].any()
+
+
+def test_resolutions_thirty_times_apart(scene_folder):
+    scene = scene_folder(frames=5, size=(120, 90), thermal_size=(4, 3))
+    served = manager(scene.path, train_num_rays_per_batch=50, thermal_num_rays_per_batch=400)
+    bundle, _ = served.next_train(0)
+    pixels = check_rays(bundle[50:], all_rays(served.train_dataset.thermal_cameras))
+    assert len(torch.unique(pixels)) == 4 * 12
+
+
+@pytest.mark.parametrize("own_camera", [False, True])
+def test_streams_alone(scene_folder, own_camera):
+    scene = scene_folder(own_camera=own_camera, thermal_size=(12, 10) if own_camera else None)
+    rays = {"train_num_rays_per_batch": 64, "thermal_num_rays_per_batch": 32}
+    bundle, batch = manager(scene.path, streams="rgb", **rays).next_train(0)
+    assert (bundle.metadata["stream"] == RGB_STREAM).all() and len(bundle) == 64 and not batch["thermal"].any()
+    served = manager(scene.path, streams="thermal", **rays)
+    bundle, batch = served.next_train(0)
+    count = 32 if own_camera else 64
+    assert (bundle.metadata["stream"] == THERMAL_STREAM).all() and len(bundle) == count
+    assert served.get_train_rays_per_batch() == count and not batch["image"].any() and batch["thermal"].any()
+
+
+def test_batches_depend_on_seed_and_step_alone(scene_folder):
+    scene = scene_folder()
+    first, second = manager(scene.path), manager(scene.path)
+    for step in range(5):
+        first.next_train(step)
+    torch.manual_seed(123)
+    for step in (5, 4, 5):
+        (ours, batch), (again, copy) = first.next_train(step), second.next_train(step)
+        assert torch.equal(ours.origins, again.origins) and torch.equal(ours.directions, again.directions)
+        assert torch.equal(batch["image"], copy["image"]) and torch.equal(batch["thermal"], copy["thermal"])
+    assert not torch.equal(first.next_train(4)[1]["image"], first.next_train(5)[1]["image"])
+    other = manager(scene.path, seed=1).next_train(4)[1]["image"]
+    assert not torch.equal(first.next_train(4)[1]["image"], other)
+    # Steps and seeds that add up to the same number are different draws.
+    assert not torch.equal(manager(scene.path, seed=0).next_train(1)[1]["image"], other)
+
+
+def test_exporters_get_new_rays_for_the_same_step(scene_folder):
+    """nerfstudio's point cloud exporter asks for step 0 until it has enough points, and sets the number of rays."""
+    served = manager(scene_folder().path, mode="test")
+    served.train_pixel_sampler.num_rays_per_batch = 33
+    first, second = served.next_train(0), served.next_train(0)
+    assert len(first[0]) == 33 and not torch.equal(first[1]["image"], second[1]["image"])
+
+
+def test_evaluation_frames_never_train(scene_folder):
+    """Every frame's pixels have a colour of their own; a training batch shows the training frames' only."""
+    scene = scene_folder()
+    for number, name in enumerate(scene.names):
+        Image.fromarray(np.full((18, 24, 3), number, np.uint8)).save(scene.path / "images" / f"{name}.png")
+    served = manager(scene.path)
+    seen = lambda batch: set((batch["image"] * 255).round().int().flatten().tolist())  # noqa: E731
+    assert set().union(*(seen(served.next_train(step)[1]) for step in range(5))) == {0, 1, 3, 4, 5, 6, 8, 9}
+    assert seen(served.next_eval(0)[1]) == {2, 7}
+    assert {served.next_eval_image(step)[1]["image_idx"] for step in range(20)} == {0, 1}
+
+
+def test_masked_pixels_are_never_drawn(scene_folder):
+    scene = scene_folder()
+    mask = np.zeros((18, 24), np.uint8)
+    mask[4:9, 3:8] = 255
+    for frame in scene.meta["frames"]:
+        frame["mask_path"] = frame["file_path"].replace("images/", "mask_")
+        Image.fromarray(mask).save(scene.path / frame["mask_path"])
+    scene.rewrite()
+    served = manager(scene.path)
+    bundle, _ = served.next_train(0)
+    pixels = nearest_pixel(bundle, all_rays(served.train_dataset.cameras)) % (18 * 24)
+    assert set(pixels.tolist()) == set(np.flatnonzero(mask).tolist())
+    gridded = torch.cat([part.directions for part in served.training_rays(THERMAL_STREAM)])
+    assert len(gridded) == 8 * 25
+
+
+def test_intrinsics_of_every_frame_and_rays_without_a_table(scene_folder):
+    scene = scene_folder(distortion=DISTORTION)
+    for number, frame in enumerate(scene.meta["frames"]):
+        frame["fl_x"] = 30.0 + number
+    scene.rewrite()
+    cameras = manager(scene.path).train_dataset.cameras
+    tabled, lean = CameraRays(cameras), CameraRays(cameras, table_limit_bytes=0)
+    assert tabled.has_table and not lean.has_table
+    pixels = torch.arange(len(tabled))
+    reference = all_rays(cameras)
+    for rays in (tabled, lean):
+        columns = rays.columns(pixels)
+        for name in ("origins", "directions", "pixel_area"):
+            torch.testing.assert_close(columns[name], reference[name], atol=1e-6, rtol=2e-3)
+        assert torch.equal(columns["camera_indices"], reference["camera_indices"])
+
+
+def test_optical_axis_of_a_fisheye_lens_is_finite():
+    """A pixel centre exactly on the axis, where nerfstudio's rays are 0 / 0."""
+    cameras = Cameras(torch.eye(4)[None, :3], 5.0, 5.0, 2.5, 1.5, 5, 3, camera_type=CameraType.FISHEYE)
+    for limit in (0, 1 << 20):
+        columns = CameraRays(cameras, table_limit_bytes=limit).columns(torch.arange(15))
+        assert torch.equal(columns["directions"][7], torch.tensor([0.0, 0.0, -1.0]))
+        assert all(torch.isfinite(columns[name]).all() for name in ("directions", "pixel_area"))
+
+
+def test_frames_of_different_resolutions(scene_folder):
+    scene = scene_folder(frames=5)
+    name = scene.names[0]
+    rng = np.random.default_rng(0)
+    Image.fromarray(rng.integers(0, 256, (9, 12, 3), dtype=np.uint8)).save(scene.path / "images" / f"{name}.png")
+    Image.fromarray(rng.integers(0, 65536, (9, 12)).astype(np.uint16)).save(scene.path / "thermal" / f"{name}.png")
+    scene.meta["frames"][0].update(w=12, h=9, fl_x=13.0, fl_y=13.5, cx=6.0, cy=4.5)
+    scene.rewrite()
+    served = manager(scene.path)
+    bundle, batch = served.next_train(0)
+    pixels = check_rays(bundle, all_rays_mixed(served.train_dataset.cameras))
+    colours = torch.cat([served.train_dataset[i]["image"].reshape(-1, 3) for i in range(4)])
+    torch.testing.assert_close(batch["image"], colours[pixels])
+
+
+def all_rays_mixed(cameras) -> dict[str, torch.Tensor]:
+    parts = [all_rays(cameras[index : index + 1]) for index in range(len(cameras))]
+    for index, part in enumerate(parts):
+        part["camera_indices"] += index
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+
+def test_training_rays_are_a_regular_subset(scene_folder):
+    scene = scene_folder(own_camera=True, thermal_size=(12, 10))
+    served = manager(scene.path, mode="inference")
+    for stream, cameras in ((RGB_STREAM, served.train_dataset.cameras), (2, served.train_dataset.thermal_cameras)):
+        parts = list(served.training_rays(stream, stride=4, chunk=50))
+        assert all(len(part) == 50 for part in parts[:-1]) and all(
+            (p.metadata["stream"] == stream).all() for p in parts
+        )
+        pixels = torch.cat([nearest_pixel(part, all_rays(cameras)) for part in parts])
+        width, height = int(cameras.width[0]), int(cameras.height[0])
+        inside = [r * width + c for r in range(2, height, 4) for c in range(2, width, 4)]
+        assert pixels.tolist() == [i * width * height + p for i in range(8) for p in inside]
+    both = torch.cat([part.metadata["stream"] for part in served.training_rays(RGB_STREAM | THERMAL_STREAM)])
+    assert both.flatten().tolist() == [RGB_STREAM] * 8 * 24 * 18 + [THERMAL_STREAM] * 8 * 12 * 10
+    with pytest.raises(ValueError, match="no such grid"):
+        next(served.training_rays(0))
+
+
+@pytest.mark.parametrize("most", [1, 7, 30, 100, 1000])
+def test_training_rays_per_image_are_limited(scene_folder, most):
+    served = manager(scene_folder().path, mode="inference")
+    images = torch.cat([part.camera_indices for part in served.training_rays(RGB_STREAM, most)])
+    counts = torch.bincount(images.flatten(), minlength=8)
+    assert int(counts.max()) <= most and int(counts.min()) >= min(most / 4, 432)
+
+
+def test_a_stream_that_does_not_train_has_no_training_rays(scene_folder):
+    served = manager(scene_folder().path, streams="thermal")
+    assert list(served.training_rays(RGB_STREAM)) == []
+    assert sum(len(part) for part in served.training_rays(RGB_STREAM | THERMAL_STREAM)) == 8 * 18 * 24
+
+
+def test_nerfstudios_loaders_give_whole_images(scene_folder):
+    served = manager(scene_folder(own_camera=True, thermal_size=(12, 10)).path)
+    pairs = list(served.fixed_indices_eval_dataloader)
+    assert len(pairs) == 2
+    for camera, batch in pairs:
+        assert camera.shape == (1,) and batch["image"].shape == (18, 24, 3) and batch["thermal"].shape == (10, 12, 1)
+        assert batch["thermal_camera"].shape == (1,)
+
+
+def test_render_script_can_set_it_up_without_data(scene_folder):
+    config = ThermalDataManagerConfig(dataparser=ThermalDataParserConfig(data=scene_folder().path))
+    assert isinstance(config, VanillaDataManagerConfig)
+    config.dataparser.downscale_factor = 2.0  # type: ignore[attr-defined]
+    with _disable_datamanager_setup(config._target):
+        served = config.setup(test_mode="test", device="cpu")
+    assert int(served.eval_dataset.cameras.width[0]) == 12 and served.eval_dataset[0]["image"].shape == (9, 12, 3)
+    assert served.train_pixel_sampler is None and served.get_datapath() == config.dataparser.data
+
+
+def test_photographs_scaled_by_the_datamanager_keep_their_thermal_images(scene_folder):
+    served = manager(scene_folder().path, camera_res_scale_factor=0.5)
+    item = served.eval_dataset[0]
+    assert item["image"].shape == (9, 12, 3) and item["thermal"].shape == (18, 24, 1)
+    assert int(item["thermal_camera"].width) == 24
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("images_on_gpu", [False, True])
+def test_cuda_gives_the_batch_of_the_cpu(scene_folder, images_on_gpu):
+    scene = scene_folder(own_camera=True, thermal_size=(12, 10))
+    options = ThermalDataManagerConfig(dataparser=ThermalDataParserConfig(data=scene.path), images_on_gpu=images_on_gpu)
+    bundle, batch = options.setup(device="cuda", test_mode="val").next_train(2)
+    expected, targets = manager(scene.path).next_train(2)
+    assert bundle.origins.is_cuda and bundle.metadata["stream"].is_cuda
+    torch.testing.assert_close(bundle.directions.cpu(), expected.directions)
+    for name in targets:
+        assert batch[name].is_cuda
+        torch.testing.assert_close(batch[name].cpu(), targets[name])
+
+
+@pytest.mark.real_data
+def test_real_thermal_rays_are_those_of_its_own_camera(shared_data):
+    parser = {"downscale_factor": 8}
+    served = manager(shared_data / "arco", parser=parser, streams="thermal", thermal_num_rays_per_batch=500)
+    bundle, batch = served.next_train(0)
+    cameras = served.train_dataset.thermal_cameras
+    assert cameras is not None and (bundle.metadata["stream"] == THERMAL_STREAM).all()
+    image = int(bundle.camera_indices[0])
+    mine = (bundle.camera_indices[:, 0] == image).nonzero()[:, 0]
+    rays = cameras.generate_rays(image, keep_shape=True).flatten()
+    pixels = torch.cdist(bundle.directions[mine].double(), rays.directions.double()).argmin(1)
+    torch.testing.assert_close(bundle.directions[mine], rays.directions[pixels], atol=1e-6, rtol=0)
+    torch.testing.assert_close(bundle.origins[mine], rays.origins[pixels])
+    temperatures, valid = served.train_dataset.get_thermal(image)
+    torch.testing.assert_close(batch["thermal"][mine], temperatures.reshape(-1, 1)[pixels])
+    assert valid.all() and len(served.train_dataset) == 35

@@ -1,0 +1,190 @@
+"""Thermal files: exact temperatures, masked pixels, clear errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from thermoxels_ns.data.dead_pixels import find_dead_pixels
+from thermoxels_ns.data.thermal_files import ThermalUnit, read_temperature_c, read_thermal_file
+from thermoxels_ns.errors import ThermalFileError
+
+BOUNDS = ThermalUnit.bounds(-10.0, 40.0)
+COUNTS = ThermalUnit.linear(0.025, -100.0)
+CELSIUS = ThermalUnit.celsius()
+
+
+def save(path: Path, pixels: np.ndarray) -> Path:
+    Image.fromarray(pixels).save(path)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff"])
+def test_sixteen_bit_bounds_keep_every_step(tmp_path, suffix):
+    counts = np.arange(65536, dtype=np.uint16).reshape(256, 256)
+    got = read_temperature_c(save(tmp_path / f"a{suffix}", counts), BOUNDS)
+    assert got.dtype == np.float32
+    np.testing.assert_allclose(got, -10.0 + counts / 65535.0 * 50.0, atol=4e-6)
+    assert len(np.unique(got)) == 65536
+
+
+def test_eight_bit_bounds(tmp_path):
+    counts = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    got = read_temperature_c(save(tmp_path / "a.png", counts), BOUNDS)
+    np.testing.assert_allclose(got, -10.0 + counts / 255.0 * 50.0, atol=4e-6)
+
+
+def test_grey_jpg_reads_as_eight_bits(tmp_path):
+    got = read_temperature_c(save(tmp_path / "a.jpg", np.full((16, 16), 51, np.uint8)), BOUNDS)
+    np.testing.assert_allclose(got, 0.0, atol=0.25)  # one count is 0.2 K
+
+
+def test_equal_channels_count_as_grey_and_keep_sixteen_bits(tmp_path):
+    counts = np.array([[0, 1, 65535], [40000, 40001, 3]], np.uint16)
+    assert cv2.imwrite(str(tmp_path / "deep.png"), np.repeat(counts[..., None], 3, axis=2))
+    np.testing.assert_allclose(
+        read_temperature_c(tmp_path / "deep.png", BOUNDS), -10 + counts / 65535.0 * 50, atol=4e-6
+    )
+    eight = np.array([[1, 2], [3, 255]], np.uint8)
+    path = save(tmp_path / "grey.png", np.repeat(eight[..., None], 3, axis=2))
+    np.testing.assert_allclose(read_temperature_c(path, BOUNDS), -10 + eight / 255.0 * 50, atol=4e-6)
+
+
+def test_transparent_pixels_are_no_data(tmp_path):
+    pixels = np.full((2, 2, 4), 255, np.uint8)
+    pixels[0, 1, 3] = 0
+    read = read_thermal_file(save(tmp_path / "a.png", pixels), BOUNDS)
+    assert np.isnan(read.temperature_c[0, 1]) and read.report.nan == 1
+    assert np.isfinite(read.temperature_c).sum() == 3
+
+
+def test_false_colour_is_refused(tmp_path):
+    pixels = np.zeros((4, 4, 3), np.uint8)
+    pixels[0, 0] = (200, 10, 0)
+    with pytest.raises(ThermalFileError, match="false-colour"):
+        read_temperature_c(save(tmp_path / "a.png", pixels), BOUNDS)
+
+
+def test_counts_with_linear_unit_and_saturation(tmp_path):
+    counts = np.array([[0, 4000, 65535], [4800, 4801, 4840]], np.uint16)
+    read = read_thermal_file(save(tmp_path / "a.tiff", counts), COUNTS)
+    expected = np.array([[np.nan, 0.0, np.nan], [20.0, 20.025, 21.0]])
+    np.testing.assert_allclose(read.temperature_c, expected, atol=2e-6)
+    assert (read.report.saturated, read.report.nan, read.report.out_of_range, read.report.pixels) == (2, 0, 0, 6)
+
+
+def test_float_tiff_is_celsius_unless_linear(tmp_path):
+    values = np.array([[1.25, np.nan], [np.inf, 3000.0]], np.float32)
+    path = save(tmp_path / "a.tif", values)
+    read = read_thermal_file(path, CELSIUS)
+    np.testing.assert_array_equal(read.temperature_c, np.array([[1.25, np.nan], [np.nan, np.nan]], np.float32))
+    assert (read.report.nan, read.report.out_of_range) == (2, 1)
+    np.testing.assert_array_equal(read_temperature_c(path, BOUNDS), read.temperature_c)
+    kelvin = ThermalUnit.linear(1.0, -273.15)
+    assert read_temperature_c(save(tmp_path / "k.tif", np.full((2, 2), 293.15, np.float32)), kelvin)[0, 0] == (
+        pytest.approx(20.0, abs=1e-4)
+    )
+
+
+def test_npy_and_csv_are_celsius(tmp_path):
+    values = np.array([[20.5, -3.25], [np.nan, 7.0]])
+    np.save(tmp_path / "a.npy", values)
+    (tmp_path / "comma.csv").write_text("20.5,-3.25,\n,7.0\n".replace(",\n,", "\nNaN,"))
+    (tmp_path / "semicolon.csv").write_text("20,5;-3,25;\n-;7\n", encoding="utf-8-sig")
+    for name in ("a.npy", "comma.csv", "semicolon.csv"):
+        np.testing.assert_array_equal(read_temperature_c(tmp_path / name, BOUNDS), values.astype(np.float32))
+
+
+def test_integer_npy_is_counts_with_a_linear_unit(tmp_path):
+    np.save(tmp_path / "a.npy", np.full((2, 2), 4800, np.uint16))
+    assert read_temperature_c(tmp_path / "a.npy", COUNTS)[0, 0] == pytest.approx(20.0)
+
+
+def test_below_absolute_zero_is_masked_whatever_the_range(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([[-273.2, -273.1]]))
+    read = read_thermal_file(tmp_path / "a.npy", CELSIUS, valid_range_c=(-1e4, 1e4))
+    assert np.isnan(read.temperature_c).tolist() == [[True, False]] and read.report.out_of_range == 1
+
+
+def test_counts_without_unit_say_what_to_give(tmp_path):
+    path = save(tmp_path / "a.png", np.ones((3, 3), np.uint16))
+    with pytest.raises(ThermalFileError, match=r"a\.png.*temperature_bounds\.json"):
+        read_temperature_c(path, CELSIUS)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff", ".npy", ".csv", ".jpg"])
+@pytest.mark.parametrize("damage", ["missing", "empty", "truncated", "text"])
+def test_damaged_files_are_named(tmp_path, suffix, damage):
+    path = tmp_path / f"broken{suffix}"
+    pixels = np.random.default_rng(0).integers(0, 255, (64, 64)).astype(np.uint8)
+    if damage == "empty":
+        path.touch()
+    elif damage == "text":
+        path.write_text("this is; no image\n1")
+    elif damage == "truncated":
+        if suffix == ".npy":
+            np.save(path, pixels)
+        elif suffix == ".csv":
+            path.write_text("1,2,3\n4,5")
+        else:
+            save(path, pixels)
+        if suffix != ".csv":
+            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(ThermalFileError, match="broken"):
+        read_temperature_c(path, BOUNDS)
+
+
+@pytest.mark.parametrize("shape", [(4,), (2, 3, 4), (0, 3)])
+def test_wrong_shapes_are_refused(tmp_path, shape):
+    np.save(tmp_path / "a.npy", np.ones(shape))
+    with pytest.raises(ThermalFileError, match="height, width"):
+        read_temperature_c(tmp_path / "a.npy", CELSIUS)
+
+
+def test_unknown_suffix_and_pages_are_refused(tmp_path):
+    (tmp_path / "a.seq").write_bytes(b"x")
+    with pytest.raises(ThermalFileError, match=r"\.npy"):
+        read_temperature_c(tmp_path / "a.seq", CELSIUS)
+    page = Image.fromarray(np.ones((3, 3), np.uint16))
+    page.save(tmp_path / "two.tiff", save_all=True, append_images=[page])
+    with pytest.raises(ThermalFileError, match="2 pages"):
+        read_temperature_c(tmp_path / "two.tiff", COUNTS)
+
+
+def test_bad_units_are_refused():
+    with pytest.raises(ThermalFileError, match="unit"):
+        ThermalUnit.linear(0.0, 1.0)
+    with pytest.raises(ThermalFileError, match="unit"):
+        ThermalUnit.bounds(float("nan"), 1.0)
+
+
+def test_dead_pixels_are_stuck_while_their_surroundings_change():
+    stack = np.random.default_rng(1).normal(20, 1, (6, 20, 30)).astype(np.float32)
+    stack[:, :, 7] = 21.5
+    stack[:, 0, 0] = 5.0
+    stack[:, 3, 3] = np.nan
+    dead = find_dead_pixels(stack)
+    expected = np.zeros((20, 30), bool)
+    expected[:, 7] = expected[0, 0] = True
+    np.testing.assert_array_equal(dead, expected)
+    assert not find_dead_pixels(stack[:4]).any()
+
+
+def test_quiet_background_is_not_dead():
+    """Noise-free scene: a third of the image always shows the same sky, an object moves below it."""
+    stack = np.full((8, 30, 30), -20.0, np.float32)
+    for number in range(8):
+        stack[number, 8:] = 20.0 + np.arange(30) + number
+    assert not find_dead_pixels(stack).any()
+    assert not find_dead_pixels(np.full((8, 5, 5), 20.0, np.float32)).any()
+
+
+@pytest.mark.real_data
+def test_real_counts(shared_data):
+    read = read_thermal_file(sorted((shared_data / "arco" / "thermal").glob("*.tiff"))[0], COUNTS)
+    assert read.temperature_c.shape == (512, 640) and read.report.masked == 0
+    assert 0 < read.temperature_c.min() < np.median(read.temperature_c) < 25

@@ -1,0 +1,94 @@
+"""Broken sensors, constant scenes and wide gaps in resolution must not reach the loss."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from thermoxels_ns.data.thermal_datamanager import ThermalDataManager, ThermalDataManagerConfig
+from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
+from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
+
+DEAD_COLUMN = 5
+
+
+def manager(data, **options) -> ThermalDataManager:
+    return ThermalDataManagerConfig(dataparser=ThermalDataParserConfig(data=data), **options).setup(test_mode="val")
+
+
+def celsius(number: int, shape: tuple[int, int]) -> np.ndarray:
+    return np.random.default_rng(number).uniform(12.0, 28.0, shape).astype(np.float32)
+
+
+def broken(number: int, shape: tuple[int, int]) -> np.ndarray:
+    """The same with 1 % NaN, one infinite and one impossible pixel, and a stuck column."""
+    values = celsius(number, shape)
+    values[np.random.default_rng(100 + number).random(shape) < 0.01] = np.nan
+    values[0, 0], values[0, 1] = np.inf, -300.0
+    values[:, DEAD_COLUMN] = 25.0
+    return values
+
+
+def test_bad_pixels_are_masked_and_the_rest_is_unchanged(scene_folder, tmp_path_factory, capsys):
+    size = (40, 30)
+    clean = manager(scene_folder(suffix=".npy", size=size, counts=celsius).path)
+    clean.train_dataset.get_thermal(0)
+    expected = {index: clean.train_dataset.get_thermal(index)[0] for index in range(8)}
+    batch_clean = clean.next_train(7)
+    for number, path in enumerate(sorted((clean.config.data / "thermal").glob("*.npy"), key=lambda p: p.stem[-3:])):
+        np.save(path, broken(number, (30, 40)))
+    served = manager(clean.config.data)
+    for index in range(8):
+        got, valid = served.train_dataset.get_thermal(index)
+        assert not valid[:, DEAD_COLUMN].any() and not valid[0, :2].any()
+        assert 0.9 < float(valid.float().mean()) < 0.98
+        torch.testing.assert_close(got[valid], expected[index][valid], atol=0, rtol=0)
+        assert not got[~valid].any()
+    bundle, batch = served.next_train(7)
+    thermal = (bundle.metadata["stream"] & THERMAL_STREAM > 0)[:, 0]
+    # The same rays and colours; temperatures only where they are measurements.
+    assert torch.equal(bundle.directions, batch_clean[0].directions)
+    assert torch.equal(batch["image"], batch_clean[1]["image"])
+    assert (bundle.metadata["stream"] & RGB_STREAM > 0).all() and 0.9 < float(thermal.float().mean()) < 0.98
+    assert torch.equal(batch["thermal"][thermal], batch_clean[1]["thermal"][thermal])
+    assert torch.isfinite(batch["thermal"]).all() and not batch["thermal"][~thermal].any()
+    report = served.train_dataset.thermal_report()
+    assert report.pixels == 8 * 1200 and report.out_of_range == 8
+    assert report.dead == 8 * 30 and 8 <= report.nan < 0.02 * report.pixels
+    assert f"{report.dead} dead" in " ".join(capsys.readouterr().out.split())
+
+
+def test_thermal_only_rays_avoid_bad_pixels(scene_folder):
+    served = manager(scene_folder(suffix=".npy", size=(40, 30), counts=broken).path, streams="thermal")
+    valid = torch.cat([served.train_dataset.get_thermal(i)[1].flatten() for i in range(8)])
+    _, batch = served.next_train(0)
+    assert (batch["thermal"] > 0).all()
+    assert sum(len(part) for part in served.training_rays(THERMAL_STREAM)) == int(valid.sum())
+
+
+def test_constant_scene(scene_folder):
+    """Minimum equals maximum: the range opens to 1 K and every target is one half."""
+    scene = scene_folder(suffix=".npy", bounds=False, counts=lambda i, s: np.full(s, 20.0, np.float32))
+    served = manager(scene.path)
+    _, batch = served.next_train(0)
+    assert (batch["thermal"] == 0.5).all()
+    assert served.train_dataset.temperature_range.to_celsius(0.5) == 20.0
+
+
+def test_dead_pixels_do_not_set_the_range(scene_folder):
+    def hot_spot(number, shape):
+        values = celsius(number, shape)
+        values[3, 3] = 900.0
+        return values
+
+    served = manager(scene_folder(suffix=".npy", bounds=False, counts=hot_spot).path)
+    assert served.train_dataset.temperature_range.max_c < 28.0
+
+
+def test_no_valid_pixel_becomes_nan_in_a_narrow_range(scene_folder):
+    """0.05 K of contrast at 1500 C: the steps that float32 degrees can hold survive the normalisation."""
+    values = lambda i, s: np.float32(1500.0) + np.float32(2**-13) * np.arange(s[0] * s[1]).reshape(s)  # noqa: E731
+    served = manager(scene_folder(suffix=".npy", bounds=False, counts=values).path)
+    thermal, valid = served.train_dataset.get_thermal(0)
+    assert valid.all() and len(torch.unique(thermal)) == thermal.numel()
+    assert float(thermal.min()) == 0.0 and float(thermal.max()) == 1.0

@@ -1,0 +1,320 @@
+"""The scene folder on disk: transforms.json and its thermal partners, checked and turned into plain frames."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.data.pose_file_cameras import Intrinsics, read_intrinsics, read_pose
+from thermoxels_ns.data.thermal_files import THERMAL_SUFFIXES, ThermalUnit
+from thermoxels_ns.errors import SceneError, explain
+
+JSON_NAMES = ("transforms.json", "transforms_thermal.json")
+BOUNDS_NAME = "temperature_bounds.json"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One pair of photographs."""
+
+    name: str
+    """Name of the photograph as the json writes it, with forward slashes; frames are sorted by it."""
+    image: Path
+    thermal: Path
+    mask: Path | None
+    pose: npt.NDArray[np.float64]
+    """Camera to world, shape (4, 4), OpenGL axes, input coordinates."""
+    intrinsics: Intrinsics
+    thermal_pose: npt.NDArray[np.float64] | None
+    """Pose of the thermal camera; None: the photograph's."""
+    thermal_intrinsics: Intrinsics | None
+    """The thermal camera's own projection; None: the photograph's at the thermal image's resolution."""
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """A scene folder after reading and checking its json; frames are sorted by name."""
+
+    folder: Path
+    json_path: Path
+    frames: list[Frame]
+    unit: ThermalUnit
+    bounds_c: tuple[float, float] | None
+    """Lowest and highest temperature of temperature_bounds.json, [degrees Celsius]."""
+    meta: dict[str, Any]
+    """The json as it is (split lists, scene_box, ply_file_path, applied_transform)."""
+    left_out: list[str] = field(default_factory=list)
+    """Names of frames and files that missing_thermal="skip" left out."""
+
+
+def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "error") -> SceneFile:
+    """Read a scene folder (or the json in it) and check all that can be checked without decoding images.
+
+    Args:
+        data: The scene's folder or its json.
+        missing_thermal: What to do with a frame without a thermal partner: raise, or leave it out and name it.
+
+    Raises:
+        SceneError: Something is missing, doubled, not finite or contradictory; the message names it.
+    """
+    json_path = _find_json(data)
+    folder = json_path.parent
+    meta = _load_json(json_path)
+    entries = meta.get("frames")
+    if not isinstance(entries, list) or not entries:
+        raise SceneError(
+            explain(
+                json_path.name,
+                expected="a list 'frames' with one posed photograph per entry",
+                got="no frames: the scene has no poses",
+                remedy="Run structure from motion (ns-process-data) on the photographs first.",
+            )
+        )
+    partners = _ThermalPartners(folder)
+    frames, left_out = [], []
+    for index, entry in enumerate(entries):
+        where = f"{json_path.name}: frame {index}"
+        if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
+            raise SceneError(
+                explain(where, expected="an object with 'file_path'", got=entry, remedy="Correct the json.")
+            )
+        name = Path(entry["file_path"]).as_posix()
+        where = f"{where} ({name})"
+        image = _existing(folder / name, where, "file_path")
+        thermal = partners.of(entry, image)
+        if thermal is None:
+            left_out.append(name)
+            continue
+        frames.append(_frame(meta, entry, name, image, thermal, folder, where))
+    if missing_thermal == "error" and left_out:
+        raise SceneError(_missing_text(json_path, left_out, len(entries), partners))
+    orphans = partners.orphans(folder, [frame.image for frame in frames])
+    if missing_thermal == "error" and orphans:
+        raise SceneError(
+            explain(
+                f"{folder.name}/thermal",
+                expected="one photograph in images/ for every thermal image",
+                got=f"{partners.count} thermal images, {len(orphans)} of them without a photograph: {_some(orphans)}",
+                remedy="Restore the photographs, remove these files, or pass --missing-thermal skip.",
+            )
+        )
+    if not frames:
+        raise SceneError(
+            explain(
+                json_path.name,
+                expected="at least one frame with a thermal partner",
+                got=f"{len(entries)} frames, none with one",
+                remedy="Put the thermal images in thermal/ or name them with 'thermal_file_path'.",
+            )
+        )
+    _refuse_duplicates(json_path, frames)
+    _refuse_half_masks(json_path, frames)
+    bounds = _read_bounds(folder)
+    frames.sort(key=lambda frame: frame.name)
+    return SceneFile(folder, json_path, frames, _unit(meta, json_path, bounds), bounds, meta, left_out + orphans)
+
+
+class _ThermalPartners:
+    """Finds the thermal image of a photograph: by `thermal_file_path`, else by the same stem in thermal/."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.by_stem: dict[str, list[Path]] = {}
+        self.used_stems = False
+        thermal = folder / "thermal"
+        for path in sorted(thermal.iterdir()) if thermal.is_dir() else []:
+            if path.suffix.lower() in THERMAL_SUFFIXES and not path.name.startswith("."):
+                self.by_stem.setdefault(path.stem, []).append(path)
+
+    @property
+    def count(self) -> int:
+        return sum(len(paths) for paths in self.by_stem.values())
+
+    def of(self, entry: dict[str, Any], image: Path) -> Path | None:
+        if "thermal_file_path" in entry:
+            path = self.folder / str(entry["thermal_file_path"])
+            return path if path.is_file() else None
+        self.used_stems = True
+        found = self.by_stem.get(image.stem, [])
+        if len(found) > 1:
+            raise SceneError(
+                explain(
+                    f"thermal partner of {image.name}",
+                    expected="one file",
+                    got=", ".join(path.name for path in found),
+                    remedy="Keep one of them, or name it with 'thermal_file_path' in the frame.",
+                )
+            )
+        return found[0] if found else None
+
+    def orphans(self, folder: Path, images: list[Path]) -> list[str]:
+        """Thermal files without a photograph; frames that structure from motion left out still have theirs."""
+        if not self.used_stems:
+            return []
+        stems = {image.stem for image in images}
+        for parent in {image.parent for image in images}:
+            stems |= {path.stem for path in parent.iterdir()}
+        return [str(p.relative_to(folder)) for s, paths in self.by_stem.items() if s not in stems for p in paths]
+
+
+def _find_json(data: Path) -> Path:
+    if data.is_file() and data.suffix == ".json":
+        return data
+    for name in JSON_NAMES:
+        if (data / name).is_file():
+            return data / name
+    raise SceneError(
+        explain(
+            f"scene folder {data}",
+            expected=" or ".join(JSON_NAMES),
+            got="neither" if data.is_dir() else "no such folder",
+            remedy="Pass --data the folder that holds it (ns-process-data writes it).",
+        )
+    )
+
+
+def _load_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError) as problem:
+        raise SceneError(
+            explain(str(path), expected="valid json", got=str(problem), remedy="Write the file again.")
+        ) from problem
+    if not isinstance(content, dict):
+        raise SceneError(
+            explain(str(path), expected="a json object", got=type(content).__name__, remedy="Write the file again.")
+        )
+    return content
+
+
+def _read_bounds(folder: Path) -> tuple[float, float] | None:
+    path = folder / BOUNDS_NAME
+    if not path.is_file():
+        return None
+    content = _load_json(path)
+    keys = ("absolute_min_temperature", "absolute_max_temperature")
+    try:
+        first, second = (float(content[key]) for key in keys)
+    except (KeyError, TypeError, ValueError) as problem:
+        first = second = float("nan")
+        del problem
+    if not (np.isfinite(first) and np.isfinite(second)):
+        raise SceneError(
+            explain(
+                str(path),
+                expected=f"finite numbers {keys[0]} and {keys[1]} in degrees Celsius",
+                got={key: content.get(key) for key in keys},
+                remedy="Correct the file, or remove it if the thermal files hold degrees Celsius.",
+            )
+        )
+    return min(first, second), max(first, second)  # published scenes exist with the two names swapped
+
+
+def _unit(meta: dict[str, Any], json_path: Path, bounds: tuple[float, float] | None) -> ThermalUnit:
+    if "thermal_unit" in meta:
+        unit = meta["thermal_unit"]
+        try:
+            return ThermalUnit.linear(float(unit["celsius_per_count"]), float(unit["celsius_offset"]))
+        except (KeyError, TypeError, ValueError) as problem:
+            raise SceneError(
+                explain(
+                    f"{json_path.name}: thermal_unit",
+                    expected="numbers celsius_per_count (not 0) and celsius_offset",
+                    got=unit,
+                    remedy="Correct the json.",
+                )
+            ) from problem
+    return ThermalUnit.bounds(*bounds) if bounds else ThermalUnit.celsius()
+
+
+def _frame(
+    meta: dict[str, Any], entry: dict[str, Any], name: str, image: Path, thermal: Path, folder: Path, where: str
+) -> Frame:
+    thermal_pose = thermal_intrinsics = None
+    if "thermal_transform_matrix" in entry:
+        thermal_pose = read_pose(entry["thermal_transform_matrix"], f"{where}: thermal_transform_matrix")
+    camera = entry.get("thermal_camera", meta.get("thermal_camera"))
+    if camera is not None:
+        if not isinstance(camera, dict):
+            raise SceneError(
+                explain(where, expected="'thermal_camera' as an object", got=camera, remedy="Correct the json.")
+            )
+        thermal_intrinsics = read_intrinsics({}, camera, None, f"{where}: thermal_camera")
+    elif thermal_pose is not None:
+        raise SceneError(
+            explain(
+                where,
+                expected="'thermal_camera' (w, h, fl_x, fl_y, cx, cy) beside 'thermal_transform_matrix'",
+                got="no thermal_camera",
+                remedy="Add it at the top of the json or in every frame.",
+            )
+        )
+    mask = _existing(folder / entry["mask_path"], where, "mask_path") if "mask_path" in entry else None
+    if "transform_matrix" not in entry:
+        raise SceneError(
+            explain(
+                where,
+                expected="'transform_matrix', the camera's pose",
+                got="none",
+                remedy="Remove the frame or run structure from motion again.",
+            )
+        )
+    pose = read_pose(entry["transform_matrix"], f"{where}: transform_matrix")
+    intrinsics = read_intrinsics(meta, entry, image, where)
+    return Frame(name, image, thermal, mask, pose, intrinsics, thermal_pose, thermal_intrinsics)
+
+
+def _existing(path: Path, where: str, key: str) -> Path:
+    if path.is_file():
+        return path
+    raise SceneError(
+        explain(
+            where, expected=f"the file of '{key}'", got=f"nothing at {path}", remedy="Restore it or remove the frame."
+        )
+    )
+
+
+def _refuse_duplicates(json_path: Path, frames: list[Frame]) -> None:
+    for kind, paths in (("photograph", [f.image for f in frames]), ("thermal image", [f.thermal for f in frames])):
+        twice = [path.name for path, count in Counter(path.resolve() for path in paths).items() if count > 1]
+        if twice:
+            raise SceneError(
+                explain(
+                    json_path.name,
+                    expected=f"every {kind} in one frame only",
+                    got=f"{_some(twice)} more than once",
+                    remedy="Remove the duplicate frames: one of them could leak from training to evaluation.",
+                )
+            )
+
+
+def _refuse_half_masks(json_path: Path, frames: list[Frame]) -> None:
+    masks = sum(frame.mask is not None for frame in frames)
+    if masks not in (0, len(frames)):
+        raise SceneError(
+            explain(
+                f"{json_path.name}: mask_path",
+                expected="a mask for every frame or for none",
+                got=f"{masks} masks for {len(frames)} frames",
+                remedy="Add the missing ones (white: use the pixel).",
+            )
+        )
+
+
+def _missing_text(json_path: Path, names: list[str], frames: int, partners: _ThermalPartners) -> str:
+    return explain(
+        json_path.name,
+        expected=f"a thermal partner for each of the {frames} frames (thermal_file_path, or the same stem in thermal/)",
+        got=f"none for {len(names)}: {_some(names)} ({partners.count} files in thermal/)",
+        remedy="Restore the thermal images, remove these frames, or pass --missing-thermal skip.",
+    )
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")

@@ -1,0 +1,136 @@
+"""Which frames train and which evaluate; no frame ever does both."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from thermoxels_ns.errors import SceneError, explain
+
+SplitMode = Literal["auto", "filename", "lists", "interval"]
+_KEYS = {"train": "train_filenames", "val": "val_filenames", "test": "test_filenames"}
+
+
+@dataclass(frozen=True)
+class Split:
+    """Positions of frames in the sorted list of names."""
+
+    train: list[int]
+    val: list[int]
+    test: list[int]
+    how: str
+    """How the split was made, for the report."""
+
+
+def split_frames(
+    names: Sequence[str],
+    meta: Mapping[str, Any],
+    mode: SplitMode,
+    interval: int,
+    offset: int | None,
+    left_out: Sequence[str] = (),
+) -> Split:
+    """Split frames into training and evaluation.
+
+    Args:
+        names: Names of the frames, sorted.
+        meta: The scene's json, for its lists train_filenames, val_filenames, test_filenames.
+        mode: auto takes the first that the scene has: names with frame_train_ and frame_eval_, lists, every n-th.
+        interval: Every n-th frame evaluates (mode interval).
+        offset: First frame that evaluates; None: half the interval, so that the ends of the sequence, which the
+            others see least, stay in training.
+        left_out: Names that the lists may hold although they are no frames any more.
+
+    Raises:
+        SceneError: A side is empty, a frame is on both sides or a listed name is unknown.
+    """
+    tagged = [("frame_train_" in Path(n).name, "frame_eval_" in Path(n).name) for n in names]
+    lists = any(key in meta for key in _KEYS.values())
+    if mode == "filename" or (mode == "auto" and any(train or test for train, test in tagged)):
+        split = _by_name(names, tagged)
+    elif mode == "lists" or (mode == "auto" and lists):
+        split = _by_lists(names, meta, left_out)
+    else:
+        split = _by_interval(names, interval, offset)
+    for side, chosen in (("training", split.train), ("evaluation", split.val), ("evaluation", split.test)):
+        if not chosen:
+            raise SceneError(
+                explain(
+                    f"{side} frames",
+                    expected=f"at least one of the {len(names)} frames ({split.how})",
+                    got="none",
+                    remedy="Add frames or choose another split, e.g. --eval-mode interval --eval-interval 2.",
+                )
+            )
+    both = set(split.train) & (set(split.val) | set(split.test))
+    if both:
+        raise SceneError(
+            explain(
+                "split lists",
+                expected="no frame on both sides",
+                got=", ".join(names[i] for i in sorted(both)) + " in training and in evaluation",
+                remedy="Remove them from one list: evaluation frames must never train.",
+            )
+        )
+    return split
+
+
+def _by_name(names: Sequence[str], tagged: list[tuple[bool, bool]]) -> Split:
+    unclear = [name for name, (train, evaluate) in zip(names, tagged) if train == evaluate]
+    if unclear:
+        raise SceneError(
+            explain(
+                "split by file name",
+                expected="frame_train_ or frame_eval_ in every name",
+                got=f"{unclear[0]} ({len(unclear)} such)",
+                remedy="Rename them or pass --eval-mode interval.",
+            )
+        )
+    evaluate = [i for i, (_, test) in enumerate(tagged) if test]
+    return Split([i for i, (train, _) in enumerate(tagged) if train], evaluate, evaluate, "by file name")
+
+
+def _by_lists(names: Sequence[str], meta: Mapping[str, Any], left_out: Sequence[str]) -> Split:
+    position = {Path(name).as_posix(): i for i, name in enumerate(names)}
+    found: dict[str, list[int] | None] = {}
+    for side, key in _KEYS.items():
+        listed = [Path(str(name)).as_posix() for name in meta[key]] if key in meta else None
+        listed = None if listed is None else [name for name in listed if name not in left_out]
+        unknown = [name for name in listed or [] if name not in position]
+        if unknown:
+            raise SceneError(
+                explain(
+                    key,
+                    expected="names that are in 'frames'",
+                    got=f"{unknown[0]} ({len(unknown)} unknown)",
+                    remedy="Correct the list; it must write names as 'file_path' does.",
+                )
+            )
+        found[side] = None if listed is None else sorted({position[name] for name in listed})
+    val = found["val"] or found["test"]
+    test = found["test"] or found["val"]
+    held = set(val or []) | set(test or [])
+    train = found["train"]
+    if train is None:
+        train = [i for i in range(len(names)) if i not in held]
+    if val is None or test is None:
+        val = test = [i for i in range(len(names)) if i not in set(train)]
+    return Split(train, val, test, "by the lists in the json")
+
+
+def _by_interval(names: Sequence[str], interval: int, offset: int | None) -> Split:
+    start = interval // 2 if offset is None else offset
+    if interval < 2 or not 0 <= start < interval:
+        raise SceneError(
+            explain(
+                "eval_interval, eval_offset",
+                expected="an interval of at least 2 and an offset from 0 to interval - 1",
+                got=f"{interval}, {start}",
+                remedy="Pass --eval-interval 8.",
+            )
+        )
+    evaluate = list(range(start, len(names), interval))
+    train = [i for i in range(len(names)) if i % interval != start]
+    return Split(train, evaluate, evaluate, f"every {interval}th frame from number {start}")

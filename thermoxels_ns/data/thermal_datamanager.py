@@ -1,0 +1,158 @@
+"""nerfstudio datamanager with two streams of rays: colour and temperature."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
+from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
+from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIndicesEvalDataloader
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from thermoxels_ns.data.photo_streams import PhotoStreams, draw_generator
+from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
+from thermoxels_ns.data.thermal_dataset import ThermalDataset
+from thermoxels_ns.errors import SceneError, explain
+
+_TRAIN, _EVAL, _EVAL_IMAGE = 0, 1, 2
+
+
+@dataclass
+class ThermalDataManagerConfig(VanillaDataManagerConfig):
+    """Two streams of precomputed rays from paired photographs."""
+
+    _target: type = field(default_factory=lambda: ThermalDataManager)
+    """Class to instantiate."""
+    dataparser: AnnotatedDataParserUnion = field(default_factory=ThermalDataParserConfig)
+    """Reads the scene; thermal-data is the one that gives thermal images."""
+    train_num_rays_per_batch: int = 4096
+    """Rays through photographs per training step. Where a pair shares its camera they carry the temperature too."""
+    thermal_num_rays_per_batch: int = 2048
+    """Rays of the thermal cameras per training step, beside those of the photographs. Used only where a thermal
+    camera is not its photograph's (own pose, intrinsics or resolution)."""
+    eval_num_rays_per_batch: int = 4096
+    """Rays through photographs per evaluation batch; thermal rays in the proportion of training."""
+    streams: Literal["both", "rgb", "thermal"] = "both"
+    """Which photographs train: both, colour only, or thermal only (the baseline that sees no colour)."""
+    seed: int = 42
+    """Start of the random numbers. A batch depends on the seed and the step alone, so a resumed training repeats
+    the batches of an uninterrupted one."""
+
+
+class ThermalDataManager(VanillaDataManager[ThermalDataset]):
+    """Serves batches of colour and thermal rays of one scene.
+
+    Everything runs in this process. In training (test_mode "val") a batch is a function of seed and step alone; in
+    the other modes nerfstudio's exporters ask for step 0 again and again and want new rays each time, so there the
+    number of the call counts.
+    """
+
+    config: ThermalDataManagerConfig
+    train_dataset: ThermalDataset
+    eval_dataset: ThermalDataset
+
+    def setup_train(self) -> None:
+        """Precompute the rays and load the photographs of the training split; report what is masked."""
+        # Stock exporters and dynamic batches set the number of rays on this object.
+        self.train_pixel_sampler = _ray_counter(self.config.train_num_rays_per_batch)
+        self.train_streams.load()
+        dataset = self.train_dataset
+        temperatures = dataset.temperature_range
+        CONSOLE.print(
+            f"Training on {len(dataset)} pairs ("
+            + ("one ray carries colour and temperature" if dataset.shares_camera else "thermal cameras of their own")
+            + f"), {temperatures.min_c:.2f} to {temperatures.max_c:.2f} C; thermal: {dataset.thermal_report()}."
+        )
+
+    def setup_eval(self) -> None:
+        """Prepare whole evaluation images; rays of the evaluation split are made when first asked for."""
+        self.eval_pixel_sampler = _ray_counter(self.config.eval_num_rays_per_batch)
+        self.fixed_indices_eval_dataloader = FixedIndicesEvalDataloader(self.eval_dataset, device=self.device)
+        self.eval_dataloader = RandIndicesEvalDataloader(self.eval_dataset, device=self.device)
+        CONSOLE.print(f"Evaluating on {len(self.eval_dataset)} pairs; thermal: {self.eval_dataset.thermal_report()}.")
+
+    @cached_property
+    def train_streams(self) -> PhotoStreams:
+        """Pixels and rays of the training split."""
+        return self._streams(self.train_dataset)
+
+    @cached_property
+    def eval_streams(self) -> PhotoStreams:
+        """Pixels and rays of the evaluation split."""
+        return self._streams(self.eval_dataset)
+
+    def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
+        """Return the training batch of a step: rays, and ``image`` (n, 3) and ``thermal`` (n, 1) targets.
+
+        ``ray_bundle.metadata["stream"]`` says which targets a ray has (see `thermoxels_ns.streams`).
+        """
+        number = step if self.test_mode == "val" else self.train_count
+        self.train_count += 1
+        generator = draw_generator(self.config.seed, self.local_rank, _TRAIN, number)
+        return self.train_streams.draw(generator, self._rgb_rays(), self.config.thermal_num_rays_per_batch)
+
+    def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
+        """Return a batch of evaluation rays with the keys of `next_train`."""
+        self.eval_count += 1
+        rgb_rays = self.config.eval_num_rays_per_batch
+        share = self.config.thermal_num_rays_per_batch / max(self.config.train_num_rays_per_batch, 1)
+        generator = draw_generator(self.config.seed, self.local_rank, _EVAL, step)
+        return self.eval_streams.draw(generator, rgb_rays, max(round(rgb_rays * share), 1))
+
+    def next_eval_image(self, step: int) -> tuple[Cameras, dict]:
+        """Return one whole evaluation image; which one depends on seed and step alone."""
+        generator = draw_generator(self.config.seed, self.local_rank, _EVAL_IMAGE, step)
+        index = int(torch.randint(len(self.eval_dataset), (1,), generator=generator))
+        return self.eval_dataloader.get_camera(index)
+
+    def training_rays(
+        self, stream: int, max_rays_per_image: int | None = None, *, stride: int = 1, chunk: int = 16384
+    ) -> Iterator[RayBundle]:
+        """Give a regular, always equal subset of the training rays, in order.
+
+        Works in every test_mode; decodes no photographs.
+
+        Args:
+            stream: Bits of `thermoxels_ns.streams`; thermal gives valid pixels only, both bits give every ray once. A
+                stream that does not train (see the option streams) gives nothing.
+            max_rays_per_image: Widen the stride per photograph until no more rays than this remain.
+            stride: Every n-th pixel in both directions.
+            chunk: Rays per bundle; the last one may have fewer.
+        """
+        return self.train_streams.grid(stream, stride, max_rays_per_image, chunk)
+
+    def get_train_rays_per_batch(self) -> int:
+        """Return how many rays `next_train` gives."""
+        thermal = 0 if self.train_dataset.shares_camera else self.config.thermal_num_rays_per_batch
+        by_stream = {
+            "both": self._rgb_rays() + thermal,
+            "rgb": self._rgb_rays(),
+            "thermal": thermal or self._rgb_rays(),
+        }
+        return by_stream[self.config.streams]
+
+    def _rgb_rays(self) -> int:
+        sampler = self.train_pixel_sampler
+        return self.config.train_num_rays_per_batch if sampler is None else sampler.num_rays_per_batch
+
+    def _streams(self, dataset: ThermalDataset) -> PhotoStreams:
+        if self.config.seed < 0:
+            raise SceneError(
+                explain(
+                    "seed", expected="0 or more", got=self.config.seed, remedy="Pass --pipeline.datamanager.seed 42."
+                )
+            )
+        storage = self.device if self.config.images_on_gpu else "cpu"
+        return PhotoStreams(dataset, self.config.streams, storage, self.device)
+
+
+def _ray_counter(rays: int) -> PixelSampler:
+    return PixelSamplerConfig(num_rays_per_batch=rays).setup()

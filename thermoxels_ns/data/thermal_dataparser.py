@@ -1,0 +1,275 @@
+"""nerfstudio dataparser for scenes of paired colour and thermal photographs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Optional
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from thermoxels_ns.data.pose_file_cameras import Intrinsics
+from thermoxels_ns.data.scene_box import find_scene_box
+from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
+from thermoxels_ns.data.splits import Split, split_frames
+from thermoxels_ns.data.thermal_survey import ThermalSurvey, survey_thermal_files
+from thermoxels_ns.errors import SceneError, explain
+
+SCENE_SIZE = 2.0
+"""Longest side of the scene box in nerfstudio's world; learning rates of the field rely on it."""
+
+
+@dataclass
+class ThermalDataParserConfig(DataParserConfig):
+    """Scenes of paired colour and thermal photographs: ThermoScenes layout, or a thermal camera of its own."""
+
+    _target: type = field(default_factory=lambda: ThermalDataParser)
+    """Class to instantiate."""
+    data: Path = Path()
+    """Scene folder (with transforms.json or transforms_thermal.json), or the json itself."""
+    scale_factor: float = 1.0
+    """Size of the world relative to the default. At 1 the scene box's longest side is 2, which the learning rates of
+    the voxel field are made for."""
+    downscale_factor: Optional[int] = None  # noqa: UP045 - read by tyro
+    """Divide the resolution of the colour photographs by this; they are resized when loaded, nothing is written.
+    Thermal images keep their resolution. Default: full resolution."""
+    orientation_method: Literal["pca", "up", "vertical", "none"] = "none"
+    """How to turn the world. none keeps the axes of the input poses, so that the scene box stays as tight as given;
+    the others are nerfstudio's."""
+    center_method: Literal["box", "poses", "focus", "none"] = "box"
+    """What goes to the origin: the middle of the scene box (default, the lattice then spans -1 to 1), the mean camera,
+    the point the cameras look at, or nothing."""
+    auto_scale_poses: bool = True
+    """Scale the world so that the scene box's longest side is 2. Off: input units."""
+    scene_box: Optional[tuple[tuple[float, float, float], tuple[float, float, float]]] = None  # noqa: UP045
+    """Box to reconstruct, in the coordinates of the input poses: xmin ymin zmin xmax ymax zmax. Default: scene_box in
+    the json, else from the sparse points, else from the cameras."""
+    eval_mode: Literal["auto", "filename", "lists", "interval"] = "auto"
+    """Which frames evaluate. auto takes the first that the scene has: names with frame_train_ / frame_eval_, the lists
+    train_filenames / val_filenames / test_filenames in the json, every eval_interval-th frame."""
+    eval_interval: int = 8
+    """Every n-th frame by sorted name evaluates (eval_mode interval)."""
+    eval_offset: Optional[int] = None  # noqa: UP045
+    """First frame that evaluates (eval_mode interval). Default: half of eval_interval, so that the ends of the
+    sequence stay in training."""
+    missing_thermal: Literal["error", "skip"] = "error"
+    """A frame without a thermal image: stop, or leave the frame out and name it."""
+    valid_range_c: tuple[float, float] = (-100.0, 2000.0)
+    """Temperatures outside this range are masked, in degrees Celsius."""
+
+
+@dataclass(frozen=True)
+class _World:
+    """The similarity from input coordinates to nerfstudio's: p_ns = scale * (rotation p + translation)."""
+
+    rotation: npt.NDArray[np.float64]
+    translation: npt.NDArray[np.float64]
+    scale: float
+
+    def poses(self, poses: npt.NDArray[np.float64]) -> torch.Tensor:
+        """Move camera-to-world matrices, shape (n, 4, 4), to shape (n, 3, 4) float32."""
+        moved = np.empty((len(poses), 3, 4))
+        moved[:, :, :3] = self.rotation @ poses[:, :3, :3]
+        moved[:, :, 3] = self.scale * (poses[:, :3, 3] @ self.rotation.T + self.translation)
+        return torch.from_numpy(moved.astype(np.float32))
+
+    @property
+    def transform(self) -> torch.Tensor:
+        """nerfstudio's dataparser_transform, shape (3, 4): rotation and translation before the scale."""
+        return torch.from_numpy(np.column_stack([self.rotation, self.translation]).astype(np.float32))
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """All that training and evaluation share; made from all frames, so that both agree."""
+
+    file: SceneFile
+    split: Split
+    survey: ThermalSurvey
+    world: _World
+    box: SceneBox
+
+
+class ThermalDataParser(DataParser):
+    """Reads a scene of paired photographs; see `ThermalDataParserConfig`.
+
+    The outputs' metadata hold: ``temperature_range`` (`TemperatureRange`), ``thermal_filenames``, ``thermal_cameras``
+    (`Cameras` of the split, or None where a pair shares camera and resolution), ``thermal_unit``, ``valid_range_c``,
+    ``thermal_dead_pixels`` (a mask per resolution), ``image_scale`` (1 / downscale_factor) and ``scene_name``.
+    """
+
+    config: ThermalDataParserConfig
+
+    def __init__(self, config: ThermalDataParserConfig) -> None:
+        super().__init__(config)
+        self.downscale_factor = config.downscale_factor
+        self._scene: _Scene | None = None
+
+    def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> DataparserOutputs:
+        del kwargs
+        if self._scene is None:
+            self._scene = self._read_scene()
+        scene = self._scene
+        chosen = {"train": scene.split.train, "val": scene.split.val, "test": scene.split.test}.get(split)
+        if chosen is None:
+            raise SceneError(explain("split", expected="train, val or test", got=split, remedy="Choose one of them."))
+        frames = [scene.file.frames[index] for index in chosen]
+        shapes = [scene.survey.shapes[frame.thermal] for frame in frames]
+        factor = 1.0 / self._downscale()
+        colour = [frame.intrinsics.scaled(factor) for frame in frames]
+        thermal = [_thermal_intrinsics(frame, shape) for frame, shape in zip(frames, shapes)]
+        cameras = _cameras(colour, scene.world.poses(np.stack([frame.pose for frame in frames])))
+        thermal_cameras = _cameras(
+            thermal,
+            scene.world.poses(np.stack([f.pose if f.thermal_pose is None else f.thermal_pose for f in frames])),
+        )
+        masks = [frame.mask for frame in frames if frame.mask is not None]
+        return DataparserOutputs(
+            image_filenames=[frame.image for frame in frames],
+            cameras=cameras,
+            scene_box=scene.box,
+            mask_filenames=masks or None,
+            dataparser_transform=scene.world.transform,
+            dataparser_scale=scene.world.scale,
+            metadata={
+                "image_scale": factor,
+                "temperature_range": scene.survey.temperature_range,
+                "thermal_filenames": [frame.thermal for frame in frames],
+                "thermal_cameras": None if _same_cameras(cameras, thermal_cameras) else thermal_cameras,
+                "thermal_unit": scene.file.unit,
+                "valid_range_c": tuple(self.config.valid_range_c),
+                "thermal_dead_pixels": scene.survey.dead_pixels,
+                "scene_name": scene.file.folder.resolve().name,
+            },
+        )
+
+    def _downscale(self) -> float:
+        factor = self.config.downscale_factor
+        if factor is None:
+            return 1.0
+        if not factor >= 1:
+            raise SceneError(
+                explain("downscale_factor", expected="a number of at least 1", got=factor, remedy="Pass 2, 4 or 8.")
+            )
+        return float(factor)
+
+    def _read_scene(self) -> _Scene:
+        config = self.config
+        file = read_scene_file(Path(config.data), config.missing_thermal)
+        names = [frame.name for frame in file.frames]
+        split = split_frames(
+            names, file.meta, config.eval_mode, config.eval_interval, config.eval_offset, file.left_out
+        )
+        world, box, box_source = self._place(file)
+        survey = survey_thermal_files(
+            [frame.thermal for frame in file.frames], file.unit, config.valid_range_c, file.bounds_c
+        )
+        evaluation = set(split.val) | set(split.test)
+        CONSOLE.print(
+            f"Scene {file.folder.resolve().name}: {len(names)} frames, {len(split.train)} train, {len(evaluation)} "
+            f"evaluate ({split.how}); box from {box_source}; {survey.temperature_range.min_c:.2f} to "
+            f"{survey.temperature_range.max_c:.2f} C."
+        )
+        if file.left_out:
+            CONSOLE.print(f"Left out, no pair: {', '.join(file.left_out)}", style="bold yellow")
+        return _Scene(file, split, survey, world, box)
+
+    def _place(self, file: SceneFile) -> tuple[_World, SceneBox, str]:
+        """Choose orientation, origin and scale, and express the scene box in the new world."""
+        config = self.config
+        poses = torch.from_numpy(np.stack([frame.pose for frame in file.frames]).astype(np.float32))
+        centering = "none" if config.center_method == "box" else config.center_method
+        _, oriented = auto_orient_and_center_poses(poses, config.orientation_method, centering)
+        rotation = _nearest_rotation(oriented[:, :3].numpy().astype(np.float64))
+        box, source = find_scene_box(file, config.scene_box, rotation)
+        if config.center_method == "box":
+            translation = -box.mean(axis=0)
+        else:
+            translation = oriented[:, 3].numpy().astype(np.float64)
+        longest = float((box[1] - box[0]).max())
+        scale = (SCENE_SIZE / longest if config.auto_scale_poses else 1.0) * config.scale_factor
+        if not (np.isfinite(scale) and scale > 0):
+            raise SceneError(
+                explain(
+                    "scale_factor",
+                    expected="a finite number above 0",
+                    got=config.scale_factor,
+                    remedy="Pass --scale-factor 1.",
+                )
+            )
+        placed = scale * (box + translation)
+        return (
+            _World(rotation, translation, scale),
+            SceneBox(aabb=torch.from_numpy(placed.astype(np.float32))),
+            source,
+        )
+
+
+def _nearest_rotation(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Remove the float32 rounding of nerfstudio's orientation."""
+    left, _, right = np.linalg.svd(matrix)
+    return np.asarray(left @ right, dtype=np.float64)
+
+
+def _thermal_intrinsics(frame: Frame, shape: tuple[int, int]) -> Intrinsics:
+    """The projection of a thermal image: its own camera's, or the photograph's at the thermal resolution."""
+    height, width = shape
+    own = frame.thermal_intrinsics
+    if own is not None:
+        if (own.height, own.width) != shape:
+            raise SceneError(
+                explain(
+                    frame.thermal.name,
+                    expected=f"{own.width} x {own.height} pixels as thermal_camera says",
+                    got=f"{width} x {height}",
+                    remedy="Correct w and h of thermal_camera, or use the thermal images it was calibrated with.",
+                )
+            )
+        return own
+    colour = frame.intrinsics
+    fitting = colour.height * width / colour.width
+    if abs(height - fitting) > max(1.0, 0.03 * fitting):
+        raise SceneError(
+            explain(
+                frame.thermal.name,
+                expected=f"the photograph's aspect ratio {colour.width} x {colour.height}",
+                got=f"{width} x {height}",
+                remedy="Give the thermal camera its own intrinsics as 'thermal_camera' in the json.",
+            )
+        )
+    return colour.resized(width, height)
+
+
+def _cameras(intrinsics: list[Intrinsics], poses: torch.Tensor) -> Cameras:
+    def column(name: str, kind: torch.dtype) -> torch.Tensor:
+        return torch.tensor([[getattr(one, name)] for one in intrinsics], dtype=kind)
+
+    return Cameras(
+        camera_to_worlds=poses,
+        fx=column("fx", torch.float32),
+        fy=column("fy", torch.float32),
+        cx=column("cx", torch.float32),
+        cy=column("cy", torch.float32),
+        width=column("width", torch.int64),
+        height=column("height", torch.int64),
+        distortion_params=torch.tensor([one.distortion for one in intrinsics], dtype=torch.float32),
+        camera_type=column("camera_type", torch.int64),
+    )
+
+
+def _same_cameras(first: Cameras, second: Cameras) -> bool:
+    """True if both give the same rays for the same pixels."""
+    for name in ("width", "height", "camera_type"):
+        if not torch.equal(getattr(first, name), getattr(second, name)):
+            return False
+    return all(
+        torch.allclose(getattr(first, name), getattr(second, name), rtol=1e-6, atol=1e-7)
+        for name in ("fx", "fy", "cx", "cy", "distortion_params", "camera_to_worlds")
+    )

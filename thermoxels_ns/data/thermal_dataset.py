@@ -1,0 +1,161 @@
+"""nerfstudio dataset of paired photographs: colour as nerfstudio gives it, temperature beside it."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from jaxtyping import Bool, Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from PIL import Image
+from torch import Tensor
+
+from thermoxels_ns.data.thermal_files import PixelReport, read_thermal_file
+from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.units import TemperatureRange
+
+
+class ThermalDataset(InputDataset):
+    """Photographs of one split with their thermal partners.
+
+    An item holds ``image_idx``, ``image`` (h, w, 3), ``mask`` where the scene has masks, ``thermal`` (ht, wt, 1)
+    float32 normalised by the scene's range and 0 where invalid, ``thermal_valid`` (ht, wt, 1) bool, and
+    ``thermal_camera``, nerfstudio `Cameras` of shape (1,), where the thermal camera is not the photograph's.
+    """
+
+    def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
+        super().__init__(dataparser_outputs, scale_factor)
+        self.temperature_range: TemperatureRange = self.metadata["temperature_range"]
+        self.thermal_cameras: Cameras | None = self.metadata["thermal_cameras"]
+        if self.thermal_cameras is None and scale_factor != 1.0:
+            # The photographs change their resolution here, the thermal images do not.
+            self.thermal_cameras = deepcopy(dataparser_outputs.cameras)
+        self._thermal: dict[int, tuple[Tensor, Tensor, PixelReport]] = {}
+
+    @property
+    def shares_camera(self) -> bool:
+        """True where one ray carries a colour and a temperature."""
+        return self.thermal_cameras is None
+
+    def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
+        """Load a photograph at the resolution of its camera, shape (h, w, 3)."""
+        path = self._dataparser_outputs.image_filenames[image_idx]
+        try:
+            with Image.open(path) as opened:
+                opened.load()
+                picture = opened.convert("RGBA") if opened.mode in ("P", "PA", "LA") else opened.copy()
+        except Exception as problem:  # Pillow's plugins raise many types on damaged data
+            raise SceneError(
+                explain(
+                    str(path),
+                    expected="a readable photograph",
+                    got=problem,
+                    remedy="The file is damaged; copy it again or remove the frame.",
+                )
+            ) from problem
+        if picture.mode == "RGBA":
+            if picture.getchannel("A").getextrema()[0] != 255:
+                raise SceneError(
+                    explain(
+                        str(path),
+                        expected="an opaque photograph",
+                        got="transparent pixels",
+                        remedy="Flatten it onto a colour, or give the transparent part as mask_path.",
+                    )
+                )
+            picture = picture.convert("RGB")
+        elif picture.mode not in ("RGB", "L", "CMYK", "YCbCr"):
+            raise SceneError(
+                explain(
+                    str(path),
+                    expected="a photograph with 8 bits per channel",
+                    got=f"image mode {picture.mode}",
+                    remedy="Convert it to 8-bit RGB.",
+                )
+            )
+        return np.array(self._resized(picture.convert("RGB"), image_idx, Image.Resampling.BOX))
+
+    def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
+        """Return the item described at the class; ``image`` as uint8 or as float32 in [0, 1]."""
+        data: dict[str, Any] = {
+            "image_idx": image_idx,
+            "image": self.get_image_uint8(image_idx) if image_type == "uint8" else self.get_image_float32(image_idx),
+        }
+        mask = self.get_mask(image_idx)
+        if mask is not None:
+            data["mask"] = mask
+        data["thermal"], data["thermal_valid"] = self.get_thermal(image_idx)
+        if self.thermal_cameras is not None:
+            data["thermal_camera"] = self.thermal_cameras[image_idx : image_idx + 1]
+        return data
+
+    def get_mask(self, image_idx: int) -> Bool[Tensor, "h w 1"] | None:
+        """Return where the photograph may be used, or None if the scene has no masks."""
+        if self._dataparser_outputs.mask_filenames is None:
+            return None
+        path = self._dataparser_outputs.mask_filenames[image_idx]
+        try:
+            with Image.open(path) as opened:
+                picture = opened.convert("L")
+        except Exception as problem:
+            raise SceneError(
+                explain(str(path), expected="a readable mask", got=problem, remedy="Write the mask again.")
+            ) from problem
+        with Image.open(self._dataparser_outputs.image_filenames[image_idx]) as photograph:
+            size = photograph.size
+        if picture.size != size:
+            raise SceneError(
+                explain(
+                    str(path),
+                    expected=f"a mask of {size[0]} x {size[1]} pixels like its photograph",
+                    got=f"{picture.size[0]} x {picture.size[1]}",
+                    remedy="Write the mask at the photograph's resolution.",
+                )
+            )
+        resized = np.array(self._resized(picture, image_idx, Image.Resampling.NEAREST))
+        return torch.from_numpy(resized > 0)[..., None]
+
+    def get_thermal(self, image_idx: int) -> tuple[Float[Tensor, "ht wt 1"], Bool[Tensor, "ht wt 1"]]:
+        """Return the normalised temperatures (0 where invalid) and where they are valid; read once, then kept."""
+        return self._read_thermal(image_idx)[:2]
+
+    def thermal_report(self) -> PixelReport:
+        """Count what is masked over all thermal images of the split."""
+        return sum((self._read_thermal(index)[2] for index in range(len(self))), PixelReport())
+
+    def _read_thermal(self, image_idx: int) -> tuple[Tensor, Tensor, PixelReport]:
+        if image_idx not in self._thermal:
+            image = read_thermal_file(
+                self.metadata["thermal_filenames"][image_idx],
+                self.metadata["thermal_unit"],
+                self.metadata["valid_range_c"],
+            )
+            valid = np.isfinite(image.temperature_c)
+            report = image.report
+            dead = self.metadata["thermal_dead_pixels"].get(valid.shape)
+            if dead is not None:
+                report = report + PixelReport(dead=int((valid & dead).sum()))
+                valid &= ~dead
+            # float64: a narrow range far from 0 C would lose 16-bit steps in float32.
+            normalised = self.temperature_range.normalise(image.temperature_c.astype(np.float64))
+            thermal = np.where(valid, normalised, 0.0).astype(np.float32)
+            self._thermal[image_idx] = (
+                torch.from_numpy(thermal)[..., None],
+                torch.from_numpy(valid)[..., None],
+                report,
+            )
+        return self._thermal[image_idx]
+
+    def _resized(self, picture: Image.Image, image_idx: int, filter_: Image.Resampling) -> Image.Image:
+        """Resample to the camera's resolution; the last part of a pixel is cut, as it is from the intrinsics."""
+        width, height = int(self.cameras.width[image_idx]), int(self.cameras.height[image_idx])
+        if picture.size == (width, height):
+            return picture
+        factor = 1.0 / (self.scale_factor * self.metadata["image_scale"])
+        part = (0.0, 0.0, min(width * factor, picture.size[0]), min(height * factor, picture.size[1]))
+        return picture.resize((width, height), filter_, box=part)

@@ -1,0 +1,334 @@
+"""Thermal files to degrees Celsius: one file in, one float32 array out, NaN where the camera measured nothing."""
+
+from __future__ import annotations
+
+import csv
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from thermoxels_ns.errors import ThermalFileError, explain
+from thermoxels_ns.units import ZERO_CELSIUS_K
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+THERMAL_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".csv")
+"""File types that `read_thermal_file` knows."""
+
+_UNIT_REMEDY = (
+    "Give temperature_bounds.json (absolute_min_temperature, absolute_max_temperature) or, in transforms.json, "
+    '"thermal_unit": {"celsius_per_count": ..., "celsius_offset": ...}.'
+)
+
+
+@dataclass(frozen=True)
+class ThermalUnit:
+    """How the numbers of a thermal file become degrees Celsius; make one with `bounds`, `linear` or `celsius`."""
+
+    kind: Literal["bounds", "linear", "celsius"]
+    """bounds: counts span min to max; linear: counts times a factor plus an offset; celsius: no conversion."""
+    scale: float = 1.0
+    """bounds: max minus min, [K]; linear: [K per count]."""
+    offset_c: float = 0.0
+    """Temperature of count zero, [degrees Celsius]."""
+
+    def __post_init__(self) -> None:
+        wrong_scale = not np.isfinite(self.scale) or (self.kind == "linear" and self.scale == 0)
+        if wrong_scale or not np.isfinite(self.offset_c):
+            raise ThermalFileError(
+                explain(
+                    "thermal unit",
+                    expected="a finite offset and a finite scale (not zero for counts)",
+                    got=f"scale {self.scale}, offset {self.offset_c} C",
+                    remedy=_UNIT_REMEDY,
+                )
+            )
+
+    @classmethod
+    def bounds(cls, min_c: float, max_c: float) -> ThermalUnit:
+        """Counts 0 and 255 (8 bit) or 65535 (16 bit) stand for `min_c` and `max_c`, [degrees Celsius]."""
+        return cls("bounds", scale=max_c - min_c, offset_c=min_c)
+
+    @classmethod
+    def linear(cls, celsius_per_count: float, celsius_offset: float) -> ThermalUnit:
+        """Temperature is count * `celsius_per_count` + `celsius_offset`."""
+        return cls("linear", scale=celsius_per_count, offset_c=celsius_offset)
+
+    @classmethod
+    def celsius(cls) -> ThermalUnit:
+        """The file holds degrees Celsius."""
+        return cls("celsius")
+
+
+@dataclass(frozen=True)
+class PixelReport:
+    """How many pixels were masked and why; reports add up with ``+``."""
+
+    pixels: int = 0
+    """All pixels read."""
+    nan: int = 0
+    """Not a number in the file (also: fully transparent)."""
+    saturated: int = 0
+    """Counts at the end of a linear scale (0 and 65535 for 16 bit): the sensor saw more or less than it can say."""
+    out_of_range: int = 0
+    """Below absolute zero or outside the valid range."""
+    dead: int = 0
+    """Valid by themselves, but stuck at one value over the whole scene."""
+
+    def __add__(self, other: PixelReport) -> PixelReport:
+        return PixelReport(
+            self.pixels + other.pixels,
+            self.nan + other.nan,
+            self.saturated + other.saturated,
+            self.out_of_range + other.out_of_range,
+            self.dead + other.dead,
+        )
+
+    @property
+    def masked(self) -> int:
+        """All pixels without a usable temperature."""
+        return self.nan + self.saturated + self.out_of_range + self.dead
+
+    def __str__(self) -> str:
+        share = 100.0 * self.masked / max(self.pixels, 1)
+        return (
+            f"{self.masked} of {self.pixels} pixels masked ({share:.2f} %): {self.nan} NaN, {self.saturated} "
+            f"saturated, {self.out_of_range} out of range, {self.dead} dead"
+        )
+
+
+@dataclass(frozen=True)
+class ThermalImage:
+    """One thermal file after reading."""
+
+    temperature_c: npt.NDArray[np.float32]
+    """Shape (height, width), [degrees Celsius], NaN where invalid."""
+    report: PixelReport
+
+
+@dataclass(frozen=True)
+class _RawPixels:
+    """The numbers of a file before the unit: counts (with the type's ends) or plain values."""
+
+    values: npt.NDArray[Any]
+    no_data: npt.NDArray[np.bool_] | None = None
+
+
+def read_temperature_c(
+    path: Path, unit: ThermalUnit, valid_range_c: tuple[float, float] = (-100.0, 2000.0)
+) -> npt.NDArray[np.float32]:
+    """Read a thermal file as `read_thermal_file` does and return only the temperatures, shape (height, width)."""
+    return read_thermal_file(path, unit, valid_range_c).temperature_c
+
+
+def read_thermal_file(
+    path: Path, unit: ThermalUnit, valid_range_c: tuple[float, float] = (-100.0, 2000.0)
+) -> ThermalImage:
+    """Read a thermal file: PNG, JPG or TIFF counts, float TIFF, ``.npy`` or ``.csv``.
+
+    Counts need a unit of kind bounds or linear. Floating-point TIFF is in degrees Celsius unless the unit is linear.
+    ``.csv`` and floating-point ``.npy`` are always in degrees Celsius; an integer ``.npy`` is counts if the unit is
+    linear. The conversion runs in float64, so 16-bit steps survive.
+
+    Args:
+        path: The file; its suffix chooses the reader.
+        unit: Meaning of the numbers.
+        valid_range_c: Temperatures outside are masked, [degrees Celsius].
+
+    Returns:
+        Temperatures with NaN where invalid, and the counts of what was masked.
+
+    Raises:
+        ThermalFileError: The file is missing, damaged, a colour picture, or its counts have no unit.
+    """
+    try:
+        raw = _read_raw(path)
+    except ThermalFileError:
+        raise
+    except Exception as problem:  # decoders raise OSError, SyntaxError, ValueError, struct.error, EOFError, ...
+        raise _damaged(path, problem) from problem
+    if raw.values.ndim != 2 or 0 in raw.values.shape:
+        raise ThermalFileError(
+            explain(
+                str(path),
+                expected="one temperature per pixel, shape (height, width)",
+                got=f"shape {raw.values.shape}",
+                remedy="Export a single-channel thermal image.",
+            )
+        )
+    return _to_celsius(path, raw, unit, valid_range_c)
+
+
+def _to_celsius(path: Path, raw: _RawPixels, unit: ThermalUnit, valid_range_c: tuple[float, float]) -> ThermalImage:
+    values = raw.values
+    plain = values.dtype.kind == "f" or path.suffix.lower() in (".npy", ".csv")
+    saturated = np.zeros(values.shape, dtype=bool)
+    if unit.kind == "linear" and (values.dtype.kind in "ui" or path.suffix.lower() in (".tif", ".tiff")):
+        if values.dtype.kind in "ui":
+            ends = np.iinfo(values.dtype)
+            saturated = (values == ends.min) | (values == ends.max)
+        celsius = values.astype(np.float64) * unit.scale + unit.offset_c
+    elif plain:
+        celsius = values.astype(np.float64)
+    elif unit.kind == "bounds" and values.dtype in (np.uint8, np.uint16):
+        celsius = values.astype(np.float64) / np.iinfo(values.dtype).max * unit.scale + unit.offset_c
+    else:
+        raise ThermalFileError(
+            explain(
+                str(path),
+                expected="counts with a known unit (bounds need unsigned 8 or 16 bit)",
+                got=f"{values.dtype} counts and the unit '{unit.kind}'",
+                remedy=_UNIT_REMEDY,
+            )
+        )
+    nan = ~np.isfinite(celsius)
+    if raw.no_data is not None:
+        nan |= raw.no_data
+    saturated &= ~nan
+    low = max(valid_range_c[0], -ZERO_CELSIUS_K)
+    with np.errstate(invalid="ignore"):
+        outside = ((celsius < low) | (celsius > valid_range_c[1])) & ~nan & ~saturated
+    celsius[nan | saturated | outside] = np.nan
+    report = PixelReport(values.size, int(nan.sum()), int(saturated.sum()), int(outside.sum()))
+    return ThermalImage(celsius.astype(np.float32), report)
+
+
+def _read_raw(path: Path) -> _RawPixels:
+    if not path.is_file():
+        raise ThermalFileError(
+            explain(
+                "thermal file",
+                expected=f"a file at {path}",
+                got="nothing there",
+                remedy="Restore the file, or remove the frame or pass --missing-thermal skip.",
+            )
+        )
+    if path.stat().st_size == 0:
+        raise _damaged(path, "a file of zero bytes")
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        values = np.load(path, allow_pickle=False)
+        if not isinstance(values, np.ndarray) or values.dtype.kind not in "fui":
+            raise _damaged(path, f"an array of type {getattr(values, 'dtype', type(values))}")
+        return _RawPixels(values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values)
+    if suffix == ".csv":
+        return _RawPixels(_read_csv(path))
+    if suffix in IMAGE_SUFFIXES:
+        return _read_image(path)
+    raise ThermalFileError(
+        explain(
+            str(path),
+            expected="a thermal file of type " + ", ".join(THERMAL_SUFFIXES),
+            got=f"suffix '{path.suffix}'",
+            remedy="Convert the file to one of these.",
+        )
+    )
+
+
+def _read_csv(path: Path) -> npt.NDArray[np.float64]:
+    """Read rows of numbers split by commas or semicolons; empty cells and nan, NA, null, - are NaN."""
+    text = path.read_text(encoding="utf-8-sig")
+    semicolons = ";" in text
+    rows = []
+    for row in csv.reader(text.splitlines(), delimiter=";" if semicolons else ","):
+        cells = [cell.strip() for cell in row]
+        if cells and cells[-1] == "":
+            cells.pop()  # many cameras end each line with a separator
+        if cells:
+            # With semicolons between the cells, a comma is a decimal comma.
+            rows.append([_number(cell.replace(",", ".") if semicolons else cell) for cell in cells])
+    if not rows or len({len(row) for row in rows}) != 1:
+        raise _damaged(path, f"rows of lengths {sorted({len(row) for row in rows})}")
+    return np.array(rows, dtype=np.float64)
+
+
+def _number(cell: str) -> float:
+    return float("nan") if cell.lower() in ("", "nan", "na", "n/a", "null", "none", "-") else float(cell)
+
+
+def _read_image(path: Path) -> _RawPixels:
+    with Image.open(path) as image:
+        if getattr(image, "n_frames", 1) != 1:
+            raise ThermalFileError(
+                explain(
+                    str(path),
+                    expected="one image",
+                    got=f"{getattr(image, 'n_frames', 1)} pages",
+                    remedy="Save the page that holds the temperatures as a file of its own.",
+                )
+            )
+        image.load()  # raises on truncated data
+        bits = _integer_type(path, image)
+        if image.mode == "P":
+            image = image.convert("RGBA")
+        pixels = np.asarray(image)
+        mode = image.mode
+    if mode == "F":
+        return _RawPixels(pixels)
+    if mode in ("L", "RGB", "RGBA", "LA") and bits == np.uint16 and path.suffix.lower() == ".png":
+        deep = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # Pillow cuts 16-bit colour PNG to 8 bits
+        if deep is None or deep.dtype != np.uint16:
+            raise _damaged(path, "a 16-bit PNG that cannot be decoded")
+        pixels = deep
+    if mode == "L" or mode.startswith("I"):
+        return _RawPixels(pixels if pixels.dtype == bits else pixels.astype(bits))
+    if mode in ("RGB", "RGBA", "LA"):
+        return _one_channel(path, pixels, has_alpha=pixels.ndim == 3 and pixels.shape[-1] in (2, 4))
+    raise ThermalFileError(
+        explain(
+            str(path),
+            expected="a grey or floating-point image",
+            got=f"image mode {mode}",
+            remedy="Export the thermal image as 16-bit grey PNG or TIFF.",
+        )
+    )
+
+
+def _integer_type(path: Path, image: Image.Image) -> npt.DTypeLike:
+    """Type of the file's counts, which Pillow's modes do not always tell (mode I holds 16-bit files too)."""
+    if image.format == "PNG":
+        with path.open("rb") as stream:
+            depth = struct.unpack("B", stream.read(25)[24:])[0]  # IHDR: signature 8, length 4, type 4, size 8
+        return np.uint16 if depth == 16 else np.uint8
+    if image.format == "TIFF":
+        tags: Any = getattr(image, "tag_v2", {})
+        width = tags.get(258, (8,))
+        width = int(width[0] if isinstance(width, tuple) else width)
+        signed = tags.get(339, (1,))
+        signed = int(signed[0] if isinstance(signed, tuple) else signed) == 2
+        length = 1 if width <= 8 else 2 if width <= 16 else 4
+        return np.dtype(f"{'i' if signed else 'u'}{length}")
+    return np.uint8
+
+
+def _one_channel(path: Path, pixels: npt.NDArray[Any], has_alpha: bool) -> _RawPixels:
+    if pixels.ndim == 2:
+        return _RawPixels(pixels)
+    colours = pixels[..., :-1] if has_alpha else pixels
+    if not (colours == colours[..., :1]).all():
+        raise ThermalFileError(
+            explain(
+                str(path),
+                expected="a grey image (all channels equal)",
+                got="a false-colour picture: its palette cannot be turned back into temperatures",
+                remedy="Export the radiometric data (16-bit PNG or TIFF, .npy, .csv) or a grey palette.",
+            )
+        )
+    no_data = pixels[..., -1] == 0 if has_alpha else None
+    return _RawPixels(np.ascontiguousarray(colours[..., 0]), no_data)
+
+
+def _damaged(path: Path, problem: object) -> ThermalFileError:
+    return ThermalFileError(
+        explain(
+            str(path),
+            expected="a readable thermal file",
+            got=str(problem) or type(problem).__name__,
+            remedy="The file is damaged or not what its suffix says; copy it again or remove its frame.",
+        )
+    )

@@ -1,0 +1,81 @@
+"""One pass over all thermal files of a scene: sizes, temperature range and dead pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.data.dead_pixels import find_dead_pixels
+from thermoxels_ns.data.thermal_files import ThermalUnit, read_temperature_c
+from thermoxels_ns.errors import ThermalFileError, explain
+from thermoxels_ns.units import TemperatureRange
+
+_MOST_FRAMES = 64
+"""Frames per resolution that the search for dead pixels keeps in memory."""
+
+
+@dataclass(frozen=True)
+class ThermalSurvey:
+    """What the thermal files of a scene have in common."""
+
+    shapes: dict[Path, tuple[int, int]]
+    """Height and width of every file."""
+    temperature_range: TemperatureRange
+    """From temperature_bounds.json, else from the extremes of all valid pixels."""
+    dead_pixels: dict[tuple[int, int], npt.NDArray[np.bool_]]
+    """Mask of stuck pixels for every resolution that has some."""
+
+
+def survey_thermal_files(
+    paths: Sequence[Path],
+    unit: ThermalUnit,
+    valid_range_c: tuple[float, float],
+    bounds_c: tuple[float, float] | None,
+) -> ThermalSurvey:
+    """Read every thermal file once.
+
+    Args:
+        paths: All thermal files of the scene, training and evaluation: the range and the stuck pixels are the
+            camera's, and both sides must agree on them.
+        unit: Meaning of the numbers in the files.
+        valid_range_c: Temperatures outside are masked, [degrees Celsius].
+        bounds_c: Range to use instead of the extremes, [degrees Celsius].
+
+    Raises:
+        ThermalFileError: A file cannot be read or has no valid pixel at all.
+    """
+    shapes: dict[Path, tuple[int, int]] = {}
+    extremes: dict[Path, tuple[float, float]] = {}
+    kept: dict[tuple[int, int], list[npt.NDArray[np.float32]]] = {}
+    step = -(-len(paths) // _MOST_FRAMES)
+    for number, path in enumerate(paths):
+        temperature_c = read_temperature_c(path, unit, valid_range_c)
+        height, width = temperature_c.shape
+        shapes[path] = (height, width)
+        if not np.isfinite(temperature_c).any():
+            raise ThermalFileError(
+                explain(
+                    str(path),
+                    expected=f"temperatures from {valid_range_c[0]} to {valid_range_c[1]} C",
+                    got="no valid pixel",
+                    remedy="Check thermal_unit or temperature_bounds.json, or widen --valid-range-c.",
+                )
+            )
+        extremes[path] = (float(np.nanmin(temperature_c)), float(np.nanmax(temperature_c)))
+        if number % step == 0:
+            kept.setdefault((height, width), []).append(temperature_c)
+    dead = {shape: find_dead_pixels(np.stack(frames)) for shape, frames in kept.items()}
+    dead = {shape: mask for shape, mask in dead.items() if mask.any()}
+    if bounds_c is None:
+        for path, shape in shapes.items():
+            if shape in dead:  # the extremes of these files may be a stuck pixel's
+                live = read_temperature_c(path, unit, valid_range_c)[~dead[shape]]
+                if np.isfinite(live).any():
+                    extremes[path] = (float(np.nanmin(live)), float(np.nanmax(live)))
+        lows, highs = zip(*extremes.values())
+        bounds_c = (min(lows), max(highs))
+    return ThermalSurvey(shapes, TemperatureRange.spanning(*bounds_c), dead)
