@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -64,6 +64,10 @@ def picture_of_mesh(
         MeshError: An array does not fit the mesh, or the directions do not span a view.
         OutputError: The file cannot be written.
     """
+    # Without a screen VTK draws through Mesa, which loads the system's LLVM. A triton (torch's compiler) that is loaded
+    # after that ends in a segmentation fault; loaded before, both work.
+    with suppress(ImportError):
+        import triton  # noqa: F401
     import pyvista as pv
 
     path = Path(path)

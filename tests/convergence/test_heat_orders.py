@@ -1,0 +1,62 @@
+"""Measured orders of the heat solver: 2 in the voxel size, 1 in the time step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
+
+CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
+
+
+def body(cells: np.ndarray, voxel_m: float, temperature_c=lambda points: np.full(len(points), 20.0)) -> TetMesh:
+    corners, tets = kuhn_tets(cells)
+    points, facets = corners * voxel_m, boundary_facets(tets)
+    seen, tags, region = np.ones(len(points), bool), np.zeros(len(facets), np.int64), np.zeros(len(tets), np.int64)
+    return TetMesh(points, tets, temperature_c(points), seen, facets, tags, region)
+
+
+LENGTH = 0.8
+RATE = 3.0 * CONCRETE.diffusivity_m2_s * (np.pi / LENGTH) ** 2
+"""Decay rate of the mode below in an insulated cube, [1 / s]."""
+
+
+def cosines(points: np.ndarray) -> np.ndarray:
+    return 20.0 + 10.0 * np.cos(np.pi * points / LENGTH).prod(axis=1)
+
+
+def observed_orders(errors: list[float]) -> np.ndarray:
+    return np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
+
+
+@pytest.mark.parametrize("lumped", [True, False])
+def test_second_order_in_space(lumped: bool) -> None:
+    """Against backward Euler's own decay of the continuous mode, so that only the space error is left."""
+    dt, steps, errors = 0.2 / RATE, 5, []
+    for n in (4, 8, 16):
+        mesh = body(np.ones((n, n, n), bool), LENGTH / n, cosines)
+        end = solve_heat(HeatProblem(mesh, CONCRETE), TimeSteps(steps, dt), lumped=lumped).temperature_c[-1]
+        exact = 20.0 + (mesh.temperature_c - 20.0) / (1.0 + dt * RATE) ** steps
+        errors.append(float(np.sqrt(np.mean((end - exact) ** 2))))
+    orders = observed_orders(errors)
+    assert orders[-1] > 1.85, f"observed orders in h: {orders}, errors {errors}"
+
+
+def test_first_order_in_time() -> None:
+    """Against very short steps on the same mesh, so that only the time error is left."""
+    mesh = body(np.ones((6, 6, 6), bool), LENGTH / 6, cosines)
+    until = 1.0 / RATE
+
+    def end(steps: int) -> np.ndarray:
+        return solve_heat(HeatProblem(mesh, CONCRETE), TimeSteps(steps, until / steps)).temperature_c[-1]
+
+    # Richardson's extrapolation of backward Euler is of second order: a reference good enough for a first-order error.
+    reference = 2.0 * end(800) - end(400)
+    errors = [float(np.abs(end(steps) - reference).max()) for steps in (10, 20, 40)]
+    orders = observed_orders(errors)
+    assert np.all(np.abs(orders - 1.0) < 0.08), f"observed orders in dt: {orders}, errors {errors}"

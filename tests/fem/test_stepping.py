@@ -1,0 +1,105 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.assembly import assemble
+from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+PAPER = TimeSteps(10, 60.0)
+
+
+def heat_content(mesh: TetMesh, material, temperature_c: np.ndarray) -> np.ndarray:
+    """Integral of rho c T, T in kelvin, by the volumes of the tetrahedra: knows nothing of the solver's matrices."""
+    edges = mesh.points_m[mesh.tets[:, 1:]] - mesh.points_m[mesh.tets[:, :1]]
+    volumes = np.linalg.det(edges) / 6.0
+    means = (temperature_c[..., mesh.tets] + 273.15).mean(axis=-1)
+    return material.heat_capacity_j_m3k * means @ volumes
+
+
+@pytest.mark.parametrize("lumped", [True, False])
+@pytest.mark.parametrize("step_seconds", [1e-2, 60.0, 1e9])
+def test_heat_is_conserved(random_body, concrete, lumped, step_seconds) -> None:
+    solution = solve_heat(HeatProblem(random_body, concrete), TimeSteps(10, step_seconds), lumped=lumped)
+    content = heat_content(random_body, concrete, solution.temperature_c)
+    assert np.abs(content / content[0] - 1.0).max() < 1e-12
+    assert solution.energy_residual < 1e-14
+    assert solution.energy_residual_of_spread < 1e-12
+    np.testing.assert_allclose(solution.heat_content_j, content, rtol=1e-12)
+    assert solution.converged
+    assert np.ptp(solution.temperature_c[-1]) < np.ptp(solution.temperature_c[0])  # heat did move
+
+
+def test_every_step_satisfies_the_equations(random_body, concrete) -> None:
+    """M (T1 - T0) / dt + K T1 = 0 at every node, independently of how the step was solved."""
+    matrices = assemble(random_body, concrete)
+    solution = solve_heat(HeatProblem(random_body, concrete), PAPER)
+    for before, after in zip(solution.temperature_c, solution.temperature_c[1:]):
+        conducted = matrices.stiffness_w_k @ after
+        balance = matrices.mass_j_k @ (after - before) / 60.0 + conducted
+        assert np.abs(balance).max() < 1e-10 * np.abs(conducted).max()
+
+
+def test_a_long_step_levels_the_temperature_at_the_mean(random_body, concrete) -> None:
+    solution = solve_heat(HeatProblem(random_body, concrete), TimeSteps(1, 1e12))
+    mass = assemble(random_body, concrete).nodal_mass_j_k
+    np.testing.assert_allclose(solution.temperature_c[-1], mass @ random_body.temperature_c / mass.sum(), atol=1e-5)
+
+
+@pytest.mark.parametrize("temperature_c", [-273.15, -40.0, 0.1, 20.0, 1500.3])
+def test_uniform_temperature_does_not_change_at_all(random_body, concrete, temperature_c) -> None:
+    start = np.full(len(random_body.points_m), temperature_c)
+    solution = solve_heat(HeatProblem(random_body, concrete, start), PAPER)
+    np.testing.assert_array_equal(solution.temperature_c, temperature_c)
+    assert solution.energy_residual == 0.0 and solution.energy_residual_of_spread == 0.0
+
+
+def test_shifting_the_temperature_shifts_the_solution(random_body, concrete) -> None:
+    plain = solve_heat(HeatProblem(random_body, concrete), PAPER)
+    shifted = solve_heat(HeatProblem(random_body, concrete, random_body.temperature_c + 500.0), PAPER)
+    np.testing.assert_allclose(shifted.temperature_c, plain.temperature_c + 500.0, atol=1e-10)
+
+
+def test_initial_temperature_replaces_the_mesh_s(random_body, concrete) -> None:
+    start = random_body.temperature_c[::-1].copy()
+    given = solve_heat(HeatProblem(random_body, concrete, start), PAPER)
+    moved = solve_heat(HeatProblem(replace(random_body, temperature_c=start), concrete), PAPER)
+    np.testing.assert_array_equal(given.temperature_c, moved.temperature_c)
+    np.testing.assert_allclose(given.temperature_c[0], start, atol=1e-13)
+
+
+def test_solution_has_one_state_per_time(random_body, concrete) -> None:
+    solution = solve_heat(HeatProblem(random_body, concrete), PAPER)
+    np.testing.assert_array_equal(solution.times_s, np.arange(11) * 60.0)
+    assert solution.temperature_c.shape == (11, len(random_body.points_m))
+    assert solution.heat_w.shape == solution.iterations.shape == (10,)
+    assert solution.heat_content_j.shape == (11,)
+    assert "10 steps converged" in solution.status
+    assert any("Convection" in effect for effect in solution.skipped_effects)
+
+
+def test_net_heat_flow_is_zero_behind_insulation(random_body, concrete) -> None:
+    solution = solve_heat(HeatProblem(random_body, concrete), PAPER)
+    inner_flow = np.abs(assemble(random_body, concrete).stiffness_w_k @ solution.temperature_c[0]).sum()
+    assert np.abs(solution.heat_w).max() < 1e-10 * inner_flow
+
+
+def test_failure_to_converge_raises_and_can_be_a_status(random_body, concrete, monkeypatch) -> None:
+    from thermoxels_ns.fem import stepping
+
+    class Hasty(stepping.ConjugateGradients):
+        def __init__(self, matrix, **options) -> None:
+            super().__init__(matrix, **options, max_iterations=2)
+
+    monkeypatch.setattr(stepping, "ConjugateGradients", Hasty)
+    problem = HeatProblem(random_body, concrete)
+    with pytest.raises(HeatError, match=r"Step 1 of 10 failed.*stopped after 2 iterations"):
+        solve_heat(problem, PAPER)
+    solution = solve_heat(problem, PAPER, allow_unconverged=True)
+    assert not solution.converged and "Step 1 of 10 failed" in solution.status
+    assert len(solution.times_s) == 1 and solution.heat_w.shape == (0,)

@@ -1,0 +1,357 @@
+"""The command ns-export thermoxels-mesh, its options, and the files it writes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import pyvista
+import torch
+import tyro
+from PIL import Image
+
+from thermoxels_ns.errors import CheckpointError, HeatError, MeshError, OutputError, ThermoxelsError
+from thermoxels_ns.export import ExportThermoxelsMesh, _check_config, input_from_world, viewpoint_of_cameras
+from thermoxels_ns.export_snapshot import ExportOptions, Viewpoint, check_options, export_snapshot
+from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.mesh.solid import SolidSelection
+from thermoxels_ns.snapshot import GridSnapshot
+
+UNSEEN = 0.35
+
+
+@pytest.fixture(scope="module")
+def ball() -> GridSnapshot:
+    """A ball in a box of 12^3 voxels, 10 C on one side and 30 C on the other, its middle never observed."""
+    lattice = Lattice((-0.6, -0.6, -0.6), 0.1, (13, 13, 13))
+    points = lattice.corner_positions()
+    radius = np.linalg.norm(points, axis=-1)
+    density = (20.0 * np.maximum(0.0, 1.0 - radius)).astype(np.float32)  # the default keeps radius < 0.5
+    temperature = (20.0 + 25.0 * points[..., 0]).astype(np.float32)
+    return GridSnapshot(lattice, density, temperature, np.where(radius < UNSEEN, 0.0, 9.0).astype(np.float32))
+
+
+def read(folder: Path) -> dict:
+    return json.loads((folder / "summary.json").read_text())
+
+
+def test_full_export(ball, tmp_path) -> None:
+    lines: list[str] = []
+    options = ExportOptions(metres_per_unit=2.0, steps=3, density_percentile=80.0)
+    summary = export_snapshot(ball, np.eye(4), options, tmp_path / "new" / "folder", lines.append)
+    folder = tmp_path / "new" / "folder"
+    written = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert written == set(summary["files"])
+    assert {"mesh.vtu", "mesh.png", "heat.pvd", "heat.png", "heat/step-0003.vtu", "summary.json"} <= written
+    grid = pyvista.read(folder / "mesh.vtu")
+    assert (grid.n_points, grid.n_cells) == (summary["mesh"]["nodes"], summary["mesh"]["tets"])
+    assert summary["mesh"]["tets"] == 6 * summary["mesh"]["voxels"]
+    # 12^3 voxels of 0.2 m, a fifth of them solid.
+    assert summary["mesh"]["volume"] == pytest.approx(summary["mesh"]["voxels"] * 0.2**3)
+    assert summary["mesh"]["voxels"] == pytest.approx(0.2 * 12**3, rel=0.15)
+    assert 0.0 < summary["mesh"]["share_of_nodes_observed"] < 1.0
+    assert summary["length_unit"] == "m"
+    assert pyvista.PVDReader(folder / "heat.pvd").time_values == [0.0, 60.0, 120.0, 180.0]
+    assert any("converged" in line for line in lines)
+
+
+def test_summary_says_what_was_done(ball, tmp_path) -> None:
+    options = ExportOptions(metres_per_unit=1.0, pictures=False, conductivity_w_mk=0.5, step_seconds=30.0)
+    export_snapshot(ball, np.eye(4), options, tmp_path)
+    summary = read(tmp_path)
+    assert summary["options"]["conductivity_w_mk"] == 0.5 and summary["options"]["steps"] is None
+    assert {"thermoxels", "python", "numpy", "torch", "nerfstudio", "pyvista", "scikit-fem"} <= set(summary["versions"])
+    heat = summary["heat"]
+    assert heat["material"] == {
+        "name": "concrete (changed)",
+        "conductivity_w_mk": 0.5,
+        "density_kg_m3": 2200.0,
+        "specific_heat_j_kgk": 880.0,
+    }
+    assert heat["time"] == {"steps": 10, "step_seconds": 30.0}
+    assert abs(heat["energy_after_j"] / heat["energy_before_j"] - 1.0) < 1e-9
+    assert heat["energy_residual"] < 1e-9 and "converged" in heat["status"]
+    # Mean temperature of the ball is 20 C: its heat content is volume * rho c * 293.15 K.
+    expected = summary["mesh"]["volume"] * 2200.0 * 880.0 * 293.15
+    assert heat["energy_before_j"] == pytest.approx(expected, rel=1e-6)
+    assert heat["temperature_c"]["after"]["max"] < heat["temperature_c"]["before"]["max"]
+    assert not list(tmp_path.glob("*.png"))
+
+
+def test_without_a_scale_heat_is_skipped_and_the_message_says_what_to_pass(ball, tmp_path) -> None:
+    export_snapshot(ball, np.eye(4), ExportOptions(metres_per_unit=1.0, steps=1), tmp_path)
+    assert (tmp_path / "heat.pvd").exists()
+    lines: list[str] = []
+    summary = export_snapshot(ball, np.eye(4), ExportOptions(pictures=False), tmp_path, lines.append)
+    assert any("--metres-per-unit" in line for line in lines)
+    assert summary["heat"]["computed"] is False and "--metres-per-unit" in summary["heat"]["reason"]
+    assert summary["length_unit"] == "input unit"
+    assert (tmp_path / "mesh.vtu").exists()
+    # Heat of an earlier export belongs to another mesh.
+    assert not (tmp_path / "heat.pvd").exists() and not (tmp_path / "heat").exists()
+    assert not (tmp_path / "heat.png").exists()
+
+
+def test_heat_picture_holds_both_states(ball, tmp_path) -> None:
+    export_snapshot(ball, np.eye(4), ExportOptions(metres_per_unit=1.0, steps=1, step_seconds=1e7), tmp_path)
+    picture = np.asarray(Image.open(tmp_path / "heat.png")).astype(float)
+
+    def spread_of_hue(panel: np.ndarray) -> float:
+        body = panel[100:800, 100:900].reshape(-1, 3)
+        body = body[np.ptp(body, axis=1) > 30.0]  # coloured pixels
+        assert len(body) > 10_000
+        return float(np.std(body[:, 0] / body.sum(axis=1)))
+
+    before, after = np.split(picture, 2, axis=1)
+    assert spread_of_hue(before) > 3.0 * spread_of_hue(after)  # the long step levels it to one colour
+
+
+def test_torch_s_compiler_still_loads_after_drawing() -> None:
+    """Mesa's LLVM and triton's crash the process if pictures come first; the export sees to the order."""
+    code = """
+import numpy as np
+from thermoxels_ns.export_snapshot import ExportOptions, export_snapshot
+from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.snapshot import GridSnapshot
+ones = np.ones((3, 3, 3), np.float32)
+ball = GridSnapshot(Lattice((0.0, 0.0, 0.0), 1.0, (3, 3, 3)), ones, 20 * ones, ones)
+export_snapshot(ball, np.eye(4), ExportOptions(density_threshold=0.5), "out")
+import torch._dynamo
+print("alive")
+"""
+    with tempfile.TemporaryDirectory() as folder:
+        result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=folder)
+    assert result.returncode == 0 and "alive" in result.stdout, (result.returncode, result.stderr)
+
+
+def test_mesh_lies_at_the_input_poses(ball, tmp_path) -> None:
+    """A marked corner of the trained scene lands where the dataparser took it from, times metres per unit."""
+    rng = np.random.default_rng(5)
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    rotation *= np.sign(np.linalg.det(rotation))
+    shift, scale = rng.normal(size=3), 0.37
+    camera = np.array([1.0, -2.0, 3.0])  # input coordinates
+    trained = scale * (rotation @ camera + shift)
+    undo = input_from_world(np.column_stack([rotation, shift]), scale)
+    np.testing.assert_allclose((undo @ [*trained, 1.0])[:3], camera, atol=1e-12)
+
+    options = ExportOptions(metres_per_unit=3.0, pictures=False, steps=1)
+    export_snapshot(ball, undo, options, tmp_path)
+    points = pyvista.read(tmp_path / "mesh.vtu").points / 3.0
+    back = scale * (points @ rotation.T + shift)
+    index = ball.lattice.world_to_index(back)
+    np.testing.assert_allclose(index, np.round(index), atol=1e-9)  # nodes on lattice corners again
+    expected = read(tmp_path)["mesh"]["voxels"] * (0.1 / scale * 3.0) ** 3
+    assert read(tmp_path)["mesh"]["volume"] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("transform", "scale"),
+    [
+        (np.eye(4)[:3] * 2.0, 1.0),
+        (np.full((3, 4), np.nan), 1.0),
+        (np.eye(4)[:3], 0.0),
+        (np.eye(4)[:3], float("nan")),
+        (np.eye(4), 1.0),
+    ],
+)
+def test_impossible_dataparser_transforms_are_refused(transform, scale) -> None:
+    with pytest.raises(CheckpointError, match="dataparser_transform"):
+        input_from_world(transform, scale)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "error", "name"),
+    [
+        ("metres_per_unit", 0.0, MeshError, "metres_per_unit"),
+        ("metres_per_unit", -1.0, MeshError, "metres_per_unit"),
+        ("metres_per_unit", float("nan"), MeshError, "metres_per_unit"),
+        ("density_percentile", 101.0, MeshError, "density_percentile"),
+        ("density_threshold", -1.0, MeshError, "density_threshold"),
+        ("heat_preset", "cheese", HeatError, "heat preset"),
+        ("steps", 0, HeatError, "steps"),
+        ("step_seconds", -1.0, HeatError, "step_seconds"),
+        ("conductivity_w_mk", 0.0, HeatError, "conductivity_w_mk"),
+        ("density_kg_m3", float("inf"), HeatError, "density_kg_m3"),
+        ("specific_heat_j_kgk", -880.0, HeatError, "specific_heat_j_kgk"),
+    ],
+)
+def test_wrong_options_are_refused_before_anything_runs(ball, tmp_path, option, value, error, name) -> None:
+    with pytest.raises(error, match=name):
+        export_snapshot(ball, np.eye(4), ExportOptions(**{option: value}), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_nothing_solid_is_an_error_and_leaves_no_summary(ball, tmp_path) -> None:
+    with pytest.raises(MeshError, match="solid voxels"):
+        export_snapshot(ball, np.eye(4), ExportOptions(density_threshold=1e6), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_command_line_gives_every_option() -> None:
+    line = "--load-config a/config.yml --output-dir out --metres-per-unit 0.5 --steps 3 --step-seconds 10 "
+    line += "--density-threshold 4 --no-largest-component --no-pictures --conductivity-w-mk 0.8"
+    parsed = tyro.cli(ExportThermoxelsMesh, args=line.split())
+    assert parsed == ExportThermoxelsMesh(
+        load_config=Path("a/config.yml"),
+        output_dir=Path("out"),
+        metres_per_unit=0.5,
+        steps=3,
+        step_seconds=10.0,
+        density_threshold=4.0,
+        largest_component=False,
+        pictures=False,
+        conductivity_w_mk=0.8,
+    )
+
+
+def test_plain_command_line_takes_the_preset() -> None:
+    parsed = tyro.cli(ExportThermoxelsMesh, args=["--load-config", "c", "--output-dir", "o"])
+    selection, preset = check_options(parsed)
+    assert selection == SolidSelection()
+    assert (preset.material.name, preset.time.steps, preset.time.step_seconds) == ("concrete", 10, 60.0)
+
+
+def test_truth_and_viewpoint_reach_the_summary_and_the_pictures(ball, tmp_path, monkeypatch) -> None:
+    looks = []
+    monkeypatch.setattr("thermoxels_ns.mesh.pictures.picture_of_mesh", lambda *_, **look: looks.append(look))
+    look = Viewpoint(up=(0.0, 1.0, 0.0), view_direction=(0.0, 0.0, -1.0))
+    options = ExportOptions(density_threshold=4.0)
+    asked = []
+
+    def compare(solid, mesh):
+        asked.append((int(solid.cells.sum()), len(mesh.tets)))
+        return {"fscore": 0.5}
+
+    unscaled = export_snapshot(ball, np.eye(4), options, tmp_path, viewpoint=look, compare=compare)
+    assert not asked and "truth" not in unscaled  # a truth is in metres
+    assert {(v["up"], v["view_direction"], v["length_unit"]) for v in looks} == {
+        (look.up, look.view_direction, "input unit")
+    }
+    options = ExportOptions(density_threshold=4.0, metres_per_unit=1.0, pictures=False, steps=1)
+    export_snapshot(ball, np.eye(4), options, tmp_path, compare=compare)
+    assert asked[0][1] == 6 * asked[0][0] and read(tmp_path)["truth"] == {"fscore": 0.5}
+
+
+def test_view_from_where_the_cameras_stood() -> None:
+    """Cameras that look along +x with y of the picture along -z (an upside-down world): the picture does too."""
+    pose = np.array([[0.0, 0.0, -1.0, -3.0], [1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0]])
+    view = viewpoint_of_cameras(np.stack([pose, pose]), np.diag([2.0, 2.0, 2.0, 1.0]))
+    assert view.up == pytest.approx((0.0, 0.0, -1.0)) and view.view_direction is not None
+    assert np.dot(view.view_direction, (1.0, 0.0, 0.0)) == pytest.approx(1.0) and view.view_direction[2] > 0
+    turned = pose.copy()
+    turned[:, [0, 2]] *= -1.0  # looks back along -x
+    assert viewpoint_of_cameras(np.stack([pose, turned]), np.eye(4)).view_direction is None
+
+
+@pytest.mark.parametrize("missing", ["--load-config", "--output-dir"])
+def test_command_line_needs_input_and_output(missing, capsys) -> None:
+    line = {"--load-config": "c", "--output-dir": "o"}
+    del line[missing]
+    with pytest.raises(SystemExit):
+        tyro.cli(ExportThermoxelsMesh, args=[word for pair in line.items() for word in pair])
+    assert missing in capsys.readouterr().err
+
+
+def stand_in_run(monkeypatch, ball: GridSnapshot, fail: Exception | None = None) -> None:
+    """Put a trained model in place of nerfstudio's loading."""
+    cameras = SimpleNamespace(camera_to_worlds=torch.eye(4)[None, :3])
+    outputs = SimpleNamespace(dataparser_transform=torch.eye(4)[:3], dataparser_scale=0.5, cameras=cameras)
+    datamanager = SimpleNamespace(train_dataparser_outputs=outputs, get_datapath=lambda: Path("no-scene"))
+    pipeline = SimpleNamespace(datamanager=datamanager, grid_snapshot=lambda: ball)
+
+    def eval_setup(*_, **__):
+        if fail is not None:
+            raise fail
+        return None, pipeline, None, 0
+
+    monkeypatch.setattr("nerfstudio.utils.eval_utils.eval_setup", eval_setup)
+
+
+@pytest.fixture
+def config_file(tmp_path) -> Path:
+    path = tmp_path / "config.yml"
+    path.write_text("probe")
+    return path
+
+
+def test_run_undoes_the_dataparser_s_scale(ball, tmp_path, config_file, monkeypatch) -> None:
+    stand_in_run(monkeypatch, ball)
+    command = ExportThermoxelsMesh(load_config=config_file, output_dir=tmp_path / "out", pictures=False)
+    summary = command.run(lambda _: None)
+    assert summary["mesh"]["volume"] == pytest.approx(summary["mesh"]["voxels"] * 0.2**3)
+    assert summary["options"]["load_config"] == config_file
+
+
+@pytest.mark.parametrize(
+    ("fail", "words"),
+    [
+        (RuntimeError("Error(s) in loading state_dict"), "one and the same training run"),
+        (AssertionError("not a TrainerConfig"), "cannot be read"),
+        (KeyError("some-method"), "cannot be read"),
+        (CheckpointError("checkpoint: expected a voxel grid"), "expected a voxel grid"),
+    ],
+)
+def test_main_prints_one_clean_error_and_exits_1(ball, tmp_path, config_file, monkeypatch, capsys, fail, words) -> None:
+    stand_in_run(monkeypatch, ball, fail)
+    with pytest.raises(SystemExit) as ended:
+        ExportThermoxelsMesh(load_config=config_file, output_dir=tmp_path / "out").main()
+    assert ended.value.code == 1
+    printed = " ".join(capsys.readouterr().out.split())
+    assert printed.startswith("Error:") or " Error: " in printed
+    assert words in printed and "Traceback" not in printed
+
+
+def test_errors_of_the_program_are_not_hidden(ball, tmp_path, config_file, monkeypatch) -> None:
+    stand_in_run(monkeypatch, ball, ZeroDivisionError("a bug"))
+    with pytest.raises(ZeroDivisionError):
+        ExportThermoxelsMesh(load_config=config_file, output_dir=tmp_path / "out").main()
+
+
+def test_missing_config_and_unwritable_folder(tmp_path, config_file) -> None:
+    with pytest.raises(CheckpointError, match="no file at"):
+        ExportThermoxelsMesh(load_config=tmp_path / "no.yml", output_dir=tmp_path / "out").run(lambda _: None)
+    with pytest.raises(OutputError, match="output folder"):  # a file is in the way
+        ExportThermoxelsMesh(load_config=tmp_path / "no.yml", output_dir=config_file).run(lambda _: None)
+
+
+def test_wrong_option_is_found_before_the_folder_is_made(tmp_path, config_file) -> None:
+    command = ExportThermoxelsMesh(load_config=config_file, output_dir=tmp_path / "out", metres_per_unit=-1.0)
+    with pytest.raises(ThermoxelsError, match="metres_per_unit"):
+        command.run(lambda _: None)
+    assert not (tmp_path / "out").exists()
+
+
+def run_config(target: type, folder: Path) -> SimpleNamespace:
+    pipeline = SimpleNamespace(_target=target)
+    return SimpleNamespace(pipeline=pipeline, method_name="probe", get_checkpoint_dir=lambda: folder)
+
+
+def test_checkpoint_of_another_method_is_refused_before_loading(tmp_path) -> None:
+    with pytest.raises(CheckpointError, match=r"the checkpoint of another method \(probe\)"):
+        _check_config(run_config(object, tmp_path))  # type: ignore[arg-type]
+
+
+def test_run_without_checkpoint_is_refused_before_loading(tmp_path) -> None:
+    ours = type("Ours", (), {"grid_snapshot": lambda self: None})
+    with pytest.raises(CheckpointError, match=r"expected a file step-\*.ckpt"):
+        _check_config(run_config(ours, tmp_path))  # type: ignore[arg-type]
+    (tmp_path / "step-000000009.ckpt").touch()
+    config = run_config(ours, tmp_path)
+    assert _check_config(config) is config  # type: ignore[arg-type]
+
+
+def test_garbage_config_file(tmp_path) -> None:
+    """Through nerfstudio's real loader."""
+    pytest.importorskip("nerfstudio")
+    for text in ("just words", "a: [", "!!python/object:no.such.Thing {}"):
+        path = tmp_path / "config.yml"
+        path.write_text(text)
+        with pytest.raises(CheckpointError, match=r"config\.yml"):
+            ExportThermoxelsMesh(load_config=path, output_dir=tmp_path / "out").run(lambda _: None)

@@ -1,0 +1,226 @@
+"""The command ``ns-export thermoxels-mesh``: a trained model to a mesh with temperatures and a heat computation.
+
+Only light imports at the top: nerfstudio's exporter reads this module for ``--help`` of every subcommand.
+"""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.checks import check_shape, writable_folder
+from thermoxels_ns.errors import CheckpointError, ThermoxelsError, explain
+from thermoxels_ns.export_snapshot import ExportOptions, Viewpoint, check_options, export_snapshot
+
+if TYPE_CHECKING:
+    from nerfstudio.engine.trainer import TrainerConfig
+
+    from thermoxels_ns.mesh.solid import SolidCells
+    from thermoxels_ns.mesh.tetrahedra import TetMesh
+    from thermoxels_ns.snapshot import GridSnapshot
+
+
+@dataclass(frozen=True)
+class TrainedScene:
+    """A trained field and where it lies."""
+
+    snapshot: GridSnapshot
+    """The field."""
+    world_to_input: npt.NDArray[np.float64]
+    """Takes homogeneous column vectors of the trained scene to the coordinates of the input poses, shape (4, 4)."""
+    viewpoint: Viewpoint
+    """From where pictures show most of what the cameras saw."""
+    scene_folder: Path
+    """The photographs' folder."""
+
+
+@dataclass(kw_only=True)
+class ExportThermoxelsMesh(ExportOptions):
+    """Export a tetrahedral mesh with temperatures from a trained Thermoxels model, and let heat flow through it."""
+
+    load_config: Path
+    """The config.yml that ns-train wrote."""
+    output_dir: Path
+    """Folder for the results; it is made if it does not exist."""
+
+    def main(self) -> None:
+        """Run the export; an error of the input is printed as one sentence and the exit status is 1."""
+        from nerfstudio.utils.rich_utils import CONSOLE
+        from rich.markup import escape
+
+        try:
+            self.run(lambda line: CONSOLE.print(escape(line)))
+        except ThermoxelsError as problem:
+            CONSOLE.print(f"[bold red]Error:[/bold red] {escape(str(problem))}")
+            raise SystemExit(1) from None
+
+    def run(self, say: Any = print) -> dict[str, Any]:
+        """Run the export and return the summary that summary.json holds.
+
+        Args:
+            say: Called with one line of progress at a time.
+
+        Raises:
+            ThermoxelsError: If an option, the checkpoint, the mesh or the heat problem is not usable.
+        """
+        check_options(self)
+        writable_folder(self.output_dir)
+        say(f"Loading {self.load_config}")
+        scene = load_trained_scene(self.load_config)
+
+        def compare(solid: SolidCells, mesh: TetMesh) -> dict[str, Any] | None:
+            from thermoxels_ns.truth_comparison import compare_with_truth
+
+            lattice, scale = scene.snapshot.lattice, self.metres_per_unit or 1.0
+            return compare_with_truth(solid.cells, lattice, scene.world_to_input, scene.scene_folder, mesh, scale)
+
+        return export_snapshot(
+            scene.snapshot, scene.world_to_input, self, self.output_dir, say, scene.viewpoint, compare
+        )
+
+
+def load_trained_scene(load_config: Path) -> TrainedScene:
+    """Load a trained Thermoxels model through nerfstudio.
+
+    Args:
+        load_config: The config.yml that ns-train wrote.
+
+    Returns:
+        The trained field and where it lies.
+
+    Raises:
+        CheckpointError: If the file is missing or not a nerfstudio config, if there is no checkpoint, or if it was
+            trained with another method.
+    """
+    if not load_config.is_file():
+        raise CheckpointError(
+            explain(
+                "load_config",
+                expected="the config.yml of a training run",
+                got=f"no file at {load_config}",
+                remedy="Pass --load-config outputs/<scene>/thermoxels/<time>/config.yml.",
+            )
+        )
+    import yaml
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    try:
+        _, pipeline, _, _ = eval_setup(load_config, test_mode="test", update_config_callback=_check_config)
+    except ThermoxelsError:
+        raise
+    except (yaml.YAMLError, AssertionError, KeyError, UnicodeDecodeError) as problem:
+        raise CheckpointError(
+            explain(
+                "load_config",
+                expected="a config.yml that ns-train of this installation wrote",
+                got=f"{load_config}, which cannot be read ({type(problem).__name__}: {problem})",
+                remedy="Pass the config.yml of the training run.",
+            )
+        ) from problem
+    except (RuntimeError, pickle.UnpicklingError, EOFError) as problem:
+        raise CheckpointError(
+            explain(
+                "checkpoint",
+                expected="the parameters of the model that config.yml describes",
+                got=f"{type(problem).__name__}: {problem}",
+                remedy="Use the config.yml and the checkpoint of one and the same training run.",
+            )
+        ) from problem
+    pipeline_of_ours: Any = pipeline
+    outputs = pipeline_of_ours.datamanager.train_dataparser_outputs
+    world_to_input = input_from_world(outputs.dataparser_transform.numpy(), float(outputs.dataparser_scale))
+    return TrainedScene(
+        pipeline_of_ours.grid_snapshot(),
+        world_to_input,
+        viewpoint_of_cameras(outputs.cameras.camera_to_worlds.numpy(), world_to_input),
+        Path(pipeline_of_ours.datamanager.get_datapath()),
+    )
+
+
+def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.ArrayLike) -> Viewpoint:
+    """Choose a view for pictures: up as the photographer held the camera, from the side the cameras stood on.
+
+    Args:
+        camera_to_worlds: Poses in the trained scene (x right, y up, z back), shape (n, 3, 4) or (n, 4, 4).
+        world_to_input: Takes the trained scene to the coordinates of the input poses, shape (4, 4).
+
+    Returns:
+        The view. If the cameras stood all around, it is the usual one, obliquely from above.
+    """
+    rotation = np.asarray(world_to_input, np.float64)[:3, :3]
+    axes = np.einsum("ij,njk->nik", rotation / np.cbrt(np.linalg.det(rotation)), np.asarray(camera_to_worlds)[:, :, :3])
+    up = axes[:, :, 1].mean(axis=0)
+    if np.linalg.norm(up) < 0.1:  # cameras held every way round
+        return Viewpoint()
+    up /= np.linalg.norm(up)
+    forward = -axes[:, :, 2].mean(axis=0)
+    level = forward - (forward @ up) * up
+    direction = None
+    if np.linalg.norm(level) > 0.3:
+        level /= np.linalg.norm(level)
+        direction = tuple(float(v) for v in level + 0.35 * np.cross(up, level) - 0.35 * up)
+    return Viewpoint(tuple(float(v) for v in up), direction)  # type: ignore[arg-type]
+
+
+def input_from_world(transform: npt.ArrayLike, scale: float) -> npt.NDArray[np.float64]:
+    """Undo a nerfstudio dataparser's recentring, rotation and scaling.
+
+    The dataparser maps poses by p_world = scale * (R p_input + t); this is the inverse.
+
+    Args:
+        transform: [R | t], shape (3, 4), R orthonormal.
+        scale: Above 0.
+
+    Returns:
+        The 4x4 that takes homogeneous column vectors of the trained scene to the coordinates of the input poses.
+
+    >>> input_from_world([[1, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]], 2.0) @ [12, 0, 4, 1]
+    array([1., 0., 2., 1.])
+    """
+    remedy = "The checkpoint's dataparser is damaged; train again."
+    matrix = check_shape("dataparser_transform", np.asarray(transform, np.float64), (3, 4), remedy, CheckpointError)
+    rotation, shift = matrix[:, :3], matrix[:, 3]
+    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
+    if not (orthonormal and np.all(np.isfinite(shift)) and np.isfinite(scale) and scale > 0):
+        raise CheckpointError(
+            explain(
+                "dataparser_transform",
+                expected="a rotation, a finite shift and a scale above 0",
+                got=f"{matrix.tolist()}, scale {scale}",
+                remedy=remedy,
+            )
+        )
+    inverse = np.eye(4)
+    inverse[:3, :3] = np.linalg.inv(rotation) / scale
+    inverse[:3, 3] = -np.linalg.inv(rotation) @ shift
+    return inverse
+
+
+def _check_config(config: TrainerConfig) -> TrainerConfig:
+    """Refuse another method's run, or one without a checkpoint, before its photographs are loaded."""
+    pipeline: Any = config.pipeline
+    if not callable(getattr(pipeline._target, "grid_snapshot", None)):
+        raise CheckpointError(
+            explain(
+                "load_config",
+                expected="a model trained with a Thermoxels method",
+                got=f"the checkpoint of another method ({config.method_name})",
+                remedy="Train with ns-train thermoxels, or choose another subcommand of ns-export.",
+            )
+        )
+    folder = config.get_checkpoint_dir()
+    if not any(folder.glob("step-*.ckpt")):
+        raise CheckpointError(
+            explain(
+                "checkpoint",
+                expected=f"a file step-*.ckpt in {folder}",
+                got="none",
+                remedy="Run the command in the folder where ns-train ran, or train to the first checkpoint.",
+            )
+        )
+    return config

@@ -1,0 +1,99 @@
+"""Heat settings from a yaml file: material and time steps.
+
+The files are the only place where these numbers stand; no default in the code repeats them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import TimeSteps
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class HeatPreset:
+    """A material and the time steps that suit it."""
+
+    material: Material
+    """What the body is made of."""
+    time: TimeSteps
+    """How long it is followed."""
+
+    def as_mapping(self) -> dict[str, dict[str, Any]]:
+        """Return the content of the yaml file that this preset would be read from."""
+        return asdict(self)
+
+
+def presets_folder() -> Path:
+    """Find the presets: inside an installed package, beside it in a source tree."""
+    for folder in (_PACKAGE / "configs", _PACKAGE.parent / "configs"):
+        if folder.is_dir():
+            return folder
+    raise HeatError(
+        explain(
+            "heat presets",
+            expected=f"a folder configs in or beside {_PACKAGE}",
+            got="none",
+            remedy="Install the package again, or pass the path of a yaml file.",
+        )
+    )
+
+
+def heat_preset_names() -> list[str]:
+    """List the names that `load_heat_preset` knows."""
+    return sorted(path.stem.removeprefix("heat-") for path in presets_folder().glob("heat-*.yaml"))
+
+
+def load_heat_preset(name: str) -> HeatPreset:
+    """Read heat settings.
+
+    Args:
+        name: A preset's name, such as ``concrete`` for ``configs/heat-concrete.yaml``, or the path of a yaml file
+            (recognised by its suffix).
+
+    Returns:
+        The validated settings.
+
+    Raises:
+        HeatError: If there is no such preset or file, or if a key is missing, unknown or out of range.
+    """
+    path = Path(name) if Path(name).suffix in (".yaml", ".yml") else presets_folder() / f"heat-{name}.yaml"
+    if not path.is_file():
+        raise HeatError(
+            explain(
+                "heat preset",
+                expected=f"one of {', '.join(heat_preset_names())}, or the path of a yaml file",
+                got=repr(name),
+                remedy="Correct --heat-preset.",
+            )
+        )
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as problem:
+        raise HeatError(
+            explain(path.name, expected="a yaml file", got=str(problem), remedy="Correct the file.")
+        ) from problem
+    content = _keys(path.name, content, HeatPreset)
+    return HeatPreset(
+        Material(**_keys(f"{path.name}: material", content["material"], Material)),
+        TimeSteps(**_keys(f"{path.name}: time", content["time"], TimeSteps)),
+    )
+
+
+def _keys(name: str, content: object, target: type) -> dict[str, Any]:
+    """Return `content` if it is a mapping with exactly the fields of a dataclass."""
+    wanted = [field.name for field in fields(target)]
+    if not isinstance(content, dict) or set(content) != set(wanted):
+        got = ", ".join(map(str, content)) if isinstance(content, dict) else repr(content)
+        raise HeatError(
+            explain(name, expected=f"the keys {', '.join(wanted)}", got=got or "none", remedy="Correct the file.")
+        )
+    return content

@@ -1,0 +1,88 @@
+"""The two things nerfstudio 1.1.x lacks for plugins: an exporter hook, and loading its own checkpoints.
+
+This module is imported by every ``ns-*`` command, so it loads nothing heavy and never raises.
+"""
+
+from __future__ import annotations
+
+import sys
+from types import ModuleType
+from typing import Annotated, Any, Union, get_args
+
+import numpy as np
+import torch
+import tyro
+
+_EXPORTER = "nerfstudio.scripts.exporter"
+_SUBCOMMAND = "thermoxels-mesh"
+
+
+def install() -> None:
+    """Add what nerfstudio lacks; calling it again changes nothing."""
+    allow_checkpoint_globals()
+    extend_exporter()
+
+
+def allow_checkpoint_globals() -> None:
+    """Let ``torch.load(weights_only=True)`` read the numpy scalars that nerfstudio's checkpoints hold.
+
+    Learning-rate schedulers save numpy numbers beside the tensors. Since torch 2.6 `torch.load` refuses any type
+    that is not registered as harmless; these are: a scalar, its dtype and the classes of the plain number types.
+    Torch without the registry loads them anyway.
+    """
+    register = getattr(torch.serialization, "add_safe_globals", None)
+    if register is not None:
+        register(_checkpoint_globals())
+
+
+def _checkpoint_globals() -> list[Any]:
+    numbers = (
+        *(np.bool_, np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32, np.uint64),
+        *(np.float16, np.float32, np.float64),
+    )
+    # The function that pickle names: numpy.core.multiarray.scalar in numpy 1, numpy._core.multiarray.scalar in 2.
+    rebuild_scalar = np.float64(0).__reduce__()[0]
+    return [rebuild_scalar, np.dtype, *dict.fromkeys(type(np.dtype(number)) for number in numbers)]
+
+
+def extend_exporter() -> None:
+    """Make ``thermoxels-mesh`` a subcommand of nerfstudio's ``ns-export``, beside all of its own.
+
+    nerfstudio's exporter hands its union of subcommands to ``tyro.cli`` when it starts. Its module gets a `tyro` of
+    its own whose `cli` extends that union and whose everything else is tyro's. Only a process that has the
+    exporter loaded, or is loading it while it imports this plugin, is touched: the other commands never load it.
+    """
+    main = sys.modules.get("__main__")
+    candidates = [sys.modules.get(_EXPORTER)]
+    if getattr(getattr(main, "__spec__", None), "name", None) == _EXPORTER:  # python -m nerfstudio.scripts.exporter
+        candidates.append(main)
+    for exporter in candidates:
+        if exporter is not None and getattr(exporter, "tyro", None) is tyro:
+            vars(exporter)["tyro"] = _ExporterTyro(exporter)
+
+
+class _ExporterTyro(ModuleType):
+    """Tyro, as nerfstudio's exporter sees it."""
+
+    def __init__(self, exporter: ModuleType) -> None:
+        super().__init__("tyro", doc=tyro.__doc__)
+        self._exporter = exporter
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(tyro, name)
+
+    def cli(self, f: Any, *args: Any, **kwargs: Any) -> Any:
+        """Call `tyro.cli`, with our subcommand added where the exporter's own union is asked for."""
+        stock = vars(self._exporter).get("Commands")
+        return tyro.cli(_with_mesh_export(f) if f is stock else f, *args, **kwargs)
+
+
+def _with_mesh_export(commands: Any) -> Any:
+    """Add our subcommand to ``Annotated[Union[...], markers]`` or ``Union[...]``, keeping members and markers."""
+    from thermoxels_ns.export import ExportThermoxelsMesh
+
+    ours = Annotated[ExportThermoxelsMesh, tyro.conf.subcommand(name=_SUBCOMMAND)]
+    markers = getattr(commands, "__metadata__", ())
+    members = get_args(get_args(commands)[0] if markers else commands)
+    extended = Union[(*members, ours)]
+    return Annotated[(extended, *markers)] if markers else extended
