@@ -8,7 +8,8 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from thermoxels_ns.field.refine import prune, refine
+from thermoxels_ns.errors import PruningError
+from thermoxels_ns.field.refine import PruningReport, prune, refine
 from thermoxels_ns.ray_statistics import backdrop_evidence, voxel_weights
 from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
 
@@ -19,6 +20,8 @@ FEWEST_OPEN_RAYS = 0.002
 """Share of rays that must leave the box unsaturated for a background to be worth its cost."""
 FEWEST_SKY_DIFFERENCE = 0.01
 """Share of the temperature range by which the learned sky must differ from the scene's minimum to be kept."""
+PRUNING_ATTEMPTS = 4
+"""Thresholds tried before pruning fails."""
 RAYS_PER_IMAGE = 4096
 """Training rays per image that statistics look at."""
 
@@ -53,10 +56,24 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     return [TrainingCallback(before, count), TrainingCallback(before, change_lattice, iters=steps)]
 
 
-def prune_by_rays(model: ThermoxelsModel, datamanager):
-    """Drop the voxels to which no training ray of either stream gives weight."""
+def prune_by_rays(model: ThermoxelsModel, datamanager) -> PruningReport:
+    """Drop the voxels to which no training ray of either stream gives weight.
+
+    While surfaces are still fog, many voxels hold little weight each. Then the threshold is lowered, fourfold at a
+    time, until at most 1 % of the weight goes.
+
+    Raises:
+        PruningError: Even the lowest threshold would remove more.
+    """
     weights = voxel_weights(model, datamanager.training_rays(RGB_STREAM | THERMAL_STREAM, RAYS_PER_IMAGE))
-    return prune(model.grid, weights.largest, weights.total, model.config.prune_threshold, model.config.prune_dilation)
+    for attempt in range(PRUNING_ATTEMPTS):
+        threshold = model.config.prune_threshold / 4**attempt
+        try:
+            return prune(model.grid, weights.largest, weights.total, threshold, model.config.prune_dilation)
+        except PruningError:
+            if attempt == PRUNING_ATTEMPTS - 1:
+                raise
+    raise AssertionError("unreachable")
 
 
 @torch.no_grad()

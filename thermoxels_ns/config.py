@@ -40,7 +40,10 @@ def _trainer(optimizer: type[OptimizerConfig] = FusedAdamConfig) -> ThermoxelsTr
         mixed_precision=False,
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         pipeline=ThermoxelsPipelineConfig(
-            datamanager=ThermalDataManagerConfig(dataparser=ThermalDataParserConfig()), model=ThermoxelsModelConfig()
+            datamanager=ThermalDataManagerConfig(
+                dataparser=ThermalDataParserConfig(), train_num_rays_per_batch=2048, thermal_num_rays_per_batch=1024
+            ),
+            model=ThermoxelsModelConfig(),
         ),
         optimizers={
             "density": _group(0.3, 0.03, optimizer),

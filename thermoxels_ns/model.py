@@ -20,7 +20,7 @@ from thermoxels_ns.field.field import VoxelField
 from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.metrics import lpips, lpips_available, psnr, ssim, thermal_metrics
 from thermoxels_ns.model_config import ThermoxelsModelConfig
-from thermoxels_ns.ray_statistics import corner_weight
+from thermoxels_ns.ray_statistics import corner_temperature
 from thermoxels_ns.render.compositing import Composite, composite
 from thermoxels_ns.render.march import March, march
 from thermoxels_ns.snapshot import GridSnapshot
@@ -274,18 +274,18 @@ class ThermoxelsModel(Model):
         """The trained field for the mesher.
 
         Args:
-            thermal_rays: Thermal training rays; the weight they give each corner tells which temperatures were
-                measured.
+            thermal_rays: Thermal training rays; they tell which corners were measured and what was seen there.
 
         Returns:
-            Density, temperature and observed weight on the corners.
+            Density, temperature and observed weight on the corners, density at the voxel centres.
         """
         grid, shape = self.grid, self.grid.lattice.shape
-        observed = corner_weight(self, thermal_rays)
-        temperature_c = self.temperature_range.to_celsius(grid.temperature[:, 0].double())
+        seen = corner_temperature(self, thermal_rays)
+        temperature_c = self.temperature_range.to_celsius(seen.thermal.double())
         return GridSnapshot(
             grid.lattice,
-            grid.corner_density().float().cpu().numpy(),
-            temperature_c.view(shape).float().cpu().numpy(),
-            observed.view(shape).float().cpu().numpy(),
+            density=grid.corner_density().float().cpu().numpy(),
+            temperature_c=temperature_c.view(shape).float().cpu().numpy(),
+            observed_weight=seen.weight.view(shape).float().cpu().numpy(),
+            voxel_density=grid.voxel_density().float().cpu().numpy(),
         )

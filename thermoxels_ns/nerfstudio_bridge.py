@@ -1,4 +1,4 @@
-"""The two things nerfstudio 1.1.x lacks for plugins: an exporter hook, and loading its own checkpoints.
+"""What nerfstudio 1.1.x lacks for plugins: an exporter hook, loading its own checkpoints, errors without a traceback.
 
 This module is imported by every ``ns-*`` command, so it loads nothing heavy and never raises.
 """
@@ -6,12 +6,15 @@ This module is imported by every ``ns-*`` command, so it loads nothing heavy and
 from __future__ import annotations
 
 import sys
-from types import ModuleType
+import warnings
+from types import ModuleType, TracebackType
 from typing import Annotated, Any, Union, get_args
 
 import numpy as np
 import torch
 import tyro
+
+from thermoxels_ns.errors import ThermoxelsError
 
 _EXPORTER = "nerfstudio.scripts.exporter"
 _SUBCOMMAND = "thermoxels-mesh"
@@ -21,6 +24,28 @@ def install() -> None:
     """Add what nerfstudio lacks; calling it again changes nothing."""
     allow_checkpoint_globals()
     extend_exporter()
+    print_our_errors_plainly()
+    # nerfstudio 1.1.5 indexes rays with lists; recent torch says so several times per camera.
+    warnings.filterwarnings("ignore", message="Using a non-tuple sequence for multidimensional indexing")
+
+
+def print_our_errors_plainly() -> None:
+    """Let an uncaught `ThermoxelsError` end an ``ns-*`` command with its sentence instead of a traceback.
+
+    The exit status stays 1, and every other exception goes where it went before.
+    """
+    previous = sys.excepthook
+    if getattr(previous, "prints_thermoxels_errors", False):
+        return
+
+    def hook(kind: type[BaseException], problem: BaseException, traceback: TracebackType | None) -> None:
+        if isinstance(problem, ThermoxelsError):
+            print(f"Error: {problem}", file=sys.stderr)
+        else:
+            previous(kind, problem, traceback)
+
+    hook.prints_thermoxels_errors = True  # type: ignore[attr-defined]
+    sys.excepthook = hook
 
 
 def allow_checkpoint_globals() -> None:

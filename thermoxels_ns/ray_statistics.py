@@ -57,16 +57,37 @@ def voxel_weights(model: RayMarcher, rays: Iterable[RayBundle]) -> VoxelWeights:
     return VoxelWeights(largest.view(nx, ny, nz), total.view(nx, ny, nz))
 
 
+@dataclass(frozen=True)
+class CornerTemperature:
+    """What thermal rays say about the lattice's corners."""
+
+    thermal: Float[Tensor, " corners"]
+    """Normalised temperature, in [0, 1]; where no ray came, the stored value."""
+    weight: Float[Tensor, " corners"]
+    """Sum of the weights of the samples around the corner, shared out by the trilinear weights."""
+
+
 @torch.no_grad()
-def corner_weight(model: RayMarcher, rays: Iterable[RayBundle]) -> Float[Tensor, " corners"]:
-    """Sum over rays of each sample's weight, shared among its voxel's corners by the trilinear weights."""
-    device = model.grid.density.device
-    total = torch.zeros(model.grid.lattice.num_corners, 1, device=device)
+def corner_temperature(model: RayMarcher, rays: Iterable[RayBundle]) -> CornerTemperature:
+    """Average the temperature that rays see around each corner, each sample by its share of the pixel.
+
+    A corner's own stored value is only ever used mixed with its neighbours', so an image can be right while single
+    corners overshoot; the average over what rays used has no such freedom.
+    """
+    grid = model.grid
+    device, corners = grid.density.device, grid.lattice.num_corners
+    total = torch.zeros(corners, 2, device=device)
     for bundle in rays:
-        marched = model.march_rays(bundle.origins.to(device), bundle.directions.to(device))
+        directions = bundle.directions.to(device)
+        marched = model.march_rays(bundle.origins.to(device), directions)
         weights = marched.along.weights.flatten()[marched.active][:, None]
-        total += splat(weights, model.grid.locate(marched.positions), len(total))
-    return total[:, 0]
+        at = grid.locate(marched.positions)
+        thermal = grid.thermal_at(at, directions[marched.rays_of(marched.active)])
+        total += splat(torch.cat((weights * thermal, weights), -1), at, corners)
+    weight = total[:, 1]
+    stored = grid.temperature[:, 0]
+    thermal = torch.where(weight > 0, total[:, 0] / weight.clamp(min=1e-30), stored)
+    return CornerTemperature(thermal.clamp(0, 1), weight)
 
 
 @dataclass(frozen=True)

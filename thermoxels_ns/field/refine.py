@@ -42,6 +42,8 @@ class PruningReport:
 
     kept_voxels: int
     total_voxels: int
+    threshold: float
+    """Smallest largest weight of a voxel that was kept for its own sake."""
     lost_weight: float
     """Share of the training rays' total weight that lay in the voxels removed."""
 
@@ -49,7 +51,7 @@ class PruningReport:
         share = self.kept_voxels / self.total_voxels
         return (
             f"kept {self.kept_voxels:,} of {self.total_voxels:,} voxels ({share:.1%}); "
-            f"they lost {self.lost_weight:.2%} of the rays' weight"
+            f"threshold {self.threshold:.2g}, {self.lost_weight:.2%} of the rays' weight lost"
         )
 
 
@@ -99,4 +101,4 @@ def prune(
             )
         )
     grid.kept = keep
-    return PruningReport(int(keep.sum()), keep.numel(), lost)
+    return PruningReport(int(keep.sum()), keep.numel(), threshold, lost)

@@ -180,3 +180,10 @@ class VoxelGrid(nn.Module):
         """Density at every corner, 0 at corners of no kept voxel."""
         density = activate_density(self.density[:, 0], self.activation).view(self._lattice.shape)
         return torch.where(self.kept_corners(), density, torch.zeros_like(density))
+
+    @torch.no_grad()
+    def voxel_density(self) -> Float[Tensor, "x y z"]:
+        """Density at every voxel centre, 0 in voxels that are not kept."""
+        raw = self.density[:, 0].view(1, 1, *self._lattice.shape)
+        centre = F.avg_pool3d(raw, kernel_size=2, stride=1)[0, 0]
+        return torch.where(self.kept, activate_density(centre, self.activation), torch.zeros_like(centre))

@@ -75,7 +75,7 @@ class SolidCells:
 def select_solid(snapshot: GridSnapshot, selection: SolidSelection) -> SolidCells:
     """Choose the solid voxels of a trained field.
 
-    A voxel's density is the trilinear value at its centre. The percentile is taken over all voxels of the box. A voxel
+    A voxel's density is that at its centre. The percentile is taken over all voxels of the box. A voxel
     without density is never solid. Where more voxels tie at the threshold than were asked for (space that training
     never touched keeps its starting value), only the denser ones are taken, if there are any.
 
@@ -89,7 +89,7 @@ def select_solid(snapshot: GridSnapshot, selection: SolidSelection) -> SolidCell
     Raises:
         MeshError: No voxel is solid, or density does not tell solid from empty.
     """
-    density = snapshot.lattice.corner_to_cell_mean(snapshot.density.astype(np.float64))
+    density = snapshot.centre_density()
     if selection.density_threshold is not None:
         threshold = float(selection.density_threshold)
         cells = (density >= threshold) & (density > 0.0)

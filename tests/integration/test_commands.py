@@ -1,0 +1,172 @@
+"""nerfstudio's own commands on our method, in subprocesses."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pyvista
+import torch
+from PIL import Image
+
+from tests.integration.commands import SHORT_TRAINING, Trained, run
+
+STOCK_EXPORTS = ("pointcloud", "tsdf", "poisson", "marching-cubes", "cameras", "gaussian-splat")
+METRICS = (
+    *("psnr", "ssim", "thermal_psnr", "thermal_ssim", "thermal_hssim"),
+    *("thermal_mae_c", "thermal_mae_hit_c", "thermal_mae_roi_c", "thermal_mae_debiased_c"),
+)
+
+
+def test_training_refines_prunes_and_saves(trained: Trained):
+    saved = sorted(p.name for p in trained.checkpoints.iterdir())
+    assert saved == ["step-000000020.ckpt", "step-000000039.ckpt"]
+    state = torch.load(trained.checkpoints / saved[-1], weights_only=False)["pipeline"]
+    shape = state["_model.field.grid.corner_shape"].tolist()
+    assert max(shape) == 25 and state["_model.field.grid.density"].shape[0] == np.prod(shape)
+
+
+def test_eval_reports_every_metric(trained: Trained, tmp_path):
+    output = tmp_path / "eval.json"
+    pictures = tmp_path / "pictures"
+    result = run(
+        *("ns-eval", "--load-config", str(trained.config), "--output-path", str(output)),
+        *("--render-output-path", str(pictures)),
+    )
+    assert result.returncode == 0, result.stdout
+    results = json.loads(output.read_text())["results"]
+    assert set(METRICS) <= set(results) and "lpips" not in results
+    assert all(np.isfinite(results[name]) for name in METRICS)
+    assert results["psnr"] > 15 and results["thermal_mae_c"] < 15
+    assert len(list(pictures.glob("*thermal*.png"))) == 2
+
+
+def test_render_dataset_writes_thermal_pictures(trained: Trained, tmp_path):
+    names = ["rgb", "thermal", "gt-thermal", "depth", "raw-temperature_c"]
+    result = run(
+        *("ns-render", "dataset", "--load-config", str(trained.config), "--output-path", str(tmp_path)),
+        *("--split", "test", "--image-format", "png", "--rendered-output-names", *names),
+    )
+    assert result.returncode == 0, result.stdout
+    for name in names[:4]:
+        files = sorted((tmp_path / "test" / name).rglob("*.png"))
+        assert len(files) == 2, name
+        assert np.asarray(Image.open(files[0])).std() > 1, name  # not one flat colour
+    assert len(list((tmp_path / "test" / "raw-temperature_c").rglob("*.npy.gz"))) == 2
+
+
+def test_export_lists_ours_among_all_stock_subcommands():
+    result = run("ns-export", "--help")
+    assert result.returncode == 0, result.stdout
+    for name in (*STOCK_EXPORTS, "thermoxels-mesh"):
+        assert name in result.stdout
+
+
+def test_a_stock_export_still_works(trained: Trained, tmp_path):
+    result = run("ns-export", "cameras", "--load-config", str(trained.config), "--output-dir", str(tmp_path))
+    assert result.returncode == 0, result.stdout
+    assert len(json.loads((tmp_path / "transforms_train.json").read_text())) == 10
+
+
+def test_mesh_export_and_heat(trained: Trained, tmp_path):
+    result = run(
+        *("ns-export", "thermoxels-mesh", "--load-config", str(trained.config), "--output-dir", str(tmp_path)),
+        *("--density-percentile", "90", "--metres-per-unit", "1", "--steps", "2"),
+    )
+    assert result.returncode == 0, result.stdout
+    mesh = pyvista.read(tmp_path / "mesh.vtu")
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert mesh.n_cells == summary["mesh"]["tets"] > 0
+    low, high = np.array(json.loads((trained.scene / "transforms.json").read_text())["scene_box"])
+    slack = 0.06 * (high - low).max()  # the lattice covers the box with whole voxels
+    assert (mesh.points.min(0) > low - slack).all() and (mesh.points.max(0) < high + slack).all()
+    assert abs(summary["heat"]["energy_residual"]) < 1e-9
+    assert 0 <= summary["truth"]["fscore"] <= 1
+    assert (tmp_path / "mesh.png").stat().st_size > 5000
+
+
+def test_mesh_without_a_scale_skips_heat_and_says_what_to_pass(trained: Trained, tmp_path):
+    result = run(
+        *("ns-export", "thermoxels-mesh", "--load-config", str(trained.config), "--output-dir", str(tmp_path)),
+        *("--density-percentile", "90", "--pictures", "False"),
+    )
+    assert result.returncode == 0, result.stdout
+    assert "--metres-per-unit" in result.stdout and not (tmp_path / "heat.pvd").exists()
+    assert (tmp_path / "mesh.vtu").exists()
+
+
+def test_resume_goes_on_from_the_checkpoint(trained: Trained, tmp_path):
+    """Stopped at step 20 and resumed, the run ends with the parameters of the run that was never stopped."""
+    early = tmp_path / "early"
+    early.mkdir()
+    shutil.copy(trained.checkpoints / "step-000000020.ckpt", early)
+    result = run(
+        *("ns-train", "thermoxels", "--output-dir", str(tmp_path), "--experiment-name", "again"),
+        *("--timestamp", "run", *SHORT_TRAINING, "--max-num-iterations", "19", "--load-dir", str(early)),
+        *("thermal-data", "--data", str(trained.scene)),
+    )
+    assert result.returncode == 0, result.stdout
+    whole = torch.load(trained.checkpoints / "step-000000039.ckpt", weights_only=False)["pipeline"]
+    resumed = torch.load(
+        tmp_path / "again" / "thermoxels" / "run" / "nerfstudio_models" / "step-000000039.ckpt", weights_only=False
+    )["pipeline"]
+    assert set(whole) == set(resumed)
+    for name, tensor in whole.items():
+        assert torch.equal(tensor, resumed[name]), name
+
+
+def test_viewer_starts_and_serves_its_page(trained: Trained):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    script = Path(sys.executable).with_name("ns-viewer")
+    viewer = subprocess.Popen(
+        [str(script), "--load-config", str(trained.config), "--viewer.websocket-port", str(port)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    try:
+        page = b""
+        for _ in range(240):
+            assert viewer.poll() is None, viewer.stdout.read() if viewer.stdout else ""
+            try:
+                with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=5) as answer:
+                    page = answer.read()
+                break
+            except (urllib.error.URLError, OSError):
+                time.sleep(0.5)
+        assert b"<html" in page.lower()
+        time.sleep(2.0)
+        assert viewer.poll() is None, "the viewer ended after serving its page"
+    finally:
+        viewer.kill()
+        viewer.wait()
+
+
+@pytest.mark.parametrize("method", ["plenoxels-t"])
+def test_thermal_images_alone(tiny_scene, tmp_path, method):
+    """The baseline trains, evaluates and exports without colour."""
+    short = [word for word in SHORT_TRAINING]
+    result = run(
+        *("ns-train", method, "--output-dir", str(tmp_path), "--experiment-name", "t", "--timestamp", "run"),
+        *short,
+        *("thermal-data", "--data", str(tiny_scene)),
+    )
+    assert result.returncode == 0, result.stdout
+    config = str(tmp_path / "t" / method / "run" / "config.yml")
+    result = run("ns-eval", "--load-config", config, "--output-path", str(tmp_path / "eval.json"))
+    assert result.returncode == 0, result.stdout
+    results = json.loads((tmp_path / "eval.json").read_text())["results"]
+    assert np.isfinite(results["thermal_psnr"]) and "psnr" not in results

@@ -1,0 +1,114 @@
+"""Bad input through the real commands: one clear sentence and a non-zero exit, no traceback of ours."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.integration.commands import SHORT_TRAINING, Trained, run
+
+
+def edit(scene: Path, change) -> None:
+    path = scene / "transforms.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def lose_partner(scene: Path) -> None:
+    next((scene / "thermal").glob("frame_train_00003*")).unlink()
+
+
+def lose_photograph(scene: Path) -> None:
+    """One frame fewer than thermal files."""
+    next((scene / "images").glob("frame_train_00004*")).unlink()
+
+
+def corrupt_image(scene: Path) -> None:
+    path = next((scene / "images").glob("frame_train_00002*"))
+    path.write_bytes(path.read_bytes()[:400])
+
+
+def no_poses(scene: Path) -> None:
+    edit(scene, lambda c: [frame.pop("transform_matrix") for frame in c["frames"]])
+
+
+def nan_pose(scene: Path) -> None:
+    edit(scene, lambda c: c["frames"][5]["transform_matrix"][1].__setitem__(3, float("nan")))
+
+
+def zero_box(scene: Path) -> None:
+    edit(scene, lambda c: c.__setitem__("scene_box", [[0, 0, 0], [1, 0, 1]]))
+
+
+@pytest.mark.parametrize(
+    "damage, words",
+    [
+        (lose_partner, ["frame_train_00003"]),
+        (lose_photograph, ["frame_train_00004"]),
+        (corrupt_image, ["frame_train_00002"]),
+        (no_poses, ["transform_matrix"]),
+        (nan_pose, ["frame_train_00006"]),
+        (zero_box, ["scene_box"]),
+    ],
+)
+def test_damaged_scene(tiny_scene, tmp_path, damage, words):
+    scene = tmp_path / "scene"
+    shutil.copytree(tiny_scene, scene)
+    damage(scene)
+    result = run(
+        *("ns-train", "thermoxels", "--output-dir", str(tmp_path / "out"), *SHORT_TRAINING),
+        *("thermal-data", "--data", str(scene)),
+    )
+    assert result.returncode != 0
+    assert "Error: " in result.stdout and "expected" in result.stdout
+    assert "Traceback" not in result.stdout
+    for word in words:
+        assert word in result.stdout
+
+
+def export(config: Path, output: Path, *options: str):
+    return run(
+        *("ns-export", "thermoxels-mesh", "--load-config", str(config), "--output-dir", str(output)),
+        *("--metres-per-unit", "1", "--pictures", "False", *options),
+    )
+
+
+def test_nothing_solid(trained: Trained, tmp_path):
+    result = export(trained.config, tmp_path, "--density-threshold", "1e9")
+    assert result.returncode == 1
+    assert "solid voxels: expected at least one" in result.stdout and "Traceback" not in result.stdout
+    assert not (tmp_path / "mesh.vtu").exists()
+
+
+def test_output_folder_that_cannot_be_written(trained: Trained, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("in the way")
+    result = export(trained.config, blocked / "export")
+    assert result.returncode == 1
+    assert "output folder: expected a folder that can be written to" in " ".join(result.stdout.split())
+
+
+def test_checkpoint_of_another_method(trained: Trained, tmp_path):
+    """The config of the thermal baseline beside a checkpoint of thermoxels."""
+    folder = tmp_path / "outputs" / "tiny" / "plenoxels-t" / "run"
+    result = run(
+        *("ns-train", "plenoxels-t", "--output-dir", str(tmp_path / "outputs"), "--experiment-name", "tiny"),
+        *("--timestamp", "run", *SHORT_TRAINING, "--max-num-iterations", "2", "--pipeline.model.refine-at", "50"),
+        *("thermal-data", "--data", str(trained.scene)),
+    )
+    assert result.returncode == 0, result.stdout
+    shutil.copy(trained.checkpoints / "step-000000039.ckpt", folder / "nerfstudio_models")
+    result = export(folder / "config.yml", tmp_path / "export")
+    assert result.returncode == 1
+    assert "checkpoint: expected a voxel grid with" in " ".join(result.stdout.split())
+    result = run("ns-eval", "--load-config", str(folder / "config.yml"), "--output-path", str(tmp_path / "e.json"))
+    assert result.returncode == 1 and "Error: checkpoint:" in result.stdout and "Traceback" not in result.stdout
+
+
+def test_config_of_a_method_without_a_grid(tmp_path):
+    result = export(tmp_path / "absent.yml", tmp_path / "export")
+    assert result.returncode == 1 and "load_config: expected the config.yml" in " ".join(result.stdout.split())

@@ -1,0 +1,121 @@
+"""The command `thermoxels`: its help, its exit statuses, and the scene it writes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import get_args
+
+import pytest
+
+from thermoxels_ns import cli
+from thermoxels_ns.data.synthetic import SCENE_NAMES, load_truth
+from thermoxels_ns.demo import SceneName
+from thermoxels_ns.errors import SceneError
+
+SMALL = ["--num-train", "3", "--num-eval", "1", "--width", "16", "--height", "12"]
+
+
+def test_the_scenes_on_the_command_line_are_those_there_are():
+    assert get_args(SceneName) == SCENE_NAMES
+
+
+@pytest.mark.parametrize("command", ["demo", "synthetic"])
+def test_help_of_every_subcommand(command, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main([command, "--help"])
+    assert stop.value.code == 0
+    words = capsys.readouterr().out
+    assert "--output-dir PATH" in words
+    assert all(name in words for name in SCENE_NAMES)
+
+
+def test_help_loads_nothing_heavy():
+    script = (
+        "import sys\n"
+        "from thermoxels_ns import cli\n"
+        "try:\n    cli.main(['--help'])\nexcept SystemExit as stop:\n    assert stop.code == 0\n"
+        "heavy = {'torch', 'nerfstudio', 'pyvista', 'matplotlib', 'scipy', 'skfem', 'cv2', 'PIL'} & set(sys.modules)\n"
+        "print('loaded:', *sorted(heavy))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert "synthetic" in done.stdout
+    assert done.stdout.splitlines()[-1] == "loaded:"
+
+
+def test_synthetic_writes_the_scene_that_was_asked_for(tmp_path, capsys):
+    folder = tmp_path / "scene [1]"
+    options = ["--thermal-format", "tiff", "--noise-k", "0.5", "--drift-k", "1", "--seed", "3"]
+    assert cli.main(["synthetic", "sphere", "--output-dir", str(folder), *SMALL, *options]) == 0
+    content = json.loads((folder / "transforms.json").read_text())
+    assert (content["w"], content["h"], len(content["frames"])) == (16, 12, 4)
+    assert {k: content["truth"][k] for k in ("seed", "noise_k")} == {"seed": 3, "noise_k": 0.5}
+    assert len(content["truth"]["drift_k"]) == 4
+    assert "thermal_camera" not in content
+    assert all((folder / frame["thermal_file_path"]).suffix == ".tiff" for frame in content["frames"])
+    truth = load_truth(folder)
+    assert truth is not None and truth.name == "sphere"
+    assert f"ns-train thermoxels thermal-data --data {folder}" in capsys.readouterr().out
+
+
+def test_synthetic_with_a_camera_for_each_band(tmp_path):
+    options = ["--own-thermal-camera", "True", "--thermal-width", "10"]
+    assert cli.main(["synthetic", "sphere", "--output-dir", str(tmp_path), *SMALL, *options]) == 0
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    assert content["thermal_camera"]["w"] == 10
+    assert all("thermal_transform_matrix" in frame for frame in content["frames"])
+
+
+def test_bad_input_is_one_sentence_and_exit_status_1(tmp_path, capsys):
+    assert cli.main(["synthetic", "sphere", "--output-dir", str(tmp_path), "--noise-k", "-1"]) == 1
+    shown = capsys.readouterr()
+    assert shown.err.splitlines() == ["Error: noise_k: expected a finite number of at least 0, got -1.0. Pass 0."]
+    assert "Traceback" not in shown.out
+
+
+def test_markup_in_a_message_is_shown_as_it_is(monkeypatch, capsys):
+    def fail(self):
+        raise SceneError("folder [bold]x[/bold] [/oops]")
+
+    monkeypatch.setattr(cli.Synthetic, "main", fail)
+    assert cli.main(["synthetic", "sphere", "--output-dir", "x"]) == 1
+    assert "folder [bold]x[/bold] [/oops]" in capsys.readouterr().err
+
+
+def test_an_error_of_the_program_is_not_hidden(monkeypatch):
+    def fail(self):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(cli.Synthetic, "main", fail)
+    with pytest.raises(RuntimeError, match="a bug"):
+        cli.main(["synthetic", "sphere", "--output-dir", "x"])
+
+
+def test_an_interrupted_command_has_its_own_status(monkeypatch, capsys):
+    def interrupt(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli.Demo, "main", interrupt)
+    assert cli.main(["demo"]) == 130
+    assert "Interrupted" in capsys.readouterr().err
+
+
+def test_unknown_scenes_and_options_are_refused():
+    for words in (["synthetic", "moon", "--output-dir", "x"], ["synthetic", "sphere"], ["demo", "--sccene", "sphere"]):
+        with pytest.raises(SystemExit) as stop:
+            cli.main(words)
+        assert stop.value.code == 2
+
+
+def test_the_entry_point_hands_the_status_to_the_shell(tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    done = subprocess.run(
+        [sys.executable, "-m", "thermoxels_ns.cli", "synthetic", "sphere", "--output-dir", str(blocked)],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("Error: output folder: expected a folder that can be written to")
+    assert "Traceback" not in done.stderr

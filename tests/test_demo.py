@@ -1,0 +1,297 @@
+"""The demo around its commands: its folder, running and failing commands, figures against targets, the whole run."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import stat
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from thermoxels_ns import cli, demo
+from thermoxels_ns.demo_commands import command_line, run_command
+from thermoxels_ns.demo_results import Target, read_results
+from thermoxels_ns.errors import OutputError, ThermoxelsError
+
+PYTHON = sys.executable
+IMAGES = {
+    "psnr": 28.0,
+    "ssim": 0.9,
+    "thermal_psnr": 30.0,
+    "thermal_ssim": 0.95,
+    "thermal_mae_c": 0.5,
+    "thermal_mae_hit_c": 0.75,
+    "thermal_mae_roi_c": 1.5,
+}
+SUMMARY = {
+    "truth": {
+        "tolerance_voxels": 1.5,
+        "fscore": 0.9,
+        "precision": 0.95,
+        "recall": 0.85,
+        "voxel_size_m": 0.017,
+        "mean_distance_voxels": 0.5,
+        "mean_distance_m": 0.0085,
+        "temperature_mae_c": 1.25,
+        "temperature_nodes": 1234,
+        "volume_m3": 0.08,
+        "true_volume_m3": 0.09,
+        "area_m2": 3.5,
+        "true_area_m2": 2.5,
+    },
+    "heat": {"energy_residual": 2e-14, "energy_before_j": 1e6, "energy_after_j": 1e6},
+    "mesh": {"tets": 60000, "nodes": 15000, "share_of_nodes_observed": 0.6},
+}
+
+
+@pytest.fixture
+def console() -> Console:
+    return Console(file=io.StringIO(), width=200)
+
+
+def shown(console: Console) -> str:
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+@pytest.fixture
+def fake_commands(tmp_path, monkeypatch):
+    """A folder of commands beside a Python of its own; gives a function that writes one."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    monkeypatch.setattr("thermoxels_ns.demo_commands.sys.executable", str(folder / "python"))
+
+    def write(name: str, body: str) -> None:
+        path = folder / name
+        path.write_text(f"#!{PYTHON}\nimport os, sys, json\n{body}\n")
+        path.chmod(path.stat().st_mode | stat.S_IXUSR)
+
+    return write
+
+
+def test_the_folder_of_an_earlier_demo_is_cleared_of_what_the_demo_wrote_only(tmp_path):
+    folder = demo.prepare_folder(tmp_path / "demo")
+    for name in ("scene/images/a.png", "export/mesh.vtu", "notes.txt"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("x")
+    outside = tmp_path / "precious"
+    outside.mkdir()
+    (outside / "kept").write_text("x")
+    (folder / "outputs").symlink_to(outside)
+    demo.prepare_folder(folder)
+    assert {path.name for path in folder.iterdir()} == {".thermoxels-demo", "notes.txt"}
+    assert (outside / "kept").is_file()
+
+
+def test_a_folder_that_is_no_demos_is_left_alone(tmp_path):
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "thesis.tex").write_text("x")
+    with pytest.raises(OutputError, match=r"output_dir: expected an empty folder.*--output-dir"):
+        demo.prepare_folder(tmp_path)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["scene", "thesis.tex"]
+
+
+def test_commands_are_written_as_a_shell_reads_them():
+    commands = [command_line(words) for words in demo.demo_commands(Path("my demo"), "sphere", iterations=7)]
+    assert commands[0] == "thermoxels synthetic sphere --output-dir 'my demo/scene'"
+    assert commands[1].startswith("ns-train thermoxels --output-dir 'my demo/outputs'")
+    assert commands[1].endswith("thermal-data --data 'my demo/scene'")
+    assert "--max-num-iterations 7" in commands[1]
+    config = "--load-config 'my demo/outputs/demo/thermoxels/run/config.yml'"
+    assert [config in command for command in commands] == [False, False, True, True, True]
+    assert "--max-num-iterations" not in command_line(demo.demo_commands(Path("demo"), "sphere")[1])
+
+
+def test_output_of_a_command_is_shown_and_kept(fake_commands, tmp_path, console):
+    fake_commands("say", "print('it says [bold]', *sys.argv[1:]); print('\\u00b0C', file=sys.stderr)")
+    run_command(["say", "a b", "c"], tmp_path / "say.log", console)
+    assert shown(console).splitlines() == ["$ say 'a b' c", "it says [bold] a b c", "°C"]
+    assert (tmp_path / "say.log").read_text(encoding="utf-8") == "it says [bold] a b c\n°C\n"
+
+
+def test_output_of_a_command_comes_while_it_runs(fake_commands, tmp_path, console):
+    gate = tmp_path / "gate"
+    # The command ends well only after its first line was shown: showing it opens the gate.
+    fake_commands(
+        "wait",
+        "import time\nprint('first')\n"
+        f"for _ in range(200):\n    if os.path.exists({str(gate)!r}): break\n    time.sleep(0.05)\n"
+        "else: sys.exit('the gate stayed shut')\nprint('second')",
+    )
+
+    class Opener(io.StringIO):
+        def write(self, text: str) -> int:
+            if "first" in text:
+                gate.write_text("open")
+            return super().write(text)
+
+    seen = Console(file=Opener(), width=200)
+    run_command(["wait"], tmp_path / "wait.log", seen)
+    assert shown(seen).splitlines()[-2:] == ["first", "second"]
+
+
+def test_a_command_draws_for_the_terminal_that_shows_it(fake_commands, tmp_path, console):
+    fake_commands("ask", "print(os.environ.get('FORCE_COLOR'), os.environ.get('COLUMNS'))")
+    run_command(["ask"], tmp_path / "ask.log", Console(file=io.StringIO(), width=77, force_terminal=True))
+    assert (tmp_path / "ask.log").read_text() == "1 77\n"
+    run_command(["ask"], tmp_path / "ask.log", console)
+    assert (tmp_path / "ask.log").read_text().startswith(f"{os.environ.get('FORCE_COLOR')} ")
+
+
+def test_a_failing_command_is_an_error_with_its_last_lines(fake_commands, tmp_path, console):
+    fake_commands("fail", "for n in range(40): print('line', n)\nsys.exit('no space left')")
+    with pytest.raises(ThermoxelsError) as caught:
+        run_command(["fail"], tmp_path / "fail.log", console)
+    message = str(caught.value)
+    assert message.startswith("fail: expected exit status 0, got 1.")
+    assert message.splitlines()[-2:] == ["    line 39", "    no space left"]
+    assert len(message.splitlines()) < 20
+    assert str(tmp_path / "fail.log") in message
+
+
+def test_a_command_of_another_environment_is_not_used(fake_commands, tmp_path, console, monkeypatch):
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "ns-train").write_text("#!/bin/sh\n")
+    (other / "ns-train").chmod(0o755)
+    monkeypatch.setenv("PATH", str(other))
+    with pytest.raises(ThermoxelsError, match=r"ns-train: expected a command in .*bin, got none"):
+        run_command(["ns-train"], tmp_path / "x.log", console)
+
+
+@pytest.mark.parametrize(
+    ("measured", "at_least", "met"),
+    [
+        *((1.0, True, True), (0.99, True, False), (math.nan, True, False)),
+        *((1.0, False, True), (1.01, False, False), (math.nan, False, False)),
+    ],
+)
+def test_a_target_is_met_at_its_bound_and_never_by_nan(measured, at_least, met):
+    target = Target("x", measured, 1.0, at_least, "{:.2f} m")
+    assert target.met is met
+    assert target.measured_text == ("not measured" if math.isnan(measured) else f"{measured:.2f} m")
+    assert target.bound_text == ("≥ 1.00 m" if at_least else "≤ 1.00 m")
+
+
+def write_results(folder: Path, images: dict, summary: dict) -> tuple[Path, Path]:
+    paths = folder / "eval.json", folder / "summary.json"
+    paths[0].write_text(json.dumps({"results": images}))
+    paths[1].write_text(json.dumps(summary))
+    return paths
+
+
+def test_figures_come_from_what_the_commands_wrote(tmp_path):
+    results = read_results(*write_results(tmp_path, IMAGES, SUMMARY))
+    assert [(t.measured, t.bound, t.at_least, t.met) for t in results.targets] == [
+        (28.0, 26.0, True, True),
+        (0.5, 1.0, False, True),
+        (0.9, 0.6, True, True),
+        (2e-14, 1e-9, False, True),
+    ]
+    others = dict(results.others)
+    assert others["Voxel size"] == "17.0 mm"
+    assert others["Distance of the surface to the true one, mean"] == "0.50 voxels, 8.5 mm"
+    assert others["Volume of the mesh"] == "0.08 m³ (true: 0.09 m³)"
+
+
+def test_a_figure_that_does_not_exist_misses_its_target(tmp_path):
+    truth = SUMMARY["truth"] | {"fscore": None, "mean_distance_m": None}
+    results = read_results(*write_results(tmp_path, IMAGES, SUMMARY | {"truth": truth}))
+    assert [t.met for t in results.targets] == [True, True, False, True]
+    assert results.targets[2].measured_text == "not measured"
+
+
+@pytest.mark.parametrize(
+    ("images", "summary", "message"),
+    [
+        ({}, SUMMARY, "eval.json: results: expected a number under psnr, got 'nothing'"),
+        (IMAGES | {"psnr": "28"}, SUMMARY, "a number under psnr, got '28'"),
+        (IMAGES | {"psnr": True}, SUMMARY, "a number under psnr, got True"),
+        (IMAGES, SUMMARY | {"truth": None}, "summary.json: truth: expected an object, got None"),
+        (IMAGES, SUMMARY | {"heat": {"computed": False}}, "a number under energy_residual"),
+    ],
+)
+def test_a_missing_figure_is_named(tmp_path, images, summary, message):
+    with pytest.raises(ThermoxelsError, match=message):
+        read_results(*write_results(tmp_path, images, summary))
+    (tmp_path / "eval.json").write_text("{")
+    with pytest.raises(ThermoxelsError, match="readable json"):
+        read_results(tmp_path / "eval.json", tmp_path / "summary.json")
+
+
+@pytest.fixture
+def quick_demo(fake_commands, monkeypatch):
+    """A demo on a tiny scene whose commands write what the real ones would, without training."""
+    for name, value in (("_TRAIN_VIEWS", 3), ("_HELD_OUT_VIEWS", 2), ("_WIDTH", 16), ("_HEIGHT", 12)):
+        monkeypatch.setattr(demo, name, value)
+    after = "def after(name): return sys.argv[sys.argv.index(name) + 1]\n"
+    picture = "from PIL import Image\n"
+    fake_commands("ns-train", after + "assert os.path.isfile(after('--data') + '/transforms.json')")
+    fake_commands("ns-eval", after + f"json.dump({{'results': {IMAGES}}}, open(after('--output-path'), 'w'))")
+    fake_commands(
+        "ns-render",
+        after
+        + picture
+        + "for output in ('gt-rgb', 'rgb', 'gt-thermal', 'thermal'):\n"
+        + "    folder = os.path.join(after('--output-path'), 'test', output)\n"
+        + "    os.makedirs(folder)\n"
+        + "    for n in (1, 2): Image.new('RGB', (16, 12)).save(f'{folder}/frame_eval_{n:05d}.png')",
+    )
+
+    def export(summary: dict) -> None:
+        fake_commands(
+            "ns-export",
+            after
+            + picture
+            + "folder = after('--output-dir')\nos.makedirs(folder)\n"
+            + "Image.new('RGB', (8, 6)).save(f'{folder}/mesh-measured.png')\n"
+            + "both = Image.new('RGB', (16, 6), 'red')\nboth.paste('blue', (8, 0, 16, 6))\n"
+            + "both.save(f'{folder}/heat.png')\n"
+            + f"json.dump({summary}, open(f'{{folder}}/summary.json', 'w'))",
+        )
+
+    export(SUMMARY)
+    return export
+
+
+def test_the_whole_demo_leaves_a_page(quick_demo, tmp_path, capfd):
+    folder = tmp_path / "demo"
+    assert cli.main(["demo", "--output-dir", str(folder), "--scene", "sphere"]) == 0
+    out = capfd.readouterr().out
+    positions = [out.index(f"{n}/6  ") for n in range(1, 7)]
+    assert positions == sorted(positions)
+    for word in ("ns-train thermoxels", "ns-eval", "ns-render dataset", "ns-export thermoxels-mesh"):
+        assert f"$ {word} " in out
+    page = (folder / "index.html").read_text(encoding="utf-8")
+    assert "Thermoxels demo: sphere" in page
+    assert page.count("<img") == 2 * 6 + 4 * 2 + 3
+    assert ">10.0<" in page and ">40.0&nbsp;°C<" in page  # the bounds of the sphere's temperatures
+    assert page.count(">yes<") == 4 and ">no<" not in page
+    assert sorted(path.name for path in (folder / "logs").iterdir()) == [
+        *("ns-eval.log", "ns-export.log", "ns-render.log", "ns-train.log")
+    ]
+    assert cli.main(["demo", "--output-dir", str(folder), "--scene", "sphere"]) == 0
+
+
+def test_a_missed_target_is_shown_and_fails_after_the_page_is_written(quick_demo, tmp_path, capfd):
+    quick_demo(SUMMARY | {"truth": SUMMARY["truth"] | {"fscore": 0.59}})
+    assert cli.main(["demo", "--output-dir", str(tmp_path / "demo"), "--scene", "sphere"]) == 1
+    error = capfd.readouterr().err
+    assert "Surface F-score at 1.5 voxels 0.590 (target ≥ 0.600)" in error
+    assert "RGB PSNR" not in error
+    assert ">no<" in (tmp_path / "demo" / "index.html").read_text(encoding="utf-8")
+
+
+def test_a_failing_step_stops_the_demo(quick_demo, fake_commands, tmp_path, capfd):
+    fake_commands("ns-eval", "sys.exit('checkpoint not found')")
+    assert cli.main(["demo", "--output-dir", str(tmp_path / "demo"), "--scene", "sphere"]) == 1
+    shown_text = capfd.readouterr()
+    assert "ns-eval: expected exit status 0, got 1" in shown_text.err
+    assert "checkpoint not found" in shown_text.err
+    assert "4/6" not in shown_text.out
+    assert not (tmp_path / "demo" / "index.html").exists()

@@ -1,0 +1,223 @@
+"""Each file in configs/ says what the command that reads it does, and each entry point leads to it."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import sys
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from nerfstudio.configs.method_configs import method_configs
+from nerfstudio.plugins.registry_dataparser import discover_dataparsers
+from nerfstudio.plugins.types import MethodSpecification
+
+from thermoxels_ns import config, presets
+from thermoxels_ns.errors import HeatError, ThermoxelsError
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.presets import HeatPreset, heat_preset_names, load_heat_preset
+from thermoxels_ns.fem.problem import TimeSteps
+from thermoxels_ns.presets import read_preset, with_overrides
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+METHODS: dict[str, str] = PROJECT["entry-points"]["nerfstudio.method_configs"]
+DATAPARSERS: dict[str, str] = PROJECT["entry-points"]["nerfstudio.dataparser_configs"]
+
+FILES = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
+HEAT = [name for name in FILES if name.startswith("heat-")]
+METHOD_FILES = [name for name in FILES if name not in HEAT]
+
+
+def _object(reference: str) -> Any:
+    """What an entry point names."""
+    module, _, name = reference.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def _leaves(content: Mapping[str, Any], above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Paths and values of a nested mapping."""
+    for key, value in content.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, (*above, key))
+        else:
+            yield (*above, key), value
+
+
+def _at(tree: Any, path: tuple[str, ...]) -> Any:
+    """The value that a nested configuration has at a path."""
+    for key in path:
+        tree = tree[key] if isinstance(tree, Mapping) else getattr(tree, key)
+    return list(tree) if isinstance(tree, tuple) else tree
+
+
+def _settings(name: str) -> dict[str, Any]:
+    """What a preset of a method changes."""
+    content = yaml.safe_load((ROOT / "configs" / f"{name}.yaml").read_text(encoding="utf-8"))
+    content.pop("description")
+    return content
+
+
+def test_every_file_belongs_to_a_command() -> None:
+    assert METHOD_FILES and HEAT
+    assert set(METHOD_FILES) == set(METHODS) - {"thermoxels"}
+    assert [name.removeprefix("heat-") for name in HEAT] == heat_preset_names()
+
+
+@pytest.mark.parametrize("name", METHOD_FILES)
+def test_a_method_has_the_values_of_its_file(name: str) -> None:
+    specification = _object(METHODS[name])
+    for path, value in _leaves(_settings(name)):
+        assert _at(specification.config, path) == value, ".".join(path)
+    assert specification.description == read_preset(name)["description"]
+
+
+@pytest.mark.parametrize("name", METHOD_FILES)
+def test_a_method_repeats_no_default(name: str) -> None:
+    base = config.thermoxels.config
+    repeated = [".".join(path) for path, value in _leaves(_settings(name)) if _at(base, path) == value]
+    assert repeated == []
+
+
+@pytest.mark.parametrize("name", METHOD_FILES)
+def test_a_method_differs_from_the_base_only_where_its_file_says(name: str) -> None:
+    """Also in types: the optimizers of a preset may be of another class, their settings come from the file."""
+    changed = {path for path, _ in _leaves(_settings(name))}
+    base = dataclasses.asdict(config.thermoxels.config)
+    ours = dataclasses.asdict(_object(METHODS[name]).config)
+    classes = {"_target"}
+    differing = {
+        path
+        for path, value in _leaves(ours)
+        if _at(base, path) != (list(value) if isinstance(value, tuple) else value) and path[-1] not in classes
+    }
+    if differing - changed:
+        # Fields that the other class of optimizer adds or chooses for itself.
+        assert all(path[0] == "optimizers" and path[2] == "optimizer" for path in differing - changed)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_method_goes_through_the_file_that_training_saves(name: str) -> None:
+    """``ns-train`` writes config.yml with yaml.dump; ``--load-config`` reads it with yaml.Loader."""
+    ours = _object(METHODS[name]).config
+    again = yaml.load(yaml.dump(ours), Loader=yaml.Loader)
+    assert again == ours
+    assert again is not ours
+    # Equality of dataclasses does not look at what a subclass compares by identity: look at the text as well.
+    assert yaml.dump(again) == yaml.dump(ours)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_an_entry_point_of_a_method_leads_to_it(name: str) -> None:
+    specification = _object(METHODS[name])
+    assert isinstance(specification, MethodSpecification)
+    assert specification.config.method_name == name
+    # What ns-train offers.
+    assert method_configs[name] == specification.config
+
+
+def test_methods_share_no_configuration() -> None:
+    """An option that ns-train changes in one method does not appear in another."""
+    seen: set[int] = set()
+    for reference in METHODS.values():
+        pipeline = _object(reference).config.pipeline
+        parts = {id(pipeline), id(pipeline.datamanager), id(pipeline.datamanager.dataparser), id(pipeline.model)}
+        assert len(parts) == 4
+        assert not parts & seen
+        seen |= parts
+
+
+@pytest.mark.parametrize("name", DATAPARSERS)
+def test_an_entry_point_of_a_dataparser_leads_to_it(name: str) -> None:
+    found, descriptions = discover_dataparsers()
+    specification = _object(DATAPARSERS[name])
+    assert found[name] == specification.config
+    assert descriptions[name] == specification.description
+
+
+def test_the_command_line_is_callable() -> None:
+    assert callable(_object(PROJECT["scripts"]["thermoxels"]))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        ({"iterations": 3}, "mine.iterations"),
+        ({"pipeline": {"model": {"resolution": [64]}}}, "mine.pipeline.model.resolution"),
+        ({"optimizers": {"colour": {"optimizer": {"lr": 1.0}}}}, "mine.optimizers.colour"),
+        ({"optimizers": {"sh": {"optimizer": {"rate": 1.0}}}}, "mine.optimizers.sh.optimizer.rate"),
+    ],
+)
+def test_an_unknown_key_is_named(overrides: dict[str, Any], named: str) -> None:
+    with pytest.raises(ThermoxelsError, match=f"^{named}: expected one of "):
+        with_overrides(config.thermoxels.config, overrides, "mine")
+
+
+def test_overrides_leave_the_base_alone() -> None:
+    before = yaml.dump(config.thermoxels.config)
+    changed = with_overrides(
+        config.thermoxels.config,
+        {"pipeline": {"model": {"resolutions": [8, 16]}}, "optimizers": {"sh": {"optimizer": {"lr": 9.0}}}},
+    )
+    assert changed.pipeline.model.resolutions == (8, 16)
+    assert changed.optimizers["sh"]["optimizer"].lr == 9.0
+    assert yaml.dump(config.thermoxels.config) == before
+
+
+def test_an_unknown_preset_lists_the_known() -> None:
+    with pytest.raises(ThermoxelsError, match=r"preset: expected one of .*thermoxels-paper.*got cheese"):
+        read_preset("cheese")
+
+
+def test_a_preset_that_is_no_mapping_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "mine.yaml").write_text("- a\n- list\n")
+    monkeypatch.setattr(presets, "preset_folder", lambda: tmp_path)
+    with pytest.raises(ThermoxelsError, match=r"^mine\.yaml: expected a mapping, got list"):
+        read_preset("mine")
+
+
+@pytest.mark.parametrize("name", HEAT)
+def test_heat_settings_are_those_of_the_file_and_go_round(name: str, tmp_path: Path) -> None:
+    path = ROOT / "configs" / f"{name}.yaml"
+    preset = load_heat_preset(name.removeprefix("heat-"))
+    leaves = dict(_leaves(yaml.safe_load(path.read_text(encoding="utf-8"))))
+    assert leaves == dict(_leaves(preset.as_mapping()))
+    copy = tmp_path / "copy.yaml"
+    copy.write_text(yaml.safe_dump(preset.as_mapping()), encoding="utf-8")
+    assert load_heat_preset(str(copy)) == preset
+
+
+@pytest.mark.parametrize("part", [HeatPreset, Material, TimeSteps])
+def test_heat_settings_have_no_defaults_to_repeat(part: type) -> None:
+    missing = dataclasses.MISSING
+    assert all(field.default is missing and field.default_factory is missing for field in dataclasses.fields(part))
+
+
+@pytest.mark.parametrize("name", HEAT)
+@pytest.mark.parametrize("where", [(), ("material",), ("time",)])
+def test_an_unknown_heat_key_is_refused(name: str, where: tuple[str, ...], tmp_path: Path) -> None:
+    content = yaml.safe_load((ROOT / "configs" / f"{name}.yaml").read_text(encoding="utf-8"))
+    _at(content, where)["cheese"] = 1
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump(content), encoding="utf-8")
+    with pytest.raises(HeatError, match=r"^mine\.yaml.*: expected the keys .*cheese"):
+        load_heat_preset(str(path))
+
+
+def test_an_installed_package_brings_the_presets(tmp_path: Path) -> None:
+    """The wheel holds configs/ inside the package, where `preset_folder` looks first."""
+    from hatchling.builders.wheel import WheelBuilder
+
+    (wheel,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
+    with zipfile.ZipFile(wheel) as archive:
+        held = {Path(name).stem for name in archive.namelist() if name.startswith("thermoxels_ns/configs/")}
+    assert set(FILES) <= held

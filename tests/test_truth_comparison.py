@@ -1,0 +1,215 @@
+"""Solid voxels made from the exact scene score as they must, and every shift, scale and error is noticed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.data.synthetic import make_scene, write_scene
+from thermoxels_ns.errors import MeshError, SceneError
+from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.mesh.build import build_voxel_mesh
+from thermoxels_ns.mesh.solid import SolidSelection
+from thermoxels_ns.snapshot import GridSnapshot
+from thermoxels_ns.truth_comparison import KnownTruth, compare_with_truth, load_known_truth
+
+IDENTITY = np.eye(4)
+
+
+@pytest.fixture(scope="module")
+def hot_object() -> KnownTruth:
+    scene = make_scene("hot-object")
+    return KnownTruth(scene, scene.poses(12, 0)[0], scene.camera(64, 48))
+
+
+@pytest.fixture(scope="module")
+def sphere() -> KnownTruth:
+    scene = make_scene("sphere")
+    return KnownTruth(scene, scene.poses(12, 0)[0], scene.camera(64, 48))
+
+
+def exact_cells(truth: KnownTruth, resolution: int = 24) -> tuple[np.ndarray, Lattice]:
+    lattice = Lattice.covering(*truth.scene.scene_box, resolution)
+    centres = lattice.cell_centres().reshape(-1, 3)
+    return truth.scene.contains(centres).reshape(lattice.cell_shape), lattice
+
+
+def exact_mesh(truth: KnownTruth, world_to_metres: np.ndarray = IDENTITY, observed: float = 5.0):
+    """Mesh of the exact voxels with the exact temperatures at its nodes."""
+    cells, lattice = exact_cells(truth)
+    corners = lattice.corner_positions().reshape(-1, 3)
+    density = -truth.scene.signed_distance(corners).reshape(lattice.shape)
+    snapshot = GridSnapshot(
+        lattice,
+        np.maximum(density, 0.0).astype(np.float32),
+        truth.scene.surface_temperature_c(corners).reshape(lattice.shape).astype(np.float32),
+        np.full(lattice.shape, observed, dtype=np.float32),
+    )
+    selection = SolidSelection(density_threshold=1e-6, largest_component=False)
+    return build_voxel_mesh(snapshot, selection, world_to_metres)[0], cells, lattice
+
+
+def compare(*args, **kwargs) -> dict:
+    result = compare_with_truth(*args, **kwargs)
+    assert result is not None
+    return result
+
+
+@pytest.mark.parametrize("name", ["hot_object", "sphere"])
+def test_exact_voxels_agree_with_their_scene(name, request):
+    truth = request.getfixturevalue(name)
+    cells, lattice = exact_cells(truth)
+    result = compare(cells, lattice, IDENTITY, truth)
+    assert result["precision"] == 1.0
+    assert result["recall"] > 0.99
+    assert result["mean_distance_voxels"] < 0.5
+    assert result["mean_distance_m"] == pytest.approx(result["mean_distance_voxels"] * lattice.voxel_size)
+    assert result["voxel_size_m"] == lattice.voxel_size
+    assert result["true_area_m2"] == truth.scene.area_m2
+    assert "temperature_mae_c" not in result
+
+
+def test_volume_and_area_of_a_ball_are_those_of_its_voxels(sphere):
+    cells, lattice = exact_cells(sphere)
+    result = compare(cells, lattice, IDENTITY, sphere)
+    assert result["volume_m3"] == pytest.approx(np.count_nonzero(cells) * lattice.voxel_size**3)
+    assert result["volume_m3"] == pytest.approx(result["true_volume_m3"], rel=0.02)
+    # The faces of a digitised convex body cover each of its three shadows twice: 6 pi r^2 for a ball of area 4 pi r^2.
+    assert result["area_m2"] == pytest.approx(1.5 * result["true_area_m2"], rel=0.05)
+
+
+def test_a_hollow_ball_scores_like_a_full_one(sphere):
+    cells, lattice = exact_cells(sphere)
+    full = compare(cells, lattice, IDENTITY, sphere)
+    hollow = cells.copy()
+    middle = tuple(slice(n // 2 - 3, n // 2 + 3) for n in cells.shape)
+    hollow[middle] = False
+    result = compare(hollow, lattice, IDENTITY, sphere)
+    assert {k: result[k] for k in ("precision", "recall", "fscore")} == {
+        k: full[k] for k in ("precision", "recall", "fscore")
+    }
+    assert result["filled_volume_m3"] == full["volume_m3"] > result["volume_m3"]
+    assert result["area_m2"] == pytest.approx(full["area_m2"] + 6 * 36 * lattice.voxel_size**2)
+
+
+def test_shifted_voxels_lose_score(sphere):
+    cells, lattice = exact_cells(sphere)
+    shift = IDENTITY.copy()
+    shift[0, 3] = 4 * lattice.voxel_size
+    result = compare(cells, lattice, shift, sphere)
+    assert result["fscore"] < 0.6
+    # The surface moved by d along x: the distance is d |cos|, on average d / 2.
+    assert result["mean_distance_voxels"] == pytest.approx(2.0, abs=0.2)
+
+
+def test_a_rotated_and_scaled_world_gives_the_same_figures(hot_object):
+    mesh, cells, lattice = exact_mesh(hot_object)
+    plain = compare(cells, lattice, IDENTITY, hot_object, mesh)
+    # The same voxels in a world that is 1 / 0.4 as large and shifted.
+    world_to_truth = np.diag([0.4, 0.4, 0.4, 1.0])
+    world_to_truth[:3, 3] = (0.1, -0.2, 0.3)
+    lo = (np.asarray(lattice.lo) - world_to_truth[:3, 3]) / 0.4
+    other = Lattice(tuple(lo), lattice.voxel_size / 0.4, lattice.shape)
+    assert compare(cells, other, world_to_truth, hot_object, mesh) == pytest.approx(plain)
+
+
+def test_exact_temperatures_have_no_error_and_an_offset_is_found(hot_object):
+    mesh, cells, lattice = exact_mesh(hot_object)
+    result = compare(cells, lattice, IDENTITY, hot_object, mesh)
+    assert result["temperature_nodes"] > 500
+    assert result["temperature_mae_c"] == pytest.approx(0.0, abs=1e-5)
+    warmer = replace(mesh, temperature_c=mesh.temperature_c - 2.5)
+    assert compare(cells, lattice, IDENTITY, hot_object, warmer)["temperature_mae_c"] == pytest.approx(2.5)
+
+
+def test_only_measured_boundary_nodes_near_the_surface_count(hot_object):
+    mesh, cells, lattice = exact_mesh(hot_object)
+    boundary = np.unique(mesh.facets)
+    inner = np.setdiff1d(np.arange(len(mesh.points_m)), boundary)
+    far = boundary[: len(boundary) // 2]
+    temperature_c, observed, points_m = mesh.temperature_c.copy(), mesh.observed.copy(), mesh.points_m.copy()
+    temperature_c[inner] += 100.0
+    temperature_c[far[::2]] += 100.0
+    observed[far[::2]] = False
+    temperature_c[far[1::2]] += 100.0
+    points_m[far[1::2]] += 10.0
+    changed = replace(mesh, temperature_c=temperature_c, observed=observed, points_m=points_m)
+    result = compare(cells, lattice, IDENTITY, hot_object, changed)
+    kept = mesh.points_m[boundary[len(boundary) // 2 :]]
+    near = np.abs(hot_object.scene.signed_distance(kept)) <= 1.5 * lattice.voxel_size
+    assert result["temperature_nodes"] == np.count_nonzero(near) > 500
+    assert result["temperature_mae_c"] == pytest.approx(0.0, abs=1e-5)
+    unseen = replace(mesh, observed=np.zeros_like(mesh.observed))
+    result = compare(cells, lattice, IDENTITY, hot_object, unseen)
+    assert (result["temperature_nodes"], result["temperature_mae_c"]) == (0, None)
+
+
+def test_the_scale_of_the_mesh_is_undone(hot_object):
+    mesh, cells, lattice = exact_mesh(hot_object)
+    scaled = replace(mesh, points_m=3.0 * mesh.points_m)
+    result = compare(cells, lattice, IDENTITY, hot_object, scaled, metres_per_unit=3.0)
+    assert result == pytest.approx(compare(cells, lattice, IDENTITY, hot_object, mesh))
+    with pytest.raises(MeshError, match="metres_per_unit"):
+        compare(cells, lattice, IDENTITY, hot_object, mesh, metres_per_unit=0.0)
+
+
+def test_surfaces_that_few_training_cameras_see_are_not_asked_for(hot_object):
+    # Nobody sees the table's underside, three tenths of the scene's surface.
+    cells, lattice = exact_cells(hot_object, 40)
+    seen = compare(cells, lattice, IDENTITY, hot_object)["true_points_seen"]
+    everywhere = hot_object.scene.surface_points(20_000, 0)[0]
+    assert seen < 0.8 * len(everywhere)
+    two = replace(hot_object, training_poses=hot_object.training_poses[:2])
+    with pytest.raises(SceneError, match="training cameras: expected a part of the surface that at least 3"):
+        compare_with_truth(cells, lattice, IDENTITY, two)
+
+
+def test_truth_comes_from_the_folder_with_training_cameras_only(tmp_path):
+    scene = make_scene("sphere")
+    write_scene(scene, tmp_path, num_train=5, num_eval=2, width=16, height=12, progress=False)
+    known = load_known_truth(tmp_path)
+    assert known is not None
+    assert known.scene.name == "sphere"
+    np.testing.assert_allclose(known.training_poses, scene.poses(5, 2)[0])
+    assert known.camera == scene.camera(16, 12)
+    from_json = load_known_truth(tmp_path / "transforms.json")
+    assert from_json is not None
+    np.testing.assert_array_equal(from_json.training_poses, known.training_poses)
+    cells, lattice = exact_cells(known, 16)
+    by_folder = compare(cells, lattice, IDENTITY, tmp_path)
+    assert by_folder == compare(cells, lattice, IDENTITY, known)
+    assert json.loads(json.dumps(by_folder)) == by_folder
+
+
+def test_real_photographs_have_no_truth(tmp_path):
+    cells = np.ones((1, 1, 1), dtype=bool)
+    lattice = Lattice((0, 0, 0), 1.0, (2, 2, 2))
+    assert compare_with_truth(cells, lattice, IDENTITY, tmp_path) is None
+    (tmp_path / "transforms.json").write_text('{"frames": []}')
+    assert compare_with_truth(cells, lattice, IDENTITY, tmp_path) is None
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: content.pop("fl_x"),
+        lambda content: content.update(w="wide"),
+        lambda content: content.update(frames=[]),
+        lambda content: content["frames"][0].pop("transform_matrix"),
+        lambda content: content["frames"][0]["transform_matrix"][0].__setitem__(0, float("nan")),
+        lambda content: content["frames"][0].update(transform_matrix=[[1.0]]),
+        lambda content: content.update(frames=[7]),
+    ],
+)
+def test_a_damaged_scene_is_named(tmp_path: Path, damage):
+    write_scene(make_scene("sphere"), tmp_path, num_train=3, num_eval=0, width=8, height=6, progress=False)
+    path = tmp_path / "transforms.json"
+    content = json.loads(path.read_text())
+    damage(content)
+    path.write_text(json.dumps(content))
+    with pytest.raises(SceneError, match="Write the synthetic scene again"):
+        load_known_truth(tmp_path)

@@ -1,0 +1,126 @@
+"""The command ``thermoxels``: what nerfstudio's own commands do not offer.
+
+Only light imports at the top, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, Union
+
+import tyro
+
+from thermoxels_ns.demo import Demo, SceneName
+from thermoxels_ns.errors import ThermoxelsError
+
+
+@dataclass
+class Synthetic:
+    """Write a synthetic scene, whose shape and temperature are known exactly, as photographs and thermal images."""
+
+    scene: tyro.conf.Positional[SceneName]
+    """Which scene."""
+    output_dir: Path
+    """Folder for the scene, in the ThermoScenes layout; made if it does not exist. An earlier synthetic scene in it is
+    replaced."""
+    num_train: int = 42
+    """Training views."""
+    num_eval: int = 6
+    """Held-out views, half-way between training views."""
+    width: int = 320
+    """Width of the photographs, [pixels]."""
+    height: int = 240
+    """Height of the photographs, [pixels]."""
+    thermal_width: int | None = None
+    """Width of the thermal images, [pixels]; that of the photographs by default, half of it with
+    --own-thermal-camera True."""
+    thermal_format: Literal["png16", "tiff", "npy"] = "png16"
+    """16-bit PNG that spans the temperature bounds, 16-bit TIFF of centikelvin counts, or float32 numpy in degrees
+    Celsius."""
+    noise_k: float = 0.0
+    """Standard deviation of the noise in every thermal pixel, [K]."""
+    drift_k: float = 0.0
+    """Standard deviation of one temperature offset per thermal image, [K], as uncooled cameras have it."""
+    seed: int = 0
+    """Seed of noise and drift; the same seed writes the same files."""
+    own_thermal_camera: bool = False
+    """Take the thermal images with a second camera beside the first, with a lens and poses of its own."""
+
+    def main(self) -> None:
+        """Write the scene.
+
+        Raises:
+            ThermoxelsError: An option is out of range or the folder cannot be used.
+        """
+        from rich.console import Console
+
+        from thermoxels_ns.data.synthetic import make_scene, write_scene
+
+        folder = write_scene(
+            make_scene(self.scene),
+            self.output_dir,
+            num_train=self.num_train,
+            num_eval=self.num_eval,
+            width=self.width,
+            height=self.height,
+            thermal_width=self.thermal_width,
+            thermal_format=self.thermal_format,
+            noise_k=self.noise_k,
+            drift_k=self.drift_k,
+            seed=self.seed,
+            own_thermal_camera=self.own_thermal_camera,
+        )
+        Console(highlight=False).print(
+            f"Written to {folder}. Train with: ns-train thermoxels thermal-data --data {folder}",
+            markup=False,
+            soft_wrap=True,
+        )
+
+
+Commands = tyro.conf.FlagConversionOff[
+    Union[  # noqa: UP007 - read by tyro
+        Annotated[Demo, tyro.conf.subcommand(name="demo")],
+        Annotated[Synthetic, tyro.conf.subcommand(name="synthetic")],
+    ]
+]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a subcommand.
+
+    Args:
+        arguments: The words after ``thermoxels``; those of this process if left out.
+
+    Returns:
+        The exit status: 0, 1 for an error of the input (which is printed), 130 if the user interrupted it.
+    """
+    command = tyro.cli(
+        Commands, prog="thermoxels", args=arguments, description="RGB and thermal photographs to a solid with heat."
+    )
+    try:
+        command.main()
+    except ThermoxelsError as problem:
+        _complain("[bold red]Error:[/bold red]", str(problem))
+        return 1
+    except KeyboardInterrupt:
+        _complain("[bold red]Interrupted.[/bold red]")
+        return 130
+    return 0
+
+
+def entrypoint() -> None:
+    """Entry point of the console script."""
+    sys.exit(main())
+
+
+def _complain(heading: str, message: str = "") -> None:
+    from rich.console import Console
+    from rich.markup import escape
+
+    Console(stderr=True, highlight=False).print(f"{heading} {escape(message)}", soft_wrap=True)
+
+
+if __name__ == "__main__":
+    entrypoint()

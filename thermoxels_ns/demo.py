@@ -1,0 +1,314 @@
+"""The command ``thermoxels demo``: a synthetic scene from photographs to heat flow, held against its exact truth.
+
+Only light imports at the top, so that ``thermoxels --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+import webbrowser
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from thermoxels_ns.checks import replace_when_done, writable_folder
+from thermoxels_ns.errors import OutputError, ThermoxelsError, explain
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+    from rich.console import Console
+
+    from thermoxels_ns.demo_page import ColourBar, DemoPage
+    from thermoxels_ns.demo_results import DemoResults
+
+SceneName = Literal["hot-object", "house-corner", "sphere"]
+"""The synthetic scenes."""
+
+_MARKER = ".thermoxels-demo"
+_WRITTEN = ("index.html", "scene", "outputs", "eval.json", "eval", "renders", "export", "logs")
+_NUM_STEPS = 6
+_TRAIN_VIEWS, _HELD_OUT_VIEWS, _WIDTH, _HEIGHT = 42, 6, 320, 240
+_INPUTS_SHOWN = 6
+_COLOUR_MAP = "inferno"
+_COLOUR_STOPS = 17
+
+
+@dataclass
+class Demo:
+    """Make a synthetic scene, train, evaluate, export and simulate, and compare the result with the exact truth."""
+
+    output_dir: Path = Path("demo")
+    """Folder for all results; made if it does not exist. An earlier demo in it is replaced."""
+    scene: SceneName = "hot-object"
+    """Synthetic scene to photograph. The targets are set for hot-object."""
+    iterations: int | None = None
+    """Training steps; the default of the method if left out."""
+    open_browser: bool = False
+    """Show the page in a web browser at the end."""
+
+    def main(self) -> None:
+        """Run the demo.
+
+        Raises:
+            ThermoxelsError: The folder holds something else, a command failed, or a target was missed.
+        """
+        from rich.console import Console
+
+        run_demo(self, Console(highlight=False))
+
+
+@dataclass
+class _Steps:
+    """Announces steps and remembers how long each took."""
+
+    console: Console
+    seconds: list[tuple[str, float]] = field(default_factory=list)
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Announce a step and time what happens in it."""
+        self.console.rule(f"[bold]{len(self.seconds) + 1}/{_NUM_STEPS}  {name}")
+        start = time.monotonic()
+        yield
+        self.seconds.append((name, time.monotonic() - start))
+
+
+def run_demo(demo: Demo, console: Console) -> None:
+    """Run all steps; see `Demo`."""
+    from thermoxels_ns.data.synthetic import make_scene, write_scene
+    from thermoxels_ns.demo_commands import command_line, run_command
+    from thermoxels_ns.demo_page import build_page
+    from thermoxels_ns.demo_results import read_results
+
+    folder = prepare_folder(demo.output_dir)
+    logs = writable_folder(folder / "logs")
+    steps = _Steps(console)
+    commands = demo_commands(folder, demo.scene, demo.iterations)
+
+    with steps.step("Photograph the synthetic scene"):
+        console.print(f"$ {command_line(commands[0])}", style="bold", markup=False, soft_wrap=True)
+        write_scene(make_scene(demo.scene), folder / "scene", _TRAIN_VIEWS, _HELD_OUT_VIEWS, _WIDTH, _HEIGHT)
+    for name, command in zip(("Train", "Evaluate", "Render", "Export the mesh and let heat flow"), commands[1:]):
+        with steps.step(name):
+            run_command(command, logs / f"{command[0]}.log", console)
+    with steps.step("Compare with the truth"):
+        results = read_results(folder / "eval.json", folder / "export" / "summary.json")
+        print_results(results, console)
+
+    shown = [command_line(command) for command in commands]
+    page = assemble_page(folder, demo.scene, results, steps.seconds, shown)
+    index = folder / "index.html"
+    with replace_when_done(index) as temporary:
+        temporary.write_text(build_page(page), encoding="utf-8")
+    console.print(f"All pictures and figures: {index}", markup=False, soft_wrap=True)
+    if demo.open_browser:
+        webbrowser.open(index.resolve().as_uri())
+    missed = [f"{t.name} {t.measured_text} (target {t.bound_text})" for t in results.targets if not t.met]
+    if missed:
+        raise ThermoxelsError(
+            explain("demo", expected="every target met", got="; ".join(missed), remedy=f"See {index} for pictures.")
+        )
+
+
+def prepare_folder(path: Path) -> Path:
+    """Make the folder of a demo, without the results of an earlier demo.
+
+    Only what a demo writes is deleted, and only in a folder that a demo has marked as its own.
+
+    Raises:
+        OutputError: The folder holds something and is not a demo's, or cannot be written to.
+    """
+    folder = writable_folder(path)
+    marker = folder / _MARKER
+    if not marker.is_file() and any(folder.iterdir()):
+        raise OutputError(
+            explain(
+                "output_dir",
+                expected="an empty folder or one of an earlier demo",
+                got=f"{folder}, which holds other files",
+                remedy="Pass another folder with --output-dir.",
+            )
+        )
+    marker.write_text("Made by `thermoxels demo`, which replaces: " + ", ".join(_WRITTEN) + "\n")
+    for name in _WRITTEN:
+        old = folder / name
+        if old.is_dir() and not old.is_symlink():
+            shutil.rmtree(old)
+        else:
+            old.unlink(missing_ok=True)
+    return folder
+
+
+def demo_commands(folder: Path, scene: str, iterations: int | None = None) -> list[list[str]]:
+    """The commands of the demo in order: synthetic, ns-train, ns-eval, ns-render, ns-export."""
+    config = str(folder / "outputs" / "demo" / "thermoxels" / "run" / "config.yml")
+    steps = [] if iterations is None else ["--max-num-iterations", str(iterations)]
+    return [
+        ["thermoxels", "synthetic", scene, "--output-dir", str(folder / "scene")],
+        [
+            *("ns-train", "thermoxels", "--output-dir", str(folder / "outputs")),
+            *("--experiment-name", "demo", "--timestamp", "run", "--vis", "tensorboard", *steps),
+            # One line every hundred steps instead of a block that is drawn over and over.
+            *("--logging.steps-per-log", "100", "--logging.local-writer.max-log-size", "0"),
+            *("--logging.profiler", "none", "thermal-data", "--data", str(folder / "scene")),
+        ],
+        [
+            *("ns-eval", "--load-config", config, "--output-path", str(folder / "eval.json")),
+            *("--render-output-path", str(folder / "eval")),
+        ],
+        [
+            *("ns-render", "dataset", "--load-config", config, "--split", "test"),
+            *("--rendered-output-names", "gt-rgb", "rgb", "gt-thermal", "thermal"),
+            *("--image-format", "png", "--colormap-options.colormap", _COLOUR_MAP),
+            *("--output-path", str(folder / "renders")),
+        ],
+        [
+            *("ns-export", "thermoxels-mesh", "--load-config", config),
+            *("--output-dir", str(folder / "export"), "--metres-per-unit", "1"),
+        ],
+    ]
+
+
+def print_results(results: DemoResults, console: Console) -> None:
+    """Print the figures with a target as a table."""
+    from rich.table import Table
+
+    table = Table()
+    table.add_column("")
+    table.add_column("measured", justify="right")
+    table.add_column("target", justify="right")
+    table.add_column("met")
+    for target in results.targets:
+        met = "[green]yes[/green]" if target.met else "[bold red]no[/bold red]"
+        table.add_row(target.name, target.measured_text, target.bound_text, met)
+    console.print(table)
+
+
+def assemble_page(
+    folder: Path, scene: str, results: DemoResults, seconds: Sequence[tuple[str, float]], commands: Sequence[str]
+) -> DemoPage:
+    """Gather the pictures of a demo run for its page.
+
+    Raises:
+        ThermoxelsError: A picture that a command should have written is missing.
+    """
+    from thermoxels_ns.demo_page import Check, DemoPage, Figure, HeldOutView
+
+    bar = _colour_bar(folder / "scene")
+    renders = folder / "renders" / "test"
+    names = sorted(path.name for path in (folder / "scene" / "images").glob("frame_eval_*.png"))
+    export = folder / "export"
+    before, after = _halves(export / "heat.png")
+    return DemoPage(
+        title=f"Thermoxels demo: {scene}",
+        intro=(
+            f"{_TRAIN_VIEWS} photographs and their thermal images became a model, a tetrahedral mesh with temperatures "
+            "and a heat computation. The scene is synthetic: its shape and temperature are known exactly, so the "
+            "result can be measured."
+        ),
+        checks=tuple(Check(t.name, t.measured_text, t.bound_text, t.met) for t in results.targets),
+        more_figures=results.others,
+        training_pairs=tuple(_training_pairs(folder / "scene")),
+        views=tuple(
+            HeldOutView(
+                Path(name).stem, *(_picture(renders / o / name) for o in ("gt-rgb", "rgb", "gt-thermal", "thermal"))
+            )
+            for name in names
+        ),
+        colour_bar=bar,
+        mesh_pictures=(
+            Figure(before, "Before: the temperatures that the photographs gave."),
+            Figure(after, "After: heat has flowed through the solid. Both in one range of colours."),
+            Figure(_picture(export / "mesh-measured.png"), "Grey: no thermal ray saw the surface; it is interpolated."),
+        ),
+        seconds=tuple(seconds),
+        commands=tuple(commands),
+        files=(
+            ("scene/", "the synthetic photographs, thermal images and camera poses"),
+            ("outputs/demo/thermoxels/run/config.yml", "the training run; ns-viewer --load-config shows it"),
+            ("eval.json", "figures of the held-out views"),
+            ("renders/test/", "rendered and measured held-out views"),
+            ("export/mesh.vtu", "the mesh with temperatures, for ParaView or a solver"),
+            ("export/heat.pvd", "temperatures over time"),
+            ("export/summary.json", "figures of mesh, heat and truth, and all options"),
+            ("logs/", "what every command said"),
+        ),
+    )
+
+
+def _picture(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as problem:
+        raise ThermoxelsError(
+            explain(
+                str(path),
+                expected="a picture that the demo's commands write",
+                got=problem.strerror or str(problem),
+                remedy="Run the demo again.",
+            )
+        ) from problem
+
+
+def _halves(path: Path) -> tuple[bytes, bytes]:
+    """Cut the picture of two panels side by side, so that a narrow screen can show one below the other."""
+    from io import BytesIO
+
+    from PIL import Image
+
+    with Image.open(BytesIO(_picture(path))) as both:
+        middle = both.width // 2
+        panels = both.crop((0, 0, middle, both.height)), both.crop((middle, 0, both.width, both.height))
+    files = BytesIO(), BytesIO()
+    for panel, file in zip(panels, files):
+        panel.save(file, format="PNG")
+    return files[0].getvalue(), files[1].getvalue()
+
+
+def _colour_bar(scene: Path) -> ColourBar:
+    """The colours in which ns-render draws normalised temperatures 0 to 1, the scene's bounds."""
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    from thermoxels_ns.demo_page import ColourBar
+
+    bounds = json.loads((scene / "temperature_bounds.json").read_text())
+    stops = (n / (_COLOUR_STOPS - 1) for n in range(_COLOUR_STOPS))
+    return ColourBar(
+        tuple(to_hex(colormaps[_COLOUR_MAP](stop)) for stop in stops),
+        float(bounds["absolute_min_temperature"]),
+        float(bounds["absolute_max_temperature"]),
+    )
+
+
+def _training_pairs(scene: Path) -> Iterator[tuple[bytes, bytes]]:
+    """Some training photographs from all around, each with its thermal image in the page's colours."""
+    import numpy as np
+    from matplotlib import colormaps
+    from PIL import Image
+
+    names = sorted(path.name for path in (scene / "images").glob("frame_train_*.png"))
+    for number in range(_INPUTS_SHOWN):
+        name = names[number * len(names) // _INPUTS_SHOWN]
+        with Image.open(scene / "images" / name) as photograph:
+            rgb = np.asarray(photograph.convert("RGB"))
+        with Image.open(scene / "thermal" / name) as counts:  # 16 bits that span the bounds
+            normalised = np.asarray(counts, dtype=np.float64) / 65535.0
+        colours = np.round(255.0 * colormaps[_COLOUR_MAP](normalised)[..., :3]).astype(np.uint8)
+        yield _jpeg(rgb), _jpeg(colours)
+
+
+def _jpeg(pixels: npt.NDArray[np.uint8]) -> bytes:
+    """Encode an image for a small picture on the page."""
+    from io import BytesIO
+
+    from PIL import Image
+
+    stream = BytesIO()
+    Image.fromarray(pixels).save(stream, format="JPEG", quality=88)
+    return stream.getvalue()

@@ -1,0 +1,132 @@
+"""The figures of a demo run: read from what the commands wrote, held against their targets."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from thermoxels_ns.errors import ThermoxelsError, explain
+
+
+@dataclass(frozen=True)
+class Target:
+    """A measured figure and the bound it should keep."""
+
+    name: str
+    """What was measured."""
+    measured: float
+    """The figure; NaN if it could not be measured."""
+    bound: float
+    """The bound."""
+    at_least: bool
+    """True: the figure should be at least the bound. False: at most."""
+    form: str
+    """How to write the figure and the bound, for instance ``{:.1f} dB``."""
+
+    @property
+    def met(self) -> bool:
+        """Whether the figure keeps its bound; NaN does not."""
+        return self.measured >= self.bound if self.at_least else self.measured <= self.bound
+
+    @property
+    def measured_text(self) -> str:
+        """The figure with its unit."""
+        return "not measured" if math.isnan(self.measured) else self.form.format(self.measured)
+
+    @property
+    def bound_text(self) -> str:
+        """The bound with its unit."""
+        return ("≥ " if self.at_least else "≤ ") + self.form.format(self.bound)
+
+
+@dataclass(frozen=True)
+class DemoResults:
+    """What a demo run achieved."""
+
+    targets: tuple[Target, ...]
+    """The figures with a target."""
+    others: tuple[tuple[str, str], ...]
+    """Further figures: name and value with unit."""
+
+
+def read_results(eval_json: Path, summary_json: Path) -> DemoResults:
+    """Read the figures that ``ns-eval`` and ``ns-export thermoxels-mesh`` wrote.
+
+    Args:
+        eval_json: Output of ``ns-eval`` on the held-out views.
+        summary_json: Summary of the export, with the sections ``truth`` and ``heat``.
+
+    Raises:
+        ThermoxelsError: A file is missing or lacks a figure.
+    """
+    images = _Section(eval_json, "results")
+    truth, heat, mesh = (_Section(summary_json, name) for name in ("truth", "heat", "mesh"))
+    tolerance = truth.number("tolerance_voxels")
+    targets = (
+        Target("RGB PSNR, held-out views", images.number("psnr"), 26.0, True, "{:.2f} dB"),
+        Target("Temperature error, all pixels, mean", images.number("thermal_mae_c"), 1.0, False, "{:.2f} °C"),
+        Target(f"Surface F-score at {tolerance:g} voxels", truth.number("fscore"), 0.6, True, "{:.3f}"),
+        Target("Heat conserved, relative error", heat.number("energy_residual"), 1e-9, False, "{:.0e}"),
+    )
+    others = (
+        ("RGB SSIM", f"{images.number('ssim'):.3f}"),
+        ("Thermal PSNR", f"{images.number('thermal_psnr'):.2f} dB"),
+        ("Thermal SSIM", f"{images.number('thermal_ssim'):.3f}"),
+        ("Temperature error, pixels that hit the object, mean", f"{images.number('thermal_mae_hit_c'):.2f} °C"),
+        ("Temperature error, hot region, mean", f"{images.number('thermal_mae_roi_c'):.2f} °C"),
+        ("Voxel size", f"{1e3 * truth.number('voxel_size_m'):.1f} mm"),
+        ("Surface precision", f"{truth.number('precision'):.3f}"),
+        ("Surface recall", f"{truth.number('recall'):.3f}"),
+        (
+            "Distance of the surface to the true one, mean",
+            f"{truth.number('mean_distance_voxels'):.2f} voxels, {1e3 * truth.number('mean_distance_m'):.1f} mm",
+        ),
+        (
+            "Temperature error of measured mesh nodes near the true surface, mean",
+            f"{truth.number('temperature_mae_c'):.2f} °C ({truth.number('temperature_nodes'):.0f} nodes)",
+        ),
+        ("Volume of the mesh", f"{truth.number('volume_m3'):.4g} m³ (true: {truth.number('true_volume_m3'):.4g} m³)"),
+        (
+            "Surface of the mesh, a staircase of voxels",
+            f"{truth.number('area_m2'):.4g} m² (true: {truth.number('true_area_m2'):.4g} m²)",
+        ),
+        ("Tetrahedra", f"{mesh.number('tets'):,.0f}"),
+        ("Nodes", f"{mesh.number('nodes'):,.0f}"),
+        ("Nodes with a measured temperature", f"{100.0 * mesh.number('share_of_nodes_observed'):.0f} %"),
+        ("Heat content before", f"{heat.number('energy_before_j'):.6e} J"),
+        ("Heat content after", f"{heat.number('energy_after_j'):.6e} J"),
+    )
+    return DemoResults(targets, others)
+
+
+class _Section:
+    """One object of a json file; asks for its numbers by name."""
+
+    def __init__(self, path: Path, name: str) -> None:
+        self._path, self._name = path, name
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as problem:
+            raise ThermoxelsError(
+                explain(str(path), expected="a readable json file", got=str(problem), remedy="Run the demo again.")
+            ) from problem
+        self._content: dict[str, Any] = content.get(name) if isinstance(content, dict) else None  # type: ignore[assignment]
+        if not isinstance(self._content, dict):
+            raise self._error("an object", self._content)
+
+    def number(self, key: str) -> float:
+        """The number under `key`; NaN for null (a figure that does not exist, for instance without a surface)."""
+        value = self._content.get(key, "nothing")
+        if value is None:
+            return math.nan
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise self._error(f"a number under {key}", value)
+        return float(value)
+
+    def _error(self, expected: str, got: object) -> ThermoxelsError:
+        return ThermoxelsError(
+            explain(f"{self._path}: {self._name}", expected=expected, got=repr(got), remedy="Run the demo again.")
+        )

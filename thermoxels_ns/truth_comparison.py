@@ -1,0 +1,194 @@
+"""How well a reconstruction agrees with a synthetic scene, whose shape and temperature are known exactly."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.checks import check_positive
+from thermoxels_ns.data.pinhole import PinholeCamera
+from thermoxels_ns.data.scene_truth import SyntheticScene
+from thermoxels_ns.data.synthetic import load_truth, visible_surface_points
+from thermoxels_ns.errors import MeshError, SceneError, explain
+from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.mesh.accuracy import surface_fscore
+from thermoxels_ns.mesh.build import check_similarity
+from thermoxels_ns.mesh.solid import fill_enclosed
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+TOLERANCE_VOXELS = 1.5
+"""Surfaces closer than this agree, [voxels]."""
+MIN_VIEWS = 3
+"""A true surface point counts for recall if at least this many training cameras see it."""
+
+_SURFACE_POINTS = 20_000
+_TRAINING_PREFIX = "frame_train_"
+_JSON_NAME = "transforms.json"
+
+
+@dataclass(frozen=True, eq=False)
+class KnownTruth:
+    """A synthetic scene and the cameras that its training photographs were taken with."""
+
+    scene: SyntheticScene
+    """The exact scene."""
+    training_poses: npt.NDArray[np.float64]
+    """Training cameras, camera to world (OpenGL), shape (c, 4, 4), [m]."""
+    camera: PinholeCamera
+    """Intrinsics of all training photographs."""
+
+
+def load_known_truth(scene_folder: Path | str) -> KnownTruth | None:
+    """Get the truth of a scene folder, and its training cameras.
+
+    Args:
+        scene_folder: A scene folder, or its ``transforms.json``.
+
+    Returns:
+        The truth; None for a scene of real photographs (no ``transforms.json``, or one without ``truth``).
+
+    Raises:
+        SceneError: The json is unreadable, names an unknown scene, or its cameras cannot be used.
+    """
+    folder = Path(scene_folder)
+    folder = folder.parent if folder.is_file() else folder
+    path = folder / _JSON_NAME
+    if not path.is_file():
+        return None
+    scene = load_truth(folder)
+    if scene is None:
+        return None
+    content = json.loads(path.read_text())
+    try:
+        poses = [
+            frame["transform_matrix"]
+            for frame in content["frames"]
+            if Path(frame["file_path"]).name.startswith(_TRAINING_PREFIX)
+        ]
+        camera = PinholeCamera(
+            int(content["w"]), int(content["h"]), *(float(content[key]) for key in ("fl_x", "fl_y", "cx", "cy"))
+        )
+        training_poses = np.asarray(poses, dtype=np.float64)
+    except (KeyError, TypeError, ValueError, AttributeError) as problem:
+        if isinstance(problem, SceneError):
+            raise
+        raise _unusable(path, "intrinsics and frames as a synthetic scene has them", repr(problem)) from problem
+    if training_poses.ndim != 3 or training_poses.shape[1:] != (4, 4) or not np.isfinite(training_poses).all():
+        raise _unusable(
+            path, f"finite 4x4 poses of frames named {_TRAINING_PREFIX}*", f"an array of shape {training_poses.shape}"
+        )
+    return KnownTruth(scene, training_poses, camera)
+
+
+def compare_with_truth(
+    cells: npt.NDArray[np.bool_],
+    lattice: Lattice,
+    world_to_truth: npt.NDArray[np.float64],
+    truth: Path | str | KnownTruth,
+    mesh: TetMesh | None = None,
+    metres_per_unit: float = 1.0,
+) -> dict[str, Any] | None:
+    """Compare solid voxels, and the temperatures of a mesh made from them, with the exact scene.
+
+    Precision is the share of the reconstructed boundary within `TOLERANCE_VOXELS` of the true surface; recall the
+    share of the true surface that at least `MIN_VIEWS` training cameras see and that lies within the tolerance of
+    the reconstructed boundary; the F-score is their harmonic mean. Enclosed cavities are filled first, and the
+    boundary is not counted for precision where the scene box cuts it.
+
+    Args:
+        cells: Solid voxels, shape `lattice.cell_shape`.
+        lattice: Where they are, [world units].
+        world_to_truth: Similarity, shape (4, 4), from the lattice's world to the coordinates of the input poses, in
+            which a synthetic scene is written in metres.
+        truth: The scene folder (or its ``transforms.json``), or its truth if it is at hand.
+        mesh: The mesh of these voxels, for its temperatures. None: they are not compared.
+        metres_per_unit: The scale that was applied to the mesh's nodes after `world_to_truth`, above 0.
+
+    Returns:
+        A mapping that json can write, or None if the truth is not known: ``scene``, ``voxel_size_m``,
+        ``tolerance_voxels``, ``true_points_seen``; ``precision``, ``recall``, ``fscore``, 0 to 1;
+        ``mean_distance_voxels`` and ``mean_distance_m`` of the reconstructed boundary to the true surface (None
+        without a boundary); ``volume_m3``, ``filled_volume_m3`` (with cavities) and ``area_m2`` of the voxels (a
+        staircase: its area exceeds that of the slope it follows) beside ``true_volume_m3`` and ``true_area_m2``;
+        with a mesh also ``temperature_nodes``, the number of observed boundary nodes within the tolerance of the
+        true surface, and ``temperature_mae_c``, their mean absolute error [K] (None without such a node).
+
+    Raises:
+        SceneError: The scene folder cannot be used, or no true point is seen by enough training cameras.
+        MeshError: The voxels do not fit the lattice, the 4x4 is no similarity, or the scale is not above 0.
+    """
+    known = truth if isinstance(truth, KnownTruth) else load_known_truth(truth)
+    if known is None:
+        return None
+    transform = check_similarity("world_to_truth", world_to_truth)
+    check_positive("metres_per_unit", metres_per_unit, "Pass the scale the mesh was built with.", MeshError)
+    voxel_m = lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(transform[:3, :3]))))
+    tolerance_m = TOLERANCE_VOXELS * voxel_m
+    seen = _points_seen(known)
+    score = surface_fscore(cells, lattice, known.scene, seen, tolerance_m, transform)
+    solid = np.asarray(cells, dtype=bool)
+    result: dict[str, Any] = {
+        "scene": known.scene.name,
+        "voxel_size_m": voxel_m,
+        "tolerance_voxels": TOLERANCE_VOXELS,
+        "true_points_seen": len(seen),
+        "precision": score.precision,
+        "recall": score.recall,
+        "fscore": score.fscore,
+        "mean_distance_voxels": None if score.mean_distance is None else score.mean_distance / voxel_m,
+        "mean_distance_m": score.mean_distance,
+        "volume_m3": int(np.count_nonzero(solid)) * voxel_m**3,
+        "filled_volume_m3": int(np.count_nonzero(fill_enclosed(solid))) * voxel_m**3,
+        "true_volume_m3": float(known.scene.volume_m3),
+        "area_m2": _num_faces(solid) * voxel_m**2,
+        "true_area_m2": float(known.scene.area_m2),
+    }
+    if mesh is not None:
+        result |= _temperature_errors(known.scene, mesh, tolerance_m, metres_per_unit)
+    return result
+
+
+def _points_seen(known: KnownTruth) -> npt.NDArray[np.float64]:
+    """Points spread evenly over the part of the true surface that enough training cameras see, shape (m, 3), [m]."""
+    points, normals = known.scene.surface_points(_SURFACE_POINTS, seed=0)
+    seen = visible_surface_points(known.scene, known.training_poses, known.camera, points, normals, MIN_VIEWS)
+    if not seen.any():
+        raise SceneError(
+            explain(
+                "training cameras",
+                expected=f"a part of the surface that at least {MIN_VIEWS} of them see",
+                got=f"none, with {len(known.training_poses)} training cameras",
+                remedy="Write the scene with more training views.",
+            )
+        )
+    return points[seen]
+
+
+def _num_faces(cells: npt.NDArray[np.bool_]) -> int:
+    """Number of voxel faces between solid and empty, those on the lattice's border included."""
+    padded = np.pad(cells, 1)
+    return sum(int(np.count_nonzero(np.diff(padded, axis=axis))) for axis in range(3))
+
+
+def _temperature_errors(
+    scene: SyntheticScene, mesh: TetMesh, tolerance_m: float, metres_per_unit: float
+) -> dict[str, Any]:
+    """Mean absolute error of the measured temperatures on the part of the boundary that lies where it should."""
+    nodes = np.unique(mesh.facets)
+    nodes = nodes[mesh.observed[nodes]]
+    points = mesh.points_m[nodes] / metres_per_unit
+    near = np.abs(scene.signed_distance(points)) <= tolerance_m
+    error_k = mesh.temperature_c[nodes[near]] - scene.surface_temperature_c(points[near])
+    return {
+        "temperature_nodes": int(near.sum()),
+        "temperature_mae_c": float(np.abs(error_k).mean()) if near.any() else None,
+    }
+
+
+def _unusable(path: Path, expected: str, got: str) -> SceneError:
+    return SceneError(explain(str(path), expected=expected, got=got, remedy="Write the synthetic scene again."))
