@@ -32,7 +32,7 @@ def ball() -> GridSnapshot:
     lattice = Lattice((-0.6, -0.6, -0.6), 0.1, (13, 13, 13))
     points = lattice.corner_positions()
     radius = np.linalg.norm(points, axis=-1)
-    density = (20.0 * np.maximum(0.0, 1.0 - radius)).astype(np.float32)  # the default keeps radius < 0.5
+    density = (10.0 * np.maximum(0.0, 1.0 - radius)).astype(np.float32)  # the default keeps radius < 0.5
     temperature = (20.0 + 25.0 * points[..., 0]).astype(np.float32)
     return GridSnapshot(lattice, density, temperature, np.where(radius < UNSEEN, 0.0, 9.0).astype(np.float32))
 

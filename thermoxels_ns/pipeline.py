@@ -87,3 +87,7 @@ class ThermoxelsPipeline(VanillaPipeline):
     def grid_snapshot(self, rays_per_image: int = 20_000) -> GridSnapshot:
         """The trained field for the mesher, with the weight that thermal training rays gave each corner."""
         return self.model.grid_snapshot(self.datamanager.training_rays(THERMAL_STREAM, rays_per_image))  # type: ignore
+
+
+def _columns(grid: dict[str, int]) -> str:
+    return ", ".join(f"{name.removeprefix(_GRID)} {columns}" for name, columns in sorted(grid.items()))

@@ -25,12 +25,12 @@ def celsius_to_kelvin(temperature_c: Numbers) -> Numbers:
     >>> celsius_to_kelvin(20.0)
     293.15
     """
-    return temperature_c + ZERO_CELSIUS_K
+    return temperature_c + ZERO_CELSIUS_K  # type: ignore[return-value]
 
 
 def kelvin_to_celsius(temperature_k: Numbers) -> Numbers:
     """Convert kelvin to degrees Celsius."""
-    return temperature_k - ZERO_CELSIUS_K
+    return temperature_k - ZERO_CELSIUS_K  # type: ignore[return-value]
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class TemperatureRange:
 
     def normalise(self, temperature_c: Numbers) -> Numbers:
         """Map degrees Celsius to normalised temperature; values outside the range leave [0, 1]."""
-        return (temperature_c - self.min_c) / self.span_k
+        return (temperature_c - self.min_c) / self.span_k  # type: ignore[return-value]
 
     def to_celsius(self, thermal: Numbers) -> Numbers:
         """Map normalised temperature to degrees Celsius.
@@ -79,4 +79,4 @@ class TemperatureRange:
         >>> TemperatureRange(10.0, 30.0).to_celsius(0.25)
         15.0
         """
-        return thermal * self.span_k + self.min_c
+        return thermal * self.span_k + self.min_c  # type: ignore[return-value]

@@ -145,13 +145,13 @@ def test_bad_selection_is_refused(bad):
         SolidSelection(**bad)
 
 
-def test_default_is_one_optical_depth_per_voxel_at_any_resolution():
-    """Solid where density x voxel size >= 1, so the same field gives the same body on a finer lattice."""
+def test_default_is_half_an_optical_depth_per_voxel_at_any_resolution():
+    """Solid where density x voxel size >= 0.5, so the same field gives the same body on a finer lattice."""
     for voxel in (0.5, 0.125):
         lattice = Lattice((0.0, 0.0, 0.0), voxel, (3, 2, 2))
-        density = np.full((3, 2, 2), 1.002 / voxel, dtype=np.float32)
-        density[0] = 0.9 / voxel  # the first voxel's centre is at 0.951
+        density = np.full((3, 2, 2), 0.501 / voxel, dtype=np.float32)
+        density[0] = 0.45 / voxel  # the first voxel's centre is at 0.4755
         snapshot = GridSnapshot(lattice, density, np.zeros_like(density), np.ones_like(density))
         assert select_solid(snapshot, SolidSelection()).cells[:, 0, 0].tolist() == [False, True]
     with pytest.raises(MeshError, match="lower --voxel-optical-depth"):
-        select_solid(snapshot, SolidSelection(voxel_optical_depth=1.1))
+        select_solid(snapshot, SolidSelection(voxel_optical_depth=0.55))

@@ -69,7 +69,8 @@ class VoxelGrid(nn.Module):
         activation: DensityActivation = "relu",
     ):
         super().__init__()
-        self.sh_degree, self.temperature_degree, self.activation = sh_degree, temperature_degree, activation
+        self.sh_degree, self.temperature_degree = sh_degree, temperature_degree
+        self.activation: DensityActivation = activation
         n = lattice.num_corners
         self.density = nn.Parameter(torch.full((n, 1), raw_density(start_density, activation)))
         channels = 0 if sh_degree is None else 3 * num_coefficients(sh_degree)

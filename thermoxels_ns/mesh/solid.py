@@ -17,8 +17,8 @@ from thermoxels_ns.snapshot import GridSnapshot
 class SolidSelection:
     """How solid voxels are told from empty ones."""
 
-    voxel_optical_depth: float = 1.0
-    """Voxels in which density times edge length is at least this are solid: at 1, light that crosses one loses 63 %."""
+    voxel_optical_depth: float = 0.5
+    """Voxels in which density times edge length is at least this are solid: at 0.5, light that crosses one loses 39 %."""
     density_percentile: float | None = None
     """Percentile p of the density over all voxels of the box, 0 to 100: the (100 - p) % densest voxels are solid, as in
     the Thermoxels paper. Overrides the optical depth. Raise it if empty space turns solid, lower it if walls have
@@ -31,7 +31,7 @@ class SolidSelection:
     """Make empty space solid where it has no way out through voxel faces. Off by default: a room is a cavity too."""
 
     def __post_init__(self) -> None:
-        check_positive("voxel_optical_depth", self.voxel_optical_depth, "Pass --voxel-optical-depth 1.", MeshError)
+        check_positive("voxel_optical_depth", self.voxel_optical_depth, "Pass --voxel-optical-depth 0.5.", MeshError)
         if self.density_percentile is not None and not (
             np.isfinite(self.density_percentile) and 0.0 <= self.density_percentile <= 100.0
         ):
