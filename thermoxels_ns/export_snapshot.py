@@ -172,7 +172,7 @@ def export_snapshot(
 
     truth = compare(solid, mesh) if compare is not None and options.metres_per_unit is not None else None
     if truth is not None:
-        say(f"Truth: {truth}")
+        say("Against the truth: " + ", ".join(f"{name} {_short(value)}" for name, value in truth.items()))
     summary = {
         "options": {field.name: getattr(options, field.name) for field in fields(options)},
         "versions": _versions(),
@@ -282,6 +282,10 @@ def _heat_summary(preset: HeatPreset, solution: HeatSolution) -> dict[str, Any]:
         "iterations": solution.iterations,
         "skipped_effects": solution.skipped_effects,
     }
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _versions() -> dict[str, str]:
