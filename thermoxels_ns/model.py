@@ -151,15 +151,17 @@ class ThermoxelsModel(Model):
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         """Render rays: rgb, thermal (normalised), temperature_c, depth, accumulation.
 
-        In training, rays carry their stream (see `streams.py`) and only what a stream needs is rendered.
+        Rays may carry their stream (see `streams.py`; in training they do): then only what it needs is rendered.
         """
         origins, directions = ray_bundle.origins, ray_bundle.directions
         marched = self.march_rays(origins, directions)
-        if not self.training:
-            return self._image_outputs(self.composite_march(marched, directions, None, None), marched)
-        stream = ray_bundle.metadata["stream"][:, 0]
-        rgb_rays, thermal_rays = (stream & RGB_STREAM) > 0, (stream & THERMAL_STREAM) > 0
+        rgb_rays = thermal_rays = None
+        if "stream" in ray_bundle.metadata:
+            stream = ray_bundle.metadata["stream"][:, 0]
+            rgb_rays, thermal_rays = (stream & RGB_STREAM) > 0, (stream & THERMAL_STREAM) > 0
         seen = self.composite_march(marched, directions, rgb_rays, thermal_rays)
+        if not self.training:
+            return self._image_outputs(seen, marched)
         thermal = seen.thermal
         if self.thermal_offset is not None and thermal is not None and ray_bundle.camera_indices is not None:
             offset = self.thermal_offset - self.thermal_offset.mean()
@@ -259,7 +261,9 @@ class ThermoxelsModel(Model):
             images["img"] = torch.cat((target, predicted), dim=1)
         seen = outputs
         if batch.get("thermal_camera") is not None:
-            seen = self.get_outputs_for_camera(batch["thermal_camera"].to(self.device))
+            rays = batch["thermal_camera"].to(self.device).generate_rays(camera_indices=0, keep_shape=True)
+            rays.metadata["stream"] = torch.full_like(rays.camera_indices, THERMAL_STREAM)
+            seen = self.get_outputs_for_camera_ray_bundle(rays)
         thermal, valid = batch["thermal"].to(self.device), batch["thermal_valid"].to(self.device)
         metrics |= thermal_metrics(seen["thermal"], thermal, valid, seen["accumulation"], self.temperature_range.span_k)
         images["thermal"] = colormaps.apply_float_colormap(

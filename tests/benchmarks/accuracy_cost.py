@@ -4,8 +4,8 @@ Run it on an otherwise idle machine:
 
     python tests/benchmarks/accuracy_cost.py hot-object
 
-It runs ns-train, ns-eval and ns-export for each budget and prints a table as Markdown. Times are whole commands; the last
-column relates the training time to that of the default budget in the same run.
+It runs ns-train, ns-eval and ns-export for each budget and prints a table as Markdown. Times are whole commands; the
+last column relates the training time to that of the default budget in the same run.
 """
 
 from __future__ import annotations

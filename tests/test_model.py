@@ -1,0 +1,147 @@
+"""The model without its pipeline: which terms exist, what rays cost, what a checkpoint holds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import SceneBox
+
+from thermoxels_ns.errors import SceneError, ThermoxelsError
+from thermoxels_ns.model import ThermoxelsModel
+from thermoxels_ns.model_config import LOSS_RECIPES, ThermoxelsModelConfig
+from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
+from thermoxels_ns.units import TemperatureRange
+
+BOX = SceneBox(aabb=torch.tensor([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]]))
+
+
+def make(**options) -> ThermoxelsModel:
+    config = ThermoxelsModelConfig(**{"resolutions": (8,), "refine_at": (), "prune_at": (), **options})
+    metadata = {"temperature_range": TemperatureRange(10.0, 30.0)}
+    return config.setup(scene_box=BOX, num_train_data=4, metadata=metadata)
+
+
+def rays(n: int = 60, stream: int = RGB_STREAM | THERMAL_STREAM) -> RayBundle:
+    generator = torch.Generator().manual_seed(0)
+    origins = torch.tensor([0.0, 0.0, 3.0]) + 0.4 * torch.randn(n, 3, generator=generator)
+    directions = torch.nn.functional.normalize(0.3 * torch.randn(n, 3, generator=generator) - origins, dim=-1)
+    return RayBundle(
+        origins,
+        directions,
+        torch.ones(n, 1),
+        camera_indices=torch.arange(n)[:, None] % 4,
+        metadata={"stream": torch.full((n, 1), stream, dtype=torch.uint8)},
+    )
+
+
+def targets(n: int = 60) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    return {"image": torch.rand(n, 3, generator=generator), "thermal": torch.rand(n, 1, generator=generator)}
+
+
+def test_outputs_of_an_image():
+    model = make().eval()
+    outputs = model(rays())
+    assert set(outputs) == {"rgb", "thermal", "temperature_c", "depth", "accumulation"}
+    torch.testing.assert_close(outputs["temperature_c"], 10 + 20 * outputs["thermal"])
+    assert torch.isfinite(outputs["depth"]).all() and outputs["rgb"].shape == (60, 3)
+    assert ((outputs["accumulation"] >= 0) & (outputs["accumulation"] <= 1)).all()
+
+
+@pytest.mark.parametrize("recipe", list(LOSS_RECIPES))
+def test_only_terms_of_non_zero_weight_are_computed(recipe):
+    model = make(recipe=recipe, distortion_ramp=(0, 1)).train()
+    model.update_to_step(10)
+    terms = set(model.get_loss_dict(model(rays()), targets()))
+    weights = LOSS_RECIPES[recipe]
+    expected = {f"{name}_loss" for name in vars(weights) if getattr(weights, name)}
+    assert terms == expected
+    off = dict.fromkeys(vars(weights), 0.0) | {"rgb": 1.0}
+    model = make(recipe=recipe, loss_overrides=off).train()
+    assert set(model.get_loss_dict(model(rays()), targets())) == {"rgb_loss"}
+
+
+def test_distortion_grows_over_its_ramp():
+    model = make(distortion_ramp=(10, 20)).train()
+    values = {}
+    for step in (10, 12, 20, 30):
+        model.update_to_step(step)
+        values[step] = float(model.get_loss_dict(model(rays()), targets()).get("distortion_loss", torch.zeros(())))
+    assert values[10] == 0.0 and values[12] == pytest.approx(0.2 * values[20]) and values[20] == values[30] > 0
+
+
+@pytest.mark.parametrize("stream, absent", [(RGB_STREAM, "thermal"), (THERMAL_STREAM, "rgb")])
+def test_a_stream_renders_only_what_it_needs(stream, absent):
+    outputs = make().train()(rays(stream=stream))
+    assert outputs[absent] is None
+
+
+def test_offset_has_a_fixed_gauge_and_shifts_only_its_image():
+    model = make(per_image_offset=True).train()
+    plain = model(rays())["thermal"].detach()
+    model.thermal_offset.data[:] = 0.3  # the same for all: the gauge removes it
+    torch.testing.assert_close(model(rays())["thermal"].detach(), plain)
+    model.thermal_offset.data[:] = torch.tensor([0.4, 0.0, 0.0, 0.0])
+    shift = (model(rays())["thermal"].detach() - plain)[:, 0]
+    torch.testing.assert_close(shift[::4], torch.full((15,), 0.3))
+    torch.testing.assert_close(shift[1::4], torch.full((15,), -0.1))
+    assert torch.equal(model.eval()(rays())["thermal"], make().eval()(rays())["thermal"])  # not in evaluation
+
+
+def test_temperature_does_not_move_geometry_unless_asked():
+    for moves in (False, True):
+        model = make(thermal_density_gradient=moves, loss_overrides={"tv_density": 0.0, "distortion": 0.0}).train()
+        terms = model.get_loss_dict(model(rays(stream=THERMAL_STREAM)), targets())
+        terms["thermal_loss"].backward()
+        gradient = model.grid.density.grad
+        assert (gradient is not None and float(gradient.abs().max()) > 0) is moves
+
+
+def test_decisions_about_the_background_are_in_the_checkpoint():
+    model = make()
+    assert model.backdrop_on.tolist() == [True, True]
+    model.backdrop_on[:] = torch.tensor([False, True])
+    loaded = make()
+    loaded.load_state_dict(model.state_dict())
+    assert loaded.backdrop_on.tolist() == [False, True]
+    model.eval(), loaded.eval()
+    assert torch.equal(model(rays())["rgb"], loaded(rays())["rgb"])
+
+
+def test_backgrounds_are_built_only_when_wanted():
+    assert make(background="off", thermal_background="minimum").get_param_groups().keys() == {
+        *("density", "sh", "temperature")
+    }
+    empty = make(background="off", thermal_background="minimum", start_density=1e-12).eval()(rays())
+    assert float(empty["rgb"].max()) < 1e-6
+    torch.testing.assert_close(empty["temperature_c"], torch.full((60, 1), 10.0), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "options", [{"resolutions": (8, 12), "refine_at": (5,)}, {"resolutions": (8, 16)}, {"refine_at": (5,)}]
+)
+def test_impossible_schedules_are_refused(options):
+    with pytest.raises(ThermoxelsError, match="resolutions and refine_at: expected"):
+        make(**options)
+
+
+def test_unknown_loss_and_missing_range_are_refused():
+    with pytest.raises(ThermoxelsError, match=r"loss_overrides\.tv: expected one of rgb, thermal"):
+        make(loss_overrides={"tv": 1.0})
+    with pytest.raises(SceneError, match="thermal images with a temperature range"):
+        ThermoxelsModelConfig(resolutions=(8,), refine_at=()).setup(scene_box=BOX, num_train_data=1, metadata={})
+
+
+def test_snapshot_is_what_the_field_says():
+    model = make().eval()
+    with torch.no_grad():
+        model.grid.density += torch.rand(model.grid.density.shape)
+    snapshot = model.grid_snapshot([rays()])
+    lattice = model.grid.lattice
+    centres = torch.as_tensor(lattice.cell_centres(), dtype=torch.float32).reshape(-1, 3)
+    at_centres = model.grid.density_at(model.grid.locate(centres)).detach().view(lattice.cell_shape).numpy()
+    np.testing.assert_allclose(snapshot.centre_density(), at_centres, rtol=1e-5)
+    np.testing.assert_allclose(snapshot.temperature_c, 20.0, atol=1e-4)  # 0.5 of 10 to 30
+    assert 0 < np.count_nonzero(snapshot.observed_weight) < lattice.num_corners
