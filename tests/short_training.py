@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from thermoxels_ns.presets import with_overrides
 def train(scene: Path, steps: int, model: dict[str, Any] | None = None, rays: int = 512, rate: float = 1.0):
     """Train the default method on a scene at 16 voxels, or as `model` says, and return its pipeline."""
     config = with_overrides(
-        thermoxels.config.pipeline,
+        deepcopy(thermoxels.config.pipeline),  # nerfstudio writes the folder into it
         {
             "datamanager": {
                 "data": scene,

@@ -14,6 +14,7 @@ import pytest
 from rich.console import Console
 
 from thermoxels_ns import cli, demo
+from thermoxels_ns.demo import Demo, run_demo
 from thermoxels_ns.demo_commands import command_line, run_command
 from thermoxels_ns.demo_results import Target, read_results
 from thermoxels_ns.errors import OutputError, ThermoxelsError
@@ -295,3 +296,12 @@ def test_a_failing_step_stops_the_demo(quick_demo, fake_commands, tmp_path, capf
     assert "checkpoint not found" in shown_text.err
     assert "4/6" not in shown_text.out
     assert not (tmp_path / "demo" / "index.html").exists()
+
+
+@pytest.mark.parametrize("iterations", [0, -5])
+def test_impossible_iterations_are_refused_before_anything_is_deleted(tmp_path, iterations) -> None:
+    (tmp_path / ".thermoxels-demo").touch()
+    (tmp_path / "index.html").write_text("earlier")
+    with pytest.raises(ThermoxelsError, match="iterations: expected 1 or more"):
+        run_demo(Demo(output_dir=tmp_path, iterations=iterations), Console())
+    assert (tmp_path / "index.html").read_text() == "earlier"

@@ -16,7 +16,7 @@ import torch
 import tyro
 from PIL import Image
 
-from thermoxels_ns.errors import CheckpointError, HeatError, MeshError, OutputError, ThermoxelsError
+from thermoxels_ns.errors import CheckpointError, HeatError, MeshError, OutputError, SceneError, ThermoxelsError
 from thermoxels_ns.export import ExportThermoxelsMesh, _check_config, input_from_world, viewpoint_of_cameras
 from thermoxels_ns.export_snapshot import ExportOptions, Viewpoint, check_options, export_snapshot
 from thermoxels_ns.lattice import Lattice
@@ -98,18 +98,41 @@ def test_without_a_scale_heat_is_skipped_and_the_message_says_what_to_pass(ball,
     assert not (tmp_path / "heat.png").exists()
 
 
-def test_heat_picture_holds_both_states(ball, tmp_path) -> None:
+def test_heat_picture_holds_both_states_and_the_change(ball, tmp_path) -> None:
     export_snapshot(ball, np.eye(4), ExportOptions(metres_per_unit=1.0, steps=1, step_seconds=1e7), tmp_path)
     picture = np.asarray(Image.open(tmp_path / "heat.png")).astype(float)
 
-    def spread_of_hue(panel: np.ndarray) -> float:
+    def coloured(panel: np.ndarray) -> np.ndarray:
         body = panel[100:800, 100:900].reshape(-1, 3)
-        body = body[np.ptp(body, axis=1) > 30.0]  # coloured pixels
+        body = body[np.ptp(body, axis=1) > 30.0]
         assert len(body) > 10_000
+        return body
+
+    def spread_of_hue(panel: np.ndarray) -> float:
+        body = coloured(panel)
         return float(np.std(body[:, 0] / body.sum(axis=1)))
 
-    before, after = np.split(picture, 2, axis=1)
+    before, after, change = np.split(picture, 3, axis=1)
     assert spread_of_hue(before) > 3.0 * spread_of_hue(after)  # the long step levels it to one colour
+    warmed = np.mean(coloured(change)[:, 0] > coloured(change)[:, 2])
+    assert 0.15 < warmed < 0.85  # red where the cold side warmed, blue where the warm side cooled
+
+
+def test_small_changes_fill_their_own_symmetric_scale(ball, tmp_path, monkeypatch) -> None:
+    drawn = []
+
+    def draw(path, mesh, values=None, **look):
+        drawn.append((values, look))
+        Image.new("RGB", (8, 6)).save(path)
+
+    monkeypatch.setattr("thermoxels_ns.mesh.pictures.picture_of_mesh", draw)
+    export_snapshot(ball, np.eye(4), ExportOptions(metres_per_unit=1.0, steps=1, step_seconds=60.0), tmp_path)
+    (before, first), (after, last), (change, look) = drawn[2:]
+    assert first["clim"] == last["clim"]
+    np.testing.assert_array_equal(change, after - before)
+    low, high = look["clim"]
+    assert -low == high and 0.0 < high < 0.1 * np.ptp(first["clim"]) and look["bar_title"] == "change [K]"
+    assert Image.open(tmp_path / "heat.png").size == (24, 6)
 
 
 def test_torch_s_compiler_still_loads_after_drawing() -> None:
@@ -239,6 +262,154 @@ def test_truth_and_viewpoint_reach_the_summary_and_the_pictures(ball, tmp_path, 
     assert asked[0][1] == 6 * asked[0][0] and read(tmp_path)["truth"] == {"fscore": 0.5}
 
 
+SCALED = {"metres_per_unit": 1.0, "steps": 1}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def plain_pictures(monkeypatch) -> None:
+    monkeypatch.setattr(
+        "thermoxels_ns.mesh.pictures.picture_of_mesh", lambda path, *_, **__: Image.new("RGB", (8, 6)).save(path)
+    )
+
+
+@pytest.mark.parametrize("where", ["stepping.solve_heat", "summary"])
+def test_failed_export_leaves_the_earlier_one_untouched(ball, tmp_path, monkeypatch, where) -> None:
+    plain_pictures(monkeypatch)
+    export_snapshot(ball, np.eye(4), ExportOptions(**SCALED), tmp_path)
+    before = contents(tmp_path)
+    compare = None
+    if where == "summary":  # json has no NaN
+        compare = lambda *_: {"fscore": float("nan")}  # noqa: E731
+    else:
+
+        def fail(*_) -> None:
+            raise HeatError("Step 1 failed.")
+
+        monkeypatch.setattr("thermoxels_ns.fem.stepping.solve_heat", fail)
+    with pytest.raises(ThermoxelsError):
+        export_snapshot(ball, np.eye(4), ExportOptions(density_threshold=6.0, **SCALED), tmp_path, compare=compare)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("broken", ["mesh.files.write_vtu", "fem.files.write_heat_series", "export_pictures.draw_heat"])
+def test_export_interrupted_while_writing_leaves_no_summary(ball, tmp_path, monkeypatch, broken) -> None:
+    """So a folder with a summary is never a mixture."""
+    plain_pictures(monkeypatch)
+    export_snapshot(ball, np.eye(4), ExportOptions(**SCALED), tmp_path)
+
+    def interrupt(*_) -> None:
+        assert not (tmp_path / "summary.json").exists()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"thermoxels_ns.{broken}", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        export_snapshot(ball, np.eye(4), ExportOptions(**SCALED), tmp_path)
+    assert not (tmp_path / "summary.json").exists()
+
+
+@pytest.mark.parametrize(("pictures", "scale"), [(False, 1.0), (True, None), (False, None)])
+def test_what_is_not_made_again_is_removed(ball, tmp_path, monkeypatch, pictures, scale) -> None:
+    plain_pictures(monkeypatch)
+    export_snapshot(ball, np.eye(4), ExportOptions(**SCALED), tmp_path)
+    assert {"mesh.png", "mesh-measured.png", "heat.png", "heat.pvd"} <= set(contents(tmp_path))
+    (tmp_path / "mine.png").touch()
+    options = ExportOptions(pictures=pictures, metres_per_unit=scale, steps=1)
+    summary = export_snapshot(ball, np.eye(4), options, tmp_path)
+    assert set(contents(tmp_path)) == {*summary["files"], "mine.png"}
+
+
+@pytest.mark.parametrize("name", ["mesh.vtu", "summary.json", "mesh.png", "mesh-measured.png", "heat.pvd", "heat.png"])
+def test_folder_in_the_place_of_a_file_is_found_first(ball, tmp_path, name) -> None:
+    (tmp_path / name).mkdir()
+    with pytest.raises(OutputError, match=rf"output folder: .*got {name}\. Move it away"):
+        export_snapshot(ball, np.eye(4), ExportOptions(**SCALED), tmp_path)
+    assert [path.name for path in tmp_path.rglob("*")] == [name]
+
+
+def test_file_in_the_place_of_the_heat_folder(ball, tmp_path) -> None:
+    (tmp_path / "heat").touch()
+    with pytest.raises(OutputError, match=r"got heat\."):
+        export_snapshot(ball, np.eye(4), ExportOptions(**SCALED), tmp_path)
+    export_snapshot(ball, np.eye(4), ExportOptions(pictures=False), tmp_path)  # needs no such folder
+
+
+def test_leftovers_of_killed_exports_are_removed(ball, tmp_path) -> None:
+    (tmp_path / "heat").mkdir()
+    ours = [".mesh.123.part.vtu", ".mesh-measured.9.part.png", ".summary.77.part.json", "heat/.step-0002.123.part.vtu"]
+    others = [".mesh.final.part.vtu", ".holiday.123.part.png", "heat/.notes.1.part.vtu"]
+    for name in [*ours, *others]:
+        (tmp_path / name).touch()
+    summary = export_snapshot(ball, np.eye(4), ExportOptions(pictures=False, **SCALED), tmp_path)
+    assert set(contents(tmp_path)) == {*summary["files"], *others}
+
+
+def test_truth_that_cannot_be_used_does_not_cost_the_export(ball, tmp_path) -> None:
+    def compare(*_):
+        raise SceneError("transforms.json: expected a scene. Write it again.")
+
+    lines: list[str] = []
+    options = ExportOptions(pictures=False, **SCALED)
+    export_snapshot(ball, np.eye(4), options, tmp_path, lines.append, compare=compare)
+    assert read(tmp_path)["truth"] == {"error": "transforms.json: expected a scene. Write it again."}
+    assert any("Not compared with the truth: transforms.json" in line for line in lines)
+
+
+def test_too_many_steps_are_refused_before_anything_is_written(ball, tmp_path) -> None:
+    options = ExportOptions(metres_per_unit=1.0, steps=3_000_000)
+    with pytest.raises(HeatError, match=r"steps: .* 8 bytes = \d+ bytes\. Pass fewer and longer steps"):
+        export_snapshot(ball, np.eye(4), options, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("extreme", [{"step_seconds": 1e20}, {"metres_per_unit": 1e-9}])
+def test_extreme_but_well_posed_heat(ball, tmp_path, extreme) -> None:
+    options = ExportOptions(**{"metres_per_unit": 1.0, "pictures": False, **extreme})
+    heat = export_snapshot(ball, np.eye(4), options, tmp_path)["heat"]
+    after = heat["temperature_c"]["after"]
+    assert after["max"] - after["min"] < 1e-9 and heat["energy_residual"] < 1e-12
+
+
+def test_summary_says_that_only_the_shell_is_there(ball, tmp_path) -> None:
+    seen_half = np.where(ball.lattice.corner_positions()[..., 0] < 0.01, 9.0, 0.0).astype(np.float32)
+    half = GridSnapshot(ball.lattice, ball.density, ball.temperature_c, seen_half)
+    summary = export_snapshot(half, np.eye(4), ExportOptions(pictures=False, **SCALED), tmp_path)
+    assert any("heat content is that of the reconstructed shell" in text for text in summary["heat"]["skipped_effects"])
+    grid = pyvista.read(tmp_path / "mesh.vtu").extract_surface(algorithm=None).compute_cell_sizes()
+    seen = grid.point_data["observed"][grid.regular_faces].all(axis=1)
+    share = grid.cell_data["Area"][~seen].sum() / grid.area
+    assert 0.4 < share < 0.6 and summary["mesh"]["share_of_area_not_fully_observed"] == pytest.approx(share)
+
+
+def test_summary_says_what_a_percentile_asked_for_and_got(ball, tmp_path) -> None:
+    """Two thirds of the voxels are asked for, but only half have density: pruned voxels are never solid."""
+    pruned = ball.density.copy()
+    pruned[7:] = pruned[6] = 0.0
+    pruned[:6] = 5.0
+    field = GridSnapshot(ball.lattice, pruned, ball.temperature_c, ball.observed_weight)
+    options = ExportOptions(pictures=False, density_percentile=100.0 / 3.0)
+    mesh = export_snapshot(field, np.eye(4), options, tmp_path)["mesh"]
+    assert mesh["share_of_voxels_asked_for"] == pytest.approx(2.0 / 3.0)
+    assert mesh["share_of_voxels_kept"] == pytest.approx(6.0 / 12.0)
+    mesh = export_snapshot(ball, np.eye(4), ExportOptions(pictures=False), tmp_path)["mesh"]
+    assert "share_of_voxels_kept" not in mesh
+
+
+def test_parts_without_thermal_rays_are_left_out_and_counted(ball, tmp_path) -> None:
+    density, weight = ball.density.copy(), ball.observed_weight.copy()
+    density[:2, :2, :2], weight[:3, :3, :3] = 50.0, 0.0
+    field = GridSnapshot(ball.lattice, density, ball.temperature_c, weight)
+    lines: list[str] = []
+    options = ExportOptions(pictures=False, largest_component=False)
+    mesh = export_snapshot(field, np.eye(4), options, tmp_path, lines.append)["mesh"]
+    assert mesh["parts_without_thermal_rays_left_out"] == 1
+    left_out = mesh["voxels_without_thermal_rays_left_out"]
+    assert left_out >= 1 and mesh["voxels"] == sum(mesh["component_sizes_voxels"]) - left_out
+    assert any("1 parts of the mesh" in line for line in lines)
+
+
 def test_view_from_where_the_cameras_stood() -> None:
     """Cameras that look along +x with y of the picture along -z (an upside-down world): the picture does too."""
     pose = np.array([[0.0, 0.0, -1.0, -3.0], [1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0]])
@@ -350,8 +521,14 @@ def test_run_without_checkpoint_is_refused_before_loading(tmp_path) -> None:
 def test_garbage_config_file(tmp_path) -> None:
     """Through nerfstudio's real loader."""
     pytest.importorskip("nerfstudio")
-    for text in ("just words", "a: [", "!!python/object:no.such.Thing {}"):
+    for text, reason in (
+        ("just words", "holds no TrainerConfig of nerfstudio"),
+        ("", "the file is empty"),
+        ("# a comment", "holds no TrainerConfig of nerfstudio"),
+        ("a: [", "ParserError: "),
+        ("!!python/object:no.such.Thing {}", "ConstructorError: "),
+    ):
         path = tmp_path / "config.yml"
         path.write_text(text)
-        with pytest.raises(CheckpointError, match=r"config\.yml"):
+        with pytest.raises(CheckpointError, match=rf"config\.yml, which cannot be read \({reason}|{reason}"):
             ExportThermoxelsMesh(load_config=path, output_dir=tmp_path / "out").run(lambda _: None)

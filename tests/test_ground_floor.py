@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from thermoxels_ns.checks import check_finite, check_positive, check_shape, replace_when_done, writable_folder
+from thermoxels_ns.checks import (
+    check_finite,
+    check_positive,
+    check_shape,
+    remove_file,
+    remove_stale_temporaries,
+    replace_when_done,
+    writable_folder,
+)
 from thermoxels_ns.errors import MeshError, OutputError, ThermoxelsError
 from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.snapshot import GridSnapshot
@@ -71,3 +79,34 @@ def test_snapshot_refuses_nan_and_wrong_shapes():
         GridSnapshot(lattice, bad, good, good)
     with pytest.raises(MeshError, match="temperature_c: expected shape"):
         GridSnapshot(lattice, good, good[:1], good)
+
+
+@pytest.mark.parametrize("value", [True, np.True_, "1", None])
+def test_what_is_no_number_is_not_positive(value):
+    with pytest.raises(ThermoxelsError, match="speed: expected a finite number above 0"):
+        check_positive("speed", value, "Go forward.")
+
+
+def test_errors_of_the_disk_become_output_errors(tmp_path):
+    (tmp_path / "mesh.vtu").mkdir()
+    with pytest.raises(OutputError, match=r"mesh\.vtu: expected a file that can be written.*Move away"):
+        with replace_when_done(tmp_path / "mesh.vtu") as temporary:
+            temporary.write_text("new")
+    with pytest.raises(OutputError, match=r"a\.txt: expected a file that can be written"):
+        with replace_when_done(tmp_path / "a.txt"):
+            raise OSError(28, "No space left on device")
+    with pytest.raises(OutputError, match=r"mesh\.vtu: expected a file that can be removed"):
+        remove_file(tmp_path / "mesh.vtu")
+    with pytest.raises(MeshError, match="own words"), replace_when_done(tmp_path / "a.txt"):
+        raise MeshError("own words")
+    assert os.listdir(tmp_path) == ["mesh.vtu"]
+    remove_file(tmp_path / "absent")
+
+
+def test_only_temporaries_of_the_given_names_are_stale(tmp_path):
+    kept = {".mesh.12x.part.vtu", ".mesh.12.part.png", "mesh.12.part.vtu", ".other.12.part.vtu"}
+    for name in {*kept, ".mesh.12.part.vtu", ".step-0001.9.part.vtu"}:
+        (tmp_path / name).touch()
+    remove_stale_temporaries(tmp_path, ["mesh.vtu", "step-*.vtu"])
+    assert set(os.listdir(tmp_path)) == kept
+    remove_stale_temporaries(tmp_path / "absent", ["mesh.vtu"])

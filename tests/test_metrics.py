@@ -94,3 +94,17 @@ def test_lpips_is_asked_only_when_installed(monkeypatch):
     monkeypatch.setattr(metrics.lpips, "network", Network("alex", False), raising=False)
     assert metrics.lpips(torch.zeros(8, 8, 3), torch.ones(8, 8, 3)) == 0.25
     assert seen == [((1, 3, 8, 8), -1.0, 1.0)]
+
+
+def test_invalid_pixels_do_not_flatter_the_structure():
+    """Noise against noise is not similar, however many pixels were not measured."""
+    generator = torch.Generator().manual_seed(1)
+    a, b = (torch.rand(64, 64, 1, generator=generator) for _ in range(2))
+    valid = torch.zeros(64, 64, 1, dtype=torch.bool)
+    valid[:32, :32] = True
+    opaque = torch.ones(64, 64, 1)
+    masked = metrics.thermal_metrics(a, b, valid, opaque, 1.0)
+    whole = metrics.thermal_metrics(a, b, torch.ones_like(valid), opaque, 1.0)
+    assert masked["thermal_ssim"] < 0.2 and abs(masked["thermal_ssim"] - whole["thermal_ssim"]) < 0.1
+    assert abs(masked["thermal_hssim"] - whole["thermal_hssim"]) < 0.15
+    assert math.isnan(metrics.thermal_metrics(a, b, ~torch.ones_like(valid), opaque, 1.0)["thermal_ssim"])

@@ -23,7 +23,7 @@ def make(**options) -> ThermoxelsModel:
     return config.setup(scene_box=BOX, num_train_data=4, metadata=metadata)
 
 
-def rays(n: int = 60, stream: int = RGB_STREAM | THERMAL_STREAM) -> RayBundle:
+def rays(n: int = 60, stream: int | None = RGB_STREAM | THERMAL_STREAM) -> RayBundle:
     generator = torch.Generator().manual_seed(0)
     origins = torch.tensor([0.0, 0.0, 3.0]) + 0.4 * torch.randn(n, 3, generator=generator)
     directions = torch.nn.functional.normalize(0.3 * torch.randn(n, 3, generator=generator) - origins, dim=-1)
@@ -32,7 +32,7 @@ def rays(n: int = 60, stream: int = RGB_STREAM | THERMAL_STREAM) -> RayBundle:
         directions,
         torch.ones(n, 1),
         camera_indices=torch.arange(n)[:, None] % 4,
-        metadata={"stream": torch.full((n, 1), stream, dtype=torch.uint8)},
+        metadata={} if stream is None else {"stream": torch.full((n, 1), stream, dtype=torch.uint8)},
     )
 
 
@@ -43,7 +43,7 @@ def targets(n: int = 60) -> dict[str, torch.Tensor]:
 
 def test_outputs_of_an_image():
     model = make().eval()
-    outputs = model(rays())
+    outputs = model(rays(stream=None))
     assert set(outputs) == {"rgb", "thermal", "temperature_c", "depth", "accumulation"}
     torch.testing.assert_close(outputs["temperature_c"], 10 + 20 * outputs["thermal"])
     assert torch.isfinite(outputs["depth"]).all() and outputs["rgb"].shape == (60, 3)
@@ -114,7 +114,7 @@ def test_backgrounds_are_built_only_when_wanted():
     assert make(background="off", thermal_background="minimum").get_param_groups().keys() == {
         *("density", "sh", "temperature")
     }
-    empty = make(background="off", thermal_background="minimum", start_density=1e-12).eval()(rays())
+    empty = make(background="off", thermal_background="minimum", start_density=1e-12).eval()(rays(stream=None))
     assert float(empty["rgb"].max()) < 1e-6
     torch.testing.assert_close(empty["temperature_c"], torch.full((60, 1), 10.0), atol=1e-4, rtol=0)
 
@@ -135,7 +135,7 @@ def test_unknown_loss_and_missing_range_are_refused():
 
 
 def test_snapshot_is_what_the_field_says():
-    model = make().eval()
+    model = make(start_density=5.0).eval()
     with torch.no_grad():
         model.grid.density += torch.rand(model.grid.density.shape)
     snapshot = model.grid_snapshot([rays()])
@@ -145,3 +145,81 @@ def test_snapshot_is_what_the_field_says():
     np.testing.assert_allclose(snapshot.centre_density(), at_centres, rtol=1e-5)
     np.testing.assert_allclose(snapshot.temperature_c, 20.0, atol=1e-4)  # 0.5 of 10 to 30
     assert 0 < np.count_nonzero(snapshot.observed_weight) < lattice.num_corners
+
+
+def test_evaluation_batches_have_losses_without_regularisers():
+    model = make().eval()
+    outputs = model(rays())
+    assert set(model.get_loss_dict(outputs, targets())) == {"rgb_loss", "thermal_loss"}
+    assert set(model.get_metrics_dict(outputs, targets())) == {"psnr", "thermal_mae_c"}
+
+
+def test_a_crop_is_kept():
+    model = make(start_density=30.0, background="off").eval()
+    bundle = rays(stream=None)
+    whole = model(bundle)["accumulation"]
+    bundle.nears, bundle.fars = torch.full((60, 1), 2.9), torch.full((60, 1), 2.95)
+    cropped = model(bundle)["accumulation"]
+    assert float(cropped.max()) < 0.9 * float(whole.max()) and float(cropped.max()) > 0.0
+
+
+def test_stock_exporters_get_colour_and_opacity():
+    model = make().eval()
+    outputs = model(rays(stream=None))
+    assert torch.equal(model.get_rgba_image(outputs)[:, 3:], outputs["accumulation"])
+
+
+def test_depth_of_a_miss_does_not_depend_on_its_neighbours():
+    model = make(start_density=1e-12).eval()
+    bundle = rays(stream=None)
+    bundle.directions = bundle.directions * torch.tensor([1.0, 1.0, -1.0])  # away from the box
+    together, alone = model(bundle)["depth"], model(bundle[:1])["depth"]
+    assert torch.equal(together[:1], alone) and torch.isfinite(together).all()
+
+
+def test_other_sizes_of_the_world_are_converted():
+    """The same scene ten times larger starts equally transparent and costs the same distortion."""
+    config = ThermoxelsModelConfig(resolutions=(8,), refine_at=(), prune_at=(), distortion_ramp=(0, 1), near_plane=0.5)
+    metadata = {"temperature_range": TemperatureRange(10.0, 30.0)}
+    results = []
+    for size in (1.0, 10.0):
+        model = config.setup(scene_box=SceneBox(aabb=BOX.aabb * size), num_train_data=4, metadata=metadata).train()
+        model.update_to_step(5)
+        bundle = rays()
+        bundle.origins = bundle.origins * size
+        outputs = model(bundle)
+        results.append((outputs["accumulation"], model.get_loss_dict(outputs, targets())["distortion_loss"]))
+    torch.testing.assert_close(results[0][0], results[1][0], rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(results[0][1], results[1][1], rtol=1e-3, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "option, value",
+    [
+        *(("steps_per_voxel", v) for v in (0.0, float("inf"), float("nan"))),
+        *(("start_density", v) for v in (0.0, -1.0)),
+        *[("near_plane", -5.0), ("thermal_l2_share", 3.0), ("prune_threshold", float("nan")), ("smallest_weight", 0.5)],
+        *[("background_height", 1), ("refine_at", (-5,)), ("prune_at", (0,)), ("tv_share", 0.0)],
+        *[("loss_overrides", {"thermal": float("nan")}), ("loss_overrides", {"rgb": -1.0})],
+    ],
+)
+def test_values_that_cannot_work_are_refused(option, value):
+    with pytest.raises(ThermoxelsError, match="expected"):
+        make(**{option: value})
+
+
+def test_masked_pixels_do_not_count_in_evaluation():
+    model = make().eval()
+    generator = torch.Generator().manual_seed(2)
+    outputs = {"rgb": torch.rand(24, 32, 3, generator=generator), "thermal": torch.rand(24, 32, 1, generator=generator)}
+    outputs |= {"accumulation": torch.ones(24, 32, 1), "depth": torch.ones(24, 32, 1)}
+    mask = torch.zeros(24, 32, 1, dtype=torch.bool)
+    mask[:, :16] = True
+    batch = {"image": outputs["rgb"].clone(), "thermal": outputs["thermal"].clone(), "mask": mask}
+    batch["thermal_valid"] = torch.ones_like(mask)
+    batch["image"][:, 16:] = 0.0
+    batch["thermal"][:, 16:] = 1.4  # above the range, and masked
+    metrics, images = model.get_image_metrics_and_images(outputs, batch)
+    assert metrics["psnr"] == pytest.approx(100.0) and metrics["thermal_mae_c"] == 0.0
+    assert metrics["ssim"] == pytest.approx(1.0) and metrics["thermal_ssim"] == pytest.approx(1.0)
+    assert float(images["thermal"].max()) <= 1.0

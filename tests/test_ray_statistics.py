@@ -73,6 +73,19 @@ def test_corner_that_overshoots_is_brought_back_to_what_rays_saw():
     assert float(seen.thermal.min()) >= 0.0 and float(seen.thermal.max()) <= 1.0
 
 
+def test_what_leaks_through_a_surface_measures_nothing_behind_it():
+    """A first wall of optical depth 1.7 lets 18 % through to a second one, which is not measured for that."""
+    scene = slab()
+    shape = scene.grid.lattice.shape
+    density = torch.zeros(shape)
+    density[4], density[1] = 5.0, 500.0  # optical depth 5 x voxel size 1/3
+    scene.grid.density.data = density.reshape(-1, 1)
+    leaked = voxel_weights(scene, rays_along_minus_x()).total.sum((1, 2))
+    assert float(leaked[:2].sum()) > 0.1 * 1600
+    weight = corner_temperature(scene, rays_along_minus_x()).weight.view(shape)
+    assert float(weight[:3].max()) == 0.0 and float(weight[4].min()) > 0.0
+
+
 def test_rays_that_leave_the_box_are_found():
     scene = slab()
     scene.grid.density.data[:] = 0.0

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,9 @@ from thermoxels_ns.errors import OutputError, ThermoxelsError, explain
 
 
 def check_positive(name: str, value: float, remedy: str, error: type[ThermoxelsError] = ThermoxelsError) -> float:
-    """Return `value` if it is a finite number above zero, else raise `error`."""
-    if not (isinstance(value, (int, float, np.number)) and math.isfinite(value) and value > 0):
+    """Return `value` if it is a finite number above zero (True is no number), else raise `error`."""
+    number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+    if not (number and math.isfinite(value) and value > 0):
         raise error(explain(name, expected="a finite number above 0", got=repr(value), remedy=remedy))
     return float(value)
 
@@ -77,11 +79,55 @@ def replace_when_done(path: Path | str) -> Iterator[Path]:
 
     The temporary name keeps the suffix, because writers choose their format by it. An interrupted write leaves
     the old file or none.
+
+    Raises:
+        OutputError: The block or the renaming ended in an error of the operating system.
     """
     final = Path(path)
     temporary = final.with_name(f".{final.stem}.{os.getpid()}.part{final.suffix}")
     try:
         yield temporary
         os.replace(temporary, final)
+    except ThermoxelsError:
+        raise
+    except OSError as problem:
+        raise _output_error(final, "a file that can be written", problem) from problem
     finally:
-        temporary.unlink(missing_ok=True)
+        # The error that kept it from being renamed says more than that it cannot be removed either.
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def remove_file(path: Path | str) -> None:
+    """Remove a file if it is there, or raise `OutputError`."""
+    try:
+        Path(path).unlink(missing_ok=True)
+    except OSError as problem:
+        raise _output_error(Path(path), "a file that can be removed", problem) from problem
+
+
+def remove_stale_temporaries(folder: Path | str, names: Iterable[str]) -> None:
+    """Remove what a killed process left of files that `replace_when_done` was to make.
+
+    Args:
+        folder: Where they are; it need not exist.
+        names: The files' final names; a star stands for anything, as in ``step-*.vtu``.
+
+    Raises:
+        OutputError: One cannot be removed.
+    """
+    for name in map(Path, names):
+        for path in sorted(Path(folder).glob(f".{name.stem}.*.part{name.suffix}")):
+            if re.search(r"\.\d+\.part$", path.name.removesuffix(name.suffix)):
+                remove_file(path)
+
+
+def _output_error(path: Path, expected: str, problem: OSError) -> OutputError:
+    return OutputError(
+        explain(
+            path.name,
+            expected=f"{expected} at {path}",
+            got=problem.strerror or str(problem),
+            remedy="Move away what is there, check free space and permissions, or choose another folder.",
+        )
+    )

@@ -30,7 +30,15 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     """The callbacks of one training run, in the order in which they act at a step."""
     before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
     factors = model.config.refinements()
-    first = min((*factors, *model.config.prune_at), default=None)
+    steps = {*factors, *model.config.prune_at}
+    end = None
+    if attributes.trainer is not None:
+        end = attributes.trainer._start_step + attributes.trainer.config.max_num_iterations
+        late = sorted(step for step in steps if step >= end)
+        if late:
+            CONSOLE.log(f"the run ends before step {end}: no refinement or pruning at {', '.join(map(str, late))}")
+    # Where the lattice never changes within the run, a third of it is time enough to know what stands behind.
+    decisions = {step for step in steps if end is None or step < end} or {(end or 0) // 3}
 
     def count(step: int) -> None:
         model.update_to_step(step)
@@ -38,9 +46,9 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     def change_lattice(step: int) -> None:
         assert attributes.pipeline is not None and attributes.optimizers is not None
         datamanager = attributes.pipeline.datamanager
-        if step == first:
+        if step in decisions:
             decide_backdrop(model, datamanager)
-        if model.config.prune_threshold > 0:
+        if step in steps and model.config.prune_threshold > 0:
             report = prune_by_rays(model, datamanager)
             CONSOLE.log(f"step {step}: pruning {report}")
         if step in factors:
@@ -52,8 +60,10 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
                 attributes.optimizers.parameters[name] = [parameter]
             CONSOLE.log(f"step {step}: lattice refined to {' x '.join(map(str, model.grid.lattice.cell_shape))} voxels")
 
-    steps = tuple(sorted({*factors, *model.config.prune_at}))
-    return [TrainingCallback(before, count), TrainingCallback(before, change_lattice, iters=steps)]
+    return [
+        TrainingCallback(before, count),
+        TrainingCallback(before, change_lattice, iters=tuple(sorted(steps | decisions))),
+    ]
 
 
 def prune_by_rays(model: ThermoxelsModel, datamanager) -> PruningReport:
@@ -78,9 +88,13 @@ def prune_by_rays(model: ThermoxelsModel, datamanager) -> PruningReport:
 
 @torch.no_grad()
 def decide_backdrop(model: ThermoxelsModel, datamanager) -> None:
-    """Drop a background that the scene does not call for, and say which was chosen and why."""
+    """Drop a background that the scene does not call for, and say which was chosen and why.
+
+    Asked again at every change of the lattice: what was kept before surfaces had formed can still go.
+    """
     config = model.config
-    if config.background == "auto" and model.background_rgb is not None:
+    rgb_on, thermal_on = model.backdrop_on.tolist()
+    if config.background == "auto" and rgb_on:
         evidence = backdrop_evidence(model, datamanager.training_rays(RGB_STREAM, RAYS_PER_IMAGE))
         keep = evidence.unsaturated >= FEWEST_OPEN_RAYS
         model.backdrop_on[0] = keep
@@ -88,7 +102,7 @@ def decide_backdrop(model: ThermoxelsModel, datamanager) -> None:
             f"background: {'sphere image kept' if keep else 'none'}, "
             f"{evidence.unsaturated:.2%} of RGB rays leave the box unsaturated"
         )
-    if config.thermal_background == "auto" and model.background_thermal is not None:
+    if config.thermal_background == "auto" and thermal_on and model.background_thermal is not None:
         evidence = backdrop_evidence(model, datamanager.training_rays(THERMAL_STREAM, RAYS_PER_IMAGE))
         sky = model.background_thermal(evidence.directions)
         difference = float(sky.abs().mean()) if len(sky) else 0.0

@@ -44,8 +44,8 @@ class Demo:
 
     output_dir: Path = Path("demo")
     """Folder for all results; made if it does not exist. An earlier demo in it is replaced."""
-    scene: SceneName = "hot-object"
-    """Synthetic scene to photograph. The targets are set for hot-object."""
+    scene: SceneName = "house-corner"
+    """Synthetic scene to photograph."""
     iterations: int | None = None
     """Training steps; the default of the method if left out."""
     open_browser: bool = False
@@ -85,6 +85,10 @@ def run_demo(demo: Demo, console: Console) -> None:
     from thermoxels_ns.demo_page import build_page
     from thermoxels_ns.demo_results import read_results
 
+    if demo.iterations is not None and demo.iterations < 1:
+        raise ThermoxelsError(
+            explain("iterations", expected="1 or more", got=demo.iterations, remedy="Leave it out for the default.")
+        )
     folder = prepare_folder(demo.output_dir)
     logs = writable_folder(folder / "logs")
     steps = _Steps(console)

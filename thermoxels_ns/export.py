@@ -6,6 +6,7 @@ Only light imports at the top: nerfstudio's exporter reads this module for ``--h
 from __future__ import annotations
 
 import pickle
+import traceback
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_shape, writable_folder
+from thermoxels_ns.checks import check_shape
 from thermoxels_ns.errors import CheckpointError, ThermoxelsError, explain
-from thermoxels_ns.export_snapshot import ExportOptions, Viewpoint, check_options, export_snapshot
+from thermoxels_ns.export_snapshot import ExportOptions, Viewpoint, check_options, export_snapshot, prepare_folder
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
@@ -69,7 +70,7 @@ class ExportThermoxelsMesh(ExportOptions):
             ThermoxelsError: If an option, the checkpoint, the mesh or the heat problem is not usable.
         """
         check_options(self)
-        writable_folder(self.output_dir)
+        prepare_folder(self.output_dir, heat=self.metres_per_unit is not None)
         say(f"Loading {self.load_config}")
         scene = load_trained_scene(self.load_config)
 
@@ -118,7 +119,7 @@ def load_trained_scene(load_config: Path) -> TrainedScene:
             explain(
                 "load_config",
                 expected="a config.yml that ns-train of this installation wrote",
-                got=f"{load_config}, which cannot be read ({type(problem).__name__}: {problem})",
+                got=f"{load_config}, which cannot be read ({_reason(load_config, problem)})",
                 remedy="Pass the config.yml of the training run.",
             )
         ) from problem
@@ -140,6 +141,18 @@ def load_trained_scene(load_config: Path) -> TrainedScene:
         viewpoint_of_cameras(outputs.cameras.camera_to_worlds.numpy(), world_to_input),
         Path(pipeline_of_ours.datamanager.get_datapath()),
     )
+
+
+def _reason(load_config: Path, problem: Exception) -> str:
+    """Why nerfstudio refused a config.yml; its own checks have no message."""
+    if load_config.stat().st_size == 0:
+        return "the file is empty"
+    if str(problem):
+        return f"{type(problem).__name__}: {problem}"
+    check = (traceback.extract_tb(problem.__traceback__)[-1].line or "").strip()
+    if "TrainerConfig" in check:
+        return "it holds no TrainerConfig of nerfstudio"
+    return f"{type(problem).__name__} at: {check}"
 
 
 def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.ArrayLike) -> Viewpoint:

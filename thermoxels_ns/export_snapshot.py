@@ -16,14 +16,20 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns import __version__
-from thermoxels_ns.checks import check_positive, replace_when_done, writable_folder
-from thermoxels_ns.errors import MeshError
+from thermoxels_ns.checks import (
+    check_positive,
+    remove_file,
+    remove_stale_temporaries,
+    writable_folder,
+)
+from thermoxels_ns.errors import MeshError, OutputError, ThermoxelsError, explain
 
 if TYPE_CHECKING:
     from thermoxels_ns.fem.materials import Material
     from thermoxels_ns.fem.presets import HeatPreset
     from thermoxels_ns.fem.problem import TimeSteps
     from thermoxels_ns.fem.solution import HeatSolution
+    from thermoxels_ns.mesh.build import MeshedCells
     from thermoxels_ns.mesh.quality import MeshQuality
     from thermoxels_ns.mesh.solid import SolidCells, SolidSelection
     from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -37,6 +43,16 @@ HEAT_SKIPPED = (
     "of the input poses (1 if they are in metres)."
 )
 """What an export without a scale says."""
+
+ONLY_THE_SHELL = (
+    "Space that no camera saw, such as the inside of a wall or of a building seen from outside: empty in the mesh. "
+    "The heat content is that of the reconstructed shell, not of the whole building."
+)
+"""What the heat balance of a reconstruction leaves out."""
+
+_MESH, _SUMMARY, _HEAT = "mesh.vtu", "summary.json", "heat.pvd"
+_MESH_PICTURES = ("mesh.png", "mesh-measured.png")
+_HEAT_PICTURE = "heat.png"
 
 
 @dataclass
@@ -107,6 +123,38 @@ def check_options(options: ExportOptions) -> tuple[SolidSelection, HeatPreset]:
     return selection, replace(preset, material=material, time=_with_options(preset.time, options))
 
 
+def prepare_folder(output_dir: Path | str, *, heat: bool) -> Path:
+    """Make the folder of an export, find out what is in the way, and remove what killed exports left half-written.
+
+    Args:
+        output_dir: The folder.
+        heat: Whether the heat step will be written.
+
+    Raises:
+        OutputError: The folder cannot be written to, or a folder has the name of a file of the export.
+    """
+    from thermoxels_ns.fem.files import STEP_PATTERN
+
+    folder = writable_folder(output_dir)
+    names = (_MESH, *_MESH_PICTURES, _HEAT, _HEAT_PICTURE, _SUMMARY)
+    series = folder / Path(_HEAT).stem
+    blocked = [name for name in names if (folder / name).is_dir()]
+    if heat and series.exists() and not series.is_dir():
+        blocked.append(series.name)
+    if blocked:
+        raise OutputError(
+            explain(
+                "output folder",
+                expected=f"no folder in the place of a file, and no file in the place of a folder, in {folder}",
+                got=", ".join(blocked),
+                remedy="Move it away, or choose another folder.",
+            )
+        )
+    remove_stale_temporaries(folder, names)
+    remove_stale_temporaries(series, [STEP_PATTERN])
+    return folder
+
+
 def export_snapshot(
     snapshot: GridSnapshot,
     world_to_input: npt.NDArray[np.float64],
@@ -118,16 +166,21 @@ def export_snapshot(
 ) -> dict[str, Any]:
     """Write mesh.vtu, summary.json, and as asked mesh.png, heat.pvd, heat/*.vtu and heat.png.
 
+    All of it is computed before anything is written. Then the summary of an earlier export goes first and the new one
+    comes last, so the files in a folder with a summary.json belong together.
+
     Args:
         snapshot: The trained field.
         world_to_input: Takes homogeneous column vectors of the trained scene to the coordinates of the input poses,
             shape (4, 4). `options.metres_per_unit` takes those to metres.
         options: What to make.
-        output_dir: Folder for the results; made if it does not exist.
+        output_dir: Folder for the results; made if it does not exist. Files of an earlier export are replaced, or
+            removed if this one does not make them.
         say: Called with one line of progress at a time.
         viewpoint: How pictures look at the mesh.
         compare: Compares solid voxels and mesh (in metres) with the truth of a scene that knows it; its answer goes
-            into the summary under "truth". Asked only if the scale is known.
+            into the summary under "truth", or its error if it raises a `ThermoxelsError`. Asked only if the scale is
+            known.
 
     Returns:
         The summary that summary.json holds.
@@ -135,56 +188,83 @@ def export_snapshot(
     Raises:
         ThermoxelsError: An option is out of range, nothing is solid, the folder cannot be written to, or heat fails.
     """
-    from thermoxels_ns.fem.files import remove_heat_series, write_heat_series
+    from thermoxels_ns.export_pictures import draw_heat, draw_mesh
+    from thermoxels_ns.fem.files import heat_series_paths, remove_heat_series, write_heat_series
     from thermoxels_ns.fem.problem import HeatProblem
     from thermoxels_ns.fem.stepping import solve_heat
     from thermoxels_ns.mesh.build import build_voxel_mesh
-    from thermoxels_ns.mesh.files import write_summary, write_vtu
+    from thermoxels_ns.mesh.files import summary_text, write_summary, write_vtu
     from thermoxels_ns.mesh.quality import check_mesh
 
     selection, preset = check_options(options)
-    folder = writable_folder(output_dir)
+    scaled = options.metres_per_unit is not None
+    folder = prepare_folder(output_dir, heat=scaled)
     scale = np.diag([*[options.metres_per_unit or 1.0] * 3, 1.0])
     mesh, solid = build_voxel_mesh(snapshot, selection, scale @ world_to_input)
     quality = check_mesh(mesh)
-    write_vtu(folder / "mesh.vtu", mesh)
-    written = ["mesh.vtu"]
-    unit = "input unit" if options.metres_per_unit is None else "m"
+    unit = "m" if scaled else "input unit"
     say(f"Mesh: {quality.num_tets} tetrahedra, {quality.num_nodes} nodes, volume {quality.volume_m3:.6g} {unit}^3")
-    if options.pictures:
-        written += _mesh_pictures(folder, mesh, viewpoint, unit)
+    if solid.num_unobserved_parts:
+        parts, voxels = solid.num_unobserved_parts, solid.num_unobserved_voxels
+        say(f"Left out because no thermal ray saw them: {parts} parts of the mesh, {voxels} voxels in all.")
 
-    if options.metres_per_unit is None:
-        say(HEAT_SKIPPED)
-        remove_heat_series(folder / "heat.pvd")
-        (folder / "heat.png").unlink(missing_ok=True)
-        heat: dict[str, Any] = {"computed": False, "reason": HEAT_SKIPPED}
-    else:
+    solution = truth = None
+    if scaled:
         time = preset.time
         say(f"Heat: {time.steps} steps of {time.step_seconds:g} s through {preset.material.name}")
         solution = solve_heat(HeatProblem(mesh, preset.material), time)
-        paths = write_heat_series(folder / "heat.pvd", mesh, solution)
-        written += [path.relative_to(folder).as_posix() for path in paths]
-        heat = _heat_summary(preset, solution)
         say(f"Heat: {solution.status} Energy conserved to {solution.energy_residual:.1e}.")
-        if options.pictures:
-            written += _heat_picture(folder, mesh, solution, viewpoint)
+        truth = None if compare is None else _compared(compare, solid, mesh, say)
+    else:
+        say(HEAT_SKIPPED)
 
-    truth = compare(solid, mesh) if compare is not None and options.metres_per_unit is not None else None
-    if truth is not None:
-        say("Against the truth: " + ", ".join(f"{name} {_short(value)}" for name, value in truth.items()))
+    files = [_MESH]
+    if solution is not None:
+        files += [p.relative_to(folder).as_posix() for p in heat_series_paths(folder / _HEAT, len(solution.times_s))]
+    if options.pictures:
+        files += [*_MESH_PICTURES, *([] if solution is None else [_HEAT_PICTURE])]
+    skipped = {"computed": False, "reason": HEAT_SKIPPED}
     summary = {
         "options": {field.name: getattr(options, field.name) for field in fields(options)},
         "versions": _versions(),
         "length_unit": unit,
-        "mesh": _mesh_summary(mesh, solid, quality),
-        "heat": heat,
+        "mesh": _mesh_summary(mesh, solid, quality, selection),
+        "heat": skipped if solution is None else _heat_summary(preset, solution),
         **({} if truth is None else {"truth": truth}),
-        "files": [*written, "summary.json"],
+        "files": [*files, _SUMMARY],
     }
-    write_summary(folder / "summary.json", summary)
+    summary_text(summary)  # raises if json cannot hold it
+
+    remove_file(folder / _SUMMARY)
+    for name in {*_MESH_PICTURES, _HEAT_PICTURE} - set(files):
+        remove_file(folder / name)
+    if solution is None:
+        remove_heat_series(folder / _HEAT)
+    write_vtu(folder / _MESH, mesh)
+    if solution is not None:
+        write_heat_series(folder / _HEAT, mesh, solution)
+    if options.pictures:
+        look = {"up": viewpoint.up, "view_direction": viewpoint.view_direction}
+        draw_mesh([folder / name for name in _MESH_PICTURES], mesh, look, unit)
+        if solution is not None:
+            draw_heat(folder / _HEAT_PICTURE, mesh, solution, look)
+    write_summary(folder / _SUMMARY, summary)
     say(f"Written to {folder}: {', '.join(name for name in summary['files'] if '/' not in name)}")
     return summary
+
+
+def _compared(
+    compare: Callable[[SolidCells, TetMesh], dict[str, Any] | None], solid: SolidCells, mesh: TetMesh, say: Say
+) -> dict[str, Any] | None:
+    """Compare with the truth; a truth that cannot be used costs the comparison, not the export."""
+    try:
+        truth = compare(solid, mesh)
+    except ThermoxelsError as problem:
+        say(f"Not compared with the truth: {problem}")
+        return {"error": str(problem)}
+    if truth is not None:
+        say("Against the truth: " + ", ".join(f"{name} {_short(value)}" for name, value in truth.items()))
+    return truth
 
 
 def _with_options(preset: Settings, options: ExportOptions) -> Settings:
@@ -193,51 +273,7 @@ def _with_options(preset: Settings, options: ExportOptions) -> Settings:
     return replace(preset, **{name: value for name, value in given.items() if value is not None})
 
 
-def _mesh_pictures(folder: Path, mesh: TetMesh, viewpoint: Viewpoint, unit: str) -> list[str]:
-    """Draw the mesh twice: all temperatures, and with grey where no thermal ray measured one."""
-    from thermoxels_ns.mesh.pictures import picture_of_mesh
-
-    look: Any = {"up": viewpoint.up, "view_direction": viewpoint.view_direction, "length_unit": unit}
-    picture_of_mesh(folder / "mesh.png", mesh, title="Surface temperature", **look)
-    picture_of_mesh(
-        folder / "mesh-measured.png", mesh, title="Measured surface temperature", grey_unobserved=True, **look
-    )
-    return ["mesh.png", "mesh-measured.png"]
-
-
-def _heat_picture(folder: Path, mesh: TetMesh, solution: HeatSolution, viewpoint: Viewpoint) -> list[str]:
-    """Draw the temperatures before and after side by side, in one range of colours."""
-    import tempfile
-
-    from PIL import Image
-
-    from thermoxels_ns.mesh.pictures import picture_of_mesh
-
-    shown = np.unique(mesh.facets)
-    before, after = solution.temperature_c[0], solution.temperature_c[-1]
-    values = np.concatenate([before[shown], after[shown]])
-    clim = (float(values.min()), float(values.max()))
-    panels = []
-    with tempfile.TemporaryDirectory() as scratch:
-        for name, temperature_c, time_s in (
-            ("before", before, solution.times_s[0]),
-            ("after", after, solution.times_s[-1]),
-        ):
-            path = Path(scratch) / f"{name}.png"
-            title = f"Surface temperature at {time_s:g} s"
-            look: Any = {"up": viewpoint.up, "view_direction": viewpoint.view_direction}
-            picture_of_mesh(path, mesh, temperature_c, title=title, clim=clim, **look)
-            with Image.open(path) as image:
-                panels.append(image.convert("RGB"))
-    both = Image.new("RGB", (sum(p.width for p in panels), max(p.height for p in panels)), "white")
-    both.paste(panels[0], (0, 0))
-    both.paste(panels[1], (panels[0].width, 0))
-    with replace_when_done(folder / "heat.png") as temporary:
-        both.save(temporary)
-    return ["heat.png"]
-
-
-def _mesh_summary(mesh: TetMesh, solid: SolidCells, quality: MeshQuality) -> dict[str, Any]:
+def _mesh_summary(mesh: TetMesh, solid: MeshedCells, quality: MeshQuality, selection: SolidSelection) -> dict[str, Any]:
     """Counts and sizes, lengths in the unit that the summary names."""
     temperature = mesh.temperature_c
     return {
@@ -252,15 +288,38 @@ def _mesh_summary(mesh: TetMesh, solid: SolidCells, quality: MeshQuality) -> dic
         "bounds": {"lower": mesh.points_m.min(axis=0), "upper": mesh.points_m.max(axis=0)},
         "dihedral_angles_deg": {"min": quality.min_dihedral_deg, "max": quality.max_dihedral_deg},
         "density_threshold_used": solid.threshold,
+        **_percentile_summary(solid, selection),
         "component_sizes_voxels": solid.component_sizes,
         "voxels_removed": solid.num_removed,
+        "parts_without_thermal_rays_left_out": solid.num_unobserved_parts,
+        "voxels_without_thermal_rays_left_out": solid.num_unobserved_voxels,
         "share_of_nodes_observed": float(np.mean(mesh.observed)),
+        "share_of_area_not_fully_observed": _share_of_area_unobserved(mesh),
         "temperature_c": {
             "min": float(temperature.min()),
             "max": float(temperature.max()),
             "mean_of_nodes": float(temperature.mean()),
         },
     }
+
+
+def _percentile_summary(solid: MeshedCells, selection: SolidSelection) -> dict[str, float]:
+    """What a percentile asked for and what it got before small bodies were dropped: voxels without density, such as
+    pruned ones, are never solid.
+    """
+    if selection.density_percentile is None or selection.density_threshold is not None:
+        return {}
+    return {
+        "share_of_voxels_asked_for": 1.0 - selection.density_percentile / 100.0,
+        "share_of_voxels_kept": float(solid.component_sizes.sum()) / solid.cells.size,
+    }
+
+
+def _share_of_area_unobserved(mesh: TetMesh) -> float:
+    """Share of the boundary's area whose triangles have a node that no thermal ray saw, 0 to 1."""
+    corner = mesh.points_m[mesh.facets]
+    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    return float(area[~mesh.observed[mesh.facets].all(axis=1)].sum() / area.sum())
 
 
 def _heat_summary(preset: HeatPreset, solution: HeatSolution) -> dict[str, Any]:
@@ -280,7 +339,7 @@ def _heat_summary(preset: HeatPreset, solution: HeatSolution) -> dict[str, Any]:
         },
         "status": solution.status,
         "iterations": solution.iterations,
-        "skipped_effects": solution.skipped_effects,
+        "skipped_effects": [*solution.skipped_effects, ONLY_THE_SHELL],
     }
 
 

@@ -24,23 +24,31 @@ def psnr(predicted: Tensor, target: Tensor, valid: Tensor | None = None) -> floa
     return float(-10.0 * torch.log10(mse.clamp(min=_SMALLEST_MSE)))
 
 
-def ssim(predicted: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"]) -> float:
-    """Structural similarity (Wang et al. 2004): Gaussian window of 11 pixels, on smaller images a box that fits."""
+def ssim(
+    predicted: Float[Tensor, "h w c"], target: Float[Tensor, "h w c"], valid: Bool[Tensor, "h w 1"] | None = None
+) -> float:
+    """Structural similarity (Wang et al. 2004): Gaussian window of 11 pixels, on smaller images a box that fits.
+
+    With `valid`, the mean over the windows that hold valid pixels only; NaN if there is none.
+    """
     side = min(11, *predicted.shape[:2])
-    value = structural_similarity_index_measure(
-        predicted.permute(2, 0, 1)[None],
-        target.permute(2, 0, 1)[None],
-        data_range=1.0,
-        gaussian_kernel=side == 11,
-        kernel_size=side - (1 - side % 2),
-    )
-    return float(value)  # type: ignore[arg-type]
+    side -= 1 - side % 2
+    images = (predicted.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None])
+    window = {"data_range": 1.0, "gaussian_kernel": side == 11, "kernel_size": side}
+    if valid is None or bool(valid.all()):
+        return float(structural_similarity_index_measure(*images, **window))  # type: ignore[arg-type]
+    _, similarity = structural_similarity_index_measure(*images, **window, return_full_image=True)  # type: ignore[misc]
+    whole = F.avg_pool2d(valid.permute(2, 0, 1)[None].float(), side, 1, side // 2, count_include_pad=False)[0, 0] == 1
+    return float(similarity[0].mean(0)[whole].mean())
 
 
-def hssim(predicted: Float[Tensor, "h w 1"], target: Float[Tensor, "h w 1"]) -> float:
+def hssim(
+    predicted: Float[Tensor, "h w 1"], target: Float[Tensor, "h w 1"], valid: Bool[Tensor, "h w 1"] | None = None
+) -> float:
     """Heat-based structural similarity (arXiv 2403.10340), as the Thermoxels paper reports it.
 
-    Mean over disjoint 4 x 4 windows of (2 cov + C2) / (var_p + var_t + C2), C2 = 9e-4; 1 where both are flat.
+    Mean over disjoint 4 x 4 windows (those with valid pixels only) of (2 cov + C2) / (var_p + var_t + C2), C2 = 9e-4; 1
+    where both are flat, NaN where no window is valid.
     """
 
     def window_mean(image: Tensor) -> Tensor:
@@ -50,7 +58,8 @@ def hssim(predicted: Float[Tensor, "h w 1"], target: Float[Tensor, "h w 1"]) -> 
     var_p = window_mean(predicted**2) - mean_p**2
     var_t = window_mean(target**2) - mean_t**2
     covariance = window_mean(predicted * target) - mean_p * mean_t
-    return float(((2 * covariance + _HSSIM_C2) / (var_p + var_t + _HSSIM_C2)).mean())
+    similarity = (2 * covariance + _HSSIM_C2) / (var_p + var_t + _HSSIM_C2)
+    return float((similarity if valid is None else similarity[window_mean(valid.float()) == 1]).mean())
 
 
 def hot_region(temperature_c: Float[Tensor, "h w 1"], valid: Bool[Tensor, "h w 1"]) -> Bool[Tensor, "h w 1"]:
@@ -86,19 +95,19 @@ def thermal_metrics(
         span_k: Width of the temperature range, [K].
 
     Returns:
-        `thermal_psnr`, `thermal_ssim`, `thermal_hssim` of normalised images (pixels that are not valid are equal in
-        both), and mean absolute errors in kelvin (the size of a degree Celsius): `thermal_mae_c` over all valid
+        `thermal_psnr`, `thermal_ssim`, `thermal_hssim` of normalised images, and mean absolute errors in kelvin (the
+        size of a degree Celsius): `thermal_mae_c` over all valid
         pixels; `thermal_mae_hit_c` where opacity exceeds one half; `thermal_mae_roi_c` in the hot region;
         `thermal_mae_debiased_c` with the image's mean difference removed first. NaN where no pixel qualifies.
     """
-    filled_p = torch.where(valid, predicted.clamp(0, 1), torch.zeros_like(predicted))
+    filled_p = torch.where(valid, predicted, torch.zeros_like(predicted))
     filled_t = torch.where(valid, target, torch.zeros_like(target))
     error_k = (predicted - target) * span_k
     bias = error_k[valid].mean() if bool(valid.any()) else error_k.new_zeros(())
     return {
         "thermal_psnr": psnr(filled_p, filled_t, valid) if bool(valid.any()) else float("nan"),
-        "thermal_ssim": ssim(filled_p, filled_t),
-        "thermal_hssim": hssim(filled_p, filled_t),
+        "thermal_ssim": ssim(filled_p, filled_t, valid),
+        "thermal_hssim": hssim(filled_p, filled_t, valid),
         "thermal_mae_c": _mean_abs(error_k, valid),
         "thermal_mae_hit_c": _mean_abs(error_k, valid & (accumulation > 0.5)),
         "thermal_mae_roi_c": _mean_abs(error_k, hot_region(target, valid)),

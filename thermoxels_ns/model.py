@@ -40,7 +40,7 @@ class ThermoxelsModel(Model):
         super().populate_modules()
         config = self.config
         torch.manual_seed(config.seed)
-        config.refinements()
+        config.check()
         self.loss_weights = config.loss_weights()
         temperature_range = (self.kwargs.get("metadata") or {}).get("temperature_range")
         if not isinstance(temperature_range, TemperatureRange):
@@ -57,11 +57,13 @@ class ThermoxelsModel(Model):
             torch.tensor([temperature_range.min_c, temperature_range.max_c], dtype=torch.float64),
         )
         box = self.scene_box.aabb.double().numpy()
+        # Densities, distances and learning rates are made for a box 2 long; other sizes are converted.
+        self.unit = float((box[1] - box[0]).max()) / 2.0
         self.field = VoxelField(
             Lattice.covering(box[0], box[1], config.resolutions[0]),
             config.sh_degree,
             config.temperature_degree,
-            config.start_density,
+            config.start_density / self.unit,
             config.density_activation,
         )
         wants_rgb = config.sh_degree is not None and config.background != "off"
@@ -103,10 +105,15 @@ class ThermoxelsModel(Model):
         """Tell the model which step it is at (schedules, random blocks)."""
         self.step = step
 
-    def march_rays(self, origins: Tensor, directions: Tensor) -> March:
-        """Sample rays through the kept voxels and weigh the samples."""
+    def march_rays(
+        self, origins: Tensor, directions: Tensor, nears: Tensor | None = None, fars: Tensor | None = None
+    ) -> March:
+        """Sample rays through the kept voxels, between `nears` and `fars` (rays, 1) if given, and weigh the samples."""
         grid = self.grid
         skip = bool(grid.kept.all())
+        near: float | Tensor = self.config.near_plane * self.unit
+        if nears is not None:
+            near = nears[:, 0].clamp(min=near)
         return march(
             origins,
             directions,
@@ -114,7 +121,8 @@ class ThermoxelsModel(Model):
             lambda positions: grid.density_at(grid.locate(positions)),
             None if skip else grid.in_kept_voxel,
             self.config.steps_per_voxel,
-            self.config.near_plane,
+            near,
+            None if fars is None else fars[:, 0],
         )
 
     def composite_march(
@@ -151,19 +159,19 @@ class ThermoxelsModel(Model):
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         """Render rays: rgb, thermal (normalised), temperature_c, depth, accumulation.
 
-        Rays may carry their stream (see `streams.py`; in training they do): then only what it needs is rendered.
+        Rays of a batch carry their stream (see `streams.py`): then only what it needs is rendered, and the outputs are
+        those that losses are made of. A crop that the viewer sets (nears, fars) is kept.
         """
         origins, directions = ray_bundle.origins, ray_bundle.directions
-        marched = self.march_rays(origins, directions)
-        rgb_rays = thermal_rays = None
-        if "stream" in ray_bundle.metadata:
-            stream = ray_bundle.metadata["stream"][:, 0]
-            rgb_rays, thermal_rays = (stream & RGB_STREAM) > 0, (stream & THERMAL_STREAM) > 0
+        marched = self.march_rays(origins, directions, ray_bundle.nears, ray_bundle.fars)
+        if "stream" not in ray_bundle.metadata:
+            return self._image_outputs(self.composite_march(marched, directions, None, None), origins)
+        stream = ray_bundle.metadata["stream"][:, 0]
+        rgb_rays, thermal_rays = (stream & RGB_STREAM) > 0, (stream & THERMAL_STREAM) > 0
         seen = self.composite_march(marched, directions, rgb_rays, thermal_rays)
-        if not self.training:
-            return self._image_outputs(seen, marched)
         thermal = seen.thermal
-        if self.thermal_offset is not None and thermal is not None and ray_bundle.camera_indices is not None:
+        if self.training and self.thermal_offset is not None and thermal is not None:
+            assert ray_bundle.camera_indices is not None
             offset = self.thermal_offset - self.thermal_offset.mean()
             thermal = thermal + offset[ray_bundle.camera_indices[:, 0]][:, None]
         return {
@@ -175,20 +183,23 @@ class ThermoxelsModel(Model):
             "march": marched,
         }
 
-    def _image_outputs(self, seen: Composite, marched: March) -> dict[str, Tensor]:
+    def _image_outputs(self, seen: Composite, origins: Tensor) -> dict[str, Tensor]:
         assert seen.thermal is not None
         rgb = seen.rgb if seen.rgb is not None else seen.thermal.expand(-1, 3)
-        # A ray that hits nothing is drawn at the far side of the box: image writers cannot show infinity.
-        lattice = self.grid.lattice
-        diagonal = float(torch.linalg.norm(torch.tensor(lattice.hi) - torch.tensor(lattice.lo)))
-        far = float(marched.steps.t.amax()) if marched.steps.t.numel() else diagonal
+        # A ray that hits nothing is drawn behind the box: image writers cannot show infinity.
+        lo, hi = torch.tensor([self.grid.lattice.lo, self.grid.lattice.hi], dtype=origins.dtype, device=origins.device)
+        far = torch.linalg.norm(origins - 0.5 * (lo + hi), dim=-1) + 0.5 * torch.linalg.norm(hi - lo)
         return {
             "rgb": rgb.clamp(0, 1),
             "thermal": seen.thermal,
             "temperature_c": self.temperature_range.to_celsius(seen.thermal),
-            "depth": seen.depth.clamp(max=max(far, diagonal))[:, None],
+            "depth": torch.minimum(seen.depth, far)[:, None],
             "accumulation": seen.accumulation[:, None],
         }
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        """Colour and opacity, for nerfstudio's stock exporters."""
+        return torch.cat((outputs[output_name], outputs["accumulation"]), dim=-1)
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
@@ -215,7 +226,7 @@ class ThermoxelsModel(Model):
         if weights.distortion and ramp > 0:
             steps = marched.steps
             terms["distortion_loss"] = (weights.distortion * ramp) * losses.distortion_loss(
-                marched.along.weights, steps.t, steps.deltas, scale=2.0
+                marched.along.weights, steps.t, steps.deltas, scale=2.0 * self.unit
             )
         return terms
 
@@ -255,7 +266,9 @@ class ThermoxelsModel(Model):
         images: dict[str, Tensor] = {}
         if self.grid.sh is not None:
             target, predicted = batch["image"][..., :3].to(self.device), outputs["rgb"]
-            metrics |= {"psnr": psnr(predicted, target), "ssim": ssim(predicted, target)}
+            mask = batch["mask"].to(self.device).bool() if "mask" in batch else None
+            whole = None if mask is None else mask.expand_as(target)
+            metrics |= {"psnr": psnr(predicted, target, whole), "ssim": ssim(predicted, target, mask)}
             if lpips_available():
                 metrics["lpips"] = lpips(predicted, target)
             images["img"] = torch.cat((target, predicted), dim=1)
@@ -265,9 +278,11 @@ class ThermoxelsModel(Model):
             rays.metadata["stream"] = torch.full_like(rays.camera_indices, THERMAL_STREAM)
             seen = self.get_outputs_for_camera_ray_bundle(rays)
         thermal, valid = batch["thermal"].to(self.device), batch["thermal_valid"].to(self.device)
+        if "mask" in batch and batch["mask"].shape == valid.shape and seen is outputs:
+            valid = valid & batch["mask"].to(self.device).bool()
         metrics |= thermal_metrics(seen["thermal"], thermal, valid, seen["accumulation"], self.temperature_range.span_k)
         images["thermal"] = colormaps.apply_float_colormap(
-            torch.cat((thermal, seen["thermal"].clamp(0, 1)), dim=1), "inferno"
+            torch.cat((thermal, seen["thermal"]), dim=1).clamp(0, 1), "inferno"
         )
         images["accumulation"] = colormaps.apply_colormap(outputs["accumulation"])
         images["depth"] = colormaps.apply_depth_colormap(outputs["depth"], accumulation=outputs["accumulation"])

@@ -137,6 +137,41 @@ class ThermoxelsModelConfig(ModelConfig):
                 )
         return LossWeights(**{**known, **self.loss_overrides})
 
+    def check(self) -> None:
+        """Refuse values that cannot work.
+
+        Raises:
+            ThermoxelsError: Names the option, what it takes and what it got.
+        """
+        self.refinements()
+        ranges: dict[str, tuple[float, float, str]] = {
+            "prune_threshold": (0.0, 1.0, "from 0 to 1"),
+            "prune_dilation": (0, 100, "from 0 to 100"),
+            "temperature_degree": (0, 2, "0, 1 or 2"),
+            "start_density": (1e-30, 1e30, "a finite number above 0"),
+            "steps_per_voxel": (0.1, 1000.0, "from 0.1 to 1000"),
+            "near_plane": (0.0, 1e30, "0 or more"),
+            "smallest_weight": (0.0, 0.1, "from 0 to 0.1"),
+            "background_height": (2, 100_000, "at least 2"),
+            "thermal_l2_share": (0.0, 1.0, "from 0 to 1"),
+            "tv_share": (1e-6, 1.0, "above 0, at most 1"),
+        }
+        values = {name: (float(getattr(self, name)), *limits) for name, limits in ranges.items()}
+        values |= {
+            f"loss weight {name}": (float(weight), 0.0, 1e30, "a finite number, 0 or more")
+            for name, weight in vars(self.loss_weights()).items()
+        }
+        for name, (value, low, high, expected) in values.items():
+            if not low <= value <= high:  # NaN fails too
+                option = name.replace("_", "-")
+                raise ThermoxelsError(
+                    explain(name, expected=expected, got=value, remedy=f"Correct --pipeline.model.{option}.")
+                )
+        if self.prune_at and min(self.prune_at) < 1:
+            raise ThermoxelsError(
+                explain("prune_at", expected="steps of at least 1", got=self.prune_at, remedy="Correct the steps.")
+            )
+
     def refinements(self) -> dict[int, int]:
         """Step -> factor by which voxels are split there.
 
@@ -145,6 +180,7 @@ class ThermoxelsModelConfig(ModelConfig):
         """
         pairs = list(zip(self.resolutions, self.resolutions[1:]))
         increasing = all(b % a == 0 and b > a for a, b in pairs) and sorted(set(self.refine_at)) == list(self.refine_at)
+        increasing = increasing and min((1, *self.refine_at)) == 1
         if not self.resolutions or len(self.refine_at) != len(pairs) or not increasing:
             raise ThermoxelsError(
                 explain(

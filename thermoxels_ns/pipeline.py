@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 
-from thermoxels_ns.errors import CheckpointError, explain
+from thermoxels_ns.data.thermal_datamanager import ThermalDataManager
+from thermoxels_ns.errors import CheckpointError, SceneError, explain
 from thermoxels_ns.model import ThermoxelsModel
 from thermoxels_ns.snapshot import GridSnapshot
 from thermoxels_ns.streams import THERMAL_STREAM
 
 _GRID = "_model.field.grid."
+_ACTIVATION = "_model.field.grid.activation_index"
 
 
 @dataclass
@@ -31,17 +35,38 @@ class ThermoxelsPipeline(VanillaPipeline):
         """The voxel model."""
         return super().model  # type: ignore[return-value]
 
+    world_from_input: torch.Tensor
+
+    def __init__(self, config: ThermoxelsPipelineConfig, *args: Any, **kwargs: Any) -> None:
+        super().__init__(config, *args, **kwargs)
+        streams = getattr(config.datamanager, "streams", "both")
+        if streams == "thermal" and (self.model.grid.sh is not None or not self.model.config.thermal_density_gradient):
+            raise SceneError(
+                explain(
+                    "streams",
+                    expected="thermal images alone only for a model without colour whose density they move",
+                    got=f"thermal, with SH degree {self.model.config.sh_degree}",
+                    remedy="Use the method plenoxels-t.",
+                )
+            )
+        outputs = cast(ThermalDataManager, self.datamanager).train_dataparser_outputs
+        placed = torch.cat(
+            (outputs.dataparser_transform.double() * outputs.dataparser_scale, outputs.scene_box.aabb.T), 1
+        )
+        self.register_buffer("world_from_input", placed)
+
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint.
 
         Raises:
             CheckpointError: It belongs to another method, to other settings or to another scene.
         """
+        state = {name.removeprefix("module."): value for name, value in loaded_state.items()}
         expected = {_GRID + name: p.shape[1] for name, p in self.model.grid.row_parameters().items()}
         found = {
-            name.removeprefix("module."): tensor.shape[1]
-            for name, tensor in loaded_state.items()
-            if name.removeprefix("module.").startswith(_GRID) and getattr(tensor, "ndim", 0) == 2
+            name: tensor.shape[1]
+            for name, tensor in state.items()
+            if name.startswith(_GRID) and getattr(tensor, "ndim", 0) == 2
         }
         if expected != found:
             raise CheckpointError(
@@ -52,18 +77,61 @@ class ThermoxelsPipeline(VanillaPipeline):
                     remedy="Load it with the config.yml that was written beside it.",
                 )
             )
-        here = self.model.temperature_bounds_c.clone()
-        super().load_pipeline(loaded_state, step)
-        stored = self.model.temperature_bounds_c.to(here.device)
-        if not torch.allclose(here, stored, atol=1e-3, rtol=0):
+        own = self.state_dict()
+        self._check_settings(own, state)
+        super().load_pipeline(state, step)
+
+    def _check_settings(self, own: dict[str, Any], state: dict[str, Any]) -> None:
+        """Compare what must agree before anything is loaded."""
+        differing = sorted(set(own) ^ set(state))
+        if differing:
             raise CheckpointError(
                 explain(
-                    "temperature range",
-                    expected=f"the checkpoint's, {stored[0]:.2f} to {stored[1]:.2f} C",
-                    got=f"{here[0]:.2f} to {here[1]:.2f} C from the scene",
-                    remedy="Use the thermal files (and temperature_bounds.json) that the checkpoint was trained on.",
+                    "checkpoint",
+                    expected="the parts that the options build",
+                    got=f"a difference in {', '.join(differing)}",
+                    remedy="Use the same background, sky and per-image-offset options as in training.",
                 )
             )
+        resolution = int(state[_GRID + "corner_shape"].max()) - 1
+        if resolution not in self.model.config.resolutions:
+            raise CheckpointError(
+                explain(
+                    "checkpoint",
+                    expected=f"one of the resolutions {self.model.config.resolutions}",
+                    got=f"{resolution} voxels",
+                    remedy="Pass --pipeline.model.resolutions as in training; finer ones may follow.",
+                )
+            )
+        activations = [own[_ACTIVATION], state[_ACTIVATION]]
+        if not torch.equal(activations[0].cpu(), activations[1].cpu()):
+            raise CheckpointError(
+                explain(
+                    "density_activation",
+                    expected="the checkpoint's",
+                    got=self.model.config.density_activation,
+                    remedy="Use the option as in training.",
+                )
+            )
+        for name, what, tolerance in (
+            ("world_from_input", "poses and scene box", 1e-4),
+            ("_model.temperature_bounds_c", "temperature range", 1e-3),
+            ("_model.thermal_offset", "number of training images", 0.0),
+        ):
+            if name not in own:
+                continue
+            here, stored = own[name].cpu().double(), state[name].cpu().double()
+            offset = name == "_model.thermal_offset"
+            same = here.shape == stored.shape and (offset or torch.allclose(here, stored, atol=tolerance, rtol=1e-4))
+            if not same:
+                raise CheckpointError(
+                    explain(
+                        what,
+                        expected="those the checkpoint was trained with",
+                        got="others from the scene",
+                        remedy="Use the scene folder and the dataparser options of the training run.",
+                    )
+                )
 
     def get_average_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
         """Average metrics over images; an image where a metric has no pixel does not count for it."""
@@ -81,7 +149,12 @@ class ThermoxelsPipeline(VanillaPipeline):
         finally:
             del self.model.get_image_metrics_and_images
         for name in rows[0]:
-            averages[name] = float(torch.tensor([row[name] for row in rows]).nanmean())
+            average = float(torch.tensor([row[name] for row in rows]).nanmean())
+            if math.isnan(average):  # json has no NaN
+                CONSOLE.print(f"{name} is left out: no image has a pixel that counts for it.")
+                averages = {key: value for key, value in averages.items() if key not in (name, f"{name}_std")}
+            else:
+                averages[name] = average
         return averages
 
     def grid_snapshot(self, rays_per_image: int = 20_000) -> GridSnapshot:

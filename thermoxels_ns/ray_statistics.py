@@ -62,9 +62,9 @@ class CornerTemperature:
     """What thermal rays say about the lattice's corners."""
 
     thermal: Float[Tensor, " corners"]
-    """Normalised temperature, in [0, 1]; where no ray came, the stored value."""
+    """Normalised temperature, in [0, 1], the range of what was measured; where no ray came, the stored value."""
     weight: Float[Tensor, " corners"]
-    """Sum of the weights of the samples around the corner, shared out by the trilinear weights."""
+    """Sum of the weights of the first-hit samples around the corner, shared out by the trilinear weights."""
 
 
 @torch.no_grad()
@@ -72,7 +72,9 @@ def corner_temperature(model: RayMarcher, rays: Iterable[RayBundle]) -> CornerTe
     """Average the temperature that rays see around each corner, each sample by its share of the pixel.
 
     A corner's own stored value is only ever used mixed with its neighbours', so an image can be right while single
-    corners overshoot; the average over what rays used has no such freedom.
+    corners overshoot; the average over what rays used has no such freedom. Only first hits count: samples of rays that
+    end on something (opacity above one half), before half of the ray's light is spent. What leaks through a surface
+    measures nothing behind it.
     """
     grid = model.grid
     device, corners = grid.density.device, grid.lattice.num_corners
@@ -80,7 +82,10 @@ def corner_temperature(model: RayMarcher, rays: Iterable[RayBundle]) -> CornerTe
     for bundle in rays:
         directions = bundle.directions.to(device)
         marched = model.march_rays(bundle.origins.to(device), directions)
-        weights = marched.along.weights.flatten()[marched.active][:, None]
+        before = torch.cumsum(marched.along.weights, -1) - marched.along.weights
+        first_hit = (before < 0.5) & (marched.along.accumulation > 0.5)[:, None]
+        weights = torch.where(first_hit, marched.along.weights, torch.zeros_like(before)).flatten()
+        weights = weights[marched.active][:, None]
         at = grid.locate(marched.positions)
         thermal = grid.thermal_at(at, directions[marched.rays_of(marched.active)])
         total += splat(torch.cat((weights * thermal, weights), -1), at, corners)

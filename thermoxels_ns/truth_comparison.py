@@ -115,8 +115,10 @@ def compare_with_truth(
         ``mean_distance_voxels`` and ``mean_distance_m`` of the reconstructed boundary to the true surface (None
         without a boundary); ``volume_m3``, ``filled_volume_m3`` (with cavities) and ``area_m2`` of the voxels (a
         staircase: its area exceeds that of the slope it follows) beside ``true_volume_m3`` and ``true_area_m2``;
-        with a mesh also ``temperature_nodes``, the number of observed boundary nodes within the tolerance of the
-        true surface, and ``temperature_mae_c``, their mean absolute error [K] (None without such a node).
+        with a mesh also, of the boundary nodes within the tolerance of the true surface: ``temperature_nodes``, the
+        number that a thermal ray measured, and ``temperature_mae_c``, their mean absolute error [K] (None without such
+        a node); the same of the others (``..._unmeasured...``); and ``temperature_p95_all_c``, the error [K] that 95 %
+        of all of them stay below.
 
     Raises:
         SceneError: The scene folder cannot be used, or no true point is seen by enough training cameras.
@@ -178,15 +180,23 @@ def _num_faces(cells: npt.NDArray[np.bool_]) -> int:
 def _temperature_errors(
     scene: SyntheticScene, mesh: TetMesh, tolerance_m: float, metres_per_unit: float
 ) -> dict[str, Any]:
-    """Mean absolute error of the measured temperatures on the part of the boundary that lies where it should."""
+    """Temperature errors on the part of the boundary that lies where it should: measured nodes, and all of them."""
     nodes = np.unique(mesh.facets)
-    nodes = nodes[mesh.observed[nodes]]
     points = mesh.points_m[nodes] / metres_per_unit
     near = np.abs(scene.signed_distance(points)) <= tolerance_m
-    error_k = mesh.temperature_c[nodes[near]] - scene.surface_temperature_c(points[near])
+    nodes, points = nodes[near], points[near]
+    error_k = np.abs(mesh.temperature_c[nodes] - scene.surface_temperature_c(points))
+    measured = mesh.observed[nodes]
+
+    def mean(errors: npt.NDArray[np.float64]) -> float | None:
+        return float(errors.mean()) if len(errors) else None
+
     return {
-        "temperature_nodes": int(near.sum()),
-        "temperature_mae_c": float(np.abs(error_k).mean()) if near.any() else None,
+        "temperature_nodes": int(measured.sum()),
+        "temperature_mae_c": mean(error_k[measured]),
+        "temperature_nodes_unmeasured": int((~measured).sum()),
+        "temperature_mae_unmeasured_c": mean(error_k[~measured]),
+        "temperature_p95_all_c": float(np.quantile(error_k, 0.95)) if len(error_k) else None,
     }
 
 

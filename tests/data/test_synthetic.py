@@ -174,6 +174,22 @@ def test_real_photographs_have_no_truth_and_are_not_overwritten(tmp_path: Path) 
     assert (tmp_path / "transforms.json").read_text() == '{"frames": []}'
 
 
+def test_nothing_stale_stays_of_an_older_scene(tmp_path: Path) -> None:
+    """Fewer views and another thermal format; what the older json does not list, or lists elsewhere, is not ours."""
+    folder = tmp_path / "scene"
+    write_scene(make_scene("sphere"), folder, thermal_format="tiff", **{**SMALL, "num_train": 5})
+    (folder / "images" / "mine.png").write_text("mine")
+    outside = tmp_path / "outside.png"
+    outside.write_text("not ours")
+    content = transforms(folder)
+    content["frames"] += [{"file_path": "../outside.png", "thermal_file_path": str(outside)}, {"file_path": 3}, "odd"]
+    (folder / "transforms.json").write_text(json.dumps(content))
+    write_scene(make_scene("sphere"), folder, **SMALL)
+    listed = {f[key] for f in transforms(folder)["frames"] for key in ("file_path", "thermal_file_path")}
+    assert set(all_bytes(folder)) == {*listed, "images/mine.png", "transforms.json", "temperature_bounds.json"}
+    assert outside.read_text() == "not ours"
+
+
 def test_an_interrupted_write_leaves_no_scene_that_loads(tmp_path: Path) -> None:
     scene = make_scene("sphere")
     write_scene(scene, tmp_path, **SMALL)

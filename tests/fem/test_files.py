@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import pyvista
 
+from thermoxels_ns.errors import OutputError
 from thermoxels_ns.fem.files import remove_heat_series, write_heat_series
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.stepping import solve_heat
@@ -61,3 +62,11 @@ def test_interrupted_write_leaves_the_old_index(tmp_path, random_body, solution,
         write_heat_series(tmp_path / "heat.pvd", random_body, solution)
     assert (tmp_path / "heat.pvd").read_bytes() == before
     assert not list(tmp_path.glob(".*"))
+
+
+def test_what_is_in_the_way_is_an_output_error(tmp_path, random_body, solution) -> None:
+    (tmp_path / "heat.pvd").mkdir()
+    with pytest.raises(OutputError, match=r"heat\.pvd: expected a file that can be removed"):
+        remove_heat_series(tmp_path / "heat.pvd")
+    with pytest.raises(OutputError, match=r"heat\.pvd: expected a file that can be written"):
+        write_heat_series(tmp_path / "heat.pvd", random_body, solution)

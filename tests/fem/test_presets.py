@@ -53,3 +53,29 @@ def test_wrong_files_are_refused(tmp_path, text, message) -> None:
     path.write_text(text)
     with pytest.raises(HeatError, match=message):
         load_heat_preset(str(path))
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("1e0", r"conductivity_w_mk: expected a number, got the text '1e0'\. Write 1, without quotes"),
+        ("1.0e0", r"got the text '1.0e0'.* as in 1\.0e\+0"),
+        ("2e-30", r"Write 2\.0e-30, without"),
+        ('"1.7"', r"Write 1\.7, without quotes"),
+        ("true", "conductivity_w_mk: expected a finite number above 0, got True"),
+        ('"nan"', "conductivity_w_mk: expected a finite number above 0, got 'nan'"),
+    ],
+)
+def test_text_and_truth_values_are_no_numbers(tmp_path, value, message) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        f"material: {{name: x, conductivity_w_mk: {value}, density_kg_m3: 1, specific_heat_j_kgk: 1}}\n"
+        "time: {steps: 1, step_seconds: 1}\n"
+    )
+    with pytest.raises(HeatError, match=message):
+        load_heat_preset(str(path))
+    path.write_text(path.read_text().replace(value, "1.0e+0").replace("step_seconds: 1", "step_seconds: true"))
+    with pytest.raises(HeatError, match="step_seconds"):
+        load_heat_preset(str(path))
+    path.write_text(path.read_text().replace("true", "1.0e+0"))
+    assert load_heat_preset(str(path)).material.conductivity_w_mk == 1.0

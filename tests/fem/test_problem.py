@@ -75,3 +75,9 @@ def test_unusable_meshes_are_refused(random_body, concrete, what, message) -> No
     HeatProblem(random_body, concrete)
     with pytest.raises(HeatError, match=message):
         HeatProblem(broken(random_body, what), concrete)
+
+
+def test_times_must_be_numbers() -> None:
+    assert TimeSteps(10, 1e307).times_s[-1] == 1e308
+    with pytest.raises(HeatError, match="last time"):
+        TimeSteps(100, 1e307)

@@ -103,3 +103,11 @@ def test_failure_to_converge_raises_and_can_be_a_status(random_body, concrete, m
     solution = solve_heat(problem, PAPER, allow_unconverged=True)
     assert not solution.converged and "Step 1 of 10 failed" in solution.status
     assert len(solution.times_s) == 1 and solution.heat_w.shape == (0,)
+
+
+def test_states_that_do_not_fit_into_memory_are_refused(random_body, concrete, monkeypatch) -> None:
+    nodes = len(random_body.points_m)
+    monkeypatch.setattr("thermoxels_ns.fem.stepping.MAX_STATE_BYTES", 11 * nodes * 8)
+    assert solve_heat(HeatProblem(random_body, concrete), PAPER).converged
+    with pytest.raises(HeatError, match=rf"12 times x {nodes} nodes x 8 bytes = {12 * nodes * 8} .*--steps up to 10,"):
+        solve_heat(HeatProblem(random_body, concrete), TimeSteps(11, 60.0))

@@ -7,6 +7,8 @@ import shutil
 from pathlib import Path
 
 import pytest
+import yaml
+from nerfstudio.configs.method_configs import all_methods
 
 from tests.integration.commands import SHORT_TRAINING, Trained, run
 
@@ -109,6 +111,15 @@ def test_checkpoint_of_another_method(trained: Trained, tmp_path):
     assert result.returncode == 1 and "Error: checkpoint:" in result.stdout and "Traceback" not in result.stdout
 
 
-def test_config_of_a_method_without_a_grid(tmp_path):
+def test_config_that_is_not_there(tmp_path):
     result = export(tmp_path / "absent.yml", tmp_path / "export")
     assert result.returncode == 1 and "load_config: expected the config.yml" in " ".join(result.stdout.split())
+
+
+def test_config_of_a_stock_method(tmp_path):
+    """nerfacto's config: a method without a voxel grid is named before anything is loaded."""
+    config = tmp_path / "config.yml"
+    config.write_text(yaml.dump(all_methods["nerfacto"]))
+    result = export(config, tmp_path / "export")
+    words = " ".join(result.stdout.split())
+    assert result.returncode == 1 and "nerfacto" in words and "Traceback" not in words

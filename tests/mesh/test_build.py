@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -113,6 +115,24 @@ def test_weight_zero_is_never_a_measurement(snapshot_of):
 def test_body_no_thermal_ray_saw_is_refused(snapshot_of):
     with pytest.raises(MeshError, match="at least one node seen by a thermal ray"):
         build_voxel_mesh(snapshot_of(np.ones((3, 3, 3)), 20.0, 0.0), DENSE, np.eye(4))
+
+
+def test_part_no_thermal_ray_saw_is_left_out(snapshot_of):
+    # Three bodies: one seen, one that touches it by a corner only, and one apart that nobody saw.
+    cells = np.zeros((7, 4, 4), bool)
+    cells[:2, :2, :2] = cells[2, 2, 2] = cells[4:6, :1, :3] = True
+    weight = np.zeros((8, 5, 5))
+    weight[0] = 1.0
+    field = replace(snapshot_of(np.ones(weight.shape), 20.0, weight), voxel_density=cells.astype(np.float32))
+    every = SolidSelection(density_threshold=0.5, largest_component=False)
+    mesh, solid = build_voxel_mesh(field, every, np.eye(4))
+    assert (solid.num_unobserved_parts, solid.num_unobserved_voxels) == (1, 6)
+    expected = cells.copy()
+    expected[4:] = False
+    assert np.array_equal(solid.cells, expected) and len(mesh.tets) == 6 * 9
+    assert check_mesh(mesh).volume_m3 == pytest.approx(9 * 0.5**3)
+    mesh, solid = build_voxel_mesh(replace(field, observed_weight=np.ones((8, 5, 5), np.float32)), every, np.eye(4))
+    assert (solid.num_unobserved_parts, solid.num_unobserved_voxels, len(mesh.tets)) == (0, 0, 6 * 15)
 
 
 def test_solid_that_touches_the_border_is_tagged(snapshot_of):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+import pyvista
 from PIL import Image
 
 from thermoxels_ns.errors import MeshError, OutputError
@@ -67,6 +69,36 @@ def test_all_unobserved_is_all_grey(tmp_path, box_mesh):
     inside = stage(pixels(tmp_path / "g.png"))
     assert np.all(np.ptp(inside, axis=-1) < 8)
     assert np.mean(inside < 230) > 0.1
+
+
+def test_legend_of_grey_only_where_there_is_grey(tmp_path, box_mesh, monkeypatch):
+    words = []
+    monkeypatch.setattr(pyvista.Plotter, "add_text", lambda self, text, **_: words.append(text))
+    picture_of_mesh(tmp_path / "g.png", box_mesh, title="T", grey_unobserved=True, window_size=SIZE)
+    assert words[0] == "T" and not any("grey" in text for text in words)  # only inner nodes are unseen
+    unseen = replace(box_mesh, observed=box_mesh.points_m[:, 0] < 0.1)
+    picture_of_mesh(tmp_path / "g.png", unseen, title="T", grey_unobserved=True, window_size=SIZE)
+    assert words[2] == "T" and words[3].endswith("; grey: no thermal ray")
+
+
+def test_colour_map_and_its_title_can_be_chosen(tmp_path, box_mesh, monkeypatch):
+    bars = []
+    add = pyvista.Plotter.add_scalar_bar
+    monkeypatch.setattr(
+        pyvista.Plotter,
+        "add_scalar_bar",
+        lambda self, **how: (bars.append((how["title"], how["fmt"])), add(self, **how))[1],
+    )
+    blues = []
+    for change in (-0.01, 0.01):
+        same = np.full(len(box_mesh.points_m), change)
+        how: Any = {"clim": (-0.01, 0.01), "colour_map": "coolwarm", "bar_title": "change [K]", "window_size": SIZE}
+        picture_of_mesh(tmp_path / "c.png", box_mesh, same, **how)
+        inside = stage(pixels(tmp_path / "c.png"))
+        body = inside[np.any(inside < 230, axis=-1)]
+        blues.append(np.median(body[:, 2] - body[:, 0]))
+    assert blues[0] > 50 and blues[1] < -50
+    assert bars[0][0] == "change [K]" and "4" in bars[0][1]  # digits enough to tell 0.005 from 0.01
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, -2), (0.3, -0.5, 0.2)])

@@ -120,3 +120,16 @@ def test_differences_of_a_nanokelvin_survive() -> None:
     solution = solve_heat(HeatProblem(mesh, CONCRETE), TimeSteps(10, 600.0))
     assert solution.energy_residual_of_spread < 1e-9
     assert 1e-11 < np.ptp(solution.temperature_c[-1]) < 0.9e-9
+
+
+@pytest.mark.parametrize("shape", ["cube", "carved", "bar"])
+@pytest.mark.parametrize(("voxel_m", "dt"), [(0.05, 1e14), (0.05, 1e20), (0.05, 1e300), (1e-10, 60.0), (1e-30, 60.0)])
+def test_a_level_body_stays_level(shape: str, voxel_m: float, dt: float) -> None:
+    """Once the differences are gone, K T is round-off and M / dt + K all but singular: nothing may move or fail."""
+    cells = {"cube": np.ones((6, 6, 6), bool), "carved": carved(), "bar": np.ones((60, 1, 1), bool)}[shape]
+    solution = solve_heat(HeatProblem(body(cells, voxel_m, spots), CONCRETE), TimeSteps(10, dt))
+    states = solution.temperature_c
+    assert solution.converged and solution.energy_residual < 1e-14
+    assert states.min() >= -30.0 - 1e-9 and states.max() <= 90.0 + 1e-9
+    assert np.ptp(states[-1]) < 1e-10
+    np.testing.assert_array_equal(states[-1], states[-2])

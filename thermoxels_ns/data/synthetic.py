@@ -15,7 +15,7 @@ import numpy.typing as npt
 from PIL import Image
 from rich.progress import track
 
-from thermoxels_ns.checks import replace_when_done, writable_folder
+from thermoxels_ns.checks import remove_file, replace_when_done, writable_folder
 from thermoxels_ns.data.pinhole import PinholeCamera
 from thermoxels_ns.data.raycast import RenderedView, render_view, visible_surface_points
 from thermoxels_ns.data.scene_truth import SyntheticScene
@@ -66,7 +66,8 @@ def write_scene(
 
     Args:
         scene: What to photograph.
-        folder: Where to write; made if absent. A folder that holds a scene which is not synthetic is refused.
+        folder: Where to write; made if absent. An earlier synthetic scene in it is removed; a folder that holds a
+            scene which is not synthetic is refused.
         num_train: Number of training views.
         num_eval: Number of held-out views, half-way between training views.
         width: Width of the photographs [pixels].
@@ -204,11 +205,15 @@ def _check_options(thermal_format: str, noise_k: float, drift_k: float) -> None:
 
 
 def _prepared_folder(folder: Path | str) -> Path:
-    """Make the folders and take away the json of an earlier synthetic scene, so that no half-written one loads."""
+    """Make the folders and take away an earlier synthetic scene, so that nothing stale or half-written stays.
+
+    The json goes last: whatever interrupts this, the next call still knows what to take away.
+    """
     target = writable_folder(folder)
     old = target / "transforms.json"
     if old.exists():
-        if _read_transforms(old).get("truth") is None:
+        content = _read_transforms(old)
+        if content.get("truth") is None:
             raise SceneError(
                 explain(
                     "output folder",
@@ -217,10 +222,22 @@ def _prepared_folder(folder: Path | str) -> Path:
                     remedy="Choose another folder.",
                 )
             )
-        old.unlink()
+        for path in _listed_files(target, content):
+            remove_file(path)
+        remove_file(old)
     for name in ("images", "thermal"):
         writable_folder(target / name)
     return target
+
+
+def _listed_files(folder: Path, transforms: dict[str, Any]) -> list[Path]:
+    """Photographs and thermal files that a json lists and that lie inside the scene's folder."""
+    listed = transforms.get("frames")
+    frames = [frame for frame in listed if isinstance(frame, dict)] if isinstance(listed, list) else []
+    names = [frame.get(key) for frame in frames for key in ("file_path", "thermal_file_path")]
+    paths = [folder / name for name in names if isinstance(name, str)]
+    inside = folder.resolve()
+    return [path for path in paths if path.resolve().is_relative_to(inside) and path.is_file()]
 
 
 def _second_camera(scene: SyntheticScene, width: int, height: int) -> PinholeCamera:

@@ -169,7 +169,11 @@ class ThermalDataParser(DataParser):
         )
         world, box, box_source = self._place(file)
         survey = survey_thermal_files(
-            [frame.thermal for frame in file.frames], file.unit, config.valid_range_c, file.bounds_c
+            [frame.thermal for frame in file.frames],
+            file.unit,
+            config.valid_range_c,
+            file.bounds_c,
+            {file.frames[index].thermal for index in split.train},
         )
         evaluation = set(split.val) | set(split.test)
         CONSOLE.print(

@@ -30,6 +30,15 @@ class ThermalDataset(InputDataset):
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
         super().__init__(dataparser_outputs, scale_factor)
+        if "temperature_range" not in self.metadata:
+            raise SceneError(
+                explain(
+                    "dataparser",
+                    expected="thermal-data, which finds the thermal images",
+                    got="one that gives photographs only",
+                    remedy="Write: ns-train thermoxels thermal-data --data SCENE.",
+                )
+            )
         self.temperature_range: TemperatureRange = self.metadata["temperature_range"]
         self.thermal_cameras: Cameras | None = self.metadata["thermal_cameras"]
         if self.thermal_cameras is None and scale_factor != 1.0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +25,7 @@ class ThermalSurvey:
     shapes: dict[Path, tuple[int, int]]
     """Height and width of every file."""
     temperature_range: TemperatureRange
-    """From temperature_bounds.json, else from the extremes of all valid pixels."""
+    """From temperature_bounds.json and the extremes of the training files' valid pixels."""
     dead_pixels: dict[tuple[int, int], npt.NDArray[np.bool_]]
     """Mask of stuck pixels for every resolution that has some."""
 
@@ -35,15 +35,17 @@ def survey_thermal_files(
     unit: ThermalUnit,
     valid_range_c: tuple[float, float],
     bounds_c: tuple[float, float] | None,
+    training: Collection[Path] | None = None,
 ) -> ThermalSurvey:
     """Read every thermal file once.
 
     Args:
-        paths: All thermal files of the scene, training and evaluation: the range and the stuck pixels are the
-            camera's, and both sides must agree on them.
+        paths: All thermal files of the scene, training and evaluation.
         unit: Meaning of the numbers in the files.
         valid_range_c: Temperatures outside are masked, [degrees Celsius].
-        bounds_c: Range to use instead of the extremes, [degrees Celsius].
+        bounds_c: Range the scene declares, [degrees Celsius]. It is widened to the extremes of training files that hold
+            temperatures of their own; files that hold shares of the range cannot exceed it.
+        training: The files that training uses; range and stuck pixels come from them alone. None: all.
 
     Raises:
         ThermalFileError: A file cannot be read or has no valid pixel at all.
@@ -65,17 +67,20 @@ def survey_thermal_files(
                     remedy="Check thermal_unit or temperature_bounds.json, or widen --valid-range-c.",
                 )
             )
+        if training is not None and path not in training:
+            continue
         extremes[path] = (float(np.nanmin(temperature_c)), float(np.nanmax(temperature_c)))
         if number % step == 0:
             kept.setdefault((height, width), []).append(temperature_c)
     dead = {shape: find_dead_pixels(np.stack(frames)) for shape, frames in kept.items()}
     dead = {shape: mask for shape, mask in dead.items() if mask.any()}
-    if bounds_c is None:
-        for path, shape in shapes.items():
-            if shape in dead:  # the extremes of these files may be a stuck pixel's
-                live = read_temperature_c(path, unit, valid_range_c)[~dead[shape]]
-                if np.isfinite(live).any():
-                    extremes[path] = (float(np.nanmin(live)), float(np.nanmax(live)))
-        lows, highs = zip(*extremes.values())
-        bounds_c = (min(lows), max(highs))
-    return ThermalSurvey(shapes, TemperatureRange.spanning(*bounds_c), dead)
+    for path in extremes:
+        if shapes[path] in dead:  # the extremes of these files may be a stuck pixel's
+            live = read_temperature_c(path, unit, valid_range_c)[~dead[shapes[path]]]
+            if np.isfinite(live).any():
+                extremes[path] = (float(np.nanmin(live)), float(np.nanmax(live)))
+    lows, highs = zip(*extremes.values())
+    low, high = min(lows), max(highs)
+    if bounds_c is not None:
+        low, high = min(low, bounds_c[0]), max(high, bounds_c[1])
+    return ThermalSurvey(shapes, TemperatureRange.spanning(low, high), dead)

@@ -5,12 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree import ElementTree
 
-from thermoxels_ns.checks import replace_when_done, writable_folder
+from thermoxels_ns.checks import remove_file, replace_when_done, writable_folder
+from thermoxels_ns.errors import OutputError, explain
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.mesh.files import write_vtu
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-_STEP_PATTERN = "step-*.vtu"
+STEP_PATTERN = "step-*.vtu"
+"""Names of the files of a series."""
 
 
 def write_heat_series(pvd: Path | str, mesh: TetMesh, solution: HeatSolution) -> list[Path]:
@@ -26,11 +28,14 @@ def write_heat_series(pvd: Path | str, mesh: TetMesh, solution: HeatSolution) ->
 
     Returns:
         All paths written, the .pvd first.
+
+    Raises:
+        OutputError: A file cannot be written.
     """
     pvd = Path(pvd)
     writable_folder(pvd.parent)
     folder = writable_folder(pvd.with_suffix(""))
-    steps = [folder / f"step-{number:04d}.vtu" for number in range(len(solution.times_s))]
+    steps = heat_series_paths(pvd, len(solution.times_s))[1:]
     for path, temperature_c in zip(steps, solution.temperature_c):
         write_vtu(path, mesh, temperature_c=temperature_c)
     root = ElementTree.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
@@ -41,17 +46,37 @@ def write_heat_series(pvd: Path | str, mesh: TetMesh, solution: HeatSolution) ->
     ElementTree.indent(root)
     with replace_when_done(pvd) as temporary:
         ElementTree.ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)
-    for path in set(folder.glob(_STEP_PATTERN)) - set(steps):
-        path.unlink()
+    for path in set(folder.glob(STEP_PATTERN)) - set(steps):
+        remove_file(path)
     return [pvd, *steps]
 
 
-def remove_heat_series(pvd: Path | str) -> None:
-    """Remove a series written by `write_heat_series`, if there is one."""
+def heat_series_paths(pvd: Path | str, num_states: int) -> list[Path]:
+    """Name the files that `write_heat_series` writes for so many states, the .pvd first."""
     pvd = Path(pvd)
-    pvd.unlink(missing_ok=True)
+    return [pvd, *(pvd.with_suffix("") / f"step-{number:04d}.vtu" for number in range(num_states))]
+
+
+def remove_heat_series(pvd: Path | str) -> None:
+    """Remove a series written by `write_heat_series`, if there is one.
+
+    Raises:
+        OutputError: A file cannot be removed.
+    """
+    pvd = Path(pvd)
+    remove_file(pvd)
     folder = pvd.with_suffix("")
-    for path in folder.glob(_STEP_PATTERN):
-        path.unlink()
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()
+    for path in folder.glob(STEP_PATTERN):
+        remove_file(path)
+    try:
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+    except OSError as problem:
+        raise OutputError(
+            explain(
+                "heat series",
+                expected=f"a folder that can be removed at {folder}",
+                got=problem.strerror or str(problem),
+                remedy="Change its permissions, or choose another folder.",
+            )
+        ) from problem

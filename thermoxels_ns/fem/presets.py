@@ -5,6 +5,7 @@ The files are the only place where these numbers stand; no default in the code r
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -82,9 +83,34 @@ def load_heat_preset(name: str) -> HeatPreset:
             explain(path.name, expected="a yaml file", got=str(problem), remedy="Correct the file.")
         ) from problem
     content = _keys(path.name, content, HeatPreset)
-    return HeatPreset(
-        Material(**_keys(f"{path.name}: material", content["material"], Material)),
-        TimeSteps(**_keys(f"{path.name}: time", content["time"], TimeSteps)),
+    material = _keys(f"{path.name}: material", content["material"], Material)
+    time = _keys(f"{path.name}: time", content["time"], TimeSteps)
+    for key, value in [*material.items(), *time.items()]:
+        _check_not_text(f"{path.name}: {key}", value, is_name=key == "name")
+    return HeatPreset(Material(**material), TimeSteps(**time))
+
+
+def _check_not_text(name: str, value: object, *, is_name: bool) -> None:
+    """Refuse text that looks like a number: yaml takes 1e0 and 1.0e0 for text, and only 1.0e+0 for a number."""
+    if is_name or not isinstance(value, str):
+        return
+    try:
+        number = float(value)
+    except ValueError:
+        return
+    if not math.isfinite(number):
+        return
+    written = f"{number:.15g}"
+    mantissa, _, exponent = written.partition("e")
+    if exponent:
+        written = f"{mantissa if '.' in mantissa else mantissa + '.0'}e{exponent}"
+    raise HeatError(
+        explain(
+            name,
+            expected="a number",
+            got=f"the text {value!r}",
+            remedy=f"Write {written}, without quotes; a power of ten needs a point and a sign in yaml, as in 1.0e+0.",
+        )
     )
 
 

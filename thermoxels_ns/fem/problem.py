@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numbers
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +42,15 @@ class TimeSteps:
             )
         seconds = check_positive("step_seconds", self.step_seconds, "Pass --step-seconds 60, for example.", HeatError)
         object.__setattr__(self, "step_seconds", seconds)
+        if self.steps * (seconds / sys.float_info.max) > 1.0:
+            raise HeatError(
+                explain(
+                    "steps and step_seconds",
+                    expected=f"a last time that is a number, at most {sys.float_info.max:.3g} s",
+                    got=f"{self.steps} steps of {seconds:g} s",
+                    remedy="Pass a shorter --step-seconds.",
+                )
+            )
 
     @property
     def times_s(self) -> npt.NDArray[np.float64]:

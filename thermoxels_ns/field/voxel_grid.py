@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 import torch.nn.functional as F
@@ -81,6 +81,7 @@ class VoxelGrid(nn.Module):
         self.register_buffer("lo", torch.tensor(lattice.lo, dtype=torch.float64))
         self.register_buffer("voxel_size", torch.tensor(lattice.voxel_size, dtype=torch.float64))
         self.register_buffer("corner_shape", torch.tensor(lattice.shape))
+        self.register_buffer("activation_index", torch.tensor(get_args(DensityActivation).index(activation)))
         self.register_buffer("kept", torch.ones(lattice.cell_shape, dtype=torch.bool))
         self._lattice = lattice
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
+
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
 
 from thermoxels_ns.checks import check_finite, check_shape
 from thermoxels_ns.errors import MeshError, explain
+from thermoxels_ns.lattice import CORNER_OFFSETS
 from thermoxels_ns.mesh.solid import SolidCells, SolidSelection, select_solid
 from thermoxels_ns.mesh.temperature import MIN_OBSERVED_WEIGHT, extend_harmonically
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -14,13 +18,25 @@ from thermoxels_ns.mesh.voxel_tets import boundary_facets, boundary_tags, kuhn_t
 from thermoxels_ns.snapshot import GridSnapshot
 
 
+@dataclass(frozen=True)
+class MeshedCells(SolidCells):
+    """The solid voxels that a mesh is made of."""
+
+    num_unobserved_parts: int
+    """Parts left out because no thermal ray saw any of their nodes."""
+    num_unobserved_voxels: int
+    """Voxels of these parts; they count in `component_sizes`, but are not in `cells`."""
+
+
 def build_voxel_mesh(
     snapshot: GridSnapshot,
     selection: SolidSelection,
     world_to_metres: npt.NDArray[np.float64],
     min_observed_weight: float = MIN_OBSERVED_WEIGHT,
-) -> tuple[TetMesh, SolidCells]:
+) -> tuple[TetMesh, MeshedCells]:
     """Cut the solid part of a trained field into tetrahedra with nodal temperatures.
+
+    Parts of it that no thermal ray saw have no temperature at all and are left out.
 
     Args:
         snapshot: The trained field on its corner lattice.
@@ -35,7 +51,7 @@ def build_voxel_mesh(
         stay positive.
 
     Raises:
-        MeshError: Nothing is solid, the 4x4 is no similarity, or a part of the mesh has no measured node.
+        MeshError: Nothing is solid, the 4x4 is no similarity, or no node of the mesh was measured.
     """
     transform = check_similarity("world_to_metres", world_to_metres)
     if not (np.isfinite(min_observed_weight) and min_observed_weight >= 0.0):
@@ -47,14 +63,15 @@ def build_voxel_mesh(
                 remedy=f"Leave it out to use {MIN_OBSERVED_WEIGHT}.",
             )
         )
-    solid = select_solid(snapshot, selection)
+    least = max(min_observed_weight, np.finfo(np.float32).tiny)
+    observed_corners = snapshot.observed_weight >= least
+    solid = _without_unobserved_parts(select_solid(snapshot, selection), observed_corners)
     corners, tets = kuhn_tets(solid.cells)
     facets = boundary_facets(tets)
     tags = boundary_tags(facets, corners, snapshot.lattice.shape)
 
     nodes = tuple(corners.T)
-    weight = snapshot.observed_weight[nodes]
-    observed = (weight >= min_observed_weight) & (weight > 0.0)
+    observed = observed_corners[nodes]
     edges, num_voxels = lattice_edges(solid.cells)
     temperature_c = extend_harmonically(edges, snapshot.temperature_c[nodes], observed, edge_weights=num_voxels)
 
@@ -70,6 +87,27 @@ def build_voxel_mesh(
         region=np.zeros(len(tets), dtype=np.int64),
     )
     return mesh, solid
+
+
+def _without_unobserved_parts(solid: SolidCells, observed_corners: npt.NDArray[np.bool_]) -> MeshedCells:
+    """Leave out voxels whose connected part of the mesh has no observed node, unless that is all of them."""
+    # Voxels share a node if they touch by a face, an edge or a corner.
+    part = np.zeros(solid.cells.shape, dtype=np.int32)
+    count = int(ndimage.label(solid.cells, structure=np.ones((3, 3, 3)), output=part))  # type: ignore[arg-type]
+    nx, ny, nz = solid.cells.shape
+    touched = np.zeros(solid.cells.shape, dtype=bool)
+    for dx, dy, dz in CORNER_OFFSETS:
+        touched |= observed_corners[dx : dx + nx, dy : dy + ny, dz : dz + nz]
+    seen = np.bincount(part[solid.cells & touched], minlength=count + 1) > 0
+    found = {field.name: getattr(solid, field.name) for field in fields(SolidCells)}
+    if seen[1:].all() or not seen.any():
+        return MeshedCells(**found, num_unobserved_parts=0, num_unobserved_voxels=0)
+    found["cells"] = solid.cells & seen[part]
+    return MeshedCells(
+        **found,
+        num_unobserved_parts=int(np.count_nonzero(~seen[1:])),
+        num_unobserved_voxels=int(np.count_nonzero(solid.cells & ~seen[part])),
+    )
 
 
 def check_similarity(name: str, matrix: npt.ArrayLike) -> npt.NDArray[np.float64]:

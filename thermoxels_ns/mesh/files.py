@@ -104,21 +104,16 @@ def write_summary(path: Path | str, summary: Mapping[str, Any]) -> None:
             it.
         OutputError: The file cannot be written.
     """
-    text = json.dumps(_plain("summary", summary), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    text = summary_text(summary)
     path = Path(path)
     writable_folder(path.parent)
     with replace_when_done(path) as temporary:
-        try:
-            temporary.write_text(text, encoding="utf-8")
-        except OSError as problem:
-            raise OutputError(
-                explain(
-                    "summary file",
-                    expected=f"to write {path}",
-                    got=problem.strerror or str(problem),
-                    remedy="Check the free space and the permissions of the folder.",
-                )
-            ) from problem
+        temporary.write_text(text, encoding="utf-8")
+
+
+def summary_text(summary: Mapping[str, Any]) -> str:
+    """Text of the file that `write_summary` writes; raises the same `MeshError`."""
+    return json.dumps(_plain("summary", summary), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def _plain(name: str, value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -24,9 +25,10 @@ if TYPE_CHECKING:
 _STAGE = (0.04, 0.16, 0.80, 0.90)
 _GREY = "#b8b8b8"
 _INK = "#202020"
-_BAR_TITLE = "temperature [\N{DEGREE SIGN}C]"
+BAR_TITLE = "temperature [\N{DEGREE SIGN}C]"
+"""What a colour bar says unless told otherwise."""
 _DARKEST = 0.1
-"""Share of the colour map left out at its dark end, where shading could not be told from cold."""
+"""Share of inferno left out at its dark end, where shading could not be told from cold."""
 
 
 def picture_of_mesh(
@@ -41,6 +43,8 @@ def picture_of_mesh(
     grey_unobserved: bool = False,
     show_edges: bool = False,
     length_unit: str = "m",
+    colour_map: str = "inferno",
+    bar_title: str = BAR_TITLE,
     window_size: tuple[int, int] = (1200, 900),
 ) -> None:
     """Draw the surface of a mesh, coloured by temperature, as a PNG with a white background.
@@ -50,14 +54,17 @@ def picture_of_mesh(
     Args:
         path: File to write, ending in .png; its folder is made if need be.
         mesh: The mesh.
-        temperature_c: Nodal temperatures to show, shape (n,), [degrees Celsius]; the mesh's own if left out.
+        temperature_c: Nodal values to show, shape (n,), [degrees Celsius] unless `bar_title` says otherwise; the
+            mesh's own temperatures if left out.
         title: Text above the picture.
-        clim: Temperatures at the ends of the colour bar, [degrees Celsius]; the data's extremes if left out.
+        clim: Values at the ends of the colour bar; the data's extremes if left out.
         up: Direction that points up in the picture, in mesh coordinates.
         view_direction: Direction from the camera to the mesh; obliquely from above if left out.
         grey_unobserved: Draw triangles with a node that no thermal ray saw in grey.
         show_edges: Draw the triangles' edges.
         length_unit: Name of the unit of the node positions, written below the picture.
+        colour_map: Name of a colour map of matplotlib, such as "coolwarm" for changes to both sides of 0.
+        bar_title: Quantity and unit, written beside the colour bar.
         window_size: Width and height, [pixels].
 
     Raises:
@@ -98,13 +105,13 @@ def picture_of_mesh(
                 plotter.add_mesh(
                     surface,
                     scalars="temperature_c",
-                    cmap=_colour_map(),
+                    cmap=_colour_map(colour_map),
                     clim=(low, high),
                     show_scalar_bar=False,
                     **edges,
                     **matter,
                 )
-                _add_colour_bar(plotter, font, high - low)
+                _add_colour_bar(plotter, font, bar_title, high - low)
             if unseen.any():
                 surface = pv.PolyData.from_regular_faces(mesh.points_m, mesh.facets[unseen])
                 plotter.add_mesh(surface, color=_GREY, **edges, **matter)
@@ -151,12 +158,13 @@ def _colour_limits(values: npt.NDArray[np.float64]) -> tuple[float, float]:
     return (low, high) if high - low > 1e-3 else (low - 0.5, high + 0.5)
 
 
-def _colour_map() -> ListedColormap:
-    """Inferno (perceptually uniform, readable in grey) without its black end."""
+def _colour_map(name: str) -> ListedColormap:
+    """A colour map; inferno (perceptually uniform, readable in grey) without its black end."""
     import matplotlib
     from matplotlib.colors import ListedColormap
 
-    return ListedColormap(matplotlib.colormaps["inferno"](np.linspace(_DARKEST, 1.0, 256)))
+    start = _DARKEST if name == "inferno" else 0.0
+    return ListedColormap(matplotlib.colormaps[name](np.linspace(start, 1.0, 256)))
 
 
 def _font_file() -> str:
@@ -166,13 +174,13 @@ def _font_file() -> str:
     return str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf")
 
 
-def _add_colour_bar(plotter: pv.Plotter, font: str, span: float) -> None:
+def _add_colour_bar(plotter: pv.Plotter, font: str, title: str, span: float) -> None:
     import pyvista as pv
 
     height = plotter.window_size[1]
-    decimals = 1 if span > 2.0 else 2
+    decimals = 1 if span > 2.0 else 2 + max(0, math.ceil(-math.log10(span)))
     bar = plotter.add_scalar_bar(  # pyright: ignore[reportCallIssue]  (pyvista wraps it without self)
-        title=_BAR_TITLE,
+        title=title,
         vertical=True,
         position_x=0.86,
         position_y=0.2,

@@ -18,7 +18,7 @@ class SolidSelection:
     """How solid voxels are told from empty ones."""
 
     voxel_optical_depth: float = 0.5
-    """Voxels in which density times edge length is at least this are solid: at 0.5, light that crosses one loses 39 %."""
+    """Voxels in which density times edge length is at least this are solid: at 0.5, light that crosses loses 39 %."""
     density_percentile: float | None = None
     """Percentile p of the density over all voxels of the box, 0 to 100: the (100 - p) % densest voxels are solid, as in
     the Thermoxels paper. Overrides the optical depth. Raise it if empty space turns solid, lower it if walls have

@@ -11,8 +11,8 @@ from scipy.sparse.linalg import cg, spsolve
 from thermoxels_ns.checks import check_finite, check_shape
 from thermoxels_ns.errors import MeshError, explain
 
-MIN_OBSERVED_WEIGHT = 0.01
-"""A node counts as measured if thermal rays, all together, gave it at least a hundredth of one fully absorbed ray.
+MIN_OBSERVED_WEIGHT = 0.5
+"""A node counts as measured if thermal rays, all together, gave it at least half of one fully absorbed ray.
 Less is leakage through a surface or the tail of an interpolation, and its temperature is mostly the starting value."""
 
 _DIRECT_SOLVE_UNKNOWNS = 4000
@@ -98,8 +98,7 @@ def _parts_with_measurement(links: sparse.csr_array, observed: npt.NDArray[np.bo
                 "observed temperatures",
                 expected="at least one node seen by a thermal ray in each connected part of the mesh",
                 got=f"none in {len(blind)} of {count} parts: {shown}{', ...' if len(blind) > 3 else ''}",
-                remedy="Keep only the largest component, train with thermal images that show this part, "
-                "or lower min_observed_weight.",
+                remedy="Train with thermal images that show this part.",
             )
         )
     return parts.astype(np.int64)
@@ -119,7 +118,7 @@ def _solve(matrix: sparse.csr_array, load: npt.NDArray, degree: npt.NDArray) -> 
                 "harmonic extension of the temperature",
                 expected=f"a relative residual of at most {_RELATIVE_RESIDUAL:g}",
                 got=f"{residual / scale:.3g} with {len(load)} unobserved nodes",
-                remedy="Lower the resolution of the mesh or min_observed_weight, so that more nodes are measured.",
+                remedy="Train at a lower resolution, or with thermal images that show more of the scene.",
             )
         )
     return solution

@@ -43,7 +43,8 @@ def march(
     density_at: Callable[[Tensor], Tensor],
     keep: Callable[[Tensor], Tensor] | None = None,
     steps_per_voxel: float = 2.0,
-    near: float = 0.0,
+    near: float | Float[Tensor, " rays"] = 0.0,
+    far: Float[Tensor, " rays"] | None = None,
 ) -> March:
     """Sample rays inside the lattice and turn density into weights.
 
@@ -55,13 +56,14 @@ def march(
         keep: Maps positions to booleans: samples it refuses have density 0 without being asked; None: ask all.
         steps_per_voxel: Samples per voxel edge.
         near: Distance in front of the camera where sampling starts, world units.
+        far: Distance where it ends; None: at the box.
 
     Returns:
         Samples, densities and weights.
     """
     lo = torch.tensor(lattice.lo, dtype=origins.dtype, device=origins.device)
     hi = torch.tensor(lattice.hi, dtype=origins.dtype, device=origins.device)
-    steps = sample_box(origins, directions, lo, hi, lattice.voxel_size / steps_per_voxel, near)
+    steps = sample_box(origins, directions, lo, hi, lattice.voxel_size / steps_per_voxel, near, far)
     active = (steps.deltas > 0).flatten().nonzero()[:, 0]
     rays = active // steps.t.shape[1]
     positions = origins[rays] + directions[rays] * steps.t.flatten()[active][:, None]

@@ -24,7 +24,8 @@ def intersect_box(
     directions: Float[Tensor, "rays 3"],
     lo: Float[Tensor, " 3"],
     hi: Float[Tensor, " 3"],
-    near: float = 0.0,
+    near: float | Float[Tensor, " rays"] = 0.0,
+    far: Float[Tensor, " rays"] | None = None,
 ) -> tuple[Float[Tensor, " rays"], Float[Tensor, " rays"], Bool[Tensor, " rays"]]:
     """Intersect rays with an axis-aligned box by slabs (Kay and Kajiya 1986), each axis guarded.
 
@@ -38,6 +39,7 @@ def intersect_box(
         lo: Lower corner of the box.
         hi: Upper corner of the box.
         near: Smallest distance from the origin, >= 0.
+        far: Largest distance from the origin; None: none.
 
     Returns:
         Entry distance, exit distance and whether the ray meets the box over a length above 0; a miss has both
@@ -50,8 +52,8 @@ def intersect_box(
     infinity = torch.full_like(t_lo, torch.inf)
     enter = torch.where(parallel, torch.where(inside, -infinity, infinity), torch.minimum(t_lo, t_hi))
     leave = torch.where(parallel, torch.where(inside, infinity, -infinity), torch.maximum(t_lo, t_hi))
-    t_enter = enter.amax(-1).clamp(min=near)
-    t_leave = leave.amin(-1)
+    t_enter = torch.maximum(enter.amax(-1), torch.as_tensor(near, dtype=origins.dtype, device=origins.device))
+    t_leave = leave.amin(-1) if far is None else torch.minimum(leave.amin(-1), far)
     hit = (t_leave > t_enter) & torch.isfinite(t_leave)
     zero = torch.zeros_like(t_enter)
     return torch.where(hit, t_enter, zero), torch.where(hit, t_leave, zero), hit
@@ -63,7 +65,8 @@ def sample_box(
     lo: Float[Tensor, " 3"],
     hi: Float[Tensor, " 3"],
     step: float,
-    near: float = 0.0,
+    near: float | Float[Tensor, " rays"] = 0.0,
+    far: Float[Tensor, " rays"] | None = None,
 ) -> RaySteps:
     """Cut each ray's chord through the box into steps of length `step`; the last step takes what is left.
 
@@ -74,11 +77,12 @@ def sample_box(
         hi: Upper corner of the box.
         step: Step length, world units (the paper: half a voxel).
         near: Distance in front of the camera where sampling starts.
+        far: Distance where it ends; None: at the box.
 
     Returns:
         Samples in the middle of their steps.
     """
-    t_enter, t_leave, _ = intersect_box(origins, directions, lo, hi, near)
+    t_enter, t_leave, _ = intersect_box(origins, directions, lo, hi, near, far)
     length = t_leave - t_enter
     num_steps = max(1, int(torch.ceil(length.amax() / step)) if len(length) else 1)
     starts = torch.arange(num_steps, dtype=origins.dtype, device=origins.device) * step
