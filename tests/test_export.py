@@ -115,7 +115,7 @@ def test_heat_picture_holds_both_states_and_the_change(ball, tmp_path) -> None:
     before, after, change = np.split(picture, 3, axis=1)
     assert spread_of_hue(before) > 3.0 * spread_of_hue(after)  # the long step levels it to one colour
     warmed = np.mean(coloured(change)[:, 0] > coloured(change)[:, 2])
-    assert 0.15 < warmed < 0.85  # red where the cold side warmed, blue where the warm side cooled
+    assert 0.05 < warmed < 0.95  # red where the cold side warmed, blue where the warm side cooled
 
 
 def test_small_changes_fill_their_own_symmetric_scale(ball, tmp_path, monkeypatch) -> None:

@@ -89,12 +89,12 @@ def test_what_is_no_number_is_not_positive(value):
 
 def test_errors_of_the_disk_become_output_errors(tmp_path):
     (tmp_path / "mesh.vtu").mkdir()
-    with pytest.raises(OutputError, match=r"mesh\.vtu: expected a file that can be written.*Move away"):
-        with replace_when_done(tmp_path / "mesh.vtu") as temporary:
-            temporary.write_text("new")
-    with pytest.raises(OutputError, match=r"a\.txt: expected a file that can be written"):
-        with replace_when_done(tmp_path / "a.txt"):
-            raise OSError(28, "No space left on device")
+    blocked = pytest.raises(OutputError, match=r"mesh\.vtu: expected a file that can be written.*Move away")
+    with blocked, replace_when_done(tmp_path / "mesh.vtu") as temporary:
+        temporary.write_text("new")
+    full = pytest.raises(OutputError, match=r"a\.txt: expected a file that can be written.*No space left")
+    with full, replace_when_done(tmp_path / "a.txt"):
+        raise OSError(28, "No space left on device")
     with pytest.raises(OutputError, match=r"mesh\.vtu: expected a file that can be removed"):
         remove_file(tmp_path / "mesh.vtu")
     with pytest.raises(MeshError, match="own words"), replace_when_done(tmp_path / "a.txt"):

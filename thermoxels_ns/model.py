@@ -159,29 +159,27 @@ class ThermoxelsModel(Model):
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         """Render rays: rgb, thermal (normalised), temperature_c, depth, accumulation.
 
-        Rays of a batch carry their stream (see `streams.py`): then only what it needs is rendered, and the outputs are
-        those that losses are made of. A crop that the viewer sets (nears, fars) is kept.
+        Rays of a batch carry their stream (see `streams.py`). In training only what it needs is rendered, and the outputs
+        are those that losses are made of. A crop that the viewer sets (nears, fars) is kept.
         """
         origins, directions = ray_bundle.origins, ray_bundle.directions
         marched = self.march_rays(origins, directions, ray_bundle.nears, ray_bundle.fars)
-        if "stream" not in ray_bundle.metadata:
+        stream = ray_bundle.metadata.get("stream")
+        if stream is None:
             return self._image_outputs(self.composite_march(marched, directions, None, None), origins)
-        stream = ray_bundle.metadata["stream"][:, 0]
-        rgb_rays, thermal_rays = (stream & RGB_STREAM) > 0, (stream & THERMAL_STREAM) > 0
+        rgb_rays, thermal_rays = (stream[:, 0] & RGB_STREAM) > 0, (stream[:, 0] & THERMAL_STREAM) > 0
+        batch: dict[str, Any] = {"rgb_rays": rgb_rays, "thermal_rays": thermal_rays, "march": marched}
+        if not self.training:
+            # Stock exporters ask for batches as for images; colour is left out only where no ray is a photograph's.
+            no_rgb = None if bool(rgb_rays.any()) else rgb_rays
+            return batch | self._image_outputs(self.composite_march(marched, directions, no_rgb, None), origins)
         seen = self.composite_march(marched, directions, rgb_rays, thermal_rays)
         thermal = seen.thermal
-        if self.training and self.thermal_offset is not None and thermal is not None:
+        if self.thermal_offset is not None and thermal is not None:
             assert ray_bundle.camera_indices is not None
             offset = self.thermal_offset - self.thermal_offset.mean()
             thermal = thermal + offset[ray_bundle.camera_indices[:, 0]][:, None]
-        return {
-            "rgb": seen.rgb,
-            "thermal": thermal,
-            "accumulation": seen.accumulation[:, None],
-            "rgb_rays": rgb_rays,
-            "thermal_rays": thermal_rays,
-            "march": marched,
-        }
+        return batch | {"rgb": seen.rgb, "thermal": thermal, "accumulation": seen.accumulation[:, None]}
 
     def _image_outputs(self, seen: Composite, origins: Tensor) -> dict[str, Tensor]:
         assert seen.thermal is not None

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from thermoxels_ns.data.thermal_datamanager import ThermalDataManager
 from thermoxels_ns.errors import CheckpointError, SceneError, explain
 from thermoxels_ns.model import ThermoxelsModel
 from thermoxels_ns.snapshot import GridSnapshot
@@ -49,7 +48,8 @@ class ThermoxelsPipeline(VanillaPipeline):
                     remedy="Use the method plenoxels-t.",
                 )
             )
-        outputs = cast(ThermalDataManager, self.datamanager).train_dataparser_outputs
+        datamanager: Any = self.datamanager
+        outputs = datamanager.train_dataparser_outputs
         placed = torch.cat(
             (outputs.dataparser_transform.double() * outputs.dataparser_scale, outputs.scene_box.aabb.T), 1
         )

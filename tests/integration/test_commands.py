@@ -28,6 +28,16 @@ METRICS = (
 )
 
 
+def test_training_reports_evaluation_batches(trained: Trained, tmp_path):
+    """nerfstudio's own evaluation during training, which is off by default."""
+    result = run(
+        *("ns-train", "thermoxels", "--output-dir", str(tmp_path), *SHORT_TRAINING, "--max-num-iterations", "3"),
+        *("--steps-per-eval-batch", "1", "--steps-per-eval-image", "2", "thermal-data", "--data", str(trained.scene)),
+    )
+    assert result.returncode == 0, result.stdout
+    assert "the run ends before step 3: no refinement or pruning at 15, 30" in " ".join(result.stdout.split())
+
+
 def test_training_refines_prunes_and_saves(trained: Trained):
     saved = sorted(p.name for p in trained.checkpoints.iterdir())
     assert saved == ["step-000000020.ckpt", "step-000000039.ckpt"]
@@ -76,6 +86,20 @@ def test_a_stock_export_still_works(trained: Trained, tmp_path):
     result = run("ns-export", "cameras", "--load-config", str(trained.config), "--output-dir", str(tmp_path))
     assert result.returncode == 0, result.stdout
     assert len(json.loads((tmp_path / "transforms_train.json").read_text())) == 10
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["pointcloud", "--num-points", "300", "--remove-outliers", "False", "--normal-method", "open3d"],
+        ["tsdf", "--resolution", "24", "--target-num-faces", "200", "--downscale-factor", "1"],
+    ],
+)
+def test_stock_exports_that_render_still_work(trained: Trained, tmp_path, command):
+    options = ["--load-config", str(trained.config), "--output-dir", str(tmp_path)]
+    result = run("ns-export", command[0], *options, *command[1:])
+    assert result.returncode == 0, result.stdout
+    assert any(path.suffix in (".ply", ".obj") for path in tmp_path.iterdir())
 
 
 def test_mesh_export_and_heat(trained: Trained, tmp_path):
