@@ -159,8 +159,8 @@ class ThermoxelsModel(Model):
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         """Render rays: rgb, thermal (normalised), temperature_c, depth, accumulation.
 
-        Rays of a batch carry their stream (see `streams.py`). In training only what it needs is rendered, and the outputs
-        are those that losses are made of. A crop that the viewer sets (nears, fars) is kept.
+        Rays of a batch carry their stream (see `streams.py`). In training only what it needs is rendered, and the
+        outputs are those that losses are made of. A crop that the viewer sets (nears, fars) is kept.
         """
         origins, directions = ray_bundle.origins, ray_bundle.directions
         marched = self.march_rays(origins, directions, ray_bundle.nears, ray_bundle.fars)
