@@ -237,6 +237,7 @@ def test_other_objects_are_still_refused(tmp_path, monkeypatch) -> None:
 def test_torch_without_the_registry_is_left_alone(monkeypatch) -> None:
     monkeypatch.delattr(torch.serialization, "add_safe_globals")
     nerfstudio_bridge.allow_checkpoint_globals()
+    assert not hasattr(torch.serialization, "add_safe_globals")
 
 
 def test_installing_twice_registers_nothing_new() -> None:
