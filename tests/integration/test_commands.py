@@ -88,18 +88,13 @@ def test_a_stock_export_still_works(trained: Trained, tmp_path):
     assert len(json.loads((tmp_path / "transforms_train.json").read_text())) == 10
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        ["pointcloud", "--num-points", "300", "--remove-outliers", "False", "--normal-method", "open3d"],
-        ["tsdf", "--resolution", "24", "--target-num-faces", "200", "--downscale-factor", "1"],
-    ],
-)
-def test_stock_exports_that_render_still_work(trained: Trained, tmp_path, command):
-    options = ["--load-config", str(trained.config), "--output-dir", str(tmp_path)]
-    result = run("ns-export", command[0], *options, *command[1:])
+def test_a_stock_export_that_renders_still_works(trained: Trained, tmp_path):
+    result = run(
+        *("ns-export", "pointcloud", "--load-config", str(trained.config), "--output-dir", str(tmp_path)),
+        *("--num-points", "300", "--remove-outliers", "False", "--normal-method", "open3d"),
+    )
     assert result.returncode == 0, result.stdout
-    assert any(path.suffix in (".ply", ".obj") for path in tmp_path.iterdir())
+    assert (tmp_path / "point_cloud.ply").stat().st_size > 300
 
 
 def test_mesh_export_and_heat(trained: Trained, tmp_path):
