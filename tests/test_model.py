@@ -11,6 +11,7 @@ from nerfstudio.data.scene_box import SceneBox
 from thermoxels_ns.errors import SceneError, ThermoxelsError
 from thermoxels_ns.model import ThermoxelsModel
 from thermoxels_ns.model_config import LOSS_RECIPES, ThermoxelsModelConfig
+from thermoxels_ns.pipeline import ThermoxelsPipelineConfig
 from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.units import TemperatureRange
 
@@ -223,3 +224,20 @@ def test_masked_pixels_do_not_count_in_evaluation():
     assert metrics["psnr"] == pytest.approx(100.0) and metrics["thermal_mae_c"] == 0.0
     assert metrics["ssim"] == pytest.approx(1.0) and metrics["thermal_ssim"] == pytest.approx(1.0)
     assert float(images["thermal"].max()) <= 1.0
+
+
+@pytest.mark.parametrize(
+    "given, environment, expected", [(3, None, 3), (3, "1", 3), (None, "5", None), (None, None, 4)]
+)
+def test_threads_leave_room_for_other_programs(monkeypatch, given, environment, expected):
+    """Half of eight processors, unless the option or OMP_NUM_THREADS says otherwise."""
+    asked = []
+    monkeypatch.setattr(torch, "set_num_threads", asked.append)
+    monkeypatch.setattr("os.cpu_count", lambda: 8)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if environment is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", environment)
+    config = ThermoxelsPipelineConfig(cpu_threads=given)
+    with pytest.raises((AttributeError, TypeError)):  # no datamanager is configured: threads come first
+        config.setup(device="cpu")
+    assert asked == ([] if expected is None else [expected])

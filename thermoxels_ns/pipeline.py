@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +25,9 @@ class ThermoxelsPipelineConfig(VanillaPipelineConfig):
     """Settings of the pipeline."""
 
     _target: type = field(default_factory=lambda: ThermoxelsPipeline)
+    cpu_threads: int | None = None
+    """Threads that PyTorch uses on a CPU. Default: OMP_NUM_THREADS if set, else half of the processors, because threads
+    that wait for a processor which another program holds slow every step several times."""
 
 
 class ThermoxelsPipeline(VanillaPipeline):
@@ -37,6 +41,12 @@ class ThermoxelsPipeline(VanillaPipeline):
     world_from_input: torch.Tensor
 
     def __init__(self, config: ThermoxelsPipelineConfig, *args: Any, **kwargs: Any) -> None:
+        if config.cpu_threads is not None and config.cpu_threads < 1:
+            raise SceneError(
+                explain("cpu_threads", expected="1 or more", got=config.cpu_threads, remedy="Leave it out.")
+            )
+        if config.cpu_threads is not None or "OMP_NUM_THREADS" not in os.environ:
+            torch.set_num_threads(config.cpu_threads or max(1, (os.cpu_count() or 2) // 2))
         super().__init__(config, *args, **kwargs)
         streams = getattr(config.datamanager, "streams", "both")
         if streams == "thermal" and (self.model.grid.sh is not None or not self.model.config.thermal_density_gradient):
