@@ -8,7 +8,7 @@ from pathlib import Path
 # Before torch is loaded: its threads gain nothing on small tests and wait for each other on a busy machine.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import pytest  # noqa: E402
+import pytest
 
 
 @pytest.fixture(scope="session")
