@@ -136,7 +136,8 @@ def test_output_of_a_command_comes_while_it_runs(fake_commands, tmp_path, consol
     assert shown(seen).splitlines()[-2:] == ["first", "second"]
 
 
-def test_a_command_draws_for_the_terminal_that_shows_it(fake_commands, tmp_path, console):
+def test_a_command_draws_for_the_terminal_that_shows_it(fake_commands, tmp_path, console, monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
     fake_commands("ask", "print(os.environ.get('FORCE_COLOR'), os.environ.get('COLUMNS'))")
     run_command(["ask"], tmp_path / "ask.log", Console(file=io.StringIO(), width=77, force_terminal=True))
     assert (tmp_path / "ask.log").read_text() == "1 77\n"

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-import torch
 
 from thermoxels_ns.errors import ThermoxelsError, explain
+
+if TYPE_CHECKING:
+    import torch
 
 ZERO_CELSIUS_K = 273.15
 """0 degrees Celsius in kelvin (exact, BIPM)."""
@@ -16,7 +18,7 @@ ZERO_CELSIUS_K = 273.15
 _SMALLEST_SPAN_K = 1e-3
 _CONSTANT_SCENE_SPAN_K = 1.0
 
-Numbers = TypeVar("Numbers", float, np.ndarray, torch.Tensor)
+Numbers = TypeVar("Numbers", float, np.ndarray, "torch.Tensor")
 
 
 def celsius_to_kelvin(temperature_c: Numbers) -> Numbers:
