@@ -47,7 +47,6 @@ BUDGETS = (
     Budget("32 voxels, 400 steps", (32,), (), (250,), 400),
     Budget("64 voxels, 700 steps", (32, 64), (200,), (400,), 700),
     Budget("64 voxels, 1500 steps (default)", (32, 64), (400,), (800,), 1500),
-    Budget("128 voxels, 2000 steps", (32, 64, 128), (400, 1000), (700, 1400), 2000),
 )
 BASELINE = 2
 
