@@ -252,8 +252,8 @@ def quick_demo(fake_commands, monkeypatch):
             + picture
             + "folder = after('--output-dir')\nos.makedirs(folder)\n"
             + "Image.new('RGB', (8, 6)).save(f'{folder}/mesh-measured.png')\n"
-            + "both = Image.new('RGB', (16, 6), 'red')\nboth.paste('blue', (8, 0, 16, 6))\n"
-            + "both.save(f'{folder}/heat.png')\n"
+            + "three = Image.new('RGB', (24, 6), 'red')\nthree.paste('blue', (8, 0, 16, 6))\n"
+            + "three.paste('lime', (16, 0, 24, 6))\nthree.save(f'{folder}/heat.png')\n"
             + f"json.dump({summary}, open(f'{{folder}}/summary.json', 'w'))",
         )
 
@@ -271,7 +271,7 @@ def test_the_whole_demo_leaves_a_page(quick_demo, tmp_path, capfd):
         assert f"$ {word} " in out
     page = (folder / "index.html").read_text(encoding="utf-8")
     assert "Thermoxels demo: sphere" in page
-    assert page.count("<img") == 2 * 6 + 4 * 2 + 3
+    assert page.count("<img") == 2 * 6 + 4 * 2 + 4
     assert ">10.0<" in page and ">40.0&nbsp;°C<" in page  # the bounds of the sphere's temperatures
     assert page.count(">yes<") == 4 and ">no<" not in page
     assert sorted(path.name for path in (folder / "logs").iterdir()) == [

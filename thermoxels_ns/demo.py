@@ -207,7 +207,7 @@ def assemble_page(
     renders = folder / "renders" / "test"
     names = sorted(path.name for path in (folder / "scene" / "images").glob("frame_eval_*.png"))
     export = folder / "export"
-    before, after = _halves(export / "heat.png")
+    before, after, change = _panels(export / "heat.png", 3)
     return DemoPage(
         title=f"Thermoxels demo: {scene}",
         intro=(
@@ -228,6 +228,7 @@ def assemble_page(
         mesh_pictures=(
             Figure(before, "Before: the temperatures that the photographs gave."),
             Figure(after, "After: heat has flowed through the solid. Both in one range of colours."),
+            Figure(change, "The change, on a scale of its own."),
             Figure(_picture(export / "mesh-measured.png"), "Grey: no thermal ray saw the surface; it is interpolated."),
         ),
         seconds=tuple(seconds),
@@ -259,19 +260,20 @@ def _picture(path: Path) -> bytes:
         ) from problem
 
 
-def _halves(path: Path) -> tuple[bytes, bytes]:
-    """Cut the picture of two panels side by side, so that a narrow screen can show one below the other."""
+def _panels(path: Path, count: int) -> list[bytes]:
+    """Cut a picture of panels side by side, so that a narrow screen can show one below the other."""
     from io import BytesIO
 
     from PIL import Image
 
-    with Image.open(BytesIO(_picture(path))) as both:
-        middle = both.width // 2
-        panels = both.crop((0, 0, middle, both.height)), both.crop((middle, 0, both.width, both.height))
-    files = BytesIO(), BytesIO()
-    for panel, file in zip(panels, files):
-        panel.save(file, format="PNG")
-    return files[0].getvalue(), files[1].getvalue()
+    panels = []
+    with Image.open(BytesIO(_picture(path))) as whole:
+        for number in range(count):
+            file = BytesIO()
+            left, right = number * whole.width // count, (number + 1) * whole.width // count
+            whole.crop((left, 0, right, whole.height)).save(file, format="PNG")
+            panels.append(file.getvalue())
+    return panels
 
 
 def _colour_bar(scene: Path) -> ColourBar:
