@@ -1,9 +1,16 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
 from thermoxels_ns import losses
+from thermoxels_ns.field.kept_voxels import KeptVoxels
+from thermoxels_ns.lattice import Lattice
+
+
+def voxel_corners(lattice: Lattice, cells=None) -> torch.Tensor:
+    return KeptVoxels(lattice, cells).tables(torch.device("cpu"))[0]
 
 
 def test_thermal_loss_is_half_l2_half_l1():
@@ -14,20 +21,33 @@ def test_thermal_loss_is_half_l2_half_l1():
 
 
 def test_total_variation_of_a_ramp_is_its_slope():
-    x, y, z = torch.meshgrid(*[torch.arange(5.0)] * 3, indexing="ij")
-    ramp = (3 * x - 4 * y + 0 * z)[..., None].repeat(1, 1, 1, 2)
-    assert float(losses.total_variation(ramp)) == pytest.approx(5.0)
-    flat = torch.ones(3, 3, 3, 1, requires_grad=True)
-    losses.total_variation(flat).backward()
+    lattice = Lattice((0.0, 0.0, 0.0), 1.0, (5, 4, 6))
+    x, y, z = torch.as_tensor(lattice.corner_positions(), dtype=torch.float32).reshape(-1, 3).unbind(-1)
+    ramp = torch.stack((3 * x - 4 * y, 2 * x + y - 2 * z), -1)
+    corners = voxel_corners(lattice)
+    assert float(losses.total_variation(ramp, corners)) == pytest.approx((5.0 + 3.0) / 2)
+    assert float(losses.total_variation(ramp[:, :1], corners[7:20])) == pytest.approx(5.0)
+    flat = torch.ones(len(ramp), 1, requires_grad=True)
+    losses.total_variation(flat, corners).backward()
     assert flat.grad is not None and torch.isfinite(flat.grad).all()
 
 
+def test_total_variation_looks_at_kept_voxels_alone():
+    """The rows of two voxels that touch nowhere: the jump between them does not count."""
+    lattice = Lattice((0.0, 0.0, 0.0), 1.0, (5, 2, 2))
+    voxels = KeptVoxels(lattice, [0, 3])
+    rows = torch.from_numpy(np.where(voxels.corner_index()[:, :1] < 2, 1.0, 50.0))
+    assert float(losses.total_variation(rows, voxel_corners(lattice, [0, 3]))) == pytest.approx(1e-5)
+
+
 def test_random_block_is_contiguous_and_pure_in_its_seed():
-    rows = torch.arange(10 * 4 * 3.0)[:, None]
-    first = losses.random_block(rows, (10, 4, 3), 0.2, torch.Generator().manual_seed(5))
-    again = losses.random_block(rows, (10, 4, 3), 0.2, torch.Generator().manual_seed(5))
-    assert first.shape == (3, 4, 3, 1) and torch.equal(first, again)
-    assert float(first[1, 0, 0, 0] - first[0, 0, 0, 0]) == 12.0
+    first, again = (losses.random_block(1200, 0.2, torch.Generator().manual_seed(5)) for _ in range(2))
+    assert first == again and first[1] - first[0] == 240
+    blocks = [losses.random_block(10, 0.25, torch.Generator().manual_seed(n)) for n in range(200)]
+    assert {last - first for first, last in blocks} == {3}
+    assert {first for first, _ in blocks} == set(range(8)), "every place occurs, the first and the last too"
+    assert losses.random_block(7, 1.0, torch.Generator()) == (0, 7)
+    assert losses.random_block(5, 1e-6, torch.Generator().manual_seed(0))[1] > 0
 
 
 def brute_force_distortion(w, t, d):
@@ -40,20 +60,22 @@ def test_distortion_matches_the_double_sum():
     w = torch.rand(4, 30, generator=generator, dtype=torch.float64) / 30
     d = torch.rand(4, 30, generator=generator, dtype=torch.float64)
     t = torch.cumsum(d, -1) - d / 2
-    expected = sum(brute_force_distortion(w[r].tolist(), t[r].tolist(), d[r].tolist()) for r in range(4)) / 4
-    assert float(losses.distortion_loss(w, t, d, scale=1.0)) == pytest.approx(expected, rel=1e-12)
-    assert float(losses.distortion_loss(w, t, d, scale=2.0)) == pytest.approx(expected / 2, rel=1e-12)
+    expected = [brute_force_distortion(w[r].tolist(), t[r].tolist(), d[r].tolist()) for r in range(4)]
+    np.testing.assert_allclose(losses.ray_distortion(w, t, d, scale=1.0).numpy(), expected, rtol=1e-12)
+    np.testing.assert_allclose(2.0 * losses.ray_distortion(w, t, d, scale=2.0).numpy(), expected, rtol=1e-12)
 
 
 def test_all_terms_have_exact_gradients():
     w = (torch.rand(3, 8, dtype=torch.float64) * 0.9 + 0.05).requires_grad_()
     d = torch.full((3, 8), 0.1, dtype=torch.float64)
     t = torch.cumsum(d, -1)
-    block = torch.rand(3, 3, 3, 2, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: losses.distortion_loss(x, t, d, 2.0), (w,))
-    assert torch.autograd.gradcheck(lambda x: losses.sparsity_loss(x, d), (w,))
+    lattice = Lattice((0.0, 0.0, 0.0), 1.0, (3, 3, 3))
+    rows = torch.rand(lattice.num_corners, 2, dtype=torch.float64, requires_grad=True)
+    corners = voxel_corners(lattice)
+    assert torch.autograd.gradcheck(lambda x: losses.ray_distortion(x, t, d, 2.0), (w,))
+    assert torch.autograd.gradcheck(lambda x: losses.ray_sparsity(x, d), (w,))
     assert torch.autograd.gradcheck(lambda x: losses.beta_loss(x[:, 0]), (w,))
-    assert torch.autograd.gradcheck(losses.total_variation, (block,))
+    assert torch.autograd.gradcheck(lambda x: losses.total_variation(x, corners), (rows,))
 
 
 def test_beta_is_nil_for_decided_rays_and_dearest_at_one_half():
@@ -64,6 +86,7 @@ def test_beta_is_nil_for_decided_rays_and_dearest_at_one_half():
 
 
 def test_sparsity_ignores_padding_and_stays_finite():
-    density = torch.tensor([[1.0, float("inf")]])
-    assert float(losses.sparsity_loss(density, torch.tensor([[0.1, 0.0]]))) == pytest.approx(1.0986, abs=1e-4)
-    assert torch.isfinite(losses.sparsity_loss(density, torch.tensor([[0.1, 0.1]])))
+    density = torch.tensor([[1.0, float("inf")], [2.0, 0.0]])
+    found = losses.ray_sparsity(density, torch.tensor([[0.1, 0.0], [0.1, 0.1]]))
+    np.testing.assert_allclose(found.numpy(), np.log([3.0, 9.0]), rtol=1e-6)
+    assert torch.isfinite(losses.ray_sparsity(density, torch.full((2, 2), 0.1))).all()

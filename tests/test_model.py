@@ -8,10 +8,10 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
 
-from thermoxels_ns.errors import SceneError, ThermoxelsError
+from thermoxels_ns import pipeline
+from thermoxels_ns.errors import MemoryBudgetError, SceneError, ThermoxelsError
 from thermoxels_ns.model import ThermoxelsModel
 from thermoxels_ns.model_config import LOSS_RECIPES, ThermoxelsModelConfig
-from thermoxels_ns.pipeline import ThermoxelsPipelineConfig
 from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.units import TemperatureRange
 
@@ -73,10 +73,20 @@ def test_distortion_grows_over_its_ramp():
     assert values[10] == 0.0 and values[12] == pytest.approx(0.2 * values[20]) and values[20] == values[30] > 0
 
 
-@pytest.mark.parametrize("stream, absent", [(RGB_STREAM, "thermal"), (THERMAL_STREAM, "rgb")])
-def test_a_stream_renders_only_what_it_needs(stream, absent):
-    outputs = make().train()(rays(stream=stream))
-    assert outputs[absent] is None
+@pytest.mark.parametrize("backend", ["fused", "reference"])
+@pytest.mark.parametrize("stream, absent", [(RGB_STREAM, "temperature"), (THERMAL_STREAM, "sh")])
+def test_a_stream_renders_only_what_it_needs(stream, absent, backend):
+    """What a stream does not want is never read, has no loss and no gradient."""
+    model = make(backend=backend, loss_overrides={f"tv_{absent}": 0.0}).train()
+    model.grid.row_parameters()[absent].data.fill_(float("nan"))
+    outputs = model(rays(stream=stream))
+    other = "thermal" if absent == "temperature" else "rgb"
+    assert float(outputs[other].abs().max()) == 0.0
+    terms = model.get_loss_dict(outputs, targets())
+    assert f"{other}_loss" not in terms and len(terms) >= 2
+    sum(terms.values()).backward()
+    gradient = model.grid.row_parameters()[absent].grad
+    assert gradient is None or float(gradient.to_dense().abs().max()) == 0.0
 
 
 def test_offset_has_a_fixed_gauge_and_shifts_only_its_image():
@@ -97,7 +107,7 @@ def test_temperature_does_not_move_geometry_unless_asked():
         terms = model.get_loss_dict(model(rays(stream=THERMAL_STREAM)), targets())
         terms["thermal_loss"].backward()
         gradient = model.grid.density.grad
-        assert (gradient is not None and float(gradient.abs().max()) > 0) is moves
+        assert (gradient is not None and float(gradient.to_dense().abs().max()) > 0) is moves
 
 
 def test_decisions_about_the_background_are_in_the_checkpoint():
@@ -226,18 +236,62 @@ def test_masked_pixels_do_not_count_in_evaluation():
     assert float(images["thermal"].max()) <= 1.0
 
 
-@pytest.mark.parametrize(
-    "given, environment, expected", [(3, None, 3), (3, "1", 3), (None, "5", None), (None, None, 4)]
-)
-def test_threads_leave_room_for_other_programs(monkeypatch, given, environment, expected):
-    """Half of eight processors, unless the option or OMP_NUM_THREADS says otherwise."""
-    asked = []
-    monkeypatch.setattr(torch, "set_num_threads", asked.append)
+@pytest.mark.parametrize("environment, expected", [("5", None), (None, 4)])
+def test_torch_leaves_room_for_other_programs(monkeypatch, environment, expected):
+    """Half of eight processors, unless OMP_NUM_THREADS says otherwise; the kernels take all unless the option does."""
+    torch_asked, kernels_asked = [], []
+    monkeypatch.setattr(torch, "set_num_threads", torch_asked.append)
+    monkeypatch.setattr(pipeline, "set_num_threads", kernels_asked.append)
     monkeypatch.setattr("os.cpu_count", lambda: 8)
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     if environment is not None:
         monkeypatch.setenv("OMP_NUM_THREADS", environment)
-    config = ThermoxelsPipelineConfig(cpu_threads=given)
-    with pytest.raises((AttributeError, TypeError)):  # no datamanager is configured: threads come first
-        config.setup(device="cpu")
-    assert asked == ([] if expected is None else [expected])
+    for given in (3, None):
+        config = pipeline.ThermoxelsPipelineConfig(cpu_threads=given)
+        with pytest.raises((AttributeError, TypeError)):  # no datamanager is configured: threads come first
+            config.setup(device="cpu")
+    assert torch_asked == ([] if expected is None else [expected, expected]) and kernels_asked == [3, None]
+
+
+@pytest.mark.parametrize("given", [0, -2])
+def test_impossible_numbers_of_threads_are_refused(given):
+    with pytest.raises(SceneError, match=f"cpu_threads: expected 1 or more, got {given}"):
+        pipeline.ThermoxelsPipelineConfig(cpu_threads=given).setup(device="cpu")
+
+
+def test_both_backends_train_alike():
+    """The same batch through the compiled kernels and through plain torch: outputs, losses and gradients."""
+    found = {}
+    for backend in ("fused", "reference"):
+        model = make(backend=backend, early_stop=0.0, smallest_weight=0.0, distortion_ramp=(0, 1), sh_degree=1).train()
+        model.update_to_step(5)
+        generator = torch.Generator().manual_seed(0)
+        for parameter in model.grid.row_parameters().values():
+            parameter.data += torch.randn(parameter.shape, generator=generator)
+        outputs = model(rays())
+        terms = model.get_loss_dict(outputs, targets())
+        sum(terms.values()).backward()
+        grads = {name: p.grad.to_dense() for name, p in model.named_parameters() if p.grad is not None}
+        found[backend] = (terms, grads, outputs)
+    (terms, grads, outputs), (terms2, grads2, outputs2) = found["fused"], found["reference"]
+    assert terms.keys() == terms2.keys() and grads.keys() == grads2.keys() and len(grads) >= 5
+    for name in ("rgb", "thermal", "accumulation"):
+        torch.testing.assert_close(outputs[name], outputs2[name], rtol=1e-5, atol=1e-5)
+    for name, value in terms.items():
+        torch.testing.assert_close(value, terms2[name], rtol=1e-4, atol=1e-9)
+    for name, gradient in grads.items():
+        assert float((gradient - grads2[name]).norm()) <= 1e-3 * float(grads2[name].norm()), name
+
+
+def test_a_lattice_beyond_the_budget_is_refused_before_it_is_built(monkeypatch):
+    monkeypatch.setattr("thermoxels_ns.model.VoxelField", lambda *_: pytest.fail("the field was built"))
+    with pytest.raises(MemoryBudgetError, match=r"4096 x 4096 x 2048 voxels .*--pipeline.model.memory-budget-gb"):
+        make(resolutions=(4096,), memory_budget_gb=64.0)
+
+
+def test_a_refinement_beyond_the_budget_is_refused():
+    model = make(memory_budget_gb=0.001)
+    model.check_memory(1)
+    with pytest.raises(MemoryBudgetError, match="64 x 64 x 32 voxels"):
+        model.check_memory(8)
+    assert model.grid.lattice.cell_shape == (8, 8, 4)

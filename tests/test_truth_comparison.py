@@ -49,7 +49,7 @@ def exact_mesh(truth: KnownTruth, world_to_metres: np.ndarray = IDENTITY, observ
         truth.scene.surface_temperature_c(corners).reshape(lattice.shape).astype(np.float32),
         np.full(lattice.shape, observed, dtype=np.float32),
     )
-    selection = SolidSelection(density_threshold=1e-6, largest_component=False)
+    selection = SolidSelection(close_gaps=0, density_threshold=1e-6, largest_component=False)
     return build_voxel_mesh(snapshot, selection, world_to_metres)[0], cells, lattice
 
 

@@ -12,6 +12,7 @@ from typing import Annotated, Literal, Union
 
 import tyro
 
+from thermoxels_ns.cost import Cost
 from thermoxels_ns.demo import Demo, SceneName
 from thermoxels_ns.errors import ThermoxelsError
 
@@ -83,6 +84,7 @@ Commands = tyro.conf.FlagConversionOff[
     Union[  # noqa: UP007 - read by tyro
         Annotated[Demo, tyro.conf.subcommand(name="demo")],
         Annotated[Synthetic, tyro.conf.subcommand(name="synthetic")],
+        Annotated[Cost, tyro.conf.subcommand(name="cost")],
     ]
 ]
 

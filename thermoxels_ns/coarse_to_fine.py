@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch.nn import Parameter
 
-from thermoxels_ns.errors import PruningError
-from thermoxels_ns.field.refine import PruningReport, prune, refine
-from thermoxels_ns.ray_statistics import backdrop_evidence, voxel_weights
+from thermoxels_ns.errors import PruningError, explain
+from thermoxels_ns.field.refine import RowChange, prune, refine
+from thermoxels_ns.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
 from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
 
 if TYPE_CHECKING:
@@ -20,6 +23,8 @@ FEWEST_OPEN_RAYS = 0.002
 """Share of rays that must leave the box unsaturated for a background to be worth its cost."""
 FEWEST_SKY_DIFFERENCE = 0.01
 """Share of the temperature range by which the learned sky must differ from the scene's minimum to be kept."""
+MOST_OPENED_RAYS = 0.01
+"""Share of the rays that end on something which pruning may open."""
 PRUNING_ATTEMPTS = 4
 """Thresholds tried before pruning fails."""
 RAYS_PER_IMAGE = 4096
@@ -30,7 +35,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     """The callbacks of one training run, in the order in which they act at a step."""
     before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
     factors = model.config.refinements()
-    steps = {*factors, *model.config.prune_at}
+    steps = {*factors, *model.config.prune_at, *model.config.thin_at}
     end = None
     if attributes.trainer is not None:
         end = attributes.trainer._start_step + attributes.trainer.config.max_num_iterations
@@ -43,21 +48,31 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     def count(step: int) -> None:
         model.update_to_step(step)
 
+    def follow(old: dict[str, Parameter], change: RowChange) -> None:
+        """Point the optimisers to the rows that took the place of `old`; their state changes as the rows did."""
+        assert attributes.optimizers is not None
+        for name, new in model.grid.row_parameters().items():
+            if new is not old[name]:
+                optimizer: Any = attributes.optimizers.optimizers[name]
+                optimizer.change_rows(old[name], new, change)
+                attributes.optimizers.parameters[name] = [new]
+
     def change_lattice(step: int) -> None:
         assert attributes.pipeline is not None and attributes.optimizers is not None
         datamanager = attributes.pipeline.datamanager
         if step in decisions:
             decide_backdrop(model, datamanager)
         if step in steps and model.config.prune_threshold > 0:
-            report = prune_by_rays(model, datamanager)
-            CONSOLE.log(f"step {step}: pruning {report}")
+            old = model.grid.row_parameters()
+            thin = step in model.config.thin_at
+            threshold = model.config.thin_threshold if thin else model.config.prune_threshold
+            report, change = prune_by_rays(model, datamanager, threshold, 0 if thin else model.config.prune_dilation)
+            follow(old, change)
+            CONSOLE.log(f"step {step}: {'thinning' if thin else 'pruning'} {report}")
         if step in factors:
-            refine(model.grid, factors[step])
-            for name, parameter in model.grid.row_parameters().items():
-                optimizer = attributes.optimizers.optimizers[name]
-                optimizer.state.clear()  # moments of another lattice mean nothing here
-                optimizer.param_groups[0]["params"] = [parameter]
-                attributes.optimizers.parameters[name] = [parameter]
+            model.check_memory(factors[step])
+            old = model.grid.row_parameters()
+            follow(old, refine(model.grid, factors[step]))
             CONSOLE.log(f"step {step}: lattice refined to {' x '.join(map(str, model.grid.lattice.cell_shape))} voxels")
 
     return [
@@ -66,24 +81,60 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     ]
 
 
-def prune_by_rays(model: ThermoxelsModel, datamanager) -> PruningReport:
-    """Drop the voxels to which no training ray of either stream gives weight.
+@dataclass(frozen=True)
+class PruningReport:
+    """What pruning did."""
 
-    While surfaces are still fog, many voxels hold little weight each. Then the threshold is lowered, fourfold at a
-    time, until at most 1 % of the weight goes.
+    kept_voxels: int
+    total_voxels: int
+    threshold: float
+    """Smallest largest weight of a voxel that was kept for its own sake."""
+    opened: float
+    """Share of the rays with an end of whose weight more than half lay in the voxels removed."""
+
+    def __str__(self) -> str:
+        share = self.kept_voxels / self.total_voxels
+        return (
+            f"kept {self.kept_voxels:,} of {self.total_voxels:,} voxels ({share:.1%}); "
+            f"threshold {self.threshold:.2g}, {self.opened:.2%} of the rays lost what they ended on"
+        )
+
+
+def prune_by_rays(
+    model: ThermoxelsModel, datamanager, threshold: float, dilation: int
+) -> tuple[PruningReport, RowChange]:
+    """Keep voxels to which some training ray of either stream gives more than `threshold` of its weight.
+
+    So stay voxels in which rays that end on something have spent half of their weight, so that no surface opens where
+    it is still soft, and neighbours up to `dilation` voxels away. Where that would open more than 1 % of the rays that
+    end on something, the threshold is lowered, fourfold at a time.
 
     Raises:
-        PruningError: Even the lowest threshold would remove more.
+        PruningError: Even the lowest threshold would open more; the grid is left as it was.
     """
-    weights = voxel_weights(model, datamanager.training_rays(RGB_STREAM | THERMAL_STREAM, RAYS_PER_IMAGE))
+
+    def rays():
+        return datamanager.training_rays(RGB_STREAM | THERMAL_STREAM, RAYS_PER_IMAGE)
+
+    weights, voxels, opened = voxel_weights(model, rays()), model.grid.voxels, 1.0
     for attempt in range(PRUNING_ATTEMPTS):
-        threshold = model.config.prune_threshold / 4**attempt
-        try:
-            return prune(model.grid, weights.largest, weights.total, threshold, model.config.prune_dilation)
-        except PruningError:
-            if attempt == PRUNING_ATTEMPTS - 1:
-                raise
-    raise AssertionError("unreachable")
+        threshold = threshold / 4 if attempt else threshold
+        chosen = ((weights.largest > threshold) | weights.ends).cpu().numpy()
+        if not chosen.any():
+            continue
+        keep = voxels.dilated(chosen, dilation)
+        opened = share_of_rays_opened(model, rays(), torch.from_numpy(keep).to(weights.largest.device))
+        if opened <= MOST_OPENED_RAYS:
+            total = math.prod(voxels.lattice.cell_shape)
+            return PruningReport(int(keep.sum()), total, threshold, opened), prune(model.grid, keep)
+    raise PruningError(
+        explain(
+            "pruning",
+            expected=f"to open at most {MOST_OPENED_RAYS:.0%} of the rays that end on something",
+            got=f"{opened:.1%} at threshold {threshold:.2g}",
+            remedy="Lower --pipeline.model.prune-threshold, or prune later when surfaces have formed.",
+        )
+    )
 
 
 @torch.no_grad()

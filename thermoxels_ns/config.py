@@ -12,14 +12,15 @@ from thermoxels_ns import nerfstudio_bridge
 from thermoxels_ns.data.thermal_datamanager import ThermalDataManagerConfig
 from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
 from thermoxels_ns.model_config import ThermoxelsModelConfig
-from thermoxels_ns.optim import FusedAdamConfig, RMSpropConfig
+from thermoxels_ns.optim import FusedAdamConfig, RowAdamConfig, RowRMSpropConfig
 from thermoxels_ns.pipeline import ThermoxelsPipelineConfig
 from thermoxels_ns.presets import read_preset, with_overrides
+from thermoxels_ns.schedule import QUALITIES
 from thermoxels_ns.trainer import ThermoxelsTrainerConfig
 
 nerfstudio_bridge.install()
 
-ITERATIONS = 1500
+ITERATIONS = QUALITIES["standard"][1]
 
 
 def _group(lr: float, lr_final: float, optimizer: type[OptimizerConfig]) -> dict:
@@ -29,7 +30,7 @@ def _group(lr: float, lr_final: float, optimizer: type[OptimizerConfig]) -> dict
     }
 
 
-def _trainer(optimizer: type[OptimizerConfig] = FusedAdamConfig) -> ThermoxelsTrainerConfig:
+def _trainer(optimizer: type[OptimizerConfig] = RowAdamConfig) -> ThermoxelsTrainerConfig:
     return ThermoxelsTrainerConfig(
         method_name="thermoxels",
         max_num_iterations=ITERATIONS,
@@ -41,29 +42,29 @@ def _trainer(optimizer: type[OptimizerConfig] = FusedAdamConfig) -> ThermoxelsTr
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         pipeline=ThermoxelsPipelineConfig(
             datamanager=ThermalDataManagerConfig(
-                dataparser=ThermalDataParserConfig(), train_num_rays_per_batch=2048, thermal_num_rays_per_batch=1024
+                dataparser=ThermalDataParserConfig(), train_num_rays_per_batch=4096, thermal_num_rays_per_batch=2048
             ),
             model=ThermoxelsModelConfig(),
         ),
         optimizers={
             "density": _group(0.3, 0.03, optimizer),
-            "sh": _group(0.05, 0.005, optimizer),
+            "sh": _group(0.1, 0.01, optimizer),
             "temperature": _group(0.02, 0.002, optimizer),
-            "background": _group(0.05, 0.005, optimizer),
-            "thermal_offset": _group(0.002, 0.0002, optimizer),
+            "background": _group(0.05, 0.005, FusedAdamConfig),
+            "thermal_offset": _group(0.002, 0.0002, FusedAdamConfig),
         },
         viewer=ViewerConfig(quit_on_train_completion=True),
         vis="viewer",
     )
 
 
-def _preset(name: str, optimizer: type[OptimizerConfig] = FusedAdamConfig) -> MethodSpecification:
+def _preset(name: str, optimizer: type[OptimizerConfig] = RowAdamConfig) -> MethodSpecification:
     content = read_preset(name)
     description = content.pop("description")
     return MethodSpecification(with_overrides(_trainer(optimizer), content, name), description)
 
 
 thermoxels = MethodSpecification(_trainer(), "RGB and thermal photographs to a voxel model that heat can be solved on.")
-thermoxels_paper = _preset("thermoxels-paper", RMSpropConfig)
+thermoxels_paper = _preset("thermoxels-paper", RowRMSpropConfig)
 thermoxels_arco = _preset("thermoxels-arco")
 plenoxels_t = _preset("plenoxels-t")

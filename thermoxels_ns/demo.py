@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from thermoxels_ns.demo_page import ColourBar, DemoPage
     from thermoxels_ns.demo_results import DemoResults
 
-SceneName = Literal["hot-object", "house-corner", "sphere"]
+SceneName = Literal["hot-object", "house-corner", "sphere", "courtyard", "pipes"]
 """The synthetic scenes."""
 
 _MARKER = ".thermoxels-demo"

@@ -25,6 +25,10 @@ class PruningError(ThermoxelsError, RuntimeError):
     """Pruning would remove a part of the scene that rays see."""
 
 
+class MemoryBudgetError(ThermoxelsError, MemoryError):
+    """A lattice needs more memory than the budget allows."""
+
+
 class MeshError(ThermoxelsError, ValueError):
     """No valid mesh can be cut from the density field."""
 

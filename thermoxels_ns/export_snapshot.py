@@ -67,8 +67,12 @@ class ExportOptions:
     way, where 90 keeps the densest tenth. Takes the place of the optical depth."""
     density_threshold: float | None = None
     """Voxels at least this dense are solid, [1 / world unit]. Takes the place of both."""
-    largest_component: bool = True
-    """Keep only the largest body of voxels that touch by faces; the others are mostly floaters."""
+    close_gaps: int = 1
+    """Fill gaps and pinholes up to twice this many voxels wide; thin walls are not continuous without it. 0: none."""
+    smallest_body: float = 0.01
+    """Drop bodies (voxels that touch, if only by corners) of less than this share of the largest; mostly floaters."""
+    largest_component: bool = False
+    """Keep only the largest body of voxels that touch by faces."""
     fill_cavities: bool = False
     """Make empty space solid where it has no way out through voxel faces. Off by default: a room is a cavity too."""
     metres_per_unit: float | None = None
@@ -290,6 +294,7 @@ def _mesh_summary(mesh: TetMesh, solid: MeshedCells, quality: MeshQuality, selec
         "density_threshold_used": solid.threshold,
         **_percentile_summary(solid, selection),
         "component_sizes_voxels": solid.component_sizes,
+        "voxels_closed": solid.num_closed,
         "voxels_removed": solid.num_removed,
         "parts_without_thermal_rays_left_out": solid.num_unobserved_parts,
         "voxels_without_thermal_rays_left_out": solid.num_unobserved_voxels,

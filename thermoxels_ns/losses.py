@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 
@@ -26,32 +26,35 @@ def thermal_loss(
     return l2_share * torch.mean(error**2) + (1.0 - l2_share) * torch.mean(error.abs())
 
 
-def total_variation(block: Float[Tensor, "x y z c"], smallest: float = 1e-10) -> Float[Tensor, ""]:
-    """Mean over corners and channels of sqrt(dx^2 + dy^2 + dz^2), differences between neighbours (Plenoxels, eq. 4).
+def total_variation(
+    rows: Float[Tensor, "rows c"], corners: Int64[Tensor, "voxels 8"], smallest: float = 1e-10
+) -> Float[Tensor, ""]:
+    """Mean over voxels and channels of sqrt(dx^2 + dy^2 + dz^2), differences from corner 0 (Plenoxels, eq. 4).
 
     Args:
-        block: Corner values; at least 2 along each axis.
+        rows: Corner values.
+        corners: Rows of the corners of the voxels to look at, in the order of `lattice.CORNER_OFFSETS`.
         smallest: Added under the root so that its gradient is finite where the field is flat.
     """
-    here = block[:-1, :-1, :-1]
-    dx, dy, dz = block[1:, :-1, :-1] - here, block[:-1, 1:, :-1] - here, block[:-1, :-1, 1:] - here
+    here = rows[corners[:, 0]]
+    dz, dy, dx = rows[corners[:, 1]] - here, rows[corners[:, 2]] - here, rows[corners[:, 4]] - here
     return torch.mean(torch.sqrt(dx * dx + dy * dy + dz * dz + smallest))
 
 
-def random_block(
-    rows: Float[Tensor, "corners c"], shape: tuple[int, int, int], share: float, generator: torch.Generator
-) -> Float[Tensor, "x y z c"]:
-    """A contiguous slab of the lattice, about `share` of it, at a random place along the first axis."""
-    thickness = min(shape[0], max(2, math.ceil(share * shape[0]) + 1))
-    first = int(torch.randint(shape[0] - thickness + 1, (), generator=generator))
-    plane = shape[1] * shape[2]
-    return rows[first * plane : (first + thickness) * plane].view(thickness, shape[1], shape[2], -1)
+def random_block(voxels: int, share: float, generator: torch.Generator) -> tuple[int, int]:
+    """A contiguous part of a list of `voxels` kept voxels, about `share` of it, at a random place: first, behind last.
+
+    Kept voxels are listed slab by slab along x, so the part is contiguous in space too.
+    """
+    length = min(voxels, max(1, math.ceil(share * voxels)))
+    first = int(torch.randint(voxels - length + 1, (), generator=generator))
+    return first, first + length
 
 
-def sparsity_loss(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> Float[Tensor, ""]:
-    """Cauchy sparsity: mean over rays of sum_i log(1 + 2 s_i^2) over real steps (Plenoxels, eq. 5; SNeRG)."""
+def ray_sparsity(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> Float[Tensor, " rays"]:
+    """Cauchy sparsity of each ray: sum_i log(1 + 2 s_i^2) over real steps (Plenoxels, eq. 5; SNeRG)."""
     terms = torch.log1p(2.0 * density.clamp(max=1e9) ** 2)
-    return torch.sum(torch.where(deltas > 0, terms, torch.zeros_like(terms))) / density.shape[0]
+    return torch.sum(torch.where(deltas > 0, terms, torch.zeros_like(terms)), -1)
 
 
 def beta_loss(accumulation: Float[Tensor, " rays"], guard: float = 1e-3) -> Float[Tensor, ""]:
@@ -63,15 +66,16 @@ def beta_loss(accumulation: Float[Tensor, " rays"], guard: float = 1e-3) -> Floa
     return torch.mean(torch.log(accumulation + guard) + torch.log(1.0 - accumulation + guard)) - decided
 
 
-def distortion_loss(
+def ray_distortion(
     weights: Float[Tensor, "rays steps"],
     t: Float[Tensor, "rays steps"],
     deltas: Float[Tensor, "rays steps"],
     scale: float,
-) -> Float[Tensor, ""]:
-    """Gather each ray's weight in one short interval (mip-NeRF 360, eq. 15, in the O(n) form of DVGOv2, eq. 6-7).
+) -> Float[Tensor, " rays"]:
+    """How far each ray's weight is spread (mip-NeRF 360, eq. 15, in the O(n) form of DVGOv2, eq. 6-7).
 
-    sum_ij w_i w_j |t_i - t_j| + 1/3 sum_i w_i^2 d_i, mean over rays, lengths divided by `scale`.
+    sum_ij w_i w_j |t_i - t_j| + 1/3 sum_i w_i^2 d_i, lengths divided by `scale`; its mean gathers the weight of rays
+    in one short interval.
 
     Args:
         weights: Weights of the steps.
@@ -84,5 +88,4 @@ def distortion_loss(
     weight_before = torch.cumsum(weights, -1) - weights
     moment_before = torch.cumsum(moment, -1) - moment
     between = 2.0 * torch.sum(weights * (t * weight_before - moment_before), -1)
-    within = torch.sum(weights**2 * deltas, -1) / 3.0
-    return torch.mean(between + within)
+    return between + torch.sum(weights**2 * deltas, -1) / 3.0

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.models.base_model import Model
 from nerfstudio.utils import colormaps
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from thermoxels_ns import losses
@@ -17,12 +20,14 @@ from thermoxels_ns.coarse_to_fine import coarse_to_fine_callbacks
 from thermoxels_ns.errors import SceneError, explain
 from thermoxels_ns.field.background import SkyTemperature, SphereImage
 from thermoxels_ns.field.field import VoxelField
+from thermoxels_ns.field.harmonics import num_coefficients
+from thermoxels_ns.field.memory import check_memory
 from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.metrics import lpips, lpips_available, psnr, ssim, thermal_metrics
 from thermoxels_ns.model_config import ThermoxelsModelConfig
+from thermoxels_ns.ray_rendering import GridSamples, render_rays, sample_rays
 from thermoxels_ns.ray_statistics import corner_temperature
-from thermoxels_ns.render.compositing import Composite, composite
-from thermoxels_ns.render.march import March, march
+from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
 from thermoxels_ns.snapshot import GridSnapshot
 from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.units import TemperatureRange
@@ -34,6 +39,7 @@ class ThermoxelsModel(Model):
     config: ThermoxelsModelConfig
     temperature_bounds_c: Tensor
     backdrop_on: Tensor
+    trained_steps: Tensor
 
     def populate_modules(self) -> None:
         """Build the field, the background and what belongs to single images."""
@@ -59,8 +65,13 @@ class ThermoxelsModel(Model):
         box = self.scene_box.aabb.double().numpy()
         # Densities, distances and learning rates are made for a box 2 long; other sizes are converted.
         self.unit = float((box[1] - box[0]).max()) / 2.0
+        lattice = Lattice.covering(box[0], box[1], config.resolutions[0])
+        channels = 1 + num_coefficients(config.temperature_degree)
+        channels += 0 if config.sh_degree is None else 3 * num_coefficients(config.sh_degree)
+        need = check_memory(lattice, int(np.prod(lattice.cell_shape)), channels, config.memory_budget_gb)
+        CONSOLE.log(f"memory at the start: {need}")
         self.field = VoxelField(
-            Lattice.covering(box[0], box[1], config.resolutions[0]),
+            lattice,
             config.sh_degree,
             config.temperature_degree,
             config.start_density / self.unit,
@@ -72,6 +83,8 @@ class ThermoxelsModel(Model):
         # Whether the colour and the thermal background take part; what "auto" decided is kept in the checkpoint.
         self.register_buffer("backdrop_on", torch.tensor([wants_rgb, self.background_thermal is not None]))
         self.thermal_offset = nn.Parameter(torch.zeros(self.num_train_data)) if config.per_image_offset else None
+        # How far training got; part of the checkpoint, because view-dependence begins at some step.
+        self.register_buffer("trained_steps", torch.tensor(0))
         self.step = 0
 
     @property
@@ -101,60 +114,82 @@ class ThermoxelsModel(Model):
         """Refinement, pruning and the decision about the background."""
         return coarse_to_fine_callbacks(self, training_callback_attributes)
 
+    def check_memory(self, factor: int) -> None:
+        """Say what splitting every kept voxel into factor^3 will need, and refuse what exceeds the budget.
+
+        Raises:
+            MemoryBudgetError: The next lattice needs more than `memory_budget_gb`.
+        """
+        lattice = self.grid.lattice.refined(factor)
+        voxels, channels = len(self.grid.voxels) * factor**3, self._row_channels()
+        CONSOLE.log(f"memory: {check_memory(lattice, voxels, channels, self.config.memory_budget_gb)}")
+
+    def _row_channels(self) -> int:
+        return sum(parameter.shape[1] for parameter in self.grid.row_parameters().values())
+
     def update_to_step(self, step: int) -> None:
         """Tell the model which step it is at (schedules, random blocks)."""
         self.step = step
+        self.trained_steps.fill_(step)
 
-    def march_rays(
+    def _request(
         self, origins: Tensor, directions: Tensor, nears: Tensor | None = None, fars: Tensor | None = None
-    ) -> March:
-        """Sample rays through the kept voxels, between `nears` and `fars` (rays, 1) if given, and weigh the samples."""
-        grid = self.grid
-        skip = bool(grid.kept.all())
+    ) -> RayRequest:
+        """Rays between `nears` and `fars` (rays, 1) if given, behind the near plane."""
         near: float | Tensor = self.config.near_plane * self.unit
         if nears is not None:
             near = nears[:, 0].clamp(min=near)
-        return march(
-            origins,
-            directions,
-            grid.lattice,
-            lambda positions: grid.density_at(grid.locate(positions)),
-            None if skip else grid.in_kept_voxel,
-            self.config.steps_per_voxel,
-            near,
-            None if fars is None else fars[:, 0],
+        return RayRequest(origins, directions, near, None if fars is None else fars[:, 0])
+
+    def _options(self) -> RenderOptions:
+        """How exactly to render."""
+        config = self.config
+        return RenderOptions(
+            config.steps_per_voxel,
+            config.smallest_weight,
+            config.early_stop,
+            config.thermal_density_gradient,
+            sh_degree=self._active_sh_degree(),
         )
 
-    def composite_march(
-        self, marched: March, directions: Tensor, rgb_rays: Tensor | None, thermal_rays: Tensor | None
-    ) -> Composite:
-        """Colour and temperature of marched rays; None as a mask means all rays."""
-        grid = self.grid
-        at = grid.locate(marched.positions)
+    def _training_options(self) -> RenderOptions:
+        """The same, and what this step's loss needs beside pixels."""
+        weights, grid = self.loss_weights, self.grid
+        generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
+        return replace(
+            self._options(),
+            distortion_scale=2.0 * self.unit if self._distortion_weight() > 0 else None,
+            sparsity=weights.sparsity > 0,
+            variation={
+                name: losses.random_block(len(grid.voxels), self.config.tv_share, generator)
+                for name in grid.row_parameters()
+                if getattr(weights, f"tv_{name}")
+            },
+        )
 
-        def rows(query):
-            def rows_at(flat: Tensor) -> Tensor:
-                return query(at.select(marched.active_index(flat)), directions[marched.rays_of(flat)])
+    def _active_sh_degree(self) -> int | None:
+        """Degree of the colour at this step: the same from all sides until surfaces stand where they are."""
+        degree = self.config.sh_degree
+        return 0 if degree is not None and int(self.trained_steps) < self.config.view_dependence_from else degree
 
-            return rows_at
+    def sample_rays(self, origins: Tensor, directions: Tensor) -> GridSamples:
+        """List the samples of rays in kept voxels and their weights, for statistics."""
+        return sample_rays(self.grid, self._request(origins, directions), self._options(), self.config.backend)
 
+    def render_rays(self, request: RayRequest, options: RenderOptions) -> tuple[Tensor | None, Tensor, RayRender]:
+        """Colour and temperature of rays with what stands behind the box, and what they were made of."""
+        seen = render_rays(self.grid, request, options, self.config.backend)
         rgb_on, thermal_on = self.backdrop_on.tolist()
-        has_rgb = grid.sh is not None and (rgb_rays is None or bool(rgb_rays.any()))
-        has_thermal = thermal_rays is None or bool(thermal_rays.any())
-        backdrop_rgb = self.background_rgb(directions) if self.background_rgb is not None and rgb_on else None
+        directions = request.directions
+        backdrop = self.background_rgb(directions) if self.background_rgb is not None and rgb_on else None
         sky = self.background_thermal
-        return composite(
-            marched.steps,
-            marched.along,
-            rows(grid.rgb_at) if has_rgb else None,
-            rows(grid.thermal_at) if has_thermal else None,
-            rgb_rays,
-            thermal_rays,
-            backdrop_rgb,
+        rgb, thermal = seen.with_background(
+            backdrop,
             sky(directions) if sky is not None and thermal_on else None,
-            self.config.thermal_density_gradient,
-            self.config.smallest_weight,
+            request,
+            options.thermal_moves_density,
         )
+        return rgb, thermal, seen
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         """Render rays: rgb, thermal (normalised), temperature_c, depth, accumulation.
@@ -162,35 +197,37 @@ class ThermoxelsModel(Model):
         Rays of a batch carry their stream (see `streams.py`). In training only what it needs is rendered, and the
         outputs are those that losses are made of. A crop that the viewer sets (nears, fars) is kept.
         """
-        origins, directions = ray_bundle.origins, ray_bundle.directions
-        marched = self.march_rays(origins, directions, ray_bundle.nears, ray_bundle.fars)
+        request = self._request(ray_bundle.origins, ray_bundle.directions, ray_bundle.nears, ray_bundle.fars)
         stream = ray_bundle.metadata.get("stream")
         if stream is None:
-            return self._image_outputs(self.composite_march(marched, directions, None, None), origins)
+            return self._image_outputs(request)
         rgb_rays, thermal_rays = (stream[:, 0] & RGB_STREAM) > 0, (stream[:, 0] & THERMAL_STREAM) > 0
-        batch: dict[str, Any] = {"rgb_rays": rgb_rays, "thermal_rays": thermal_rays, "march": marched}
+        batch: dict[str, Any] = {"rgb_rays": rgb_rays, "thermal_rays": thermal_rays}
         if not self.training:
             # Stock exporters ask for batches as for images; colour is left out only where no ray is a photograph's.
-            no_rgb = None if bool(rgb_rays.any()) else rgb_rays
-            return batch | self._image_outputs(self.composite_march(marched, directions, no_rgb, None), origins)
-        seen = self.composite_march(marched, directions, rgb_rays, thermal_rays)
-        thermal = seen.thermal
-        if self.thermal_offset is not None and thermal is not None:
+            if not bool(rgb_rays.any()):
+                request = replace(request, rgb_rays=rgb_rays)
+            return batch | self._image_outputs(request)
+        request = replace(request, rgb_rays=rgb_rays, thermal_rays=thermal_rays)
+        rgb, thermal, seen = self.render_rays(request, self._training_options())
+        if self.thermal_offset is not None:
             assert ray_bundle.camera_indices is not None
             offset = self.thermal_offset - self.thermal_offset.mean()
             thermal = thermal + offset[ray_bundle.camera_indices[:, 0]][:, None]
-        return batch | {"rgb": seen.rgb, "thermal": thermal, "accumulation": seen.accumulation[:, None]}
+        return batch | {"rgb": rgb, "thermal": thermal, "accumulation": seen.accumulation[:, None], "render": seen}
 
-    def _image_outputs(self, seen: Composite, origins: Tensor) -> dict[str, Tensor]:
-        assert seen.thermal is not None
-        rgb = seen.rgb if seen.rgb is not None else seen.thermal.expand(-1, 3)
+    def _image_outputs(self, request: RayRequest) -> dict[str, Tensor]:
+        rgb, thermal, seen = self.render_rays(request, self._options())
+        origins = request.origins
+        if rgb is None:
+            rgb = thermal.expand(-1, 3)
         # A ray that hits nothing is drawn behind the box: image writers cannot show infinity.
         lo, hi = torch.tensor([self.grid.lattice.lo, self.grid.lattice.hi], dtype=origins.dtype, device=origins.device)
         far = torch.linalg.norm(origins - 0.5 * (lo + hi), dim=-1) + 0.5 * torch.linalg.norm(hi - lo)
         return {
             "rgb": rgb.clamp(0, 1),
-            "thermal": seen.thermal,
-            "temperature_c": self.temperature_range.to_celsius(seen.thermal),
+            "thermal": thermal,
+            "temperature_c": self.temperature_range.to_celsius(thermal),
             "depth": torch.minimum(seen.depth, far)[:, None],
             "accumulation": seen.accumulation[:, None],
         }
@@ -203,51 +240,42 @@ class ThermoxelsModel(Model):
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
     ) -> dict[str, Tensor]:
         """The weighted loss terms; those of weight 0 are not computed."""
-        weights, marched, terms = self.loss_weights, outputs["march"], {}
-        if weights.rgb and outputs["rgb"] is not None:
-            chosen = outputs["rgb_rays"]
+        weights, terms = self.loss_weights, {}
+        chosen = outputs["rgb_rays"]
+        if weights.rgb and outputs["rgb"] is not None and bool(chosen.any()):
             terms["rgb_loss"] = weights.rgb * losses.rgb_loss(outputs["rgb"][chosen], batch["image"][chosen])
-        if weights.thermal and outputs["thermal"] is not None:
-            chosen = outputs["thermal_rays"]
+        chosen = outputs["thermal_rays"]
+        if weights.thermal and bool(chosen.any()):
             terms["thermal_loss"] = weights.thermal * losses.thermal_loss(
                 outputs["thermal"][chosen], batch["thermal"][chosen], self.config.thermal_l2_share
             )
         if not self.training:
             return terms
-        terms |= self._variation_terms()
-        if weights.sparsity:
-            terms["sparsity_loss"] = weights.sparsity * losses.sparsity_loss(marched.density, marched.steps.deltas)
+        seen: RayRender = outputs["render"]
+        for name, value in seen.variation.items():
+            terms[f"tv_{name}_loss"] = getattr(weights, f"tv_{name}") * value
+        if seen.sparsity is not None:
+            terms["sparsity_loss"] = weights.sparsity * seen.sparsity.mean()
         if weights.beta:
-            terms["beta_loss"] = weights.beta * losses.beta_loss(marched.along.accumulation)
-        first, last = self.config.distortion_ramp
-        ramp = min(1.0, max(0.0, (self.step - first) / max(1, last - first)))
-        if weights.distortion and ramp > 0:
-            steps = marched.steps
-            terms["distortion_loss"] = (weights.distortion * ramp) * losses.distortion_loss(
-                marched.along.weights, steps.t, steps.deltas, scale=2.0 * self.unit
-            )
+            terms["beta_loss"] = weights.beta * losses.beta_loss(seen.accumulation)
+        if seen.distortion is not None:
+            terms["distortion_loss"] = self._distortion_weight() * seen.distortion.mean()
         return terms
 
-    def _variation_terms(self) -> dict[str, Tensor]:
-        weights, grid = self.loss_weights, self.grid
-        generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
-        terms = {}
-        for name, parameter in grid.row_parameters().items():
-            weight = getattr(weights, f"tv_{name}")
-            if weight:
-                block = losses.random_block(parameter, grid.lattice.shape, self.config.tv_share, generator)
-                terms[f"tv_{name}_loss"] = weight * losses.total_variation(block)
-        return terms
+    def _distortion_weight(self) -> float:
+        """Weight of the distortion term at this step: it grows over its ramp."""
+        first, last = self.config.distortion_ramp
+        return self.loss_weights.distortion * min(1.0, max(0.0, (self.step - first) / max(1, last - first)))
 
     @torch.no_grad()
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
         """PSNR and temperature error of the batch."""
         metrics = {}
-        if outputs["rgb"] is not None:
-            chosen = outputs["rgb_rays"]
+        chosen = outputs["rgb_rays"]
+        if outputs["rgb"] is not None and bool(chosen.any()):
             metrics["psnr"] = torch.tensor(psnr(outputs["rgb"][chosen], batch["image"][chosen]))
-        if outputs["thermal"] is not None:
-            chosen = outputs["thermal_rays"]
+        chosen = outputs["thermal_rays"]
+        if bool(chosen.any()):
             error = (outputs["thermal"][chosen] - batch["thermal"][chosen]).abs().mean()
             metrics["thermal_mae_c"] = error * self.temperature_range.span_k
         return metrics
@@ -296,13 +324,14 @@ class ThermoxelsModel(Model):
         Returns:
             Density, temperature and observed weight on the corners, density at the voxel centres.
         """
-        grid, shape = self.grid, self.grid.lattice.shape
+        grid = self.grid
         seen = corner_temperature(self, thermal_rays)
-        temperature_c = self.temperature_range.to_celsius(seen.thermal.double())
+        # Corners of no kept voxel are given the middle of the range; nothing reads them.
+        thermal = grid.corner_values(seen.thermal.float(), fill=0.5)
         return GridSnapshot(
             grid.lattice,
             density=grid.corner_density().float().cpu().numpy(),
-            temperature_c=temperature_c.view(shape).float().cpu().numpy(),
-            observed_weight=seen.weight.view(shape).float().cpu().numpy(),
+            temperature_c=self.temperature_range.to_celsius(thermal).cpu().numpy(),
+            observed_weight=grid.corner_values(seen.weight.float()).cpu().numpy(),
             voxel_density=grid.voxel_density().float().cpu().numpy(),
         )

@@ -10,6 +10,10 @@ from nerfstudio.models.base_model import ModelConfig
 
 from thermoxels_ns.errors import ThermoxelsError, explain
 from thermoxels_ns.field.voxel_grid import DensityActivation
+from thermoxels_ns.ray_rendering import Backend
+from thermoxels_ns.schedule import QUALITIES, schedule_for
+
+_STANDARD = schedule_for(*QUALITIES["standard"])
 
 
 @dataclass(frozen=True)
@@ -39,12 +43,12 @@ LOSS_RECIPES: Mapping[str, LossWeights] = {
     "default": LossWeights(
         rgb=1.0,
         thermal=1.0,
-        tv_density=1e-4,
-        tv_sh=1e-3,
+        tv_density=1e-5,
+        tv_sh=1e-5,
         tv_temperature=1e-3,
         sparsity=0.0,
         beta=0.0,
-        distortion=1e-2,
+        distortion=0.1,
     ),
     # The published training configuration of the original code (TV, sparsity and beta as there).
     "paper": LossWeights(
@@ -70,19 +74,25 @@ class ThermoxelsModelConfig(ModelConfig):
     eval_num_rays_per_chunk: int = 8192
     """Rays rendered at once for a whole image."""
 
-    resolutions: tuple[int, ...] = (32, 64)
+    resolutions: tuple[int, ...] = _STANDARD.resolutions
     """Voxels along the longest side of the scene box, coarse to fine; each a multiple of the one before."""
-    refine_at: tuple[int, ...] = (400,)
+    refine_at: tuple[int, ...] = _STANDARD.refine_at
     """Steps at which the next resolution begins; one fewer than resolutions."""
-    prune_at: tuple[int, ...] = (800,)
+    prune_at: tuple[int, ...] = _STANDARD.prune_at
     """Further steps at which voxels that no ray gives weight to are dropped (done at every refinement too)."""
-    prune_threshold: float = 0.01
+    prune_threshold: float = 0.03
     """A voxel stays if some training ray gave it more than this share of a pixel. 0 switches pruning off."""
     prune_dilation: int = 1
     """Voxels kept around those, so that surfaces can still move."""
+    thin_at: tuple[int, ...] = _STANDARD.thin_at
+    """Steps at which surfaces are thinned: fog before them and what shines through from behind them goes."""
+    thin_threshold: float = 0.2
+    """At those steps a voxel stays only if some training ray gave it more than this share of a pixel."""
 
     sh_degree: int | None = 2
     """Degree of the view-dependent colour, 0 to 2. None: no colour (thermal images alone)."""
+    view_dependence_from: int = _STANDARD.view_dependence_from
+    """Step from which colour depends on the direction; before, it cannot explain away a surface in the wrong place."""
     temperature_degree: int = 0
     """Degree of view-dependent temperature; 0 (the paper): surfaces look equally warm from all sides."""
     density_activation: DensityActivation = "exp"
@@ -95,6 +105,12 @@ class ThermoxelsModelConfig(ModelConfig):
     """Samples per voxel edge along a ray (the paper: 2)."""
     near_plane: float = 0.0
     """Distance before each camera that stays empty, in scene units (the scene box is 2 long)."""
+    early_stop: float = 1e-5
+    """A ray ends where less than this share of its light is left; its pixel is off by at most this much. 0: never."""
+    backend: Backend = "auto"
+    """fused: compiled kernels, on a CPU; reference: plain PyTorch; auto: fused on a CPU, reference on a GPU."""
+    memory_budget_gb: float = 4.0
+    """Memory that the voxel grid with its optimiser may need, [GB]; what needs more is refused before it is taken."""
     smallest_weight: float = 1e-5
     """Samples that fill less than this share of a pixel add no colour or temperature. 0 is exact and slower."""
 
@@ -112,7 +128,7 @@ class ThermoxelsModelConfig(ModelConfig):
     beta, distortion."""
     thermal_l2_share: float = 0.5
     """lambda of the paper's eq. 4."""
-    distortion_ramp: tuple[int, int] = (200, 800)
+    distortion_ramp: tuple[int, int] = _STANDARD.distortion_ramp
     """Steps over which the distortion term grows from nothing to its weight."""
     tv_share: float = 0.1
     """Share of the lattice that each step's total variation looks at."""
@@ -146,12 +162,15 @@ class ThermoxelsModelConfig(ModelConfig):
         self.refinements()
         ranges: dict[str, tuple[float, float, str]] = {
             "prune_threshold": (0.0, 1.0, "from 0 to 1"),
+            "thin_threshold": (0.0, 1.0, "from 0 to 1"),
             "prune_dilation": (0, 100, "from 0 to 100"),
             "temperature_degree": (0, 2, "0, 1 or 2"),
             "start_density": (1e-30, 1e30, "a finite number above 0"),
             "steps_per_voxel": (0.1, 1000.0, "from 0.1 to 1000"),
             "near_plane": (0.0, 1e30, "0 or more"),
             "smallest_weight": (0.0, 0.1, "from 0 to 0.1"),
+            "early_stop": (0.0, 0.1, "from 0 to 0.1"),
+            "memory_budget_gb": (1e-6, 1e6, "a number above 0"),
             "background_height": (2, 100_000, "at least 2"),
             "thermal_l2_share": (0.0, 1.0, "from 0 to 1"),
             "tv_share": (1e-6, 1.0, "above 0, at most 1"),
@@ -167,10 +186,12 @@ class ThermoxelsModelConfig(ModelConfig):
                 raise ThermoxelsError(
                     explain(name, expected=expected, got=value, remedy=f"Correct --pipeline.model.{option}.")
                 )
-        if self.prune_at and min(self.prune_at) < 1:
-            raise ThermoxelsError(
-                explain("prune_at", expected="steps of at least 1", got=self.prune_at, remedy="Correct the steps.")
-            )
+        for name in ("prune_at", "thin_at"):
+            at = getattr(self, name)
+            if at and min(at) < 1:
+                raise ThermoxelsError(
+                    explain(name, expected="steps of at least 1", got=at, remedy="Correct the steps.")
+                )
 
     def refinements(self) -> dict[int, int]:
         """Step -> factor by which voxels are split there.

@@ -1,27 +1,210 @@
-"""Optimiser settings for the groups of the model."""
+"""Optimisers that touch only rows with a gradient, as nerfstudio optimizer configs.
+
+A batch of rays sees a small part of a voxel grid. Rows (entries along the first axis) without a gradient keep their
+value and their state, and each row's bias correction counts its own updates, so that a corner that is seen for the
+first time late in a training starts like all others did.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, OptimizerConfig
+from torch import Tensor
+
+from thermoxels_ns.field.refine import RowChange
+from thermoxels_ns.threads import run_ranges
+
+
+class RowOptimizer(torch.optim.Optimizer):
+    """An optimiser whose step goes over the rows of each parameter that have a gradient.
+
+    Gradients are row-sparse tensors (`torch.sparse_coo`, one sparse dimension) or dense ones, whose rows of zeros count
+    as rows without a gradient.
+    """
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
+        """Update all parameters once."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is None:
+                    continue
+                rows, values = touched_rows(parameter.grad)
+                state = self.state[parameter]
+                if not state:
+                    state.update(self.new_state(parameter))
+                if len(rows):
+                    self.update_rows(parameter.view(len(parameter), -1), rows, values, state, group)
+        return loss
+
+    def new_state(self, parameter: Tensor) -> dict[str, Tensor]:
+        """State of a parameter that was never updated; each entry has the parameter's rows."""
+        raise TypeError(f"{type(self).__name__} does not say what its state is")
+
+    def update_rows(
+        self, parameter: Tensor, rows: Tensor, gradient: Tensor, state: dict[str, Tensor], group: dict[str, Any]
+    ) -> None:
+        """Update ``parameter[rows]``, seen as (rows, channels), with `gradient` (len(rows), channels)."""
+        raise TypeError(f"{type(self).__name__} does not say how rows are updated")
+
+    def change_rows(self, old: Tensor, new: torch.nn.Parameter, change: RowChange) -> None:
+        """Go on with a parameter whose rows were split or dropped: the state follows as the values did.
+
+        Args:
+            old: The parameter so far.
+            new: The one that takes its place.
+            change: How values of rows changed.
+        """
+        for group in self.param_groups:
+            group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
+        state = self.state.pop(old, None)  # type: ignore[arg-type]
+        if state:
+            self.state[new] = {
+                name: change(values.view(len(values), -1)).reshape(-1, *values.shape[1:])
+                for name, values in state.items()
+            }
+
+
+def touched_rows(gradient: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows with a gradient, ascending, and their gradients, (rows, channels)."""
+    if gradient.is_sparse:
+        rows = gradient._indices()[0]
+        # Accumulation into `grad` forgets that a tensor is coalesced; finding out is quicker than doing it again.
+        if not gradient.is_coalesced() and not bool((rows[1:] > rows[:-1]).all()):
+            gradient = gradient.coalesce()
+        values = gradient._values()
+        return gradient._indices()[0], values.view(len(values), -1)
+    flat = gradient.reshape(len(gradient), -1)
+    rows = (flat != 0).any(-1).nonzero()[:, 0]
+    return rows, flat[rows]
+
+
+class RowAdam(RowOptimizer):
+    """Adam (Kingma and Ba 2015) on touched rows, each with its own bias correction.
+
+    Args:
+        params: Parameters or groups.
+        lr: Learning rate.
+        betas: Decay of the running means of the gradient and of its square.
+        eps: Added to the root of the second moment.
+    """
+
+    def __init__(self, params, lr: float = 1e-3, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15):
+        super().__init__(params, {"lr": lr, "betas": tuple(betas), "eps": eps})
+
+    def new_state(self, parameter: Tensor) -> dict[str, Tensor]:
+        """Two moments and the number of updates of each row."""
+        return {
+            "exp_avg": torch.zeros_like(parameter),
+            "exp_avg_sq": torch.zeros_like(parameter),
+            "updates": torch.zeros(len(parameter), dtype=parameter.dtype, device=parameter.device),
+        }
+
+    def update_rows(self, parameter, rows, gradient, state, group):
+        """One step of Adam on some rows."""
+        (beta1, beta2), lr, eps = group["betas"], group["lr"], group["eps"]
+        first, second = (state[name].view(len(parameter), -1) for name in ("exp_avg", "exp_avg_sq"))
+        if parameter.device.type == "cpu":
+            from thermoxels_ns import optim_kernels
+
+            adam_rows: Any = optim_kernels.adam_rows
+
+            arrays = [t.detach().contiguous().numpy() for t in (rows, gradient)]
+            held = [t.detach().numpy() for t in (parameter, first, second, state["updates"])]
+            constants = lr, beta1, beta2, eps, _corrections(beta1), _corrections(beta2)
+            run_ranges(lambda a, b: adam_rows(a, b, *arrays, *held, *constants), len(rows), 2048)
+            return
+        updates = state["updates"][rows] + 1
+        m = beta1 * first[rows] + (1 - beta1) * gradient
+        v = beta2 * second[rows] + (1 - beta2) * gradient * gradient
+        first[rows], second[rows], state["updates"][rows] = m, v, updates
+        count = (updates + 0.5).floor()  # interpolation leaves numbers that are not whole
+        root = (v / (1 - beta2**count)[:, None]).sqrt() + eps
+        parameter[rows] -= lr * (m / (1 - beta1**count)[:, None]) / root
+
+
+class RowRMSprop(RowOptimizer):
+    """RMSprop (Tieleman and Hinton 2012) on touched rows, as Plenoxels uses it.
+
+    Args:
+        params: Parameters or groups.
+        lr: Learning rate.
+        alpha: Decay of the running mean of squared gradients.
+        eps: Added to its root.
+    """
+
+    def __init__(self, params, lr: float = 1e-2, alpha: float = 0.95, eps: float = 1e-8):
+        super().__init__(params, {"lr": lr, "alpha": alpha, "eps": eps})
+
+    def new_state(self, parameter: Tensor) -> dict[str, Tensor]:
+        """The running mean of squared gradients."""
+        return {"square_avg": torch.zeros_like(parameter)}
+
+    def update_rows(self, parameter, rows, gradient, state, group):
+        """One step of RMSprop on some rows."""
+        lr, alpha, eps = group["lr"], group["alpha"], group["eps"]
+        square = state["square_avg"].view(len(parameter), -1)
+        if parameter.device.type == "cpu":
+            from thermoxels_ns import optim_kernels
+
+            rmsprop_rows: Any = optim_kernels.rmsprop_rows
+
+            arrays = [t.detach().contiguous().numpy() for t in (rows, gradient)]
+            held = [t.detach().numpy() for t in (parameter, square)]
+            run_ranges(lambda a, b: rmsprop_rows(a, b, *arrays, *held, lr, alpha, eps), len(rows), 2048)
+            return
+        mean = alpha * square[rows] + (1 - alpha) * gradient * gradient
+        square[rows] = mean
+        parameter[rows] -= lr * gradient / (mean.sqrt() + eps)
+
+
+def _corrections(beta: float) -> np.ndarray:
+    """1 - beta^t for t = 0, 1, ... until it is 1; the last entry serves all later t."""
+    if beta not in _TABLES:
+        count = 2 if beta == 0 else min(1_000_000, int(np.ceil(np.log(1e-17) / np.log(beta))) + 2)
+        table = 1.0 - np.power(beta, np.arange(count, dtype=np.float64))
+        table[-1] = 1.0
+        _TABLES[beta] = table
+    return _TABLES[beta]
+
+
+_TABLES: dict[float, np.ndarray] = {}
+
+
+@dataclass
+class RowAdamConfig(OptimizerConfig):
+    """Adam that touches only rows with a gradient."""
+
+    _target: type = RowAdam
+    eps: float = 1e-15
+    """Added to the root of the second moment; tiny, so that corners few rays see move as fast as the others."""
+    betas: tuple[float, float] = (0.9, 0.999)
+    """Decay of the running means of the gradient and of its square."""
+
+
+@dataclass
+class RowRMSpropConfig(OptimizerConfig):
+    """RMSprop that touches only rows with a gradient, as Plenoxels uses it."""
+
+    _target: type = RowRMSprop
+    alpha: float = 0.95
+    """Decay of the running mean of squared gradients."""
 
 
 @dataclass
 class FusedAdamConfig(AdamOptimizerConfig):
-    """Adam whose step is one compiled pass over each parameter (several times faster on CPU than the default)."""
+    """Dense Adam whose step is one compiled pass over each parameter, for what has no rows (the background)."""
 
     eps: float = 1e-15
-    """Added to the root of the second moment; tiny, so that corners few rays see move as fast as the others."""
+    """Added to the root of the second moment."""
     fused: bool = True
     """Use the fused implementation."""
-
-
-@dataclass
-class RMSpropConfig(OptimizerConfig):
-    """RMSprop as Plenoxels uses it."""
-
-    _target: type = torch.optim.RMSprop
-    alpha: float = 0.95
-    """Decay of the running mean of squared gradients."""

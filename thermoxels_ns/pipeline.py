@@ -10,11 +10,15 @@ from typing import Any
 import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 
 from thermoxels_ns.errors import CheckpointError, SceneError, explain
 from thermoxels_ns.model import ThermoxelsModel
+from thermoxels_ns.ray_rendering import choose_backend
 from thermoxels_ns.snapshot import GridSnapshot
 from thermoxels_ns.streams import THERMAL_STREAM
+from thermoxels_ns.threads import set_num_threads
+from thermoxels_ns.warm_up import compile_kernels
 
 _GRID = "_model.field.grid."
 _ACTIVATION = "_model.field.grid.activation_index"
@@ -26,8 +30,8 @@ class ThermoxelsPipelineConfig(VanillaPipelineConfig):
 
     _target: type = field(default_factory=lambda: ThermoxelsPipeline)
     cpu_threads: int | None = None
-    """Threads that PyTorch uses on a CPU. Default: OMP_NUM_THREADS if set, else half of the processors, because threads
-    that wait for a processor which another program holds slow every step several times."""
+    """Threads of the compiled kernels. Default: one per processor. (PyTorch's own are half of the processors, or
+    OMP_NUM_THREADS: they wait for each other, and one whose processor another program holds slows every step.)"""
 
 
 class ThermoxelsPipeline(VanillaPipeline):
@@ -45,9 +49,12 @@ class ThermoxelsPipeline(VanillaPipeline):
             raise SceneError(
                 explain("cpu_threads", expected="1 or more", got=config.cpu_threads, remedy="Leave it out.")
             )
-        if config.cpu_threads is not None or "OMP_NUM_THREADS" not in os.environ:
-            torch.set_num_threads(config.cpu_threads or max(1, (os.cpu_count() or 2) // 2))
+        set_num_threads(config.cpu_threads)
+        if "OMP_NUM_THREADS" not in os.environ:
+            torch.set_num_threads(max(1, (os.cpu_count() or 2) // 2))
         super().__init__(config, *args, **kwargs)
+        if choose_backend(self.model.config.backend, self.model.grid.density.device) == "fused":
+            compile_kernels(CONSOLE.log)
         streams = getattr(config.datamanager, "streams", "both")
         if streams == "thermal" and (self.model.grid.sh is not None or not self.model.config.thermal_density_gradient):
             raise SceneError(
@@ -143,13 +150,38 @@ class ThermoxelsPipeline(VanillaPipeline):
                     )
                 )
 
+    def get_average_eval_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
+        """Average metrics over the held-out images; in ns-eval also those of the surface, if the truth is known."""
+        averages = super().get_average_eval_image_metrics(*args, **kwargs)
+        if self.test_mode == "test":  # ns-eval; training has "val"
+            averages |= self.geometry_metrics()
+        return averages
+
+    def geometry_metrics(self) -> dict[str, float]:
+        """How well the surface agrees with the exact scene, see `thermoxels_ns.geometry_metrics`; empty if unknown."""
+        from thermoxels_ns.export import input_from_world
+        from thermoxels_ns.geometry_metrics import geometry_metrics
+
+        datamanager: Any = self.datamanager
+        outputs = datamanager.train_dataparser_outputs
+        world_to_input = input_from_world(outputs.dataparser_transform.numpy(), float(outputs.dataparser_scale))
+        # Density alone decides what is solid: no thermal rays are needed.
+        snapshot = self.model.grid_snapshot(())
+        return geometry_metrics(snapshot, world_to_input, datamanager.get_datapath(), _say)
+
     def get_average_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
-        """Average metrics over images; an image where a metric has no pixel does not count for it."""
+        """Average metrics over images; an image where a metric has no pixel does not count for it.
+
+        ``half_transparent``, the share of rays that are neither through nor stopped, joins the metrics of the model.
+        """
+        from thermoxels_ns.geometry_metrics import half_transparent_share
+
         rows: list[dict[str, float]] = []
         one_image = self.model.get_image_metrics_and_images
 
         def remember(outputs, batch):
             metrics, images = one_image(outputs, batch)
+            metrics["half_transparent"] = half_transparent_share(outputs["accumulation"])
             rows.append(dict(metrics))
             return metrics, images
 
@@ -174,3 +206,7 @@ class ThermoxelsPipeline(VanillaPipeline):
 
 def _columns(grid: dict[str, int]) -> str:
     return ", ".join(f"{name.removeprefix(_GRID)} {columns}" for name, columns in sorted(grid.items()))
+
+
+def _say(line: str) -> None:
+    CONSOLE.print(escape(line))

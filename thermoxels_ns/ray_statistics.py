@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from thermoxels_ns.field.interpolation import splat
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.render.march import March
+from thermoxels_ns.ray_rendering import GridSamples
 
 
-class RayMarcher(Protocol):
+class RaySampler(Protocol):
     """What is needed of a model here."""
 
     @property
@@ -24,51 +24,76 @@ class RayMarcher(Protocol):
         """The voxel grid."""
         ...
 
-    def march_rays(self, origins: Tensor, directions: Tensor) -> March:
+    def sample_rays(self, origins: Tensor, directions: Tensor) -> GridSamples:
         """Sample and weigh rays."""
         ...
 
 
 @dataclass(frozen=True)
 class VoxelWeights:
-    """Weights of rays per voxel, shape of the lattice's voxels."""
+    """Weights of rays per kept voxel."""
 
-    largest: Float[Tensor, "x y z"]
+    largest: Float[Tensor, " voxels"]
     """Largest weight a sample in the voxel had on any ray."""
-    total: Float[Tensor, "x y z"]
+    total: Float[Tensor, " voxels"]
     """Sum of the weights of all samples in the voxel."""
+    ends: Bool[Tensor, " voxels"]
+    """Voxels in which some ray that ends on something (opacity above one half) has spent half of its weight."""
 
 
 @torch.no_grad()
-def voxel_weights(model: RayMarcher, rays: Iterable[RayBundle]) -> VoxelWeights:
+def voxel_weights(model: RaySampler, rays: Iterable[RayBundle]) -> VoxelWeights:
     """Accumulate ray weights in voxels."""
-    lattice = model.grid.lattice
-    nx, ny, nz = lattice.cell_shape
-    device = model.grid.density.device
-    largest, total = torch.zeros(nx * ny * nz, device=device), torch.zeros(nx * ny * nz, device=device)
+    density = model.grid.density
+    largest, total = (torch.zeros(len(model.grid.voxels), device=density.device) for _ in range(2))
+    ends = torch.zeros(len(model.grid.voxels), dtype=torch.bool, device=density.device)
     for bundle in rays:
-        marched = model.march_rays(bundle.origins.to(device), bundle.directions.to(device))
-        weights = marched.along.weights.flatten()[marched.active]
-        corner = model.grid.locate(marched.positions).first_corner
-        k, j = corner % lattice.shape[2], corner // lattice.shape[2] % lattice.shape[1]
-        voxel = (corner // (lattice.shape[1] * lattice.shape[2]) * ny + j) * nz + k
-        largest.scatter_reduce_(0, voxel, weights, reduce="amax")
-        total.index_add_(0, voxel, weights)
-    return VoxelWeights(largest.view(nx, ny, nz), total.view(nx, ny, nz))
+        samples = model.sample_rays(bundle.origins.to(density.device), bundle.directions.to(density.device))
+        weight = samples.weight.to(largest.dtype)
+        largest.scatter_reduce_(0, samples.at.number, weight, reduce="amax")
+        total.index_add_(0, samples.at.number, weight)
+        opacity = (1.0 - samples.transmittance)[samples.ray]
+        half = (samples.before < 0.5 * opacity) & (samples.before + samples.weight >= 0.5 * opacity) & (opacity > 0.5)
+        ends[samples.at.number[half]] = True
+    return VoxelWeights(largest, total, ends)
+
+
+@torch.no_grad()
+def share_of_rays_opened(model: RaySampler, rays: Iterable[RayBundle], keep: Bool[Tensor, " voxels"]) -> float:
+    """Share of the rays that end on something (opacity above one half) of whose weight more than half would go.
+
+    Fog that goes makes no ray see through; a body that goes does.
+
+    Args:
+        model: The field.
+        rays: Rays to ask.
+        keep: Voxels that would stay, one boolean per kept voxel.
+    """
+    device = model.grid.density.device
+    hit, opened = 0, 0
+    for bundle in rays:
+        samples = model.sample_rays(bundle.origins.to(device), bundle.directions.to(device))
+        lost = torch.zeros_like(samples.transmittance)
+        goes = ~keep[samples.at.number]
+        lost.index_add_(0, samples.ray[goes], samples.weight[goes].to(lost.dtype))
+        opacity = 1.0 - samples.transmittance
+        hit += int((opacity > 0.5).sum())
+        opened += int(((opacity > 0.5) & (lost > 0.5 * opacity)).sum())
+    return opened / max(1, hit)
 
 
 @dataclass(frozen=True)
 class CornerTemperature:
-    """What thermal rays say about the lattice's corners."""
+    """What thermal rays say about the stored corners."""
 
-    thermal: Float[Tensor, " corners"]
+    thermal: Float[Tensor, " rows"]
     """Normalised temperature, in [0, 1], the range of what was measured; where no ray came, the stored value."""
-    weight: Float[Tensor, " corners"]
+    weight: Float[Tensor, " rows"]
     """Sum of the weights of the first-hit samples around the corner, shared out by the trilinear weights."""
 
 
 @torch.no_grad()
-def corner_temperature(model: RayMarcher, rays: Iterable[RayBundle]) -> CornerTemperature:
+def corner_temperature(model: RaySampler, rays: Iterable[RayBundle]) -> CornerTemperature:
     """Average the temperature that rays see around each corner, each sample by its share of the pixel.
 
     A corner's own stored value is only ever used mixed with its neighbours', so an image can be right while single
@@ -77,18 +102,16 @@ def corner_temperature(model: RayMarcher, rays: Iterable[RayBundle]) -> CornerTe
     measures nothing behind it.
     """
     grid = model.grid
-    device, corners = grid.density.device, grid.lattice.num_corners
-    total = torch.zeros(corners, 2, device=device)
+    device = grid.density.device
+    total = torch.zeros(grid.voxels.num_rows, 2, device=device)
     for bundle in rays:
         directions = bundle.directions.to(device)
-        marched = model.march_rays(bundle.origins.to(device), directions)
-        before = torch.cumsum(marched.along.weights, -1) - marched.along.weights
-        first_hit = (before < 0.5) & (marched.along.accumulation > 0.5)[:, None]
-        weights = torch.where(first_hit, marched.along.weights, torch.zeros_like(before)).flatten()
-        weights = weights[marched.active][:, None]
-        at = grid.locate(marched.positions)
-        thermal = grid.thermal_at(at, directions[marched.rays_of(marched.active)])
-        total += splat(torch.cat((weights * thermal, weights), -1), at, corners)
+        samples = model.sample_rays(bundle.origins.to(device), directions)
+        first_hit = (samples.before < 0.5) & (samples.transmittance < 0.5)[samples.ray]
+        at = samples.at.select(first_hit)
+        weights = samples.weight[first_hit][:, None]
+        thermal = grid.thermal_at(at, directions[samples.ray[first_hit]])
+        total += splat(torch.cat((weights * thermal, weights), -1), at).to(total.dtype)
     weight = total[:, 1]
     stored = grid.temperature[:, 0]
     thermal = torch.where(weight > 0, total[:, 0] / weight.clamp(min=1e-30), stored)
@@ -108,14 +131,14 @@ class BackdropEvidence:
 
 
 @torch.no_grad()
-def backdrop_evidence(model: RayMarcher, rays: Iterable[RayBundle]) -> BackdropEvidence:
+def backdrop_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> BackdropEvidence:
     """Find the rays that leave the box unsaturated."""
     device = model.grid.density.device
     seen, open_directions = 0, [torch.zeros(0, 3, device=device)]
     for bundle in rays:
         directions = bundle.directions.to(device)
-        marched = model.march_rays(bundle.origins.to(device), directions)
-        open_directions.append(directions[marched.along.transmittance > 0.5])
+        samples = model.sample_rays(bundle.origins.to(device), directions)
+        open_directions.append(directions[samples.transmittance > 0.5])
         seen += len(directions)
     found = torch.cat(open_directions)
     return BackdropEvidence(seen, len(found) / max(1, seen), found)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
+
+from thermoxels_ns.schedule import QUALITIES, Quality, Schedule, schedule_for
 
 
 @dataclass
@@ -14,6 +17,24 @@ class ThermoxelsTrainerConfig(TrainerConfig):
     """Settings of a training run."""
 
     _target: type = field(default_factory=lambda: ThermoxelsTrainer)
+    quality: Quality | None = None
+    """Named setting of resolution and length: draft (a first look), standard (the default) or fine. It replaces
+    max-num-iterations, the lengths of the learning rate schedules, and the model's resolutions, refine-at, prune-at,
+    thin-at, distortion-ramp and view-dependence-from."""
+
+    def __post_init__(self) -> None:
+        if self.quality is not None:
+            self.follow_schedule(schedule_for(*QUALITIES[self.quality]))
+
+    def follow_schedule(self, schedule: Schedule) -> None:
+        """Set everything that depends on the resolution and the number of steps."""
+        self.max_num_iterations = schedule.steps
+        for group in self.optimizers.values():
+            if group.get("scheduler") is not None:
+                group["scheduler"].max_steps = schedule.steps
+        model: Any = self.pipeline.model
+        for item in ("resolutions", "refine_at", "prune_at", "thin_at", "distortion_ramp", "view_dependence_from"):
+            setattr(model, item, getattr(schedule, item))
 
 
 class ThermoxelsTrainer(Trainer):

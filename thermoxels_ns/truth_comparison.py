@@ -131,7 +131,7 @@ def compare_with_truth(
     check_positive("metres_per_unit", metres_per_unit, "Pass the scale the mesh was built with.", MeshError)
     voxel_m = lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(transform[:3, :3]))))
     tolerance_m = TOLERANCE_VOXELS * voxel_m
-    seen = _points_seen(known)
+    seen = points_seen(known)
     score = surface_fscore(cells, lattice, known.scene, seen, tolerance_m, transform)
     solid = np.asarray(cells, dtype=bool)
     result: dict[str, Any] = {
@@ -155,7 +155,7 @@ def compare_with_truth(
     return result
 
 
-def _points_seen(known: KnownTruth) -> npt.NDArray[np.float64]:
+def points_seen(known: KnownTruth) -> npt.NDArray[np.float64]:
     """Points spread evenly over the part of the true surface that enough training cameras see, shape (m, 3), [m]."""
     points, normals = known.scene.surface_points(_SURFACE_POINTS, seed=0)
     seen = visible_surface_points(known.scene, known.training_poses, known.camera, points, normals, MIN_VIEWS)

@@ -5,8 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from thermoxels_ns.data.cylinder import Cylinder
 from thermoxels_ns.data.rectangles import distance_to_box
-from thermoxels_ns.data.solids import BoxSolid, SolidUnion, Sphere
+from thermoxels_ns.data.solid_union import SolidUnion
+from thermoxels_ns.data.solids import BoxSolid, Sphere
 from thermoxels_ns.data.synthetic_scenes import SCENE_NAMES, make_scene
 from thermoxels_ns.errors import SceneError
 
@@ -19,6 +21,8 @@ SOLIDS = {
     "box": BoxSolid([CUBE]),
     "notched": NOTCHED,
     "sphere": Sphere((0.3, -0.2, 0.5), 0.7),
+    **{f"cylinder-{axis}": Cylinder((0.3, -0.2, 0.5), 0.4, 1.5, axis) for axis in range(3)},
+    "disc": Cylinder((0.0, 0.1, 0.2), 0.5, 0.1, 2),
     "union": SolidUnion((NOTCHED, Sphere((0.5, 0.5, 1.25), 0.25))),
     **{name: make_scene(name).solid for name in SCENE_NAMES},
 }
@@ -186,6 +190,56 @@ def test_sphere_hits_are_analytic_even_from_far_away() -> None:
         np.testing.assert_allclose(distance, away - np.array([0.5, 0.4, 0.3, 0.0, -np.inf]), rtol=1e-15)
 
 
+def test_distance_to_a_cylinder_is_that_to_its_side_end_or_rim() -> None:
+    rod = Cylinder((1.0, 2.0, 3.0), radius=0.5, length=4.0, axis=1)
+    points = np.array([[0, 0, 0], [0, 0, 0.4], [0, 1.9, 0], [2, 1, 0], [0.1, 5, 0.2], [3.5, -6, 0], [0, 2.3, 0.9]])
+    np.testing.assert_allclose(
+        rod.signed_distance(points + rod.centre), [-0.5, -0.1, -0.1, 1.5, 3.0, 5.0, 0.5], atol=1e-14
+    )
+    assert rod.volume == pytest.approx(math.pi) and rod.area == pytest.approx(4.5 * math.pi)
+    assert rod.bounds == ((0.5, 0.0, 2.5), (1.5, 4.0, 3.5))
+
+
+def test_cylinder_hits_are_analytic_even_from_far_away() -> None:
+    rod = Cylinder((0.0, 0.0, 0.0), radius=0.5, length=2.0, axis=2)
+    height = np.array([0.0, 0.3, 0.4, 0.5, 0.6])
+    for away in (2.0, 1e6):
+        origins = np.stack([np.full(5, -away), height, np.full(5, 0.25)], axis=1)
+        distance = rod.intersect(origins, np.tile([1.0, 0.0, 0.0], (5, 1))).distance
+        np.testing.assert_allclose(distance, away - np.array([0.5, 0.4, 0.3, 0.0, -np.inf]), rtol=1e-15)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 1e-7, -1e-7, 1e-17, 1e-160, -1e-200, 1e-300])
+def test_rays_along_a_cylinder_enter_through_its_end(tilt: float) -> None:
+    rod = Cylinder((0.0, 0.0, 0.0), radius=0.5, length=2.0, axis=2)
+    hits = rod.intersect(
+        [[0.1, 0.2, 5.0], [0.1, 0.2, -5.0], [0.6, 0.0, 5.0]], [[tilt, 0, -1], [0, tilt, 1], [0, 0, -1]]
+    )
+    np.testing.assert_allclose(hits.distance, [4.0, 4.0, np.inf])
+    np.testing.assert_array_equal(hits.normal, [[0, 0, 1], [0, 0, -1], [0, 0, 0]])
+    level = rod.intersect(
+        [[-2.0, 0.0, 0.5], [-2.0, 0.0, 1.5], [2.0, 0.0, 0.5]], [[1, 0, tilt], [1, 0, 0], [1, 0, tilt]]
+    )
+    np.testing.assert_allclose(level.distance, [1.5, np.inf, np.inf])
+    np.testing.assert_allclose(level.normal[0], [-1, 0, 0], atol=1e-12)
+
+
+def test_a_ray_that_starts_in_a_cylinder_sees_no_wall_from_behind() -> None:
+    rod = Cylinder((0.0, 0.0, 0.0), radius=0.5, length=2.0, axis=0)
+    assert not rod.intersect([0.2, 0.1, 0.0], np.concatenate([np.eye(3), -np.eye(3)])).hit.any()
+
+
+def test_points_on_a_cylinder_are_uniform_by_area() -> None:
+    rod = Cylinder((0.0, 0.0, 0.0), radius=0.5, length=1.5, axis=0)
+    points, normals = rod.surface_points(40_000, seed=4)
+    on_end = np.abs(normals[:, 0]) > 0.5
+    assert on_end.mean() == pytest.approx(2 * math.pi * 0.25 / rod.area, abs=0.01)
+    from_axis = np.hypot(points[on_end, 1], points[on_end, 2])
+    assert np.square(from_axis / 0.5).mean() == pytest.approx(0.5, abs=0.015)
+    assert points[~on_end, 0].std() == pytest.approx(1.5 / math.sqrt(12.0), abs=0.01)
+    np.testing.assert_array_equal(points, rod.surface_points(40_000, seed=4)[0])
+
+
 def test_distances_are_multiples_of_the_direction(solid) -> None:
     origins, directions = random_rays(solid, 300)
     np.testing.assert_allclose(
@@ -250,11 +304,32 @@ def test_a_union_adds_up_and_takes_the_nearest() -> None:
         (Sphere((0, 0, 0), 1.0), Sphere((1.5, 0, 0), 1.0)),
         (BoxSolid([CUBE]), BoxSolid([((1.0, 0, 0), (2, 1, 1))])),
         (BoxSolid([CUBE]), Sphere((0.5, 0.5, 0.5), 0.1)),
+        (BoxSolid([CUBE]), Cylinder((0.5, 0.5, 1.25), 0.1, 0.5, axis=2)),
+        (Cylinder((1.2, 0.5, 0.5), 0.2, 0.5, axis=2), BoxSolid([CUBE])),
+        (BoxSolid([CUBE]), Cylinder((1.1, 1.1, 0.5), 0.15, 0.5, axis=2)),
+        (Cylinder((0, 0, 0), 0.5, 2.0, axis=1), Sphere((0, 1.2, 0), 0.3)),
+        (Cylinder((0, 0, 0), 0.5, 2.0, axis=1), Cylinder((0.7, 1.5, 0.7), 0.5, 2.0, axis=1)),
+        (Cylinder((0, 0, 0), 0.5, 2.0, axis=1), Cylinder((0, 0, 0.9), 0.5, 2.0, axis=0)),
     ],
 )
 def test_a_union_refuses_overlap(parts: tuple) -> None:
     with pytest.raises(SceneError, match="parts 0 and 1"):
         SolidUnion(parts)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        (BoxSolid([CUBE]), Cylinder((0.5, 0.5, 1.3), 0.1, 0.5, axis=2)),
+        (BoxSolid([CUBE]), Cylinder((1.1, 1.1, 0.5), 0.14, 0.5, axis=2)),
+        (Sphere((0, 1.4, 0), 0.3), Cylinder((0, 0, 0), 0.5, 2.0, axis=1)),
+        (Cylinder((0, 0, 0), 0.5, 2.0, axis=1), Cylinder((0.8, 1.5, 0.8), 0.5, 2.0, axis=1)),
+        (Cylinder((0, 0, 0), 0.5, 2.0, axis=1), Cylinder((0, 2.1, 0), 0.5, 2.0, axis=1)),
+        (Cylinder((0, 0, 0), 0.5, 2.0, axis=1), Cylinder((0, 0, 1.1), 0.5, 2.0, axis=0)),
+    ],
+)
+def test_a_union_takes_parts_with_a_gap(parts: tuple) -> None:
+    assert SolidUnion(parts).volume == pytest.approx(parts[0].volume + parts[1].volume)
 
 
 def test_bad_solids_say_what_is_wrong() -> None:
@@ -266,6 +341,9 @@ def test_bad_solids_say_what_is_wrong() -> None:
         BoxSolid([])
     with pytest.raises(SceneError, match="radius above 0"):
         Sphere((0, 0, 0), 0.0)
+    for radius, length, axis in ((0.0, 1.0, 0), (1.0, math.nan, 0), (1.0, 1.0, 3)):
+        with pytest.raises(SceneError, match="an axis of 0, 1 or 2"):
+            Cylinder((0, 0, 0), radius, length, axis)
 
 
 def test_distance_to_a_box_is_zero_inside() -> None:

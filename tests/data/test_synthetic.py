@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from thermoxels_ns.data.raycast import render_view
-from thermoxels_ns.data.synthetic import load_truth, make_scene, write_scene
+from thermoxels_ns.data.synthetic import SCENE_NAMES, load_truth, make_scene, write_scene
 from thermoxels_ns.errors import OutputError, SceneError
 
 SMALL = {"num_train": 3, "num_eval": 2, "width": 40, "height": 30, "progress": False}
@@ -52,7 +52,7 @@ def test_layout_is_that_of_thermoscenes(tmp_path: Path) -> None:
     np.testing.assert_array_equal([f["transform_matrix"] for f in content["frames"]], [*train, *held_out])
 
 
-@pytest.mark.parametrize("name", ["hot-object", "house-corner", "sphere"])
+@pytest.mark.parametrize("name", SCENE_NAMES)
 def test_sixteen_bit_png_round_trip(tmp_path: Path, name: str) -> None:
     scene = make_scene(name)
     write_scene(scene, tmp_path, **SMALL)
@@ -152,7 +152,7 @@ def test_truth_comes_back_from_the_folder(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ('{"truth": {"synthetic_scene": "castle"}}', "hot-object, house-corner, sphere, got 'castle'"),
+        ('{"truth": {"synthetic_scene": "castle"}}', f"{', '.join(SCENE_NAMES)}, got 'castle'"),
         ('{"truth": {"seed": 1}}', "synthetic_scene"),
         ('{"truth": ', "readable json"),
         ("[1, 2]", "json object"),

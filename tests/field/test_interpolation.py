@@ -1,17 +1,25 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
 from thermoxels_ns.field.interpolation import TrilinearPoints, interpolate, splat
+from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.lattice import Lattice
 
 LATTICE = Lattice((-1.0, 0.5, 2.0), 0.25, (5, 4, 6))
+ALL = KeptVoxels(LATTICE)
+SOME = KeptVoxels(LATTICE, np.flatnonzero(np.random.default_rng(1).random(60) < 0.4))
 
 
-def random_points(n: int, seed: int = 0) -> torch.Tensor:
-    lo, hi = torch.tensor(LATTICE.lo, dtype=torch.float64), torch.tensor(LATTICE.hi, dtype=torch.float64)
-    return lo + torch.rand(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * (hi - lo)
+def random_points(n: int, voxels: KeptVoxels = ALL, seed: int = 0) -> torch.Tensor:
+    """Points spread evenly over the kept voxels."""
+    generator = torch.Generator().manual_seed(seed)
+    number = torch.randint(len(voxels), (n,), generator=generator).numpy()
+    index = np.stack(np.unravel_index(voxels.cells[number], LATTICE.cell_shape), -1)
+    place = torch.rand(n, 3, generator=generator, dtype=torch.float64)
+    return torch.tensor(LATTICE.lo, dtype=torch.float64) + (torch.from_numpy(index) + place) * LATTICE.voxel_size
 
 
 def trilinear_function(p: torch.Tensor) -> torch.Tensor:
@@ -19,12 +27,13 @@ def trilinear_function(p: torch.Tensor) -> torch.Tensor:
     return torch.stack((1 + 2 * x - y + 3 * z, x * y - 2 * y * z + x * y * z), -1)
 
 
-def test_trilinear_functions_are_exact():
-    rows = trilinear_function(torch.as_tensor(LATTICE.corner_positions()).reshape(-1, 3))
-    points = random_points(500)
-    torch.testing.assert_close(
-        interpolate(rows, TrilinearPoints(LATTICE, points)), trilinear_function(points), rtol=0, atol=1e-12
-    )
+@pytest.mark.parametrize("voxels", [ALL, SOME], ids=["dense", "sparse"])
+def test_trilinear_functions_are_exact(voxels):
+    rows = trilinear_function(torch.as_tensor(LATTICE.index_to_world(voxels.corner_index())))
+    points = random_points(500, voxels)
+    at = TrilinearPoints(voxels, points)
+    assert bool(at.kept().all())
+    torch.testing.assert_close(interpolate(rows, at), trilinear_function(points), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("end", ["lo", "hi"])
@@ -34,40 +43,51 @@ def test_corners_of_the_box_give_the_corner_value_and_outside_the_nearest(end):
     outward = -1.0 if end == "lo" else 1.0
     expected = rows[0] if end == "lo" else rows[-1]
     for point in (corner, corner + outward * 7.0):
-        torch.testing.assert_close(interpolate(rows, TrilinearPoints(LATTICE, point))[0], expected)
+        torch.testing.assert_close(interpolate(rows, TrilinearPoints(ALL, point))[0], expected)
+
+
+def test_points_in_voxels_that_are_not_kept_are_known():
+    centres = torch.as_tensor(LATTICE.cell_centres()).reshape(-1, 3)
+    at = TrilinearPoints(SOME, centres)
+    np.testing.assert_array_equal(at.kept().numpy(), SOME.mask().reshape(-1))
+    np.testing.assert_array_equal(at.number[at.kept()].numpy(), np.arange(len(SOME)))
+    torch.testing.assert_close(at.fraction, torch.full_like(centres, 0.5), rtol=0, atol=1e-12)
 
 
 def test_weights_sum_to_one_and_select_is_a_subset():
-    at = TrilinearPoints(LATTICE, random_points(50))
+    at = TrilinearPoints(SOME, random_points(50, SOME))
     torch.testing.assert_close(at.weights().sum(-1), torch.ones(50, dtype=torch.float64))
     chosen = torch.tensor([3, 7, 7])
-    assert torch.equal(at.select(chosen).corners(), at.corners()[chosen])
+    part = at.select(chosen)
+    assert torch.equal(part.rows(), at.rows()[chosen]) and torch.equal(part.fraction, at.fraction[chosen])
 
 
-def test_gradient_is_exact():
-    at = TrilinearPoints(LATTICE, random_points(40))
-    rows = torch.rand(LATTICE.num_corners, 3, dtype=torch.float64, requires_grad=True)
+@pytest.mark.parametrize("voxels", [ALL, SOME], ids=["dense", "sparse"])
+def test_gradient_is_exact(voxels):
+    at = TrilinearPoints(voxels, random_points(40, voxels))
+    rows = torch.rand(voxels.num_rows, 3, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda r: interpolate(r, at), (rows,))
 
 
-def test_splat_is_the_transpose_and_conserves_the_sum():
-    at = TrilinearPoints(LATTICE, random_points(200))
-    rows = torch.rand(LATTICE.num_corners, 2, dtype=torch.float64)
+@pytest.mark.parametrize("voxels", [ALL, SOME], ids=["dense", "sparse"])
+def test_splat_is_the_transpose_and_conserves_the_sum(voxels):
+    at = TrilinearPoints(voxels, random_points(200, voxels))
+    rows = torch.rand(voxels.num_rows, 2, dtype=torch.float64)
     values = torch.rand(200, 2, dtype=torch.float64)
-    spread = splat(values, at, LATTICE.num_corners)
+    spread = splat(values, at)
     torch.testing.assert_close((spread * rows).sum(), (values * interpolate(rows, at)).sum())
     torch.testing.assert_close(spread.sum(0), values.sum(0))
 
 
 def test_gradient_has_the_same_bits_for_any_number_of_threads():
-    at = TrilinearPoints(LATTICE, random_points(20_000).float())
+    at = TrilinearPoints(ALL, random_points(20_000).float())
     values = torch.rand(20_000, 27)
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
-        one = splat(values, at, LATTICE.num_corners)
+        one = splat(values, at)
         torch.set_num_threads(2)
-        two = splat(values, at, LATTICE.num_corners)
+        two = splat(values, at)
     finally:
         torch.set_num_threads(before)
     assert torch.equal(one, two)
@@ -75,7 +95,7 @@ def test_gradient_has_the_same_bits_for_any_number_of_threads():
 
 def test_no_points_give_no_rows_and_no_gradient():
     rows = torch.rand(LATTICE.num_corners, 2, requires_grad=True)
-    out = interpolate(rows, TrilinearPoints(LATTICE, torch.zeros(0, 3)))
+    out = interpolate(rows, TrilinearPoints(ALL, torch.zeros(0, 3)))
     assert out.shape == (0, 2)
     out.sum().backward()
     assert rows.grad is not None and float(rows.grad.abs().sum()) == 0.0

@@ -1,17 +1,23 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
-from thermoxels_ns.errors import PruningError
-from thermoxels_ns.field.refine import dilate, prune, refine
+from thermoxels_ns.field.kept_voxels import KeptVoxels
+from thermoxels_ns.field.refine import prune, refine, split_voxels
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.lattice import Lattice
 
 
-def random_grid(activation="exp") -> VoxelGrid:
+def random_grid(activation="exp", kept: float = 1.0, temperature_degree: int = 0) -> VoxelGrid:
     torch.manual_seed(0)
-    grid = VoxelGrid(Lattice((-1.0, -1.0, -0.5), 0.25, (9, 9, 5)), sh_degree=1, activation=activation)
+    lattice = Lattice((-1.0, -1.0, -0.5), 0.25, (9, 9, 5))
+    grid = VoxelGrid(lattice, sh_degree=1, temperature_degree=temperature_degree, activation=activation)
+    if kept < 1:
+        voxels = KeptVoxels(lattice, np.flatnonzero(np.random.default_rng(0).random(256) < kept))
+        rows = {k: torch.zeros(voxels.num_rows, p.shape[1]) for k, p in grid.row_parameters().items()}
+        grid.replace_voxels(voxels, rows)
     for parameter in grid.row_parameters().values():
         parameter.data = torch.randn_like(parameter)
     return grid
@@ -22,19 +28,47 @@ def points_inside(grid: VoxelGrid, n: int = 300) -> torch.Tensor:
     return lo + torch.rand(n, 3, generator=torch.Generator().manual_seed(3)) * (hi - lo)
 
 
+def at_index(lattice: Lattice, *index: tuple[int, int, int]) -> np.ndarray:
+    return np.sort([np.ravel_multi_index(i, lattice.cell_shape) for i in index])
+
+
+def values_at(grid: VoxelGrid, points: torch.Tensor):
+    directions = torch.nn.functional.normalize(points + 3.0, dim=-1)
+    at = grid.locate(points)
+    return grid.density_at(at), grid.rgb_at(at, directions), grid.thermal_at(at, directions)
+
+
 @pytest.mark.parametrize("activation", ["relu", "exp", "softplus"])
 @pytest.mark.parametrize("factor", [2, 3])
-def test_refinement_changes_nothing_that_a_ray_can_see(activation, factor):
-    grid = random_grid(activation)
-    points, directions = points_inside(grid), torch.nn.functional.normalize(torch.randn(300, 3), dim=-1)
-    at = grid.locate(points)
-    before = grid.density_at(at), grid.rgb_at(at, directions), grid.thermal_at(at, directions)
+@pytest.mark.parametrize("kept", [1.0, 0.3])
+def test_refinement_changes_nothing_that_a_ray_can_see(activation, factor, kept):
+    grid = random_grid(activation, kept, temperature_degree=1)
+    points = points_inside(grid, 1000)
+    points = points[grid.in_kept_voxel(points)]
+    assert len(points) > 200
+    before = values_at(grid, points)
     refine(grid, factor)
     assert grid.lattice.cell_shape == (8 * factor, 8 * factor, 4 * factor)
-    at = grid.locate(points)
-    after = grid.density_at(at), grid.rgb_at(at, directions), grid.thermal_at(at, directions)
-    for old, new in zip(before, after):
+    assert bool(grid.in_kept_voxel(points).all())
+    for old, new in zip(before, values_at(grid, points)):
         torch.testing.assert_close(old, new, atol=2e-5, rtol=2e-5)
+
+
+@pytest.mark.parametrize("factor", [2, 3])
+@pytest.mark.parametrize("kept", [1.0, 0.3])
+def test_old_corners_keep_their_values_to_the_last_bit(factor, kept):
+    grid = random_grid(kept=kept)
+    old = grid.voxels
+    before = {name: p.detach().clone() for name, p in grid.row_parameters().items()}
+    change = refine(grid, factor)
+    fine = np.ravel_multi_index(tuple((old.corner_index() * factor).T), grid.lattice.shape)
+    rows = np.searchsorted(grid.voxels.corners, fine)
+    np.testing.assert_array_equal(grid.voxels.corners[rows], fine)
+    for name, parameter in grid.row_parameters().items():
+        assert torch.equal(parameter.data[rows], before[name])
+        assert torch.equal(change(before[name]), parameter.data)
+    # What is the same everywhere stays so.
+    torch.testing.assert_close(change(torch.full((old.num_rows, 1), 7.0)), torch.full((grid.voxels.num_rows, 1), 7.0))
 
 
 def test_refinement_while_an_old_graph_is_alive():
@@ -45,18 +79,28 @@ def test_refinement_while_an_old_graph_is_alive():
     fresh = grid.density_at(grid.locate(points_inside(grid))).sum()
     fresh.backward()
     assert grid.density.grad is not None and grid.density.grad.shape == grid.density.shape
-    assert float(loss) == pytest.approx(float(fresh), rel=1e-5)
+    assert float(loss.detach()) == pytest.approx(float(fresh.detach()), rel=1e-5)
 
 
 def test_refinement_keeps_the_children_of_kept_voxels():
     grid = random_grid()
-    grid.kept[:] = False
-    grid.kept[2, 3, 1] = True
+    prune(grid, grid.voxels.cells == at_index(grid.lattice, (2, 3, 1)))
     points = points_inside(grid, 3000)
     before = grid.in_kept_voxel(points)
     refine(grid, 2)
-    assert int(grid.kept.sum()) == 8
+    assert int(grid.kept.sum()) == len(grid.voxels) == 8 and grid.voxels.num_rows == 27
     assert torch.equal(before, grid.in_kept_voxel(points)) and bool(before.any())
+
+
+@pytest.mark.parametrize("factor", [2, 3, 4])
+def test_split_voxels_are_those_of_the_dense_mask(factor):
+    voxels = random_grid(kept=0.3).voxels
+    expected = voxels.mask()
+    for axis in range(3):
+        expected = expected.repeat(factor, axis)
+    fine = split_voxels(voxels, factor)
+    np.testing.assert_array_equal(fine.mask(), expected)
+    assert fine.lattice == voxels.lattice.refined(factor) and bool((np.diff(fine.cells) > 0).all())
 
 
 def test_kept_includes_the_far_face_and_nothing_outside():
@@ -66,47 +110,72 @@ def test_kept_includes_the_far_face_and_nothing_outside():
     assert not bool(grid.in_kept_voxel(torch.tensor([grid.lattice.lo]) - 1e-3))
 
 
-def test_pruning_keeps_what_rays_see_and_its_neighbours():
+@pytest.mark.parametrize("kept", [1.0, 0.3])
+def test_pruning_copies_what_stays(kept):
+    grid = random_grid(kept=kept)
+    old, before = grid.voxels, {name: p.detach().clone() for name, p in grid.row_parameters().items()}
+    points = points_inside(grid, 1000)
+    keep = np.random.default_rng(5).random(len(old)) < 0.4
+    number = grid.locate(points).number
+    stays = (number >= 0) & torch.from_numpy(keep)[number.clamp(min=0)]
+    seen = values_at(grid, points[stays])
+    change = prune(grid, keep)
+    np.testing.assert_array_equal(grid.voxels.cells, old.cells[keep])
+    assert torch.equal(grid.in_kept_voxel(points), stays) and 50 < int(stays.sum()) < 500
+    assert all(torch.equal(a, b) for a, b in zip(seen, values_at(grid, points[stays])))
+    for name, parameter in grid.row_parameters().items():
+        where = np.searchsorted(old.corners, grid.voxels.corners)
+        assert torch.equal(parameter.data, before[name][where])
+        assert torch.equal(change(before[name]), parameter.data) and parameter.requires_grad
+
+
+def test_pruning_nothing_and_everything():
     grid = random_grid()
-    largest, total = torch.zeros(8, 8, 4), torch.zeros(8, 8, 4)
-    largest[4, 4, 2], total[4, 4, 2] = 0.9, 50.0
-    report = prune(grid, largest, total, threshold=0.01, dilation=1)
-    assert int(grid.kept.sum()) == report.kept_voxels == 27 and report.lost_weight == 0.0
-    assert bool(grid.kept[3:6, 3:6, 1:4].all())
+    before = grid.density.detach().clone()
+    prune(grid, np.ones(len(grid.voxels), dtype=bool))
+    assert torch.equal(grid.density, before) and grid.voxels.all_kept
+    prune(grid, np.zeros(len(grid.voxels), dtype=bool))
+    assert len(grid.voxels) == 0 and grid.density.shape == (0, 1) and not bool(grid.kept.any())
+    assert float(grid.voxel_density().abs().max()) == 0.0
 
 
-def test_pruning_that_would_remove_the_scene_fails_and_changes_nothing():
-    grid = random_grid()
-    largest, total = torch.full((8, 8, 4), 0.005), torch.ones(8, 8, 4)
-    largest[0, 0, 0] = 0.5
-    with pytest.raises(PruningError, match=r"at most 1% of the rays' weight, got 9\d\.\d%.*--pipeline.model.prune"):
-        prune(grid, largest, total, threshold=0.01)
-    assert bool(grid.kept.all())
+def test_dense_views_are_nil_where_nothing_is_kept():
+    grid = random_grid("relu", kept=0.3)
+    corners, centres = grid.corner_density(), grid.voxel_density()
+    stored = torch.zeros(grid.lattice.num_corners, dtype=torch.bool)
+    stored[torch.from_numpy(grid.voxels.corners)] = True
+    assert float(corners.view(-1)[~stored].abs().max()) == 0.0 and int((~stored).sum()) > 0
+    torch.testing.assert_close(corners.view(-1)[stored], grid.density.data[:, 0].clamp(min=0))
+    assert float(centres[~grid.kept].abs().max()) == 0.0
+    middle = torch.as_tensor(grid.lattice.cell_centres(), dtype=torch.float32)[grid.kept]
+    torch.testing.assert_close(centres[grid.kept], grid.density_at(grid.locate(middle)).detach(), rtol=1e-5, atol=1e-6)
+    assert float(grid.corner_values(grid.density.data[:, 0], fill=0.5).view(-1)[~stored].min()) == 0.5
 
 
-def test_pruning_without_any_weight_fails():
-    grid = random_grid()
-    with pytest.raises(PruningError):
-        prune(grid, torch.zeros(8, 8, 4), torch.zeros(8, 8, 4), threshold=0.01)
-
-
-def test_dilation_at_the_border():
-    voxels = torch.zeros(4, 4, 4, dtype=torch.bool)
-    voxels[0, 0, 0] = True
-    assert int(dilate(voxels, 1).sum()) == 8 and int(dilate(voxels, 0).sum()) == 1
-
-
-def test_checkpoint_of_a_finer_lattice_loads_into_a_coarse_grid_with_the_same_parameters():
-    fine = random_grid()
+@pytest.mark.parametrize("kept", [1.0, 0.3])
+def test_checkpoint_of_a_finer_lattice_loads_into_a_coarse_grid_with_the_same_parameters(kept):
+    fine = random_grid(kept=kept)
     refine(fine, 2)
-    fine.kept[:3] = False
+    prune(fine, fine.voxels.cells > 500)
     coarse = random_grid()
     density = coarse.density
     coarse.load_state_dict(fine.state_dict())
     assert coarse.density is density and coarse.lattice == fine.lattice
     assert torch.equal(coarse.density, fine.density) and torch.equal(coarse.kept, fine.kept)
-    at = coarse.locate(points_inside(coarse))
-    assert torch.equal(coarse.density_at(at), fine.density_at(at))
+    points = points_inside(coarse)
+    points = points[coarse.in_kept_voxel(points)]
+    assert len(points) and torch.equal(coarse.density_at(coarse.locate(points)), fine.density_at(fine.locate(points)))
+    # It has taken over a copy.
+    fine.density.data += 1.0
+    assert not torch.equal(coarse.density, fine.density)
+
+
+def test_checkpoint_whose_rows_do_not_fit_is_refused():
+    grid = random_grid()
+    state = grid.state_dict()
+    state["cells"] = state["cells"][:-5]
+    with pytest.raises(RuntimeError, match="size mismatch"):
+        random_grid().load_state_dict(state)
 
 
 def test_a_query_without_points_gives_no_rows():

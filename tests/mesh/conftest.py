@@ -41,7 +41,7 @@ def box_mesh(snapshot_of) -> TetMesh:
     weight = np.ones(shape)
     weight[1:-1, 1:-1, 1:-1] = 0.0
     snapshot = snapshot_of(np.ones(shape), 20.0 + 0.5 * (3 * x + y - 2 * z), weight)
-    return build_voxel_mesh(snapshot, SolidSelection(density_threshold=0.5), np.eye(4))[0]
+    return build_voxel_mesh(snapshot, SolidSelection(close_gaps=0, density_threshold=0.5), np.eye(4))[0]
 
 
 @pytest.fixture

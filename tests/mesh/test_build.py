@@ -13,7 +13,7 @@ from thermoxels_ns.mesh.quality import check_mesh
 from thermoxels_ns.mesh.solid import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX
 
-DENSE = SolidSelection(density_threshold=0.5)
+DENSE = SolidSelection(close_gaps=0, density_threshold=0.5)
 
 
 def rotation(seed: int) -> np.ndarray:
@@ -64,7 +64,7 @@ def test_temperature_and_observed_follow_the_corners(snapshot_of):
     density = np.ones(shape)
     density[3] = 0.0
     mesh, solid = build_voxel_mesh(
-        snapshot_of(density, values, weight), SolidSelection(density_threshold=0.9), np.eye(4)
+        snapshot_of(density, values, weight), SolidSelection(close_gaps=0, density_threshold=0.9), np.eye(4)
     )
     assert solid.cells[:, 0, 0].tolist() == [True, True, False]
     index = np.rint(mesh.points_m / 0.5).astype(int)
@@ -95,7 +95,7 @@ def test_extension_conducts_like_the_voxels_do(snapshot_of):
     values = np.zeros(density.shape)
     values[-1] = 100.0
     mesh, solid = build_voxel_mesh(
-        snapshot_of(density, values, weight), SolidSelection(density_threshold=1.0), np.eye(4)
+        snapshot_of(density, values, weight), SolidSelection(close_gaps=0, density_threshold=1.0), np.eye(4)
     )
     per_layer = solid.cells.sum(axis=(1, 2))
     assert (per_layer[0], per_layer[-1]) == (1, 4)
@@ -124,7 +124,7 @@ def test_part_no_thermal_ray_saw_is_left_out(snapshot_of):
     weight = np.zeros((8, 5, 5))
     weight[0] = 1.0
     field = replace(snapshot_of(np.ones(weight.shape), 20.0, weight), voxel_density=cells.astype(np.float32))
-    every = SolidSelection(density_threshold=0.5, largest_component=False)
+    every = SolidSelection(close_gaps=0, density_threshold=0.5, largest_component=False)
     mesh, solid = build_voxel_mesh(field, every, np.eye(4))
     assert (solid.num_unobserved_parts, solid.num_unobserved_voxels) == (1, 6)
     expected = cells.copy()

@@ -37,8 +37,8 @@ def test_density_that_is_not_finite_never_reaches_the_mesher(bad):
 def test_selection_does_not_depend_on_the_scale_of_density(scale):
     # 3e38: the sum of eight corners overflows float32.
     pattern = np.random.default_rng(3).random((9, 9, 9))
-    expected = select_solid(snapshot(pattern), SolidSelection(density_percentile=90.0)).cells
-    solid = select_solid(snapshot(pattern * scale), SolidSelection(density_percentile=90.0))
+    expected = select_solid(snapshot(pattern), SolidSelection(close_gaps=0, density_percentile=90.0)).cells
+    solid = select_solid(snapshot(pattern * scale), SolidSelection(close_gaps=0, density_percentile=90.0))
     assert np.isfinite(solid.threshold)
     assert np.array_equal(solid.cells, expected)
 
@@ -46,7 +46,7 @@ def test_selection_does_not_depend_on_the_scale_of_density(scale):
 def test_one_voxel_wall():
     density = np.zeros((9, 12, 12))
     density[4:6, 1:-1, 1:-1] = 40.0
-    mesh, solid = build_voxel_mesh(snapshot(density), SolidSelection(density_threshold=40.0), np.eye(4))
+    mesh, solid = build_voxel_mesh(snapshot(density), SolidSelection(close_gaps=0, density_threshold=40.0), np.eye(4))
     assert np.unique(np.argwhere(solid.cells)[:, 0]).tolist() == [4]
     quality = check_mesh(mesh)
     assert quality.volume_m3 == pytest.approx(81 * 0.1**3)
@@ -54,7 +54,9 @@ def test_one_voxel_wall():
 
 
 def test_smallest_lattice():
-    mesh, _ = build_voxel_mesh(snapshot(np.ones((2, 2, 2))), SolidSelection(density_threshold=1.0), np.eye(4))
+    mesh, _ = build_voxel_mesh(
+        snapshot(np.ones((2, 2, 2))), SolidSelection(close_gaps=0, density_threshold=1.0), np.eye(4)
+    )
     quality = check_mesh(mesh)
     assert (quality.num_nodes, quality.num_tets, quality.num_box_facets) == (8, 6, 12)
 
@@ -64,7 +66,9 @@ def test_opaque_body_is_seen_on_its_skin_only():
     shape = (20, 20, 20)
     weight = np.ones(shape, dtype=np.float32)
     weight[1:-1, 1:-1, 1:-1] = 0.0
-    mesh, _ = build_voxel_mesh(snapshot(np.full(shape, 1e4), weight), SolidSelection(density_threshold=1.0), np.eye(4))
+    mesh, _ = build_voxel_mesh(
+        snapshot(np.full(shape, 1e4), weight), SolidSelection(close_gaps=0, density_threshold=1.0), np.eye(4)
+    )
     assert np.count_nonzero(~mesh.observed) == 18**3
     assert np.abs(mesh.temperature_c - (15.0 + mesh.points_m[:, 0] / 0.1)).max() < 1e-6
 
@@ -82,7 +86,9 @@ def test_opaque_body_is_seen_on_its_skin_only():
 def test_every_mesh_that_is_built_is_valid(shape, seed, fill, percentile, largest, fill_cavities, mirror):
     random = np.random.default_rng(seed)
     density = random.random(shape) * (random.random(shape) < fill)
-    selection = SolidSelection(density_percentile=percentile, largest_component=largest, fill_cavities=fill_cavities)
+    selection = SolidSelection(
+        close_gaps=0, density_percentile=percentile, largest_component=largest, fill_cavities=fill_cavities
+    )
     field = snapshot(density)
     try:
         solid = select_solid(field, selection)

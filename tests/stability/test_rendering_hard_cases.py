@@ -8,6 +8,7 @@ import torch
 from torch.nn.functional import normalize
 
 from thermoxels_ns.errors import ThermoxelsError
+from thermoxels_ns.field.refine import prune
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.render.compositing import composite, ray_weights
@@ -146,11 +147,13 @@ def test_wall_one_voxel_thick_is_opaque_from_both_sides(angle):
 def test_constant_temperature_renders_constant_wherever_it_hits_after_pruning():
     """Pruned neighbours must not leak their values into what is kept."""
     grid, _ = wall(0.0)
-    grid.kept = torch.zeros_like(grid.kept)
     middle = grid.kept.shape[0] // 2
-    grid.kept[middle - 1 : middle + 1] = True
-    grid.temperature.data[:] = 0.0  # what no kept voxel touches
-    grid.temperature.data[grid.kept_corners().flatten()] = 0.4
+    keep = grid.kept.numpy()
+    keep[: middle - 1], keep[middle + 1 :] = False, False
+    grid.temperature.data[:] = 0.0
+    grid.temperature.data.view(*grid.lattice.shape)[middle - 1 : middle + 2] = 0.4
+    prune(grid, keep.reshape(-1))
+    assert bool((grid.temperature == 0.4).all()) and len(grid.voxels) == 2 * 32 * 32
     origins = torch.tensor([[3.0, 0.1, 0.2], [2.0, -2.0, 0.3]])
     directions = normalize(torch.tensor([[-1.0, 0.01, 0.02], [-1.0, 1.0, 0.0]]), dim=-1)
     marched = march(

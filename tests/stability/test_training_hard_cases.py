@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 
 from tests.short_training import train
 from thermoxels_ns.data.raycast import render_view
 from thermoxels_ns.data.synthetic import make_scene, write_scene
+from thermoxels_ns.errors import ThermoxelsError
 from thermoxels_ns.streams import RGB_STREAM
 
 
@@ -78,6 +80,10 @@ def test_one_training_view(tmp_path):
     assert all_finite(pipeline) and np.isfinite(evaluate(pipeline)["psnr"])
 
 
+def voxel_index(voxels) -> np.ndarray:
+    return np.stack(np.unravel_index(voxels.cells, voxels.lattice.cell_shape), -1)
+
+
 def weight_before_the_surface(pipeline, scene) -> float:
     """Share of the training rays' weight that lies clearly before the first true surface."""
     truth, camera = make_scene("sphere"), make_scene("sphere").camera(40, 30)
@@ -91,10 +97,14 @@ def weight_before_the_surface(pipeline, scene) -> float:
     for bundle in rays:
         here = surface[start : start + len(bundle)]
         start += len(bundle)
-        marched = pipeline.model.march_rays(bundle.origins, bundle.directions)
-        weights = marched.along.weights[torch.isfinite(here)]
-        early = marched.steps.t[torch.isfinite(here)] < here[torch.isfinite(here), None] - 0.3
-        before, total = before + float((weights * early).sum()), total + float(weights.sum())
+        samples = pipeline.model.sample_rays(bundle.origins, bundle.directions)
+        position = torch.tensor(samples.at.voxels.lattice.lo) + samples.at.voxels.lattice.voxel_size * (
+            samples.at.fraction + torch.from_numpy(voxel_index(samples.at.voxels)[samples.at.number.numpy()])
+        )
+        t = (position - bundle.origins[samples.ray]).norm(dim=-1)
+        hits = torch.isfinite(here)[samples.ray]
+        early = hits & (t < here[samples.ray] - 0.3)
+        before, total = before + float(samples.weight[early].sum()), total + float(samples.weight[hits].sum())
     assert start == len(surface)
     return before / total
 
@@ -146,6 +156,66 @@ def test_image_without_a_valid_thermal_pixel_in_evaluation_does_not_spoil_the_av
     monkeypatch.setattr(dataset, "get_data", blind)
     metrics = evaluate(pipeline)
     assert np.isfinite(metrics["thermal_mae_c"]) and np.isfinite(metrics["thermal_psnr"])
+
+
+SCHEDULE = {"resolutions": [8, 16], "refine_at": [30], "prune_at": [50], "thin_at": [60], "distortion_ramp": [5, 20]}
+
+
+@pytest.mark.parametrize("rate", [100.0, 1e6])
+@pytest.mark.parametrize("recipe", ["default", "paper"])
+def test_learning_rates_far_too_large_end_in_a_finite_model_or_a_clear_error(tmp_path, recipe, rate):
+    scene = sphere(tmp_path / "scene")
+    activation = "exp" if recipe == "default" else "relu"
+    try:
+        pipeline = train(scene, 70, {**SCHEDULE, "recipe": recipe, "density_activation": activation}, rate=rate)
+    except ThermoxelsError as error:
+        assert "--pipeline.model" in str(error) or "learning rate" in str(error)
+        return
+    assert all_finite(pipeline)
+    assert all(np.isfinite(value) for value in evaluate(pipeline).values())
+    snapshot = pipeline.grid_snapshot()
+    assert np.isfinite(snapshot.density).all() and np.isfinite(snapshot.temperature_c).all()
+
+
+def mask_frames(scene, blind: set[int]) -> None:
+    """Give every frame a mask; those of some let nothing through."""
+    transforms = json.loads((scene / "transforms.json").read_text())
+    for number, frame in enumerate(transforms["frames"]):
+        frame["mask_path"] = f"mask_{number}.png"
+        value = 0 if number in blind else 255
+        Image.fromarray(np.full((30, 40), value, np.uint8)).save(scene / frame["mask_path"])
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+
+
+def test_an_image_whose_pixels_are_all_masked(tmp_path):
+    scene = sphere(tmp_path / "scene")
+    mask_frames(scene, {3})
+    pipeline = train(scene, 70, SCHEDULE)
+    assert pipeline.model.grid.lattice.cell_shape[0] == 16
+    assert all_finite(pipeline) and np.isfinite(evaluate(pipeline)["thermal_mae_c"])
+
+
+def test_a_thermal_file_without_a_valid_pixel_is_named(tmp_path):
+    scene = sphere(tmp_path / "scene", thermal_format="npy")
+    frame = json.loads((scene / "transforms.json").read_text())["frames"][3]
+    path = scene / frame["thermal_file_path"]
+    np.save(path, np.full_like(np.load(path), np.nan))
+    with pytest.raises(ThermoxelsError, match=rf"{path.name}: expected temperatures .* got no valid pixel"):
+        train(scene, 1)
+
+
+def test_views_that_all_look_the_same_way(tmp_path):
+    """Parallel axes: the cameras stand side by side and see one side of the body."""
+    scene = sphere(tmp_path / "scene")
+    transforms = json.loads((scene / "transforms.json").read_text())
+    first = np.array(transforms["frames"][0]["transform_matrix"])
+    for number, frame in enumerate(transforms["frames"]):
+        pose = first.copy()
+        pose[:3, 3] += 0.1 * (number - 6) * first[:3, 0]
+        frame["transform_matrix"] = pose.tolist()
+    (scene / "transforms.json").write_text(json.dumps(transforms))
+    pipeline = train(scene, 70, SCHEDULE)
+    assert all_finite(pipeline) and np.isfinite(evaluate(pipeline)["psnr"])
 
 
 def test_training_repeats_bit_for_bit(tmp_path):

@@ -1,4 +1,4 @@
-"""Exact solids: boxes with boxes cut out, spheres and disjoint unions of them.
+"""Exact solids: boxes with boxes cut out, and spheres.
 
 Every solid is a closed set and answers, without approximation, where a point lies, how far the surface is, how
 large volume and area are, and where a ray first enters. Lengths are metres; nothing here depends on a lattice.
@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
 from typing import Protocol
 
 import numpy as np
@@ -306,83 +305,6 @@ class Sphere:
         normals = np.random.default_rng(seed).standard_normal((count, 3))
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         return np.asarray(self.centre) + self.radius * normals, normals
-
-
-@dataclass(frozen=True, eq=False)
-class SolidUnion:
-    """Solids side by side that share no volume and no face; a sphere may touch another solid in a point."""
-
-    parts: tuple[BoxSolid | Sphere, ...]
-    """The solids. Boxes that touch belong into one `BoxSolid`, which knows that the shared face is not exposed."""
-
-    def __post_init__(self) -> None:
-        for (i, first), (j, second) in combinations(enumerate(self.parts), 2):
-            if _overlap(first, second):
-                raise SceneError(
-                    explain(
-                        f"parts {i} and {j}",
-                        expected="solids that do not overlap and share no face",
-                        got=f"{type(first).__name__} {first.bounds} and {type(second).__name__} {second.bounds}",
-                        remedy="Move one of them, or join boxes in one BoxSolid.",
-                    )
-                )
-
-    @property
-    def bounds(self) -> Box:
-        """Lower and upper corner of the smallest box around the solid [m]."""
-        corners = np.array([part.bounds for part in self.parts])
-        return _corners(corners[:, 0].min(axis=0), corners[:, 1].max(axis=0))
-
-    @property
-    def volume(self) -> float:
-        """Volume [m3]."""
-        return sum(part.volume for part in self.parts)
-
-    @property
-    def area(self) -> float:
-        """Area of the surface [m2]."""
-        return sum(part.area for part in self.parts)
-
-    def contains(self, points: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Which of the points (n, 3) lie in the solid or on its surface."""
-        return np.any([part.contains(points) for part in self.parts], axis=0)
-
-    def signed_distance(self, points: npt.ArrayLike) -> FloatArray:
-        """Distance of the points (n, 3) to the surface [m], negative inside; exact because the parts are disjoint."""
-        return np.min([part.signed_distance(points) for part in self.parts], axis=0)
-
-    def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> Hits:
-        """First entry of rays: origins (n, 3) or one shared (3,), directions (n, 3)."""
-        first = self.parts[0].intersect(origins, directions)
-        distance, normal = first.distance, first.normal
-        for part in self.parts[1:]:
-            other = part.intersect(origins, directions)
-            nearer = other.distance < distance
-            distance = np.where(nearer, other.distance, distance)
-            normal[nearer] = other.normal[nearer]
-        return Hits(distance, normal)
-
-    def surface_points(self, count: int, seed: int) -> tuple[FloatArray, FloatArray]:
-        """Draw points uniformly by area: positions (count, 3) and outward normals (count, 3)."""
-        areas = np.array([part.area for part in self.parts])
-        shares = np.random.default_rng(seed).multinomial(count, areas / areas.sum())
-        drawn = [
-            part.surface_points(int(share), seed + 1 + number)
-            for number, (part, share) in enumerate(zip(self.parts, shares))
-        ]
-        return np.concatenate([points for points, _ in drawn]), np.concatenate([normals for _, normals in drawn])
-
-
-def _overlap(first: BoxSolid | Sphere, second: BoxSolid | Sphere) -> bool:
-    """Whether two solids share more than a point where a sphere touches."""
-    for sphere, other in ((first, second), (second, first)):
-        if isinstance(sphere, Sphere):
-            gap = float(other.signed_distance([sphere.centre])[0]) - sphere.radius
-            return gap < -_EDGE_TOLERANCE * sphere.radius
-    assert isinstance(first, BoxSolid) and isinstance(second, BoxSolid)
-    (lo_a, hi_a), (lo_b, hi_b) = first.filled_boxes, second.filled_boxes
-    apart = (hi_a[:, None] < lo_b[None]) | (hi_b[None] < lo_a[:, None])
-    return not bool(apart.any(axis=2).all())
 
 
 def _corners(lo: npt.ArrayLike, hi: npt.ArrayLike) -> Box:

@@ -10,6 +10,7 @@ from thermoxels_ns.data.rectangles import distance_to_box
 from thermoxels_ns.data.scene_truth import SyntheticScene
 from thermoxels_ns.data.solid_texture import Paint, SolidTexture, SunLight, painted
 from thermoxels_ns.data.solids import Box, BoxSolid
+from thermoxels_ns.data.surroundings import sky_rgb, sky_temperature_c
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -41,7 +42,6 @@ _SIDE_OPENINGS = (
 _WALL_C, _BRIDGE_K = 5.0, 3.0
 _BRIDGE_Z, _BRIDGE_WIDTH_M = 0.5 * (_BALCONY[0][2] + _BALCONY[1][2]), 0.35
 _AIR_C, _SKY_DROP_K = 0.0, 20.0
-_HORIZON_BLEND = 0.08
 
 
 def _openings() -> tuple[list[Box], list[Box], list[float], list[int]]:
@@ -121,32 +121,11 @@ def house_corner() -> SyntheticScene:
         temperature_bounds_c=(_AIR_C - _SKY_DROP_K, 15.0),
         colour=lambda points, normals: painted(points, normals, part(points, normals), paints, texture, light),
         surface_temperature_c=temperature_c,
-        background_rgb=_sky_rgb,
-        background_temperature_c=_sky_temperature_c,
+        background_rgb=sky_rgb,
+        background_temperature_c=lambda directions: sky_temperature_c(directions, _AIR_C, _SKY_DROP_K),
         rings=tuple(
             CameraRing((0.4, -0.7, aim), radius, height, start_deg=-145.0, span_deg=200.0)
             for aim, radius, height in ((2.4, 11.8, 1.7), (1.7, 12.1, 4.8), (1.3, 11.6, 9.0))
         ),
         focal_share=0.86,
     )
-
-
-def _rise(z: FloatArray) -> FloatArray:
-    """Height above the horizon, max(z, 0) with a smooth bend: (z + b)^2 / 4b within b of it, and 1 at the zenith."""
-    b = _HORIZON_BLEND
-    return np.where(z > b, z, np.square(np.maximum(z + b, 0.0)) / (4.0 * b))
-
-
-def _sky_temperature_c(directions: npt.ArrayLike) -> FloatArray:
-    """0 C at the horizon, -20 C at the zenith, linear in the sine of the elevation; far ground up to 2 C below."""
-    z = np.asarray(directions, dtype=np.float64)[:, 2]
-    return _AIR_C - _SKY_DROP_K * _rise(z) + 2.0 * _rise(-z)
-
-
-def _sky_rgb(directions: npt.ArrayLike) -> npt.NDArray[np.float32]:
-    """Pale haze at the horizon, blue above, grey green below."""
-    z = np.asarray(directions, dtype=np.float64)[:, 2:]
-    haze, blue, ground = (0.82, 0.86, 0.90), (0.26, 0.45, 0.80), (0.46, 0.48, 0.40)
-    up, down = _rise(z), np.minimum(3.0 * _rise(-z), 1.0)
-    colour = haze + np.subtract(blue, haze) * up + np.subtract(ground, haze) * down
-    return np.clip(colour, 0.0, 1.0).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The synthetic scenes by name: a hot object on a table, a heated house corner, a sphere."""
+"""The synthetic scenes by name: an object on a table, a house corner, a sphere, a courtyard, pipes before a wall."""
 
 from __future__ import annotations
 
@@ -11,8 +11,12 @@ from thermoxels_ns.data.pinhole import CameraRing
 from thermoxels_ns.data.rectangles import distance_to_box
 from thermoxels_ns.data.scene_truth import SyntheticScene
 from thermoxels_ns.data.solid_texture import Paint, SolidTexture, SunLight, painted
-from thermoxels_ns.data.solids import Box, BoxSolid, SolidUnion, Sphere
+from thermoxels_ns.data.solid_union import SolidUnion
+from thermoxels_ns.data.solids import Box, BoxSolid, Sphere
+from thermoxels_ns.data.surroundings import room_rgb
+from thermoxels_ns.data.synthetic_courtyard import courtyard
 from thermoxels_ns.data.synthetic_house import house_corner
+from thermoxels_ns.data.synthetic_pipes import pipes
 from thermoxels_ns.errors import SceneError, explain
 
 FloatArray = npt.NDArray[np.float64]
@@ -53,7 +57,7 @@ def _hot_object() -> SyntheticScene:
         temperature_bounds_c=(room_c, 70.0),
         colour=lambda points, normals: painted(points, normals, part(points), paints, texture, light),
         surface_temperature_c=temperature_c,
-        background_rgb=_room_rgb,
+        background_rgb=room_rgb,
         background_temperature_c=lambda directions: np.full(len(np.asarray(directions)), room_c),
         rings=(
             CameraRing((0.0, 0.0, 0.05), 1.45, 0.36),
@@ -93,13 +97,13 @@ def _sphere() -> SyntheticScene:
     )
 
 
-def _room_rgb(directions: npt.ArrayLike) -> npt.NDArray[np.float32]:
-    """Light grey walls, a little warmer to one side and darker below."""
-    x, y, z = np.asarray(directions, dtype=np.float32).T
-    return np.stack([0.74 + 0.04 * x + 0.06 * z, 0.73 + 0.07 * z, 0.72 + 0.03 * y + 0.08 * z], axis=1)
-
-
-_BUILDERS = {"hot-object": _hot_object, "house-corner": house_corner, "sphere": _sphere}
+_BUILDERS = {
+    "hot-object": _hot_object,
+    "house-corner": house_corner,
+    "sphere": _sphere,
+    "courtyard": courtyard,
+    "pipes": pipes,
+}
 
 SCENE_NAMES = tuple(_BUILDERS)
 """Names that `make_scene` knows."""

@@ -1,4 +1,4 @@
-"""Trilinear interpolation of rows stored on lattice corners, and its exact gradient.
+"""Trilinear interpolation of rows stored on the corners of kept voxels, and its exact gradient.
 
 Forward is one weighted gather per point (`torch.nn.functional.embedding_bag`, which never materialises the
 points x 8 corners x channels values). Backward sorts the points by voxel, sums each voxel's contributions and
@@ -9,33 +9,40 @@ from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from thermoxels_ns.lattice import CORNER_OFFSETS, Lattice
+from thermoxels_ns.field.kept_voxels import KeptVoxels
 
 
 class TrilinearPoints:
-    """Where points lie in a lattice: their voxel, its eight corners and the trilinear weights.
+    """Where points lie in a lattice: their voxel, the rows of its eight corners and the trilinear weights.
 
     Made once per set of points and used for density, colour and temperature alike.
 
     Args:
-        lattice: The corner lattice.
+        voxels: The kept voxels.
         points: World positions, shape (n, 3). Points outside the lattice take the value of the nearest face.
+
+    Attributes:
+        number: Number of the kept voxel each point lies in; -1 where that voxel is not kept. Values can be
+            interpolated only where it is not -1.
+        fraction: Place in the voxel, 0 to 1, shape (n, 3).
     """
 
-    def __init__(self, lattice: Lattice, points: Float[Tensor, "n 3"]):
+    def __init__(self, voxels: KeptVoxels, points: Float[Tensor, "n 3"]):
+        lattice = voxels.lattice
         lo = torch.tensor(lattice.lo, dtype=points.dtype, device=points.device)
         cells = torch.tensor(lattice.cell_shape, dtype=points.dtype, device=points.device)
         position = torch.clamp((points - lo) / lattice.voxel_size, min=torch.zeros_like(cells), max=cells)
         corner = torch.minimum(position.floor(), cells - 1)
+        self.voxels = voxels
         self.fraction: Float[Tensor, "n 3"] = position - corner
-        index = corner.long()
-        _, ny, nz = lattice.shape
-        self.first_corner: Int64[Tensor, " n"] = (index[:, 0] * ny + index[:, 1]) * nz + index[:, 2]
-        dx, dy, dz = CORNER_OFFSETS.T
-        self.corner_steps = torch.as_tensor((dx * ny + dy) * nz + dz, device=points.device)
+        self.number: Int64[Tensor, " n"] = voxels.number_at(corner.long())
+
+    def kept(self) -> Bool[Tensor, " n"]:
+        """Whether each point lies in a kept voxel."""
+        return self.number >= 0
 
     def weights(self) -> Float[Tensor, "n 8"]:
         """Trilinear weights in the corner order of `CORNER_OFFSETS`; they sum to 1."""
@@ -43,25 +50,27 @@ class TrilinearPoints:
         face = torch.stack((v * w, v * z, y * w, y * z), -1)
         return torch.cat((face * u[:, None], face * x[:, None]), -1)
 
-    def corners(self) -> Int64[Tensor, "n 8"]:
-        """Flat corner indices in the order of `CORNER_OFFSETS`."""
-        return self.first_corner[:, None] + self.corner_steps
+    def voxel_rows(self) -> Int64[Tensor, "voxels 8"]:
+        """Rows of the corners of every kept voxel in the order of `CORNER_OFFSETS`."""
+        return self.voxels.tables(self.number.device)[0]
 
-    def select(self, chosen: Tensor) -> TrilinearPoints:
-        """The same for a subset of the points (boolean mask or indices)."""
+    def rows(self) -> Int64[Tensor, "n 8"]:
+        """Rows of the corners of each point's voxel in the order of `CORNER_OFFSETS`."""
+        return self.voxel_rows()[self.number]
+
+    def select(self, chosen: Tensor | slice) -> TrilinearPoints:
+        """The same for a subset of the points (boolean mask, indices or slice)."""
         subset = object.__new__(TrilinearPoints)
-        subset.fraction = self.fraction[chosen]
-        subset.first_corner = self.first_corner[chosen]
-        subset.corner_steps = self.corner_steps
+        subset.voxels, subset.fraction, subset.number = self.voxels, self.fraction[chosen], self.number[chosen]
         return subset
 
 
-def interpolate(rows: Float[Tensor, "corners channels"], at: TrilinearPoints) -> Float[Tensor, "n channels"]:
+def interpolate(rows: Float[Tensor, "rows channels"], at: TrilinearPoints) -> Float[Tensor, "n channels"]:
     """Interpolate `rows` at points: f(p) = sum over the voxel's corners of w_c(p) rows[c].
 
     Args:
-        rows: One row of values per lattice corner.
-        at: The points.
+        rows: One row of values per stored corner.
+        at: The points, all in kept voxels.
 
     Returns:
         Interpolated rows; differentiable with respect to `rows`.
@@ -69,36 +78,37 @@ def interpolate(rows: Float[Tensor, "corners channels"], at: TrilinearPoints) ->
     return _Interpolate.apply(rows, at)  # type: ignore[return-value]
 
 
-def splat(values: Float[Tensor, "n channels"], at: TrilinearPoints, num_corners: int) -> Float[Tensor, "c channels"]:
+def splat(values: Float[Tensor, "n channels"], at: TrilinearPoints) -> Float[Tensor, "rows channels"]:
     """Add values at points to their voxels' corners with trilinear weights: the transpose of `interpolate`."""
-    return _splat(values, at, num_corners)
+    return _splat(values, at)
 
 
 class _Interpolate(torch.autograd.Function):
     @staticmethod
     def forward(ctx, rows: Tensor, at: TrilinearPoints) -> Tensor:
-        ctx.at, ctx.num_corners = at, rows.shape[0]
-        if at.first_corner.numel() == 0:
+        ctx.at = at
+        if at.number.numel() == 0:
             return rows.new_zeros((0, rows.shape[1]))
-        return F.embedding_bag(at.corners(), rows, mode="sum", per_sample_weights=at.weights().to(rows.dtype))
+        return F.embedding_bag(at.rows(), rows, mode="sum", per_sample_weights=at.weights().to(rows.dtype))
 
     @staticmethod
     def backward(ctx, *grad_outputs: Tensor):
-        return _splat(grad_outputs[0], ctx.at, ctx.num_corners), None
+        return _splat(grad_outputs[0], ctx.at), None
 
 
-def _splat(values: Tensor, at: TrilinearPoints, num_corners: int) -> Tensor:
-    total = values.new_zeros((num_corners, values.shape[1]))
+def _splat(values: Tensor, at: TrilinearPoints) -> Tensor:
+    total = values.new_zeros((at.voxels.num_rows, values.shape[1]))
     if values.shape[0] == 0:
         return total
-    ordered, order = torch.sort(at.first_corner, stable=True)
-    cells, counts = torch.unique_consecutive(ordered, return_counts=True)
+    ordered, order = torch.sort(at.number, stable=True)
+    numbers, counts = torch.unique_consecutive(ordered, return_counts=True)
     starts = torch.cumsum(counts, 0) - counts
     weights = at.weights().to(values.dtype)[order]
+    rows = at.voxel_rows()[numbers]
     values = values.contiguous()
-    for corner, step in enumerate(at.corner_steps.tolist()):
-        per_cell = F.embedding_bag(
+    for corner in range(8):
+        per_voxel = F.embedding_bag(
             order, values, starts, mode="sum", per_sample_weights=weights[:, corner].contiguous()
         )
-        total.index_add_(0, cells + step, per_cell)  # rows are distinct: no race
+        total.index_add_(0, rows[:, corner], per_voxel)  # rows are distinct: no race
     return total

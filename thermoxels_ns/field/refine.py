@@ -1,104 +1,109 @@
-"""Coarse to fine: split voxels, and drop those that no ray gives weight to."""
+"""Coarse to fine: split voxels, and drop those that no ray gives weight to.
+
+Both change which corners have rows. What else has one row per corner (optimiser state) follows through the
+`RowChange` they return.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
+import numpy as np
+import numpy.typing as npt
 import torch
-import torch.nn.functional as F
-from jaxtyping import Bool, Float
 from torch import Tensor
 
-from thermoxels_ns.errors import PruningError, explain
+from thermoxels_ns.field.interpolation import TrilinearPoints, interpolate
+from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.lattice import Lattice
+
+RowChange = Callable[[Tensor], Tensor]
+"""Maps values of the old rows, shape (old rows, channels), to values of the new ones."""
 
 
-def resample_rows(rows: Float[Tensor, "old c"], lattice: Lattice, factor: int) -> Float[Tensor, "new c"]:
-    """Trilinear values of `rows` on the corners of ``lattice.refined(factor)``; old corners keep theirs exactly."""
-    nx, ny, nz = lattice.refined(factor).shape
-    volume = rows.T.reshape(1, -1, *lattice.shape)
-    fine = F.interpolate(volume, size=(nx, ny, nz), mode="trilinear", align_corners=True)
-    return fine.reshape(rows.shape[1], -1).T.contiguous()
+ROWS_AT_ONCE = 1 << 17
+"""Rows interpolated at once: corner numbers and weights take more memory than the values."""
 
 
-@torch.no_grad()
-def refine(grid: VoxelGrid, factor: int = 2) -> None:
-    """Split every voxel into factor^3 without changing the field where density is trilinear or exponential.
-
-    Density is per world unit, so nothing is rescaled. A split voxel is kept if its parent was.
-    """
-    lattice = grid.lattice
-    rows = {name: resample_rows(p.data, lattice, factor) for name, p in grid.row_parameters().items()}
-    kept = grid.kept
-    for axis in range(3):
-        kept = kept.repeat_interleave(factor, dim=axis)
-    grid.replace_lattice(lattice.refined(factor), rows, kept)
-
-
-@dataclass(frozen=True)
-class PruningReport:
-    """What pruning did."""
-
-    kept_voxels: int
-    total_voxels: int
-    threshold: float
-    """Smallest largest weight of a voxel that was kept for its own sake."""
-    lost_weight: float
-    """Share of the training rays' total weight that lay in the voxels removed."""
-
-    def __str__(self) -> str:
-        share = self.kept_voxels / self.total_voxels
-        return (
-            f"kept {self.kept_voxels:,} of {self.total_voxels:,} voxels ({share:.1%}); "
-            f"threshold {self.threshold:.2g}, {self.lost_weight:.2%} of the rays' weight lost"
-        )
+def split_voxels(voxels: KeptVoxels, factor: int) -> KeptVoxels:
+    """Split every kept voxel into `factor`^3 kept ones."""
+    _, ny, nz = voxels.lattice.cell_shape
+    index = np.stack((voxels.cells // (ny * nz), voxels.cells // nz % ny, voxels.cells % nz), axis=1) * factor
+    fine = voxels.lattice.refined(factor)
+    _, fy, fz = fine.cell_shape
+    first = (index[:, 0] * fy + index[:, 1]) * fz + index[:, 2]
+    within = np.arange(factor)
+    steps = ((within[:, None, None] * fy + within[None, :, None]) * fz + within).reshape(-1)
+    cells = (first[:, None] + steps).reshape(-1)
+    cells.sort()
+    return KeptVoxels(fine, cells)
 
 
-def dilate(voxels: Bool[Tensor, "x y z"], by: int) -> Bool[Tensor, "x y z"]:
-    """Grow a set of voxels by `by` voxels in all 26 directions."""
-    if by <= 0:
-        return voxels
-    grown = F.max_pool3d(voxels[None, None].float(), kernel_size=2 * by + 1, stride=1, padding=by)
-    return grown[0, 0] > 0.5
+def parents_of_corners(old: KeptVoxels, new: KeptVoxels, factor: int) -> TrilinearPoints:
+    """Where the corners of split voxels lie in the voxels they came from; old corners lie exactly on old ones."""
+    index = new.corner_index()
+    at = object.__new__(TrilinearPoints)
+    number = torch.full((len(index),), -1, dtype=torch.int64)
+    fraction = torch.zeros(len(index), 3, dtype=torch.float64)
+    limit = np.asarray(old.lattice.cell_shape)
+    for back in np.ndindex(2, 2, 2):
+        # A corner on the face between two old voxels belongs to both; either may be the one that is kept.
+        missing = (number < 0).nonzero()[:, 0].numpy()
+        voxel = index[missing] // factor - np.asarray(back)
+        possible = ((index[missing] % factor == 0) | (np.asarray(back) == 0)).all(1)
+        possible &= ((voxel >= 0) & (voxel < limit)).all(1)
+        missing, voxel = missing[possible], voxel[possible]
+        found = old.number_at(torch.from_numpy(voxel))
+        number[missing] = torch.where(found >= 0, found, number[missing])
+        place = torch.from_numpy(index[missing] / factor - voxel)
+        fraction[missing] = torch.where((found >= 0)[:, None], place, fraction[missing])
+    assert bool((number >= 0).all()), "every corner of a split voxel lies in its parent"
+    at.voxels, at.number, at.fraction = old, number, fraction
+    return at
 
 
 @torch.no_grad()
-def prune(
-    grid: VoxelGrid,
-    largest_weight: Float[Tensor, "x y z"],
-    total_weight: Float[Tensor, "x y z"],
-    threshold: float,
-    dilation: int = 1,
-    largest_loss: float = 0.01,
-) -> PruningReport:
-    """Keep voxels to which some training ray gave more than `threshold` of its weight, and their neighbours.
+def refine(grid: VoxelGrid, factor: int = 2) -> RowChange:
+    """Split every kept voxel into factor^3 without changing the field (what is interpolated stays trilinear).
 
-    Args:
-        grid: The grid; its kept voxels can only become fewer.
-        largest_weight: Largest weight any sample in each voxel had on any training ray.
-        total_weight: Sum of the weights in each voxel over all training rays.
-        threshold: Smallest `largest_weight` of a voxel that is kept.
-        dilation: Voxels added around those.
-        largest_loss: Largest share of the total weight that may go.
+    Density is per world unit, so nothing is rescaled.
 
     Returns:
-        What was kept and lost.
-
-    Raises:
-        PruningError: More than `largest_loss` of the weight would go; the grid is left as it was.
+        How values of rows change: trilinear interpolation; old corners keep theirs exactly.
     """
-    keep = dilate(largest_weight > threshold, dilation) & grid.kept
-    total = float(total_weight.sum())
-    lost = float(total_weight[~keep].sum()) / total if total > 0 else 1.0
-    if lost > largest_loss:
-        raise PruningError(
-            explain(
-                "pruning",
-                expected=f"to remove at most {largest_loss:.0%} of the rays' weight",
-                got=f"{lost:.1%} at threshold {threshold:g}",
-                remedy="Lower --pipeline.model.prune-threshold, or prune later when surfaces have formed.",
-            )
-        )
-    grid.kept = keep
-    return PruningReport(int(keep.sum()), keep.numel(), threshold, lost)
+    new = split_voxels(grid.voxels, factor)
+    at = parents_of_corners(grid.voxels, new, factor)
+
+    def change(rows: Tensor) -> Tensor:
+        moved = object.__new__(TrilinearPoints)
+        moved.voxels, moved.number, moved.fraction = at.voxels, at.number.to(rows.device), at.fraction.to(rows.device)
+        split = rows.new_empty((len(at.number), rows.shape[1]))
+        for first in range(0, len(split), ROWS_AT_ONCE):
+            part = slice(first, first + ROWS_AT_ONCE)
+            split[part] = interpolate(rows, moved.select(part))
+        return split
+
+    grid.replace_voxels(new, {name: change(p.data) for name, p in grid.row_parameters().items()})
+    return change
+
+
+@torch.no_grad()
+def prune(grid: VoxelGrid, keep: npt.NDArray[np.bool_]) -> RowChange:
+    """Keep only some of the kept voxels.
+
+    Args:
+        grid: The grid.
+        keep: One boolean per kept voxel.
+
+    Returns:
+        How values of rows change: those of corners that stay are copied.
+    """
+    voxels = grid.voxels
+    new = KeptVoxels(voxels.lattice, voxels.cells[keep])
+    stay: npt.NDArray[np.int64] = np.searchsorted(voxels.corners, new.corners)
+
+    def change(rows: Tensor) -> Tensor:
+        return rows[torch.from_numpy(stay).to(rows.device)]
+
+    grid.replace_voxels(new, {name: change(p.data) for name, p in grid.row_parameters().items()})
+    return change

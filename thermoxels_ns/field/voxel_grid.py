@@ -11,7 +11,8 @@ from torch import Tensor, nn
 
 from thermoxels_ns.field.harmonics import harmonics, harmonics_with_unit_mean, num_coefficients
 from thermoxels_ns.field.interpolation import TrilinearPoints, interpolate
-from thermoxels_ns.lattice import CORNER_OFFSETS, Lattice
+from thermoxels_ns.field.kept_voxels import KeptVoxels
+from thermoxels_ns.lattice import Lattice
 
 DensityActivation = Literal["relu", "softplus", "exp"]
 
@@ -42,13 +43,13 @@ def raw_density(density: float, kind: DensityActivation) -> float:
 
 
 class VoxelGrid(nn.Module):
-    """The parameters of the field, one row per lattice corner.
+    """The parameters of the field, one row per corner of a kept voxel.
 
-    Refinement makes new parameters (autograd remembers the shape of a leaf), so optimisers must be pointed to them.
-    Loading a checkpoint exchanges only the data: optimisers that were built before stay valid.
+    Refinement and pruning make new parameters (autograd remembers the shape of a leaf), so optimisers must be pointed
+    to them. Loading a checkpoint exchanges only the data: optimisers that were built before stay valid.
 
     Args:
-        lattice: Start lattice.
+        lattice: Start lattice; all its voxels are kept at first.
         sh_degree: Degree of the colour harmonics; None: no colour.
         temperature_degree: Degree of the temperature harmonics; 0: the same from all directions (the paper).
         start_density: Start density everywhere, [1 / world unit]; near-transparent.
@@ -58,7 +59,7 @@ class VoxelGrid(nn.Module):
     lo: Tensor
     voxel_size: Tensor
     corner_shape: Tensor
-    kept: Tensor
+    cells: Tensor
 
     def __init__(
         self,
@@ -71,6 +72,7 @@ class VoxelGrid(nn.Module):
         super().__init__()
         self.sh_degree, self.temperature_degree = sh_degree, temperature_degree
         self.activation: DensityActivation = activation
+        self._voxels = KeptVoxels(lattice)
         n = lattice.num_corners
         self.density = nn.Parameter(torch.full((n, 1), raw_density(start_density, activation)))
         channels = 0 if sh_degree is None else 3 * num_coefficients(sh_degree)
@@ -82,28 +84,34 @@ class VoxelGrid(nn.Module):
         self.register_buffer("voxel_size", torch.tensor(lattice.voxel_size, dtype=torch.float64))
         self.register_buffer("corner_shape", torch.tensor(lattice.shape))
         self.register_buffer("activation_index", torch.tensor(get_args(DensityActivation).index(activation)))
-        self.register_buffer("kept", torch.ones(lattice.cell_shape, dtype=torch.bool))
-        self._lattice = lattice
+        self.register_buffer("cells", torch.from_numpy(self._voxels.cells))
 
     @property
     def lattice(self) -> Lattice:
-        """The corner lattice the rows belong to."""
-        return self._lattice
+        """The corner lattice."""
+        return self._voxels.lattice
+
+    @property
+    def voxels(self) -> KeptVoxels:
+        """The kept voxels and the rows of their corners."""
+        return self._voxels
+
+    @property
+    def kept(self) -> Bool[Tensor, "x y z"]:
+        """Kept voxels as a dense mask, on the CPU."""
+        return torch.from_numpy(self._voxels.mask())
 
     def row_parameters(self) -> dict[str, nn.Parameter]:
-        """The parameters that have one row per corner, by name."""
+        """The parameters that have one row per stored corner, by name."""
         rows = {"density": self.density, "sh": self.sh, "temperature": self.temperature}
         return {name: p for name, p in rows.items() if p is not None}
 
-    def replace_lattice(
-        self, lattice: Lattice, rows: dict[str, Tensor], kept: Bool[Tensor, "x y z"], keep_identity: bool = False
-    ) -> None:
-        """Exchange the lattice, the rows of every parameter and the kept voxels.
+    def replace_voxels(self, voxels: KeptVoxels, rows: dict[str, Tensor], keep_identity: bool = False) -> None:
+        """Exchange the kept voxels and the rows of every parameter.
 
         Args:
-            lattice: New lattice.
+            voxels: New kept voxels, of this lattice or another.
             rows: New rows by parameter name.
-            kept: New kept voxels.
             keep_identity: Exchange the data of the parameters that exist; only while no graph uses them.
         """
         for name, parameter in self.row_parameters().items():
@@ -112,43 +120,54 @@ class VoxelGrid(nn.Module):
                 parameter.data, parameter.grad = data, None
             else:
                 setattr(self, name, nn.Parameter(data))
-        device = self.lo.device
-        self._lattice = lattice
+        device, lattice = self.lo.device, voxels.lattice
+        self._voxels = voxels
         self.lo = torch.tensor(lattice.lo, dtype=torch.float64, device=device)
         self.voxel_size = torch.tensor(lattice.voxel_size, dtype=torch.float64, device=device)
         self.corner_shape = torch.tensor(lattice.shape, device=device)
-        self.kept = kept.to(device)
+        self.cells = torch.from_numpy(voxels.cells).to(device)
 
     def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs):
-        """Take over the checkpoint's lattice before its rows are copied."""
-        names = ("lo", "voxel_size", "corner_shape", "kept")
+        """Take over the checkpoint's kept voxels before its rows are copied."""
+        names = ("lo", "voxel_size", "corner_shape", "cells")
         if all(prefix + name in state_dict for name in names):
-            lo, size, shape, kept = (state_dict[prefix + name] for name in names)
+            lo, size, shape, cells = (state_dict[prefix + name] for name in names)
             nx, ny, nz = (int(n) for n in shape)
             x, y, z = (float(v) for v in lo)
-            lattice = Lattice((x, y, z), float(size), (nx, ny, nz))
+            voxels = KeptVoxels(Lattice((x, y, z), float(size), (nx, ny, nz)), cells.cpu().numpy().copy())
             rows = {
                 name: state_dict[prefix + name]
                 for name in self.row_parameters()
                 if prefix + name in state_dict and state_dict[prefix + name].shape[1:] == getattr(self, name).shape[1:]
             }
-            if len(rows) == len(self.row_parameters()):
-                self.replace_lattice(lattice, {k: v.clone() for k, v in rows.items()}, kept.clone(), keep_identity=True)
+            fits = all(len(values) == voxels.num_rows for values in rows.values())
+            if fits and len(rows) == len(self.row_parameters()):
+                self.replace_voxels(voxels, {k: v.clone() for k, v in rows.items()}, keep_identity=True)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     def locate(self, points: Float[Tensor, "n 3"]) -> TrilinearPoints:
         """Find the voxels and trilinear weights of world positions."""
-        return TrilinearPoints(self._lattice, points)
+        return TrilinearPoints(self._voxels, points)
 
     def density_at(self, at: TrilinearPoints) -> Float[Tensor, " n"]:
         """Density, [1 / world unit], >= 0."""
         return activate_density(interpolate(self.density, at)[:, 0], self.activation)
 
-    def rgb_at(self, at: TrilinearPoints, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Colour in [0, 1] seen along unit directions: the sigmoid of the interpolated harmonics."""
+    def rgb_at(
+        self, at: TrilinearPoints, directions: Float[Tensor, "n 3"], degree: int | None = None
+    ) -> Float[Tensor, "n 3"]:
+        """Colour in [0, 1] seen along unit directions: the sigmoid of the interpolated harmonics.
+
+        Args:
+            at: The points.
+            directions: Unit directions.
+            degree: Degree up to which the harmonics take part; None: all.
+        """
         assert self.sh is not None and self.sh_degree is not None, "this grid has no colour"
+        degree = self.sh_degree if degree is None else min(degree, self.sh_degree)
         coefficients = interpolate(self.sh, at).view(len(directions), 3, num_coefficients(self.sh_degree))
-        return torch.sigmoid((coefficients * harmonics(directions, self.sh_degree)[:, None]).sum(-1))
+        basis = harmonics(directions, degree)[:, None]
+        return torch.sigmoid((coefficients[..., : basis.shape[-1]] * basis).sum(-1))
 
     def thermal_at(self, at: TrilinearPoints, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
         """Normalised temperature; the first coefficient is its mean over directions."""
@@ -158,34 +177,30 @@ class VoxelGrid(nn.Module):
         basis = harmonics_with_unit_mean(directions, self.temperature_degree)
         return (coefficients * basis).sum(-1, keepdim=True)
 
-    def in_kept_voxel(self, points: Float[Tensor, "... 3"]) -> Bool[Tensor, "..."]:
+    def in_kept_voxel(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
         """Whether world positions lie in a kept voxel; outside the lattice none is kept."""
-        cells = ((points - self.lo.to(points.dtype)) / self.voxel_size.to(points.dtype)).floor().long()
-        limit = torch.tensor(self.kept.shape, device=points.device)
-        # A point on the last face belongs to the last voxel.
-        flush = (cells == limit) & (points <= torch.tensor(self._lattice.hi, device=points.device, dtype=points.dtype))
-        cells = torch.where(flush, limit - 1, cells)
-        inside = ((cells >= 0) & (cells < limit)).all(-1)
-        x, y, z = torch.minimum(cells.clamp(min=0), limit - 1).unbind(-1)
-        return inside & self.kept[x, y, z]
+        lo = torch.tensor(self.lattice.lo, dtype=points.dtype, device=points.device)
+        hi = torch.tensor(self.lattice.hi, dtype=points.dtype, device=points.device)
+        inside = ((points >= lo) & (points <= hi)).all(-1)
+        return inside & self.locate(points).kept()
 
-    def kept_corners(self) -> Bool[Tensor, "x y z"]:
-        """Corners of kept voxels, shape of the lattice."""
-        corners = torch.zeros(self._lattice.shape, dtype=torch.bool, device=self.kept.device)
-        nx, ny, nz = self.kept.shape
-        for dx, dy, dz in CORNER_OFFSETS.tolist():
-            corners[dx : dx + nx, dy : dy + ny, dz : dz + nz] |= self.kept
-        return corners
+    @torch.no_grad()
+    def corner_values(self, rows: Float[Tensor, " rows"], fill: float = 0.0) -> Float[Tensor, "x y z"]:
+        """Spread one value per stored corner over the whole lattice; `fill` at the corners of no kept voxel."""
+        values = torch.full((self.lattice.num_corners,), fill, dtype=rows.dtype, device=rows.device)
+        values[torch.from_numpy(self._voxels.corners).to(rows.device)] = rows
+        return values.view(self.lattice.shape)
 
     @torch.no_grad()
     def corner_density(self) -> Float[Tensor, "x y z"]:
         """Density at every corner, 0 at corners of no kept voxel."""
-        density = activate_density(self.density[:, 0], self.activation).view(self._lattice.shape)
-        return torch.where(self.kept_corners(), density, torch.zeros_like(density))
+        return self.corner_values(activate_density(self.density[:, 0], self.activation))
 
     @torch.no_grad()
     def voxel_density(self) -> Float[Tensor, "x y z"]:
         """Density at every voxel centre, 0 in voxels that are not kept."""
-        raw = self.density[:, 0].view(1, 1, *self._lattice.shape)
-        centre = F.avg_pool3d(raw, kernel_size=2, stride=1)[0, 0]
-        return torch.where(self.kept, activate_density(centre, self.activation), torch.zeros_like(centre))
+        corners, _, _ = self._voxels.tables(self.density.device)
+        centre = activate_density(self.density[:, 0][corners].mean(-1), self.activation)
+        values = torch.zeros(self.lattice.cell_shape, dtype=centre.dtype, device=centre.device)
+        values.view(-1)[self.cells] = centre
+        return values

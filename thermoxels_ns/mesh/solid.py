@@ -25,13 +25,36 @@ class SolidSelection:
     holes."""
     density_threshold: float | None = None
     """Voxels at least this dense are solid, [1 / world unit of the trained scene]. Overrides both."""
-    largest_component: bool = True
-    """Keep only the largest body whose voxels touch by faces; the rest are mostly floaters."""
+    close_gaps: int = 1
+    """Fill gaps and pinholes up to twice this many voxels wide (a morphological closing); thin walls are not
+    continuous without it. 0: none."""
+    smallest_body: float = 0.01
+    """Drop bodies (voxels that touch, if only by corners) of less than this share of the largest; mostly floaters."""
+    largest_component: bool = False
+    """Keep only the largest body of voxels that touch by faces."""
     fill_cavities: bool = False
     """Make empty space solid where it has no way out through voxel faces. Off by default: a room is a cavity too."""
 
     def __post_init__(self) -> None:
         check_positive("voxel_optical_depth", self.voxel_optical_depth, "Pass --voxel-optical-depth 0.5.", MeshError)
+        if not (isinstance(self.close_gaps, int) and 0 <= self.close_gaps <= 100):
+            raise MeshError(
+                explain(
+                    "close_gaps",
+                    expected="a whole number from 0 to 100",
+                    got=self.close_gaps,
+                    remedy="Pass --close-gaps 1.",
+                )
+            )
+        if not 0.0 <= self.smallest_body <= 1.0:
+            raise MeshError(
+                explain(
+                    "smallest_body",
+                    expected="a share from 0 to 1",
+                    got=self.smallest_body,
+                    remedy="Pass --smallest-body 0.01.",
+                )
+            )
         if self.density_percentile is not None and not (
             np.isfinite(self.density_percentile) and 0.0 <= self.density_percentile <= 100.0
         ):
@@ -64,10 +87,12 @@ class SolidCells:
     """True where a voxel is solid, shape (nx-1, ny-1, nz-1); at least one is."""
     threshold: float
     """Density at voxel centres from which on a voxel counted as solid, [1 / world unit]."""
+    num_closed: int
+    """Voxels of gaps that were filled."""
     component_sizes: npt.NDArray[np.int64]
-    """Voxels in each face-connected body after thresholding, largest first."""
+    """Voxels in each body after that, largest first; they touch by nothing, or (`largest_component`) by no face."""
     num_removed: int
-    """Voxels dropped because they are not in the largest body."""
+    """Voxels dropped because their body is too small."""
     num_added: int
     """Voxels of enclosed cavities that were made solid."""
 
@@ -109,17 +134,22 @@ def select_solid(snapshot: GridSnapshot, selection: SolidSelection) -> SolidCell
             )
         )
 
-    labels = face_connected(cells)
+    thresholded = int(cells.sum())
+    cells = close_gaps(cells, selection.close_gaps)
+    labels = face_connected(cells) if selection.largest_component else connected(cells)
     sizes = np.bincount(labels.ravel())[1:]
     before = int(cells.sum())
     if selection.largest_component and len(sizes) > 1:
         cells = labels == 1 + int(np.argmax(sizes))
+    elif len(sizes) > 1:
+        cells = np.concatenate(([False], sizes >= selection.smallest_body * sizes.max()))[labels]
     kept = int(cells.sum())
     if selection.fill_cavities:
         cells = fill_enclosed(cells)
     return SolidCells(
         cells=cells,
         threshold=threshold,
+        num_closed=before - thresholded,
         component_sizes=np.sort(sizes)[::-1].astype(np.int64),
         num_removed=before - kept,
         num_added=int(cells.sum()) - kept,
@@ -131,6 +161,27 @@ def face_connected(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
     labels = np.zeros(cells.shape, dtype=np.int32)
     ndimage.label(cells, output=labels)
     return labels
+
+
+def connected(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
+    """Number the bodies whose voxels touch by faces, edges or corners, as `face_connected` does."""
+    labels = np.zeros(cells.shape, dtype=np.int32)
+    ndimage.label(cells, structure=np.ones((3, 3, 3)), output=labels)
+    return labels
+
+
+def close_gaps(cells: npt.NDArray[np.bool_], by: int) -> npt.NDArray[np.bool_]:
+    """Fill what a ball (by the city block distance) of radius `by` voxels cannot enter; nothing solid goes.
+
+    >>> close_gaps(np.array([[[True, False, True]]]), 1)[0, 0].tolist()
+    [True, True, True]
+    """
+    if by == 0:
+        return cells
+    # Where the box cuts the scene, what is solid goes on behind it.
+    grown = ndimage.binary_dilation(np.pad(cells, by, mode="edge"), iterations=by)
+    closed = ndimage.binary_erosion(grown, iterations=by, border_value=1)
+    return np.logical_or(closed[by:-by, by:-by, by:-by], cells)
 
 
 def fill_enclosed(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:

@@ -1,0 +1,155 @@
+"""How long a training step takes: fused against reference, and how it grows with the resolution.
+
+Run it on an otherwise idle machine:
+
+    python tests/benchmarks/step_speed.py --resolutions 64 128 256
+
+A synthetic house with a thermal camera of its own is trained to the middle of its last stage; then single steps with
+4096 RGB and 4096 thermal rays are timed on one and the same state, and a view of 320 x 240 is rendered. Every figure
+is a median; ratios are against the named baseline of the same run.
+"""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import tyro
+from nerfstudio.utils.rich_utils import CONSOLE
+from training_run import TrainingRun
+
+from thermoxels_ns.data.synthetic import make_scene, write_scene
+from thermoxels_ns.schedule import schedule_for
+from thermoxels_ns.threads import num_threads
+
+
+@dataclass
+class StepSpeed:
+    """Time training steps."""
+
+    resolutions: tuple[int, ...] = (64, 128, 256)
+    """Voxels along the longest side."""
+    scene: str = "house-corner"
+    """Synthetic scene."""
+    rays: int = 4096
+    """Rays of each stream."""
+    steps: int = 600
+    """Length of the training whose middle is timed."""
+    repeats: int = 7
+    """Steps per median."""
+    reference_up_to: int = 128
+    """Finest lattice on which the reference is timed too."""
+
+    def main(self) -> None:
+        """Print the table."""
+        rows = []
+        with tempfile.TemporaryDirectory() as folder:
+            scene = write_scene(
+                make_scene(self.scene), Path(folder) / "scene", own_thermal_camera=True, thermal_width=320
+            )
+            for resolution in self.resolutions:
+                rows.append(self.measure(scene, resolution))
+        print(
+            f"\n{self.scene}, {self.rays} RGB + {self.rays} thermal rays, {num_threads()} threads, "
+            f"medians of {self.repeats}\n"
+        )
+        print(
+            "| voxels | kept | fused step | against the lattice before | reference step | reference / fused "
+            "| 320 x 240 view | beside the kernels |"
+        )
+        print("|---|---|---|---|---|---|---|---|")
+        before = None
+        for row in rows:
+            fused, reference = row["fused"], row["reference"]
+            print(
+                f"| {row['resolution']} | {row['kept']:.1%} | {1e3 * fused:.0f} ms "
+                f"| {'' if before is None else f'{fused / before:.2f}'} "
+                f"| {'' if reference is None else f'{reference:.2f} s'} "
+                f"| {'' if reference is None else f'{reference / fused:.0f}'} "
+                f"| {1e3 * row['view']:.0f} ms | {row['overhead']:.0%} |"
+            )
+            before = fused
+
+    def measure(self, scene: Path, resolution: int) -> dict:
+        """Train to the middle of the last stage and time."""
+        schedule = schedule_for(resolution, self.steps)
+        rays = {"train_num_rays_per_batch": self.rays, "thermal_num_rays_per_batch": self.rays}
+        run = TrainingRun(scene, schedule, {"pipeline": {"datamanager": rays}})
+        with CONSOLE.status(f"{resolution} voxels"):
+            run.advance((max((*schedule.prune_at, *schedule.refine_at)) + schedule.thin_at[0]) // 2)
+            config, model = run.pipeline.model.config, run.pipeline.model
+            fused = self.median(run.take_step)
+            kernels = self.median_of_kernels(run)
+            reference = None
+            if resolution <= self.reference_up_to:
+                config.backend = "reference"
+                torch.set_num_threads(num_threads())
+                reference = self.median(run.take_step)
+                config.backend = "auto"
+                torch.set_num_threads(max(1, num_threads() // 2))
+            run.pipeline.eval()
+            camera = run.pipeline.datamanager.eval_dataset.cameras[0:1]
+            view = self.median(lambda: model.get_outputs_for_camera(camera))
+        voxels = model.grid.voxels
+        return {
+            "resolution": resolution,
+            "kept": len(voxels) / voxels.mask().size,
+            "fused": fused,
+            "reference": reference,
+            "view": view,
+            "overhead": (fused - kernels) / fused,
+        }
+
+    def median(self, work: Callable[[], object]) -> float:
+        """Median time of one call, after one that does not count."""
+        work()
+        times = []
+        for _ in range(self.repeats):
+            start = time.perf_counter()
+            work()
+            times.append(time.perf_counter() - start)
+        return statistics.median(times)
+
+    def median_of_kernels(self, run: TrainingRun) -> float:
+        """Time per step that is spent in compiled kernels: renderer forward and backward, and row optimisers."""
+        from thermoxels_ns.optim import RowOptimizer
+        from thermoxels_ns.render import fused
+
+        spent = [0.0]
+
+        def timed(function):
+            def call(*args, **kwargs):
+                start = time.perf_counter()
+                try:
+                    return function(*args, **kwargs)
+                finally:
+                    spent[0] += time.perf_counter() - start
+
+            return call
+
+        forward, backward = fused._Render.forward, fused._Render.backward
+        rows = [o for o in run.optimizers.optimizers.values() if isinstance(o, RowOptimizer)]
+        updates = [o.update_rows for o in rows]
+        fused._Render.forward, fused._Render.backward = staticmethod(timed(forward)), staticmethod(timed(backward))
+        for optimizer, update in zip(rows, updates):
+            optimizer.update_rows = timed(update)  # type: ignore[method-assign]
+        times = []
+        try:
+            for _ in range(self.repeats + 1):
+                spent[0] = 0.0
+                run.take_step()
+                times.append(spent[0])
+        finally:
+            fused._Render.forward, fused._Render.backward = staticmethod(forward), staticmethod(backward)
+            for optimizer, update in zip(rows, updates):
+                optimizer.update_rows = update  # type: ignore[method-assign]
+        return statistics.median(times[1:])
+
+
+if __name__ == "__main__":
+    tyro.cli(StepSpeed).main()

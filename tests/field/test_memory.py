@@ -1,0 +1,100 @@
+"""What a lattice will take in memory is said, and refused, before it is taken."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.errors import MemoryBudgetError
+from thermoxels_ns.field.kept_voxels import KeptVoxels
+from thermoxels_ns.field.memory import check_memory, memory_need
+from thermoxels_ns.lattice import Lattice
+
+TESTS = Path(__file__).parents[1]
+KERNELS = 0.3e9
+"""What loading the compiled kernels takes, whatever the lattice, [bytes]."""
+
+
+def cube(resolution: int) -> Lattice:
+    return Lattice.covering((-1, -1, -1), (1, 1, 1), resolution)
+
+
+def after_training(resolution: int, share: float) -> dict[str, float]:
+    """Memory of a process that trains on a shell; see `shell_training.py`."""
+    if not Path("/proc/self/status").exists():
+        pytest.skip("this system does not tell the peak memory of a process in /proc")
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(TESTS.parent)}
+    command = [sys.executable, str(TESTS / "shell_training.py"), str(resolution), str(share)]
+    result = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize("resolution, share", [(256, 0.05), (64, 1.0)])
+def test_training_takes_what_was_predicted(resolution, share):
+    """What stays is at most the prediction and at least half of it; the peak is at most one and a half of it.
+
+    About 10 s at 256 voxels, of which one in twenty is kept: there the peak is at most 1.5 GB above the imports.
+    """
+    found = after_training(resolution, share)
+    assert found["resolution"] == resolution and found["share"] == pytest.approx(share, rel=0.01)
+    assert found["rows"] <= found["predicted_rows"] <= 1.5 * found["rows"]
+    assert found["stays"] <= found["predicted"] <= 2.0 * found["stays"]
+    above = found["peak"] - found["imports"]
+    assert above - KERNELS <= 1.5 * found["most_predicted"]
+    if resolution == 256:
+        assert above <= 1.5e9, f"{above / 1e9:.2f} GB above the imports"
+
+
+def test_prediction_grows_with_what_is_kept_and_hardly_with_the_lattice():
+    lattice = cube(512)
+    few, more = memory_need(lattice, 100_000, 29), memory_need(lattice, 1_000_000, 29)
+    assert more.gigabytes > 3 * few.gigabytes
+    assert memory_need(cube(128), 100_000, 29).gigabytes == pytest.approx(few.gigabytes, abs=0.3)
+    assert memory_need(lattice, 100_000, 2).gigabytes < few.gigabytes
+
+
+def test_rows_of_a_full_lattice_are_its_corners():
+    lattice = cube(16)
+    assert memory_need(lattice, 16**3, 29).rows == KeptVoxels(lattice).num_rows == 17**3
+    assert memory_need(lattice, 16**3 - 1, 29).rows <= 17**3
+
+
+@pytest.mark.parametrize("thickness", [3.0, 5.0, 9.0])
+def test_rows_of_shells_a_few_voxels_thick_are_within_a_third_of_the_prediction(thickness):
+    lattice = cube(96)
+    distance = np.abs(np.linalg.norm(lattice.cell_centres() * 48, axis=-1) - 30)
+    voxels = KeptVoxels(lattice, np.flatnonzero(distance.reshape(-1) < 0.5 * thickness))
+    predicted = memory_need(lattice, len(voxels), 29).rows
+    assert 0.75 < predicted / voxels.num_rows < 1.35
+
+
+def test_budget():
+    need = memory_need(cube(128), 128**3, 29)
+    assert 0.5 < need.gigabytes < 2.0
+    assert check_memory(cube(128), 128**3, 29, budget_gb=need.gigabytes) == need
+    with pytest.raises(MemoryBudgetError) as caught:
+        check_memory(cube(128), 128**3, 29, budget_gb=0.99 * need.gigabytes)
+    message = str(caught.value)
+    for part in ("memory: expected at most the budget of", "128 x 128 x 128 voxels", f"{need.gigabytes:.2f} GB"):
+        assert part in message
+    for remedy in ("--pipeline.model.resolutions", "--pipeline.model.memory-budget-gb"):
+        assert remedy in message
+
+
+@pytest.mark.parametrize("resolution", [1024, 4096, 100_000])
+def test_a_lattice_beyond_the_budget_is_refused_without_taking_memory(resolution):
+    tracemalloc.start()
+    try:
+        with pytest.raises(MemoryBudgetError, match=f"{resolution} x {resolution} x {resolution} voxels"):
+            check_memory(cube(resolution), resolution**3, 29, budget_gb=64.0)
+        assert tracemalloc.get_traced_memory()[1] < 1e6
+    finally:
+        tracemalloc.stop()

@@ -1,0 +1,288 @@
+"""Cases that break naive volume rendering, for both renderers: what must hold exactly, and their agreement."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from tests.reference.two_renderers import (
+    EVERYTHING,
+    RENDERERS,
+    as_double,
+    compare,
+    in_double,
+    keep_only,
+    random_grid,
+    random_request,
+    see,
+)
+from thermoxels_ns.errors import ThermoxelsError
+from thermoxels_ns.field.voxel_grid import VoxelGrid
+from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.ray_rendering import fused_render, reference_render, sample_rays
+from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
+
+CUBE = Lattice.covering((-1, -1, -1), (1, 1, 1), 16)
+TUBE = Lattice((0.0, 0.0, 0.0), 1.0, (257, 2, 2))
+"""256 voxels in a row: 512 samples on a ray along it."""
+ALONG = RayRequest(torch.tensor([[-3.0, 0.3, 0.6]]), torch.tensor([[1.0, 0.0, 0.0]]))
+
+
+def request(origins, directions) -> RayRequest:
+    origins = torch.as_tensor(origins, dtype=torch.float32)
+    directions = normalize(torch.as_tensor(directions, dtype=torch.float32).expand_as(origins), dim=-1)
+    return RayRequest(origins, directions)
+
+
+def filled(density: float, lattice: Lattice = CUBE, temperature: float = 0.4) -> VoxelGrid:
+    grid = random_grid(1, 0, "relu", 1.0, lattice)
+    grid.density.data.fill_(density)
+    grid.temperature.data.fill_(temperature)
+    return grid
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
+@pytest.mark.parametrize("sigma", [1e4, 1e30, float("inf")])
+def test_huge_density_is_opaque_with_finite_gradients(renderer, sigma):
+    rays = random_request(filled(1.0), 80, mixed=False)
+    for grid, asked in ((filled(sigma), rays), (as_double(filled(sigma)), in_double(rays))):
+        seen = see(renderer, grid, asked, replace(EVERYTHING, thermal_moves_density=True))
+        hit = torch.isfinite(seen.values["depth"])
+        assert 60 < int(hit.sum()) <= 80
+        assert bool((seen.values["accumulation"][hit] == 1.0).all())
+        assert float(seen.values["transmittance"][hit].max()) < 1e-30
+        torch.testing.assert_close(seen.values["thermal"][hit, 0], torch.full((int(hit.sum()),), 0.4).double())
+        for value in (seen.values[name][hit] for name in ("rgb", "depth", "distortion", "sparsity")):
+            assert bool(torch.isfinite(value).all())
+        assert all(bool(torch.isfinite(g).all()) for g in seen.gradients.values())
+        assert float(seen.gradients["temperature"].norm()) > 0
+
+
+@pytest.mark.parametrize("sigma", [1e4, 1e30])
+def test_huge_density_agrees(sigma):
+    grid = filled(0.0)
+    generator = torch.Generator().manual_seed(1)
+    grid.density.data = sigma * (torch.rand(grid.density.shape, generator=generator) - 0.5)
+    compare(grid, random_request(grid), EVERYTHING)
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
+@pytest.mark.parametrize("activation", ["relu", "softplus", "exp"])
+def test_nan_density_is_refused_not_made_transparent(renderer, activation):
+    grid = random_grid(0, 0, activation, 1.0, CUBE)
+    grid.density.data[len(grid.density) // 2] = float("nan")
+    with pytest.raises(ThermoxelsError, match=r"density: expected numbers >= 0, got .*NaN"):
+        RENDERERS[renderer](grid, random_request(grid), RenderOptions())
+
+
+def test_nan_density_where_no_ray_comes_harms_nothing():
+    grid = random_grid(0, 0, "exp", 1.0, CUBE)
+    rays = request([[-3.0, 0.51, 0.51]], [1.0, 0.0, 0.0])
+    clean = see("fused", grid, rays)
+    grid.density.data[0] = float("nan")
+    spoiled = see("fused", grid, rays)
+    assert all(torch.equal(clean.values[name], spoiled.values[name]) for name in clean.values)
+
+
+def test_transmittance_keeps_its_digits_over_512_samples():
+    """Behind an optical depth of 30 each weight is far below what 1 - accumulation can hold in single precision."""
+    grid = random_grid(0, 0, "relu", 1.0, TUBE)
+    grid.density.data.fill_(0.04)
+    grid.density.data[:4] = 60.0
+    single = sample_rays(grid, ALONG, RenderOptions(), "fused")
+    exact = sample_rays(as_double(grid), in_double(ALONG), RenderOptions(), "reference")
+    assert len(single.weight) == len(exact.weight) == 512
+    error = (single.weight.double() - exact.weight).abs() / exact.weight
+    assert float(error.max()) < 1e-5 and 0 < float(exact.weight[-1]) < 1e-17
+    assert float(single.transmittance) == pytest.approx(float(exact.transmittance), rel=1e-5)
+    reference = compare(grid, ALONG, replace(EVERYTHING, thermal_moves_density=True))
+    assert float(reference.values["transmittance"]) < 1e-16
+
+
+def test_vanishing_density_keeps_value_and_gradient():
+    """1 - exp(-1e-8) is 0 in single precision; a renderer that computes it so has a plateau without gradient."""
+    grid = random_grid(0, 0, "relu", 1.0, TUBE)
+    grid.density.data.fill_(1e-9)
+    reference = compare(grid, ALONG, RenderOptions())
+    assert float(reference.values["accumulation"]) == pytest.approx(256e-9, rel=1e-6)
+    for renderer in RENDERERS:
+        grid.density.grad = None
+        RENDERERS[renderer](grid, ALONG, RenderOptions()).accumulation.sum().backward()
+        assert float(grid.density.grad.to_dense().sum()) == pytest.approx(256.0, rel=1e-5)
+
+
+@pytest.mark.parametrize("eps", [0.1, 1e-2, 1e-3, 1e-5])
+@pytest.mark.parametrize("density", [0.5, 2.5])
+def test_early_stop_is_off_by_less_than_its_bound(eps, density):
+    grid = random_grid(2, 0, "exp", 0.7, CUBE, density=density)
+    rays = random_request(grid, 300, mixed=False)
+    whole = fused_render(grid, rays, RenderOptions())
+    stopped = fused_render(grid, rays, RenderOptions(early_stop=eps))
+    backdrop = torch.ones(300, 3), torch.ones(300, 1)
+    pairs = [(getattr(whole, n), getattr(stopped, n)) for n in ("rgb", "thermal", "accumulation", "transmittance")]
+    pairs += list(zip(whole.with_background(*backdrop, rays), stopped.with_background(*backdrop, rays)))
+    for exact, early in pairs:
+        assert float((exact - early).abs().max()) <= eps + 1e-6
+    full, short = (sample_rays(grid, rays, RenderOptions(early_stop=e), "fused") for e in (0.0, eps))
+    assert 0 < len(short.weight) < len(full.weight)
+    # It stops only rays of which less than eps is left.
+    ended = short.transmittance != full.transmittance
+    assert bool(ended.any()) and bool((short.transmittance[ended] < eps).all())
+
+
+def test_skipped_colours_are_off_by_less_than_their_bound():
+    grid = random_grid(2, 0, "exp", 1.0, CUBE, density=-1.0)
+    rays = random_request(grid, 200, mixed=False)
+    steps = torch.bincount(sample_rays(grid, rays, RenderOptions(), "fused").ray, minlength=200)
+    exact, skipped = (fused_render(grid, rays, RenderOptions(smallest_weight=w)) for w in (0.0, 1e-2))
+    error = (exact.rgb - skipped.rgb).abs().amax(-1)
+    assert float(error.max()) > 0 and bool((error <= 1e-2 * steps + 1e-6).all())
+    torch.testing.assert_close(exact.accumulation, skipped.accumulation, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("slope", [0.0, 1e-7, -1e-7, 1e-6, -1e-6, 1e-30, -1e-30, 1e-42])
+def test_axis_parallel_rays(axis, sign, slope):
+    """d in {0, +-1e-6, +-1e-7}: no sign flips, no infinities; the chord is 2, also along faces between voxels."""
+    directions = torch.zeros(5, 3)
+    directions[:, axis], directions[:, (axis + 1) % 3] = sign, slope
+    origins = torch.zeros(5, 3)
+    origins[:, axis] = -4.0 * sign
+    origins[:, (axis + 2) % 3] = torch.tensor([0.5, 0.0, 0.03, -0.125, 0.999])
+    rays = request(origins, directions)
+    full = filled(0.25)
+    for renderer in RENDERERS:
+        seen = RENDERERS[renderer](full, rays, RenderOptions())
+        torch.testing.assert_close(
+            seen.accumulation, torch.full((5,), 1 - np.exp(-0.5)), check_dtype=False, rtol=1e-5, atol=0
+        )
+    sparse = random_grid(1, 0, "relu", 0.05, CUBE)
+    compare(sparse, rays)
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
+@pytest.mark.parametrize("offset, hits", [(1.0, True), (1.0 + 1e-6, False), (-1.0, True), (1.5, False)])
+def test_parallel_ray_on_a_face_hits_just_outside_it_misses(renderer, offset, hits):
+    rays = request([[-4.0, offset, 0.03]], [1.0, 0.0, 0.0])
+    seen = RENDERERS[renderer](filled(5.0), rays, RenderOptions())
+    assert (float(seen.accumulation) > 0.99) is hits and bool(torch.isinf(seen.depth)) is not hits
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
+@pytest.mark.parametrize("slope", [-1e-6, -1e-7])
+def test_a_ray_that_is_nearly_parallel_enters_through_the_side_it_crosses(renderer, slope):
+    """It starts just above the box and comes down to its top in the middle of it."""
+    origins = torch.tensor([[-41.0, 1.0, 0.03]], dtype=torch.float64)
+    origins[0, 1] -= 41.0 * slope
+    rays = RayRequest(origins, torch.tensor([[1.0, slope, 0.0]], dtype=torch.float64))
+    seen = RENDERERS[renderer](as_double(filled(0.25)), rays, RenderOptions())
+    assert float(seen.accumulation) == pytest.approx(1.0 - np.exp(-0.25), rel=1e-6)
+
+
+@pytest.mark.parametrize("corner", [(1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (1.0, 1.0, 1.0), (-1.0, 1.0, -1.0)])
+def test_camera_on_a_face_an_edge_and_a_corner(corner):
+    origins = torch.tensor([corner])
+    inward, outward = request(origins, -origins), request(origins, origins)
+    for renderer in RENDERERS:
+        grid = filled(0.25)
+        seen = RENDERERS[renderer](grid, inward, RenderOptions())
+        chord = 2.0 * float(origins.norm())
+        assert float(seen.accumulation) == pytest.approx(1.0 - np.exp(-0.25 * chord), rel=1e-5)
+        assert float(RENDERERS[renderer](grid, outward, RenderOptions()).accumulation) == pytest.approx(0.0, abs=1e-6)
+    compare(random_grid(1, 0, "relu", 0.3, CUBE), inward)
+
+
+def test_camera_inside_starts_at_itself_and_a_box_behind_is_missed():
+    rays = request([[0.2, 0.01, 0.02], [3.0, 0.01, 0.02]], [1.0, 0.0, 0.0])
+    for renderer in RENDERERS:
+        seen = RENDERERS[renderer](filled(0.5), rays, RenderOptions())
+        torch.testing.assert_close(
+            seen.accumulation, torch.tensor([1.0 - np.exp(-0.4), 0.0]).float(), rtol=1e-5, atol=0
+        )
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
+def test_miss_is_exactly_the_background_with_depth_infinite(renderer):
+    rays = request([[0.0, 0.0, 5.0], [3.0, 3.0, 0.0], [-3.0, 0.0, 0.0]], [[0, 0, 1.0], [1.0, -1.0, 0], [0, 1.0, 0]])
+    seen = RENDERERS[renderer](filled(50.0), rays, RenderOptions())
+    rgb, thermal = torch.rand(3, 3), torch.rand(3, 1)
+    assert all(torch.equal(a, b) for a, b in zip(seen.with_background(rgb, thermal, rays), (rgb, thermal)))
+    assert bool((seen.accumulation == 0).all()) and bool((seen.transmittance == 1).all())
+    assert bool(torch.isinf(seen.depth).all())
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
+@pytest.mark.parametrize("activation, raw", [("relu", 0.0), ("relu", -3.0), ("exp", -1e30)])
+def test_rays_through_nothing_show_the_background_and_pull_at_no_temperature(renderer, activation, raw):
+    grid = random_grid(1, 0, activation, 1.0, CUBE)
+    grid.density.data.fill_(raw)
+    rays = random_request(grid, 50, mixed=False)
+    rgb, thermal = torch.rand(50, 3, requires_grad=True), torch.rand(50, 1, requires_grad=True)
+    seen = RENDERERS[renderer](grid, rays, EVERYTHING)
+    with_background = seen.with_background(rgb, thermal, rays)
+    assert all(torch.equal(a, b) for a, b in zip(with_background, (rgb, thermal)))
+    assert bool((seen.accumulation == 0).all()) and bool(torch.isinf(seen.depth).all())
+    assert float(seen.distortion.abs().max()) == 0.0 and float(seen.sparsity.abs().max()) == 0.0
+    (with_background[0].sum() + with_background[1].sum()).backward()
+    for parameter in grid.row_parameters().values():
+        assert parameter.grad is None or float(parameter.grad.to_dense().abs().max()) == 0.0
+    assert bool((rgb.grad == 1).all()) and bool((thermal.grad == 1).all())
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
+@pytest.mark.parametrize("temperature_degree", [0, 1])
+def test_constant_temperature_renders_constant_wherever_it_is_opaque(renderer, temperature_degree):
+    """Voxels that are not kept have no temperature that could mix with the others'."""
+    index = np.stack(np.unravel_index(np.arange(16**3), (16, 16, 16)), -1)
+    ball = np.flatnonzero(np.linalg.norm(index - 7.5, axis=1) < 6)
+    grid = random_grid(None, temperature_degree, "exp", ball, CUBE)
+    grid.density.data.fill_(8.0)
+    grid.temperature.data.zero_()
+    grid.temperature.data[:, 0] = 0.4
+    rays = random_request(grid, 200, mixed=False)
+    seen = RENDERERS[renderer](grid, rays, RenderOptions())
+    opaque = seen.accumulation > 0.5
+    assert 100 < int(opaque.sum()) < 200
+    torch.testing.assert_close(
+        seen.thermal[opaque, 0] / seen.accumulation[opaque], torch.full((int(opaque.sum()),), 0.4), rtol=2e-6, atol=0
+    )
+    assert float(seen.accumulation[opaque].min()) > 0.99999
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
+@pytest.mark.parametrize("storage", ["dense", "sparse"])
+@pytest.mark.parametrize("angle", [0.0, 30.0, 45.0])
+def test_wall_one_voxel_thick_is_opaque_from_both_sides(renderer, storage, angle):
+    lattice = Lattice.covering((-1, -1, -1), (1, 1, 1), 32)
+    normal = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0.0])
+    grid = random_grid(None, 0, "relu", 1.0, lattice)
+    if storage == "sparse":
+        near = np.abs(lattice.cell_centres() @ normal) / lattice.voxel_size
+        keep_only(grid, np.flatnonzero(near.reshape(-1) < 2.0))
+    positions = lattice.index_to_world(grid.voxels.corner_index())
+    inside = np.abs(positions @ normal) / lattice.voxel_size <= 0.75
+    grid.density.data = torch.tensor(np.where(inside, 600.0, 0.0)[:, None], dtype=torch.float32)
+    side = torch.tensor([-normal[1], normal[0], 0.0])
+    facing = torch.tensor(normal)
+    for sign in (1.0, -1.0):
+        origins = sign * 3.0 * facing + torch.linspace(-0.5, 0.5, 101)[:, None] * side + torch.tensor([0.0, 0.0, 0.137])
+        seen = RENDERERS[renderer](grid, request(origins, -sign * facing), RenderOptions())
+        assert float(seen.accumulation.min()) > 0.99
+        # It is hit where it stands: half its thickness, and the voxels that interpolation smears it over.
+        assert float((seen.depth - 3.0).abs().max()) < (0.75 + np.abs(normal).sum()) * lattice.voxel_size
+
+
+def test_gradient_of_an_opaque_ray_comes_from_its_front_alone():
+    grid = filled(1e3)
+    rays = request([[-3.0, 0.01, 0.02]], [1.0, 0.0, 0.0])
+    for render in (reference_render, fused_render):
+        for parameter in grid.parameters():
+            parameter.grad = None
+        render(grid, rays, RenderOptions()).rgb.sum().backward()
+        rows = grid.sh.grad.to_dense().abs().amax(-1).view(CUBE.shape)
+        assert float(rows[:2].max()) > 0.01 and float(rows[3:].max()) < 1e-12

@@ -1,0 +1,301 @@
+"""The compiled renderer against its plain torch twin, over random grids: values, gradients, samples."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.nn.functional import normalize
+
+from tests.reference.two_renderers import (
+    EVERYTHING,
+    as_double,
+    compare,
+    in_double,
+    keep_only,
+    random_grid,
+    random_request,
+    see,
+)
+from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.ray_rendering import fused_render, sample_rays
+from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
+
+ACTIVATIONS = ("relu", "softplus", "exp")
+
+
+def with_variation(grid, options=EVERYTHING) -> RenderOptions:
+    """The options with total variation of a block in the middle for all parameters."""
+    count = len(grid.voxels)
+    return replace(options, variation={name: (count // 4, count // 2) for name in grid.row_parameters()})
+
+
+@pytest.mark.parametrize("kept", [1.0, 0.4], ids=["dense", "sparse"])
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize(
+    ("sh_degree", "temperature_degree"), itertools.product((None, 0, 1, 2), (0, 1)), ids=lambda d: f"degree {d}"
+)
+def test_everything_at_once(sh_degree, temperature_degree, activation, kept):
+    grid = random_grid(sh_degree, temperature_degree, activation, kept)
+    reference = compare(grid, random_request(grid), with_variation(grid), background=True)
+    colour = {"background rgb"} if sh_degree is None else set()
+    assert all(float(g.norm()) > 0 for name, g in reference.gradients.items() if name not in colour)
+
+
+@pytest.mark.parametrize("kept", [1.0, 0.4], ids=["dense", "sparse"])
+@pytest.mark.parametrize("background", [False, True])
+@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize(
+    "options",
+    [
+        RenderOptions(),
+        RenderOptions(distortion_scale=0.7),
+        RenderOptions(sparsity=True),
+        RenderOptions(variation={"temperature": (3, 4)}),
+        RenderOptions(variation={"density": (0, 100), "sh": (50, 51)}, sparsity=True),
+        RenderOptions(steps_per_voxel=0.7, smallest_weight=1e-3, distortion_scale=2.0),
+        RenderOptions(steps_per_voxel=5.3, smallest_weight=1e-2),
+    ],
+    ids=["plain", "distortion", "sparsity", "one variation", "two variations", "coarse steps", "fine steps"],
+)
+def test_each_term_alone(options, moves, background, kept):
+    grid = random_grid(1, 1, "softplus", kept)
+    options = replace(options, thermal_moves_density=moves)
+    reference = compare(grid, random_request(grid), options, background)
+    assert ("distortion" in reference.values) is (options.distortion_scale is not None)
+    assert ("sparsity" in reference.values) is options.sparsity
+
+
+@pytest.mark.parametrize("kept", [1.0, 0.4], ids=["dense", "sparse"])
+@pytest.mark.parametrize("stored", [0, 1, 2])
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_harmonics_up_to_a_degree(degree, stored, kept):
+    """What lies behind the degree gets no gradient, and the picture is that of a grid where it is nil."""
+    grid = random_grid(stored, 0, "exp", kept)
+    request = random_request(grid)
+    reference = compare(grid, request, with_variation(grid, replace(RenderOptions(), sh_degree=degree)))
+    plain = see("fused", grid, request, replace(RenderOptions(), sh_degree=degree))
+    behind = (torch.arange(grid.sh.shape[1]) % (stored + 1) ** 2) >= (degree + 1) ** 2
+    gradient = plain.gradients["sh"].abs().amax(0)
+    assert bool((gradient[~behind] > 0).all()) and bool((gradient[behind] == 0).all())
+    grid.sh.data[:, behind] = 0.0
+    torch.testing.assert_close(see("fused", grid, request, RenderOptions()).values["rgb"], plain.values["rgb"])
+    assert "distortion" not in reference.values
+
+
+@pytest.mark.parametrize("rgb", [None, True, False])
+@pytest.mark.parametrize("thermal", [None, True, False])
+@pytest.mark.parametrize("moves", [False, True])
+def test_rays_that_want_only_one_stream_or_none(rgb, thermal, moves):
+    grid = random_grid(1, 0)
+    plain = random_request(grid, 60, mixed=False)
+    wants = [None if w is None else torch.full((60,), w) for w in (rgb, thermal)]
+    request = RayRequest(plain.origins, plain.directions, plain.near, None, *wants)
+    reference = compare(grid, request, replace(EVERYTHING, thermal_moves_density=moves), background=True)
+    if rgb is False:
+        assert float(reference.values["rgb"].abs().max()) == 0.0
+    if thermal is False:
+        assert float(reference.gradients["temperature"].abs().max()) == 0.0
+
+
+def test_a_stream_that_no_ray_wants_has_no_gradient_rows():
+    grid = random_grid(1)
+    nothing, everything = torch.zeros(40, dtype=torch.bool), torch.ones(40, dtype=torch.bool)
+    plain = random_request(grid, 40)
+    for wants, absent in (((nothing, everything), "sh"), ((everything, nothing), "temperature")):
+        for parameter in grid.parameters():
+            parameter.grad = None
+        seen = fused_render(grid, RayRequest(plain.origins, plain.directions, 0.0, None, *wants), RenderOptions())
+        (seen.rgb.sum() + seen.thermal.sum() + seen.accumulation.sum()).backward()
+        assert grid.row_parameters()[absent].grad is None and grid.density.grad is not None
+
+
+def test_gradients_hold_the_touched_rows_and_no_others():
+    grid = random_grid(1)
+    request = random_request(grid, 3)
+    fused_render(grid, request, RenderOptions()).accumulation.sum().backward()
+    gradient = grid.density.grad
+    assert gradient.is_sparse
+    rows = gradient._indices()[0]
+    assert 0 < len(rows) < 0.3 * len(grid.density) and bool((rows.diff() > 0).all())
+    samples = sample_rays(grid, request, RenderOptions(), "reference")
+    assert set(rows.tolist()) == set(samples.at.rows().flatten().tolist())
+
+
+@pytest.mark.parametrize("near", [0.0, 0.9, "per ray"])
+@pytest.mark.parametrize("far", [None, "per ray"])
+def test_near_and_far(near, far):
+    grid = random_grid(0, 0)
+    plain = random_request(grid, 80)
+    span = torch.rand(2, 80, generator=torch.Generator().manual_seed(4))
+    near = 0.5 + span[0] if near == "per ray" else near
+    request = RayRequest(plain.origins, plain.directions, near, None if far is None else 1.0 + 2.0 * span[1])
+    reference = compare(grid, request)
+    assert 0 < int((reference.values["accumulation"] > 0).sum()) <= 80
+
+
+def test_values_at_the_limit_of_exp_have_no_gradient():
+    """Raw density above 15 stays at e^15; in a tiny box such a step is not yet opaque, and sparsity sees it too."""
+    lattice = Lattice((0.0, 0.0, 0.0), 1e-6, (5, 5, 5))
+    grid = random_grid(0, 0, "exp", 1.0, lattice, density=17.0)
+    assert 0.1 < float((grid.density > 15).double().mean()) < 0.95
+    reference = compare(grid, random_request(grid, 60), replace(EVERYTHING, distortion_scale=1e-6))
+    assert float(reference.gradients["density"].norm()) > 0
+    grid.density.data.fill_(20.0)
+    assert float(see("fused", grid, random_request(grid, 60)).gradients["density"].abs().max()) == 0.0
+
+
+def test_weights_next_to_the_smallest_weight_are_seen_by_both_passes_or_by_none():
+    """A weight that single precision rounds across the limit: colour that was never read has no gradient."""
+    lattice = Lattice((0.0, 0.0, 0.0), 1.0, (2, 2, 2))
+    grid = random_grid(0, 0, "relu", 1.0, lattice)
+    grid.density.data.fill_(1e-3)
+    origins = torch.tensor([[-1.0, 0.3, 0.4]])
+    request = RayRequest(origins, torch.tensor([[1.0, 0.0, 0.0]]))
+    samples = sample_rays(as_double(grid), in_double(request), RenderOptions(steps_per_voxel=1.0), "fused")
+    exact = float(samples.weight)
+    rounded = float(torch.tensor(exact, dtype=torch.float32))
+    limit = 0.5 * (exact + rounded)
+    assert exact != rounded
+    options = RenderOptions(steps_per_voxel=1.0, smallest_weight=limit)
+    for _ in range(20):
+        seen = see("fused", grid, request, options)
+        shown = float(seen.values["rgb"].abs().max()) > 0
+        assert (float(seen.gradients["sh"].abs().max()) > 0) is shown
+        assert (float(seen.gradients["temperature"].abs().max()) > 0) is (float(seen.values["thermal"]) > 0)
+
+
+def test_a_second_backward_through_one_render_is_refused():
+    grid = random_grid(0)
+    seen = fused_render(grid, random_request(grid, 20), RenderOptions())
+    loss = seen.accumulation.sum()
+    loss.backward(retain_graph=True)
+    first = grid.density.grad.to_dense().clone()
+    with pytest.raises(RuntimeError, match="a fused render can be differentiated once"):
+        loss.backward()
+    assert torch.equal(grid.density.grad.to_dense(), first)
+
+
+def test_parameters_that_are_not_asked_for_get_no_gradient():
+    grid = random_grid(1)
+    grid.density.requires_grad_(False)
+    seen = fused_render(grid, random_request(grid, 30, mixed=False), RenderOptions())
+    (seen.rgb.sum() + seen.thermal.sum()).backward()
+    assert grid.density.grad is None and grid.sh.grad is not None and grid.temperature.grad is not None
+
+
+def test_no_rays():
+    grid = random_grid(1)
+    nothing = torch.zeros(0, 3)
+    for renderer in ("reference", "fused"):
+        seen = see(renderer, grid, RayRequest(nothing, nothing))
+        assert seen.values["rgb"].shape == (0, 3) and seen.values["depth"].shape == (0,)
+        assert all(float(g.abs().sum()) == 0.0 for g in seen.gradients.values())
+
+
+# What is skipped: blocks without kept voxels.
+
+
+def flat(shape: tuple[int, int, int], *index: tuple[int, int, int]) -> np.ndarray:
+    return np.sort(np.array([np.ravel_multi_index(i, shape) for i in index], dtype=np.int64))
+
+
+SHAPES = [(8, 8, 8), (9, 17, 5), (16, 8, 24), (7, 1, 3), (1, 1, 1), (23, 25, 24)]
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+@pytest.mark.parametrize("pattern", ["all", "none", "first", "last", "one block", "two corners", "few", "checkers"])
+def test_block_skipping(shape, pattern):
+    total, random = int(np.prod(shape)), np.random.default_rng(2)
+    index = np.stack(np.unravel_index(np.arange(total), shape), -1)
+    last = tuple(n - 1 for n in shape)
+    cells = {
+        "all": np.arange(total),
+        "none": np.zeros(0, dtype=np.int64),
+        "first": np.array([0]),
+        "last": np.array([total - 1]),
+        "one block": np.flatnonzero((index // 8 == [n // 16 for n in shape]).all(1)),
+        "two corners": np.unique(flat(shape, (0, 0, 0), last)),
+        "few": np.flatnonzero(random.random(total) < 0.02),
+        "checkers": np.flatnonzero(index.sum(1) % 2 == 0),
+    }[pattern]
+    lattice = Lattice((-0.3, 0.2, -1.0), 0.125, tuple(n + 1 for n in shape))
+    grid = random_grid(0, 0, "softplus", cells, lattice)
+    reference = compare(grid, random_request(grid, 60), EVERYTHING, background=True)
+    if len(cells) == 0:
+        assert bool(torch.isinf(reference.values["depth"]).all())
+        assert bool((reference.values["transmittance"] == 1.0).all())
+
+
+@st.composite
+def cases(draw):
+    """A lattice of any shape, a sparse pattern and rays, some of them along the axes and on faces between voxels."""
+    shape = draw(st.tuples(*[st.integers(1, 20)] * 3))
+    seed = draw(st.integers(0, 2**20))
+    kept = draw(st.sampled_from([0.0, 0.01, 0.1, 0.5, 0.999]))
+    # Voxel sizes and places that binary fractions cannot hold make sums round.
+    size = draw(st.sampled_from([0.25, 0.1, 1 / 3, 7.0]))
+    lattice = Lattice(
+        tuple(draw(st.sampled_from([0.0, -0.7, 3.1])) for _ in range(3)), size, tuple(n + 1 for n in shape)
+    )
+    grid = random_grid(0, 0, "softplus", kept, lattice, seed)
+    rays = random_request(grid, 24, seed)
+    origins, directions = rays.origins.clone(), rays.directions.clone()
+    for ray in range(0, 24, 3):
+        axis = draw(st.integers(0, 2))
+        directions[ray] = torch.zeros(3)
+        directions[ray, axis] = draw(st.sampled_from([1.0, -1.0]))
+        directions[ray, (axis + 1) % 3] = draw(st.sampled_from([0.0, 0.0, 1e-7, -1e-6, 0.1]))
+        face = draw(st.integers(0, shape[(axis + 2) % 3]))
+        origins[ray, (axis + 2) % 3] = lattice.lo[(axis + 2) % 3] + face * size
+    directions = normalize(directions, dim=-1)
+    steps = draw(st.sampled_from([0.3, 1.0, 2.0, 3.7]))
+    return (
+        grid,
+        RayRequest(origins, directions, draw(st.sampled_from([0.0, 1.0]))),
+        RenderOptions(steps_per_voxel=steps),
+    )
+
+
+@given(cases())
+@settings(max_examples=60, deadline=None, derandomize=True, database=None)
+def test_both_backends_list_the_same_samples(case):
+    grid, request, options = case
+    grid, request = as_double(grid), in_double(request)
+    found, expected = (sample_rays(grid, request, options, backend) for backend in ("fused", "reference"))
+    torch.testing.assert_close(found.transmittance, expected.transmittance, rtol=1e-11, atol=0)
+    # Steps so short that only rounding decides whether they exist have no weight.
+    parts = []
+    for samples in (found, expected):
+        real = samples.weight > 1e-13
+        parts.append((samples.ray[real], samples.at.number[real], samples.weight[real], samples.before[real]))
+    (ray, number, weight, before), (ray2, number2, weight2, before2) = parts
+    assert torch.equal(ray, ray2) and torch.equal(number, number2)
+    torch.testing.assert_close(weight, weight2, rtol=1e-9, atol=1e-15)
+    torch.testing.assert_close(before, before2, rtol=1e-9, atol=1e-12)
+
+
+@given(cases())
+@settings(max_examples=40, deadline=None, derandomize=True, database=None)
+def test_any_pattern_has_the_reference_s_values_and_gradients(case):
+    grid, request, options = case
+    compare(grid, request, replace(EVERYTHING, steps_per_voxel=options.steps_per_voxel), background=True)
+
+
+@pytest.mark.parametrize("backend", ["fused", "reference"])
+def test_samples_leave_out_what_no_voxel_keeps(backend):
+    grid = keep_only(random_grid(0, lattice=Lattice((0.0, 0.0, 0.0), 1.0, (25, 3, 3))), flat((24, 2, 2), (20, 1, 0)))
+    grid.density.data.fill_(0.3)
+    request = RayRequest(torch.tensor([[-3.0, 1.5, 0.25]]), torch.tensor([[1.0, 0.0, 0.0]]))
+    samples = sample_rays(grid, request, RenderOptions(), backend)
+    assert samples.at.number.tolist() == [0, 0] and samples.ray.tolist() == [0, 0]
+    torch.testing.assert_close(
+        samples.at.fraction, torch.tensor([[0.25, 0.5, 0.25], [0.75, 0.5, 0.25]]), atol=1e-6, rtol=0
+    )
+    assert float(samples.before[1]) == pytest.approx(float(samples.weight[0]), rel=1e-6)
+    assert float(samples.transmittance) == pytest.approx(1.0 - float(samples.weight.sum()), rel=1e-6)

@@ -1,0 +1,118 @@
+"""The same bits for any number of threads: gradients, updates and a whole training."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from tests.reference.two_renderers import random_grid, random_request
+from tests.short_training import train_with_optimizers
+from thermoxels_ns.data.synthetic import make_scene, write_scene
+from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.optim import RowAdam, RowRMSprop
+from thermoxels_ns.ray_rendering import fused_render, sample_rays
+from thermoxels_ns.render.ray_render import RenderOptions
+from thermoxels_ns.threads import num_threads, set_num_threads
+
+COUNTS = (1, 2, 5)
+
+pytestmark = pytest.mark.usefixtures("restored_threads")
+
+
+def flat(value: Any) -> dict[str, torch.Tensor]:
+    """All tensors in nested dictionaries and lists, by their path."""
+    found = {}
+
+    def walk(node: Any, path: str) -> None:
+        if isinstance(node, torch.Tensor):
+            found[path] = node.detach().clone()
+        elif isinstance(node, dict):
+            for key, child in node.items():
+                walk(child, f"{path}.{key}")
+        elif isinstance(node, list | tuple):
+            for place, child in enumerate(node):
+                walk(child, f"{path}.{place}")
+
+    walk(value, "")
+    return found
+
+
+def assert_same_bits(results: list[dict[str, torch.Tensor]]) -> None:
+    first = results[0]
+    assert first
+    for other in results[1:]:
+        assert other.keys() == first.keys()
+        differing = [name for name, value in first.items() if not torch.equal(value, other[name])]
+        assert differing == []
+
+
+@pytest.mark.parametrize("kept", [1.0, 0.3])
+def test_values_and_gradients(kept):
+    lattice = Lattice.covering((-1, -1, -1), (1, 1, 1), 24)
+    results = []
+    for count in COUNTS:
+        set_num_threads(count)
+        assert num_threads() == count
+        grid = random_grid(2, 1, "exp", kept, lattice, density=0.0)
+        voxels = len(grid.voxels)
+        options = RenderOptions(
+            distortion_scale=2.0,
+            sparsity=True,
+            thermal_moves_density=True,
+            variation={name: (voxels // 3, voxels // 2) for name in grid.row_parameters()},
+        )
+        request = random_request(grid, 1500)
+        seen = fused_render(grid, request, options)
+        pairs = [(name, value) for name, value in vars(seen).items() if isinstance(value, torch.Tensor)]
+        generator = torch.Generator().manual_seed(0)
+        loss = sum(seen.variation.values(), torch.zeros(()))
+        for name, value in pairs:
+            if name != "depth":
+                loss = loss + (torch.rand(value.shape, generator=generator) * value).sum()
+        loss.backward()
+        found = dict(pairs) | {f"variation {name}": value for name, value in seen.variation.items()}
+        for name, parameter in grid.row_parameters().items():
+            found |= {f"{name} rows": parameter.grad._indices(), f"{name} gradient": parameter.grad._values()}
+            assert len(parameter.grad._values()) > 1000
+        samples = sample_rays(grid, request, options, "fused")
+        found |= {"ray": samples.ray, "weight": samples.weight, "number": samples.at.number}
+        results.append(flat(found))
+    assert_same_bits(results)
+
+
+@pytest.mark.parametrize("make", [RowAdam, RowRMSprop])
+def test_updates(make):
+    results = []
+    for count in COUNTS:
+        set_num_threads(count)
+        generator = torch.Generator().manual_seed(0)
+        parameter = torch.nn.Parameter(torch.randn(30_000, 7, generator=generator))
+        optimizer = make([parameter], lr=0.01)
+        for _ in range(3):
+            rows = (torch.rand(30_000, generator=generator) < 0.5).nonzero()[:, 0]
+            values = torch.randn(len(rows), 7, generator=generator)
+            parameter.grad = torch.sparse_coo_tensor(rows[None], values, parameter.shape)
+            optimizer.step()
+        results.append(flat({"value": parameter, "state": dict(optimizer.state[parameter])}))
+    assert_same_bits(results)
+
+
+def test_a_training_that_refines_and_prunes(tmp_path):
+    """What a checkpoint holds, model and optimisers, after steps on both sides of refinement, pruning and thinning."""
+    scene = write_scene(make_scene("sphere"), tmp_path / "scene", 6, 1, width=40, height=30, progress=False)
+    schedule = {"resolutions": [8, 16], "refine_at": [6], "prune_at": [9], "thin_at": [11], "distortion_ramp": [2, 4]}
+    # So few steps form no surface: rays end in a fog, of which pruning and thinning take the thinnest parts.
+    schedule |= {"start_density": 3.0, "prune_threshold": 0.02, "thin_threshold": 0.04, "prune_dilation": 0}
+    results = []
+    for count in COUNTS:
+        torch.set_num_threads(count)
+        pipeline, optimizers = train_with_optimizers(scene, 14, schedule, rays=700, threads=count)
+        assert num_threads() == count
+        grid = pipeline.model.grid
+        assert grid.lattice.cell_shape[0] == 16 and not grid.voxels.all_kept
+        states = {name: optimizer.state_dict()["state"] for name, optimizer in optimizers.optimizers.items()}
+        results.append(flat({"model": dict(pipeline.state_dict()), "optimizers": states}))
+    assert any("optimizers.sh.0.exp_avg" in name for name in results[0])
+    assert_same_bits(results)

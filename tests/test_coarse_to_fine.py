@@ -1,0 +1,148 @@
+"""Pruning by what rays see, on a slab whose answer is known, and what a schedule does to optimisers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes
+
+from thermoxels_ns.coarse_to_fine import prune_by_rays
+from thermoxels_ns.errors import MemoryBudgetError, PruningError
+from thermoxels_ns.model import ThermoxelsModel
+from thermoxels_ns.model_config import ThermoxelsModelConfig
+from thermoxels_ns.optim import RowAdam
+from thermoxels_ns.units import TemperatureRange
+
+
+def model_of(**options) -> ThermoxelsModel:
+    """A slab, solid for x < -0.5 (2 of 8 voxels), with nothing in front of it."""
+    plain = {"resolutions": (8,), "refine_at": (), "prune_at": (), "thin_at": (), "density_activation": "relu"}
+    config = ThermoxelsModelConfig(**{**plain, **options})
+    box = SceneBox(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+    metadata = {"temperature_range": TemperatureRange(10.0, 30.0)}
+    model = config.setup(scene_box=box, num_train_data=4, metadata=metadata)
+    corners = torch.as_tensor(model.grid.lattice.corner_positions(), dtype=torch.float32).reshape(-1, 3)
+    model.grid.density.data = torch.where(corners[:, :1] < -0.49, 500.0, 0.0)
+    return model.train()
+
+
+class Rays:
+    """Stands for the data manager: rays along -x onto the slab."""
+
+    def __init__(self, width: float = 0.97):
+        self.width = width
+
+    def training_rays(self, stream: int, most: int) -> Iterator[RayBundle]:
+        y, z = torch.meshgrid(*[torch.linspace(-self.width, self.width, 30)] * 2, indexing="ij")
+        origins = torch.stack((torch.full_like(y, 3.0), y, z), -1).reshape(-1, 3)
+        for part in origins.split(400):
+            yield RayBundle(part, torch.tensor([-1.0, 0.0, 0.0]).expand_as(part), torch.ones(len(part), 1))
+
+
+@pytest.mark.parametrize("dilation, layers", [(0, [2]), (1, [1, 2, 3]), (2, [0, 1, 2, 3, 4])])
+def test_pruning_keeps_what_rays_see_and_its_neighbours(dilation, layers):
+    model = model_of()
+    old = model.grid.voxels
+    report, change = prune_by_rays(model, Rays(), 0.01, dilation)
+    kept = model.grid.kept
+    assert [x for x in range(8) if bool(kept[x].any())] == layers and bool(kept[layers].all())
+    assert report.kept_voxels == len(model.grid.voxels) == 64 * len(layers) and report.total_voxels == 512
+    assert report.opened == 0.0 and report.threshold == 0.01
+    assert change(torch.arange(old.num_rows)[:, None].float()).shape == (model.grid.voxels.num_rows, 1)
+    assert str(report).startswith(f"kept {64 * len(layers)} of 512 voxels")
+
+
+def fog(model: ThermoxelsModel, density: float) -> None:
+    """Put fog in place of the slab where y > 0: it stops rays, and no voxel has much of it."""
+    y = torch.as_tensor(model.grid.lattice.corner_positions(), dtype=torch.float32)[..., 1].reshape(-1, 1)
+    model.grid.density.data = torch.where(y > 0.01, density, model.grid.density.data)
+
+
+def test_a_threshold_that_would_open_rays_is_lowered():
+    """A ray spends a fifth of its light in its first sample of fog: 0.3 keeps the slab and opens half of the rays."""
+    model = model_of()
+    fog(model, 1.5)
+    report, _ = prune_by_rays(model, Rays(), 0.3, 0)
+    assert report.threshold == pytest.approx(0.3 / 4) and report.opened <= 0.01
+    kept = model.grid.kept
+    assert bool(kept[7, 5:].all()) and not bool(kept[7, :3].any()) and bool(kept[2, :4].all())
+
+
+def test_pruning_that_would_remove_a_part_of_the_scene_fails_and_changes_nothing():
+    """No sample of this fog has more than 1.5 % of a ray, but it stops 60 % of it."""
+    model = model_of(resolutions=(32,))
+    fog(model, 0.48)
+    before = model.grid.density
+    with pytest.raises(
+        PruningError, match=r"open at most 1% of the rays.* got 4\d\.\d% .*--pipeline.model.prune-threshold"
+    ):
+        prune_by_rays(model, Rays(), 0.99, 0)
+    assert model.grid.voxels.all_kept and model.grid.density is before
+
+
+def test_pruning_without_any_weight_fails():
+    model = model_of()
+    model.grid.density.data.zero_()
+    with pytest.raises(PruningError):
+        prune_by_rays(model, Rays(), 0.01, 1)
+    assert model.grid.voxels.all_kept
+
+
+def attributes(model: ThermoxelsModel, steps: int) -> TrainingCallbackAttributes:
+    groups = model.get_param_groups()
+    rows = model.grid.row_parameters()
+    optimizers: Any = SimpleNamespace(
+        optimizers={name: RowAdam(groups[name], lr=0.1) for name in rows}, parameters=dict(groups)
+    )
+    pipeline: Any = SimpleNamespace(datamanager=Rays(), model=model)
+    trainer: Any = SimpleNamespace(_start_step=0, config=SimpleNamespace(max_num_iterations=steps))
+    return TrainingCallbackAttributes(optimizers, None, pipeline, trainer)
+
+
+def test_optimisers_follow_the_schedule():
+    """At each change of the lattice every optimiser holds the new parameters, with state of as many rows."""
+    model = model_of(resolutions=(8, 16), refine_at=(3,), prune_at=(5,), thin_at=(7,), prune_dilation=1)
+    given = attributes(model, 10)
+    callbacks = model.get_training_callbacks(given)
+    sizes = []
+    for step in range(10):
+        for callback in callbacks:
+            callback.run_callback(step)
+        sizes.append(len(model.grid.voxels))
+        for name, parameter in model.grid.row_parameters().items():
+            optimizer = given.optimizers.optimizers[name]
+            assert optimizer.param_groups[0]["params"] == [parameter] == given.optimizers.parameters[name]
+            parameter.grad = torch.zeros_like(parameter)
+            parameter.grad[: 5 + step] = 1e-9
+            optimizer.step()
+            assert set(optimizer.state) == {parameter}
+            assert all(len(values) == len(parameter) for values in optimizer.state[parameter].values())
+    # The slab fills 4 of 16 layers; its front with a neighbour on either side, then what a surface alone needs.
+    assert sizes[:3] == [512] * 3 and sizes[3:5] == [192 * 8] * 2 and sizes[5] == sizes[6] < sizes[4]
+    assert sizes[7] == sizes[9] < sizes[6] and model.step == 9
+
+
+def test_a_refinement_beyond_the_budget_leaves_the_lattice_as_it_is():
+    model = model_of(resolutions=(8, 32), refine_at=(2,), memory_budget_gb=0.001, prune_threshold=0.0)
+    callbacks = model.get_training_callbacks(attributes(model, 4))
+    for step in range(2):
+        for callback in callbacks:
+            callback.run_callback(step)
+    with pytest.raises(MemoryBudgetError, match="32 x 32 x 32"):
+        for callback in callbacks:
+            callback.run_callback(2)
+    assert model.grid.lattice.cell_shape == (8, 8, 8) and model.grid.voxels.all_kept
+
+
+def test_what_lies_behind_the_end_of_the_run_does_not_happen():
+    model = model_of(resolutions=(8, 16), refine_at=(3,), prune_at=(5,))
+    for step in range(3):
+        for callback in model.get_training_callbacks(attributes(model, 3)):
+            callback.run_callback(step)
+    assert model.grid.lattice.cell_shape == (8, 8, 8) and model.grid.voxels.all_kept

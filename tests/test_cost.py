@@ -1,0 +1,369 @@
+"""The command `thermoxels cost` around its runs: what is planned, run, kept, repeated and reported."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import stat
+import sys
+import types
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from thermoxels_ns import cli
+from thermoxels_ns.cost import Cost, planned_settings, run_cost
+from thermoxels_ns.cost_runs import (
+    FIGURES,
+    parse_setting,
+    read_evaluation,
+    read_runs,
+    scene_fingerprint,
+    training_options,
+    training_seconds,
+)
+from thermoxels_ns.errors import SceneError, ThermoxelsError
+
+PYTHON = sys.executable
+# A training takes `steps` / 100 seconds by its files' times; the evaluation improves with the steps.
+NS_TRAIN = """
+folder = value("--output-dir"), value("--experiment-name"), sys.argv[1], value("--timestamp")
+run = pathlib.Path(*folder)
+(run / "nerfstudio_models").mkdir(parents=True)
+steps = int(value("--max-num-iterations", {"draft": 50, "standard": 200}.get(value("--quality"), 0)))
+(run / "config.yml").write_text(json.dumps({"steps": steps, "method": sys.argv[1], "words": sys.argv[1:]}))
+start, end = run / "dataparser_transforms.json", run / "nerfstudio_models" / "step-000000001.ckpt"
+for path, when in ((start, 1000.0), (end, 1000.0 + steps / 100)):
+    path.write_text("")
+    os.utime(path, (when, when))
+"""
+NS_EVAL = """
+run = json.loads(pathlib.Path(value("--load-config")).read_text())
+results = {"thermal_mae_c": 80 / run["steps"], "half_transparent": 0.02, "thermal_mae_c_std": 1.0}
+if run["method"] == "thermoxels":
+    results |= {"psnr": 20 + run["steps"] / 20, "ssim": 0.9}
+results |= {name: 0.9 for name in ("fscore", "precision", "recall", "fscore_128")}
+pathlib.Path(value("--output-path")).write_text(json.dumps({"results": results}))
+"""
+PRELUDE = """
+import json, os, pathlib, sys
+def value(option, default=None):
+    return sys.argv[sys.argv.index(option) + 1] if option in sys.argv else default
+with open(pathlib.Path(__file__).parent / "calls", "a") as calls:
+    print(*[pathlib.Path(sys.argv[0]).name, *sys.argv[1:]], file=calls)
+"""
+
+
+def schedule_for(resolution: int, steps: int):
+    """Stands for the package's: easy to read back."""
+    return types.SimpleNamespace(
+        resolutions=(resolution // 2, resolution),
+        refine_at=(steps // 2,),
+        prune_at=(),
+        distortion_ramp=(steps // 4, steps // 2),
+        steps=steps,
+    )
+
+
+@pytest.fixture(autouse=True)
+def fake_schedule(monkeypatch):
+    module = types.SimpleNamespace(schedule_for=schedule_for)
+    monkeypatch.setitem(sys.modules, "thermoxels_ns.schedule", module)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def commands(tmp_path, monkeypatch):
+    """Fake ns-train and ns-eval; gives a function that replaces one, and one that lists what was called."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    monkeypatch.setattr("thermoxels_ns.cost_process.sys.executable", str(folder / "python"))
+
+    def write(name: str, body: str) -> None:
+        path = folder / name
+        path.write_text(f"#!{PYTHON} -S\n{PRELUDE}\n{body}\n")
+        path.chmod(path.stat().st_mode | stat.S_IXUSR)
+
+    def calls() -> list[list[str]]:
+        path = folder / "calls"
+        lines = path.read_text().splitlines() if path.is_file() else []
+        path.unlink(missing_ok=True)
+        return [line.split() for line in lines]
+
+    write("ns-train", NS_TRAIN)
+    write("ns-eval", NS_EVAL)
+    return types.SimpleNamespace(write=write, calls=calls)
+
+
+@pytest.fixture
+def scene(tmp_path) -> Path:
+    folder = tmp_path / "scene [1]"
+    folder.mkdir()
+    (folder / "transforms.json").write_text("{}")
+    return folder
+
+
+@pytest.fixture
+def start(scene, tmp_path, commands):
+    """Gives a function that runs the command and returns what it printed."""
+
+    def run(**options) -> str:
+        console = Console(file=io.StringIO(), width=200)
+        defaults = {"settings": ("32:100", "64:400"), "qualities": (), "warm_up": False}
+        run_cost(Cost(scene, tmp_path / "cost", **(defaults | options)), console)
+        assert isinstance(console.file, io.StringIO)
+        return console.file.getvalue()
+
+    return run
+
+
+def table(folder: Path) -> dict[str, dict[str, str]]:
+    with (folder / "cost.csv").open(newline="") as file:
+        return {row["setting"]: row for row in csv.DictReader(file)}
+
+
+def test_a_setting_becomes_the_options_of_its_schedule():
+    assert parse_setting("64:800") == (64, 800)
+    words = training_options(64, 800)
+    text = " ".join(words)
+    assert text.startswith("--max-num-iterations 800 --optimizers.density.scheduler.max-steps 800 ")
+    assert "--pipeline.model.resolutions 32 64 --pipeline.model.refine-at 400 --pipeline.model.prune-at " in text
+    assert text.endswith("--pipeline.model.distortion-ramp 200 400")
+    assert all(" " not in word for word in words)
+
+
+@pytest.mark.parametrize("text", ["64", "64:", ":800", "0:800", "64:0", "-64:800", "64:8e2", "64:800:2", " 64:800", ""])
+def test_what_is_no_setting_is_refused(text):
+    with pytest.raises(ThermoxelsError, match=r"settings: expected voxels and steps, such as 64:800"):
+        parse_setting(text)
+
+
+def test_the_rows_of_settings_qualities_methods_and_recipes():
+    cost = Cost(
+        Path("s"),
+        settings=("32:100",),
+        qualities=("draft", "standard"),
+        methods=("thermoxels", "plenoxels-t"),
+        recipes=("default", "paper"),
+        train_options="--pipeline.model.seed 7",
+    )
+    rows, baseline = planned_settings(cost)
+    assert baseline == "standard"
+    assert {row.name: row.training for row in rows[1:]} == {
+        "draft": "ns-train thermoxels --quality draft --pipeline.model.seed 7",
+        "standard": "ns-train thermoxels --quality standard --pipeline.model.seed 7",
+        "standard, plenoxels-t": "ns-train plenoxels-t --quality standard --pipeline.model.seed 7",
+        "standard, recipe paper": (
+            "ns-train thermoxels --quality standard --pipeline.model.recipe paper --pipeline.model.seed 7"
+        ),
+    }
+    assert rows[0].training.startswith("ns-train thermoxels --max-num-iterations 100 ")
+    assert [row.beside for row in rows] == [False, False, False, True, True]
+    assert len({row.file_name for row in rows}) == len(rows)
+
+
+def test_other_methods_and_recipes_are_trained_at_the_baseline():
+    cost = Cost(Path("s"), settings=("32:100", "64:400"), qualities=(), recipes=("paper", "default"), baseline="32:100")
+    rows, baseline = planned_settings(cost)
+    assert (baseline, rows[-1].name) == ("32:100", "32:100, recipe default")
+    assert rows[-1].options == tuple(training_options(32, 100))
+    assert rows[0].options == (*rows[-1].options, "--pipeline.model.recipe", "paper")
+    assert planned_settings(Cost(Path("s"), settings=("32:100", "64:400"), qualities=()))[1] == "64:400"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"settings": (), "qualities": ()}, "expected a setting or a quality"),
+        ({"baseline": "best"}, r"baseline: expected one of 32:100, 64:400, got best"),
+        ({"methods": ()}, "methods: expected at least one"),
+        ({"recipes": ()}, "recipes: expected at least one"),
+        ({"train_options": "'"}, "train_options: expected words as in a shell"),
+        ({"repeats": 0}, "repeats: expected 1 or more, got 0"),
+        ({"target_mae": 0.0}, "target_mae: expected a finite number above 0"),
+        ({"target_psnr": math.nan}, "target_psnr: expected a finite number above 0"),
+    ],
+)
+def test_options_that_cannot_work_are_refused_before_anything_runs(start, commands, options, message):
+    with pytest.raises(ThermoxelsError, match=message):
+        start(**options)
+    assert commands.calls() == []
+
+
+def test_a_scene_that_is_not_there_is_named(tmp_path, commands):
+    with pytest.raises(SceneError, match="scene: expected a scene folder, got none at"):
+        run_cost(Cost(tmp_path / "nowhere", tmp_path / "cost", qualities=()), Console(file=io.StringIO()))
+
+
+def test_figures_of_the_runs_reach_all_files(start, scene, tmp_path):
+    shown = start(methods=("thermoxels", "plenoxels-t"), target_mae=0.5, target_psnr=30.0)
+    folder = tmp_path / "cost"
+    rows = table(folder)
+    assert list(rows) == ["32:100", "64:400", "64:400, plenoxels-t"]
+    small, large, other = rows.values()
+    assert (float(small["training_seconds"]), float(large["training_seconds"])) == (1.0, 4.0)
+    assert (float(small["psnr"]), float(large["psnr"]), other["psnr"]) == (25.0, 40.0, "")
+    assert (small["thermal_mae_c"], small["fscore"], small["half_transparent"]) == ("0.8", "0.9", "0.02")
+    assert float(small["seconds"]) > 0
+    assert float(large["time_ratio"]) == 1.0 and large["baseline"] == "64:400"
+    assert float(small["time_ratio"]) == pytest.approx(float(small["seconds"]) / float(large["seconds"]), rel=1e-4)
+    page = (folder / "cost.md").read_text()
+    assert page.startswith("| setting | training | ns-train | time / 64:400 | RGB PSNR | thermal MAE |")
+    assert "scene [1]: one run each" in page
+    verdict = "Cheapest setting with a thermal MAE of at most 0.5 °C and an RGB PSNR of at least 30 dB: 64:400 "
+    assert verdict in page and verdict in shown
+    assert "| 32:100 | 1 s |" in shown
+    assert (folder / "cost.png").stat().st_size > 10_000
+    assert not any((folder / "models").iterdir())
+    assert {path.name for path in (folder / "logs").iterdir()} >= {"32-100-1-train.log", "32-100-1-eval.log"}
+
+
+def test_that_no_setting_will_do_is_said_and_no_error(start):
+    assert "No measured setting has a thermal MAE of at most 0.01 °C. The best: MAE 0.20" in start(target_mae=0.01)
+
+
+def test_the_real_commands_get_what_they_need(start, scene, tmp_path, commands):
+    start(settings=("64:400",), train_options="thermal-data --downscale-factor 2")
+    train, evaluate = commands.calls()
+    text = " ".join(train)
+    assert text.startswith(f"ns-train thermoxels --data {scene} --output-dir {tmp_path / 'cost' / 'models'} ")
+    assert " ".join(training_options(64, 400)) in text
+    assert text.endswith("thermal-data --downscale-factor 2")
+    config = tmp_path / "cost" / "models" / "64-400-1" / "thermoxels" / "run" / "config.yml"
+    assert " ".join(evaluate).startswith(f"ns-eval --load-config {config} --output-path ")
+
+
+def test_finished_runs_are_not_run_again(start, commands, tmp_path):
+    start()
+    before = (tmp_path / "cost" / "runs.csv").read_text()
+    assert len(commands.calls()) == 4
+    shown = start()
+    assert commands.calls() == []
+    assert (tmp_path / "cost" / "runs.csv").read_text() == before
+    assert "2 of 2 runs are in" in shown and "| 64:400 |" in shown
+    start(settings=("32:100", "48:200"))
+    assert [call[0] for call in commands.calls()] == ["ns-train", "ns-eval"]
+    assert list(table(tmp_path / "cost")) == ["32:100", "48:200"]
+    assert [run.setting for run in read_runs(tmp_path / "cost" / "runs.csv")] == ["32:100", "64:400", "48:200"]
+    start(again=True)
+    assert len(commands.calls()) == 4
+    assert sorted(run.setting for run in read_runs(tmp_path / "cost" / "runs.csv")) == ["32:100", "48:200", "64:400"]
+
+
+@pytest.mark.parametrize("change", ["scene", "options"])
+def test_runs_of_another_scene_or_with_other_options_do_not_count(start, commands, scene, change):
+    start(settings=("32:100",))
+    commands.calls()
+    if change == "scene":
+        (scene / "transforms.json").write_text("[]")
+    start(settings=("32:100",), train_options="--pipeline.model.seed 1" if change == "options" else "")
+    assert len(commands.calls()) == 2
+
+
+def test_an_interrupted_start_goes_on_where_it_stopped(start, commands, tmp_path):
+    commands.write("ns-eval", NS_EVAL.replace("results =", "assert run['steps'] < 400\nresults =", 1))
+    with pytest.raises(ThermoxelsError, match=r"(?s)1 that did not.*64:400: ns-eval: expected exit status 0.*Assert"):
+        start()
+    # What was measured is reported all the same.
+    assert list(table(tmp_path / "cost")) == ["32:100"]
+    commands.calls()
+    commands.write("ns-eval", NS_EVAL)
+    start()
+    assert [call[0] for call in commands.calls()] == ["ns-train", "ns-eval"]
+    assert list(table(tmp_path / "cost")) == ["32:100", "64:400"]
+
+
+def test_a_failed_training_does_not_stop_the_others(start, commands, tmp_path):
+    commands.write("ns-train", NS_TRAIN.replace("start, end", "assert steps != 100\nstart, end", 1))
+    with pytest.raises(ThermoxelsError, match="32:100: ns-train: expected exit status 0, got 1"):
+        start()
+    assert list(table(tmp_path / "cost")) == ["64:400"]
+    assert not any((tmp_path / "cost" / "models").iterdir())
+
+
+def test_repeats_are_run_in_turns_and_their_medians_shown(start, commands, tmp_path):
+    shown = start(repeats=3)
+    steps = [call[call.index("--max-num-iterations") + 1] for call in commands.calls() if call[0] == "ns-train"]
+    assert steps == ["100", "400"] * 3
+    seconds = [r.figures["seconds"] for r in read_runs(tmp_path / "cost" / "runs.csv") if r.setting == "32:100"]
+    row = table(tmp_path / "cost")["32:100"]
+    assert row["repeats"] == "3"
+    assert float(row["seconds"]) == pytest.approx(sorted(seconds)[1], rel=1e-5)
+    assert "medians of 3 runs" in shown
+
+
+def test_the_warm_up_is_the_quickest_setting_and_does_not_count(start, commands, tmp_path):
+    start(settings=("64:400", "32:100"), qualities=("draft",), warm_up=True)
+    trained = [call for call in commands.calls() if call[0] == "ns-train"]
+    assert len(trained) == 4
+    assert trained[0][trained[0].index("--max-num-iterations") + 1] == "100"
+    assert len(read_runs(tmp_path / "cost" / "runs.csv")) == 3
+    assert not any((tmp_path / "cost" / "models").iterdir())
+    start(settings=("64:400", "32:100"), qualities=("draft",), warm_up=True)
+    assert commands.calls() == []
+
+
+def test_models_are_kept_on_request(start, tmp_path):
+    start(settings=("32:100",), keep_models=True)
+    assert (tmp_path / "cost" / "models" / "32-100-1" / "thermoxels" / "run" / "config.yml").is_file()
+
+
+def test_a_damaged_list_of_runs_is_named(start, tmp_path):
+    start(settings=("32:100",))
+    path = tmp_path / "cost" / "runs.csv"
+    for content in ("setting,repeat\n32:100,1\n", path.read_text().replace(",0.9,", ",much,"), "\0"):
+        path.write_text(content)
+        with pytest.raises(ThermoxelsError, match=r"runs\.csv: expected the finished runs of an earlier start"):
+            start(settings=("32:100",))
+
+
+def test_runs_survive_the_file_exactly(start, tmp_path):
+    start(methods=("thermoxels", "plenoxels-t"))
+    runs = read_runs(tmp_path / "cost" / "runs.csv")
+    assert [run.setting for run in runs] == ["32:100", "64:400", "64:400, plenoxels-t"]
+    assert set(runs[0].figures) == set(FIGURES)
+    assert math.isnan(runs[-1].figures["psnr"]) and math.isnan(runs[0].figures["surface_distance_m"])
+    assert runs[0].figures["thermal_mae_c"] == 80 / 100
+
+
+def test_a_fingerprint_changes_with_files_and_json(scene):
+    seen = {scene_fingerprint(scene)}
+    (scene / "images").mkdir()
+    (scene / "images" / "a.png").write_bytes(b"1234")
+    seen.add(scene_fingerprint(scene))
+    (scene / "images" / "a.png").write_bytes(b"12345")
+    seen.add(scene_fingerprint(scene))
+    (scene / "transforms.json").write_text("[]")  # as long as before
+    seen.add(scene_fingerprint(scene))
+    assert len(seen) == 4
+    assert scene_fingerprint(scene) in seen
+
+
+def test_runs_without_results_are_named(tmp_path):
+    with pytest.raises(ThermoxelsError, match=r"expected dataparser_transforms\.json and a checkpoint"):
+        training_seconds(tmp_path)
+    with pytest.raises(ThermoxelsError, match="expected the results of ns-eval"):
+        read_evaluation(tmp_path / "none.json")
+    (tmp_path / "eval.json").write_text(json.dumps({"results": [1]}))
+    with pytest.raises(ThermoxelsError, match="expected the results of ns-eval"):
+        read_evaluation(tmp_path / "eval.json")
+
+
+def test_the_command_line(commands, scene, tmp_path, capsys):
+    words = ["cost", str(scene), "--output-dir", str(tmp_path / "c"), "--settings", "32:100", "--qualities"]
+    words += ["--warm-up", "False", "--train-options=--pipeline.model.seed 3", "--target-psnr", "24"]
+    assert cli.main(words) == 0
+    assert "an RGB PSNR of at least 24 dB: 32:100" in " ".join(capsys.readouterr().out.split())
+    assert commands.calls()[0][-2:] == ["--pipeline.model.seed", "3"]
+    assert cli.main([*words[:5], "32"]) == 1
+    assert "Error: settings: expected voxels and steps" in capsys.readouterr().err
+
+
+def test_the_help_explains_the_options(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["cost", "--help"])
+    assert stop.value.code == 0
+    words = " ".join(capsys.readouterr().out.split())
+    assert all(option in words for option in ("--settings", "--qualities", "--target-mae", "--recipes", "--baseline"))

@@ -1,0 +1,159 @@
+"""Medians, ratios, the Pareto front, the cheapest setting, and the files of a report."""
+
+from __future__ import annotations
+
+import csv
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from thermoxels_ns.cost_report import (
+    CostRow,
+    Targets,
+    cheapest,
+    draw_plot,
+    markdown_table,
+    median_rows,
+    pareto_front,
+    verdict,
+    write_csv,
+)
+from thermoxels_ns.cost_runs import FIGURES, CostRun, CostSetting
+
+NAN = math.nan
+NOTHING = dict.fromkeys(FIGURES, NAN)
+
+
+def setting(name: str, method: str = "thermoxels") -> CostSetting:
+    return CostSetting(name, method, ("--quality", name))
+
+
+def run(name: str, repeat: int = 1, **figures: float) -> CostRun:
+    return CostRun(name, repeat, "scene", "1", "ns-train", {**NOTHING, **figures})
+
+
+def rows(**by_name: tuple[float, float, float]) -> list[CostRow]:
+    """Rows of (seconds, psnr, thermal MAE)."""
+    names = list(by_name)
+    runs = [run(n, seconds=s, psnr=p, thermal_mae_c=m) for n, (s, p, m) in by_name.items()]
+    return median_rows([setting(n) for n in names], runs, names[-1])
+
+
+def test_the_front_of_points_that_can_be_checked_by_hand():
+    seconds = [10, 20, 20, 30, 40, 50]
+    psnr = [20, 25, 24, 25, 26, NAN]
+    # 24 dB at 20 s is beaten at the same time, 25 dB at 30 s by the same at 20 s.
+    assert pareto_front(seconds, psnr, True) == [True, True, False, False, True, False]
+    assert pareto_front([1, 2], [1.0, 0.5], False) == [True, True]
+    assert pareto_front([1, 2], [0.5, 1.0], False) == [True, False]
+    assert pareto_front([], [], True) == []
+
+
+def test_equal_points_are_both_on_the_front():
+    assert pareto_front([1, 1, 2], [5, 5, 5], True) == [True, True, False]
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), min_size=1, max_size=12), st.booleans())
+def test_every_point_off_the_front_is_beaten_by_one_on_it_and_none_on_it_is_beaten(points, higher):
+    front = pareto_front([c for c, _ in points], [v for _, v in points], higher)
+
+    def beats(a, b):
+        better = a[1] >= b[1] if higher else a[1] <= b[1]
+        return a[0] <= b[0] and better and a != b
+
+    for point, on in zip(points, front):
+        beaten = [other for other, other_on in zip(points, front) if other_on and beats(other, point)]
+        assert bool(beaten) != on
+
+
+def test_medians_and_ratios():
+    runs = [run("a", n, seconds=s, psnr=p) for n, (s, p) in enumerate([(10, 20.0), (90, NAN), (12, 22.0)], 1)]
+    runs += [run("b", seconds=6.0, psnr=19.0), run("not planned", seconds=1.0, psnr=99.0)]
+    a, b = median_rows([setting("a"), setting("b"), setting("never ran")], runs, "b")
+    assert (a.repeats, a.figures["seconds"], a.figures["psnr"], a.time_ratio) == (3, 12, 21.0, 2.0)
+    assert (b.repeats, b.time_ratio) == (1, 1.0)
+    assert math.isnan(a.figures["thermal_mae_c"])
+    assert a.fronts == b.fronts == {"psnr"}
+
+
+def test_without_a_run_of_the_baseline_there_are_no_ratios():
+    (a,) = median_rows([setting("a"), setting("b")], [run("a", seconds=5.0)], "b")
+    assert math.isnan(a.time_ratio)
+    assert "| a | 5 s | - |" in markdown_table([a], "b")
+
+
+def test_the_cheapest_setting_keeps_all_targets():
+    measured = rows(draft=(10, 25.0, 0.9), standard=(30, 31.0, 0.35), fine=(60, 33.0, 0.30), odd=(20, 20.0, 0.32))
+
+    def name(**targets):
+        best = cheapest(measured, Targets(**targets))
+        return best and best.setting.name
+
+    assert name(thermal_mae_c=0.4) == "odd"
+    assert name(psnr=25.0) == "draft"  # a bound is kept where it is reached
+    assert name(thermal_mae_c=0.4, psnr=30.0) == "standard"
+    assert name(thermal_mae_c=0.3, psnr=33.0) == "fine"
+    assert name(thermal_mae_c=0.1) is None
+    assert name(psnr=33.01) is None
+
+
+def test_a_setting_without_the_figure_keeps_no_target():
+    measured = rows(colourless=(1, NAN, 0.1), standard=(30, 31.0, 0.35))
+    best = cheapest(measured, Targets(psnr=20.0))
+    assert best is not None and best.setting.name == "standard"
+
+
+def test_the_verdict_names_the_setting_and_how_to_train_it():
+    measured = rows(draft=(10, 25.0, 0.9), standard=(30, 31.0, 0.35))
+    words = verdict(measured, Targets(0.4, 30.0), "my scene")
+    assert words.startswith(
+        "Cheapest setting with a thermal MAE of at most 0.4 °C and an RGB PSNR of at least 30 dB: standard (30 s, 0.35"
+    )
+    assert words.endswith("ns-train thermoxels --data 'my scene' --quality standard")
+
+
+def test_the_verdict_says_plainly_that_none_will_do():
+    measured = rows(draft=(10, 25.0, 0.9), standard=(30, 31.0, 0.35))
+    words = verdict(measured, Targets(psnr=40.0), "s")
+    assert words.startswith("No measured setting has an RGB PSNR of at least 40 dB.")
+    assert "MAE 0.35 °C (standard)" in words and "PSNR 31.0 dB (standard)" in words
+    assert "--settings" in words
+
+
+def test_the_table_has_only_columns_with_figures_and_marks_the_front():
+    measured = rows(draft=(10, 25.0, 0.9), slow=(90, 24.0, 0.8), standard=(30, 31.0, 0.35))
+    lines = markdown_table(measured, "standard").splitlines()
+    assert lines[0] == "| setting | ns-train | time / standard | RGB PSNR | thermal MAE | Pareto front |"
+    assert lines[2] == "| draft | 10 s | 0.33 | 25.0 dB | 0.90 °C | MAE, PSNR |"
+    assert lines[3] == "| slow | 90 s | 3.00 | 24.0 dB | 0.80 °C |  |"
+    assert len({line.count("|") for line in lines}) == 1
+
+
+def test_the_csv_has_every_figure(tmp_path):
+    measured = rows(draft=(10, 25.0, 0.9), standard=(30, 31.0, 0.35))
+    write_csv(tmp_path / "cost.csv", measured, "standard")
+    with (tmp_path / "cost.csv").open(newline="") as file:
+        draft, standard = csv.DictReader(file)
+    assert set(FIGURES) < set(draft)
+    assert (draft["setting"], draft["seconds"], draft["fscore"], draft["baseline"]) == ("draft", "10", "", "standard")
+    assert float(draft["time_ratio"]) == pytest.approx(1 / 3, rel=1e-4)
+    assert (standard["front_psnr"], standard["training"]) == ("1", "ns-train thermoxels --quality standard")
+
+
+@pytest.mark.parametrize("known_truth", [True, False])
+def test_the_plot_has_a_panel_for_every_figure_there_is(tmp_path, known_truth):
+    runs = [
+        run(n, seconds=s, psnr=p, thermal_mae_c=m, peak_memory_gb=1.0, fscore_128=0.9 if known_truth else NAN)
+        for n, s, p, m in [("draft", 10, 25.0, 0.9), ("standard", 30, 31.0, 0.35), ("odd", 20, NAN, 0.5)]
+    ]
+    measured = median_rows([setting(n) for n in ("draft", "standard", "odd")], runs, "standard")
+    draw_plot(tmp_path / "cost.png", measured, Targets(0.4, None), "a scene")
+    with Image.open(tmp_path / "cost.png") as picture:
+        assert picture.width > 1000 and picture.height > 1000
+        right_end = picture.width // 2 + picture.width // 10
+        corner = picture.convert("L").crop((right_end, picture.height // 2 + 60, picture.width, picture.height))
+        drawn = corner.getextrema()[0] < 128
+    assert drawn == known_truth  # without an F-score there are three panels

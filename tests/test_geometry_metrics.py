@@ -1,0 +1,157 @@
+"""Figures of geometry: the exact scene scores as it must, and ns-eval gets them from the right surface."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.short_training import train
+from thermoxels_ns.data.synthetic import make_scene, write_scene
+from thermoxels_ns.geometry_metrics import geometry_metrics, half_transparent_share
+from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.snapshot import GridSnapshot
+from thermoxels_ns.truth_comparison import KnownTruth, compare_with_truth
+
+IDENTITY = np.eye(4)
+SCORES = ("fscore", "precision", "recall")
+
+
+def exact_snapshot(truth: KnownTruth, resolution: int, world_to_input: np.ndarray = IDENTITY) -> GridSnapshot:
+    """The exact scene on a lattice in the trained world: opaque where it is solid."""
+    input_to_world = np.linalg.inv(world_to_input)
+    lo, hi = (np.asarray(end) for end in truth.scene.scene_box)
+    ends = np.array([[(lo, hi)[bit][axis] for axis, bit in enumerate(bits)] for bits in np.ndindex(2, 2, 2)])
+    ends = ends @ input_to_world[:3, :3].T + input_to_world[:3, 3]
+    lattice = Lattice.covering(ends.min(axis=0), ends.max(axis=0), resolution)
+    centres = lattice.cell_centres().reshape(-1, 3) @ world_to_input[:3, :3].T + world_to_input[:3, 3]
+    solid = truth.scene.contains(centres).reshape(lattice.cell_shape)
+    corner = np.zeros(lattice.shape, dtype=np.float32)
+    return GridSnapshot(lattice, corner, corner, corner, (solid * 2.0 / lattice.voxel_size).astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def sphere() -> KnownTruth:
+    scene = make_scene("sphere")
+    return KnownTruth(scene, scene.poses(12, 0)[0], scene.camera(64, 48))
+
+
+def test_the_exact_scene_scores_full(sphere):
+    result = geometry_metrics(exact_snapshot(sphere, 32), IDENTITY, sphere)
+    assert result["precision"] == 1.0 and result["fscore"] > 0.99
+    assert 0.0 < result["surface_distance_voxels"] < 0.5
+
+
+def test_the_figures_are_those_of_the_export(sphere):
+    snapshot = exact_snapshot(sphere, 24)
+    result = geometry_metrics(snapshot, IDENTITY, sphere)
+    assert snapshot.voxel_density is not None
+    exported = compare_with_truth(snapshot.voxel_density > 0, snapshot.lattice, IDENTITY, sphere)
+    assert exported is not None
+    assert {name: result[name] for name in SCORES} == {name: exported[name] for name in SCORES}
+    assert result["surface_distance_voxels"] == pytest.approx(exported["mean_distance_voxels"])
+    assert result["surface_distance_m"] == pytest.approx(exported["mean_distance_m"])
+
+
+def test_only_what_the_default_selection_takes_counts(sphere):
+    """Fog and a floater change nothing: the largest body of voxels with an optical depth of one half is the surface."""
+    snapshot = exact_snapshot(sphere, 32)
+    assert snapshot.voxel_density is not None
+    plain = geometry_metrics(snapshot, IDENTITY, sphere)
+    density = snapshot.voxel_density.copy()
+    density[density == 0] = 0.49 / snapshot.lattice.voxel_size
+    density[:2, :2, :2] = 5.0 / snapshot.lattice.voxel_size
+    assert geometry_metrics(replace(snapshot, voxel_density=density), IDENTITY, sphere) == plain
+    density[density < 0.5 / snapshot.lattice.voxel_size] = 0.51 / snapshot.lattice.voxel_size
+    assert geometry_metrics(replace(snapshot, voxel_density=density), IDENTITY, sphere)["fscore"] < 0.5
+
+
+def test_coarse_lattices_are_judged_by_the_common_voxel(sphere):
+    """At 128 voxels both scores are one; a coarse lattice that agrees within its own voxels does not in finer ones."""
+    shift = IDENTITY.copy()
+    fine = exact_snapshot(sphere, 128)
+    at_128 = geometry_metrics(fine, shift, sphere)
+    assert at_128["fscore_128"] == at_128["fscore"]
+    shift[0, 3] = 1.0 * exact_snapshot(sphere, 16).lattice.voxel_size
+    coarse = geometry_metrics(exact_snapshot(sphere, 16), shift, sphere)
+    assert coarse["fscore"] > 0.95
+    assert coarse["fscore_128"] < 0.5
+
+
+def test_nothing_solid_scores_nothing_and_says_why(sphere):
+    snapshot = exact_snapshot(sphere, 16)
+    assert snapshot.voxel_density is not None
+    said: list[str] = []
+    result = geometry_metrics(
+        replace(snapshot, voxel_density=snapshot.voxel_density * 0), IDENTITY, sphere, said.append
+    )
+    assert result == dict.fromkeys((*SCORES, "fscore_128"), 0.0)
+    assert said[0].startswith("The geometry scores 0: solid voxels: expected at least one voxel")
+
+
+def test_photographs_have_no_figures_and_a_damaged_truth_is_told(sphere, tmp_path):
+    snapshot = exact_snapshot(sphere, 16)
+    said: list[str] = []
+    assert geometry_metrics(snapshot, IDENTITY, tmp_path, said.append) == {}
+    assert said == []
+    (tmp_path / "transforms.json").write_text("{")
+    assert geometry_metrics(snapshot, IDENTITY, tmp_path, said.append) == {}
+    assert said[0].startswith("Geometry is not compared with the truth: ")
+
+
+def test_half_transparent_rays_lie_strictly_between():
+    accumulation = torch.tensor([[0.0, 0.0999], [0.1001, 0.5], [0.8999, 0.9001], [1.0, 0.95]])[..., None]
+    assert half_transparent_share(accumulation) == 3 / 8
+    assert half_transparent_share(torch.tensor([0.0, 1.0])) == 0.0
+    assert half_transparent_share(torch.tensor([0.5])) == 1.0
+
+
+@pytest.fixture(scope="module")
+def pipeline(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene") / "hot"
+    write_scene(make_scene("hot-object"), folder, 8, 2, width=24, height=18, progress=False)
+    return train(folder, steps=0)
+
+
+def test_evaluation_has_the_share_of_half_transparent_rays(pipeline):
+    """Taken from the rendered images; training's own evaluation does without the geometry."""
+    shares = []
+    with torch.no_grad():
+        for camera, _ in pipeline.datamanager.fixed_indices_eval_dataloader:
+            accumulation = pipeline.model.get_outputs_for_camera(camera)["accumulation"]
+            shares.append(float(((accumulation > 0.1) & (accumulation < 0.9)).float().mean()))
+    averages = pipeline.get_average_eval_image_metrics()
+    assert averages["half_transparent"] == pytest.approx(sum(shares) / len(shares), abs=1e-6)
+    assert 0.0 < averages["half_transparent"] <= 1.0  # the start is fog
+    assert "fscore" not in averages
+
+
+def test_ns_eval_compares_the_trained_density_with_the_scene(pipeline, monkeypatch):
+    """A field that holds the exact scene, in the trained world's own coordinates, scores full."""
+    from thermoxels_ns.export import input_from_world
+    from thermoxels_ns.truth_comparison import load_known_truth
+
+    outputs = pipeline.datamanager.train_dataparser_outputs
+    world_to_input = input_from_world(outputs.dataparser_transform.numpy(), float(outputs.dataparser_scale))
+    assert not np.allclose(world_to_input, IDENTITY)
+    known = load_known_truth(pipeline.datamanager.get_datapath())
+    assert known is not None
+    exact = exact_snapshot(known, 48, world_to_input)
+    asked = []
+    monkeypatch.setattr(pipeline.model, "grid_snapshot", lambda rays: asked.append(list(rays)) or exact)
+    monkeypatch.setattr(pipeline, "test_mode", "test")
+    averages = pipeline.get_average_eval_image_metrics(get_std=True)
+    assert averages["precision"] > 0.99 and averages["recall"] > 0.95
+    assert averages["surface_distance_voxels"] < 0.6
+    assert "fscore_std" not in averages and "half_transparent_std" in averages
+    assert asked == [[]]  # density needs no rays
+
+
+def test_ns_eval_takes_the_density_that_the_model_has(pipeline, monkeypatch):
+    said = []
+    monkeypatch.setattr("thermoxels_ns.pipeline.CONSOLE.print", said.append)
+    result = pipeline.geometry_metrics()
+    assert result["fscore"] == 0.0  # nothing is solid at the start
+    assert "The geometry scores 0" in said[0]

@@ -1,0 +1,297 @@
+"""Optimisers that touch only rows with a gradient: torch's own where all rows are touched, nothing where none is."""
+
+from __future__ import annotations
+
+import copy
+import io
+
+import numpy as np
+import pytest
+import torch
+
+from thermoxels_ns.field.refine import prune, refine
+from thermoxels_ns.field.voxel_grid import VoxelGrid
+from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.optim import RowAdam, RowAdamConfig, RowOptimizer, RowRMSprop, RowRMSpropConfig, touched_rows
+
+ROWS, CHANNELS = 50, 6
+KINDS = {"adam": RowAdam, "rmsprop": RowRMSprop}
+
+
+def gradient(seed: int, share: float = 1.0, rows: int = ROWS, dtype=torch.float32) -> torch.Tensor:
+    """A row-sparse gradient that touches about `share` of the rows."""
+    generator = torch.Generator().manual_seed(seed)
+    chosen = (torch.rand(rows, generator=generator) < share).nonzero()[:, 0]
+    values = torch.randn(len(chosen), CHANNELS, generator=generator, dtype=torch.float64).to(dtype)
+    return torch.sparse_coo_tensor(chosen[None], values, (rows, CHANNELS), is_coalesced=True, check_invariants=True)
+
+
+def parameter(seed: int = 0, dtype=torch.float32) -> torch.nn.Parameter:
+    values = torch.randn(ROWS, CHANNELS, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return torch.nn.Parameter(values.to(dtype))
+
+
+def step(optimizer: torch.optim.Optimizer, of: torch.nn.Parameter, grad: torch.Tensor) -> None:
+    of.grad = grad
+    optimizer.step()
+
+
+@pytest.mark.parametrize("layout", ["sparse", "dense"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    ("ours", "theirs", "options"),
+    [
+        (RowAdam, torch.optim.Adam, {"lr": 0.1, "betas": (0.9, 0.999), "eps": 1e-15}),
+        (RowAdam, torch.optim.Adam, {"lr": 0.03, "betas": (0.5, 0.8), "eps": 1e-3}),
+        (RowAdam, torch.optim.Adam, {"lr": 0.03, "betas": (0.0, 0.9), "eps": 1e-8}),
+        (RowRMSprop, torch.optim.RMSprop, {"lr": 0.1, "alpha": 0.95, "eps": 1e-8}),
+        (RowRMSprop, torch.optim.RMSprop, {"lr": 0.01, "alpha": 0.5, "eps": 1e-2}),
+    ],
+)
+def test_torch_s_own_where_all_rows_are_touched(ours, theirs, options, dtype, layout):
+    here, there = parameter(dtype=dtype), parameter(dtype=dtype)
+    a, b = ours([here], **options), theirs([there], **options)
+    for n in range(25):
+        grad = gradient(n, dtype=dtype)
+        step(a, here, grad if layout == "sparse" else grad.to_dense())
+        step(b, there, grad.to_dense())
+    rtol = 1e-11 if dtype == torch.float64 else 2e-5
+    torch.testing.assert_close(here.data, there.data, rtol=rtol, atol=rtol)
+
+
+def adam_by_hand(grads: list[np.ndarray], lr: float, beta1: float, beta2: float, eps: float) -> np.ndarray:
+    """Change of a value by Adam (Kingma and Ba 2015, algorithm 1)."""
+    m = v = change = 0.0
+    for t, g in enumerate(grads, 1):
+        m, v = beta1 * m + (1 - beta1) * g, beta2 * v + (1 - beta2) * g * g
+        change = change - lr * m / (1 - beta1**t) / (np.sqrt(v / (1 - beta2**t)) + eps)
+    return np.asarray(change)
+
+
+def test_each_row_counts_its_own_updates():
+    """A row that was touched in steps 3, 7 and 8 is where Adam would be after three steps of its own."""
+    value = parameter(dtype=torch.float64)
+    start, history = value.detach().clone(), [[] for _ in range(ROWS)]
+    optimizer = RowAdam([value], lr=0.1, betas=(0.9, 0.99), eps=1e-6)
+    for n in range(12):
+        grad = gradient(n, 0.3, dtype=torch.float64)
+        for row, g in zip(*(part.numpy() for part in touched_rows(grad))):
+            history[row].append(g)
+        step(optimizer, value, grad)
+    expected = np.stack([adam_by_hand(grads, 0.1, 0.9, 0.99, 1e-6) * np.ones(CHANNELS) for grads in history])
+    np.testing.assert_allclose((value.detach() - start).numpy(), expected, rtol=1e-10, atol=1e-14)
+    np.testing.assert_array_equal(optimizer.state[value]["updates"].numpy(), [len(grads) for grads in history])
+    assert len({len(grads) for grads in history}) > 3
+
+
+def test_first_touch_late_in_training_gets_the_full_first_step():
+    """With the correction of all other rows it would move by lr (1 - beta1) / sqrt(1 - beta2), three times too much."""
+    value = parameter()
+    before = value.detach().clone()
+    optimizer = RowAdam([value], lr=0.1)
+    for _ in range(300):
+        step(optimizer, value, torch.sparse_coo_tensor([[0]], torch.ones(1, CHANNELS), value.shape))
+    push = torch.sparse_coo_tensor([[7]], torch.tensor([[3.0, -3.0, 1e-6, -1e-6, 1e4, -1e4]]), value.shape)
+    step(optimizer, value, push)
+    moved = before[7] - value.detach()[7]
+    torch.testing.assert_close(moved, 0.1 * torch.tensor([1.0, -1.0] * 3), rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("layout", ["sparse", "dense"])
+def test_rows_without_a_gradient_keep_value_and_state_to_the_last_bit(kind, layout):
+    value = parameter()
+    optimizer = KINDS[kind]([value], lr=0.1)
+    step(optimizer, value, gradient(0))
+    before = value.detach().clone(), copy.deepcopy(dict(optimizer.state[value]))
+    grad = gradient(1, 0.4)
+    touched = torch.zeros(ROWS, dtype=torch.bool)
+    touched[grad.indices()[0]] = True
+    step(optimizer, value, grad if layout == "sparse" else grad.to_dense())
+    assert 5 < int(touched.sum()) < 45
+    for old, new in [(before[0], value.data), *((before[1][k], v) for k, v in optimizer.state[value].items())]:
+        assert torch.equal(old[~touched], new[~touched]) and bool((old[touched] != new[touched]).any())
+
+
+def plain_twin(
+    optimizer: RowOptimizer, value: torch.Tensor, grad: torch.Tensor, state: dict[str, torch.Tensor]
+) -> None:
+    """One step through the branch that other devices take."""
+
+    class Disguised:
+        def __init__(self, tensor: torch.Tensor):
+            self.tensor, self.device = tensor, torch.device("meta")
+
+        def __len__(self) -> int:
+            return len(self.tensor)
+
+        def __getitem__(self, rows):
+            return self.tensor[rows]
+
+        def __setitem__(self, rows, values) -> None:
+            self.tensor[rows] = values
+
+    rows, values = touched_rows(grad)
+    optimizer.update_rows(Disguised(value), rows, values, state, optimizer.param_groups[0])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("fractional", [False, True])
+def test_compiled_updates_are_those_of_their_plain_twin(kind, fractional):
+    """Also where interpolation left rows with a number of updates that is no whole number."""
+    value = parameter(dtype=torch.float64)
+    twin = value.detach().clone()
+    optimizer = KINDS[kind]([value], lr=0.1)
+    state = optimizer.new_state(twin)
+    optimizer.state[value].update(optimizer.new_state(value))
+    if fractional and kind == "adam":
+        counts = torch.rand(ROWS, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * 9
+        counts[:3] = torch.tensor([7.0 - 1e-7, 7.0, 7.0 + 1e-7])
+        for held in (state, optimizer.state[value]):
+            held["updates"].copy_(counts)
+            held["exp_avg"].fill_(0.2)
+            held["exp_avg_sq"].fill_(0.3)
+    for n in range(6):
+        grad = gradient(n, 0.5, dtype=torch.float64)
+        step(optimizer, value, grad)
+        plain_twin(optimizer, twin, grad, state)
+    torch.testing.assert_close(value.data, twin, rtol=1e-12, atol=1e-14)
+    for name, values in state.items():
+        torch.testing.assert_close(optimizer.state[value][name], values, rtol=1e-12, atol=1e-14)
+
+
+def test_rounded_numbers_of_updates_count_as_what_they_were():
+    """Splitting into thirds interpolates 7 updates as 6.9999995 or 7.0000005: the correction stays that of 7."""
+    moved = []
+    for count in (7.0, 7.0 - 5e-7, 7.0 + 5e-7):
+        value = parameter()
+        optimizer = RowAdam([value], lr=0.1, betas=(0.5, 0.7))
+        step(optimizer, value, gradient(0))
+        optimizer.state[value]["updates"].fill_(count)
+        start = value.detach().clone()
+        step(optimizer, value, gradient(1))
+        moved.append(value.detach() - start)
+    torch.testing.assert_close(moved[0], moved[1], rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(moved[0], moved[2], rtol=1e-5, atol=1e-7)
+
+
+def test_duplicate_and_unsorted_rows_are_summed():
+    rows, values = touched_rows(torch.sparse_coo_tensor([[4, 1, 4]], torch.tensor([[1.0], [2.0], [3.0]]), (6, 1)))
+    assert rows.tolist() == [1, 4] and values.tolist() == [[2.0], [4.0]]
+    dense = torch.zeros(6, 2, 2)
+    dense[3, 1, 0] = -1.0
+    rows, values = touched_rows(dense)
+    assert rows.tolist() == [3] and values.tolist() == [[0.0, 0.0, -1.0, 0.0]]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_parameters_of_any_shape_and_without_a_gradient(kind):
+    image, other = torch.nn.Parameter(torch.ones(4, 5, 3)), torch.nn.Parameter(torch.ones(3))
+    optimizer = KINDS[kind]([image, other], lr=0.1)
+    image.grad = torch.zeros(4, 5, 3)
+    image.grad[2] = 1.0
+    optimizer.step()
+    assert torch.equal(other, torch.ones(3)) and other not in optimizer.state
+    changed = (image != 1).flatten(1).any(-1)
+    assert changed.tolist() == [False, False, True, False]
+    image.grad, other.grad = None, torch.zeros(3)
+    optimizer.step()
+    assert torch.equal(other, torch.ones(3))
+
+
+def trained_grid(kind: str) -> tuple[VoxelGrid, dict[str, RowOptimizer]]:
+    """A sparse grid after a few steps that touched some rows."""
+    torch.manual_seed(0)
+    grid = VoxelGrid(Lattice((0.0, 0.0, 0.0), 1.0, (6, 5, 4)), sh_degree=1, temperature_degree=1)
+    prune(grid, np.random.default_rng(0).random(len(grid.voxels)) < 0.6)
+    optimizers = {name: KINDS[kind]([p], lr=0.1) for name, p in grid.row_parameters().items()}
+    for _ in range(4):
+        for name, p in grid.row_parameters().items():
+            rows = (torch.rand(len(p)) < 0.5).nonzero()[:, 0]
+            step(optimizers[name], p, torch.sparse_coo_tensor(rows[None], torch.randn(len(rows), p.shape[1]), p.shape))
+    return grid, optimizers
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("change", ["split", "prune"])
+def test_state_follows_split_and_pruned_rows(kind, change):
+    """As the values do: old corners keep theirs to the last bit."""
+    grid, optimizers = trained_grid(kind)
+    voxels, old = grid.voxels, grid.row_parameters()
+    states = {name: copy.deepcopy(dict(optimizers[name].state[p])) for name, p in old.items()}
+    if change == "split":
+        moved = refine(grid, 2)
+        same = np.ravel_multi_index(tuple((voxels.corner_index() * 2).T), grid.lattice.shape)
+        there, here = np.searchsorted(grid.voxels.corners, same), np.arange(voxels.num_rows)
+    else:
+        moved = prune(grid, np.arange(len(voxels)) % 3 == 0)
+        there, here = np.arange(grid.voxels.num_rows), np.searchsorted(voxels.corners, grid.voxels.corners)
+    for name, new in grid.row_parameters().items():
+        optimizer = optimizers[name]
+        optimizer.change_rows(old[name], new, moved)
+        assert [p for group in optimizer.param_groups for p in group["params"]] == [new]
+        assert list(optimizer.state) == [new] and new is not old[name]
+        for key, values in optimizer.state[new].items():
+            assert len(values) == len(new) and values.shape[1:] == states[name][key].shape[1:]
+            assert torch.equal(values[there], states[name][key][here])
+        before = new.detach().clone()
+        rows = torch.tensor([0, len(new) - 1])
+        step(optimizer, new, torch.sparse_coo_tensor(rows[None], torch.ones(2, new.shape[1]), new.shape))
+        assert (new != before).any(-1).nonzero()[:, 0].tolist() == rows.tolist()
+
+
+def test_rows_may_change_before_the_first_step():
+    grid = VoxelGrid(Lattice((0.0, 0.0, 0.0), 1.0, (3, 3, 3)), sh_degree=None)
+    old = grid.density
+    optimizer = RowAdam([old])
+    optimizer.change_rows(old, grid.density, refine(grid, 2))
+    optimizer.change_rows(old, grid.density, lambda rows: rows)
+    assert optimizer.param_groups[0]["params"][0] is grid.density and not optimizer.state
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_training_goes_on_bit_for_bit_after_a_checkpoint(kind):
+    grid, optimizers = trained_grid(kind)
+    file = io.BytesIO()
+    torch.save({"grid": grid.state_dict(), **{name: o.state_dict() for name, o in optimizers.items()}}, file)
+    file.seek(0)
+    loaded = torch.load(file, weights_only=True)
+    other = VoxelGrid(Lattice((0.0, 0.0, 0.0), 1.0, (6, 5, 4)), sh_degree=1, temperature_degree=1)
+    resumed = {name: KINDS[kind]([p], lr=0.7) for name, p in other.row_parameters().items()}
+    other.load_state_dict(loaded["grid"])
+    for name, optimizer in resumed.items():
+        optimizer.load_state_dict(loaded[name])
+        assert optimizer.param_groups[0]["lr"] == 0.1
+    for n in range(3):
+        for (name, p), q in zip(grid.row_parameters().items(), other.row_parameters().values()):
+            rows = torch.arange(n, len(p), 2 + n)
+            push = torch.sparse_coo_tensor(rows[None], torch.randn(len(rows), p.shape[1]), p.shape)
+            step(optimizers[name], p, push)
+            step(resumed[name], q, push.clone())
+            assert torch.equal(p, q)
+            assert all(torch.equal(v, resumed[name].state[q][k]) for k, v in optimizers[name].state[p].items())
+
+
+def test_configs_build_their_optimisers():
+    value = parameter()
+    adam = RowAdamConfig(lr=0.2, betas=(0.8, 0.9)).setup([value])
+    assert isinstance(adam, RowAdam) and adam.defaults == {"lr": 0.2, "betas": (0.8, 0.9), "eps": 1e-15}
+    rmsprop = RowRMSpropConfig(lr=0.2).setup([value])
+    assert isinstance(rmsprop, RowRMSprop) and rmsprop.defaults["alpha"] == 0.95
+    schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda n: 0.5**n)
+    schedule.step()
+    assert adam.param_groups[0]["lr"] == pytest.approx(0.1)
+
+
+def test_step_evaluates_a_closure():
+    value = torch.nn.Parameter(torch.tensor([[2.0], [0.0]]))
+    optimizer = RowAdam([value], lr=0.1)
+
+    def closure():
+        optimizer.zero_grad()
+        loss = (value**2).sum()
+        loss.backward()
+        return loss
+
+    assert float(optimizer.step(closure)) == 4.0
+    assert value.detach()[:, 0].tolist() == pytest.approx([1.9, 0.0])

@@ -1,0 +1,96 @@
+"""Ranges of work shared among threads."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from thermoxels_ns import threads
+from thermoxels_ns.threads import num_threads, run_ranges, run_tasks, set_num_threads
+
+
+@pytest.fixture(autouse=True)
+def restored() -> Iterator[None]:
+    before = threads._state["threads"]
+    yield
+    set_num_threads(before or None)
+
+
+@given(st.integers(1, 6), st.integers(0, 5000), st.integers(1, 300))
+@settings(max_examples=80, deadline=None, derandomize=True, database=None)
+def test_ranges_cover_everything_once_in_order(count, total, smallest):
+    set_num_threads(count)
+    ranges = run_ranges(lambda first, last: (first, last), total, smallest)
+    assert [i for first, last in ranges for i in range(first, last)] == list(range(total))
+    assert all(last > first for first, last in ranges)
+    assert all(last - first >= smallest for first, last in ranges[:-1])
+
+
+def test_work_runs_in_as_many_threads_as_were_asked_for():
+    """Each waits until all are there: fewer threads than asked for would wait in vain."""
+    set_num_threads(3)
+    together = threading.Barrier(3)
+    assert len(set(run_tasks([lambda: together.wait(20) for _ in range(3)]))) == 3
+    set_num_threads(1)
+    assert run_ranges(lambda *_: threading.current_thread(), 10_000, 1) == [threading.main_thread()]
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_an_error_in_a_range_reaches_the_caller_and_the_next_call_works(count):
+    set_num_threads(count)
+
+    def work(first: int, last: int) -> int:
+        if first <= 700 < last:
+            raise ValueError("range with 700")
+        return last - first
+
+    with pytest.raises(ValueError, match="range with 700"):
+        run_ranges(work, 1000)
+    with pytest.raises(ValueError, match="range with 700"):
+        run_tasks([lambda: 1, lambda: work(700, 701)])
+    assert sum(run_ranges(work, 500)) == 500  # type: ignore[arg-type]
+
+
+def test_tasks_keep_their_order():
+    set_num_threads(4)
+    assert run_tasks([lambda n=n: n for n in range(20)]) == list(range(20))
+    assert run_tasks([]) == [] and run_ranges(lambda a, b: b, 0) == []
+
+
+def test_default_is_one_thread_per_processor():
+    set_num_threads(7)
+    assert num_threads() == 7
+    set_num_threads(None)
+    assert num_threads() == os.cpu_count()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_a_forked_process_has_threads_of_its_own():
+    """Data loaders fork: the pool that they inherit has no living thread, and work given to it would never end."""
+    set_num_threads(3)
+    assert sum(run_ranges(lambda a, b: b - a, 5000)) == 5000  # type: ignore[arg-type]
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        answer = b"wrong"
+        try:
+            if sum(run_ranges(lambda a, b: b - a, 5000)) == 5000:  # type: ignore[arg-type]
+                answer = b"right"
+        finally:
+            os.write(write, answer)
+            os._exit(0)
+    os.close(write)
+    alarm = threading.Timer(30.0, os.kill, (child, 9))
+    alarm.start()
+    try:
+        with os.fdopen(read, "rb") as pipe:
+            assert pipe.read() == b"right"
+    finally:
+        alarm.cancel()
+        os.waitpid(child, 0)
+    assert sum(run_ranges(lambda a, b: b - a, 5000)) == 5000  # type: ignore[arg-type]

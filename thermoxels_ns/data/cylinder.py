@@ -1,0 +1,152 @@
+"""An exact round rod along one of the axes, with flat ends."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.data.solids import Box, Hits, Vector
+from thermoxels_ns.errors import SceneError, explain
+
+FloatArray = npt.NDArray[np.float64]
+
+_PARALLEL_SINE_SQUARED = 1e-30
+
+
+@dataclass(frozen=True, eq=False)
+class Cylinder:
+    """A closed circular cylinder with flat ends whose axis is parallel to x, y or z.
+
+    >>> Cylinder((0.0, 0.0, 1.0), radius=0.5, length=2.0, axis=2).bounds
+    ((-0.5, -0.5, 0.0), (0.5, 0.5, 2.0))
+    """
+
+    centre: Vector
+    """Middle of the axis [m]."""
+    radius: float
+    """Radius [m], above 0."""
+    length: float
+    """Length along the axis [m], above 0."""
+    axis: int
+    """Direction of the axis: 0 for x, 1 for y, 2 for z."""
+
+    def __post_init__(self) -> None:
+        sizes = (self.radius, self.length)
+        finite = np.isfinite(self.centre).all() and np.isfinite(sizes).all()
+        if not (finite and min(sizes) > 0 and self.axis in (0, 1, 2)):
+            raise SceneError(
+                explain(
+                    "cylinder",
+                    expected="a finite centre, a radius and a length above 0, and an axis of 0, 1 or 2",
+                    got=f"centre {self.centre}, radius {self.radius}, length {self.length}, axis {self.axis}",
+                    remedy="Correct these.",
+                )
+            )
+
+    @property
+    def bounds(self) -> Box:
+        """Lower and upper corner of the smallest box around the solid [m]."""
+        half = [self.radius] * 3
+        half[self.axis] = 0.5 * self.length
+        (x, y, z), (a, b, c) = self.centre, half
+        return (x - a, y - b, z - c), (x + a, y + b, z + c)
+
+    @property
+    def volume(self) -> float:
+        """Volume [m3]."""
+        return math.pi * self.radius**2 * self.length
+
+    @property
+    def area(self) -> float:
+        """Area of the surface, both ends included [m2]."""
+        return 2.0 * math.pi * self.radius * (self.radius + self.length)
+
+    def contains(self, points: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Which of the points (n, 3) lie in the solid or on its surface."""
+        return self.signed_distance(points) <= 0.0
+
+    def signed_distance(self, points: npt.ArrayLike) -> FloatArray:
+        """Distance of the points (n, 3) to the surface [m], negative inside."""
+        relative = np.subtract(points, self.centre)
+        u, v = self._across
+        beside = np.hypot(relative[:, u], relative[:, v]) - self.radius
+        beyond = np.abs(relative[:, self.axis]) - 0.5 * self.length
+        outside = np.hypot(np.maximum(beside, 0.0), np.maximum(beyond, 0.0))
+        inside = np.minimum(np.maximum(beside, beyond), 0.0)
+        return np.asarray(outside + inside, dtype=np.float64)
+
+    def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> Hits:
+        """First entry of rays: origins (n, 3) or one shared (3,), directions (n, 3).
+
+        A ray is inside while it is both between the planes of the ends and within the endless cylinder; it enters
+        where the later of the two begins. The half chord comes from the foot of the perpendicular to the axis, which
+        does not cancel for far origins.
+        """
+        directions = np.asarray(directions, dtype=np.float64)
+        start = np.broadcast_to(np.subtract(origins, self.centre), directions.shape)
+        side_in, side_out = self._within_mantle(start, directions)
+        end_in, end_out = self._between_ends(start[:, self.axis], directions[:, self.axis])
+        entry = np.maximum(side_in, end_in)
+        hit = (entry <= np.minimum(side_out, end_out)) & (entry >= 0.0) & np.isfinite(entry)
+        through_end = hit & (end_in > side_in)
+        through_side = hit & ~through_end
+        normal = np.zeros(directions.shape)
+        normal[through_end, self.axis] = -np.sign(directions[through_end, self.axis])
+        at = start[through_side] + entry[through_side, None] * directions[through_side]
+        for axis in self._across:
+            normal[through_side, axis] = at[:, axis] / self.radius
+        return Hits(np.where(hit, entry, np.inf), normal)
+
+    def surface_points(self, count: int, seed: int) -> tuple[FloatArray, FloatArray]:
+        """Draw points uniformly by area: positions (count, 3) and outward normals (count, 3)."""
+        draw = np.random.default_rng(seed)
+        on_side = draw.random(count) < self.length / (self.length + self.radius)
+        angle = 2.0 * math.pi * draw.random(count)
+        share, end = 2.0 * draw.random(count) - 1.0, np.where(draw.random(count) < 0.5, -1.0, 1.0)
+        u, v = self._across
+        normals = np.zeros((count, 3))
+        normals[:, u], normals[:, v] = np.where(on_side, (np.cos(angle), np.sin(angle)), 0.0)
+        normals[:, self.axis] = np.where(on_side, 0.0, end)
+        points = np.empty((count, 3))
+        from_axis = self.radius * np.where(on_side, 1.0, np.sqrt(np.abs(share)))
+        points[:, u] = from_axis * np.cos(angle)
+        points[:, v] = from_axis * np.sin(angle)
+        points[:, self.axis] = 0.5 * self.length * np.where(on_side, share, end)
+        return points + self.centre, normals
+
+    @property
+    def _across(self) -> tuple[int, int]:
+        """The two axes at right angles to the cylinder's."""
+        u, v = (a for a in range(3) if a != self.axis)
+        return u, v
+
+    def _within_mantle(self, start: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where rays enter and leave the endless cylinder; infinity to minus infinity for those that miss it."""
+        flat, way = start[:, list(self._across)], directions[:, list(self._across)]
+        squared = np.einsum("ij,ij->i", way, way)
+        # A tilt below rounding: the quotients below would lose all digits or overflow.
+        parallel = squared <= _PARALLEL_SINE_SQUARED * np.einsum("ij,ij->i", directions, directions)
+        squared = np.where(parallel, 1.0, squared)
+        foot = np.where(parallel, 0.0, -np.einsum("ij,ij->i", flat, way) / squared)
+        perpendicular = flat + foot[:, None] * way
+        half_chord_squared = self.radius**2 - np.einsum("ij,ij->i", perpendicular, perpendicular)
+        half_chord = np.sqrt(np.maximum(half_chord_squared, 0.0) / squared)
+        meets = half_chord_squared >= 0.0
+        enter = np.where(parallel, -np.inf, foot - half_chord)
+        leave = np.where(parallel, np.inf, foot + half_chord)
+        return np.where(meets, enter, np.inf), np.where(meets, leave, -np.inf)
+
+    def _between_ends(self, height: FloatArray, rise: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where rays enter and leave the slab between the ends; infinity to minus infinity for those that miss it."""
+        half = 0.5 * self.length
+        level = rise == 0.0
+        # A nearly level ray may reach a plane at infinity, which is what it does.
+        with np.errstate(over="ignore"):
+            low, high = (-half - height) / np.where(level, 1.0, rise), (half - height) / np.where(level, 1.0, rise)
+        enter, leave = np.minimum(low, high), np.maximum(low, high)
+        inside = np.abs(height) <= half
+        enter = np.where(level, np.where(inside, -np.inf, np.inf), enter)
+        return enter, np.where(level, np.where(inside, np.inf, -np.inf), leave)

@@ -1,0 +1,152 @@
+"""Which voxels of a lattice are kept, and in which row their corners are stored.
+
+Rows exist for corners of kept voxels only (the link table and compact rows of Plenoxels, Fridovich-Keil et al. 2022),
+in the order of their flat corner index. Corners k and k + 1 of a kept voxel then stand in neighbouring rows, so four
+row numbers per voxel find all eight. The voxel under a point is found through blocks of 8^3 voxels: an empty block
+costs one look-up and four bytes, whatever the resolution.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from thermoxels_ns.lattice import CORNER_OFFSETS, Lattice
+
+BLOCK = 8
+"""Voxels along the side of a block."""
+
+IntArray = npt.NDArray[np.int64]
+
+
+class KeptVoxels:
+    """The kept voxels of a lattice and the rows of their corners.
+
+    Args:
+        lattice: The lattice.
+        cells: Flat indices of the kept voxels, ascending, each once; None: all.
+
+    Attributes:
+        cells: Flat voxel indices, ascending, shape (voxels,), int64. The place in this list is the voxel's number.
+        corners: Flat index of the corner that each row holds, ascending, shape (rows,), int64.
+        voxel_rows: Rows of the corners (0,0,0), (0,1,0), (1,0,0), (1,1,0) of each voxel, shape (voxels, 4), int32; the
+            corner one step along z stands in the next row.
+        block_slot: Place of each block's table, -1 for a block without kept voxels, shape (blocks,), int32.
+        voxel_number: Tables of the blocks, one after the other: number of each voxel, -1 where it is not kept,
+            shape (slots * 512,), int32.
+    """
+
+    def __init__(self, lattice: Lattice, cells: npt.ArrayLike | None = None):
+        self.lattice = lattice
+        _, ny, nz = lattice.cell_shape
+        total = int(np.prod(lattice.cell_shape))
+        self.cells: IntArray = np.arange(total) if cells is None else np.ascontiguousarray(cells, dtype=np.int64)
+        self.all_kept = len(self.cells) == total
+        first = self._first_corners()
+        _, cy, cz = lattice.shape
+        steps = [0, cz, cy * cz, cy * cz + cz]
+        if self.all_kept:
+            self.corners: IntArray = np.arange(lattice.num_corners)
+            self.voxel_rows = np.stack([first + step for step in steps], axis=1).astype(np.int32)
+        else:
+            used = np.zeros(lattice.num_corners, dtype=bool)
+            for step in steps:
+                used[first + step] = True
+                used[first + step + 1] = True
+            self.corners = np.flatnonzero(used)
+            del used
+            self.voxel_rows = np.empty((len(first), 4), dtype=np.int32)
+            for column, step in enumerate(steps):
+                self.voxel_rows[:, column] = np.searchsorted(self.corners, first + step)
+        self.block_shape = tuple(-(-n // BLOCK) for n in lattice.cell_shape)
+        x, y, z = self.cells // (ny * nz), self.cells // nz % ny, self.cells % nz
+        _, by, bz = self.block_shape
+        block = ((x // BLOCK) * by + y // BLOCK) * bz + z // BLOCK
+        self.block_slot = np.full(int(np.prod(self.block_shape)), -1, dtype=np.int32)
+        self.block_slot[block] = 0
+        occupied = np.flatnonzero(self.block_slot == 0)
+        self.block_slot[occupied] = np.arange(len(occupied), dtype=np.int32)
+        self.voxel_number = np.full(len(occupied) * BLOCK**3, -1, dtype=np.int32)
+        within = ((x % BLOCK) * BLOCK + y % BLOCK) * BLOCK + z % BLOCK
+        self.voxel_number[self.block_slot[block].astype(np.int64) * BLOCK**3 + within] = np.arange(len(self.cells))
+
+    @property
+    def num_rows(self) -> int:
+        """Number of stored corners."""
+        return len(self.corners)
+
+    def __len__(self) -> int:
+        return len(self.cells)
+
+    def _first_corners(self) -> IntArray:
+        _, ny, nz = self.lattice.cell_shape
+        x, y, z = self.cells // (ny * nz), self.cells // nz % ny, self.cells % nz
+        return (x * self.lattice.shape[1] + y) * self.lattice.shape[2] + z
+
+    def mask(self) -> npt.NDArray[np.bool_]:
+        """Kept voxels as a dense array, shape of the lattice's voxels."""
+        kept = np.zeros(self.lattice.cell_shape, dtype=bool)
+        kept.reshape(-1)[self.cells] = True
+        return kept
+
+    def corner_index(self) -> IntArray:
+        """Lattice index (i, j, k) of every stored corner, shape (rows, 3)."""
+        _, ny, nz = self.lattice.shape
+        return np.stack((self.corners // (ny * nz), self.corners // nz % ny, self.corners % nz), axis=1)
+
+    def dilated(self, chosen: npt.NDArray[np.bool_], by: int) -> npt.NDArray[np.bool_]:
+        """Grow a subset of the kept voxels by `by` voxels in all 26 directions, within the kept ones.
+
+        Args:
+            chosen: One boolean per kept voxel.
+            by: Voxels; growth may pass through voxels that are not kept.
+
+        Returns:
+            One boolean per kept voxel.
+        """
+        if by <= 0:
+            return chosen
+        grown = np.zeros(self.lattice.cell_shape, dtype=bool)
+        grown.reshape(-1)[self.cells[chosen]] = True
+        for axis in range(3):
+            before = grown.copy() if by > 1 else grown
+            spread = np.zeros_like(grown)
+            for shift in range(1, by + 1):
+                near, far = [slice(None)] * 3, [slice(None)] * 3
+                near[axis], far[axis] = slice(shift, None), slice(None, -shift)
+                spread[tuple(near)] |= before[tuple(far)]
+                spread[tuple(far)] |= before[tuple(near)]
+            grown |= spread
+        return grown.reshape(-1)[self.cells]
+
+    @cached_property
+    def _tables(self) -> dict[torch.device, tuple[Tensor, Tensor, Tensor]]:
+        return {}
+
+    def tables(self, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+        """`voxel_rows` of all eight corners (voxels, 8), `block_slot` and `voxel_number` as int64 tensors."""
+        if device not in self._tables:
+            four = torch.from_numpy(self.voxel_rows).to(device, torch.int64)
+            eight = torch.stack((four, four + 1), dim=-1).flatten(1)  # order of CORNER_OFFSETS
+            slot = torch.from_numpy(self.block_slot).to(device, torch.int64)
+            number = torch.from_numpy(self.voxel_number).to(device, torch.int64)
+            self._tables[device] = (eight, slot, number)
+        return self._tables[device]
+
+    def number_at(self, voxel: Tensor) -> Tensor:
+        """Number of voxels given by their lattice index (n, 3), inside the lattice; -1 where it is not kept."""
+        _, slot, number = self.tables(voxel.device)
+        if len(number) == 0:
+            return torch.full_like(voxel[:, 0], -1)
+        block, within = voxel // BLOCK, voxel % BLOCK
+        _, by, bz = self.block_shape
+        at = slot[(block[:, 0] * by + block[:, 1]) * bz + block[:, 2]]
+        place = (within[:, 0] * BLOCK + within[:, 1]) * BLOCK + within[:, 2]
+        return torch.where(at >= 0, number[at.clamp(min=0) * BLOCK**3 + place], at)
+
+
+assert CORNER_OFFSETS[1].tolist() == [0, 0, 1], "rows of neighbours along z follow each other"

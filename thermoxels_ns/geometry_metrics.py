@@ -1,0 +1,94 @@
+"""What ns-eval says about geometry: how opaque rays are, and for a known truth how well the exported surface fits.
+
+Pictures can be right while the surface is fog. These figures stand beside PSNR and temperature errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from torch import Tensor
+
+from thermoxels_ns.errors import MeshError, ThermoxelsError
+from thermoxels_ns.mesh.accuracy import surface_fscore
+from thermoxels_ns.mesh.build import check_similarity
+from thermoxels_ns.mesh.solid import SolidSelection, select_solid
+from thermoxels_ns.snapshot import GridSnapshot
+from thermoxels_ns.truth_comparison import TOLERANCE_VOXELS, KnownTruth, load_known_truth, points_seen
+
+HALF_TRANSPARENT = (0.1, 0.9)
+"""A ray whose accumulation lies strictly between these is neither through nor stopped."""
+COMMON_RESOLUTION = 128
+"""Voxels along the longest side of the lattice whose voxel size `fscore_128` is measured with."""
+
+
+def half_transparent_share(accumulation: Tensor) -> float:
+    """Share of rays that are neither through nor stopped, 0 to 1: fog, or the edge of something.
+
+    Args:
+        accumulation: Opacity of rays, 0 to 1, any shape, at least one.
+    """
+    low, high = HALF_TRANSPARENT
+    return float(((accumulation > low) & (accumulation < high)).double().mean())
+
+
+def geometry_metrics(
+    snapshot: GridSnapshot,
+    world_to_input: npt.NDArray[np.float64],
+    truth: Path | str | KnownTruth,
+    say: Callable[[str], None] = print,
+) -> dict[str, float]:
+    """Compare the surface that an export with default options has with the exact scene, if it is known.
+
+    The surface is the boundary of the voxels that `SolidSelection` chooses by default; precision, recall and F-score
+    are defined by `thermoxels_ns.truth_comparison.compare_with_truth`.
+
+    Args:
+        snapshot: The trained field; only its density counts.
+        world_to_input: Similarity, shape (4, 4), from the lattice's world to the coordinates of the input poses, in
+            which a synthetic scene is written in metres.
+        truth: The scene folder (or its ``transforms.json``), or its truth if it is at hand.
+        say: Called with the reason where a figure cannot be given.
+
+    Returns:
+        Nothing for a scene of real photographs. Else ``fscore``, ``precision``, ``recall``, 0 to 1, at 1.5 voxels of
+        the snapshot's lattice; ``fscore_128``, at 1.5 voxels of a lattice of 128 voxels over the same box, so that
+        lattices of any resolution can be compared; ``surface_distance_voxels`` and ``surface_distance_m``, the mean
+        distance of the reconstructed surface to the true one. Without any solid voxel the scores are 0 and there is no
+        distance.
+    """
+    try:
+        known = truth if isinstance(truth, KnownTruth) else load_known_truth(truth)
+        if known is None:
+            return {}
+        seen = points_seen(known)
+    except ThermoxelsError as problem:
+        say(f"Geometry is not compared with the truth: {problem}")
+        return {}
+    try:
+        cells = select_solid(snapshot, SolidSelection()).cells
+    except MeshError as problem:
+        say(f"The geometry scores 0: {problem}")
+        return dict.fromkeys(("fscore", "precision", "recall", "fscore_128"), 0.0)
+
+    lattice = snapshot.lattice
+    transform = check_similarity("world_to_input", world_to_input)
+    voxel_m = lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(transform[:3, :3]))))
+    common_voxel_m = voxel_m * max(lattice.cell_shape) / COMMON_RESOLUTION
+    own, common = (
+        surface_fscore(cells, lattice, known.scene, seen, TOLERANCE_VOXELS * size_m, transform)
+        for size_m in (voxel_m, common_voxel_m)
+    )
+    result = {
+        "fscore": own.fscore,
+        "precision": own.precision,
+        "recall": own.recall,
+        f"fscore_{COMMON_RESOLUTION}": common.fscore,
+    }
+    if own.mean_distance is not None:
+        result["surface_distance_voxels"] = own.mean_distance / voxel_m
+        result["surface_distance_m"] = own.mean_distance
+    return result

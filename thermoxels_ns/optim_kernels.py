@@ -1,0 +1,51 @@
+"""Compiled row updates of the optimisers; the plain twins stand in `optim`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def adam_rows(
+    begin: int,
+    end: int,
+    rows,
+    gradient,
+    values,
+    first,
+    second,
+    updates,
+    lr,
+    beta1,
+    beta2,
+    eps,
+    correction1,
+    correction2,
+):
+    """One step of Adam on entries `begin` to `end` of the list of rows."""
+    last1, last2 = len(correction1) - 1, len(correction2) - 1
+    one = values.dtype.type  # constants in the parameter's precision, so that the inner loop has one width
+    b1, c1, b2, c2, tiny = one(beta1), one(1.0 - beta1), one(beta2), one(1.0 - beta2), one(eps)
+    for n in range(begin, end):
+        row = rows[n]
+        updates[row] += one(1.0)
+        count = int(updates[row] + 0.5)  # interpolation leaves numbers that are not whole
+        rate, share = one(lr / correction1[min(count, last1)]), one(1.0 / correction2[min(count, last2)])
+        at, m, v, g = values[row], first[row], second[row], gradient[n]
+        for k in range(at.shape[0]):
+            m[k] = b1 * m[k] + c1 * g[k]
+            v[k] = b2 * v[k] + c2 * g[k] * g[k]
+            at[k] -= rate * m[k] / (np.sqrt(v[k] * share) + tiny)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def rmsprop_rows(begin: int, end: int, rows, gradient, values, square, lr, alpha, eps):
+    """One step of RMSprop on entries `begin` to `end` of the list of rows."""
+    one = values.dtype.type
+    keep, take, rate, tiny = one(alpha), one(1.0 - alpha), one(lr), one(eps)
+    for n in range(begin, end):
+        at, mean, g = values[rows[n]], square[rows[n]], gradient[n]
+        for k in range(at.shape[0]):
+            mean[k] = keep * mean[k] + take * g[k] * g[k]
+            at[k] -= rate * g[k] / (np.sqrt(mean[k]) + tiny)

@@ -1,0 +1,176 @@
+"""The two renderers of a voxel grid: plain torch, the reference, and compiled kernels on the CPU."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from thermoxels_ns import losses
+from thermoxels_ns.errors import ThermoxelsError, explain
+from thermoxels_ns.field.interpolation import TrilinearPoints
+from thermoxels_ns.field.voxel_grid import VoxelGrid
+from thermoxels_ns.render.compositing import composite
+from thermoxels_ns.render.march import March, march
+from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
+
+Backend = Literal["auto", "reference", "fused"]
+
+
+def choose_backend(backend: Backend, device: torch.device) -> Literal["reference", "fused"]:
+    """Turn auto into the fastest backend of a device: the compiled kernels on a CPU, else the reference.
+
+    Raises:
+        ThermoxelsError: The compiled kernels are asked for on another device than the CPU.
+    """
+    assert backend in get_args(Backend)
+    if backend == "fused" and device.type != "cpu":
+        raise ThermoxelsError(
+            explain(
+                "backend",
+                expected=f"auto or reference on {device.type}",
+                got="fused, whose kernels run on the CPU",
+                remedy="Pass --pipeline.model.backend auto, or --machine.device-type cpu.",
+            )
+        )
+    if backend == "auto":
+        return "fused" if device.type == "cpu" else "reference"
+    return backend
+
+
+def render_rays(grid: VoxelGrid, request: RayRequest, options: RenderOptions, backend: Backend) -> RayRender:
+    """Render rays through a grid with the backend of choice."""
+    if choose_backend(backend, grid.density.device) == "fused":
+        return fused_render(grid, request, options)
+    return reference_render(grid, request, options)
+
+
+def march_grid(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> March:
+    """Sample rays through the kept voxels and weigh the samples, in plain torch."""
+    return march(
+        request.origins,
+        request.directions,
+        grid.lattice,
+        lambda positions: grid.density_at(grid.locate(positions)),
+        None if grid.voxels.all_kept else grid.in_kept_voxel,
+        options.steps_per_voxel,
+        request.near,
+        request.far,
+    )
+
+
+def reference_render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayRender:
+    """Render rays in plain torch: the twin that every faster renderer is tested against."""
+    marched = march_grid(grid, request, options)
+    at = grid.locate(marched.positions)
+
+    def rows(query):
+        def rows_at(flat: Tensor) -> Tensor:
+            return query(at.select(marched.active_index(flat)), request.directions[marched.rays_of(flat)])
+
+        return rows_at
+
+    def rgb_at(points: TrilinearPoints, directions: Tensor) -> Tensor:
+        return grid.rgb_at(points, directions, options.sh_degree)
+
+    seen = composite(
+        marched.steps,
+        marched.along,
+        rows(rgb_at) if grid.sh is not None else None,
+        rows(grid.thermal_at),
+        request.rgb_rays,
+        request.thermal_rays,
+        thermal_moves_density=options.thermal_moves_density,
+        smallest_weight=options.smallest_weight,
+    )
+    assert seen.thermal is not None
+    steps = marched.steps
+    distortion = sparsity = None
+    if options.distortion_scale:
+        distortion = losses.ray_distortion(marched.along.weights, steps.t, steps.deltas, options.distortion_scale)
+    if options.sparsity:
+        sparsity = losses.ray_sparsity(marched.density, steps.deltas)
+    corners = grid.voxels.tables(grid.density.device)[0]
+    parameters = grid.row_parameters()
+    variation = {
+        name: losses.total_variation(parameters[name], corners[first:last])
+        for name, (first, last) in options.variation.items()
+    }
+    return RayRender(
+        seen.rgb,
+        seen.thermal,
+        marched.along.transmittance,
+        marched.along.accumulation,
+        seen.depth.detach(),
+        distortion,
+        sparsity,
+        variation,
+    )
+
+
+def fused_render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayRender:
+    """Render rays with the compiled kernels."""
+    from thermoxels_ns.render.fused import render
+
+    return render(_arrays(grid), grid.density, grid.sh, grid.temperature, grid.activation, request, options)
+
+
+@dataclass(frozen=True)
+class GridSamples:
+    """Samples of rays in kept voxels, ray after ray, for statistics. No gradients."""
+
+    ray: Int64[Tensor, " n"]
+    """Ray of each sample, ascending."""
+    at: TrilinearPoints
+    """Where the samples lie."""
+    weight: Float[Tensor, " n"]
+    """Share of the pixel."""
+    before: Float[Tensor, " n"]
+    """Share of the pixel that is spent before the sample."""
+    transmittance: Float[Tensor, " rays"]
+    """Share of the pixel that is left for the background."""
+
+
+@torch.no_grad()
+def sample_rays(grid: VoxelGrid, request: RayRequest, options: RenderOptions, backend: Backend) -> GridSamples:
+    """March rays and list their samples; neither colour nor temperature is read."""
+    at = object.__new__(TrilinearPoints)
+    at.voxels = grid.voxels
+    if choose_backend(backend, grid.density.device) == "fused":
+        from thermoxels_ns.render.fused import march as fused_march
+
+        nothing = torch.zeros(len(request.origins), dtype=torch.bool)
+        request = RayRequest(request.origins, request.directions, request.near, request.far, nothing, nothing)
+        marched = fused_march(_arrays(grid), grid.density, None, grid.temperature, grid.activation, request, options)
+        records = marched.records
+        offset, used = torch.from_numpy(records.offset), torch.from_numpy(records.used)
+        ray = torch.repeat_interleave(torch.arange(len(used)), offset.diff())
+        reached = torch.arange(len(ray)) - offset[ray] < used[ray]
+        at.number = torch.from_numpy(records.number)[reached].long()
+        at.fraction = torch.from_numpy(records.fraction)[reached]
+        ray = ray[reached]
+        weight = torch.from_numpy(records.weight)[reached]
+        before = 1.0 - torch.from_numpy(records.left)[reached] - weight
+        return GridSamples(ray, at, weight, before, torch.from_numpy(marched.sums.transmittance))
+    marched = march_grid(grid, request, options)
+    weights = marched.along.weights
+    before = torch.cumsum(weights, -1) - weights
+    located = grid.locate(marched.positions)
+    at.number, at.fraction = located.number, located.fraction
+    return GridSamples(
+        marched.rays_of(marched.active),
+        at,
+        weights.flatten()[marched.active],
+        before.flatten()[marched.active],
+        marched.along.transmittance,
+    )
+
+
+def _arrays(grid: VoxelGrid):
+    from thermoxels_ns.render.fused import VoxelArrays
+
+    voxels = grid.voxels
+    return VoxelArrays(voxels.lattice, voxels.voxel_rows, voxels.block_slot, voxels.voxel_number)

@@ -1,0 +1,345 @@
+"""Compiled forward pass: march rays, skip empty voxels, weigh, and read colour and temperature where there is weight.
+
+Plain loops for numba. Every function works on a range of rays, so that threads can share a batch: no two rays write
+the same place. Geometry and sums are in double precision whatever the parameters are.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+Floats = npt.NDArray[np.floating]
+Ints = Any  # arrays of integers; numba knows which
+
+BLOCK = 8
+"""Voxels along the side of a block; the rule is that of `KeptVoxels`."""
+OPAQUE = 100.0
+"""Optical depth of a step from which it counts as opaque."""
+EXP_LIMIT = 15.0
+"""Raw density from which `exp` stays constant."""
+RELU, SOFTPLUS, EXP = 0, 1, 2
+
+
+class Volume(NamedTuple):
+    """The kept voxels and their parameters as plain arrays."""
+
+    lo: Floats
+    """Lower corner, (3,) float64."""
+    hi: Floats
+    """Upper corner, (3,) float64."""
+    size: float
+    """Edge of a voxel."""
+    cells: Ints
+    """Voxels along x, y, z, (3,) int64."""
+    block_slot: Ints
+    voxel_number: Ints
+    voxel_rows: Ints
+    density: Floats
+    """(rows, 1), raw."""
+    sh: Floats
+    """(rows, 3 k), or (0, 0)."""
+    temperature: Floats
+    """(rows, k)."""
+    activation: int
+
+
+class Rays(NamedTuple):
+    """A batch of rays."""
+
+    origins: Floats
+    directions: Floats
+    near: Floats
+    far: Floats
+    wants: Ints
+    """Bits per ray, (rays,) uint8: 1 colour, 2 temperature."""
+
+
+class Settings(NamedTuple):
+    """What to compute and how exactly."""
+
+    step: float
+    smallest_weight: float
+    early_stop: float
+    distortion_scale: float
+    """Length that counts as 1 in the distortion; 0: not computed."""
+    sparsity: int
+    """1: sum the sparsity term."""
+    thermal_moves_density: int
+    sh_active: int
+    """Colour harmonics per channel that take part; those behind them count as 0."""
+
+
+class Records(NamedTuple):
+    """What the forward pass remembers of each sample in a kept voxel, ray after ray."""
+
+    offset: Ints
+    """First record of each ray, (rays + 1,) int64."""
+    used: Ints
+    """Records of each ray before it was opaque, (rays,) int64."""
+    number: Ints
+    """Number of the voxel, int32."""
+    step: Ints
+    """Number of the step, int32."""
+    fraction: Floats
+    """Place in the voxel, (records, 3)."""
+    density: Floats
+    """Density; after the backward pass the gradient of the raw density."""
+    left: Floats
+    """Transmittance behind the step; after the backward pass the gradient of the temperature."""
+    weight: Floats
+    """Weight."""
+    rgb: Floats
+    """Colour, (records, 3); after the backward pass the gradient of its logits."""
+
+
+class Sums(NamedTuple):
+    """What comes out per ray."""
+
+    rgb: Floats
+    thermal: Floats
+    transmittance: Floats
+    accumulation: Floats
+    depth: Floats
+    distortion: Floats
+    sparsity: Floats
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def chord(rays: Rays, r: int, volume: Volume):
+    """Entry and exit distance of a ray, both 0 for a miss; each axis guarded as in `sampling.intersect_box`."""
+    enter, leave = float(rays.near[r]), float(rays.far[r])
+    for axis in range(3):
+        origin, direction = float(rays.origins[r, axis]), float(rays.directions[r, axis])
+        lo, hi = volume.lo[axis], volume.hi[axis]
+        if abs(direction) < 1e-20:
+            if origin < lo or origin > hi:
+                return 0.0, 0.0
+            continue
+        inverse = 1.0 / direction
+        a, b = (lo - origin) * inverse, (hi - origin) * inverse
+        enter = max(enter, min(a, b))
+        leave = min(leave, max(a, b))
+    if not (leave > enter and leave < math.inf):
+        return 0.0, 0.0
+    return enter, leave
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def next_sample(i: int, enter: float, length: float, step: float, rays: Rays, r: int, volume: Volume):
+    """The first sample from step `i` on that lies in a kept voxel.
+
+    Returns:
+        Its step, the voxel's number, distance, step length and place in the voxel; step -1 if there is none.
+    """
+    ox, oy, oz = float(rays.origins[r, 0]), float(rays.origins[r, 1]), float(rays.origins[r, 2])
+    dx, dy, dz = float(rays.directions[r, 0]), float(rays.directions[r, 1]), float(rays.directions[r, 2])
+    lx, ly, lz = volume.lo[0], volume.lo[1], volume.lo[2]
+    h = volume.size
+    nx, ny, nz = volume.cells[0], volume.cells[1], volume.cells[2]
+    by, bz = (ny + BLOCK - 1) // BLOCK, (nz + BLOCK - 1) // BLOCK
+    while True:
+        delta = min(step, length - i * step)
+        if delta <= 0.0:
+            return -1, -1, 0.0, 0.0, 0.0, 0.0, 0.0
+        t = enter + i * step + 0.5 * delta
+        ux = min(max((ox + dx * t - lx) / h, 0.0), float(nx))
+        uy = min(max((oy + dy * t - ly) / h, 0.0), float(ny))
+        uz = min(max((oz + dz * t - lz) / h, 0.0), float(nz))
+        x, y, z = min(int(ux), nx - 1), min(int(uy), ny - 1), min(int(uz), nz - 1)
+        slot = volume.block_slot[((x >> 3) * by + (y >> 3)) * bz + (z >> 3)]
+        if slot >= 0:
+            number = volume.voxel_number[(slot << 9) + (((x & 7) << 6) | ((y & 7) << 3) | (z & 7))]
+            if number >= 0:
+                return i, number, t, delta, ux - x, uy - y, uz - z
+            i += 1
+            continue
+        # Empty block: on to the first sample behind its far side (a little early rather than late).
+        leave = math.inf
+        if dx != 0.0:
+            leave = min(leave, (lx + ((x >> 3) + (1 if dx > 0.0 else 0)) * BLOCK * h - ox) / dx)
+        if dy != 0.0:
+            leave = min(leave, (ly + ((y >> 3) + (1 if dy > 0.0 else 0)) * BLOCK * h - oy) / dy)
+        if dz != 0.0:
+            leave = min(leave, (lz + ((z >> 3) + (1 if dz > 0.0 else 0)) * BLOCK * h - oz) / dz)
+        ahead = (min(leave, enter + length + step) - enter) / step - 0.5 - 1e-6
+        i = max(i + 1, int(ahead) + 1 if ahead >= 0.0 else 0)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def count_samples(first: int, last: int, rays: Rays, volume: Volume, settings: Settings, counts: Ints):
+    """Number of samples in kept voxels of rays `first` to `last`."""
+    for r in range(first, last):
+        enter, leave = chord(rays, r, volume)
+        count = 0
+        i = 0
+        while True:
+            found = next_sample(i, enter, leave - enter, settings.step, rays, r, volume)
+            if found[0] < 0:
+                break
+            count += 1
+            i = found[0] + 1
+        counts[r] = count
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def basis_of(directions: Floats, r: int, count: int, scale: float, basis: Floats):
+    """Spherical harmonics of a ray's direction, the first `count` of `harmonics.harmonics`, times `scale`."""
+    basis[0] = 0.28209479177387814 * scale
+    if count > 1:
+        x, y, z = float(directions[r, 0]), float(directions[r, 1]), float(directions[r, 2])
+        one = 0.4886025119029199 * scale
+        basis[1], basis[2], basis[3] = -one * y, one * z, -one * x
+        if count > 4:
+            off = 1.0925484305920792 * scale
+            basis[4], basis[5], basis[7] = off * x * y, -off * y * z, -off * x * z
+            basis[6] = 0.31539156525252005 * scale * (3.0 * z * z - 1.0)
+            basis[8] = 0.5462742152960396 * scale * (x * x - y * y)
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+def gather(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: float, into: Floats):
+    """Interpolate one row of `values` at a place in a voxel."""
+    gx, gy, gz = 1.0 - fx, 1.0 - fy, 1.0 - fz
+    a, b, c, d = rows[number, 0], rows[number, 1], rows[number, 2], rows[number, 3]
+    one = values.dtype.type
+    wa0, wa1, wb0, wb1 = one(gx * gy * gz), one(gx * gy * fz), one(gx * fy * gz), one(gx * fy * fz)
+    wc0, wc1, wd0, wd1 = one(fx * gy * gz), one(fx * gy * fz), one(fx * fy * gz), one(fx * fy * fz)
+    ra0, ra1, rb0, rb1 = values[a], values[a + 1], values[b], values[b + 1]
+    rc0, rc1, rd0, rd1 = values[c], values[c + 1], values[d], values[d + 1]
+    for k in range(into.shape[0]):
+        into[k] = (wa0 * ra0[k] + wa1 * ra1[k] + wb0 * rb0[k] + wb1 * rb1[k]) + (
+            wc0 * rc0[k] + wc1 * rc1[k] + wd0 * rd0[k] + wd1 * rd1[k]
+        )
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+def gather_some(
+    values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: float, count: int, active: int, into: Floats
+):
+    """Interpolate the first `active` of every `count` channels."""
+    gx, gy, gz = 1.0 - fx, 1.0 - fy, 1.0 - fz
+    a, b, c, d = rows[number, 0], rows[number, 1], rows[number, 2], rows[number, 3]
+    one = values.dtype.type
+    wa0, wa1, wb0, wb1 = one(gx * gy * gz), one(gx * gy * fz), one(gx * fy * gz), one(gx * fy * fz)
+    wc0, wc1, wd0, wd1 = one(fx * gy * gz), one(fx * gy * fz), one(fx * fy * gz), one(fx * fy * fz)
+    for channel in range(0, into.shape[0], count):
+        for k in range(channel, channel + active):
+            into[k] = (wa0 * values[a, k] + wa1 * values[a + 1, k] + wb0 * values[b, k] + wb1 * values[b + 1, k]) + (
+                wc0 * values[c, k] + wc1 * values[c + 1, k] + wd0 * values[d, k] + wd1 * values[d + 1, k]
+            )
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+def gather_one(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: float):
+    """Interpolate the first channel at a place in a voxel."""
+    gx, gy, gz = 1.0 - fx, 1.0 - fy, 1.0 - fz
+    a, b, c, d = rows[number, 0], rows[number, 1], rows[number, 2], rows[number, 3]
+    return gx * (
+        gy * (gz * values[a, 0] + fz * values[a + 1, 0]) + fy * (gz * values[b, 0] + fz * values[b + 1, 0])
+    ) + fx * (gy * (gz * values[c, 0] + fz * values[c + 1, 0]) + fy * (gz * values[d, 0] + fz * values[d + 1, 0]))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def activate(raw: float, kind: int):
+    """Density of an interpolated raw value; a NaN stays one."""
+    if kind == RELU:
+        return raw if not raw <= 0.0 else 0.0
+    if kind == SOFTPLUS:
+        return raw if raw > 20.0 else math.log1p(math.exp(raw))
+    return math.exp(raw if not raw > EXP_LIMIT else EXP_LIMIT)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def march_forward(first: int, last: int, rays: Rays, volume: Volume, settings: Settings, records: Records, sums: Sums):
+    """Render rays `first` to `last` (paper, eq. 1 and 2) and record their samples.
+
+    Returns:
+        Number of samples whose density is NaN.
+    """
+    channels, thermal_channels = volume.sh.shape[1], volume.temperature.shape[1]
+    count = channels // 3
+    active = min(count, settings.sh_active)
+    coefficients = np.empty(channels, volume.sh.dtype)
+    thermal_coefficients = np.empty(thermal_channels, volume.temperature.dtype)
+    basis, thermal_basis = np.empty(9), np.empty(9)
+    wrong = 0
+    for r in range(first, last):
+        enter, leave = chord(rays, r, volume)
+        length = leave - enter
+        wants_rgb, wants_thermal = (rays.wants[r] & 1) != 0 and channels > 0, (rays.wants[r] & 2) != 0
+        if wants_rgb:
+            basis_of(rays.directions, r, active, 1.0, basis)
+        if wants_thermal:
+            basis_of(rays.directions, r, thermal_channels, 1.0 / 0.28209479177387814, thermal_basis)
+        red, green, blue, thermal, expected = 0.0, 0.0, 0.0, 0.0, 0.0
+        left, depth_sum = 1.0, 0.0
+        weight_sum, moment_sum, distortion, sparsity = 0.0, 0.0, 0.0, 0.0
+        n, i = records.offset[r], 0
+        while True:
+            i, number, t, delta, fx, fy, fz = next_sample(i, enter, length, settings.step, rays, r, volume)
+            if i < 0:
+                break
+            density = activate(gather_one(volume.density, volume.voxel_rows, number, fx, fy, fz), volume.activation)
+            if density != density:
+                wrong += 1
+                break
+            optical = min(density * delta, OPAQUE)
+            alpha = -math.expm1(-optical)
+            weight = left * alpha
+            depth_sum += optical
+            left *= math.exp(-optical) if alpha > 0.5 else 1.0 - alpha
+            records.number[n], records.step[n] = number, i
+            records.fraction[n, 0], records.fraction[n, 1], records.fraction[n, 2] = fx, fy, fz
+            records.density[n], records.left[n], records.weight[n] = density, left, weight
+            expected += weight * t
+            if settings.distortion_scale > 0.0:
+                distortion += 2.0 * weight * (t * weight_sum - moment_sum) + weight * weight * delta / 3.0
+                weight_sum += weight
+                moment_sum += weight * t
+            if settings.sparsity:
+                limited = min(density, 1e9)
+                sparsity += math.log1p(2.0 * limited * limited)
+            if records.weight[n] > settings.smallest_weight:  # as rounded: the backward pass asks the same
+                if wants_rgb:
+                    if active == count:
+                        gather(volume.sh, volume.voxel_rows, number, fx, fy, fz, coefficients)
+                    else:
+                        gather_some(volume.sh, volume.voxel_rows, number, fx, fy, fz, count, active, coefficients)
+                    for c in range(3):
+                        logit = 0.0
+                        for k in range(active):
+                            logit += coefficients[c * count + k] * basis[k]
+                        records.rgb[n, c] = 1.0 / (1.0 + math.exp(-logit))
+                    red += weight * records.rgb[n, 0]
+                    green += weight * records.rgb[n, 1]
+                    blue += weight * records.rgb[n, 2]
+                if wants_thermal:
+                    value = 0.0
+                    if thermal_channels == 1:
+                        value = gather_one(volume.temperature, volume.voxel_rows, number, fx, fy, fz)
+                    else:
+                        gather(volume.temperature, volume.voxel_rows, number, fx, fy, fz, thermal_coefficients)
+                        for k in range(thermal_channels):
+                            value += thermal_coefficients[k] * thermal_basis[k]
+                    thermal += weight * value
+            n += 1
+            i += 1
+            if left < settings.early_stop:
+                break
+        records.used[r] = n - records.offset[r]
+        opacity = -math.expm1(-depth_sum)
+        sums.transmittance[r], sums.accumulation[r] = left, opacity
+        sums.depth[r] = expected / opacity if opacity > 0.0 else math.inf
+        if channels:
+            sums.rgb[r, 0], sums.rgb[r, 1], sums.rgb[r, 2] = red, green, blue
+        sums.thermal[r, 0] = thermal
+        if settings.distortion_scale > 0.0:
+            sums.distortion[r] = distortion / settings.distortion_scale
+        if settings.sparsity:
+            sums.sparsity[r] = sparsity
+    return wrong

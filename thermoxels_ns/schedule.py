@@ -1,0 +1,93 @@
+"""When a training refines, prunes and thins: one rule for every resolution and number of steps.
+
+The shares of the run at which things happen were measured on synthetic scenes (`tests/benchmarks/default_sweep.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from thermoxels_ns.errors import ThermoxelsError, explain
+
+COARSEST = 32
+"""Voxels along the longest side that a training starts with, or a few more."""
+_REFINE: Mapping[int, tuple[float, ...]] = {
+    0: (),
+    1: (0.25,),
+    2: (0.2, 0.5),
+    3: (0.15, 0.35, 0.6),
+    4: (0.12, 0.27, 0.44, 0.62),
+}
+_PRUNE_AFTER = 0.13
+"""Share of the run after each refinement at which what turned out empty is dropped."""
+_THIN = 0.8
+_VIEW_DEPENDENCE = 0.8
+_RAMP = (0.1, 0.4)
+
+Quality = Literal["draft", "standard", "fine"]
+QUALITIES: Mapping[Quality, tuple[int, int]] = {"draft": (64, 800), "standard": (128, 1500), "fine": (256, 4000)}
+"""Resolution and steps of the named qualities; `thermoxels cost` measures what they give."""
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The course of a training."""
+
+    resolutions: tuple[int, ...]
+    """Voxels along the longest side, coarse to fine."""
+    refine_at: tuple[int, ...]
+    """Steps at which the next resolution begins."""
+    prune_at: tuple[int, ...]
+    """Steps at which voxels without weight are dropped, beside those of refinement."""
+    thin_at: tuple[int, ...]
+    """Steps at which surfaces are thinned."""
+    distortion_ramp: tuple[int, int]
+    """Steps over which the distortion term grows."""
+    view_dependence_from: int
+    """Step from which colour depends on the direction."""
+    steps: int
+    """Number of steps."""
+
+
+def schedule_for(resolution: int, steps: int) -> Schedule:
+    """The course of a training that ends at a resolution after some steps.
+
+    Args:
+        resolution: Voxels along the longest side of the scene box at the end, at least 1.
+        steps: Training steps, at least 10.
+
+    Raises:
+        ThermoxelsError: A number is too small.
+
+    >>> schedule_for(128, 1000).refine_at
+    (200, 500)
+    """
+    if resolution < 1 or steps < 10:
+        raise ThermoxelsError(
+            explain(
+                "schedule",
+                expected="at least 1 voxel and 10 steps",
+                got=f"{resolution} voxels, {steps} steps",
+                remedy="Raise them.",
+            )
+        )
+    resolutions = [resolution]
+    while resolutions[0] % 2 == 0 and resolutions[0] // 2 >= COARSEST and len(resolutions) <= max(_REFINE):
+        resolutions.insert(0, resolutions[0] // 2)
+    refine = _REFINE[len(resolutions) - 1]
+    prune = [share + _PRUNE_AFTER for share in refine] or [0.5]
+
+    def at(share: float) -> int:
+        return max(1, round(share * steps))
+
+    return Schedule(
+        tuple(resolutions),
+        tuple(at(share) for share in refine),
+        tuple(at(share) for share in prune),
+        (at(_THIN),),
+        (at(_RAMP[0]), at(_RAMP[1])),
+        at(_VIEW_DEPENDENCE),
+        steps,
+    )
