@@ -26,6 +26,7 @@ from thermoxels_ns.cost_runs import (
     training_seconds,
 )
 from thermoxels_ns.errors import SceneError, ThermoxelsError
+from thermoxels_ns.schedule import schedule_for
 
 PYTHON = sys.executable
 # A training takes `steps` / 100 seconds by its files' times; the evaluation improves with the steps.
@@ -55,23 +56,6 @@ def value(option, default=None):
 with open(pathlib.Path(__file__).parent / "calls", "a") as calls:
     print(*[pathlib.Path(sys.argv[0]).name, *sys.argv[1:]], file=calls)
 """
-
-
-def schedule_for(resolution: int, steps: int):
-    """Stands for the package's: easy to read back."""
-    return types.SimpleNamespace(
-        resolutions=(resolution // 2, resolution),
-        refine_at=(steps // 2,),
-        prune_at=(),
-        distortion_ramp=(steps // 4, steps // 2),
-        steps=steps,
-    )
-
-
-@pytest.fixture(autouse=True)
-def fake_schedule(monkeypatch):
-    module = types.SimpleNamespace(schedule_for=schedule_for)
-    monkeypatch.setitem(sys.modules, "thermoxels_ns.schedule", module)  # type: ignore[arg-type]
 
 
 @pytest.fixture
@@ -129,8 +113,11 @@ def test_a_setting_becomes_the_options_of_its_schedule():
     words = training_options(64, 800)
     text = " ".join(words)
     assert text.startswith("--max-num-iterations 800 --optimizers.density.scheduler.max-steps 800 ")
-    assert "--pipeline.model.resolutions 32 64 --pipeline.model.refine-at 400 --pipeline.model.prune-at " in text
-    assert text.endswith("--pipeline.model.distortion-ramp 200 400")
+    schedule = schedule_for(64, 800)
+    refine, prune, thin = (" ".join(map(str, at)) for at in (schedule.refine_at, schedule.prune_at, schedule.thin_at))
+    assert f"--pipeline.model.resolutions 32 64 --pipeline.model.refine-at {refine} --pipeline.model.prune-at " in text
+    assert f"--pipeline.model.prune-at {prune} --pipeline.model.thin-at {thin} " in text
+    assert text.endswith(f"--pipeline.model.view-dependence-from {schedule.view_dependence_from}")
     assert all(" " not in word for word in words)
 
 

@@ -219,7 +219,7 @@ class ThermoxelsModel(Model):
     def _image_outputs(self, request: RayRequest) -> dict[str, Tensor]:
         rgb, thermal, seen = self.render_rays(request, self._options())
         origins = request.origins
-        if rgb is None:
+        if rgb is None or (request.rgb_rays is not None and not bool(request.rgb_rays.any())):
             rgb = thermal.expand(-1, 3)
         # A ray that hits nothing is drawn behind the box: image writers cannot show infinity.
         lo, hi = torch.tensor([self.grid.lattice.lo, self.grid.lattice.hi], dtype=origins.dtype, device=origins.device)

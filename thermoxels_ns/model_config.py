@@ -86,7 +86,7 @@ class ThermoxelsModelConfig(ModelConfig):
     """Voxels kept around those, so that surfaces can still move."""
     thin_at: tuple[int, ...] = _STANDARD.thin_at
     """Steps at which surfaces are thinned: fog before them and what shines through from behind them goes."""
-    thin_threshold: float = 0.2
+    thin_threshold: float = 0.05
     """At those steps a voxel stays only if some training ray gave it more than this share of a pixel."""
 
     sh_degree: int | None = 2

@@ -62,7 +62,7 @@ CANDIDATES: Mapping[str, Candidate] = {
     "beta 1e-3": _losses(beta=1e-3),
     "view-dependent from the start": Candidate({"view_dependence_from": 0}, {}),
     "no thinning": Candidate({"thin_at": []}, {}),
-    "thinning at 0.1": Candidate({"thin_threshold": 0.1}, {}),
+    "thinning at 0.15": Candidate({"thin_threshold": 0.15}, {}),
     "2048 rays": Candidate({}, {}, rays=2048),
     "thermal moves density": Candidate({"thermal_density_gradient": True}, {}),
 }

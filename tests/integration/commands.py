@@ -11,7 +11,8 @@ from pathlib import Path
 SHORT_TRAINING = [
     *("--max-num-iterations", "40", "--steps-per-save", "20", "--vis", "tensorboard"),
     *("--pipeline.model.resolutions", "12", "24", "--pipeline.model.refine-at", "15"),
-    *("--pipeline.model.prune-at", "30", "--pipeline.datamanager.train-num-rays-per-batch", "512"),
+    *("--pipeline.model.prune-at", "30", "--pipeline.model.thin-at", "35"),
+    *("--pipeline.model.view-dependence-from", "25", "--pipeline.datamanager.train-num-rays-per-batch", "512"),
     *("--logging.local-writer.enable", "False", "--save-only-latest-checkpoint", "False"),
 ]
 

@@ -20,11 +20,14 @@ import torch
 from PIL import Image
 
 from tests.integration.commands import SHORT_TRAINING, Trained, run
+from thermoxels_ns.field.kept_voxels import KeptVoxels
+from thermoxels_ns.lattice import Lattice
 
 STOCK_EXPORTS = ("pointcloud", "tsdf", "poisson", "marching-cubes", "cameras", "gaussian-splat")
 METRICS = (
     *("psnr", "ssim", "thermal_psnr", "thermal_ssim", "thermal_hssim"),
     *("thermal_mae_c", "thermal_mae_hit_c", "thermal_mae_roi_c", "thermal_mae_debiased_c"),
+    *("half_transparent", "fscore", "precision", "recall", "fscore_128"),
 )
 
 
@@ -35,7 +38,7 @@ def test_training_reports_evaluation_batches(trained: Trained, tmp_path):
         *("--steps-per-eval-batch", "1", "--steps-per-eval-image", "2", "thermal-data", "--data", str(trained.scene)),
     )
     assert result.returncode == 0, result.stdout
-    assert "the run ends before step 3: no refinement or pruning at 15, 30" in " ".join(result.stdout.split())
+    assert "the run ends before step 3: no refinement or pruning at 15, 30, 35" in " ".join(result.stdout.split())
 
 
 def test_training_refines_prunes_and_saves(trained: Trained):
@@ -43,7 +46,9 @@ def test_training_refines_prunes_and_saves(trained: Trained):
     assert saved == ["step-000000020.ckpt", "step-000000039.ckpt"]
     state = torch.load(trained.checkpoints / saved[-1], weights_only=False)["pipeline"]
     shape = state["_model.field.grid.corner_shape"].tolist()
-    assert max(shape) == 25 and state["_model.field.grid.density"].shape[0] == np.prod(shape)
+    rows, cells = state["_model.field.grid.density"].shape[0], state["_model.field.grid.cells"]
+    voxels = KeptVoxels(Lattice((0.0, 0.0, 0.0), 1.0, tuple(shape)), cells.numpy())
+    assert max(shape) == 25 and rows == voxels.num_rows <= np.prod(shape)
 
 
 def test_eval_reports_every_metric(trained: Trained, tmp_path):

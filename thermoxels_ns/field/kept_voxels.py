@@ -113,13 +113,12 @@ class KeptVoxels:
         grown = np.zeros(self.lattice.cell_shape, dtype=bool)
         grown.reshape(-1)[self.cells[chosen]] = True
         for axis in range(3):
-            before = grown.copy() if by > 1 else grown
             spread = np.zeros_like(grown)
             for shift in range(1, by + 1):
                 near, far = [slice(None)] * 3, [slice(None)] * 3
                 near[axis], far[axis] = slice(shift, None), slice(None, -shift)
-                spread[tuple(near)] |= before[tuple(far)]
-                spread[tuple(far)] |= before[tuple(near)]
+                spread[tuple(near)] |= grown[tuple(far)]
+                spread[tuple(far)] |= grown[tuple(near)]
             grown |= spread
         return grown.reshape(-1)[self.cells]
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,10 +18,17 @@ from torch import Tensor
 from thermoxels_ns.errors import ThermoxelsError, explain
 from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.render import kernels, kernels_backward
+from thermoxels_ns.render.kernel_cache import forget_stale_kernels
 from thermoxels_ns.render.kernels import Rays, Records, Settings, Sums, Volume
 from thermoxels_ns.render.kernels_backward import RayGradients, RowGradients
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions, near_and_far
 from thermoxels_ns.threads import num_threads, run_ranges, run_tasks
+
+# Before the first call, which loads what was compiled earlier.
+forget_stale_kernels(
+    Path(kernels.march_forward.stats.cache_path),
+    (Path(str(module.__file__)) for module in (kernels, kernels_backward)),
+)
 
 ACTIVATIONS = {"relu": kernels.RELU, "softplus": kernels.SOFTPLUS, "exp": kernels.EXP}
 SMALLEST_VARIATION = 1e-10
