@@ -259,20 +259,22 @@ def _row_gradients(marched: Marched, used, rays_moved: bool, options: RenderOpti
     pushes = {name: g for name, g in zip(options.variation, variation) if g is not None}
     places = [np.full(num_rows if parameters[name].shape[1] else 0, -1, dtype=np.int32) for name in NAMES]
 
-    def place(index: int):
+    def place(index: int) -> np.ndarray:
+        """Number the rows of a parameter that get a gradient and list them."""
         name = NAMES[index]
         first, last = options.variation[name] if name in pushes else (0, 0)
         if not parameters[name].shape[1]:
-            return 0
-        return kernels_backward.place_rows(used[index], volume.voxel_rows, first, last, places[index])
+            return np.zeros(0, dtype=np.int64)
+        total = kernels_backward.place_rows(used[index], volume.voxel_rows, first, last, places[index])
+        return kernels_backward.list_rows(places[index], total)
 
-    totals: Any = run_tasks([lambda index=index: place(index) for index in range(3)])
+    touched: Any = run_tasks([lambda index=index: place(index) for index in range(3)])
     values = [
-        np.zeros((total, parameters[name].shape[1]), parameters[name].dtype) for name, total in zip(NAMES, totals)
+        np.zeros((len(found), parameters[name].shape[1]), parameters[name].dtype) for name, found in zip(NAMES, touched)
     ]
     rows = RowGradients(places[0], values[0], places[1], values[1], places[2], values[2])
     if rays_moved:
-        bounds = _row_ranges(places[0], num_threads())
+        bounds = _row_ranges(touched[0], num_rows, num_threads())
         run_tasks(
             [
                 lambda low=low, high=high: kernels_backward.add_rows(
@@ -289,13 +291,12 @@ def _row_gradients(marched: Marched, used, rays_moved: bool, options: RenderOpti
             at = places[index][low : low + len(block)]
             inside = np.flatnonzero(at >= 0)
             values[index][at[inside]] += block[inside] * values[index].dtype.type(float(pushes[name]))
-        if totals[index] == 0:
+        if len(touched[index]) == 0:
             gradients.append(None)
             continue
-        touched = torch.from_numpy(np.flatnonzero(places[index] >= 0))[None]
         gradients.append(
             torch.sparse_coo_tensor(
-                touched,
+                torch.from_numpy(touched[index])[None],
                 torch.from_numpy(values[index]),
                 parameters[name].shape,
                 is_coalesced=True,
@@ -305,13 +306,12 @@ def _row_gradients(marched: Marched, used, rays_moved: bool, options: RenderOpti
     return gradients
 
 
-def _row_ranges(place: np.ndarray, threads: int) -> list[int]:
+def _row_ranges(touched: np.ndarray, num_rows: int, threads: int) -> list[int]:
     """Bounds of row ranges with about equally many touched rows."""
-    touched = np.flatnonzero(place >= 0)
     if threads == 1 or len(touched) == 0:
-        return [0, len(place)]
+        return [0, num_rows]
     cuts = touched[(np.arange(1, threads) * len(touched)) // threads]
-    return [0, *(int(cut) for cut in cuts), len(place)]
+    return [0, *(int(cut) for cut in cuts), num_rows]
 
 
 def _array(values: Tensor) -> np.ndarray:

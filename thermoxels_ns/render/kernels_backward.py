@@ -198,6 +198,16 @@ def place_rows(used: Ints, voxel_rows: Ints, block_first: int, block_last: int, 
     return total
 
 
+@njit(nogil=True, cache=True, error_model="numpy")
+def list_rows(place: Ints, total: int):
+    """The `total` rows that `place_rows` numbered, ascending, int64."""
+    rows = np.empty(total, np.int64)
+    for row in range(len(place)):
+        if place[row] >= 0:
+            rows[place[row]] = row
+    return rows
+
+
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 def add_rows(
     first_row: int, last_row: int, rays: Rays, volume: Volume, settings: Settings, records: Records, rows: RowGradients

@@ -1,0 +1,49 @@
+"""What is left when a training is killed without warning."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import torch
+
+from tests.integration.commands import SHORT_TRAINING, run
+
+
+def test_kill_9_while_saving_loses_at_most_the_work_since_the_last_checkpoint(tiny_scene: Path, tmp_path: Path):
+    """Every step saves, so most of the time goes into checkpoints and the signal falls into one."""
+    words = [
+        *("thermoxels", "--output-dir", str(tmp_path), "--experiment-name", "killed", "--timestamp", "run"),
+        *SHORT_TRAINING,
+        *("--steps-per-save", "1", "--max-num-iterations", "100000", "--pipeline.model.resolutions", "32", "64"),
+    ]
+    scene = ("thermal-data", "--data", str(tiny_scene))
+    folder = tmp_path / "killed" / "thermoxels" / "run" / "nerfstudio_models"
+    process = subprocess.Popen(
+        [str(Path(sys.executable).with_name("ns-train")), *words, *scene],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    try:
+        end = time.monotonic() + 200
+        while len(list(folder.glob("*.ckpt"))) < 4:
+            assert process.poll() is None and time.monotonic() < end, "no checkpoint was written"
+            time.sleep(0.003)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    steps = []
+    for checkpoint in folder.iterdir():
+        steps.append(torch.load(checkpoint, weights_only=False)["step"])
+        assert checkpoint.name == f"step-{steps[-1]:09d}.ckpt"
+    assert sorted(steps) == list(range(1, max(steps) + 1)) and len(steps) >= 4
+    again = [*words, "--load-dir", str(folder), "--max-num-iterations", "3", "--steps-per-save", "1000"]
+    result = run("ns-train", *again, *scene)
+    assert result.returncode == 0, result.stdout
+    last = folder / f"step-{max(steps) + 3:09d}.ckpt"
+    assert last.is_file(), sorted(path.name for path in folder.iterdir())
