@@ -26,7 +26,7 @@ from thermoxels_ns.threads import num_threads, run_ranges, run_tasks
 
 # Before the first call, which loads what was compiled earlier.
 forget_stale_kernels(
-    Path(kernels.march_forward.stats.cache_path),
+    Path(str(kernels.march_forward.stats.cache_path)),
     (Path(str(module.__file__)) for module in (kernels, kernels_backward)),
 )
 
