@@ -171,7 +171,7 @@ def connected(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
 
 
 def close_gaps(cells: npt.NDArray[np.bool_], by: int) -> npt.NDArray[np.bool_]:
-    """Fill what a ball (by the city block distance) of radius `by` voxels cannot enter; nothing solid goes.
+    """Fill what a cube of 2 `by` + 1 voxels, made of empty voxels, cannot reach; nothing solid goes.
 
     >>> close_gaps(np.array([[[True, False, True]]]), 1)[0, 0].tolist()
     [True, True, True]
@@ -179,8 +179,9 @@ def close_gaps(cells: npt.NDArray[np.bool_], by: int) -> npt.NDArray[np.bool_]:
     if by == 0:
         return cells
     # Where the box cuts the scene, what is solid goes on behind it.
-    grown = ndimage.binary_dilation(np.pad(cells, by, mode="edge"), iterations=by)
-    closed = ndimage.binary_erosion(grown, iterations=by, border_value=1)
+    touching = np.ones((3, 3, 3), dtype=bool)
+    grown = ndimage.binary_dilation(np.pad(cells, by, mode="edge"), touching, iterations=by)
+    closed = ndimage.binary_erosion(grown, touching, iterations=by, border_value=1)
     return np.logical_or(closed[by:-by, by:-by, by:-by], cells)
 
 
