@@ -62,10 +62,10 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         datamanager = attributes.pipeline.datamanager
         if step in decisions:
             decide_backdrop(model, datamanager)
-        if step in steps and model.config.prune_threshold > 0:
+        thin = step in model.config.thin_at
+        threshold = model.config.thin_threshold if thin else model.config.prune_threshold
+        if step in steps and threshold > 0:
             old = model.grid.row_parameters()
-            thin = step in model.config.thin_at
-            threshold = model.config.thin_threshold if thin else model.config.prune_threshold
             report, change = prune_by_rays(model, datamanager, threshold, 0 if thin else model.config.prune_dilation)
             follow(old, change)
             CONSOLE.log(f"step {step}: {'thinning' if thin else 'pruning'} {report}")

@@ -30,7 +30,15 @@ def _group(lr: float, lr_final: float, optimizer: type[OptimizerConfig]) -> dict
     }
 
 
-def _trainer(optimizer: type[OptimizerConfig] = RowAdamConfig) -> ThermoxelsTrainerConfig:
+def _trainer(
+    optimizer: type[OptimizerConfig] = RowAdamConfig, dense: type[OptimizerConfig] = FusedAdamConfig
+) -> ThermoxelsTrainerConfig:
+    """The default training.
+
+    Args:
+        optimizer: For the rows of the voxel grid.
+        dense: For what every batch touches whole.
+    """
     return ThermoxelsTrainerConfig(
         method_name="thermoxels",
         max_num_iterations=ITERATIONS,
@@ -50,21 +58,21 @@ def _trainer(optimizer: type[OptimizerConfig] = RowAdamConfig) -> ThermoxelsTrai
             "density": _group(0.3, 0.03, optimizer),
             "sh": _group(0.1, 0.01, optimizer),
             "temperature": _group(0.02, 0.002, optimizer),
-            "background": _group(0.05, 0.005, FusedAdamConfig),
-            "thermal_offset": _group(0.002, 0.0002, FusedAdamConfig),
+            "background": _group(0.05, 0.005, dense),
+            "thermal_offset": _group(0.002, 0.0002, dense),
         },
         viewer=ViewerConfig(quit_on_train_completion=True),
         vis="viewer",
     )
 
 
-def _preset(name: str, optimizer: type[OptimizerConfig] = RowAdamConfig) -> MethodSpecification:
+def _preset(name: str, *optimizers: type[OptimizerConfig]) -> MethodSpecification:
     content = read_preset(name)
     description = content.pop("description")
-    return MethodSpecification(with_overrides(_trainer(optimizer), content, name), description)
+    return MethodSpecification(with_overrides(_trainer(*optimizers), content, name), description)
 
 
 thermoxels = MethodSpecification(_trainer(), "RGB and thermal photographs to a voxel model that heat can be solved on.")
-thermoxels_paper = _preset("thermoxels-paper", RowRMSpropConfig)
+thermoxels_paper = _preset("thermoxels-paper", RowRMSpropConfig, RowRMSpropConfig)
 thermoxels_arco = _preset("thermoxels-arco")
 plenoxels_t = _preset("plenoxels-t")

@@ -43,7 +43,7 @@ class Cost:
     """Scene folder. For a synthetic scene the surface is compared with the exact one."""
     output_dir: Path = Path("cost")
     """Folder for runs.csv (single runs), cost.csv (medians), cost.png, cost.md and logs."""
-    settings: tuple[str, ...] = ("32:400", "64:800", "128:800", "128:1600")
+    settings: tuple[str, ...] = ("32:400", "128:800")
     """What to train, as resolution:steps, voxels along the longest side of the scene box and training steps; the
     schedule in between is made to fit. May be empty."""
     qualities: tuple[str, ...] = ("draft", "standard", "fine")

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import os
 import re
-import shutil
 import subprocess
 import sys
 import time
@@ -17,6 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from thermoxels_ns.demo_commands import installed_command
 from thermoxels_ns.errors import ThermoxelsError, explain
 
 _POLL_S = 0.05
@@ -50,17 +50,7 @@ def run_measured(words: Sequence[str], log: Path, watch: Watch = lambda _: None)
     Raises:
         ThermoxelsError: There is no such command, or it failed; the message holds its last lines.
     """
-    folder = Path(sys.executable).parent
-    program = shutil.which(words[0], path=str(folder))
-    if program is None:
-        raise ThermoxelsError(
-            explain(
-                words[0],
-                expected=f"a command in {folder}",
-                got="none",
-                remedy="Install this package and nerfstudio into the environment of this Python.",
-            )
-        )
+    program = installed_command(words[0])
     environment = dict(os.environ, PYTHONUNBUFFERED="1", PYTHONIOENCODING="utf-8")
     with log.open("wb") as file:
         start = time.monotonic()

@@ -41,6 +41,26 @@ def command_line(arguments: Sequence[str | Path]) -> str:
     return shlex.join(str(argument) for argument in arguments)
 
 
+def installed_command(name: str) -> str:
+    """Path of a command of this installation, found beside the running Python.
+
+    Raises:
+        ThermoxelsError: There is no such command.
+    """
+    folder = Path(sys.executable).parent
+    program = shutil.which(name, path=str(folder))
+    if program is None:
+        raise ThermoxelsError(
+            explain(
+                name,
+                expected=f"a command in {folder}",
+                got="none",
+                remedy="Install this package and nerfstudio into the environment of this Python.",
+            )
+        )
+    return program
+
+
 def run_command(arguments: Sequence[str | Path], log: Path, console: Console) -> None:
     """Run one command of this installation; its output is shown as it comes and kept in a file.
 
@@ -56,17 +76,7 @@ def run_command(arguments: Sequence[str | Path], log: Path, console: Console) ->
         ThermoxelsError: There is no such command, or it failed; the message holds its last lines.
     """
     words = [str(argument) for argument in arguments]
-    folder = Path(sys.executable).parent
-    program = shutil.which(words[0], path=str(folder))
-    if program is None:
-        raise ThermoxelsError(
-            explain(
-                words[0],
-                expected=f"a command in {folder}",
-                got="none",
-                remedy="Install this package and nerfstudio into the environment of this Python.",
-            )
-        )
+    program = installed_command(words[0])
     console.print(f"$ {command_line(words)}", style="bold", markup=False, highlight=False, soft_wrap=True)
     start = time.monotonic()
     decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")  # a chunk may end within a character

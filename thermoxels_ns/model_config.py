@@ -39,7 +39,7 @@ class LossWeights:
 
 
 LOSS_RECIPES: Mapping[str, LossWeights] = {
-    # Tuned on the synthetic scenes: what meshes need (opaque solids, empty air) at no cost to the images.
+    # Tuned on the synthetic scenes for what meshes need: opaque solids, empty air.
     "default": LossWeights(
         rgb=1.0,
         thermal=1.0,
@@ -87,7 +87,8 @@ class ThermoxelsModelConfig(ModelConfig):
     thin_at: tuple[int, ...] = _STANDARD.thin_at
     """Steps at which surfaces are thinned: fog before them and what shines through from behind them goes."""
     thin_threshold: float = 0.05
-    """At those steps a voxel stays only if some training ray gave it more than this share of a pixel."""
+    """At those steps a voxel stays only if some training ray gave it more than this share of a pixel, or spent half of
+    its light there. 0 switches thinning off."""
 
     sh_degree: int | None = 2
     """Degree of the view-dependent colour, 0 to 2. None: no colour (thermal images alone)."""

@@ -137,8 +137,6 @@ class GridSamples:
 @torch.no_grad()
 def sample_rays(grid: VoxelGrid, request: RayRequest, options: RenderOptions, backend: Backend) -> GridSamples:
     """March rays and list their samples; neither colour nor temperature is read."""
-    at = object.__new__(TrilinearPoints)
-    at.voxels = grid.voxels
     if choose_backend(backend, grid.density.device) == "fused":
         from thermoxels_ns.render.fused import march as fused_march
 
@@ -149,8 +147,8 @@ def sample_rays(grid: VoxelGrid, request: RayRequest, options: RenderOptions, ba
         offset, used = torch.from_numpy(records.offset), torch.from_numpy(records.used)
         ray = torch.repeat_interleave(torch.arange(len(used)), offset.diff())
         reached = torch.arange(len(ray)) - offset[ray] < used[ray]
-        at.number = torch.from_numpy(records.number)[reached].long()
-        at.fraction = torch.from_numpy(records.fraction)[reached]
+        number, fraction = torch.from_numpy(records.number)[reached].long(), torch.from_numpy(records.fraction)[reached]
+        at = TrilinearPoints.placed(grid.voxels, number, fraction)
         ray = ray[reached]
         weight = torch.from_numpy(records.weight)[reached]
         before = 1.0 - torch.from_numpy(records.left)[reached] - weight
@@ -158,11 +156,9 @@ def sample_rays(grid: VoxelGrid, request: RayRequest, options: RenderOptions, ba
     marched = march_grid(grid, request, options)
     weights = marched.along.weights
     before = torch.cumsum(weights, -1) - weights
-    located = grid.locate(marched.positions)
-    at.number, at.fraction = located.number, located.fraction
     return GridSamples(
         marched.rays_of(marched.active),
-        at,
+        grid.locate(marched.positions),
         weights.flatten()[marched.active],
         before.flatten()[marched.active],
         marched.along.transmittance,

@@ -35,27 +35,23 @@ class VoxelWeights:
 
     largest: Float[Tensor, " voxels"]
     """Largest weight a sample in the voxel had on any ray."""
-    total: Float[Tensor, " voxels"]
-    """Sum of the weights of all samples in the voxel."""
     ends: Bool[Tensor, " voxels"]
     """Voxels in which some ray that ends on something (opacity above one half) has spent half of its weight."""
 
 
 @torch.no_grad()
 def voxel_weights(model: RaySampler, rays: Iterable[RayBundle]) -> VoxelWeights:
-    """Accumulate ray weights in voxels."""
+    """Find how much of a ray each voxel ever held, and where rays end."""
     density = model.grid.density
-    largest, total = (torch.zeros(len(model.grid.voxels), device=density.device) for _ in range(2))
+    largest = torch.zeros(len(model.grid.voxels), device=density.device)
     ends = torch.zeros(len(model.grid.voxels), dtype=torch.bool, device=density.device)
     for bundle in rays:
         samples = model.sample_rays(bundle.origins.to(density.device), bundle.directions.to(density.device))
-        weight = samples.weight.to(largest.dtype)
-        largest.scatter_reduce_(0, samples.at.number, weight, reduce="amax")
-        total.index_add_(0, samples.at.number, weight)
+        largest.scatter_reduce_(0, samples.at.number, samples.weight.to(largest.dtype), reduce="amax")
         opacity = (1.0 - samples.transmittance)[samples.ray]
         half = (samples.before < 0.5 * opacity) & (samples.before + samples.weight >= 0.5 * opacity) & (opacity > 0.5)
         ends[samples.at.number[half]] = True
-    return VoxelWeights(largest, total, ends)
+    return VoxelWeights(largest, ends)
 
 
 @torch.no_grad()

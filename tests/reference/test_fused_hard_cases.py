@@ -13,7 +13,7 @@ from tests.reference.two_renderers import (
     EVERYTHING,
     RENDERERS,
     as_double,
-    compare,
+    assert_twins_agree,
     in_double,
     keep_only,
     random_grid,
@@ -67,7 +67,7 @@ def test_huge_density_agrees(sigma):
     grid = filled(0.0)
     generator = torch.Generator().manual_seed(1)
     grid.density.data = sigma * (torch.rand(grid.density.shape, generator=generator) - 0.5)
-    compare(grid, random_request(grid), EVERYTHING)
+    assert_twins_agree(grid, random_request(grid), EVERYTHING)
 
 
 @pytest.mark.parametrize("renderer", RENDERERS)
@@ -99,7 +99,7 @@ def test_transmittance_keeps_its_digits_over_512_samples():
     error = (single.weight.double() - exact.weight).abs() / exact.weight
     assert float(error.max()) < 1e-5 and 0 < float(exact.weight[-1]) < 1e-17
     assert float(single.transmittance) == pytest.approx(float(exact.transmittance), rel=1e-5)
-    reference = compare(grid, ALONG, replace(EVERYTHING, thermal_moves_density=True))
+    reference = assert_twins_agree(grid, ALONG, replace(EVERYTHING, thermal_moves_density=True))
     assert float(reference.values["transmittance"]) < 1e-16
 
 
@@ -107,7 +107,7 @@ def test_vanishing_density_keeps_value_and_gradient():
     """1 - exp(-1e-8) is 0 in single precision; a renderer that computes it so has a plateau without gradient."""
     grid = random_grid(0, 0, "relu", 1.0, TUBE)
     grid.density.data.fill_(1e-9)
-    reference = compare(grid, ALONG, RenderOptions())
+    reference = assert_twins_agree(grid, ALONG, RenderOptions())
     assert float(reference.values["accumulation"]) == pytest.approx(256e-9, rel=1e-6)
     for renderer in RENDERERS:
         grid.density.grad = None
@@ -162,7 +162,7 @@ def test_axis_parallel_rays(axis, sign, slope):
             seen.accumulation, torch.full((5,), 1 - np.exp(-0.5)), check_dtype=False, rtol=1e-5, atol=0
         )
     sparse = random_grid(1, 0, "relu", 0.05, CUBE)
-    compare(sparse, rays)
+    assert_twins_agree(sparse, rays)
 
 
 @pytest.mark.parametrize("renderer", RENDERERS)
@@ -194,7 +194,7 @@ def test_camera_on_a_face_an_edge_and_a_corner(corner):
         chord = 2.0 * float(origins.norm())
         assert float(seen.accumulation) == pytest.approx(1.0 - np.exp(-0.25 * chord), rel=1e-5)
         assert float(RENDERERS[renderer](grid, outward, RenderOptions()).accumulation) == pytest.approx(0.0, abs=1e-6)
-    compare(random_grid(1, 0, "relu", 0.3, CUBE), inward)
+    assert_twins_agree(random_grid(1, 0, "relu", 0.3, CUBE), inward)
 
 
 def test_camera_inside_starts_at_itself_and_a_box_behind_is_missed():

@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 from tests.reference.two_renderers import (
     EVERYTHING,
     as_double,
-    compare,
+    assert_twins_agree,
     in_double,
     keep_only,
     random_grid,
@@ -42,7 +42,7 @@ def with_variation(grid, options=EVERYTHING) -> RenderOptions:
 )
 def test_everything_at_once(sh_degree, temperature_degree, activation, kept):
     grid = random_grid(sh_degree, temperature_degree, activation, kept)
-    reference = compare(grid, random_request(grid), with_variation(grid), background=True)
+    reference = assert_twins_agree(grid, random_request(grid), with_variation(grid), background=True)
     colour = {"background rgb"} if sh_degree is None else set()
     assert all(float(g.norm()) > 0 for name, g in reference.gradients.items() if name not in colour)
 
@@ -66,7 +66,7 @@ def test_everything_at_once(sh_degree, temperature_degree, activation, kept):
 def test_each_term_alone(options, moves, background, kept):
     grid = random_grid(1, 1, "softplus", kept)
     options = replace(options, thermal_moves_density=moves)
-    reference = compare(grid, random_request(grid), options, background)
+    reference = assert_twins_agree(grid, random_request(grid), options, background)
     assert ("distortion" in reference.values) is (options.distortion_scale is not None)
     assert ("sparsity" in reference.values) is options.sparsity
 
@@ -78,7 +78,7 @@ def test_harmonics_up_to_a_degree(degree, stored, kept):
     """What lies behind the degree gets no gradient, and the picture is that of a grid where it is nil."""
     grid = random_grid(stored, 0, "exp", kept)
     request = random_request(grid)
-    reference = compare(grid, request, with_variation(grid, replace(RenderOptions(), sh_degree=degree)))
+    reference = assert_twins_agree(grid, request, with_variation(grid, replace(RenderOptions(), sh_degree=degree)))
     plain = see("fused", grid, request, replace(RenderOptions(), sh_degree=degree))
     behind = (torch.arange(grid.sh.shape[1]) % (stored + 1) ** 2) >= (degree + 1) ** 2
     gradient = plain.gradients["sh"].abs().amax(0)
@@ -96,7 +96,7 @@ def test_rays_that_want_only_one_stream_or_none(rgb, thermal, moves):
     plain = random_request(grid, 60, mixed=False)
     wants = [None if w is None else torch.full((60,), w) for w in (rgb, thermal)]
     request = RayRequest(plain.origins, plain.directions, plain.near, None, *wants)
-    reference = compare(grid, request, replace(EVERYTHING, thermal_moves_density=moves), background=True)
+    reference = assert_twins_agree(grid, request, replace(EVERYTHING, thermal_moves_density=moves), background=True)
     if rgb is False:
         assert float(reference.values["rgb"].abs().max()) == 0.0
     if thermal is False:
@@ -135,7 +135,7 @@ def test_near_and_far(near, far):
     span = torch.rand(2, 80, generator=torch.Generator().manual_seed(4))
     near = 0.5 + span[0] if near == "per ray" else near
     request = RayRequest(plain.origins, plain.directions, near, None if far is None else 1.0 + 2.0 * span[1])
-    reference = compare(grid, request)
+    reference = assert_twins_agree(grid, request)
     assert 0 < int((reference.values["accumulation"] > 0).sum()) <= 80
 
 
@@ -144,7 +144,7 @@ def test_values_at_the_limit_of_exp_have_no_gradient():
     lattice = Lattice((0.0, 0.0, 0.0), 1e-6, (5, 5, 5))
     grid = random_grid(0, 0, "exp", 1.0, lattice, density=17.0)
     assert 0.1 < float((grid.density > 15).double().mean()) < 0.95
-    reference = compare(grid, random_request(grid, 60), replace(EVERYTHING, distortion_scale=1e-6))
+    reference = assert_twins_agree(grid, random_request(grid, 60), replace(EVERYTHING, distortion_scale=1e-6))
     assert float(reference.gradients["density"].norm()) > 0
     grid.density.data.fill_(20.0)
     assert float(see("fused", grid, random_request(grid, 60)).gradients["density"].abs().max()) == 0.0
@@ -226,7 +226,7 @@ def test_block_skipping(shape, pattern):
     }[pattern]
     lattice = Lattice((-0.3, 0.2, -1.0), 0.125, tuple(n + 1 for n in shape))
     grid = random_grid(0, 0, "softplus", cells, lattice)
-    reference = compare(grid, random_request(grid, 60), EVERYTHING, background=True)
+    reference = assert_twins_agree(grid, random_request(grid, 60), EVERYTHING, background=True)
     if len(cells) == 0:
         assert bool(torch.isinf(reference.values["depth"]).all())
         assert bool((reference.values["transmittance"] == 1.0).all())
@@ -284,7 +284,7 @@ def test_both_backends_list_the_same_samples(case):
 @settings(max_examples=40, deadline=None, derandomize=True, database=None)
 def test_any_pattern_has_the_reference_s_values_and_gradients(case):
     grid, request, options = case
-    compare(grid, request, replace(EVERYTHING, steps_per_voxel=options.steps_per_voxel), background=True)
+    assert_twins_agree(grid, request, replace(EVERYTHING, steps_per_voxel=options.steps_per_voxel), background=True)
 
 
 @pytest.mark.parametrize("backend", ["fused", "reference"])

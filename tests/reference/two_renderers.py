@@ -178,7 +178,7 @@ def assert_same(found: Seen, reference: Seen, values: float, gradients: float) -
             assert cosine > 0.9999, f"gradient of {name}: cosine {cosine}"
 
 
-def compare(
+def assert_twins_agree(
     grid: VoxelGrid, request: RayRequest, options: RenderOptions = EVERYTHING, background: bool = False
 ) -> Seen:
     """Compare the fused renderer in both precisions with the reference in double precision, and return the latter."""

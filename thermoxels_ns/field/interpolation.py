@@ -40,6 +40,13 @@ class TrilinearPoints:
         self.fraction: Float[Tensor, "n 3"] = position - corner
         self.number: Int64[Tensor, " n"] = voxels.number_at(corner.long())
 
+    @classmethod
+    def placed(cls, voxels: KeptVoxels, number: Int64[Tensor, " n"], fraction: Float[Tensor, "n 3"]) -> TrilinearPoints:
+        """Points whose voxel and place in it are known already."""
+        points = object.__new__(cls)
+        points.voxels, points.number, points.fraction = voxels, number, fraction
+        return points
+
     def kept(self) -> Bool[Tensor, " n"]:
         """Whether each point lies in a kept voxel."""
         return self.number >= 0
@@ -60,9 +67,7 @@ class TrilinearPoints:
 
     def select(self, chosen: Tensor | slice) -> TrilinearPoints:
         """The same for a subset of the points (boolean mask, indices or slice)."""
-        subset = object.__new__(TrilinearPoints)
-        subset.voxels, subset.fraction, subset.number = self.voxels, self.fraction[chosen], self.number[chosen]
-        return subset
+        return TrilinearPoints.placed(self.voxels, self.number[chosen], self.fraction[chosen])
 
 
 def interpolate(rows: Float[Tensor, "rows channels"], at: TrilinearPoints) -> Float[Tensor, "n channels"]:

@@ -42,7 +42,6 @@ def split_voxels(voxels: KeptVoxels, factor: int) -> KeptVoxels:
 def parents_of_corners(old: KeptVoxels, new: KeptVoxels, factor: int) -> TrilinearPoints:
     """Where the corners of split voxels lie in the voxels they came from; old corners lie exactly on old ones."""
     index = new.corner_index()
-    at = object.__new__(TrilinearPoints)
     number = torch.full((len(index),), -1, dtype=torch.int64)
     fraction = torch.zeros(len(index), 3, dtype=torch.float64)
     limit = np.asarray(old.lattice.cell_shape)
@@ -58,8 +57,7 @@ def parents_of_corners(old: KeptVoxels, new: KeptVoxels, factor: int) -> Triline
         place = torch.from_numpy(index[missing] / factor - voxel)
         fraction[missing] = torch.where((found >= 0)[:, None], place, fraction[missing])
     assert bool((number >= 0).all()), "every corner of a split voxel lies in its parent"
-    at.voxels, at.number, at.fraction = old, number, fraction
-    return at
+    return TrilinearPoints.placed(old, number, fraction)
 
 
 @torch.no_grad()
@@ -75,8 +73,7 @@ def refine(grid: VoxelGrid, factor: int = 2) -> RowChange:
     at = parents_of_corners(grid.voxels, new, factor)
 
     def change(rows: Tensor) -> Tensor:
-        moved = object.__new__(TrilinearPoints)
-        moved.voxels, moved.number, moved.fraction = at.voxels, at.number.to(rows.device), at.fraction.to(rows.device)
+        moved = TrilinearPoints.placed(at.voxels, at.number.to(rows.device), at.fraction.to(rows.device))
         split = rows.new_empty((len(at.number), rows.shape[1]))
         for first in range(0, len(split), ROWS_AT_ONCE):
             part = slice(first, first + ROWS_AT_ONCE)
