@@ -140,13 +140,16 @@ def test_ns_eval_compares_the_trained_density_with_the_scene(pipeline, monkeypat
     assert known is not None
     exact = exact_snapshot(known, 48, world_to_input)
     asked = []
-    monkeypatch.setattr(pipeline.model, "grid_snapshot", lambda rays: asked.append(list(rays)) or exact)
+    monkeypatch.setattr(
+        pipeline.model, "grid_snapshot", lambda rays, views: asked.append((len(list(rays)), len(views.size))) or exact
+    )
     monkeypatch.setattr(pipeline, "test_mode", "test")
     averages = pipeline.get_average_eval_image_metrics(get_std=True)
     assert averages["precision"] > 0.99 and averages["recall"] > 0.95
     assert averages["surface_distance_voxels"] < 0.6
     assert "fscore_std" not in averages and "half_transparent_std" in averages
-    assert asked == [[]]  # density needs no rays
+    ((rays, views),) = asked
+    assert rays > 0 and views == len(pipeline.datamanager.train_dataset)  # what is solid is decided as in an export
 
 
 def test_ns_eval_takes_the_density_that_the_model_has(pipeline, monkeypatch):

@@ -10,8 +10,10 @@ from nerfstudio.data.scene_box import SceneBox
 
 from thermoxels_ns import pipeline
 from thermoxels_ns.errors import MemoryBudgetError, SceneError, ThermoxelsError
+from thermoxels_ns.field.refine import prune
 from thermoxels_ns.model import ThermoxelsModel
 from thermoxels_ns.model_config import LOSS_RECIPES, ThermoxelsModelConfig
+from thermoxels_ns.snapshot import Views
 from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.units import TemperatureRange
 
@@ -156,6 +158,34 @@ def test_snapshot_is_what_the_field_says():
     np.testing.assert_allclose(snapshot.centre_density(), at_centres, rtol=1e-5)
     np.testing.assert_allclose(snapshot.temperature_c, 20.0, atol=1e-4)  # 0.5 of 10 to 30
     assert 0 < np.count_nonzero(snapshot.observed_weight) < lattice.num_corners
+
+
+def test_snapshot_holds_what_rays_say_on_the_whole_lattice():
+    """After pruning, voxels that are not kept have no weight and their corners are grey."""
+    model = make(start_density=5.0).eval()
+    sh = model.grid.row_parameters()["sh"]
+    sh.data = 3 * torch.randn(sh.shape, generator=torch.Generator().manual_seed(0))
+    prune(model.grid, model.grid.voxels.cells // 32 >= 4)  # x > 0 of 8 x 8 x 4 voxels
+    views = Views(np.eye(4)[None, :3], np.ones((1, 2)), np.ones((1, 2)), np.ones((1, 2), np.int64))
+    snapshot = model.grid_snapshot([rays(), rays(stream=RGB_STREAM)], views)
+    evidence, colour = snapshot.evidence, snapshot.colour
+    assert snapshot.views is views and evidence is not None and colour is not None
+    accumulation = float(model(rays(stream=None))["accumulation"].detach().sum())
+    assert evidence.voxel_weight[4:].sum() == pytest.approx(2 * accumulation, rel=1e-5)
+    assert accumulation > 1.0 and not evidence.voxel_weight[:4].any()
+    assert evidence.half_depth_density.dtype == evidence.voxel_weight.dtype == np.float32
+    np.testing.assert_allclose(evidence.half_depth_density, 5.0, rtol=1e-5)
+    # Degree 0 alone, as the field renders it at the corners from any side.
+    corners = torch.as_tensor(model.grid.lattice.corner_positions(), dtype=torch.float32)[4:].reshape(-1, 3)
+    seen = model.grid.rgb_at(model.grid.locate(corners), torch.eye(3)[torch.arange(len(corners)) % 3], degree=0)
+    np.testing.assert_allclose(colour[4:].reshape(-1, 3), seen.detach(), atol=1e-6)
+    assert colour[4:].std() > 0.1 and (colour[:4] == 0.5).all()
+
+
+def test_snapshot_says_nothing_of_what_is_not_known():
+    snapshot = make(sh_degree=None, background="off").grid_snapshot(())
+    assert (snapshot.colour, snapshot.evidence, snapshot.views) == (None, None, None)
+    assert make().grid_snapshot([rays()]).evidence is not None
 
 
 def test_evaluation_batches_have_losses_without_regularisers():

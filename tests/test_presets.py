@@ -35,7 +35,9 @@ DATAPARSERS: dict[str, str] = PROJECT["entry-points"]["nerfstudio.dataparser_con
 
 FILES = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
 HEAT = [name for name in FILES if name.startswith("heat-")]
-METHOD_FILES = [name for name in FILES if name not in HEAT]
+SCENES = [name for name in FILES if name.startswith("scene-")]
+OTHERS = ("heat-", "patches-", "scene-", "materials")
+METHOD_FILES = [name for name in FILES if not name.startswith(OTHERS)]
 
 
 def _object(reference: str) -> Any:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
 
+from thermoxels_ns.field.interpolation import TrilinearPoints
 from thermoxels_ns.field.refine import prune
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.ray_rendering import Backend, GridSamples, sample_rays
-from thermoxels_ns.ray_statistics import backdrop_evidence, corner_temperature, share_of_rays_opened, voxel_weights
+from thermoxels_ns.ray_statistics import backdrop_evidence, field_evidence, share_of_rays_opened, voxel_weights
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
+from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
 
 
 @dataclass
@@ -72,7 +75,7 @@ def test_weight_lies_in_the_surface_and_sums_to_the_rays(backend):
 
 def test_corner_temperature_is_measured_where_rays_came_and_only_there(backend):
     scene = slab(backend)
-    seen = corner_temperature(scene, rays_along_minus_x())
+    seen = field_evidence(scene, rays_along_minus_x()).temperature
     shape = scene.grid.lattice.shape
     weight, thermal = seen.weight.view(shape), seen.thermal.view(shape)
     assert float(seen.weight.sum()) == pytest.approx(1600, rel=1e-4)
@@ -88,7 +91,7 @@ def test_corner_that_overshoots_is_brought_back_to_what_rays_saw(backend):
     stored = scene.grid.temperature.data.view(shape)
     stored[4:] = 9.0  # in front of the surface, where hardly any weight lies
     stored[3] -= 0.4
-    seen = corner_temperature(scene, rays_along_minus_x())
+    seen = field_evidence(scene, rays_along_minus_x()).temperature
     assert float(seen.thermal.min()) >= 0.0 and float(seen.thermal.max()) <= 1.0
 
 
@@ -98,7 +101,7 @@ def test_corners_that_differ_in_turn_are_averaged(backend):
     shape = scene.grid.lattice.shape
     index = torch.stack(torch.meshgrid(*[torch.arange(n) for n in shape], indexing="ij"), -1)
     scene.grid.temperature.data = (0.5 + 0.2 * (1 - 2 * (index.sum(-1) % 2))).reshape(-1, 1).float()
-    seen = corner_temperature(scene, rays_along_minus_x())
+    seen = field_evidence(scene, rays_along_minus_x()).temperature
     inner = seen.thermal.view(shape)[3:5, 1:-1, 1:-1]
     assert float((inner - 0.5).abs().max()) < 0.6 * 0.2 and float(seen.weight.view(shape)[3:5].min()) > 0
 
@@ -112,7 +115,7 @@ def test_what_leaks_through_a_surface_measures_nothing_behind_it(backend):
     scene.grid.density.data = density.reshape(-1, 1)
     leaked = total_weight(scene).view(6, 6, 6).sum((1, 2))
     assert float(leaked[:2].sum()) > 0.1 * 1600
-    weight = corner_temperature(scene, rays_along_minus_x()).weight.view(shape)
+    weight = field_evidence(scene, rays_along_minus_x()).temperature.weight.view(shape)
     assert float(weight[:3].max()) == 0.0 and float(weight[4].min()) > 0.0
 
 
@@ -133,7 +136,7 @@ def test_voxels_that_are_not_kept_have_no_weight(backend):
     assert weights.largest.shape == weights.ends.shape == total.shape == (108,)
     assert float(total.sum()) == pytest.approx(800, rel=1e-4)
     assert float(total.view(6, 6, 3)[3].sum()) > 0.99 * 800 and bool(weights.ends.view(6, 6, 3)[3].all())
-    seen = corner_temperature(scene, rays_along_minus_x())
+    seen = field_evidence(scene, rays_along_minus_x()).temperature
     assert seen.weight.shape == (scene.grid.voxels.num_rows,) and float(seen.weight.sum()) == pytest.approx(
         800, rel=1e-4
     )
@@ -151,3 +154,121 @@ def test_rays_are_opened_by_the_loss_of_what_they_end_on_alone(backend):
         assert share_of_rays_opened(scene, rays_along_minus_x(), keep) == pytest.approx(expected, abs=0.02)
     scene.grid.density.data[:] = 0.05  # fog that no ray ends in
     assert share_of_rays_opened(scene, rays_along_minus_x(), layer < 0) == 0.0
+
+
+def layers(scene: Scene, density: dict[int, float]) -> None:
+    """Give whole layers of corners along x a density, all others none."""
+    values = torch.zeros(scene.grid.lattice.shape)
+    for layer, value in density.items():
+        values[layer] = value
+    scene.grid.density.data = values.reshape(-1, 1)
+
+
+def test_evidence_spends_every_ray_s_opacity_and_no_more(backend):
+    """In fog that lets much through, the weights of all voxels sum to what the rays lost."""
+    scene = slab(backend)
+    scene.grid.density.data = 0.05 + torch.rand(scene.grid.density.shape, generator=torch.Generator().manual_seed(0))
+    bundles = list(rays_along_minus_x())
+    opacity = sum(float((1 - scene.sample_rays(b.origins, b.directions).transmittance).sum()) for b in bundles)
+    assert 0.1 * 1600 < opacity < 0.9 * 1600
+    evidence = field_evidence(scene, bundles)
+    assert evidence.rays == 1600
+    assert float(evidence.voxel_weight.sum()) == pytest.approx(opacity, rel=1e-5)
+    torch.testing.assert_close(evidence.voxel_weight.float(), total_weight(scene), rtol=1e-4, atol=1e-4)
+
+
+def test_half_depth_has_the_density_of_the_wall_that_each_ray_ends_on(backend):
+    """The wall is twice as dense where y > 0; the rays come row by row of y, so their order is known."""
+    scene = slab(backend)
+    y = torch.as_tensor(scene.grid.lattice.corner_positions()[..., 1]).reshape(-1, 1)
+    scene.grid.density.data *= torch.where(y > 0.01, 2.0, torch.where(y < -0.01, 1.0, 1.5))
+    found = field_evidence(scene, rays_along_minus_x()).half_depth_density
+    # In the layer in front of the last solid corners half of the corners are solid.
+    centres = torch.tensor([250.0, 250.0, 312.5, 437.5, 500.0, 500.0])
+    origins = torch.cat([bundle.origins for bundle in rays_along_minus_x()])
+    torch.testing.assert_close(found, centres[((origins[:, 1] + 1) * 3).long()])
+
+
+def test_half_depth_lies_behind_a_thin_veil(backend):
+    """A veil that takes a third leaves the half to the wall behind it; one that takes two thirds does not."""
+    scene = slab(backend)
+    for veil, expected in ((-3 * math.log(2 / 3), 250.0), (-3 * math.log(1 / 3), -1.5 * math.log(1 / 3))):
+        layers(scene, {4: veil, 1: 500.0, 0: 500.0})
+        found = field_evidence(scene, rays_along_minus_x()).half_depth_density
+        torch.testing.assert_close(found, torch.full((1600,), expected))
+
+
+def test_rays_that_end_on_nothing_have_no_half_depth_but_weight(backend):
+    scene = slab(backend)
+    layers(scene, {2: -3 * math.log(0.55)})
+    evidence = field_evidence(scene, rays_along_minus_x())
+    assert len(evidence.half_depth_density) == 0
+    assert float(evidence.voxel_weight.sum()) == pytest.approx(0.45 * 1600, rel=0.02)
+    assert float(evidence.temperature.weight.max()) == 0.0
+
+
+def test_rays_of_photographs_are_evidence_but_measure_no_temperature(backend):
+    scene = slab(backend)
+
+    def bundles(bits):
+        for number, bundle in enumerate(rays_along_minus_x()):
+            bundle.metadata["stream"] = torch.full((len(bundle), 1), bits(number), dtype=torch.uint8)
+            yield bundle
+
+    colour = field_evidence(scene, bundles(lambda _: RGB_STREAM))
+    assert float(colour.temperature.weight.max()) == 0.0 and len(colour.half_depth_density) == 1600
+    assert torch.equal(colour.temperature.thermal, scene.grid.temperature.data[:, 0].clamp(0, 1))
+    assert float(colour.voxel_weight.sum()) == pytest.approx(1600, rel=1e-4)
+    # The first three of six bundles carry both streams.
+    half = field_evidence(scene, bundles(lambda number: RGB_STREAM | THERMAL_STREAM if number < 3 else RGB_STREAM))
+    thermal = field_evidence(scene, [b for n, b in enumerate(rays_along_minus_x()) if n < 3])
+    assert torch.equal(half.temperature.weight, thermal.temperature.weight)
+    assert torch.equal(half.temperature.thermal, thermal.temperature.thermal)
+    assert torch.equal(half.voxel_weight, colour.voxel_weight)
+
+
+def test_evidence_lies_in_kept_voxels_in_their_order(backend):
+    scene = slab(backend)
+    prune(scene.grid, scene.grid.voxels.cells % 6 < 3)
+    evidence = field_evidence(scene, rays_along_minus_x())
+    weight = evidence.voxel_weight.view(6, 6, 3)
+    assert float(weight[3].sum()) > 0.99 * 800 and float(weight.sum()) == pytest.approx(800, rel=1e-4)
+    assert evidence.half_depth_density.tolist() == [250.0] * 800
+
+
+def test_without_rays_there_is_no_evidence():
+    scene = slab()
+    evidence = field_evidence(scene, ())
+    assert evidence.rays == 0 and len(evidence.half_depth_density) == 0 and float(evidence.voxel_weight.sum()) == 0.0
+    assert torch.equal(evidence.temperature.thermal, scene.grid.temperature.data[:, 0].clamp(0, 1))
+
+
+class Listed:
+    """A grid of one kept layer of voxels with samples as a test says."""
+
+    def __init__(self, ray: list[int], weight: list[float], before: list[float], transmittance: list[float]):
+        self.grid = VoxelGrid(Lattice((0.0, 0.0, 0.0), 1.0, (len(ray) + 1, 2, 2)), sh_degree=None)
+        self.grid.density.data = torch.arange(len(ray) + 1.0).repeat_interleave(4)[:, None] * 10
+        number = torch.arange(len(ray))
+        at = TrilinearPoints.placed(self.grid.voxels, number, torch.full((len(ray), 3), 0.5))
+        self.samples = GridSamples(
+            torch.tensor(ray), at, torch.tensor(weight), torch.tensor(before), torch.tensor(transmittance)
+        )
+
+    def sample_rays(self, origins, directions) -> GridSamples:
+        return self.samples
+
+
+def test_each_ray_that_ends_has_exactly_one_half_depth_however_sums_are_rounded():
+    """Ray 0 meets its half twice and ray 2 between two samples; ray 1 ends on nothing."""
+    scene = Listed(
+        ray=[0, 0, 0, 1, 2, 2],
+        weight=[0.4999999, 1e-7, 0.5, 0.5, 0.3, 0.3],
+        before=[0.0, 0.4999998, 0.4999999, 0.0, 0.0, 0.2999999],
+        transmittance=[0.0, 0.5, 0.4],
+    )
+    bundle = RayBundle(torch.zeros(3, 3), torch.eye(3), torch.ones(3, 1))
+    found = field_evidence(scene, [bundle]).half_depth_density
+    assert len(found) == 2 and found.tolist()[0] in (15.0, 25.0) and found.tolist()[1] in (45.0, 55.0)
+    ends = voxel_weights(scene, [bundle]).ends
+    assert ends.tolist() == [float(10 * number + 5) in found.tolist() for number in range(6)]

@@ -12,7 +12,7 @@ import pytest
 from thermoxels_ns.data.synthetic import make_scene, write_scene
 from thermoxels_ns.errors import MeshError, SceneError
 from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.mesh.build import build_voxel_mesh
+from thermoxels_ns.mesh.build import MeshOptions, build_mesh
 from thermoxels_ns.mesh.solid import SolidSelection
 from thermoxels_ns.snapshot import GridSnapshot
 from thermoxels_ns.truth_comparison import KnownTruth, compare_with_truth, load_known_truth
@@ -50,7 +50,7 @@ def exact_mesh(truth: KnownTruth, world_to_metres: np.ndarray = IDENTITY, observ
         np.full(lattice.shape, observed, dtype=np.float32),
     )
     selection = SolidSelection(close_gaps=0, density_threshold=1e-6, largest_component=False)
-    return build_voxel_mesh(snapshot, selection, world_to_metres)[0], cells, lattice
+    return build_mesh(snapshot, selection, world_to_metres, MeshOptions("voxel")).mesh, cells, lattice
 
 
 def compare(*args, **kwargs) -> dict:
@@ -213,3 +213,27 @@ def test_a_damaged_scene_is_named(tmp_path: Path, damage):
     path.write_text(json.dumps(content))
     with pytest.raises(SceneError, match="Write the synthetic scene again"):
         load_known_truth(tmp_path)
+
+
+def test_mesh_of_the_exact_voxels_is_near_the_truth_in_shape_and_temperature(sphere) -> None:
+    truth = sphere
+    mesh, cells, lattice = exact_mesh(truth)
+    result = compare(cells, lattice, IDENTITY, truth, mesh)
+    assert 0.1 < result["chamfer_voxels"] < 0.5
+    assert result["chamfer_m"] == pytest.approx(result["chamfer_voxels"] * lattice.voxel_size)
+    assert result["chamfer_m"] < result["hausdorff_m"] < 1.5 * lattice.voxel_size
+    assert result["share_of_seen_reached"] == 1.0 and result["temperature_seen_mae_c"] < 0.5
+    assert result["mesh_volume_m3"] == pytest.approx(result["volume_m3"])
+    # The staircase has 1.5 times the sphere's area; what its triangles stand for is the sphere's.
+    assert result["area_m2"] > 1.4 * result["true_area_m2"]
+    assert result["mesh_area_m2"] == pytest.approx(result["true_area_m2"], rel=0.03)
+
+
+def test_distances_and_sizes_are_in_units_of_the_truth_whatever_the_scale_of_the_mesh(sphere) -> None:
+    truth = sphere
+    mesh, cells, lattice = exact_mesh(truth)
+    plain = compare(cells, lattice, IDENTITY, truth, mesh)
+    scaled_mesh, _, _ = exact_mesh(truth, np.diag([3.0, 3.0, 3.0, 1.0]))
+    scaled = compare(cells, lattice, IDENTITY, truth, scaled_mesh, 3.0)
+    for name in ("chamfer_m", "hausdorff_m", "mesh_volume_m3", "mesh_area_m2", "temperature_seen_mae_c"):
+        assert scaled[name] == pytest.approx(plain[name], rel=1e-6)

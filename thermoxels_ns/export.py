@@ -5,6 +5,7 @@ Only light imports at the top: nerfstudio's exporter reads this module for ``--h
 
 from __future__ import annotations
 
+import json
 import pickle
 import traceback
 from dataclasses import dataclass
@@ -16,7 +17,8 @@ import numpy.typing as npt
 
 from thermoxels_ns.checks import check_shape
 from thermoxels_ns.errors import CheckpointError, ThermoxelsError, explain
-from thermoxels_ns.export_snapshot import ExportOptions, Viewpoint, check_options, export_snapshot, prepare_folder
+from thermoxels_ns.export_options import ExportOptions, Viewpoint, check_options
+from thermoxels_ns.export_snapshot import export_snapshot, prepare_folder
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
@@ -69,20 +71,40 @@ class ExportThermoxelsMesh(ExportOptions):
         Raises:
             ThermoxelsError: If an option, the checkpoint, the mesh or the heat problem is not usable.
         """
-        check_options(self)
-        prepare_folder(self.output_dir, heat=self.metres_per_unit is not None)
+        scaled = check_options(self).distance is not None or self.metres_per_unit is not None
+        prepare_folder(self.output_dir, heat=scaled)
         say(f"Loading {self.load_config}")
         scene = load_trained_scene(self.load_config)
 
-        def compare(solid: SolidCells, mesh: TetMesh) -> dict[str, Any] | None:
+        def compare(solid: SolidCells, mesh: TetMesh, scale: float) -> dict[str, Any] | None:
             from thermoxels_ns.truth_comparison import compare_with_truth
 
-            lattice, scale = scene.snapshot.lattice, self.metres_per_unit or 1.0
+            lattice = scene.snapshot.lattice
             return compare_with_truth(solid.cells, lattice, scene.world_to_input, scene.scene_folder, mesh, scale)
 
         return export_snapshot(
-            scene.snapshot, scene.world_to_input, self, self.output_dir, say, scene.viewpoint, compare
+            scene.snapshot,
+            scene.world_to_input,
+            self,
+            self.output_dir,
+            say,
+            scene.viewpoint,
+            compare,
+            scene_json(scene.scene_folder),
         )
+
+
+def scene_json(scene_folder: Path) -> dict[str, Any]:
+    """The scene's json as it is, for what it says about scale and up; empty if the scene has none (COLMAP)."""
+    from thermoxels_ns.data.scene_file import JSON_NAMES
+
+    folder = scene_folder if scene_folder.is_dir() else scene_folder.parent
+    names = [scene_folder] if scene_folder.is_file() else [folder / name for name in JSON_NAMES]
+    for path in names:
+        if path.is_file():
+            content = json.loads(path.read_text(encoding="utf-8"))
+            return content if isinstance(content, dict) else {}
+    return {}
 
 
 def load_trained_scene(load_config: Path) -> TrainedScene:

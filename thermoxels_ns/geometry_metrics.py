@@ -35,6 +35,15 @@ def half_transparent_share(accumulation: Tensor) -> float:
     return float(((accumulation > low) & (accumulation < high)).double().mean())
 
 
+def has_truth(scene_folder: Path | str, say: Callable[[str], None] = print) -> bool:
+    """Whether a scene's exact shape is known; what stands in the way of a synthetic scene's is said."""
+    try:
+        return load_known_truth(scene_folder) is not None
+    except ThermoxelsError as problem:
+        say(f"Geometry is not compared with the truth: {problem}")
+        return False
+
+
 def geometry_metrics(
     snapshot: GridSnapshot,
     world_to_input: npt.NDArray[np.float64],
@@ -47,7 +56,7 @@ def geometry_metrics(
     are defined by `thermoxels_ns.truth_comparison.compare_with_truth`.
 
     Args:
-        snapshot: The trained field; only its density counts.
+        snapshot: The trained field, with the evidence and the cameras that an export has.
         world_to_input: Similarity, shape (4, 4), from the lattice's world to the coordinates of the input poses, in
             which a synthetic scene is written in metres.
         truth: The scene folder (or its ``transforms.json``), or its truth if it is at hand.

@@ -20,15 +20,15 @@ from thermoxels_ns.coarse_to_fine import coarse_to_fine_callbacks
 from thermoxels_ns.errors import SceneError, explain
 from thermoxels_ns.field.background import SkyTemperature, SphereImage
 from thermoxels_ns.field.field import VoxelField
-from thermoxels_ns.field.harmonics import num_coefficients
+from thermoxels_ns.field.harmonics import harmonics, num_coefficients
 from thermoxels_ns.field.memory import check_memory
 from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.metrics import lpips, lpips_available, psnr, ssim, thermal_metrics
 from thermoxels_ns.model_config import ThermoxelsModelConfig
 from thermoxels_ns.ray_rendering import GridSamples, render_rays, sample_rays
-from thermoxels_ns.ray_statistics import corner_temperature
+from thermoxels_ns.ray_statistics import FieldEvidence, field_evidence
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
-from thermoxels_ns.snapshot import GridSnapshot
+from thermoxels_ns.snapshot import GridSnapshot, RayEvidence, Views
 from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.units import TemperatureRange
 
@@ -315,23 +315,48 @@ class ThermoxelsModel(Model):
         return metrics, images
 
     @torch.no_grad()
-    def grid_snapshot(self, thermal_rays: Iterable[RayBundle]) -> GridSnapshot:
+    def grid_snapshot(self, rays: Iterable[RayBundle], views: Views | None = None) -> GridSnapshot:
         """The trained field for the mesher.
 
         Args:
-            thermal_rays: Thermal training rays; they tell which corners were measured and what was seen there.
+            rays: Training rays of both streams; they tell where solid is, which corners were measured and what
+                temperature was seen there. Without any there is no evidence.
+            views: The training cameras.
 
         Returns:
-            Density, temperature and observed weight on the corners, density at the voxel centres.
+            Density, temperature, observed weight and colour on the corners, density at the voxel centres, and what the
+            rays say.
         """
         grid = self.grid
-        seen = corner_temperature(self, thermal_rays)
+        seen = field_evidence(self, rays)
         # Corners of no kept voxel are given the middle of the range; nothing reads them.
-        thermal = grid.corner_values(seen.thermal.float(), fill=0.5)
+        thermal = grid.corner_values(seen.temperature.thermal.float(), fill=0.5)
+        colour = self._corner_colour()
         return GridSnapshot(
             grid.lattice,
             density=grid.corner_density().float().cpu().numpy(),
             temperature_c=self.temperature_range.to_celsius(thermal).cpu().numpy(),
-            observed_weight=grid.corner_values(seen.weight.float()).cpu().numpy(),
+            observed_weight=grid.corner_values(seen.temperature.weight.float()).cpu().numpy(),
             voxel_density=grid.voxel_density().float().cpu().numpy(),
+            colour=None if colour is None else colour.cpu().numpy(),
+            evidence=self._ray_evidence(seen) if seen.rays else None,
+            views=views,
         )
+
+    def _ray_evidence(self, seen: FieldEvidence) -> RayEvidence:
+        """What rays say about voxels, on the whole lattice."""
+        weight = np.zeros(self.grid.lattice.cell_shape, dtype=np.float32)
+        weight.reshape(-1)[self.grid.voxels.cells] = seen.voxel_weight.cpu().numpy()
+        return RayEvidence(weight, seen.half_depth_density.float().cpu().numpy())
+
+    def _corner_colour(self) -> Tensor | None:
+        """Colour at the corners from the harmonic of degree 0, grey at corners of no kept voxel, (x, y, z, 3).
+
+        The sigmoid of the mean stands for the mean of the sigmoid: exact where the colour is the same from all sides.
+        """
+        grid = self.grid
+        if grid.sh is None or grid.sh_degree is None:
+            return None
+        constant = harmonics(grid.sh.new_tensor([[0.0, 0.0, 1.0]]), 0)  # the same in all directions
+        mean = grid.sh.view(-1, 3, num_coefficients(grid.sh_degree))[..., 0] * constant
+        return torch.stack([grid.corner_values(rows, 0.5) for rows in torch.sigmoid(mean).float().unbind(-1)], -1)

@@ -16,7 +16,7 @@ from thermoxels_ns.errors import CheckpointError, SceneError, explain
 from thermoxels_ns.model import ThermoxelsModel
 from thermoxels_ns.ray_rendering import choose_backend
 from thermoxels_ns.snapshot import GridSnapshot
-from thermoxels_ns.streams import THERMAL_STREAM
+from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.threads import set_num_threads
 from thermoxels_ns.warm_up import compile_kernels
 
@@ -160,14 +160,15 @@ class ThermoxelsPipeline(VanillaPipeline):
     def geometry_metrics(self) -> dict[str, float]:
         """How well the surface agrees with the exact scene, see `thermoxels_ns.geometry_metrics`; empty if unknown."""
         from thermoxels_ns.export import input_from_world
-        from thermoxels_ns.geometry_metrics import geometry_metrics
+        from thermoxels_ns.geometry_metrics import geometry_metrics, has_truth
 
         datamanager: Any = self.datamanager
+        if not has_truth(datamanager.get_datapath(), _say):
+            return {}
         outputs = datamanager.train_dataparser_outputs
         world_to_input = input_from_world(outputs.dataparser_transform.numpy(), float(outputs.dataparser_scale))
-        # Density alone decides what is solid: no thermal rays are needed.
-        snapshot = self.model.grid_snapshot(())
-        return geometry_metrics(snapshot, world_to_input, datamanager.get_datapath(), _say)
+        # With the rays' evidence and the cameras, as an export has them: they decide what is solid.
+        return geometry_metrics(self.grid_snapshot(), world_to_input, datamanager.get_datapath(), _say)
 
     def get_average_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
         """Average metrics over images; an image where a metric has no pixel does not count for it.
@@ -200,8 +201,10 @@ class ThermoxelsPipeline(VanillaPipeline):
         return averages
 
     def grid_snapshot(self, rays_per_image: int = 20_000) -> GridSnapshot:
-        """The trained field for the mesher, with the weight that thermal training rays gave each corner."""
-        return self.model.grid_snapshot(self.datamanager.training_rays(THERMAL_STREAM, rays_per_image))  # type: ignore
+        """The trained field for the mesher, with what training rays of both streams say about it, and the cameras."""
+        datamanager: Any = self.datamanager
+        rays = datamanager.training_rays(RGB_STREAM | THERMAL_STREAM, rays_per_image)
+        return self.model.grid_snapshot(rays, datamanager.training_views())
 
 
 def _columns(grid: dict[str, int]) -> str:

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
 from thermoxels_ns.field.interpolation import splat
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.ray_rendering import GridSamples
+from thermoxels_ns.streams import THERMAL_STREAM
 
 
 class RaySampler(Protocol):
@@ -48,10 +49,19 @@ def voxel_weights(model: RaySampler, rays: Iterable[RayBundle]) -> VoxelWeights:
     for bundle in rays:
         samples = model.sample_rays(bundle.origins.to(density.device), bundle.directions.to(density.device))
         largest.scatter_reduce_(0, samples.at.number, samples.weight.to(largest.dtype), reduce="amax")
-        opacity = (1.0 - samples.transmittance)[samples.ray]
-        half = (samples.before < 0.5 * opacity) & (samples.before + samples.weight >= 0.5 * opacity) & (opacity > 0.5)
-        ends[samples.at.number[half]] = True
+        ends[samples.at.number[_half_way(samples)]] = True
     return VoxelWeights(largest, ends)
+
+
+def _half_way(samples: GridSamples) -> Int64[Tensor, " ends"]:
+    """For each ray that ends on something (opacity above one half) the sample by which half of its weight is spent."""
+    opacity = (1.0 - samples.transmittance)[samples.ray]
+    spent = (opacity > 0.5) & (samples.before + samples.weight >= 0.5 * opacity)
+    (places,) = spent.nonzero(as_tuple=True)
+    ray = samples.ray[places]
+    first = torch.ones_like(ray, dtype=torch.bool)
+    first[1:] = ray[1:] != ray[:-1]
+    return places[first]
 
 
 @torch.no_grad()
@@ -88,30 +98,64 @@ class CornerTemperature:
     """Sum of the weights of the first-hit samples around the corner, shared out by the trilinear weights."""
 
 
-@torch.no_grad()
-def corner_temperature(model: RaySampler, rays: Iterable[RayBundle]) -> CornerTemperature:
-    """Average the temperature that rays see around each corner, each sample by its share of the pixel.
+@dataclass(frozen=True)
+class FieldEvidence:
+    """What training rays say about the trained field."""
 
-    A corner's own stored value is only ever used mixed with its neighbours', so an image can be right while single
-    corners overshoot; the average over what rays used has no such freedom. Only first hits count: samples of rays that
-    end on something (opacity above one half), before half of the ray's light is spent. What leaks through a surface
-    measures nothing behind it.
+    rays: int
+    """Rays looked at."""
+    temperature: CornerTemperature
+    """What the thermal ones among them measured."""
+    voxel_weight: Float[Tensor, " voxels"]
+    """Sum of the weights that rays spent in each kept voxel, [rays]."""
+    half_depth_density: Float[Tensor, " ends"]
+    """Density at the centre of the voxel in which each ray that ends on something (opacity above one half) has spent
+    half of its weight, [1 / world unit], in the order of the rays."""
+
+
+@torch.no_grad()
+def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidence:
+    """Find in one pass where rays spend their weight, and what temperature thermal rays see around each corner.
+
+    The temperature is the average over thermal rays, each sample by its share of the pixel. A corner's own stored value
+    is only ever used mixed with its neighbours', so an image can be right while single corners overshoot; the average
+    over what rays used has no such freedom. Only first hits count for it: samples of rays that end on something
+    (opacity above one half), before half of the ray's light is spent. What leaks through a surface measures nothing
+    behind it.
+
+    Args:
+        model: The field.
+        rays: Rays of either stream. One that says of no stream (see `thermoxels_ns.streams`) counts as thermal too.
     """
     grid = model.grid
     device = grid.density.device
-    total = torch.zeros(grid.voxels.num_rows, 2, device=device)
+    centre_density = grid.voxel_density().view(-1)[grid.cells]
+    corners = torch.zeros(grid.voxels.num_rows, 2, device=device)
+    voxels = torch.zeros(len(grid.voxels), dtype=torch.float64, device=device)
+    half_depth = [centre_density[:0]]
+    seen = 0
     for bundle in rays:
         directions = bundle.directions.to(device)
         samples = model.sample_rays(bundle.origins.to(device), directions)
-        first_hit = (samples.before < 0.5) & (samples.transmittance < 0.5)[samples.ray]
+        seen += len(directions)
+        voxels.index_add_(0, samples.at.number, samples.weight.double())
+        half_depth.append(centre_density[samples.at.number[_half_way(samples)]])
+        first_hit = (samples.before < 0.5) & (_is_thermal(bundle, device) & (samples.transmittance < 0.5))[samples.ray]
         at = samples.at.select(first_hit)
         weights = samples.weight[first_hit][:, None]
         thermal = grid.thermal_at(at, directions[samples.ray[first_hit]])
-        total += splat(torch.cat((weights * thermal, weights), -1), at).to(total.dtype)
-    weight = total[:, 1]
+        corners += splat(torch.cat((weights * thermal, weights), -1), at).to(corners.dtype)
+    weight = corners[:, 1]
     stored = grid.temperature[:, 0]
-    thermal = torch.where(weight > 0, total[:, 0] / weight.clamp(min=1e-30), stored)
-    return CornerTemperature(thermal.clamp(0, 1), weight)
+    thermal = torch.where(weight > 0, corners[:, 0] / weight.clamp(min=1e-30), stored)
+    return FieldEvidence(seen, CornerTemperature(thermal.clamp(0, 1), weight), voxels, torch.cat(half_depth))
+
+
+def _is_thermal(bundle: RayBundle, device: torch.device) -> Bool[Tensor, " rays"]:
+    stream = bundle.metadata.get("stream")
+    if stream is None:
+        return torch.ones(len(bundle.origins), dtype=torch.bool, device=device)
+    return (stream[:, 0].to(device) & THERMAL_STREAM) > 0
 
 
 @dataclass(frozen=True)

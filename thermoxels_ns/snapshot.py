@@ -8,8 +8,33 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.checks import check_finite, check_shape
-from thermoxels_ns.errors import MeshError
+from thermoxels_ns.errors import MeshError, explain
 from thermoxels_ns.lattice import Lattice
+
+
+@dataclass(frozen=True)
+class Views:
+    """The training cameras (pinholes without distortion), in the coordinates of the lattice."""
+
+    camera_to_world: npt.NDArray[np.float64]
+    """Poses [R | centre], x right, y up, z back (OpenGL), shape (c, 3, 4)."""
+    focal: npt.NDArray[np.float64]
+    """Focal lengths along x and y, shape (c, 2), [pixels]."""
+    centre: npt.NDArray[np.float64]
+    """Principal points x, y from the image's upper left corner, shape (c, 2), [pixels]."""
+    size: npt.NDArray[np.int64]
+    """Image widths and heights, shape (c, 2), [pixels]."""
+
+
+@dataclass(frozen=True)
+class RayEvidence:
+    """What training rays, colour and thermal alike, say about where solid is."""
+
+    voxel_weight: npt.NDArray[np.float32]
+    """Sum of the weights that rays spent in each voxel, shape `lattice.cell_shape`, [rays]."""
+    half_depth_density: npt.NDArray[np.float32]
+    """Density, [1 / world unit], at the centre of the voxel in which each ray that ends on something (opacity above
+    one half) has spent half of its weight, shape (rays,)."""
 
 
 @dataclass(frozen=True)
@@ -27,19 +52,57 @@ class GridSnapshot:
     voxel_density: npt.NDArray[np.float32] | None = None
     """Density at the voxel centres as the field has it, shape `lattice.cell_shape`, [1 / world unit]. None: density is
     trilinear, so it is the mean of the corners."""
+    colour: npt.NDArray[np.float32] | None = None
+    """Red, green, blue in [0, 1] at the corners, the mean over all directions, shape (*lattice.shape, 3). None: the
+    model has no colour."""
+    evidence: RayEvidence | None = None
+    """What training rays spent where. None: not known."""
+    views: Views | None = None
+    """The training cameras of both streams. None: not known."""
 
     def __post_init__(self) -> None:
-        remedy = "The checkpoint is damaged; resume from an earlier one."
+        lattice = self.lattice
         for name in ("density", "temperature_c", "observed_weight"):
-            array = getattr(self, name)
-            check_shape(f"grid snapshot {name}", array, self.lattice.shape, remedy, MeshError)
-            check_finite(f"grid snapshot {name}", array, remedy, MeshError)
+            _check(name, getattr(self, name), lattice.shape)
         if self.voxel_density is not None:
-            check_shape("grid snapshot voxel_density", self.voxel_density, self.lattice.cell_shape, remedy, MeshError)
-            check_finite("grid snapshot voxel_density", self.voxel_density, remedy, MeshError)
+            _check("voxel_density", self.voxel_density, lattice.cell_shape)
+        if self.colour is not None:
+            _check("colour", self.colour, (*lattice.shape, 3), least=0.0, most=1.0)
+        if self.evidence is not None:
+            _check("voxel_weight", self.evidence.voxel_weight, lattice.cell_shape, least=0.0)
+            _check("half_depth_density", self.evidence.half_depth_density, (None,), least=0.0)
+        if self.views is not None:
+            count = len(self.views.camera_to_world)
+            _check("camera_to_world", self.views.camera_to_world, (count, 3, 4), remedy=_CAMERAS)
+            _check("focal", self.views.focal, (count, 2), least=_SMALLEST_FOCAL, remedy=_CAMERAS)
+            _check("centre", self.views.centre, (count, 2), remedy=_CAMERAS)
+            _check("size", self.views.size, (count, 2), least=1, remedy=_CAMERAS)
 
     def centre_density(self) -> npt.NDArray[np.float64]:
         """Density at the voxel centres, shape `lattice.cell_shape`, [1 / world unit]."""
         if self.voxel_density is not None:
             return self.voxel_density.astype(np.float64)
         return self.lattice.corner_to_cell_mean(self.density.astype(np.float64))
+
+
+_SMALLEST_FOCAL = 1e-6  # pixels; what is smaller is no lens
+_FIELD = "The checkpoint is damaged; resume from an earlier one."
+_CAMERAS = "Correct the camera poses and intrinsics of the scene."
+
+
+def _check(
+    name: str,
+    array: npt.NDArray,
+    shape: tuple[int | None, ...],
+    *,
+    least: float = -np.inf,
+    most: float = np.inf,
+    remedy: str = _FIELD,
+) -> None:
+    name = f"grid snapshot {name}"
+    check_shape(name, array, shape, remedy, MeshError)
+    check_finite(name, array, remedy, MeshError)
+    if array.size and not least <= array.min() <= array.max() <= most:
+        expected = f"{least:g} or more" if most == np.inf else f"values from {least:g} to {most:g}"
+        got = f"{array.min():g} to {array.max():g}"
+        raise MeshError(explain(name, expected=expected, got=got, remedy=remedy))

@@ -18,7 +18,9 @@ from thermoxels_ns.errors import MeshError, SceneError, explain
 from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.mesh.accuracy import surface_fscore
 from thermoxels_ns.mesh.build import check_similarity
+from thermoxels_ns.mesh.quality import facet_areas, signed_volumes
 from thermoxels_ns.mesh.solid import fill_enclosed
+from thermoxels_ns.mesh.surface_distance import surface_distances
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 TOLERANCE_VOXELS = 1.5
@@ -114,11 +116,16 @@ def compare_with_truth(
         ``tolerance_voxels``, ``true_points_seen``; ``precision``, ``recall``, ``fscore``, 0 to 1;
         ``mean_distance_voxels`` and ``mean_distance_m`` of the reconstructed boundary to the true surface (None
         without a boundary); ``volume_m3``, ``filled_volume_m3`` (with cavities) and ``area_m2`` of the voxels (a
-        staircase: its area exceeds that of the slope it follows) beside ``true_volume_m3`` and ``true_area_m2``;
-        with a mesh also, of the boundary nodes within the tolerance of the true surface: ``temperature_nodes``, the
-        number that a thermal ray measured, and ``temperature_mae_c``, their mean absolute error [K] (None without such
-        a node); the same of the others (``..._unmeasured...``); and ``temperature_p95_all_c``, the error [K] that 95 %
-        of all of them stay below.
+        staircase: its area exceeds that of the slope it follows) beside ``true_volume_m3`` and ``true_area_m2``.
+
+        With a mesh also ``mesh_volume_m3`` and ``mesh_area_m2`` (of the true surface that its triangles stand for);
+        ``chamfer_voxels``, ``chamfer_m`` and ``hausdorff_m`` between its surface and the part of the true one that is
+        seen (`thermoxels_ns.mesh.surface_distance`); ``temperature_seen_mae_c``, the mean absolute error [K] at the
+        surface points closest to those true points that lie within the tolerance, and ``share_of_seen_reached``, the
+        share of them that do; and of the boundary nodes within the tolerance of the true surface:
+        ``temperature_nodes``, the number that a thermal ray measured, and ``temperature_mae_c``, their mean absolute
+        error [K] (None without such a node); the same of the others (``..._unmeasured...``); and
+        ``temperature_p95_all_c``, the error [K] that 95 % of all of them stay below.
 
     Raises:
         SceneError: The scene folder cannot be used, or no true point is seen by enough training cameras.
@@ -151,6 +158,7 @@ def compare_with_truth(
         "true_area_m2": float(known.scene.area_m2),
     }
     if mesh is not None:
+        result |= _mesh_errors(known.scene, mesh, seen, voxel_m, metres_per_unit)
         result |= _temperature_errors(known.scene, mesh, tolerance_m, metres_per_unit)
     return result
 
@@ -175,6 +183,35 @@ def _num_faces(cells: npt.NDArray[np.bool_]) -> int:
     """Number of voxel faces between solid and empty, those on the lattice's border included."""
     padded = np.pad(cells, 1)
     return sum(int(np.count_nonzero(np.diff(padded, axis=axis))) for axis in range(3))
+
+
+def _mesh_errors(
+    scene: SyntheticScene,
+    mesh: TetMesh,
+    seen: npt.NDArray[np.float64],
+    voxel_m: float,
+    metres_per_unit: float,
+) -> dict[str, Any]:
+    """Size of the mesh, its distance to the true surface, and temperature errors where they meet."""
+    area = facet_areas(mesh.points_m, mesh.facets)
+    if mesh.boundary is not None:
+        area = area * mesh.boundary.area_factor
+    result: dict[str, Any] = {
+        "mesh_volume_m3": float(signed_volumes(mesh.points_m, mesh.tets).sum()) / metres_per_unit**3,
+        "mesh_area_m2": float(area.sum()) / metres_per_unit**2,
+    }
+    distances = surface_distances(mesh, scene, seen, metres_per_unit)
+    if distances is None:
+        return result
+    reached = distances.closest_distance <= TOLERANCE_VOXELS * voxel_m
+    error_k = np.abs(distances.closest_temperature_c - scene.surface_temperature_c(seen))[reached]
+    return result | {
+        "chamfer_voxels": distances.chamfer / voxel_m,
+        "chamfer_m": distances.chamfer,
+        "hausdorff_m": distances.hausdorff,
+        "temperature_seen_mae_c": float(error_k.mean()) if len(error_k) else None,
+        "share_of_seen_reached": float(reached.mean()),
+    }
 
 
 def _temperature_errors(

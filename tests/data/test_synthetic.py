@@ -45,6 +45,7 @@ def test_layout_is_that_of_thermoscenes(tmp_path: Path) -> None:
     assert [content[k] for k in ("k1", "k2", "p1", "p2")] == [0.0] * 4
     assert [content[k] for k in ("fl_x", "fl_y", "cx", "cy")] == [40.0, 40.0, 20.0, 15.0]
     assert content["scene_box"] == [list(c) for c in scene.scene_box]
+    assert (content["metres_per_unit"], content["up"]) == (1.0, [0, 0, 1])
     assert [f["file_path"] for f in content["frames"]] == [f"images/{n}.png" for n in names]
     assert [f["thermal_file_path"] for f in content["frames"]] == [f"thermal/{n}.png" for n in names]
     assert "thermal_camera" not in content and "thermal_unit" not in content

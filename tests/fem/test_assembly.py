@@ -4,11 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import sparse
 from scipy.sparse.linalg import spsolve
+from scipy.spatial import Delaunay
+from skfem import Basis, BilinearForm, ElementTetP1, MeshTet
+from skfem.helpers import dot
 
-from thermoxels_ns.fem.assembly import assemble
+from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.assembly import HeatMatrices, assemble, assemble_mass, assemble_stiffness
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 
 def linear(points: np.ndarray) -> np.ndarray:
@@ -82,3 +88,251 @@ def test_stiffness_of_the_voxel_mesh_is_an_m_matrix(random_body, concrete) -> No
     assert off_diagonal.max() < 1e-15
     assert np.abs(dense - dense.T).max() < 1e-15
     assert np.abs(dense.sum(axis=1)).max() < 1e-14
+
+
+def oriented(points: np.ndarray, tets: np.ndarray) -> np.ndarray:
+    """Drop flat tetrahedra and turn the inverted ones over."""
+    sides = points[tets[:, 1:]] - points[tets[:, :1]]
+    volumes = np.linalg.det(sides)
+    tets = np.where(volumes[:, None] > 0, tets, tets[:, [0, 2, 1, 3]])
+    return tets[np.abs(volumes) > 1e-3 * np.median(np.abs(volumes))]
+
+
+def kuhn_mesh() -> tuple[np.ndarray, np.ndarray]:
+    corners, tets = kuhn_tets(np.random.default_rng(5).random((4, 3, 5)) < 0.8)
+    return 0.07 * corners, tets
+
+
+def bcc_mesh() -> tuple[np.ndarray, np.ndarray]:
+    """Body-centred cubic lattice: between two neighbouring centres, one tetrahedron per edge of their common face."""
+    corner, centre = {}, {}
+    points, tets = [], []
+
+    def node(kept: dict, index: tuple, position: np.ndarray) -> int:
+        if index not in kept:
+            kept[index] = len(points)
+            points.append(position)
+        return kept[index]
+
+    for cell in np.ndindex(4, 3, 3):
+        for axis in range(3):
+            behind = np.array(cell)
+            ahead = behind + np.eye(3, dtype=int)[axis]
+            if ahead[axis] == (4, 3, 3)[axis]:
+                continue
+            ends = [node(centre, tuple(c), c + 0.5) for c in (behind, ahead)]
+            u, v = np.eye(3, dtype=int)[[(axis + 1) % 3, (axis + 2) % 3]]
+            around = [node(corner, tuple(c), c) for c in (ahead, ahead + u, ahead + u + v, ahead + v)]
+            tets += [[*ends, around[k], around[(k + 1) % 4]] for k in range(4)]
+    positions = 0.1 * np.array(points, dtype=float)
+    return positions, oriented(positions, np.array(tets))
+
+
+def random_mesh() -> tuple[np.ndarray, np.ndarray]:
+    points = np.random.default_rng(6).uniform(-1.0, 2.0, (150, 3))
+    tets = oriented(points, Delaunay(points).simplices.astype(np.int64))
+    used, numbers = np.unique(tets, return_inverse=True)
+    return points[used], numbers.reshape(-1, 4)
+
+
+def fan_mesh() -> tuple[np.ndarray, np.ndarray]:
+    """A hundred thin tetrahedra around one axis, numbered at random."""
+    count = 100
+    order = np.random.default_rng(8).permutation(count) + 2
+    angle = 2.0 * np.pi * np.arange(count) / count
+    points = np.zeros((count + 2, 3))
+    points[1, 2] = 0.5
+    points[order, 0], points[order, 1] = np.cos(angle), np.sin(angle)
+    tets = np.column_stack([np.zeros(count, int), np.ones(count, int), order, np.roll(order, -1)])
+    return points, oriented(points, tets)
+
+
+MESHES = {"kuhn": kuhn_mesh, "bcc": bcc_mesh, "random": random_mesh, "fan": fan_mesh}
+
+
+@BilinearForm
+def weighted_gradients(u, v, w):
+    return w["weight"] * dot(u.grad, v.grad)
+
+
+@BilinearForm
+def weighted_product(u, v, w):
+    return w["weight"] * u * v
+
+
+def by_scikit_fem(form, points: np.ndarray, tets: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    basis = Basis(MeshTet(points.T.copy(), tets.T.copy(), validate=False), ElementTetP1(), intorder=2)
+    return form.assemble(basis, weight=np.broadcast_to(weight[:, None], basis.dx.shape)).toarray()
+
+
+def entries_per_row(matrix: sparse.csr_matrix) -> int:
+    return int(np.diff(matrix.indptr).max())
+
+
+@pytest.mark.parametrize("mesh", MESHES)
+def test_stiffness_is_that_of_an_independent_assembly(mesh: str) -> None:
+    points, tets = MESHES[mesh]()
+    conductivity = 10.0 ** np.random.default_rng(9).uniform(-3.0, 3.0, len(tets))
+    for weight in (np.full(len(tets), 1.7), conductivity):
+        expected = by_scikit_fem(weighted_gradients, points, tets, weight)
+        stiffness = assemble_stiffness(points, tets, 1.7 if weight is not conductivity else conductivity)
+        assert np.abs(stiffness.toarray() - expected).max() < 1e-13 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("mesh", MESHES)
+def test_mass_is_that_of_an_independent_assembly(mesh: str) -> None:
+    points, tets = MESHES[mesh]()
+    for capacity in (2.0e6, 10.0 ** np.random.default_rng(9).uniform(3.0, 7.0, len(tets))):
+        expected = by_scikit_fem(weighted_product, points, tets, np.broadcast_to(capacity, len(tets)))
+        mass, nodal = assemble_mass(points, tets, capacity)
+        assert np.abs(mass.toarray() - expected).max() < 1e-13 * np.abs(expected).max()
+        np.testing.assert_allclose(nodal, expected.sum(axis=1), rtol=1e-12)
+        assert (mass != mass.T).nnz == 0
+
+
+@pytest.mark.parametrize("mesh", MESHES)
+def test_stiffness_is_symmetric_bit_for_bit_and_its_rows_sum_to_zero(mesh: str) -> None:
+    points, tets = MESHES[mesh]()
+    stiffness = assemble_stiffness(points, tets, 1.7)
+    assert (stiffness != stiffness.T).nnz == 0
+    assert np.all(np.abs(stiffness.sum(axis=1)).A1 <= 1e-15 * np.abs(stiffness).sum(axis=1).A1)
+    again = assemble_stiffness(points, tets, 1.7)
+    np.testing.assert_array_equal(stiffness.data, again.data)
+    np.testing.assert_array_equal(stiffness.indices, again.indices)
+
+
+def turned(points: np.ndarray) -> np.ndarray:
+    """Turned about two axes and moved far away."""
+    c, s = np.cos(0.7), np.sin(0.7)
+    about_z, about_x = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.array([[1, 0, 0], [0, c, s], [0, -s, c]])
+    return points @ about_z @ about_x + np.array([30.0, -50.0, 10.0])
+
+
+@pytest.mark.parametrize(("mesh", "entries"), [("kuhn", 7), ("bcc", 9)])
+def test_right_angles_couple_nothing_wherever_the_body_stands(mesh: str, entries: int) -> None:
+    """Nodes that only right angles lie between have no entry, so that matrices of lattices are small."""
+    points, tets = MESHES[mesh]()
+    stiffness = assemble_stiffness(points, tets, 1.7)
+    moved = assemble_stiffness(turned(points), tets, 1.7)
+    assert entries_per_row(stiffness) == entries_per_row(moved) == entries
+    assert stiffness.nnz == moved.nnz
+    assert np.abs(stiffness - moved).max() < 1e-11 * stiffness.max()
+
+
+def test_an_angle_that_is_nearly_right_is_no_right_angle() -> None:
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [1e-9, 1, 0], [0, 0, 1]])
+    stiffness = assemble_stiffness(points, np.array([[0, 1, 2, 3]]), 1.0).toarray()
+    assert stiffness[1, 2] == pytest.approx(-1e-9 / 6.0, rel=1e-5)
+    assert stiffness[1, 3] == stiffness[2, 3] == 0.0
+
+
+def test_connected_bodies_have_connected_matrices() -> None:
+    """Leaving out what is 0 cuts no body in two: pieces are found from the stiffness matrix."""
+    for make in MESHES.values():
+        points, tets = make()
+        ends = tets[:, [[0, 1], [0, 2], [0, 3]]].reshape(-1, 2)
+        links = sparse.coo_matrix((np.ones(len(ends)), ends.T), shape=(len(points),) * 2)
+        by_edges, number = sparse.csgraph.connected_components(links, directed=False)
+        by_stiffness, same = sparse.csgraph.connected_components(assemble_stiffness(points, tets, 1.0), directed=False)
+        assert by_edges == by_stiffness
+        np.testing.assert_array_equal(number, same)
+
+
+def test_numbering_does_not_matter() -> None:
+    points, tets = random_mesh()
+    rng = np.random.default_rng(10)
+    new = rng.permutation(len(points))
+    old = np.argsort(new)
+    even = np.array([[0, 1, 2, 3], [1, 2, 0, 3], [3, 2, 1, 0]])[rng.integers(0, 3, len(tets))]
+    mixed = new[np.take_along_axis(tets, even, axis=1)][rng.permutation(len(tets))]
+    expected = assemble_stiffness(points, tets, 1.7).toarray()
+    stiffness = assemble_stiffness(points[old], mixed, 1.7).toarray()
+    np.testing.assert_allclose(stiffness[np.ix_(new, new)], expected, atol=1e-13 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("scale", [1e-60, 1e-20, 1e20, 1e60])
+def test_scale(scale: float) -> None:
+    """K grows with the size of a body, its mass with the cube; neither over- nor underflows on the way."""
+    points, tets = bcc_mesh()
+    stiffness, (_, mass) = assemble_stiffness(points, tets, 1.7), assemble_mass(points, tets, 2e6)
+    scaled = assemble_stiffness(scale * points, tets, 1.7)
+    assert scaled.nnz == stiffness.nnz
+    np.testing.assert_allclose(scaled.data, scale * stiffness.data, rtol=1e-12)
+    np.testing.assert_allclose(assemble_mass(scale * points, tets, 2e6)[1], scale**3 * mass, rtol=1e-12)
+
+
+def test_two_layers_in_series() -> None:
+    """A wall of two materials with a contrast of 1e6: the temperature is linear in each and the heat that of two
+    resistances."""
+    corners, tets = kuhn_tets(np.ones((8, 2, 2), bool))
+    points = 0.05 * corners
+    conductivity = np.where(points[tets].mean(axis=1)[:, 0] < 0.15, 1e3, 1e-3)
+    stiffness = assemble_stiffness(points, tets, conductivity)
+    cold, hot = points[:, 0] < 1e-9, points[:, 0] > 0.4 - 1e-9
+    free = ~(cold | hot)
+    solved = np.where(hot, 1.0, 0.0)
+    solved[free] = spsolve(stiffness[free][:, free], -stiffness[free][:, hot] @ solved[hot])
+    flow = 1.0 / (0.15 / 1e3 + 0.25 / 1e-3)
+    x = points[:, 0]
+    exact = np.where(x < 0.15, flow * x / 1e3, 1.0 - flow * (0.4 - x) / 1e-3)
+    np.testing.assert_allclose(solved, exact, atol=1e-12)
+    assert (stiffness @ solved)[hot].sum() == pytest.approx(flow * 0.1**2, rel=1e-9)
+
+
+def test_layout_of_the_arrays_does_not_matter() -> None:
+    points, tets = random_mesh()
+    expected = assemble_stiffness(points, tets, 1.7).toarray()
+    read_only = points.copy()
+    read_only.flags.writeable = False
+    for given, numbers in (
+        (np.asfortranarray(points), tets.astype(np.int32)),
+        (read_only, np.asfortranarray(tets)),
+        (np.repeat(points, 2, axis=0)[::2], tets[::-1][::-1]),
+    ):
+        np.testing.assert_array_equal(assemble_stiffness(given, numbers, 1.7).toarray(), expected)
+
+
+TET = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+ONE = np.array([[0, 1, 2, 3]])
+FLAT = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 1e-13]])
+
+
+@pytest.mark.parametrize("assembled", [assemble_stiffness, assemble_mass])
+@pytest.mark.parametrize(
+    ("points", "tets", "value", "message"),
+    [
+        (TET, np.array([[0, 1, 2, 4]]), 1.0, "mesh tets: expected node numbers from 0 to 3, got 0 to 4"),
+        (TET, np.array([[0, 1, 2, -1]]), 1.0, "mesh tets: expected node numbers"),
+        (TET, ONE[:, :3], 1.0, "mesh tets: expected shape"),
+        (TET[:, :2], ONE, 1.0, "mesh points: expected shape"),
+        (TET, ONE[:, [1, 0, 2, 3]], 1.0, "mesh tets: expected volumes above 0, got 1 of 1 flat or inverted"),
+        (TET, np.array([[0, 1, 2, 2]]), 1.0, "1 of 1 flat"),
+        (FLAT, ONE, 1.0, "1 of 1 flat"),
+        (np.where(TET == 1.0, np.nan, TET), ONE, 1.0, "mesh points: expected finite numbers only, got 3 of 12"),
+        (TET, ONE, 0.0, "expected finite numbers above 0"),
+        (TET, ONE, -1.0, "expected finite numbers above 0"),
+        (TET, ONE, np.inf, "expected finite numbers above 0"),
+        (TET, ONE, np.array([1.0, 2.0]), r"one for all or shape \(1,\), got shape \(2,\)"),
+        (TET, ONE, np.array([np.nan]), "with 1 that are not"),
+    ],
+)
+def test_what_cannot_be_assembled_is_refused(assembled, points, tets, value, message: str) -> None:
+    with pytest.raises(HeatError, match=message):
+        assembled(points, tets, value)
+
+
+def test_flat_and_inverted_tetrahedra_are_counted() -> None:
+    points, tets = random_mesh()
+    tets[::7] = tets[::7][:, [1, 0, 2, 3]]
+    with pytest.raises(HeatError, match=f"got {len(tets[::7])} of {len(tets)} flat or inverted"):
+        assemble_stiffness(points, tets, 1.0)
+    thin = np.vstack([TET[:3], [0.3, 0.3, 1e-11]])
+    assert np.all(np.isfinite(assemble_stiffness(thin, ONE, 1.0).data))
+
+
+def test_lumped_and_consistent_matrices_of_a_mesh(random_body, concrete) -> None:
+    lumped, consistent = assemble(random_body, concrete), assemble(random_body, concrete, lumped=False)
+    assert isinstance(lumped, HeatMatrices)
+    np.testing.assert_array_equal(lumped.stiffness_w_k.toarray(), consistent.stiffness_w_k.toarray())
+    np.testing.assert_array_equal(lumped.nodal_mass_j_k, consistent.nodal_mass_j_k)
+    assert lumped.mass_j_k.nnz == len(random_body.points_m) < consistent.mass_j_k.nnz

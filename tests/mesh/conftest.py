@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
+from tests.house_mesh import house_mesh
 from thermoxels_ns.lattice import CORNER_OFFSETS, Lattice
-from thermoxels_ns.mesh.build import build_voxel_mesh
+from thermoxels_ns.mesh.build import MeshOptions, build_mesh
 from thermoxels_ns.mesh.quality import signed_volumes
 from thermoxels_ns.mesh.solid import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -35,13 +37,14 @@ def snapshot_of() -> Callable[..., GridSnapshot]:
 
 @pytest.fixture
 def box_mesh(snapshot_of) -> TetMesh:
-    """A fully solid box of 3 x 4 x 2 voxels of 0.5 m, temperature 20 + 3 x + y - 2 z, its inner nodes unseen."""
+    """A full box of 3 x 4 x 2 voxels of 0.5 m, untagged, temperature 20 + 3 x + y - 2 z, its inner nodes unseen."""
     shape = (4, 5, 3)
     x, y, z = np.meshgrid(*map(np.arange, shape), indexing="ij")
     weight = np.ones(shape)
     weight[1:-1, 1:-1, 1:-1] = 0.0
     snapshot = snapshot_of(np.ones(shape), 20.0 + 0.5 * (3 * x + y - 2 * z), weight)
-    return build_voxel_mesh(snapshot, SolidSelection(close_gaps=0, density_threshold=0.5), np.eye(4))[0]
+    selection = SolidSelection(close_gaps=0, density_threshold=0.5)
+    return replace(build_mesh(snapshot, selection, np.eye(4), MeshOptions("voxel")).mesh, boundary=None)
 
 
 @pytest.fixture
@@ -96,3 +99,9 @@ def corner_density() -> Callable[[npt.NDArray[np.bool_]], npt.NDArray[np.float32
         return density
 
     return make
+
+
+@pytest.fixture(scope="session")
+def tagged_mesh() -> TetMesh:
+    """A small house with regions, patches and colours, some parts of them empty."""
+    return house_mesh()

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.errors import MeshError
-from thermoxels_ns.mesh.build import build_voxel_mesh, check_similarity
-from thermoxels_ns.mesh.quality import check_mesh
+from thermoxels_ns.mesh.build import MeshOptions, build_mesh, check_similarity
+from thermoxels_ns.mesh.quality import check_mesh, facet_areas
 from thermoxels_ns.mesh.solid import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX
 
 DENSE = SolidSelection(close_gaps=0, density_threshold=0.5)
+VOXEL = MeshOptions("voxel")
+MODES = ["conforming", "voxel"]
 
 
 def rotation(seed: int) -> np.ndarray:
@@ -39,7 +41,8 @@ def carved(snapshot_of):
 @pytest.mark.parametrize("seed", range(3))
 def test_rotated_scaled_and_mirrored_meshes_stay_valid(snapshot_of, seed, mirror):
     linear = rotation(seed) @ (np.diag([1.0, 1.0, -1.0]) if mirror else np.eye(3))
-    mesh, solid = build_voxel_mesh(carved(snapshot_of), DENSE, similarity(3.0, linear, (5.0, -7.0, 1.0)))
+    built = build_mesh(carved(snapshot_of), DENSE, similarity(3.0, linear, (5.0, -7.0, 1.0)), VOXEL)
+    mesh, solid = built.mesh, built.solid
     quality = check_mesh(mesh)  # positive volumes, facets outwards
     assert quality.volume_m3 == pytest.approx(solid.cells.sum() * (0.25 * 3.0) ** 3, rel=1e-12)
     assert quality.min_tet_volume_m3 == pytest.approx((0.25 * 3.0) ** 3 / 6, rel=1e-9)
@@ -48,7 +51,7 @@ def test_rotated_scaled_and_mirrored_meshes_stay_valid(snapshot_of, seed, mirror
 def test_points_are_transformed_lattice_corners(snapshot_of):
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # a quarter turn about z
     snapshot = snapshot_of(np.ones((2, 2, 2)), lo=(1.0, 2.0, 3.0), voxel_size=0.5)
-    mesh, _ = build_voxel_mesh(snapshot, DENSE, similarity(2.0, turn, (10.0, 20.0, 30.0)))
+    mesh = build_mesh(snapshot, DENSE, similarity(2.0, turn, (10.0, 20.0, 30.0)), VOXEL).mesh
     # Corner (0, 0, 0) at (1, 2, 3): turned (-2, 1, 3), doubled (-4, 2, 6), shifted (6, 22, 36).
     assert mesh.points_m[0].tolist() == [6.0, 22.0, 36.0]
     # Corner (1, 0, 0) is node 4 and lies one metre further along y.
@@ -63,9 +66,10 @@ def test_temperature_and_observed_follow_the_corners(snapshot_of):
     weight[1, 1, 1] = 0.0
     density = np.ones(shape)
     density[3] = 0.0
-    mesh, solid = build_voxel_mesh(
-        snapshot_of(density, values, weight), SolidSelection(close_gaps=0, density_threshold=0.9), np.eye(4)
+    built = build_mesh(
+        snapshot_of(density, values, weight), SolidSelection(close_gaps=0, density_threshold=0.9), np.eye(4), VOXEL
     )
+    mesh, solid = built.mesh, built.solid
     assert solid.cells[:, 0, 0].tolist() == [True, True, False]
     index = np.rint(mesh.points_m / 0.5).astype(int)
     assert np.array_equal(mesh.observed, ~np.all(index == 1, axis=1))
@@ -78,9 +82,9 @@ def test_corners_with_less_than_the_least_weight_are_extended(snapshot_of):
     values = np.full((3, 3, 3), 20.0)
     values[1, 1, 1] = 900.0
     snapshot = snapshot_of(np.ones((3, 3, 3)), values, weight)
-    mesh, _ = build_voxel_mesh(snapshot, DENSE, np.eye(4))
+    mesh = build_mesh(snapshot, DENSE, np.eye(4), VOXEL).mesh
     assert (mesh.observed.sum(), mesh.temperature_c.max()) == (26, 20.0)
-    mesh, _ = build_voxel_mesh(snapshot, DENSE, np.eye(4), min_observed_weight=0.0)
+    mesh = build_mesh(snapshot, DENSE, np.eye(4), MeshOptions("voxel", min_observed_weight=0.0)).mesh
     assert (mesh.observed.sum(), mesh.temperature_c.max()) == (27, 900.0)
 
 
@@ -94,9 +98,10 @@ def test_extension_conducts_like_the_voxels_do(snapshot_of):
     weight[[0, -1]] = 1.0
     values = np.zeros(density.shape)
     values[-1] = 100.0
-    mesh, solid = build_voxel_mesh(
-        snapshot_of(density, values, weight), SolidSelection(close_gaps=0, density_threshold=1.0), np.eye(4)
+    built = build_mesh(
+        snapshot_of(density, values, weight), SolidSelection(close_gaps=0, density_threshold=1.0), np.eye(4), VOXEL
     )
+    mesh, solid = built.mesh, built.solid
     per_layer = solid.cells.sum(axis=(1, 2))
     assert (per_layer[0], per_layer[-1]) == (1, 4)
     x = mesh.points_m[:, 0] / 0.5
@@ -108,13 +113,15 @@ def test_extension_conducts_like_the_voxels_do(snapshot_of):
 def test_weight_zero_is_never_a_measurement(snapshot_of):
     weight = np.ones((3, 3, 3))
     weight[1, 1, 1] = 0.0
-    mesh, _ = build_voxel_mesh(snapshot_of(np.ones((3, 3, 3)), 20.0, weight), DENSE, np.eye(4), min_observed_weight=0.0)
+    mesh = build_mesh(
+        snapshot_of(np.ones((3, 3, 3)), 20.0, weight), DENSE, np.eye(4), MeshOptions("voxel", min_observed_weight=0.0)
+    ).mesh
     assert mesh.observed.sum() == 26
 
 
 def test_body_no_thermal_ray_saw_is_refused(snapshot_of):
     with pytest.raises(MeshError, match="at least one node seen by a thermal ray"):
-        build_voxel_mesh(snapshot_of(np.ones((3, 3, 3)), 20.0, 0.0), DENSE, np.eye(4))
+        build_mesh(snapshot_of(np.ones((3, 3, 3)), 20.0, 0.0), DENSE, np.eye(4))
 
 
 def test_part_no_thermal_ray_saw_is_left_out(snapshot_of):
@@ -125,18 +132,20 @@ def test_part_no_thermal_ray_saw_is_left_out(snapshot_of):
     weight[0] = 1.0
     field = replace(snapshot_of(np.ones(weight.shape), 20.0, weight), voxel_density=cells.astype(np.float32))
     every = SolidSelection(close_gaps=0, density_threshold=0.5, largest_component=False)
-    mesh, solid = build_voxel_mesh(field, every, np.eye(4))
-    assert (solid.num_unobserved_parts, solid.num_unobserved_voxels) == (1, 6)
+    built = build_mesh(field, every, np.eye(4), VOXEL)
+    mesh, solid = built.mesh, built.solid
+    assert (built.unobserved_parts, built.unobserved_voxels) == (1, 6)
     expected = cells.copy()
     expected[4:] = False
     assert np.array_equal(solid.cells, expected) and len(mesh.tets) == 6 * 9
     assert check_mesh(mesh).volume_m3 == pytest.approx(9 * 0.5**3)
-    mesh, solid = build_voxel_mesh(replace(field, observed_weight=np.ones((8, 5, 5), np.float32)), every, np.eye(4))
-    assert (solid.num_unobserved_parts, solid.num_unobserved_voxels, len(mesh.tets)) == (0, 0, 6 * 15)
+    seen = replace(field, observed_weight=np.ones((8, 5, 5), np.float32))
+    built = build_mesh(seen, every, np.eye(4), VOXEL)
+    assert (built.unobserved_parts, built.unobserved_voxels, len(built.mesh.tets)) == (0, 0, 6 * 15)
 
 
 def test_solid_that_touches_the_border_is_tagged(snapshot_of):
-    mesh, _ = build_voxel_mesh(carved(snapshot_of), DENSE, similarity(1.0, rotation(4)))
+    mesh = build_mesh(carved(snapshot_of), DENSE, similarity(1.0, rotation(4)), VOXEL).mesh
     quality = check_mesh(mesh)
     assert 0 < quality.num_box_facets < quality.num_facets
     assert np.count_nonzero(mesh.facet_tags == FACET_BOX) == quality.num_box_facets
@@ -158,6 +167,91 @@ def test_what_is_no_similarity_is_refused(bad):
         check_similarity("world_to_metres", bad)
 
 
-def test_negative_least_weight_is_refused(snapshot_of):
+def test_negative_least_weight_is_refused():
     with pytest.raises(MeshError, match="min_observed_weight"):
-        build_voxel_mesh(snapshot_of(np.ones((2, 2, 2))), DENSE, np.eye(4), min_observed_weight=-1.0)
+        MeshOptions(min_observed_weight=-1.0)
+
+
+def ball(snapshot_of, seen_side: bool = False):
+    """A ball of radius 5.3 voxels of 0.5 in a lattice of 14, its density exponential in the distance to its surface."""
+    corner = np.stack(np.meshgrid(*[np.arange(15.0)] * 3, indexing="ij"), axis=-1)
+    inside = 5.3 - np.linalg.norm(corner - 7.0, axis=-1)
+    weight = (np.abs(inside) < 1.5) * (corner[..., 0] > 7.0 if seen_side else 1.0)
+    centre = np.stack(np.meshgrid(*[np.arange(14) + 0.5] * 3, indexing="ij"), axis=-1)
+    depth = 5.3 - np.linalg.norm(centre - 7.0, axis=-1)
+    field = snapshot_of(np.exp(3.0 * inside), 20.0 + corner[..., 0], weight)
+    return replace(field, voxel_density=np.exp(3.0 * depth).astype(np.float32))
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+def test_conforming_mesh_follows_the_level_set(snapshot_of, mirror):
+    linear = rotation(5) @ (np.diag([1.0, 1.0, -1.0]) if mirror else np.eye(3))
+    selection = SolidSelection(close_gaps=0, density_threshold=1.0)
+    mesh = build_mesh(ball(snapshot_of), selection, similarity(3.0, linear, (5.0, -7.0, 1.0))).mesh
+    quality = check_mesh(mesh)
+    radius = 5.3 * 0.5 * 3.0
+    assert quality.area_m2 == pytest.approx(4 * np.pi * radius**2, rel=0.02)
+    assert quality.volume_m3 == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.03)
+    assert quality.min_dihedral_deg > 10.7 and quality.max_dihedral_deg < 164.8
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_temperatures_come_from_what_was_seen_and_stay_in_its_range(snapshot_of, mode):
+    mesh = build_mesh(ball(snapshot_of, seen_side=True), DENSE, np.eye(4), MeshOptions(mode)).mesh
+    x = mesh.points_m[:, 0] / 0.5
+    assert mesh.observed[x > 11].any() and not mesh.observed[x < 6].any()
+    assert mesh.temperature_c[mesh.observed] == pytest.approx(20.0 + x[mesh.observed], abs=0.51)
+    seen = mesh.temperature_c[mesh.observed]
+    assert mesh.temperature_c.min() >= seen.min() - 1e-9 and mesh.temperature_c.max() <= seen.max() + 1e-9
+    assert np.ptp(mesh.temperature_c[x < 4]) < 0.5  # far from what was seen it is level
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_boundary_is_tagged_with_normal_and_true_area(snapshot_of, mode):
+    turn = rotation(6)
+    mesh = build_mesh(ball(snapshot_of), DENSE, similarity(2.0, turn), MeshOptions(mode)).mesh
+    boundary = mesh.boundary
+    assert boundary is not None and boundary.seen.all()  # without cameras nothing is known to be hidden
+    outwards = mesh.points_m[mesh.facets].mean(axis=1) - 2.0 * turn @ np.full(3, 3.5)
+    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    assert np.einsum("ij,ij->i", outwards, boundary.normal).min() > 0.9
+    true_area = (facet_areas(mesh.points_m, mesh.facets) * boundary.area_factor).sum()
+    radius = np.cbrt(3 / (4 * np.pi) * check_mesh(mesh).volume_m3)
+    assert true_area == pytest.approx(4 * np.pi * radius**2, rel=0.03)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_faces_of_the_box_are_tagged_and_flat(snapshot_of, mode):
+    mesh = build_mesh(carved(snapshot_of), DENSE, np.eye(4), MeshOptions(mode)).mesh
+    assert mesh.boundary is not None
+    cut = mesh.facet_tags == FACET_BOX
+    assert 0 < cut.sum() < len(cut)
+    assert np.abs(mesh.boundary.normal[cut]).max(axis=1) == pytest.approx(np.ones(cut.sum()))
+    assert np.all(mesh.boundary.area_factor[cut] == 1.0)
+    names = [mesh.boundary.patch_names[n] for n in np.unique(mesh.boundary.patch[cut])]
+    assert names == ["cut"]
+
+
+def test_up_decides_which_way_a_facet_faces(snapshot_of):
+    field = ball(snapshot_of)
+    shares = {}
+    for up in ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0)):
+        boundary = build_mesh(field, DENSE, np.eye(4), MeshOptions(up=up)).mesh.boundary
+        assert boundary is not None
+        top = boundary.patch == boundary.patch_names.index("exterior-up")
+        shares[up] = boundary.normal[top].mean(axis=0)
+    assert np.argmax(shares[(0.0, 0.0, 1.0)]) == 2 and np.argmax(shares[(1.0, 0.0, 0.0)]) == 0
+
+
+def test_colour_is_that_of_corners_with_density(snapshot_of):
+    field = ball(snapshot_of)
+    density = np.where(field.density > 0.05, field.density, 0.0).astype(np.float32)
+    colour = np.where(density[..., None] > 0.0, [0.75, 0.5, 0.25], 0.0).astype(np.float32)
+    mesh = build_mesh(replace(field, density=density, colour=colour), DENSE, np.eye(4)).mesh
+    assert mesh.colour is not None
+    assert np.all(mesh.colour == np.array([0.75, 0.5, 0.25], np.float32))
+
+
+def test_unknown_kind_of_boundary_is_refused():
+    with pytest.raises(MeshError, match="boundary: expected conforming or voxel"):
+        MeshOptions(boundary="smooth")  # type: ignore[arg-type]

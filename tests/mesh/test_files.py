@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import meshio
 import numpy as np
 import pytest
 import pyvista as pv
@@ -33,6 +34,24 @@ def test_mesh_round_trips_through_pyvista(tmp_path, box_mesh):
     assert [p.name for p in path.parent.iterdir()] == ["mesh.vtu"]
 
 
+def test_colours_and_regions_are_written(tmp_path, tagged_mesh):
+    write_vtu(tmp_path / "mesh.vtu", tagged_mesh)
+    grid = pv.read(tmp_path / "mesh.vtu")
+    assert grid.point_data["colour"].dtype == np.uint8
+    assert np.abs(grid.point_data["colour"] / 255.0 - tagged_mesh.colour).max() <= 0.5 / 255.0 + 1e-6
+    assert np.array_equal(grid.cell_data["region"], tagged_mesh.region)
+    names = {name: int(grid.field_data[name][0]) for name in grid.field_data.keys()}  # noqa: SIM118
+    assert names == {"region:walls": 0, "region:floor slab": 1, "region:roof": 2}
+
+
+def test_meshio_reads_the_mesh(tmp_path, tagged_mesh):
+    write_vtu(tmp_path / "mesh.vtu", tagged_mesh)
+    read = meshio.read(tmp_path / "mesh.vtu")
+    assert np.array_equal(read.points, tagged_mesh.points_m)
+    assert np.array_equal(read.cells_dict["tetra"], tagged_mesh.tets)
+    assert np.array_equal(read.point_data["temperature_c"], tagged_mesh.temperature_c)
+
+
 def test_temperature_of_a_later_step_replaces_the_meshs_own(tmp_path, box_mesh):
     later = box_mesh.temperature_c + 1.0
     write_vtu(tmp_path / "step.vtu", box_mesh, temperature_c=later)
@@ -53,6 +72,7 @@ def test_same_mesh_same_bytes(tmp_path, box_mesh):
         ({"heat": np.zeros(3)}, r"point_data\['heat'\]: expected shape"),
         ({"heat": np.full(60, np.nan)}, r"point_data\['heat'\]: expected finite"),
         ({"temperature_c": np.zeros(60)}, "expected names other than"),
+        ({"colour": np.zeros((60, 3))}, "expected names other than"),
     ],
 )
 def test_bad_point_data_leaves_the_old_file(tmp_path, box_mesh, data, message):

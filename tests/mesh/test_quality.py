@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.errors import MeshError
-from thermoxels_ns.mesh.quality import check_mesh, dihedral_range_deg, facet_areas, facet_normals, signed_volumes
+from thermoxels_ns.mesh.face_count import group_faces
+from thermoxels_ns.mesh.quality import (
+    check_mesh,
+    count_twin_nodes,
+    count_wrong_facets,
+    dihedral_range_deg,
+    facet_areas,
+    facet_normals,
+    signed_volumes,
+)
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
 
@@ -120,3 +129,43 @@ def test_numbers_out_of_range_nan_shapes_and_emptiness(box_mesh):
         check_mesh(replace(box_mesh, region=box_mesh.region[1:]))
     with pytest.raises(MeshError, match="at least one tetrahedron"):
         check_mesh(replace(box_mesh, tets=box_mesh.tets[:0], region=box_mesh.region[:0]))
+
+
+def test_facets_with_node_numbers_out_of_range(box_mesh):
+    for shift in (-1, 1000):
+        bad = box_mesh.facets.copy()
+        bad[2, 1] += shift * len(box_mesh.points_m)
+        with pytest.raises(MeshError, match="mesh facets: expected node numbers from 0 to 59"):
+            check_mesh(replace(box_mesh, facets=bad))
+
+
+def test_wrong_facets_are_counted(box_mesh):
+    faces = group_faces(box_mesh.tets)
+    facets = box_mesh.facets
+    flipped = facets.copy()
+    flipped[3] = flipped[3, ::-1]
+    cases = (
+        (facets, 0),
+        (facets[2:], 2),
+        (flipped, 2),
+        (np.vstack([facets, facets[:3]]), 3),
+        (facets[:0], len(facets)),
+    )
+    for changed, expected in cases:
+        assert count_wrong_facets(replace(box_mesh, facets=changed), faces) == expected
+
+
+def test_twin_nodes_are_counted():
+    random = np.random.default_rng(0)
+    points = random.integers(0, 4, size=(500, 3)).astype(float)
+    assert count_twin_nodes(points) == 500 - len(np.unique(points, axis=0))
+    assert count_twin_nodes(random.normal(size=(500, 3))) == 0
+    assert count_twin_nodes(np.array([[0.0, 1.0, 2.0], [-0.0, 1.0, 2.0], [1.0, 0.0, 2.0]])) == 1
+
+
+def test_a_spherical_fan_of_thin_tetrahedra_is_no_crack():
+    # Boundary triangles that meet at 1 degree are sharp, but do not lie on each other.
+    angle = np.radians(1.0)
+    points = np.array([[0.0, 0, 0], [0, 0, 1], [1, 0, 0], [np.cos(angle), np.sin(angle), 0]])
+    tets = np.array([[0, 2, 3, 1]])
+    assert check_mesh(mesh_from(points, tets)).min_dihedral_deg == pytest.approx(1.0)

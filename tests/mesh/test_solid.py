@@ -1,14 +1,23 @@
-"""Which voxels are solid."""
+"""Which voxels are solid, and what each step says it did."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.looking_cameras import looking_at
 from thermoxels_ns.errors import MeshError
 from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.mesh.solid import SolidSelection, close_gaps, fill_enclosed, select_solid
+from thermoxels_ns.mesh.solid import SolidCells, SolidSelection, SolidStep, close_gaps, fill_enclosed, select_solid
 from thermoxels_ns.snapshot import GridSnapshot
+
+
+def step_of(solid: SolidCells, name: str) -> SolidStep:
+    """The one step of that name."""
+    (found,) = (step for step in solid.steps if step.name == name)
+    return found
 
 
 def cells_along_x(values: list[float]) -> np.ndarray:
@@ -88,18 +97,20 @@ def test_largest_component_and_what_was_removed(snapshot_of):
     solid = select_solid(snapshot, largest)
     assert np.flatnonzero(solid.cells).tolist() == [2, 3, 4]
     assert solid.component_sizes.tolist() == [3, 2, 1]
-    assert (solid.num_removed, solid.num_added) == (3, 0)
+    assert (step_of(solid, "largest body").removed, step_of(solid, "largest body").added) == (3, 0)
     every = select_solid(snapshot, SolidSelection(close_gaps=0, density_threshold=1.0, largest_component=False))
     assert np.flatnonzero(every.cells).tolist() == [0, 2, 3, 4, 6, 7]
-    assert every.num_removed == 0
+    assert step_of(every, "small bodies").removed == 0
     not_small = select_solid(snapshot, SolidSelection(close_gaps=0, density_threshold=1.0, smallest_body=0.5))
-    assert np.flatnonzero(not_small.cells).tolist() == [2, 3, 4, 6, 7] and not_small.num_removed == 1
+    assert (
+        np.flatnonzero(not_small.cells).tolist() == [2, 3, 4, 6, 7] and step_of(not_small, "small bodies").removed == 1
+    )
 
 
 def test_gaps_are_closed_and_wide_ones_are_not(snapshot_of):
     snapshot = snapshot_of(cells_along_x([5, 0, 0, 5, 0, 0, 0, 5]))
     one = select_solid(snapshot, SolidSelection(density_threshold=1.0))
-    assert np.flatnonzero(one.cells).tolist() == [0, 1, 2, 3, 7] and one.num_closed == 2
+    assert np.flatnonzero(one.cells).tolist() == [0, 1, 2, 3, 7] and step_of(one, "close gaps").added == 2
     wall = np.ones((9, 9, 1), dtype=bool)
     wall[2, 3] = wall[5, 6] = False
     assert close_gaps(wall, 1).all() and close_gaps(wall, 0) is wall
@@ -120,16 +131,103 @@ def test_voxels_that_touch_by_edge_or_corner_only_are_different_bodies(snapshot_
         assert np.argwhere(solid.cells).tolist() == [[0, 0, 0]]
 
 
-def test_cavities_are_filled_only_on_request(snapshot_of):
+def test_cavities_are_filled_unless_the_body_is_to_stay_hollow(snapshot_of):
     density = np.ones((8, 8, 8))
     density[3:5, 3:5, 3:5] = 0.0
     snapshot = snapshot_of(density)
-    hollow = select_solid(snapshot, SolidSelection(close_gaps=0, density_threshold=0.4))
-    filled = select_solid(snapshot, SolidSelection(close_gaps=0, density_threshold=0.4, fill_cavities=True))
+    hollow = select_solid(snapshot, SolidSelection(close_gaps=0, density_threshold=0.4, interior="hollow"))
+    filled = select_solid(snapshot, SolidSelection(close_gaps=0, density_threshold=0.4))
     missing = 7**3 - int(hollow.cells.sum())
     assert missing > 0
     assert filled.cells.all()
-    assert filled.num_added == missing
+    assert step_of(filled, "interior").added == missing
+    assert f"{missing} voxels of enclosed cavities are filled; the cameras" in step_of(filled, "interior").remark
+    assert [step.name for step in hollow.steps] == ["threshold", "small bodies"]
+
+
+@pytest.fixture
+def facade(snapshot_of) -> GridSnapshot:
+    """A plate one voxel of 0.5 thick that three cameras see from +x, across the lattice."""
+    density = np.zeros((17, 17, 17))
+    density[9:11] = 20.0
+    eyes = [(30.0, 4.0, 4.0), (30.0, 6.0, 4.0), (30.0, 4.0, 6.0)]
+    return replace(snapshot_of(density), views=looking_at((4.0, 4.0, 4.0), eyes))
+
+
+def test_a_wall_thickness_is_in_metres_and_takes_the_place_of_filling(facade):
+    thin = select_solid(facade, SolidSelection(close_gaps=0, density_threshold=15.0))
+    assert thin.cells.sum(axis=0).max() == 1
+    thick = select_solid(facade, SolidSelection(close_gaps=0, density_threshold=15.0, wall_thickness=0.4), 0.2)
+    assert (thick.cells[:, 6:10, 6:10].sum(axis=0) == 4).all() and thick.cells[6:10, 8, 8].all()  # 0.4 m = 4 voxels
+    assert [step.name for step in thick.steps] == ["threshold", "small bodies", "wall"]
+    wall = step_of(thick, "wall")
+    assert wall.added == thick.cells.sum() - thin.cells.sum() and "0.4 m thick (4 voxels)" in wall.remark
+
+
+def test_a_wall_thickness_needs_a_scale_and_cameras(facade):
+    selection = SolidSelection(wall_thickness=0.3)
+    with pytest.raises(MeshError, match=r"wall_thickness.*scale is known.*--metres-per-unit"):
+        select_solid(facade, selection)
+    with pytest.raises(MeshError, match="metres_per_world_unit"):
+        select_solid(facade, selection, 0.0)
+    with pytest.raises(MeshError, match=r"wall_thickness.*training cameras.*leave out --wall-thickness"):
+        select_solid(replace(facade, views=None), selection, 1.0)
+
+
+def test_a_room_that_photographs_were_taken_in_stays_empty(snapshot_of):
+    density = np.full((21, 21, 21), 9.0)
+    density[4:17, 4:17, 4:17] = 0.0
+    inside = looking_at((5.0, 5.0, 5.0), [(4.0, 4.0, 5.5), (6.0, 4.5, 5.0)])
+    field = snapshot_of(density)
+    room = select_solid(replace(field, views=inside), SolidSelection(density_threshold=5.0))
+    assert not room.cells[5:15, 5:15, 5:15].any()
+    assert "1 cavities with a camera in them stay empty" in step_of(room, "interior").remark
+    assert select_solid(field, SolidSelection(density_threshold=5.0)).cells.all()
+
+
+def test_what_the_cameras_cannot_look_into_is_filled(snapshot_of):
+    """A box without a floor, photographed from above and all around."""
+    density = np.zeros((21, 21, 21), dtype=np.float32)
+    field = snapshot_of(density)
+    shell = np.zeros((20, 20, 20), dtype=np.float32)
+    shell[4:16, 4:16, 4:16] = 50.0
+    shell[6:14, 6:14, 4:14] = 0.0
+    angle = 2 * np.pi * np.arange(12) / 12
+    eyes = np.column_stack((5 + 25 * np.cos(angle), 5 + 25 * np.sin(angle), np.full(12, 15.0)))
+    field = replace(field, voxel_density=shell, views=looking_at((5.0, 5.0, 5.0), eyes))
+    solid = select_solid(field, SolidSelection(close_gaps=0, seal_openings=0))
+    assert solid.cells[4:16, 4:16, 4:16].all() and solid.cells.sum() == 12**3
+    assert solid.level[10, 10, 10] == 1.0
+    step = step_of(solid, "interior")
+    assert step.added == 8 * 8 * 10 and "640 voxels that cameras cannot look into" in step.remark
+    assert (select_solid(field, SolidSelection(close_gaps=0, interior="hollow")).cells == (shell > 0)).all()
+
+
+def test_the_steps_lead_from_nothing_to_the_result(snapshot_of):
+    random = np.random.default_rng(3)
+    field = snapshot_of(random.random((14, 13, 12)) ** 3)
+    solid = select_solid(field, SolidSelection(density_percentile=85.0, smallest_body=0.5))
+    assert [step.name for step in solid.steps] == ["threshold", "close gaps", "small bodies", "interior"]
+    assert sum(step.added - step.removed for step in solid.steps) == solid.cells.sum()
+    assert step_of(solid, "threshold").remark == solid.explanation and solid.explanation.startswith("The densest 15 %")
+    assert all(step.remark.endswith(".") and step.added >= 0 <= step.removed for step in solid.steps)
+
+
+@pytest.mark.parametrize("case", ["one voxel", "full", "checkerboard", "noise", "one voxel wide"])
+def test_the_level_has_the_sign_of_the_choice_in_hard_cases(snapshot_of, corner_density, case):
+    shape = (7, 6, 1) if case == "one voxel wide" else (7, 6, 5)
+    cells = {
+        "one voxel": np.arange(210).reshape(7, 6, 5) == 100,
+        "full": np.ones(shape, dtype=bool),
+        "checkerboard": np.indices(shape).sum(axis=0) % 2 == 0,
+        "noise": np.random.default_rng(0).random(shape) < 0.3,
+        "one voxel wide": np.random.default_rng(1).random(shape) < 0.5,
+    }[case]
+    field = replace(snapshot_of(corner_density(cells)), voxel_density=50.0 * cells.astype(np.float32))
+    for options in ({}, {"close_gaps": 0, "interior": "hollow", "smallest_body": 0.0}):
+        solid = select_solid(field, SolidSelection(density_threshold=1.0, **options))
+        assert np.array_equal(solid.level > 0, solid.cells) and np.array_equal(solid.level < 0, ~solid.cells)
+    assert np.array_equal(solid.cells, cells)
 
 
 def test_fill_enclosed_leaves_what_leads_outside():
@@ -155,14 +253,31 @@ def test_fill_enclosed_of_nothing_is_nothing():
 
 
 @pytest.mark.parametrize(
-    "bad", [{"density_percentile": -1.0}, {"density_percentile": np.nan}, {"density_threshold": -0.1}]
+    "bad",
+    [
+        {"density_percentile": -1.0},
+        {"density_percentile": np.nan},
+        {"density_threshold": -0.1},
+        {"density_threshold": np.inf},
+        {"voxel_optical_depth": 0.0},
+        {"voxel_optical_depth": np.nan},
+        {"close_gaps": -1},
+        {"close_gaps": 1.5},
+        {"seal_openings": -1},
+        {"seal_openings": True},
+        {"smallest_body": 1.1},
+        {"smallest_body": np.nan},
+        {"interior": "filled"},
+        {"wall_thickness": 0.0},
+        {"wall_thickness": np.inf},
+    ],
 )
 def test_bad_selection_is_refused(bad):
-    with pytest.raises(MeshError, match=next(iter(bad))):
-        SolidSelection(close_gaps=0, **bad)
+    with pytest.raises(MeshError, match=f"^{next(iter(bad))}: expected .*, got .*"):
+        SolidSelection(**bad)
 
 
-def test_default_is_half_an_optical_depth_per_voxel_at_any_resolution():
+def test_without_rays_the_default_is_half_an_optical_depth_per_voxel_at_any_resolution():
     """Solid where density x voxel size >= 0.5, so the same field gives the same body on a finer lattice."""
     for voxel in (0.5, 0.125):
         lattice = Lattice((0.0, 0.0, 0.0), voxel, (3, 2, 2))

@@ -8,7 +8,14 @@ import pytest
 from thermoxels_ns.errors import MeshError
 from thermoxels_ns.mesh.quality import check_mesh, facet_areas, signed_volumes
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
-from thermoxels_ns.mesh.voxel_tets import boundary_facets, boundary_tags, count_facets, kuhn_tets, lattice_edges
+from thermoxels_ns.mesh.voxel_tets import (
+    boundary_facets,
+    boundary_tags,
+    count_facets,
+    kuhn_tets,
+    lattice_edges,
+    voxel_facets,
+)
 
 
 def exposed_faces(cells: np.ndarray) -> int:
@@ -67,6 +74,25 @@ def test_random_carved_blocks_are_valid(mesh_of_cells, random_cells, seed):
     quality = check_mesh(mesh_of_cells(cells, voxel_size=0.25))
     assert quality.volume_m3 == pytest.approx(cells.sum() * 0.25**3, rel=1e-13)
     assert quality.area_m2 == pytest.approx(exposed_faces(cells) * 0.25**2, rel=1e-13)
+
+
+def turned(facets: np.ndarray) -> list:
+    """Triangles with their smallest node first, orientation kept, in one order."""
+    rows = [tuple(np.roll(row, -int(np.argmin(row)))) for row in facets]
+    assert len(set(rows)) == len(rows)
+    return sorted(rows)
+
+
+@pytest.mark.parametrize("name", PATTERNS)
+def test_voxel_faces_give_the_boundary_of_the_tetrahedra(name):
+    cells = pattern(name)
+    assert turned(voxel_facets(cells)) == turned(boundary_facets(kuhn_tets(cells)[1]))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_voxel_faces_give_the_boundary_of_random_blocks(random_cells, seed):
+    cells = random_cells(seed)
+    assert turned(voxel_facets(cells)) == turned(boundary_facets(kuhn_tets(cells)[1]))
 
 
 def test_single_voxel_by_hand():

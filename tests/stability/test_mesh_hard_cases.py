@@ -9,10 +9,12 @@ from hypothesis import strategies as st
 
 from thermoxels_ns.errors import MeshError
 from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.mesh.build import build_voxel_mesh
+from thermoxels_ns.mesh.build import MeshOptions, build_mesh
 from thermoxels_ns.mesh.quality import check_mesh
 from thermoxels_ns.mesh.solid import SolidSelection, select_solid
 from thermoxels_ns.snapshot import GridSnapshot
+
+VOXEL = MeshOptions("voxel")
 
 
 def snapshot(density: np.ndarray, observed_weight: np.ndarray | float = 1.0) -> GridSnapshot:
@@ -46,7 +48,8 @@ def test_selection_does_not_depend_on_the_scale_of_density(scale):
 def test_one_voxel_wall():
     density = np.zeros((9, 12, 12))
     density[4:6, 1:-1, 1:-1] = 40.0
-    mesh, solid = build_voxel_mesh(snapshot(density), SolidSelection(close_gaps=0, density_threshold=40.0), np.eye(4))
+    built = build_mesh(snapshot(density), SolidSelection(close_gaps=0, density_threshold=40.0), np.eye(4), VOXEL)
+    mesh, solid = built.mesh, built.solid
     assert np.unique(np.argwhere(solid.cells)[:, 0]).tolist() == [4]
     quality = check_mesh(mesh)
     assert quality.volume_m3 == pytest.approx(81 * 0.1**3)
@@ -54,9 +57,8 @@ def test_one_voxel_wall():
 
 
 def test_smallest_lattice():
-    mesh, _ = build_voxel_mesh(
-        snapshot(np.ones((2, 2, 2))), SolidSelection(close_gaps=0, density_threshold=1.0), np.eye(4)
-    )
+    selection = SolidSelection(close_gaps=0, density_threshold=1.0)
+    mesh = build_mesh(snapshot(np.ones((2, 2, 2))), selection, np.eye(4), VOXEL).mesh
     quality = check_mesh(mesh)
     assert (quality.num_nodes, quality.num_tets, quality.num_box_facets) == (8, 6, 12)
 
@@ -66,9 +68,9 @@ def test_opaque_body_is_seen_on_its_skin_only():
     shape = (20, 20, 20)
     weight = np.ones(shape, dtype=np.float32)
     weight[1:-1, 1:-1, 1:-1] = 0.0
-    mesh, _ = build_voxel_mesh(
-        snapshot(np.full(shape, 1e4), weight), SolidSelection(close_gaps=0, density_threshold=1.0), np.eye(4)
-    )
+    mesh = build_mesh(
+        snapshot(np.full(shape, 1e4), weight), SolidSelection(close_gaps=0, density_threshold=1.0), np.eye(4), VOXEL
+    ).mesh
     assert np.count_nonzero(~mesh.observed) == 18**3
     assert np.abs(mesh.temperature_c - (15.0 + mesh.points_m[:, 0] / 0.1)).max() < 1e-6
 
@@ -80,14 +82,14 @@ def test_opaque_body_is_seen_on_its_skin_only():
     fill=st.floats(0.05, 1.0),
     percentile=st.floats(0.0, 99.0),
     largest=st.booleans(),
-    fill_cavities=st.booleans(),
+    interior=st.sampled_from(["solid", "hollow"]),
     mirror=st.booleans(),
 )
-def test_every_mesh_that_is_built_is_valid(shape, seed, fill, percentile, largest, fill_cavities, mirror):
+def test_every_mesh_that_is_built_is_valid(shape, seed, fill, percentile, largest, interior, mirror):
     random = np.random.default_rng(seed)
     density = random.random(shape) * (random.random(shape) < fill)
     selection = SolidSelection(
-        close_gaps=0, density_percentile=percentile, largest_component=largest, fill_cavities=fill_cavities
+        close_gaps=0, density_percentile=percentile, largest_component=largest, interior=interior
     )
     field = snapshot(density)
     try:
@@ -98,8 +100,9 @@ def test_every_mesh_that_is_built_is_valid(shape, seed, fill, percentile, larges
         assert not centre.any() or np.ptp(centre) == 0.0
         return
     transform = np.diag([-2.0 if mirror else 2.0, 2.0, 2.0, 1.0])
-    mesh, built = build_voxel_mesh(field, selection, transform)
+    built = build_mesh(field, selection, transform, VOXEL)
+    mesh = built.mesh
     quality = check_mesh(mesh)
-    assert np.array_equal(built.cells, solid.cells)
+    assert np.array_equal(built.solid.cells, solid.cells)
     assert quality.volume_m3 == pytest.approx(solid.cells.sum() * 0.2**3, rel=1e-9)
-    assert solid.cells.sum() == solid.component_sizes.sum() - solid.num_removed + solid.num_added
+    assert solid.cells.sum() == sum(step.added - step.removed for step in solid.steps)

@@ -1,7 +1,8 @@
 """Write a synthetic scene as a folder of photographs and thermal images, and get its truth back from the folder.
 
 The layout is that of ThermoScenes: ``images/``, ``thermal/``, ``transforms.json`` and ``temperature_bounds.json``,
-with ``frame_train_`` and ``frame_eval_`` names. The scene box and the name of the truth are added to the json.
+with ``frame_train_`` and ``frame_eval_`` names. The scene box, the scale (metres), up (z) and the name of the truth are
+added to the json.
 """
 
 from __future__ import annotations
@@ -134,6 +135,7 @@ def write_scene(
         transforms["thermal_camera"] = _intrinsics(thermal_camera)
     if thermal_format == "tiff":  # a 16-bit PNG has its unit in the bounds, and count 0 is a temperature there
         transforms["thermal_unit"] = unit
+    transforms |= {"metres_per_unit": 1.0, "up": [0, 0, 1]}
     transforms["scene_box"] = [list(corner) for corner in scene.scene_box]
     transforms["truth"] = {"synthetic_scene": scene.name, "seed": seed, "noise_k": noise_k, "drift_k": drifts.tolist()}
     transforms["frames"] = frames

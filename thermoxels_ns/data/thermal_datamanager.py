@@ -17,10 +17,12 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIn
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from thermoxels_ns.data.camera_views import views_of_cameras
 from thermoxels_ns.data.photo_streams import PhotoStreams, draw_generator
 from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.thermal_dataset import ThermalDataset
 from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.snapshot import Views
 
 _TRAIN, _EVAL, _EVAL_IMAGE = 0, 1, 2
 
@@ -128,6 +130,16 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
             chunk: Rays per bundle; the last one may have fewer.
         """
         return self.train_streams.grid(stream, stride, max_rays_per_image, chunk)
+
+    def training_views(self) -> Views:
+        """Give the cameras of the streams that train: the photographs', and the thermal ones where they differ."""
+        dataset, streams = self.train_dataset, self.config.streams
+        chosen = []
+        if streams != "thermal" or dataset.thermal_cameras is None:
+            chosen.append(dataset.cameras)
+        if streams != "rgb" and dataset.thermal_cameras is not None:
+            chosen.append(dataset.thermal_cameras)
+        return views_of_cameras(chosen)
 
     def get_train_rays_per_batch(self) -> int:
         """Return how many rays `next_train` gives."""

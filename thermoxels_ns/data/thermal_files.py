@@ -13,6 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from thermoxels_ns.data.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
+from thermoxels_ns.data.thermal_size import check_thermal_size
 from thermoxels_ns.errors import ThermalFileError, explain
 from thermoxels_ns.units import ZERO_CELSIUS_K
 
@@ -127,11 +129,15 @@ def read_temperature_c(
 
 
 def read_thermal_file(
-    path: Path, unit: ThermalUnit, valid_range_c: tuple[float, float] = (-100.0, 2000.0)
+    path: Path,
+    unit: ThermalUnit,
+    valid_range_c: tuple[float, float] = (-100.0, 2000.0),
+    suffix: str | None = None,
 ) -> ThermalImage:
-    """Read a thermal file: PNG, JPG or TIFF counts, float TIFF, ``.npy`` or ``.csv``.
+    """Read a thermal file: PNG, JPG or TIFF counts, float TIFF, FLIR R-JPEG, ``.npy`` or ``.csv``.
 
-    Counts need a unit of kind bounds or linear. Floating-point TIFF is in degrees Celsius unless the unit is linear.
+    A FLIR R-JPEG is read by the calibration and the settings in it, whatever the unit. Counts need a unit of kind
+    bounds or linear. Floating-point TIFF is in degrees Celsius unless the unit is linear.
     ``.csv`` and floating-point ``.npy`` are always in degrees Celsius; an integer ``.npy`` is counts if the unit is
     linear. The conversion runs in float64, so 16-bit steps survive.
 
@@ -139,6 +145,7 @@ def read_thermal_file(
         path: The file; its suffix chooses the reader.
         unit: Meaning of the numbers.
         valid_range_c: Temperatures outside are masked, [degrees Celsius].
+        suffix: Read the file as if its name ended so; None: as it ends.
 
     Returns:
         Temperatures with NaN where invalid, and the counts of what was masked.
@@ -146,8 +153,9 @@ def read_thermal_file(
     Raises:
         ThermalFileError: The file is missing, damaged, a colour picture, or its counts have no unit.
     """
+    suffix = (suffix or path.suffix).lower()
     try:
-        raw = _read_raw(path)
+        raw = _read_raw(path, suffix)
     except ThermalFileError:
         raise
     except Exception as problem:  # decoders raise OSError, SyntaxError, ValueError, struct.error, EOFError, ...
@@ -161,14 +169,16 @@ def read_thermal_file(
                 remedy="Export a single-channel thermal image.",
             )
         )
-    return _to_celsius(path, raw, unit, valid_range_c)
+    return _to_celsius(path, suffix, raw, unit, valid_range_c)
 
 
-def _to_celsius(path: Path, raw: _RawPixels, unit: ThermalUnit, valid_range_c: tuple[float, float]) -> ThermalImage:
+def _to_celsius(
+    path: Path, suffix: str, raw: _RawPixels, unit: ThermalUnit, valid_range_c: tuple[float, float]
+) -> ThermalImage:
     values = raw.values
-    plain = values.dtype.kind == "f" or path.suffix.lower() in (".npy", ".csv")
+    plain = values.dtype.kind == "f" or suffix in (".npy", ".csv")
     saturated = np.zeros(values.shape, dtype=bool)
-    if unit.kind == "linear" and (values.dtype.kind in "ui" or path.suffix.lower() in (".tif", ".tiff")):
+    if unit.kind == "linear" and (values.dtype.kind in "ui" or suffix in (".tif", ".tiff")):
         if values.dtype.kind in "ui":
             ends = np.iinfo(values.dtype)
             saturated = (values == ends.min) | (values == ends.max)
@@ -198,7 +208,7 @@ def _to_celsius(path: Path, raw: _RawPixels, unit: ThermalUnit, valid_range_c: t
     return ThermalImage(celsius.astype(np.float32), report)
 
 
-def _read_raw(path: Path) -> _RawPixels:
+def _read_raw(path: Path, suffix: str) -> _RawPixels:
     if not path.is_file():
         raise ThermalFileError(
             explain(
@@ -210,21 +220,25 @@ def _read_raw(path: Path) -> _RawPixels:
         )
     if path.stat().st_size == 0:
         raise _damaged(path, "a file of zero bytes")
-    suffix = path.suffix.lower()
     if suffix == ".npy":
-        values = np.load(path, allow_pickle=False)
+        values = np.load(path, mmap_mode="r", allow_pickle=False)  # mapped: its size is checked before it is read
         if not isinstance(values, np.ndarray) or values.dtype.kind not in "fui":
             raise _damaged(path, f"an array of type {getattr(values, 'dtype', type(values))}")
+        if values.ndim >= 2 and values.size:
+            check_thermal_size(path, values.shape[1], values.shape[0])
+        values = np.array(values)
         return _RawPixels(values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values)
     if suffix == ".csv":
         return _RawPixels(_read_csv(path))
     if suffix in IMAGE_SUFFIXES:
+        if is_flir_jpeg(path):
+            return _RawPixels(read_flir_jpeg(path).temperature_c())
         return _read_image(path)
     raise ThermalFileError(
         explain(
             str(path),
             expected="a thermal file of type " + ", ".join(THERMAL_SUFFIXES),
-            got=f"suffix '{path.suffix}'",
+            got=f"suffix '{suffix}'",
             remedy="Convert the file to one of these.",
         )
     )
@@ -253,6 +267,7 @@ def _number(cell: str) -> float:
 
 def _read_image(path: Path) -> _RawPixels:
     with Image.open(path) as image:
+        check_thermal_size(path, *image.size)
         if getattr(image, "n_frames", 1) != 1:
             raise ThermalFileError(
                 explain(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import numbers
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +13,8 @@ import numpy.typing as npt
 
 from thermoxels_ns.checks import check_finite, check_positive, check_shape
 from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.effects import Effect
+from thermoxels_ns.fem.flat_tets import count_flat_tets
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.units import ZERO_CELSIUS_K
@@ -59,18 +63,54 @@ class TimeSteps:
 
 
 @dataclass(frozen=True)
-class HeatProblem:
-    """Transient heat conduction in a uniform body whose boundary is insulated.
+class AdaptiveSteps:
+    """Steps as long as a tolerance allows.
 
-    rho c dT/dt = div(k grad T) inside, k grad T . n = 0 on the boundary, T = T0 at the start.
+    >>> AdaptiveSteps(3600.0, outputs=3).times_s.tolist()
+    [0.0, 1200.0, 2400.0, 3600.0]
+    """
+
+    duration_s: float
+    """Time to follow the body for, [s], above 0."""
+    tolerance_k: float = 0.05
+    """Largest error of any temperature that the steps may make, as estimated from their embedded pair, [K]. The
+    default is half of what building physics asks of a temperature (ISO 10211: 0.1 K)."""
+    outputs: int = 10
+    """Number of equal intervals at whose ends temperatures are kept."""
+
+    def __post_init__(self) -> None:
+        for name, remedy in (("duration_s", "Give a time in seconds."), ("tolerance_k", "Give a tolerance in kelvin.")):
+            object.__setattr__(self, name, check_positive(name, getattr(self, name), remedy, HeatError))
+        whole = isinstance(self.outputs, numbers.Integral) and not isinstance(self.outputs, bool)
+        if not whole or self.outputs < 1:
+            expected, remedy = "a whole number of at least 1", "Give the number of intervals, such as 10."
+            raise HeatError(explain("outputs", expected=expected, got=repr(self.outputs), remedy=remedy))
+
+    @property
+    def times_s(self) -> npt.NDArray[np.float64]:
+        """Start, then the end of every interval, shape (outputs + 1,), [s]."""
+        return np.linspace(0.0, self.duration_s, self.outputs + 1)
+
+
+@dataclass(frozen=True)
+class HeatProblem:
+    """Heat in a body: conduction, storage, and the effects that the scene calls for.
+
+    rho c dT/dt = div(k grad T) inside, T = T0 at the start; where no effect acts on the boundary it is insulated,
+    k grad T . n = 0.
     """
 
     mesh: TetMesh
     """The body."""
-    material: Material
-    """What all of it is made of."""
+    material: Material | Mapping[str, Material]
+    """What all of it is made of, or one material per name of a region of the mesh."""
     initial_temperature_c: npt.NDArray[np.float64] | None = None
-    """Nodal temperature at the start, shape (n,), [degrees Celsius]; None: the mesh's own."""
+    """Nodal temperature at the start, shape (n,), [degrees Celsius]; None: the mesh's own. A steady solver starts its
+    iterations from it."""
+    effects: tuple[Effect, ...] = ()
+    """What acts on the body; several may act on one patch."""
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Direction that points up, for effects that depend on it."""
 
     def __post_init__(self) -> None:
         points, tets = self.mesh.points_m, self.mesh.tets
@@ -100,6 +140,8 @@ class HeatProblem:
             )
         self._check_volumes(remedy)
         self._check_temperatures()
+        self._check_materials()
+        self._check_effects()
 
     @property
     def start_c(self) -> npt.NDArray[np.float64]:
@@ -107,19 +149,69 @@ class HeatProblem:
         given = self.mesh.temperature_c if self.initial_temperature_c is None else self.initial_temperature_c
         return np.asarray(given, dtype=np.float64)
 
+    @property
+    def conductivity_w_mk(self) -> float | npt.NDArray[np.float64]:
+        """Thermal conductivity, one for all or one per tetrahedron, shape (t,), [W / (m K)]."""
+        return self._property("conductivity_w_mk")
+
+    @property
+    def heat_capacity_j_m3k(self) -> float | npt.NDArray[np.float64]:
+        """Heat capacity per volume, one for all or one per tetrahedron, shape (t,), [J / (m3 K)]."""
+        return self._property("heat_capacity_j_m3k")
+
+    def _property(self, name: str) -> float | npt.NDArray[np.float64]:
+        if isinstance(self.material, Material):
+            return float(getattr(self.material, name))
+        known, names = self.material, self.mesh.region_names
+        by_region = [float(getattr(known[region], name)) if region in known else np.nan for region in names]
+        return np.array(by_region)[self.mesh.region]
+
+    def _check_materials(self) -> None:
+        if isinstance(self.material, Material):
+            return
+        remedy, names = "Give one Material, or one per region: {name of region: Material}.", self.mesh.region_names
+        if not isinstance(self.material, Mapping):
+            got = repr(self.material)
+            raise HeatError(explain("material", expected="a Material or a mapping", got=got, remedy=remedy))
+        shape = (len(self.mesh.tets),)
+        region = check_shape(
+            "mesh region", self.mesh.region, shape, "Build the mesh with thermoxels_ns.mesh.", HeatError
+        )
+        if region.min() < 0 or region.max() >= len(names):
+            expected, got = f"numbers from 0 to {len(names) - 1}", f"{region.min()} to {region.max()}"
+            raise HeatError(explain("mesh region", expected=expected, got=got, remedy="Name every region of the mesh."))
+        used = {names[number] for number in np.unique(region)}
+        missing, unknown = used - set(self.material), set(self.material) - set(names)
+        wrong = [name for name, material in self.material.items() if not isinstance(material, Material)]
+        if missing or unknown or wrong:
+            got = "; ".join(
+                f"{what}: {', '.join(sorted(names))}"
+                for what, names in (("none for", missing), ("unknown", unknown), ("no Material for", wrong))
+                if names
+            )
+            expected = f"a Material for each of the regions {', '.join(sorted(used))}"
+            raise HeatError(explain("material", expected=expected, got=got, remedy=remedy))
+
+    def _check_effects(self) -> None:
+        wrong = [type(effect).__name__ for effect in self.effects if not isinstance(effect, Effect)]
+        if wrong or not isinstance(self.effects, tuple):
+            got = ", ".join(wrong) or type(self.effects).__name__
+            remedy = "Use the effects of thermoxels_ns.fem.effects."
+            raise HeatError(explain("effects", expected="a tuple of effects", got=got, remedy=remedy))
+        length = math.hypot(*self.up) if len(self.up) == 3 else math.nan
+        if not (math.isfinite(length) and length > 0.0):
+            expected, remedy = "a direction", "Give three numbers, such as (0, 0, 1)."
+            raise HeatError(explain("up", expected=expected, got=repr(self.up), remedy=remedy))
+        object.__setattr__(self, "up", tuple(float(part) / length for part in self.up))
+
     def _check_volumes(self, remedy: str) -> None:
-        corner = self.mesh.points_m[self.mesh.tets]
-        edges = corner[:, 1:] - corner[:, :1]
-        volumes = np.einsum("ti,ti->t", edges[:, 0], np.cross(edges[:, 1], edges[:, 2])) / 6.0
-        # A tetrahedron flat to round-off of its own size cannot carry gradients.
-        size = np.abs(edges).max(axis=(1, 2))
-        bad = int(np.count_nonzero(~(volumes > 1e-12 * size**3)))
+        bad = count_flat_tets(self.mesh.points_m, self.mesh.tets)
         if bad:
             raise HeatError(
                 explain(
                     "mesh tets",
                     expected="volumes above 0",
-                    got=f"{bad} of {len(volumes)} flat or inverted",
+                    got=f"{bad} of {len(self.mesh.tets)} flat or inverted",
                     remedy=remedy,
                 )
             )

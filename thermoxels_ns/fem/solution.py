@@ -2,10 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
+
+from thermoxels_ns.fem.account import Assembled
+
+LEFT_OUT = {
+    "convection": "Convection: not modelled, {}.",
+    "radiation": "Thermal radiation: not modelled, {}.",
+    "absorbed solar": "Solar gain and internal sources: not modelled.",
+}
+"""What a computation without an effect of this kind says."""
+
+
+@dataclass(frozen=True)
+class EffectHeat:
+    """Heat that one effect brings into the body."""
+
+    effect: str
+    """What it is and where it acts."""
+    heat_w: npt.NDArray[np.float64]
+    """Mean heat flow into the body during each interval, as the scheme evaluates it, shape (s,), [W]; negative where
+    heat leaves. A steady state has one interval."""
+    group_names: tuple[str, ...]
+    """Names of the patches, or for a source of the regions, that it acts on."""
+    group_heat_w: npt.NDArray[np.float64]
+    """The same for each of them, shape (s, g), [W]."""
 
 
 @dataclass(frozen=True)
@@ -15,22 +40,80 @@ class HeatSolution:
     times_s: npt.NDArray[np.float64]
     """Time of each state, the start first, shape (s + 1,), [s]."""
     temperature_c: npt.NDArray[np.float64]
-    """Nodal temperatures, shape (s + 1, n), [degrees Celsius]."""
+    """Nodal temperatures, shape (s + 1, n), [degrees Celsius]. Surfaces with a fixed temperature have it from the
+    start."""
     heat_w: npt.NDArray[np.float64]
-    """Net heat flow into the body during each step, measured as the change of its heat content over the step,
+    """Net heat flow into the body during each interval, measured as the change of its heat content over it,
     shape (s,), [W], positive into the body. Behind an insulated boundary it is 0 up to round-off."""
     heat_content_j: npt.NDArray[np.float64]
     """Heat content above absolute zero at each time, 1^T M T with T in kelvin, shape (s + 1,), [J]."""
     energy_residual: float
-    """Largest change of the heat content that no heat flow accounts for, relative to the heat content."""
+    """Largest change of the heat content that no heat flow accounts for, relative to the heat content or to all heat
+    exchanged, whichever is more."""
     energy_residual_of_spread: float
-    """The same change relative to the heat stored in the initial differences, sum m_i |T_i - mean T|: the
-    stricter measure. 0 where the initial temperature is uniform and nothing changed."""
+    """The same change relative to the heat stored in the initial differences, sum m_i |T_i - mean T|, plus all heat
+    exchanged: the stricter measure. 0 where nothing is unaccounted for."""
     status: str
     """The outcome as a sentence."""
     converged: bool
     """Whether every step was solved to tolerance."""
     iterations: npt.NDArray[np.int64]
-    """Iterations of the linear solver in each step, shape (s,)."""
+    """Iterations of the linear solver in each interval, shape (s,)."""
     skipped_effects: tuple[str, ...]
     """What the computation leaves out, one sentence each."""
+    effects: tuple[EffectHeat, ...] = ()
+    """Heat that each effect of the problem brought, in the order of the problem."""
+    newton_iterations: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    """Steps of Newton's method in each interval, shape (s,); all 0 without radiation."""
+    steps: int = 0
+    """Number of time steps taken."""
+    time_error_k: float = float("nan")
+    """Estimated largest error of the steps at any temperature, their estimates added up, [K]; NaN for fixed steps."""
+    assembled: Assembled = field(default_factory=Assembled)
+    """What was assembled."""
+
+
+@dataclass(frozen=True)
+class SteadySolution:
+    """Temperatures that no longer change, and the account of the heat."""
+
+    temperature_c: npt.NDArray[np.float64]
+    """Nodal temperatures, shape (n,), [degrees Celsius]."""
+    effects: tuple[EffectHeat, ...]
+    """Heat that each effect of the problem brings, in the order of the problem; they add up to 0."""
+    energy_residual: float
+    """Sum of all heat flows, which should be 0, relative to the sum of their sizes."""
+    status: str
+    """The outcome as a sentence."""
+    converged: bool
+    """Whether the equations were solved to tolerance."""
+    iterations: int
+    """Iterations of the linear solver."""
+    newton_iterations: int
+    """Steps of Newton's method; 0 without radiation."""
+    assembled: Assembled
+    """What was assembled."""
+
+
+def heat_by_effect(
+    effects: Sequence[str], groups: Sequence[tuple[str, str]], group_heat_w: npt.NDArray[np.float64]
+) -> tuple[EffectHeat, ...]:
+    """Sort the heat flows of groups by effect.
+
+    Args:
+        effects: Labels of all effects.
+        groups: Effect and patch or region of each column.
+        group_heat_w: Heat flows, shape (s, g), [W].
+    """
+    sorted_heat = []
+    for effect in effects:
+        columns = [number for number, (owner, _) in enumerate(groups) if owner == effect]
+        heat = group_heat_w[:, columns]
+        sorted_heat.append(EffectHeat(effect, heat.sum(axis=1), tuple(groups[c][1] for c in columns), heat))
+    return tuple(sorted_heat)
+
+
+def left_out(kinds: Sequence[str]) -> tuple[str, ...]:
+    """Say what a computation with effects of these kinds leaves out, one sentence each."""
+    why = "no effect asks for it" if kinds else "the boundary is insulated"
+    return tuple(sentence.format(why) for kind, sentence in LEFT_OUT.items() if kind not in kinds)

@@ -1,143 +1,168 @@
-"""Backward Euler in time."""
+"""The temperatures of a body through time."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from thermoxels_ns.errors import HeatError, explain
-from thermoxels_ns.fem.assembly import HeatMatrices, assemble
-from thermoxels_ns.fem.linear_solver import ConjugateGradients, LinearSolution
-from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
-from thermoxels_ns.fem.solution import HeatSolution
+from thermoxels_ns.fem.marching import AdaptiveMarch, Taken, equal_steps
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.schemes import BACKWARD_EULER, SDIRK2, Scheme
+from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect, left_out
+from thermoxels_ns.fem.steady import too_cold
+from thermoxels_ns.fem.system import HeatSystem, effect_labels
 from thermoxels_ns.units import celsius_to_kelvin
 
-INSULATED_BOUNDARY = (
-    "Convection: not modelled, the boundary is insulated.",
-    "Thermal radiation: not modelled, the boundary is insulated.",
-    "Solar gain and internal sources: not modelled.",
-)
-"""What pure conduction leaves out."""
+Vector = npt.NDArray[np.float64]
 
 MAX_STATE_BYTES = 4 * 2**30
 """Most memory that the temperatures of all times may take, [bytes]; every time is also a file of an export."""
 
-_ROUND_OFF = 8.0 * np.finfo(np.float64).eps
-
-
-class BackwardEuler:
-    """One step length, many steps: the matrix and its preconditioner are made once.
-
-    (M / dt + K) d = -K T_n, T_n+1 = T_n + d. Solving for the change d keeps round-off relative to the change, and
-    T is held relative to a reference for the same reason.
-    """
-
-    def __init__(self, matrices: HeatMatrices, step_seconds: float, *, relative_tolerance: float = 1e-12) -> None:
-        """Assemble M / dt + K and set up its solver.
-
-        Args:
-            matrices: Stiffness and mass.
-            step_seconds: Length of every step, [s].
-            relative_tolerance: Of the linear solver.
-        """
-        self._matrices = matrices
-        self._absolute_stiffness_w_k = abs(matrices.stiffness_w_k)
-        matrix = (matrices.mass_j_k / step_seconds + matrices.stiffness_w_k).tocsr()
-        self._solver = ConjugateGradients(matrix, relative_tolerance=relative_tolerance)
-        self._num_pieces, self._piece = _pieces(matrices.stiffness_w_k)
-        self._piece_mass = self._piece_sums(matrices.nodal_mass_j_k)
-
-    def advance(
-        self, relative_temperature_k: npt.NDArray[np.float64]
-    ) -> tuple[npt.NDArray[np.float64], LinearSolution]:
-        """Take one step from nodal temperatures relative to any reference, shape (n,), [K].
-
-        Conduction moves heat within a connected piece and never out of it, because the rows of K sum to 0. The
-        equations therefore fix each piece's mean change at 0 exactly, and it is set so instead of being left to
-        the linear solver's tolerance. What round-off puts into the right-hand side's own sum is taken out for the
-        same reason: over a long step, that is where M / dt + K is all but singular. A right-hand side that is
-        nothing but the round-off of K T is 0: the body is level.
-        """
-        net_heat_w = -(self._matrices.stiffness_w_k @ relative_temperature_k)
-        round_off_w = _ROUND_OFF * (self._absolute_stiffness_w_k @ np.abs(relative_temperature_k))
-        if np.all(np.abs(net_heat_w) <= round_off_w):
-            level = LinearSolution(np.zeros_like(net_heat_w), 0, 0.0, True, "The temperature is level: nothing flows.")
-            return relative_temperature_k.copy(), level
-        mass = self._matrices.nodal_mass_j_k
-        # Weighted by mass, this shifts the solution by a constant in each piece, which the mean change takes out again.
-        net_heat_w -= mass * (self._piece_sums(net_heat_w) / self._piece_mass)[self._piece]
-        solution = self._solver.solve(net_heat_w)
-        mean_change = self._piece_sums(mass * solution.x) / self._piece_mass
-        change = solution.x - mean_change[self._piece]
-        return relative_temperature_k + change, solution
-
-    def _piece_sums(self, nodal: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        return np.bincount(self._piece, weights=nodal, minlength=self._num_pieces).astype(np.float64, copy=False)
-
-
-def _pieces(stiffness: sparse.csr_matrix) -> tuple[int, npt.NDArray[np.int32]]:
-    """Number the connected pieces of a body and give each node its piece."""
-    count, piece = connected_components(stiffness, directed=False)
-    return int(count), piece
-
 
 def solve_heat(
     problem: HeatProblem,
-    time: TimeSteps,
+    time: TimeSteps | AdaptiveSteps,
     *,
+    scheme: Scheme | None = None,
     lumped: bool = True,
+    lumped_boundary: bool = True,
     relative_tolerance: float = 1e-12,
     allow_unconverged: bool = False,
 ) -> HeatSolution:
-    """Follow the temperatures of an insulated body through time.
+    """Follow the temperatures of a body through time.
+
+    With the defaults no temperature leaves the range of the start and of the surroundings, unless a flux or source
+    drives it out, on meshes without obtuse angles and at any step length.
 
     Args:
-        problem: Body, material and initial temperatures.
-        time: The steps.
-        lumped: Lump the mass matrix, which keeps temperatures within their initial range at any step length.
+        problem: Body, materials, initial temperatures and effects; without effects the boundary is insulated.
+        time: Equal steps, or steps as long as a tolerance allows.
+        scheme: The scheme in time; None: backward Euler for equal steps, SDIRK2 (with backward Euler where it would
+            overshoot) for a tolerance, which needs a scheme with an estimate.
+        lumped: Lump the mass matrix, which keeps temperatures within their range at any step length.
+        lumped_boundary: Evaluate convection and radiation at the nodes, for the same reason.
         relative_tolerance: Of the linear solver in each step.
         allow_unconverged: Return what was computed, with `converged` False and the reason in `status`, instead
             of raising when a step cannot be solved.
 
     Returns:
-        Temperatures at the start and after every step, and the heat balance.
+        Temperatures at the start and after every step or interval, and the heat balance.
 
     Raises:
-        HeatError: If the temperatures of all times do not fit into memory, or a step's linear solver does not converge.
+        HeatError: If the temperatures of all times do not fit into memory, an effect does not fit the mesh, a step's
+            solver does not converge, or the temperature falls below absolute zero.
     """
-    states = _room_for_states(time.steps + 1, len(problem.mesh.points_m))
-    matrices = assemble(problem.mesh, problem.material, lumped=lumped)
-    stepper = BackwardEuler(matrices, time.step_seconds, relative_tolerance=relative_tolerance)
-    start_c = problem.start_c
-    # The middle of the range, not the mean: exact for a uniform temperature.
-    reference_c = 0.5 * (float(start_c.min()) + float(start_c.max()))
-    states[0] = start_c - reference_c
-    iterations = np.zeros(time.steps, dtype=np.int64)
-    done, failure = 0, ""
-    for step in range(time.steps):
-        states[step + 1], linear = stepper.advance(states[step])
-        iterations[step] = linear.iterations
-        if not linear.converged:
-            failure = f"Step {step + 1} of {time.steps} failed. {linear.status}"
+    states = _room_for_states(len(time.times_s), len(problem.mesh.points_m))
+    system = HeatSystem(problem, lumped=lumped, lumped_boundary=lumped_boundary)
+    states[0] = problem.start_c - system.reference_c
+    if len(system.fixed.nodes):
+        states[0, system.fixed.nodes] = system.fixed.temperature_k(0.0)
+    account = _Account(system, states, time.times_s)
+    march: AdaptiveMarch | None = None
+    if isinstance(time, TimeSteps):
+        steps: Iterator[Taken] = equal_steps(system, scheme or BACKWARD_EULER, states[0], time, relative_tolerance)
+    else:
+        _check_estimate(scheme)
+        march = AdaptiveMarch(system, scheme or SDIRK2, states[0], time, relative_tolerance=relative_tolerance)
+        steps = march.steps()
+    failure = ""
+    for taken in steps:
+        failure = taken.failure or too_cold(system, taken.step.relative_k)
+        if failure:
             break
-        done = step + 1
+        account.add(taken)
     if failure and not allow_unconverged:
         raise HeatError(f"{failure} Use shorter steps (--step-seconds) or check the mesh's quality.")
-    states, iterations = states[: done + 1], iterations[:done]
-    return _account(
-        matrices.nodal_mass_j_k,
-        states,
-        reference_c,
-        time.times_s[: done + 1],
-        iterations,
-        failure or f"All {time.steps} steps converged, in {int(iterations.max())} iterations at most.",
-        not failure,
-    )
+    return account.close(failure or account.success(march), not failure, adaptive=march is not None)
 
 
-def _room_for_states(num_times: int, num_nodes: int) -> npt.NDArray[np.float64]:
+class _Account:
+    """Keeps states at the ends of intervals and adds up the heat that flowed in between."""
+
+    def __init__(self, system: HeatSystem, states_k: Vector, times_s: Vector) -> None:
+        self._system, self._states, self._times = system, states_k, times_s
+        self._done = self._steps = self._most_iterations = 0
+        self._heat_j = np.zeros((len(times_s) - 1, len(system.groups)))
+        self._exchanged_j = np.zeros(len(times_s) - 1)
+        self._iterations = np.zeros((len(times_s) - 1, 2), dtype=np.int64)
+        self._error_k = 0.0
+
+    def add(self, taken: Taken) -> None:
+        """Count a step."""
+        step, row = taken.step, self._done
+        self._heat_j[row] += taken.step_s * step.group_heat_w
+        self._exchanged_j[row] += taken.step_s * float(np.abs(step.group_heat_w).sum())
+        self._iterations[row] += step.iterations, step.newton_iterations
+        self._most_iterations = max(self._most_iterations, step.iterations)
+        self._error_k += step.error_k
+        self._steps += 1
+        if taken.ends_interval:
+            self._done += 1
+            self._states[self._done] = step.relative_k
+
+    def success(self, march: AdaptiveMarch | None) -> str:
+        """Say that all went well, and how."""
+        sentence = f"All {self._steps} steps converged, in {self._most_iterations} iterations at most."
+        if march is None:
+            return sentence
+        if march.repeated:
+            sentence += f" {march.repeated} more were repeated with a shorter length."
+        if march.made_safe:
+            sentence += f" {march.made_safe} were taken with backward Euler because SDIRK2 would have overshot."
+        if march.out_of_range:
+            sentence += (
+                f" In {march.out_of_range} a temperature left its range, which happens on meshes with obtuse angles "
+                "and with consistent masses."
+            )
+        return sentence
+
+    def close(self, status: str, converged: bool, *, adaptive: bool) -> HeatSolution:
+        """Balance the heat and convert to degrees Celsius, in place because the states may be large."""
+        system, done = self._system, self._done
+        states_k, times_s = self._states[: done + 1], self._times[: done + 1]
+        heat_j, mass = self._heat_j[:done], system.nodal_mass_j_k
+        total_mass = float(mass.sum())
+        relative_content = states_k @ mass
+        content = relative_content + total_mass * celsius_to_kelvin(system.reference_c)
+        supplied = np.concatenate([[0.0], np.cumsum(heat_j.sum(axis=1))])
+        unexplained = float(np.max(np.abs(relative_content - relative_content[0] - supplied)))
+        exchanged = float(self._exchanged_j[:done].sum())
+        mean = relative_content[0] / total_mass
+        spread = float(mass @ np.abs(states_k[0] - mean))
+        states_k += system.reference_c
+        lengths = np.diff(times_s)
+        kinds = [effect.kind for effect in system.problem.effects]
+        return HeatSolution(
+            times_s=times_s,
+            temperature_c=states_k,
+            heat_w=np.diff(relative_content) / lengths,
+            heat_content_j=content,
+            energy_residual=_share(unexplained, max(float(content[0]), exchanged)),
+            energy_residual_of_spread=_share(unexplained, spread + exchanged),
+            status=status,
+            converged=converged,
+            iterations=self._iterations[:done, 0],
+            skipped_effects=left_out(kinds),
+            effects=heat_by_effect(effect_labels(system.problem), system.groups, heat_j / lengths[:, None]),
+            newton_iterations=self._iterations[:done, 1],
+            steps=self._steps,
+            time_error_k=self._error_k if adaptive else float("nan"),
+            assembled=system.assembled,
+        )
+
+
+def _check_estimate(scheme: Scheme | None) -> None:
+    if scheme is not None and scheme.estimate is None:
+        remedy = "Use SDIRK2, or equal steps."
+        raise HeatError(
+            explain("scheme", expected="one with an error estimate for adaptive steps", got=scheme.name, remedy=remedy)
+        )
+
+
+def _room_for_states(num_times: int, num_nodes: int) -> Vector:
     """Array for the temperatures of all times, or an error that says how much memory they need."""
     needed = num_times * num_nodes * 8
     try:
@@ -154,38 +179,6 @@ def _room_for_states(num_times: int, num_nodes: int) -> npt.NDArray[np.float64]:
             remedy=f"Pass fewer and longer steps (--steps up to {max(MAX_STATE_BYTES // (8 * num_nodes) - 1, 1)}, "
             "--step-seconds), or a coarser mesh.",
         )
-    )
-
-
-def _account(
-    nodal_mass_j_k: npt.NDArray[np.float64],
-    states_k: npt.NDArray[np.float64],
-    reference_c: float,
-    times_s: npt.NDArray[np.float64],
-    iterations: npt.NDArray[np.int64],
-    status: str,
-    converged: bool,
-) -> HeatSolution:
-    """Balance the heat and convert to degrees Celsius, in place because the states may be large."""
-    total_mass = float(nodal_mass_j_k.sum())
-    relative_content = states_k @ nodal_mass_j_k
-    content = relative_content + total_mass * celsius_to_kelvin(reference_c)
-    # The boundary is insulated and there are no sources: any change of the content is unaccounted for.
-    unexplained = float(np.max(np.abs(relative_content - relative_content[0])))
-    mean = relative_content[0] / total_mass
-    spread = float(nodal_mass_j_k @ np.abs(states_k[0] - mean))
-    states_k += reference_c
-    return HeatSolution(
-        times_s=times_s,
-        temperature_c=states_k,
-        heat_w=np.diff(relative_content) / np.diff(times_s),
-        heat_content_j=content,
-        energy_residual=_share(unexplained, float(content[0])),
-        energy_residual_of_spread=_share(unexplained, spread),
-        status=status,
-        converged=converged,
-        iterations=iterations,
-        skipped_effects=INSULATED_BOUNDARY,
     )
 
 

@@ -1,8 +1,8 @@
-"""From a trained field to a voxel mesh in metres."""
+"""From a trained field to a tetrahedral mesh in metres, with temperatures and a tagged boundary."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -11,30 +11,82 @@ from scipy import ndimage
 from thermoxels_ns.checks import check_finite, check_shape
 from thermoxels_ns.errors import MeshError, explain
 from thermoxels_ns.lattice import CORNER_OFFSETS
+from thermoxels_ns.mesh.boundary import BoundaryMode, tag_boundary
+from thermoxels_ns.mesh.components import node_parts, renumbered
+from thermoxels_ns.mesh.node_values import interpolate_corners
+from thermoxels_ns.mesh.patch_rules import PatchRules
+from thermoxels_ns.mesh.patches import apply_regions
 from thermoxels_ns.mesh.solid import SolidCells, SolidSelection, select_solid
-from thermoxels_ns.mesh.temperature import MIN_OBSERVED_WEIGHT, extend_harmonically
-from thermoxels_ns.mesh.tetrahedra import TetMesh
-from thermoxels_ns.mesh.voxel_tets import boundary_facets, boundary_tags, kuhn_tets, lattice_edges
+from thermoxels_ns.mesh.stuffing import stuff
+from thermoxels_ns.mesh.temperature import MIN_OBSERVED_WEIGHT, extend_harmonically, tet_edges
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, TetMesh
+from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, lattice_edges, voxel_facets
 from thermoxels_ns.snapshot import GridSnapshot
 
 
 @dataclass(frozen=True)
-class MeshedCells(SolidCells):
-    """The solid voxels that a mesh is made of."""
+class MeshOptions:
+    """How solid voxels become a mesh."""
 
-    num_unobserved_parts: int
+    boundary: BoundaryMode = "conforming"
+    """conforming: the boundary follows the level set of the density (isosurface stuffing); voxel: it follows voxel
+    faces, and every boundary triangle says how much true surface it stands for."""
+    min_observed_weight: float = MIN_OBSERVED_WEIGHT
+    """Nodes with less thermal ray weight than this are not measurements, [rays], at least 0; 0 keeps every node that
+    any ray touched."""
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Direction that points up, in the coordinates of the mesh."""
+    rules: PatchRules = field(default_factory=PatchRules)
+    """Patches and regions of the user."""
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.min_observed_weight) and self.min_observed_weight >= 0.0):
+            raise MeshError(
+                explain(
+                    "min_observed_weight",
+                    expected="a finite number of at least 0",
+                    got=self.min_observed_weight,
+                    remedy=f"Leave it out to use {MIN_OBSERVED_WEIGHT}.",
+                )
+            )
+        if self.boundary not in ("conforming", "voxel"):
+            raise MeshError(
+                explain("boundary", expected="conforming or voxel", got=self.boundary, remedy="Pass one of them.")
+            )
+
+
+@dataclass(frozen=True)
+class BuiltMesh:
+    """A mesh and what it was made from."""
+
+    mesh: TetMesh
+    """The mesh."""
+    solid: SolidCells
+    """The solid voxels it was made from."""
+    unobserved_parts: int
     """Parts left out because no thermal ray saw any of their nodes."""
-    num_unobserved_voxels: int
-    """Voxels of these parts; they count in `component_sizes`, but are not in `cells`."""
+    unobserved_voxels: int
+    """Voxels of these parts; they count in `solid.component_sizes`, but are not in `solid.cells`."""
 
 
-def build_voxel_mesh(
+@dataclass(frozen=True)
+class _Shape:
+    """Nodes and elements before they have temperatures."""
+
+    points: npt.NDArray[np.float64]
+    """Nodes as fractional corner indices, shape (n, 3)."""
+    tets: npt.NDArray[np.int64]
+    facets: npt.NDArray[np.int64]
+    facet_tags: npt.NDArray[np.int64]
+
+
+def build_mesh(
     snapshot: GridSnapshot,
     selection: SolidSelection,
     world_to_metres: npt.NDArray[np.float64],
-    min_observed_weight: float = MIN_OBSERVED_WEIGHT,
-) -> tuple[TetMesh, MeshedCells]:
-    """Cut the solid part of a trained field into tetrahedra with nodal temperatures.
+    options: MeshOptions = MeshOptions(),
+) -> BuiltMesh:
+    """Cut the solid part of a trained field into tetrahedra with nodal temperatures and boundary tags.
 
     Parts of it that no thermal ray saw have no temperature at all and are left out.
 
@@ -43,8 +95,7 @@ def build_voxel_mesh(
         selection: Which voxels are solid.
         world_to_metres: Similarity (rotation or reflection, one scale, shift), shape (4, 4), that maps homogeneous
             column vectors of the trained scene to metres.
-        min_observed_weight: Nodes with less thermal ray weight than this are not measurements, [rays], at least 0;
-            0 keeps every node that any ray touched.
+        options: Kind of boundary, tags, and what counts as measured.
 
     Returns:
         The mesh, and the solid voxels it was made from. A reflection turns the tetrahedra over, so that their volumes
@@ -54,43 +105,111 @@ def build_voxel_mesh(
         MeshError: Nothing is solid, the 4x4 is no similarity, or no node of the mesh was measured.
     """
     transform = check_similarity("world_to_metres", world_to_metres)
-    if not (np.isfinite(min_observed_weight) and min_observed_weight >= 0.0):
-        raise MeshError(
-            explain(
-                "min_observed_weight",
-                expected="a finite number of at least 0",
-                got=min_observed_weight,
-                remedy=f"Leave it out to use {MIN_OBSERVED_WEIGHT}.",
-            )
-        )
-    least = max(min_observed_weight, np.finfo(np.float32).tiny)
-    observed_corners = snapshot.observed_weight >= least
-    solid = _without_unobserved_parts(select_solid(snapshot, selection), observed_corners)
-    corners, tets = kuhn_tets(solid.cells)
-    facets = boundary_facets(tets)
-    tags = boundary_tags(facets, corners, snapshot.lattice.shape)
+    least = max(options.min_observed_weight, float(np.finfo(np.float32).tiny))
+    scale = float(np.cbrt(abs(np.linalg.det(transform[:3, :3]))))
+    solid = select_solid(snapshot, selection, scale)
+    solid, num_parts, num_voxels = _without_unobserved_parts(solid, snapshot.observed_weight >= least)
 
-    nodes = tuple(corners.T)
-    observed = observed_corners[nodes]
-    edges, num_voxels = lattice_edges(solid.cells)
-    temperature_c = extend_harmonically(edges, snapshot.temperature_c[nodes], observed, edge_weights=num_voxels)
+    if options.boundary == "voxel":
+        shape = _voxel_shape(solid.cells)
+        temperature_c, weight = _measured(snapshot, shape.points)
+        edges, around = lattice_edges(solid.cells)
+    else:
+        shape = _stuffed_shape(solid.level)
+        temperature_c, weight = _measured(snapshot, shape.points)
+        shape, stays = _with_a_measurement(shape, weight >= least)
+        temperature_c, weight = temperature_c[stays], weight[stays]
+        edges, around = tet_edges(shape.tets), None
+    observed = weight >= least
+    temperature_c = extend_harmonically(edges, temperature_c, observed, edge_weights=around)
 
+    tets, facets = shape.tets, shape.facets
     if np.linalg.det(transform[:3, :3]) < 0.0:
         tets, facets = tets[:, [0, 2, 1, 3]], facets[:, ::-1]
+    points_m = apply_transform(transform, snapshot.lattice.index_to_world(shape.points))
+    colour = _colour(snapshot, shape.points)
+    region, region_names = apply_regions(
+        options.rules, points_m[tets].mean(axis=1), None if colour is None else colour[tets].mean(axis=1)
+    )
     mesh = TetMesh(
-        points_m=apply_transform(transform, snapshot.lattice.index_to_world(corners)),
+        points_m=points_m,
         tets=np.ascontiguousarray(tets),
         temperature_c=temperature_c,
         observed=observed,
         facets=np.ascontiguousarray(facets),
-        facet_tags=tags,
-        region=np.zeros(len(tets), dtype=np.int64),
+        facet_tags=shape.facet_tags,
+        region=region,
+        region_names=region_names,
+        colour=colour,
     )
-    return mesh, solid
+    boundary = tag_boundary(
+        mesh,
+        shape.points,
+        solid,
+        snapshot.lattice,
+        snapshot.views,
+        transform,
+        options.boundary,
+        options.up,
+        options.rules,
+    )
+    return BuiltMesh(replace(mesh, boundary=boundary), solid, num_parts, num_voxels)
 
 
-def _without_unobserved_parts(solid: SolidCells, observed_corners: npt.NDArray[np.bool_]) -> MeshedCells:
-    """Leave out voxels whose connected part of the mesh has no observed node, unless that is all of them."""
+def _voxel_shape(cells: npt.NDArray[np.bool_]) -> _Shape:
+    corners, tets = kuhn_tets(cells)
+    facets = voxel_facets(cells)
+    nx, ny, nz = cells.shape
+    tags = boundary_tags(facets, corners, (nx + 1, ny + 1, nz + 1))
+    return _Shape(corners.astype(np.float64), tets, facets, tags)
+
+
+def _stuffed_shape(level: npt.NDArray[np.floating]) -> _Shape:
+    stuffed = stuff(level)
+    tags = np.where(stuffed.on_box, FACET_BOX, FACET_SURFACE).astype(np.int64)
+    return _Shape(stuffed.points, stuffed.tets, stuffed.facets, tags)
+
+
+def _measured(
+    snapshot: GridSnapshot, points: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Temperature at points given by fractional corner indices, and the ray weight behind it, each shape (n,)."""
+    return interpolate_corners(points, snapshot.temperature_c, snapshot.observed_weight)
+
+
+def _colour(snapshot: GridSnapshot, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float32] | None:
+    """Colour at points from corners with density, grey where there is none around, shape (n, 3)."""
+    if snapshot.colour is None:
+        return None
+    colour, weight = interpolate_corners(points, snapshot.colour, snapshot.density > 0.0)
+    return np.where(weight[:, None] > 0.0, colour, 0.5).astype(np.float32)
+
+
+def _with_a_measurement(shape: _Shape, observed: npt.NDArray[np.bool_]) -> tuple[_Shape, npt.NDArray[np.bool_]]:
+    """Leave out parts of a mesh without an observed node, unless that is all of them; also: which nodes stay.
+
+    Voxels that touch by a corner only are one part as voxels, but may be two once their surface is smooth.
+    """
+    part = node_parts(shape.tets, len(shape.points))
+    seen = np.bincount(part[observed], minlength=int(part.max()) + 1) > 0
+    stays = seen[part]
+    if stays.all() or not seen.any():
+        return shape, np.ones(len(stays), dtype=bool)
+    number = renumbered(stays)
+    facet_stays = stays[shape.facets[:, 0]]
+    kept = _Shape(
+        shape.points[stays],
+        number[shape.tets[stays[shape.tets[:, 0]]]],
+        number[shape.facets[facet_stays]],
+        shape.facet_tags[facet_stays],
+    )
+    return kept, stays
+
+
+def _without_unobserved_parts(
+    solid: SolidCells, observed_corners: npt.NDArray[np.bool_]
+) -> tuple[SolidCells, int, int]:
+    """Leave out bodies without an observed corner, unless that is all of them; also their number and their voxels."""
     # Voxels share a node if they touch by a face, an edge or a corner.
     part = np.zeros(solid.cells.shape, dtype=np.int32)
     count = int(ndimage.label(solid.cells, structure=np.ones((3, 3, 3)), output=part))  # type: ignore[arg-type]
@@ -99,15 +218,11 @@ def _without_unobserved_parts(solid: SolidCells, observed_corners: npt.NDArray[n
     for dx, dy, dz in CORNER_OFFSETS:
         touched |= observed_corners[dx : dx + nx, dy : dy + ny, dz : dz + nz]
     seen = np.bincount(part[solid.cells & touched], minlength=count + 1) > 0
-    found = {field.name: getattr(solid, field.name) for field in fields(SolidCells)}
     if seen[1:].all() or not seen.any():
-        return MeshedCells(**found, num_unobserved_parts=0, num_unobserved_voxels=0)
-    found["cells"] = solid.cells & seen[part]
-    return MeshedCells(
-        **found,
-        num_unobserved_parts=int(np.count_nonzero(~seen[1:])),
-        num_unobserved_voxels=int(np.count_nonzero(solid.cells & ~seen[part])),
-    )
+        return solid, 0, 0
+    goes = solid.cells & ~seen[part]
+    kept = replace(solid, cells=solid.cells & ~goes, level=np.where(goes, -np.abs(solid.level), solid.level))
+    return kept, int(np.count_nonzero(~seen[1:])), int(np.count_nonzero(goes))
 
 
 def check_similarity(name: str, matrix: npt.ArrayLike) -> npt.NDArray[np.float64]:

@@ -13,10 +13,11 @@ import numpy.typing as npt
 
 from thermoxels_ns.checks import check_finite, check_shape, replace_when_done, writable_folder
 from thermoxels_ns.errors import MeshError, OutputError, explain
+from thermoxels_ns.mesh.file_content import check_suffix, colour_bytes, file_content
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.units import celsius_to_kelvin
 
-_OWN_ARRAYS = ("temperature_c", "temperature_k", "observed")
+_OWN_ARRAYS = ("temperature_c", "temperature_k", "observed", "colour")
 
 
 def write_vtu(
@@ -28,8 +29,9 @@ def write_vtu(
 ) -> None:
     """Write a mesh as a VTK unstructured grid (.vtu, read by ParaView, pyvista and meshio).
 
-    Point arrays: `temperature_c` [degrees Celsius], `temperature_k` [K], `observed` (1: measured, 0: extended). Cell
-    array: `region`.
+    Point arrays: `temperature_c` [degrees Celsius], `temperature_k` [K], `observed` (1: measured, 0: extended) and,
+    if the mesh has colours, `colour` (red, green, blue as bytes). Cell array: `region`; field
+    arrays `region:NAME` hold the number of each region.
 
     Args:
         path: File to write, ending in .vtu; its folder is made if need be.
@@ -44,21 +46,17 @@ def write_vtu(
     import pyvista as pv
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
-    path = Path(path)
-    if path.suffix != ".vtu":
-        raise OutputError(
-            explain("mesh file", expected="a name that ends in .vtu", got=path.name, remedy="Rename the file.")
-        )
-    num_nodes = len(mesh.points_m)
+    path = check_suffix(path, ".vtu")
+    content = file_content(mesh, temperature_c)
+    num_nodes = len(content.points_m)
     remedy = "Pass one finite value per mesh node."
-    temperature = np.asarray(mesh.temperature_c if temperature_c is None else temperature_c, dtype=np.float64)
-    check_shape("temperature_c", temperature, (num_nodes,), remedy, MeshError)
-    check_finite("temperature_c", temperature, remedy, MeshError)
     arrays = {
-        "temperature_c": temperature,
-        "temperature_k": celsius_to_kelvin(temperature),
+        "temperature_c": content.temperature_c,
+        "temperature_k": celsius_to_kelvin(content.temperature_c),
         "observed": mesh.observed.astype(np.uint8),
     }
+    if mesh.colour is not None:
+        arrays["colour"] = colour_bytes(mesh.colour)
     for name, values in (point_data or {}).items():
         values = np.asarray(values)
         if name in _OWN_ARRAYS:
@@ -68,17 +66,32 @@ def write_vtu(
         check_shape(f"point_data[{name!r}]", values, (num_nodes, *values.shape[1:]), remedy, MeshError)
         arrays[name] = check_finite(f"point_data[{name!r}]", values, remedy, MeshError)
 
-    grid = pv.UnstructuredGrid({pv.CellType.TETRA: mesh.tets}, np.asarray(mesh.points_m, dtype=np.float64))
+    grid = pv.UnstructuredGrid({pv.CellType.TETRA: content.tets}, content.points_m)
     for name, values in arrays.items():
         grid.point_data[name] = values
-    grid.cell_data["region"] = mesh.region
+    grid.cell_data["region"] = content.region
+    # As numbers: meshio refuses a file that holds text.
+    for number, name in enumerate(content.region_names):
+        grid.field_data[f"region:{name}"] = [number]
     grid.set_active_scalars("temperature_c")
+    write_vtk(vtkXMLUnstructuredGridWriter(), path, grid)
 
+
+def write_vtk(writer: Any, path: Path, data: Any) -> None:
+    """Write a VTK data set with the XML writer for its kind; the folder is made if need be.
+
+    Args:
+        writer: A new writer.
+        path: File to write.
+        data: What to write.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
     writable_folder(path.parent)
     with replace_when_done(path) as temporary:
-        writer = vtkXMLUnstructuredGridWriter()
         writer.SetFileName(str(temporary))
-        writer.SetInputData(grid)
+        writer.SetInputData(data)
         if not writer.Write() or writer.GetErrorCode() or not temporary.is_file():
             raise OutputError(
                 explain(

@@ -9,10 +9,25 @@ import numpy.typing as npt
 
 from thermoxels_ns.checks import check_finite, check_shape
 from thermoxels_ns.errors import MeshError, explain
+from thermoxels_ns.mesh.face_count import Groups, IntArray, faces_of_rows, group_faces, group_pairs
+from thermoxels_ns.mesh.tet_shapes import shapes_in_chunks, signed_volumes
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
-from thermoxels_ns.mesh.voxel_tets import OUTWARD_FACES, boundary_facets, count_facets
+from thermoxels_ns.mesh.topology import group_sides
 
-_CHUNK = 1 << 18
+__all__ = [
+    "MeshQuality",
+    "check_arrays",
+    "check_mesh",
+    "count_overlaps",
+    "count_twin_nodes",
+    "count_wrong_facets",
+    "dihedral_range_deg",
+    "facet_area_vectors",
+    "facet_areas",
+    "facet_normals",
+    "signed_volumes",
+]
+
 _REMEDY = "The mesh is damaged: build it again, and report this if it persists."
 
 
@@ -42,41 +57,26 @@ class MeshQuality:
     """Largest angle between two faces of a tetrahedron, [degrees]."""
 
 
-def signed_volumes(points: npt.NDArray[np.float64], tets: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
-    """Volumes det(p1 - p0, p2 - p0, p3 - p0) / 6, shape (t,), [m^3]; negative if a tetrahedron is turned over."""
-    origin = points[tets[:, 0]]
-    a, b, c = (points[tets[:, n]] - origin for n in (1, 2, 3))
-    return np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
-
-
-def facet_area_vectors(points: npt.NDArray[np.float64], facets: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+def facet_area_vectors(points: npt.NDArray[np.float64], facets: IntArray) -> npt.NDArray[np.float64]:
     """Area times unit normal of triangles (right-hand rule), shape (f, 3), [m^2]."""
     origin = points[facets[:, 0]]
     return 0.5 * np.cross(points[facets[:, 1]] - origin, points[facets[:, 2]] - origin)
 
 
-def facet_areas(points: npt.NDArray[np.float64], facets: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+def facet_areas(points: npt.NDArray[np.float64], facets: IntArray) -> npt.NDArray[np.float64]:
     """Areas of triangles, shape (f,), [m^2]."""
     return np.linalg.norm(facet_area_vectors(points, facets), axis=1)
 
 
-def facet_normals(points: npt.NDArray[np.float64], facets: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+def facet_normals(points: npt.NDArray[np.float64], facets: IntArray) -> npt.NDArray[np.float64]:
     """Unit normals of triangles (right-hand rule), shape (f, 3)."""
     vectors = facet_area_vectors(points, facets)
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def dihedral_range_deg(points: npt.NDArray[np.float64], tets: npt.NDArray[np.int64]) -> tuple[float, float]:
-    """Smallest and largest angle between two faces of a tetrahedron, [degrees]."""
-    smallest, largest = 180.0, 0.0
-    first, second = np.triu_indices(4, k=1)
-    for start in range(0, len(tets), _CHUNK):
-        chunk = tets[start : start + _CHUNK]
-        normals = facet_normals(points, chunk[:, OUTWARD_FACES].reshape(-1, 3)).reshape(-1, 4, 3)
-        cosine = -np.einsum("tij,tij->ti", normals[:, first], normals[:, second])
-        angles = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        smallest, largest = min(smallest, float(angles.min())), max(largest, float(angles.max()))
-    return smallest, largest
+def dihedral_range_deg(points: npt.NDArray[np.float64], tets: IntArray) -> tuple[float, float]:
+    """Smallest and largest angle between two faces of a tetrahedron, [degrees]; 0 at a face without area."""
+    return _volumes_and_angles(points, tets)[1:]
 
 
 def check_mesh(mesh: TetMesh) -> MeshQuality:
@@ -96,39 +96,50 @@ def check_mesh(mesh: TetMesh) -> MeshQuality:
     Raises:
         MeshError: A check failed; the message says which, where and how often.
     """
-    _check_arrays(mesh)
-    volumes = signed_volumes(mesh.points_m, mesh.tets)
+    check_arrays(mesh)
+    unused = len(mesh.points_m) - np.count_nonzero(np.bincount(mesh.tets.ravel(), minlength=len(mesh.points_m)))
+    if unused:
+        _fail("points_m", "nodes that belong to a tetrahedron", f"{unused} that belong to none")
+    twins = count_twin_nodes(mesh.points_m)
+    if twins:
+        _fail("points_m", "different positions", f"{twins} nodes at the place of another")
+    volumes, smallest, largest = _volumes_and_angles(mesh.points_m, mesh.tets)
     bad = np.flatnonzero(~(volumes > 0.0))
     if len(bad):
         _fail("tetrahedra", "volumes above 0", f"{len(bad)} of {len(volumes)} at or below 0, the first is {bad[0]}")
 
-    _, uses = count_facets(mesh.tets)
-    if uses.max() > 2:
-        _fail("tetrahedra", "faces shared by at most 2", f"{np.count_nonzero(uses > 2)} faces shared by more")
-    if not np.array_equal(_canonical(mesh.facets), _canonical(boundary_facets(mesh.tets))):
-        _fail("facets", "the faces owned by one tetrahedron, normals outwards", "different triangles or orientations")
-    num_non_manifold = _check_boundary(mesh)
+    faces = group_faces(mesh.tets)
+    shared_by_more = np.count_nonzero(faces.sizes > 2)
+    if shared_by_more:
+        _fail("tetrahedra", "faces shared by at most 2", f"{shared_by_more} faces shared by more")
+    wrong = count_wrong_facets(mesh, faces)
+    if wrong:
+        _fail(
+            "facets", "the faces owned by one tetrahedron, normals outwards", f"{wrong} missing, extra or turned over"
+        )
+    sides = group_sides(mesh.facets)
+    # Closed: each tetrahedron's faces meet every edge an even number of times, and faces with two owners cancel.
+    assert not np.any(sides.sizes % 2)
+    folded = count_overlaps(mesh.points_m, mesh.facets, sides)
+    if folded:
+        _fail("tetrahedra", "neighbours whose faces match", f"a crack: {folded} pairs of boundary triangles overlap")
 
-    low, high = dihedral_range_deg(mesh.points_m, mesh.tets)
     return MeshQuality(
         num_nodes=len(mesh.points_m),
         num_tets=len(mesh.tets),
         num_facets=len(mesh.facets),
         num_box_facets=int(np.count_nonzero(mesh.facet_tags == FACET_BOX)),
-        num_non_manifold_edges=num_non_manifold,
+        num_non_manifold_edges=int(np.count_nonzero(sides.sizes > 2)),
         volume_m3=float(volumes.sum()),
         area_m2=float(facet_areas(mesh.points_m, mesh.facets).sum()),
         min_tet_volume_m3=float(volumes.min()),
-        min_dihedral_deg=low,
-        max_dihedral_deg=high,
+        min_dihedral_deg=smallest,
+        max_dihedral_deg=largest,
     )
 
 
-def _fail(name: str, expected: str, got: str) -> None:
-    raise MeshError(explain(f"mesh {name}", expected=expected, got=got, remedy=_REMEDY))
-
-
-def _check_arrays(mesh: TetMesh) -> None:
+def check_arrays(mesh: TetMesh) -> None:
+    """Raise `MeshError` if shapes do not fit, numbers are not finite, or node numbers are out of range."""
     nodes, tets, facets = len(mesh.points_m), len(mesh.tets), len(mesh.facets)
     shapes: dict[str, tuple[int | None, ...]] = {
         "points_m": (None, 3),
@@ -144,49 +155,88 @@ def _check_arrays(mesh: TetMesh) -> None:
         check_finite(f"mesh {name}", getattr(mesh, name), _REMEDY, MeshError)
     if tets == 0:
         _fail("tets", "at least one tetrahedron", "none")
-    if mesh.tets.min() < 0 or mesh.tets.max() >= nodes:
-        _fail("tets", f"node numbers from 0 to {nodes - 1}", f"{mesh.tets.min()} to {mesh.tets.max()}")
-    unused = nodes - np.count_nonzero(np.bincount(mesh.tets.ravel(), minlength=nodes))
-    if unused:
-        _fail("points_m", "nodes that belong to a tetrahedron", f"{unused} that belong to none")
-    ordered = mesh.points_m[np.lexsort(mesh.points_m.T)]
-    twins = np.count_nonzero(np.all(ordered[1:] == ordered[:-1], axis=1))
-    if twins:
-        _fail("points_m", "different positions", f"{twins} nodes at the place of another")
+    for name, numbers in (("tets", mesh.tets), ("facets", mesh.facets)):
+        if len(numbers) and not (numbers.min() >= 0 and numbers.max() < nodes):
+            _fail(name, f"node numbers from 0 to {nodes - 1}", f"{numbers.min()} to {numbers.max()}")
 
 
-def _canonical(facets: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Turn each triangle so that its smallest node comes first, keep its orientation, and sort the rows."""
+def count_twin_nodes(points: npt.NDArray[np.float64]) -> int:
+    """Number of nodes at the place of an earlier one."""
+    # Equal points have equal sums of scrambled bits (and -0.0 + 0.0 is 0.0); only points with equal sums are compared.
+    bits = (np.asarray(points, dtype=np.float64) + 0.0).view(np.uint64)
+    sums = (bits ^ (bits >> np.uint64(29))) @ np.array(
+        [0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64
+    )
+    ordered = np.sort(sums)
+    doubled = ordered[1:][ordered[1:] == ordered[:-1]]
+    if len(doubled) == 0:
+        return 0
+    candidates = points[np.isin(sums, doubled)]
+    candidates = candidates[np.lexsort(candidates.T)]
+    return int(np.count_nonzero(np.all(candidates[1:] == candidates[:-1], axis=1)))
+
+
+def count_wrong_facets(mesh: TetMesh, faces: Groups) -> int:
+    """How far `mesh.facets` are from the faces of one owner with outward normals: missing, extra and turned ones.
+
+    Args:
+        mesh: The mesh; its arrays passed `check_arrays`.
+        faces: `face_count.group_faces(mesh.tets)`.
+
+    Returns:
+        Number of triangles to take away and to add; a triangle turned over counts twice, 0 if all is as it should be.
+    """
+    wanted = faces_of_rows(mesh.tets, faces.order[faces.start[faces.sizes == 1]])
+    both = np.concatenate([_smallest_first(wanted), _smallest_first(mesh.facets)])
+    same = group_pairs(both[:, 0], both[:, 1] * len(mesh.points_m) + both[:, 2])
+    return int(np.abs(same.sums(np.repeat([1, -1], [len(wanted), len(mesh.facets)]))).sum())
+
+
+def count_overlaps(points: npt.NDArray[np.float64], facets: IntArray, sides: Groups) -> int:
+    """Number of pairs of triangles that share an edge and lie on the same side of it in the same plane.
+
+    This is how a crack looks: the faces of neighbours that do not match are boundary triangles, one upon the other.
+
+    Args:
+        points: Nodes, shape (n, 3).
+        facets: Triangles with an area, shape (f, 3).
+        sides: `topology.group_sides(facets)`.
+    """
+    vectors = facet_area_vectors(points, facets)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normals = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    facet, side = np.divmod(sides.order, 3)
+    direction = np.where(facets[facet, side] < facets[facet, (side + 1) % 3], 1.0, -1.0)
+    edge = np.repeat(np.arange(len(sides.start)), sides.sizes)
+    # The direction from an edge into a triangle is the triangle's normal turned by 90 degrees about the edge, one way
+    # or the other as the triangle passes along the edge.
+    overlaps = 0
+    for gap in range(1, int(sides.sizes.max(initial=1))):
+        pairs = np.flatnonzero(edge[gap:] == edge[:-gap])
+        cosine = np.einsum("ij,ij->i", normals[facet[pairs + gap]], normals[facet[pairs]])
+        cosine *= direction[pairs + gap] * direction[pairs]
+        overlaps += int(np.count_nonzero(cosine > 1.0 - 1e-10))
+    return overlaps
+
+
+def _volumes_and_angles(
+    points: npt.NDArray[np.float64], tets: IntArray
+) -> tuple[npt.NDArray[np.float64], float, float]:
+    """Signed volumes, shape (t,), [m^3], and the smallest and largest dihedral angle, [degrees]."""
+    volumes = np.empty(len(tets))
+    low, high = 1.0, -1.0
+    for which, shapes in shapes_in_chunks(points, tets):
+        volumes[which] = shapes.volumes
+        cosines = shapes.dihedral_cosines()
+        low, high = min(low, float(cosines.min())), max(high, float(cosines.max()))
+    return volumes, float(np.degrees(np.arccos(high))), float(np.degrees(np.arccos(low)))
+
+
+def _fail(name: str, expected: str, got: str) -> None:
+    raise MeshError(explain(f"mesh {name}", expected=expected, got=got, remedy=_REMEDY))
+
+
+def _smallest_first(facets: IntArray) -> IntArray:
+    """Turn each triangle so that its smallest node comes first; its orientation stays."""
     turn = (np.argmin(facets, axis=1)[:, None] + np.arange(3)) % 3
-    turned = np.take_along_axis(facets, turn, axis=1)
-    return turned[np.lexsort((turned[:, 2], turned[:, 1], turned[:, 0]))]
-
-
-def _check_boundary(mesh: TetMesh) -> int:
-    """Raise if the boundary lies on itself; return the number of non-manifold edges."""
-    facets = mesh.facets
-    edges = np.concatenate([facets[:, [0, 1]], facets[:, [1, 2]], facets[:, [2, 0]]])
-    apexes = np.concatenate([facets[:, 2], facets[:, 0], facets[:, 1]])
-    low, high = edges.min(axis=1), edges.max(axis=1)
-    order = np.lexsort((high, low))
-    low, high, apexes = low[order], high[order], apexes[order]
-    first = np.concatenate([[True], (low[1:] != low[:-1]) | (high[1:] != high[:-1])])
-    edge = np.cumsum(first) - 1
-    uses = np.bincount(edge)
-    # Closed: each tetrahedron's faces meet every edge an even number of times, and faces with two owners cancel.
-    assert not np.any(uses % 2)
-
-    # Unit vectors from an edge into its triangles. Two that agree: two triangles lie on each other.
-    along = mesh.points_m[high] - mesh.points_m[low]
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    inward = mesh.points_m[apexes] - mesh.points_m[low]
-    inward -= np.einsum("ij,ij->i", inward, along)[:, None] * along
-    inward /= np.linalg.norm(inward, axis=1, keepdims=True)
-    folded = 0
-    for gap in range(1, int(uses.max())):
-        same_edge = edge[gap:] == edge[:-gap]
-        cosine = np.einsum("ij,ij->i", inward[gap:], inward[:-gap])
-        folded += int(np.count_nonzero(same_edge & (cosine > 1.0 - 1e-10)))
-    if folded:
-        _fail("tetrahedra", "neighbours whose faces match", f"a crack: {folded} pairs of boundary triangles overlap")
-    return int(np.count_nonzero(uses > 2))
+    return np.take_along_axis(facets, turn, axis=1)

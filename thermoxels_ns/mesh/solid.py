@@ -1,24 +1,55 @@
-"""Which voxels are solid: the densest share, one connected body, cavities filled on request."""
+"""Which voxels are solid: dense enough, gaps closed, floaters dropped, walls thickened, interiors filled."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
 from thermoxels_ns.checks import check_positive
 from thermoxels_ns.errors import MeshError, explain
+from thermoxels_ns.mesh.interior import interior
+from thermoxels_ns.mesh.level_set import level_of
+from thermoxels_ns.mesh.morphology import close_gaps, connected, face_connected, fill_enclosed
+from thermoxels_ns.mesh.threshold import (
+    Threshold,
+    automatic_threshold,
+    density_threshold,
+    optical_depth_threshold,
+    percentile_threshold,
+)
+from thermoxels_ns.mesh.wall_thickness import wall_behind
 from thermoxels_ns.snapshot import GridSnapshot
+
+__all__ = [
+    "InteriorKind",
+    "SolidCells",
+    "SolidSelection",
+    "SolidStep",
+    "close_gaps",
+    "connected",
+    "face_connected",
+    "fill_enclosed",
+    "select_solid",
+]
+
+BoolArray = npt.NDArray[np.bool_]
+InteriorKind = Literal["solid", "hollow"]
+
+_WIDEST = 100
 
 
 @dataclass(frozen=True)
 class SolidSelection:
-    """How solid voxels are told from empty ones."""
+    """How solid voxels are told from empty ones. Without a threshold of your own it is found from the training rays."""
 
-    voxel_optical_depth: float = 0.5
-    """Voxels in which density times edge length is at least this are solid: at 0.5, light that crosses loses 39 %."""
+    voxel_optical_depth: float | None = None
+    """Voxels in which density times edge length is at least this are solid: at 0.5, light that crosses one loses 39 %.
+    Lower it if walls have holes, raise it if empty space turns solid. Left out, the threshold is automatic: such that
+    85 % of the training rays that end on something end in a solid voxel."""
     density_percentile: float | None = None
     """Percentile p of the density over all voxels of the box, 0 to 100: the (100 - p) % densest voxels are solid, as in
     the Thermoxels paper. Overrides the optical depth. Raise it if empty space turns solid, lower it if walls have
@@ -32,20 +63,30 @@ class SolidSelection:
     """Drop bodies (voxels that touch, if only by corners) of less than this share of the largest; mostly floaters."""
     largest_component: bool = False
     """Keep only the largest body of voxels that touch by faces."""
-    fill_cavities: bool = False
-    """Make empty space solid where it has no way out through voxel faces. Off by default: a room is a cavity too."""
+    interior: InteriorKind = "solid"
+    """What becomes of the inside of a body of which photographs only show the shell. solid: it is filled, namely
+    cavities that the shell encloses, and space within the body's convex hull that the training cameras would see if
+    the shell did not stand in front of it (fewer than one in ten look into it). hollow: the shell alone is meshed, as
+    thick as the photographs happened to make it. A cavity with a camera in it is a room and is never filled."""
+    seal_openings: int = 2
+    """While looking for the inside, openings in the shell up to twice this many voxels wide count as closed. It leaves
+    the shell itself as it is."""
+    wall_thickness: float | None = None
+    """For facades seen from one side: make the seen surface this thick, [m], growing away from the cameras, never into
+    space that they look through. Takes the place of filling the interior. Needs metres per unit."""
 
     def __post_init__(self) -> None:
-        check_positive("voxel_optical_depth", self.voxel_optical_depth, "Pass --voxel-optical-depth 0.5.", MeshError)
-        if not (isinstance(self.close_gaps, int) and 0 <= self.close_gaps <= 100):
-            raise MeshError(
-                explain(
-                    "close_gaps",
-                    expected="a whole number from 0 to 100",
-                    got=self.close_gaps,
-                    remedy="Pass --close-gaps 1.",
-                )
+        if self.voxel_optical_depth is not None:
+            check_positive(
+                "voxel_optical_depth", self.voxel_optical_depth, "Pass --voxel-optical-depth 0.5.", MeshError
             )
+        for name, usual in (("close_gaps", 1), ("seal_openings", 2)):
+            value = getattr(self, name)
+            if not (isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= _WIDEST):
+                remedy = f"Pass --{name.replace('_', '-')} {usual}."
+                raise MeshError(
+                    explain(name, expected=f"a whole number from 0 to {_WIDEST}", got=repr(value), remedy=remedy)
+                )
         if not 0.0 <= self.smallest_body <= 1.0:
             raise MeshError(
                 explain(
@@ -55,9 +96,7 @@ class SolidSelection:
                     remedy="Pass --smallest-body 0.01.",
                 )
             )
-        if self.density_percentile is not None and not (
-            np.isfinite(self.density_percentile) and 0.0 <= self.density_percentile <= 100.0
-        ):
+        if self.density_percentile is not None and not 0.0 <= self.density_percentile <= 100.0:
             raise MeshError(
                 explain(
                     "density_percentile",
@@ -67,151 +106,192 @@ class SolidSelection:
                 )
             )
         if self.density_threshold is not None and not (
-            np.isfinite(self.density_threshold) and self.density_threshold >= 0.0
+            math.isfinite(self.density_threshold) and self.density_threshold >= 0.0
         ):
             raise MeshError(
                 explain(
                     "density_threshold",
                     expected="a finite number of at least 0, [1 / world unit]",
                     got=self.density_threshold,
-                    remedy="Leave it out to select by --voxel-optical-depth.",
+                    remedy="Leave it out, and the training rays tell the threshold.",
                 )
             )
+        if self.interior not in get_args(InteriorKind):
+            raise MeshError(
+                explain(
+                    "interior",
+                    expected=" or ".join(get_args(InteriorKind)),
+                    got=repr(self.interior),
+                    remedy="Pass --interior solid.",
+                )
+            )
+        if self.wall_thickness is not None:
+            remedy = "Pass --wall-thickness 0.3, or leave it out to mesh what was seen."
+            check_positive("wall_thickness", self.wall_thickness, remedy, MeshError)
+
+
+@dataclass(frozen=True)
+class SolidStep:
+    """What one step on the way from density to solid did."""
+
+    name: str
+    """Which step: threshold, close gaps, small bodies, largest body, wall or interior."""
+    added: int
+    """Voxels that it made solid."""
+    removed: int
+    """Voxels that it made empty."""
+    remark: str
+    """How and why, in a sentence or two."""
 
 
 @dataclass(frozen=True)
 class SolidCells:
     """The solid voxels and how they were found."""
 
-    cells: npt.NDArray[np.bool_]
+    cells: BoolArray
     """True where a voxel is solid, shape (nx-1, ny-1, nz-1); at least one is."""
+    level: npt.NDArray[np.float32]
+    """Above 0 in solid voxels, below 0 in empty ones, in [-1, 1]; its trilinear zero between voxel centres is the
+    surface. Shape of `cells`."""
     threshold: float
     """Density at voxel centres from which on a voxel counted as solid, [1 / world unit]."""
-    num_closed: int
-    """Voxels of gaps that were filled."""
+    explanation: str
+    """Which rule chose the threshold, and why."""
+    steps: tuple[SolidStep, ...]
+    """What each step did, in order; the first is the threshold."""
     component_sizes: npt.NDArray[np.int64]
-    """Voxels in each body after that, largest first; they touch by nothing, or (`largest_component`) by no face."""
-    num_removed: int
-    """Voxels dropped because their body is too small."""
-    num_added: int
-    """Voxels of enclosed cavities that were made solid."""
+    """Voxels in each body once gaps are closed, largest first; they touch by nothing, or (`largest_component`) by no
+    face."""
 
 
-def select_solid(snapshot: GridSnapshot, selection: SolidSelection) -> SolidCells:
+def select_solid(
+    snapshot: GridSnapshot, selection: SolidSelection, metres_per_world_unit: float | None = None
+) -> SolidCells:
     """Choose the solid voxels of a trained field.
 
-    A voxel's density is that at its centre. The percentile is taken over all voxels of the box. A voxel
-    without density is never solid. Where more voxels tie at the threshold than were asked for (space that training
-    never touched keeps its starting value), only the denser ones are taken, if there are any.
+    A voxel's density is that at its centre. A voxel without density is solid only if a step after the threshold makes
+    it so.
 
     Args:
         snapshot: The trained field on its corner lattice.
-        selection: Threshold and what to do with floaters and cavities.
+        selection: Threshold and what to do with gaps, floaters and interiors.
+        metres_per_world_unit: Length of one unit of the lattice's world, [m]; only a wall thickness needs it.
 
     Returns:
-        The solid voxels, the threshold used and what was removed and added.
+        The solid voxels, the level whose zero is their surface, and what each step did.
 
     Raises:
-        MeshError: No voxel is solid, or density does not tell solid from empty.
+        MeshError: No voxel is solid, density does not tell solid from empty, or a wall thickness is asked for but the
+            scale or the cameras are not known.
     """
+    thickness = _wall_voxels(snapshot, selection, metres_per_world_unit)
     density = snapshot.centre_density()
-    if selection.density_threshold is not None:
-        threshold = float(selection.density_threshold)
-        cells = (density >= threshold) & (density > 0.0)
-    elif selection.density_percentile is None:
-        threshold = selection.voxel_optical_depth / snapshot.lattice.voxel_size
-        cells = density >= threshold
-    else:
-        threshold = float(np.percentile(density, selection.density_percentile))
-        cells = _densest(density, threshold, selection.density_percentile)
-    if not cells.any():
+    chosen = _threshold(snapshot, density, selection)
+    if not chosen.cells.any():
         raise MeshError(
             explain(
                 "solid voxels",
-                expected=f"at least one voxel with density above 0 and at least the threshold {threshold:.6g}",
-                got=f"none of {cells.size}; the highest density at a voxel centre is {density.max():.6g}",
+                expected=f"at least one voxel with density above 0 and at least the threshold {chosen.density:.6g}",
+                got=f"none of {density.size}; the highest density at a voxel centre is {density.max():.6g}",
                 remedy="Train longer, or lower --voxel-optical-depth, --density-threshold or --density-percentile.",
             )
         )
+    cells = chosen.cells
+    steps = [SolidStep("threshold", int(cells.sum()), 0, chosen.explanation)]
 
-    thresholded = int(cells.sum())
-    cells = close_gaps(cells, selection.close_gaps)
-    labels = face_connected(cells) if selection.largest_component else connected(cells)
-    sizes = np.bincount(labels.ravel())[1:]
-    before = int(cells.sum())
-    if selection.largest_component and len(sizes) > 1:
-        cells = labels == 1 + int(np.argmax(sizes))
-    elif len(sizes) > 1:
-        cells = np.concatenate(([False], sizes >= selection.smallest_body * sizes.max()))[labels]
-    kept = int(cells.sum())
-    if selection.fill_cavities:
-        cells = fill_enclosed(cells)
+    def step(name: str, after: BoolArray, remark: str) -> BoolArray:
+        steps.append(SolidStep(name, int((after & ~cells).sum()), int((cells & ~after).sum()), remark))
+        return after
+
+    if selection.close_gaps:
+        width = 2 * selection.close_gaps
+        cells = step(
+            "close gaps", close_gaps(cells, selection.close_gaps), f"Gaps up to {width} voxels wide are filled."
+        )
+    kept, sizes, remark = _bodies(cells, selection)
+    cells = step("largest body" if selection.largest_component else "small bodies", kept, remark)
+    if thickness is not None:
+        assert snapshot.views is not None
+        wall = cells | wall_behind(cells, snapshot.lattice, snapshot.views, thickness)
+        cells = step(
+            "wall", wall, f"The seen surface is made {selection.wall_thickness:g} m thick ({thickness:.3g} voxels)."
+        )
+    elif selection.interior == "solid":
+        cells = step("interior", *_filled(cells, snapshot, selection))
     return SolidCells(
         cells=cells,
-        threshold=threshold,
-        num_closed=before - thresholded,
+        level=level_of(density, chosen.density, chosen.cells, cells),
+        threshold=chosen.density,
+        explanation=chosen.explanation,
+        steps=tuple(steps),
         component_sizes=np.sort(sizes)[::-1].astype(np.int64),
-        num_removed=before - kept,
-        num_added=int(cells.sum()) - kept,
     )
 
 
-def face_connected(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
-    """Number the bodies whose voxels touch by faces: 1, 2, ... in C order of their first voxel, 0 elsewhere."""
-    labels = np.zeros(cells.shape, dtype=np.int32)
-    ndimage.label(cells, output=labels)
-    return labels
+def _threshold(snapshot: GridSnapshot, density: npt.NDArray[np.float64], selection: SolidSelection) -> Threshold:
+    if selection.density_threshold is not None:
+        return density_threshold(density, selection.density_threshold)
+    if selection.density_percentile is not None:
+        return percentile_threshold(density, selection.density_percentile)
+    if selection.voxel_optical_depth is not None:
+        return optical_depth_threshold(snapshot, density, selection.voxel_optical_depth)
+    return automatic_threshold(snapshot, density)
 
 
-def connected(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
-    """Number the bodies whose voxels touch by faces, edges or corners, as `face_connected` does."""
-    labels = np.zeros(cells.shape, dtype=np.int32)
-    ndimage.label(cells, structure=np.ones((3, 3, 3)), output=labels)
-    return labels
+def _bodies(cells: BoolArray, selection: SolidSelection) -> tuple[BoolArray, npt.NDArray[np.int64], str]:
+    """Drop bodies that are too small; sizes of all of them, and what was done."""
+    labels = face_connected(cells) if selection.largest_component else connected(cells)
+    sizes = np.bincount(labels.ravel())[1:]
+    if selection.largest_component:
+        keep = np.zeros(len(sizes), dtype=bool)
+        keep[np.argmax(sizes)] = True
+        remark = f"The largest of {len(sizes)} bodies is kept."
+    else:
+        keep = sizes >= selection.smallest_body * sizes.max()
+        remark = (
+            f"{len(sizes) - int(keep.sum())} of {len(sizes)} bodies have less than "
+            f"{selection.smallest_body:.2%} of the largest one's voxels and go."
+        )
+    return np.concatenate(([False], keep))[labels], sizes, remark
 
 
-def close_gaps(cells: npt.NDArray[np.bool_], by: int) -> npt.NDArray[np.bool_]:
-    """Fill what a cube of 2 `by` + 1 voxels, made of empty voxels, cannot reach; nothing solid goes.
-
-    >>> close_gaps(np.array([[[True, False, True]]]), 1)[0, 0].tolist()
-    [True, True, True]
-    """
-    if by == 0:
-        return cells
-    # Where the box cuts the scene, what is solid goes on behind it.
-    touching = np.ones((3, 3, 3), dtype=bool)
-    grown = ndimage.binary_dilation(np.pad(cells, by, mode="edge"), touching, iterations=by)
-    closed = ndimage.binary_erosion(grown, touching, iterations=by, border_value=1)
-    return np.logical_or(closed[by:-by, by:-by, by:-by], cells)
-
-
-def fill_enclosed(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Make solid all empty voxels that have no way to the outside of the box through voxel faces.
-
-    >>> cells = np.ones((3, 3, 3), dtype=bool)
-    >>> cells[1, 1, 1] = False
-    >>> bool(fill_enclosed(cells).all())
-    True
-    """
-    empty = np.pad(~np.asarray(cells, dtype=bool), 1, constant_values=True)
-    labels = face_connected(empty)
-    return (labels != labels[0, 0, 0])[1:-1, 1:-1, 1:-1]
+def _filled(cells: BoolArray, snapshot: GridSnapshot, selection: SolidSelection) -> tuple[BoolArray, str]:
+    inside = interior(cells, snapshot.lattice, snapshot.views, selection.seal_openings)
+    remark = f"{int(inside.enclosed.sum())} voxels of enclosed cavities are filled"
+    if snapshot.views is None:
+        remark += "; the cameras are not known, so nothing is known to be hidden from them."
+    else:
+        remark += (
+            f", and {int(inside.hidden.sum())} voxels that cameras cannot look into, within the hull of their body."
+        )
+    if inside.rooms:
+        remark += f" {inside.rooms} cavities with a camera in them stay empty."
+    return cells | inside.enclosed | inside.hidden, remark
 
 
-def _densest(density: npt.NDArray[np.float64], threshold: float, percentile: float) -> npt.NDArray[np.bool_]:
-    """Voxels that make up the densest (100 - percentile) %, ties resolved as `select_solid` says."""
-    if percentile > 0.0 and 0.0 < density.min() == density.max():
+def _wall_voxels(
+    snapshot: GridSnapshot, selection: SolidSelection, metres_per_world_unit: float | None
+) -> float | None:
+    """The wall thickness that is asked for, [voxels]."""
+    if selection.wall_thickness is None:
+        return None
+    if metres_per_world_unit is None:
         raise MeshError(
             explain(
-                "density",
-                expected="some voxels denser than others",
-                got=f"the same density {threshold:.6g} in all {density.size} voxels",
-                remedy="Train longer, or pass --density-threshold to say from which density on a voxel is solid.",
+                "wall_thickness",
+                expected="a scene whose scale is known",
+                got=f"{selection.wall_thickness:g} m, but no length of a unit",
+                remedy="Pass --metres-per-unit 1 if the input poses are in metres, or leave out --wall-thickness.",
             )
         )
-    positive = density > 0.0
-    reached = positive & (density >= threshold)
-    denser = positive & (density > threshold)
-    asked = np.ceil((1.0 - percentile / 100.0) * density.size) + 1
-    too_many = np.count_nonzero(reached) > asked
-    return denser if too_many and denser.any() else reached
+    check_positive("metres_per_world_unit", metres_per_world_unit, "Pass --metres-per-unit.", MeshError)
+    if snapshot.views is None or len(snapshot.views.focal) == 0:
+        raise MeshError(
+            explain(
+                "wall_thickness",
+                expected="training cameras, which tell the side that is seen",
+                got="a field without cameras",
+                remedy="Export from a trained scene, or leave out --wall-thickness.",
+            )
+        )
+    return selection.wall_thickness / (metres_per_world_unit * snapshot.lattice.voxel_size)

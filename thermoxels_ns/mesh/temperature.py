@@ -16,7 +16,8 @@ MIN_OBSERVED_WEIGHT = 0.5
 Less is leakage through a surface or the tail of an interpolation, and its temperature is mostly the starting value."""
 
 _DIRECT_SOLVE_UNKNOWNS = 4000
-_RELATIVE_RESIDUAL = 1e-9
+_RELATIVE_RESIDUAL = 1e-7
+_TET_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]], dtype=np.int64)
 
 
 def extend_harmonically(
@@ -32,11 +33,12 @@ def extend_harmonically(
     leaves the observed range of its connected part. What rounding adds beyond it is clipped.
 
     Args:
-        edges: Node pairs, shape (e, 2), each edge once.
+        edges: Node pairs, shape (e, 2); the weights of a pair that comes more than once add up.
         temperature_c: Nodal temperatures, shape (n,), [degrees Celsius]; read at observed nodes only.
         observed: True where a node's temperature is a measurement, shape (n,).
         edge_weights: Conductance of each edge, shape (e,), above 0; equal if left out. The number of solid voxels
-            around an edge (`voxel_tets.lattice_edges`) gives uniform conductivity in the voxels.
+            around an edge (`voxel_tets.lattice_edges`) gives uniform conductivity in the voxels; pairs that come once
+            per tetrahedron (`tet_edges`) give that of the BCC lattice, and weights above 0 in any mesh.
 
     Returns:
         Temperature of every node, shape (n,), [degrees Celsius].
@@ -81,6 +83,11 @@ def extend_harmonically(
     high = np.asarray(ndimage.maximum(temperature[fixed], parts[fixed], labels))
     temperature[free] = np.clip(temperature[free], low[parts[free]], high[parts[free]])
     return temperature
+
+
+def tet_edges(tets: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """The six edges of every tetrahedron, shape (6 t, 2); an edge comes once for each tetrahedron around it."""
+    return tets[:, _TET_EDGES].reshape(-1, 2)
 
 
 def _parts_with_measurement(links: sparse.csr_array, observed: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:

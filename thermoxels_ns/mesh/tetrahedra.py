@@ -9,6 +9,24 @@ import numpy.typing as npt
 
 
 @dataclass(frozen=True)
+class Boundary:
+    """What physics needs to know of every boundary triangle, in the order of `TetMesh.facets`."""
+
+    normal: npt.NDArray[np.float64]
+    """Outward unit normal of the true surface, shape (f, 3). On a staircase of voxel faces it is not that of the
+    triangle."""
+    area_factor: npt.NDArray[np.float64]
+    """Area of true surface that a triangle stands for, over its own area, shape (f,), above 0; 1 where the mesh follows
+    the surface."""
+    seen: npt.NDArray[np.bool_]
+    """True where some training camera has a free line of sight to the triangle, shape (f,)."""
+    patch: npt.NDArray[np.int64]
+    """Index into `patch_names`, shape (f,)."""
+    patch_names: tuple[str, ...]
+    """Names of the patches, all different; some may have no triangle."""
+
+
+@dataclass(frozen=True)
 class TetMesh:
     """A conforming tetrahedral mesh with nodal temperatures, in metres."""
 
@@ -25,7 +43,13 @@ class TetMesh:
     facet_tags: npt.NDArray[np.int64]
     """One of the `FACET_*` constants per boundary triangle, shape (f,)."""
     region: npt.NDArray[np.int64]
-    """Region number per tetrahedron, shape (t,); 0 is the only region so far."""
+    """Region number per tetrahedron, shape (t,); an index into `region_names`."""
+    region_names: tuple[str, ...] = ("solid",)
+    """Names of the regions, all different."""
+    boundary: Boundary | None = None
+    """Tags of the boundary triangles; None for a mesh that was not tagged."""
+    colour: npt.NDArray[np.float32] | None = None
+    """Colour of each node, red, green, blue in [0, 1], shape (n, 3); None if it is not known."""
 
 
 FACET_SURFACE = 0

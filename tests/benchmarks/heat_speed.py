@@ -1,0 +1,202 @@
+"""What transient conduction costs beside a straightforward scikit-fem script: time and peak memory.
+
+Run it on an otherwise idle machine:
+
+    OMP_NUM_THREADS=1 python tests/benchmarks/heat_speed.py
+
+An insulated concrete cube of 1 m, cut into N^3 voxels of six tetrahedra, is followed through ten steps of backward
+Euler. Both sides get the nodes and tetrahedra and return the temperatures of all times; both use one core and conjugate
+gradients with the diagonal as preconditioner to a relative residual of 1e-12. The script measures it against M T / dt
+and starts from the last temperature; we measure against the heat that flows, K T, which is the stricter test. Ours
+includes all checks of the input, and everything else that `solve_heat` does.
+
+Times are medians, the two sides taking turns in one process; compiled kernels are loaded before the first. Memory is
+that of a process for each side alone: its peak less what it needs after its imports.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from scipy import sparse
+from scipy.sparse.linalg import cg
+
+TOLERANCE = 1e-12
+SIDE_M = 1.0
+
+
+@dataclass
+class HeatSpeed:
+    """Compare with scikit-fem."""
+
+    voxels: tuple[int, ...] = (20, 40, 64)
+    """Voxels along a side, N; the mesh has 6 N^3 tetrahedra."""
+    ours_alone: tuple[int, ...] = (88,)
+    """Further N on which only our side is measured, to see how its cost grows."""
+    steps: int = 10
+    """Time steps."""
+    step_seconds: float = 60.0
+    """Length of a step, [s]."""
+    repeats: int = 5
+    """Runs per median."""
+    consistent: bool = True
+    """Add a table with the consistent mass matrix; the other one has it lumped on both sides."""
+    side: str = ""
+    """Internal: run this side once on the mesh in `folder` and print its peak memory."""
+    folder: Path = Path()
+    """Internal: where the mesh is."""
+    lumped: bool = True
+    """Internal: for `side`."""
+
+    def main(self) -> None:
+        """Print the tables."""
+        if self.side:
+            print(json.dumps(self.peak_memory_mb()))
+            return
+        for lumped in (True, False) if self.consistent else (True,):
+            print(
+                f"\n{'Lumped' if lumped else 'Consistent'} mass, {self.steps} steps of {self.step_seconds:g} s, "
+                f"medians of {self.repeats}\n"
+            )
+            print(
+                "| tetrahedra | scikit-fem | ours | ours / scikit-fem | per million tetrahedra "
+                "| memory of scikit-fem | ours | ours / scikit-fem | largest difference |"
+            )
+            print("|---|---|---|---|---|---|---|---|---|")
+            for voxels in self.voxels:
+                print(self.row(voxels, lumped, alone=False), flush=True)
+            for voxels in self.ours_alone:
+                print(self.row(voxels, lumped, alone=True), flush=True)
+
+    def row(self, voxels: int, lumped: bool, *, alone: bool) -> str:
+        """One row of a table."""
+        points, tets = cube(voxels)
+        start = temperatures(points)
+        sides = {"ours": lambda: self.ours(points, tets, start, lumped)}
+        if not alone:
+            sides["scikit-fem"] = lambda: self.scikit_fem(points, tets, start, lumped)
+        seconds, last = take_turns(sides, self.repeats)
+        with tempfile.TemporaryDirectory() as folder:
+            np.save(Path(folder) / "points.npy", points)
+            np.save(Path(folder) / "tets.npy", tets)
+            memory = {side: self.in_own_process(side, Path(folder), lumped) for side in sides}
+        ours, ours_mb = seconds["ours"], memory["ours"]
+        per_million = f"{1e6 * ours / len(tets):.2f} s"
+        if alone:
+            return f"| {len(tets):,} | | {ours:.2f} s | | {per_million} | | {ours_mb:.0f} MB | | |"
+        theirs, theirs_mb = seconds["scikit-fem"], memory["scikit-fem"]
+        difference = np.abs(last["ours"] - last["scikit-fem"]).max()
+        memory_ratio = f"{ours_mb / theirs_mb:.2f}" if theirs_mb > 0 else ""
+        return (
+            f"| {len(tets):,} | {theirs:.2f} s | {ours:.2f} s | {ours / theirs:.2f} | {per_million} "
+            f"| {theirs_mb:.0f} MB | {ours_mb:.0f} MB | {memory_ratio} | {difference:.0e} K |"
+        )
+
+    def in_own_process(self, side: str, folder: Path, lumped: bool) -> float:
+        """Peak memory of one side, [MB]."""
+        options = [f"--side={side}", f"--folder={folder}", f"--steps={self.steps}"]
+        options += [f"--step-seconds={self.step_seconds!r}", "--lumped" if lumped else "--no-lumped"]
+        done = subprocess.run([sys.executable, __file__, *options], capture_output=True, text=True, check=True)
+        return float(json.loads(done.stdout.splitlines()[-1]))
+
+    def peak_memory_mb(self) -> float:
+        """Run one side in this process; what the imports and the kernels need does not count."""
+        run = self.ours if self.side == "ours" else self.scikit_fem
+        points, tets = cube(1)
+        run(points, tets, temperatures(points), self.lumped)
+        before = most_memory_kb()
+        points, tets = np.load(self.folder / "points.npy"), np.load(self.folder / "tets.npy")
+        run(points, tets, temperatures(points), self.lumped)
+        return (most_memory_kb() - before) / 1024.0
+
+    def ours(self, points: np.ndarray, tets: np.ndarray, start: np.ndarray, lumped: bool) -> np.ndarray:
+        """Temperatures of all times by this package."""
+        from thermoxels_ns.fem.materials import Material
+        from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+        from thermoxels_ns.fem.stepping import solve_heat
+        from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+        none, seen, region = np.zeros((0, 3), np.int64), np.ones(len(points), bool), np.zeros(len(tets), np.int64)
+        mesh = TetMesh(points, tets, start, seen, none, none[:, 0], region)
+        problem = HeatProblem(mesh, Material("concrete", 1.7, 2200.0, 880.0))
+        time_steps = TimeSteps(self.steps, self.step_seconds)
+        return solve_heat(problem, time_steps, lumped=lumped, relative_tolerance=TOLERANCE).temperature_c
+
+    def scikit_fem(self, points: np.ndarray, tets: np.ndarray, start: np.ndarray, lumped: bool) -> np.ndarray:
+        """Temperatures of all times by a script as its documentation suggests."""
+        from skfem import Basis, BilinearForm, ElementTetP1, MeshTet
+        from skfem.helpers import dot
+
+        @BilinearForm
+        def conduction(u: Any, v: Any, _: Any) -> Any:
+            return 1.7 * dot(u.grad, v.grad)
+
+        @BilinearForm
+        def storage(u: Any, v: Any, _: Any) -> Any:
+            return 2200.0 * 880.0 * u * v
+
+        space = MeshTet(np.ascontiguousarray(points.T), np.ascontiguousarray(tets.T))
+        basis = Basis(space, ElementTetP1())
+        stiffness, mass = conduction.assemble(basis), storage.assemble(basis)
+        if lumped:
+            mass = sparse.diags(np.asarray(mass.sum(axis=1)).ravel(), format="csr")
+        matrix = (mass / self.step_seconds + stiffness).tocsr()
+        jacobi = sparse.diags(1.0 / matrix.diagonal())
+        states = [start]
+        for _ in range(self.steps):
+            heat = mass @ states[-1] / self.step_seconds
+            state, failed = cg(matrix, heat, x0=states[-1], rtol=TOLERANCE, atol=0.0, M=jacobi)
+            if failed:
+                raise RuntimeError("scikit-fem script: conjugate gradients did not converge")
+            states.append(state)
+        return np.array(states)
+
+
+def most_memory_kb() -> int:
+    """Most memory this process ever had, [kB]. Linux; what `resource` gives there includes the parent's."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
+
+
+def cube(voxels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes, [m], and tetrahedra of the cube."""
+    from thermoxels_ns.mesh.voxel_tets import kuhn_tets
+
+    corners, tets = kuhn_tets(np.ones((voxels, voxels, voxels), bool))
+    return corners * (SIDE_M / voxels), tets
+
+
+def temperatures(points: np.ndarray) -> np.ndarray:
+    """A gradient and a warm spot, [degrees Celsius]: no mode of the cube, which one iteration would solve."""
+    spot = np.exp(-np.square(points - 0.4).sum(axis=1) / 0.05)
+    return 20.0 + 5.0 * points[:, 0] + 10.0 * spot
+
+
+def take_turns(
+    sides: dict[str, Callable[[], np.ndarray]], repeats: int
+) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+    """Median seconds and last result of each side; our first call, which loads kernels, does not count."""
+    sides["ours"]()
+    seconds: dict[str, list[float]] = {side: [] for side in sides}
+    last = {}
+    for _ in range(repeats):
+        for side, run in sides.items():
+            begin = time.perf_counter()
+            last[side] = run()
+            seconds[side].append(time.perf_counter() - begin)
+    return {side: statistics.median(times) for side, times in seconds.items()}, last
+
+
+if __name__ == "__main__":
+    tyro.cli(HeatSpeed).main()

@@ -1,0 +1,76 @@
+"""Measured orders of isosurface stuffing: 2 in the voxel size on smooth bodies, and what sharp edges cost."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, tet_mesh
+from thermoxels_ns.mesh.quality import MeshQuality, check_mesh, facet_areas
+from thermoxels_ns.mesh.stuffing import stuff
+from thermoxels_ns.mesh.tet_shapes import signed_volumes
+
+SMOOTH = ("sphere", "torus")
+SHARP = tuple(name for name in SHAPES if SHAPES[name].sharp_edges)
+
+
+@cache
+def quality(name: str, cells: int, voxels_to_one: float = 1.5) -> MeshQuality:
+    return check_mesh(tet_mesh(stuff(SHAPES[name].level(cells, voxels_to_one)), 2.0 / cells))
+
+
+def errors(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Relative errors of volume and area with 24, 48 and 96 voxels along the box."""
+    shape, volumes, areas = SHAPES[name], [], []
+    for cells in (24, 48, 96):
+        solid = stuff(shape.level(cells))
+        points = solid.points * (2.0 / cells)
+        volumes.append(signed_volumes(points, solid.tets).sum() / shape.volume - 1.0)
+        areas.append(facet_areas(points, solid.facets).sum() / shape.area - 1.0)
+    return np.abs(volumes), np.abs(areas)
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+def test_second_order_on_smooth_bodies(name):
+    for what, error in zip(("volume", "area"), errors(name)):
+        orders = np.log2(error[:-1] / error[1:])
+        assert orders.min() > 1.9, f"{name}, {what}: observed orders {orders}, errors {error}"
+        assert error[1] < 0.01, f"{name}, {what}: errors {error}"
+
+
+@pytest.mark.parametrize("name", SHARP)
+def test_volume_stays_of_second_order_with_sharp_edges(name):
+    error, _ = errors(name)
+    orders = np.log2(error[:-1] / error[1:])
+    assert orders.min() > 1.65, f"{name}, volume: observed orders {orders}, errors {error}"
+    assert error[1] < 0.01, f"{name}, volume: errors {error}"
+
+
+@pytest.mark.parametrize("name", SHARP)
+def test_sharp_edges_become_chamfers_about_half_a_voxel_wide(name):
+    """Each voxel of edge loses a third of a voxel face of area, at any resolution: area is of first order there."""
+    shape = SHAPES[name]
+    lost = np.array([(shape.area - quality(name, cells).area_m2) / (2.0 / cells) for cells in (24, 48)])
+    assert lost / shape.sharp_edges == pytest.approx(0.36, abs=0.08)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_bodies_in_48_voxels(name):
+    """Levels that stop one voxel from the surface."""
+    shape, found = SHAPES[name], quality(name, 48, 1.0)
+    assert found.volume_m3 == pytest.approx(shape.volume, rel=0.01)
+    chamfers = 0.40 * shape.sharp_edges * (2.0 / 48)
+    assert shape.area * 0.99 - chamfers <= found.area_m2 <= shape.area * 1.01
+    assert found.num_non_manifold_edges == 0
+    assert ANGLE_BOUNDS_DEG[0] <= found.min_dihedral_deg <= found.max_dihedral_deg <= ANGLE_BOUNDS_DEG[1]
+
+
+@pytest.mark.parametrize(
+    ("voxels_to_one", "least", "most"), [(1.0, -1e-3, 1e-3), (0.5, 0.010, 0.018), (0.01, 0.1, 0.15)]
+)
+def test_levels_that_stop_near_the_surface_make_it_rough(voxels_to_one, least, most):
+    """The area of a sphere in 48 voxels, relative; `stuff` documents it."""
+    relative = quality("sphere", 48, voxels_to_one).area_m2 / SHAPES["sphere"].area - 1.0
+    assert least < relative < most

@@ -1,0 +1,51 @@
+"""A file name from a json or from metadata never leads out of the folder."""
+
+from __future__ import annotations
+
+import pytest
+
+from thermoxels_ns.data.folder_walls import path_inside
+from thermoxels_ns.errors import SceneError
+
+
+@pytest.mark.parametrize("name", ["a.tiff", "thermal/a.tiff", "./a.tiff", "thermal\\a.tiff", "a..b/c.jpg"])
+def test_names_inside_are_paths_inside(tmp_path, name):
+    assert path_inside(tmp_path, name, "frame 3").is_relative_to(tmp_path.resolve())
+
+
+def test_both_slashes_name_the_same_file(tmp_path):
+    assert path_inside(tmp_path, "thermal\\a.tiff", "x") == path_inside(tmp_path, "thermal/a.tiff", "x")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../a",
+        "b/../../a",
+        "b/../c",
+        "..\\a",
+        "/etc/hostname",
+        "C:\\a",
+        "c:a",
+        "\\\\server\\share\\a",
+        "\\a",
+        "",
+        " ",
+        "a\0b",
+    ],
+)
+def test_names_that_lead_out_are_refused_by_where_they_stand(tmp_path, name):
+    with pytest.raises(SceneError, match=r"transforms\.json: frame 3: expected a file inside"):
+        path_inside(tmp_path, name, "transforms.json: frame 3")
+
+
+def test_a_link_that_leads_out_is_refused_and_one_inside_is_not(tmp_path):
+    outside, folder = tmp_path / "outside", tmp_path / "scene"
+    outside.mkdir()
+    folder.mkdir()
+    (folder / "real").mkdir()
+    (folder / "out").symlink_to(outside)
+    (folder / "in").symlink_to(folder / "real")
+    with pytest.raises(SceneError, match="a link to"):
+        path_inside(folder, "out/secret.txt", "frame 0")
+    assert path_inside(folder, "in/a.tiff", "frame 0") == folder.resolve() / "real" / "a.tiff"

@@ -1,0 +1,297 @@
+"""Camera files to degrees: formats by content, presets, corrections, and files that are none."""
+
+from __future__ import annotations
+
+import struct
+import warnings
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.data.flir_file import FlirFile, picture_bytes, smooth_counts
+from thermoxels_ns.data.radiometric_conditions import Conditions
+from thermoxels_ns.data.radiometric_model import corrected_temperature_c
+from thermoxels_ns.data.radiometry import RadiometryOptions, detect_format, read_thermogram
+from thermoxels_ns.data.thermal_cameras import COUNT_SCALES, recognised_camera
+from thermoxels_ns.errors import SceneError, ThermalFileError, ThermoxelsError
+
+WALL_C = np.array([[18.25, 19.5, 20.75], [21.0, 22.25, 23.5]])
+
+
+def save_tiff(path: Path, pixels: np.ndarray, make: str = "", model: str = "") -> Path:
+    exif = Image.Exif()
+    exif[271], exif[272], exif[36867], exif[50735] = make, model, "2024:10:30 10:50:42", "77"
+    Image.fromarray(pixels).save(path, "TIFF", exif=exif)
+    return path
+
+
+def counts_of(celsius: np.ndarray, per_count: float, offset: float) -> np.ndarray:
+    return np.rint((celsius - offset) / per_count).astype(np.uint16)
+
+
+@pytest.mark.parametrize(
+    ("camera", "count", "celsius"),
+    [
+        ("workswell", 4800, 20.0),
+        ("flir-high-gain", 7500, 26.85),
+        ("flir-low-gain", 750, 26.85),
+        ("flir-duo", 29315, 20.0),
+        ("sensefly", 12000, 20.0),
+    ],
+)
+def test_presets_by_hand(tmp_path, camera, count, celsius):
+    path = save_tiff(tmp_path / "a.tiff", np.full((2, 3), count, np.uint16))
+    got = read_thermogram(path, RadiometryOptions(camera=camera))
+    np.testing.assert_allclose(got.temperature_c, celsius, atol=1e-5)
+    assert got.metadata.celsius_per_count == COUNT_SCALES[camera].celsius_per_count
+
+
+def test_a_camera_that_the_file_names_needs_no_preset(tmp_path):
+    counts = counts_of(WALL_C, 0.025, -100.0)
+    got = read_thermogram(save_tiff(tmp_path / "a.tiff", counts, "Workswell", "WIRIS Pro"))
+    np.testing.assert_allclose(got.temperature_c, WALL_C, atol=1e-5)
+    assert (got.metadata.camera, got.metadata.serial) == ("Workswell WIRIS Pro", "77")
+    assert got.metadata.taken_at.isoformat() == "2024-10-30T10:50:42"
+
+
+def test_the_users_word_comes_before_the_files(tmp_path):
+    path = save_tiff(tmp_path / "a.tiff", counts_of(WALL_C, 0.04, -273.15), "Workswell", "WIRIS Pro")
+    for options in (
+        RadiometryOptions(camera="flir-high-gain"),
+        RadiometryOptions(celsius_per_count=0.04, celsius_offset=-273.15),
+    ):
+        np.testing.assert_allclose(read_thermogram(path, options).temperature_c, WALL_C, atol=0.021)
+
+
+def test_counts_of_an_unknown_camera_are_refused_with_the_choices(tmp_path):
+    path = save_tiff(tmp_path / "a.tiff", counts_of(WALL_C, 0.04, -273.15), "FLIR", "Duo Pro R")
+    with pytest.raises(ThermalFileError, match=r"counts of FLIR Duo Pro R.*flir-high-gain.*--celsius-per-count"):
+        read_thermogram(path)
+    assert recognised_camera(None, None) is None and recognised_camera("Workswell", "WIRIS") is None
+
+
+def test_floats_are_degrees(tmp_path):
+    got = read_thermogram(save_tiff(tmp_path / "a.tiff", WALL_C.astype(np.float32)))
+    np.testing.assert_allclose(got.temperature_c, WALL_C, atol=1e-6)
+    assert got.metadata.celsius_per_count is None
+
+
+def test_tables_and_sixteen_bit_png(tmp_path):
+    np.save(tmp_path / "a.npy", WALL_C.astype(np.float32))
+    np.savetxt(tmp_path / "a.csv", WALL_C, delimiter=";", fmt="%.2f")
+    Image.fromarray(counts_of(WALL_C, 0.01, -100.0)).save(tmp_path / "a.png")
+    for name, options, kind in (
+        ("a.npy", None, "NPY"),
+        ("a.csv", None, "CSV"),
+        ("a.png", RadiometryOptions(camera="sensefly"), "PNG"),
+    ):
+        got = read_thermogram(tmp_path / name, options)
+        np.testing.assert_allclose(got.temperature_c, WALL_C, atol=1e-5)
+        assert got.metadata.format == kind and got.temperature_c.dtype == np.float32
+
+
+def test_whole_numbers_in_an_array_need_a_unit(tmp_path):
+    np.save(tmp_path / "a.npy", counts_of(WALL_C, 0.01, -273.15))
+    with pytest.raises(ThermalFileError, match="whole numbers and no unit"):
+        read_thermogram(tmp_path / "a.npy")
+    got = read_thermogram(tmp_path / "a.npy", RadiometryOptions(camera="flir-duo"))
+    np.testing.assert_allclose(got.temperature_c, WALL_C, atol=1e-5)
+
+
+def test_content_decides_and_not_the_name(tmp_path):
+    np.save(tmp_path / "a.npy", WALL_C)
+    np.savetxt(tmp_path / "a.csv", WALL_C, delimiter=",")
+    save_tiff(tmp_path / "a.tiff", WALL_C.astype(np.float32))
+    for name, wrong, kind in (("a.npy", "b.jpg", "NPY"), ("a.csv", "c.tiff", "CSV"), ("a.tiff", "d.csv", "TIFF")):
+        (tmp_path / name).rename(tmp_path / wrong)
+        assert detect_format(tmp_path / wrong) == kind
+        np.testing.assert_allclose(read_thermogram(tmp_path / wrong).temperature_c, WALL_C, atol=1e-5)
+
+
+def test_stored_temperatures_are_corrected_by_the_model(tmp_path):
+    np.save(tmp_path / "a.npy", WALL_C)
+    options = RadiometryOptions(emissivity=0.9, reflected_c=10.0, distance_m=5.0, air_c=12.0)
+    got = read_thermogram(tmp_path / "a.npy", options)
+    after = Conditions(emissivity=0.9, reflected_c=10.0, distance_m=5.0, air_c=12.0)
+    np.testing.assert_allclose(got.temperature_c, corrected_temperature_c(WALL_C, Conditions(), after), atol=1e-5)
+    assert (got.temperature_c > WALL_C).all()  # warmer than the surroundings it mirrors
+    assert got.metadata.conditions == after and got.metadata.camera_conditions == Conditions()
+
+
+def test_a_correction_that_the_camera_made_is_not_made_again(tmp_path):
+    np.save(tmp_path / "a.npy", WALL_C)
+    stored = Conditions(emissivity=0.9, reflected_c=10.0)
+    same = read_thermogram(tmp_path / "a.npy", RadiometryOptions(stored=stored, emissivity=0.9))
+    np.testing.assert_array_equal(same.temperature_c, WALL_C.astype(np.float32))
+    apparent = read_thermogram(tmp_path / "a.npy", RadiometryOptions(stored=stored, emissivity=1.0))
+    np.testing.assert_allclose(apparent.temperature_c, corrected_temperature_c(WALL_C, stored, Conditions()), atol=1e-5)
+
+
+def test_an_emissivity_without_surroundings_asks_for_them(tmp_path):
+    np.save(tmp_path / "a.npy", WALL_C)
+    with pytest.raises(ThermoxelsError, match=r"reflected_c.*--reflected-c"):
+        read_thermogram(tmp_path / "a.npy", RadiometryOptions(emissivity=0.9))
+
+
+def test_pixels_that_cannot_be_under_the_settings_are_masked_and_counted(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([[20.0, -60.0, np.nan]]))
+    got = read_thermogram(tmp_path / "a.npy", RadiometryOptions(emissivity=0.5, reflected_c=20.0))
+    assert got.temperature_c[0, 0] == pytest.approx(20.0, abs=1e-4)
+    assert np.isnan(got.temperature_c[0, 1:]).all()
+    assert (got.report.nan, got.report.out_of_range, got.report.pixels) == (1, 1, 3)
+
+
+def test_ends_of_the_scale_and_of_the_valid_range_are_masked(tmp_path):
+    counts = np.array([[0, 4800, 65535, 12000]], np.uint16)
+    path = save_tiff(tmp_path / "a.tiff", counts)
+    got = read_thermogram(path, RadiometryOptions(camera="workswell", valid_range_c=(-20.0, 150.0)))
+    np.testing.assert_array_equal(np.isfinite(got.temperature_c), [[False, True, False, False]])
+    assert (got.report.saturated, got.report.out_of_range) == (2, 1)
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"celsius_per_count": 0.04}, "both or neither"),
+        ({"celsius_offset": 0.0}, "both or neither"),
+        ({"celsius_per_count": 0.0, "celsius_offset": 0.0}, "thermal unit"),
+        ({"celsius_per_count": 0.1, "celsius_offset": 0.0, "camera": "workswell"}, "a preset or a scale"),
+        ({"emissivity": 1.5}, "emissivity"),
+    ],
+)
+def test_options_that_cannot_be_are_refused_at_once(values, said):
+    with pytest.raises(ThermoxelsError, match=said):
+        RadiometryOptions(**values)
+
+
+def bad_png(width: int, height: int) -> bytes:
+    header = b"IHDR" + struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
+    body = b"IDAT" + zlib.compress(b"\0" * 64)
+    chunks = b"".join(
+        struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+        for chunk in (header, body, b"IEND")
+    )
+    return b"\x89PNG\r\n\x1a\n" + chunks
+
+
+def bad_tiff(width: int, height: int) -> bytes:
+    tags = [(256, 4, width), (257, 4, height), (258, 3, 16), (259, 3, 1), (262, 3, 1), (273, 4, 8), (279, 4, 2)]
+    entries = b"".join(struct.pack("<HHII", tag, kind, 1, value) for tag, kind, value in tags)
+    return b"II*\0" + struct.pack("<I", 10) + b"\0\0" + struct.pack("<H", len(tags)) + entries + bytes(4)
+
+
+def bad_npy(width: int, height: int) -> bytes:
+    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({height}, {width}), }}".ljust(117) + "\n"
+    return b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header.encode() + bytes(4 * width * height % 10**6)
+
+
+def tiff_bytes(pixels: np.ndarray, folder: Path) -> bytes:
+    return save_tiff(folder / "made.tiff", pixels).read_bytes()
+
+
+HARD: dict[str, tuple[str, str]] = {
+    "palette.jpg": ("false-colour", "as the camera wrote it"),
+    "palette.png": ("a picture for the eye", "Export"),
+    "palette.tiff": ("3 channels of 8 bits", "Export"),
+    "grey8.tiff": ("1 channel of 8 bits", "Export"),
+    "truncated.jpg": ("cut off", "Copy"),
+    "truncated.tiff": ("readable", "copy"),
+    "truncated.npy": ("readable", "copy"),
+    "truncated.png": ("readable", "copy"),
+    "zero.tiff": ("zero bytes", "Copy"),
+    "zero.jpg": ("zero bytes", "Copy"),
+    "wide.png": ("30000 x 4", "damaged"),
+    "wide.tiff": ("30000 x 4", "damaged"),
+    "wide.npy": ("30000 x 4", "damaged"),
+    "wide.csv": ("30000 x", "damaged"),
+    "huge.png": ("30000|size", "damaged"),
+    "text.tiff": ("starts with b'Dear", "Export"),
+    "program.jpg": ("starts with", "Export"),
+    "ragged.csv": ("lengths", "damaged"),
+    "words.csv": ("starts with", "Export"),
+    "cube.npy": ("one temperature per pixel", "single-channel"),
+    "pickle.npy": ("readable", "damaged"),
+}
+
+
+@pytest.fixture
+def hard_files(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(1)
+    colours = rng.integers(0, 255, (20, 30, 3), dtype=np.uint8)
+    flir = FlirFile(smooth_counts()).jpeg()
+    counts = tiff_bytes(smooth_counts(), tmp_path)
+    np.save(tmp_path / "cube.npy", np.ones((2, 3, 4)))
+    np.save(tmp_path / "pickle.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    np.save(tmp_path / "whole.npy", WALL_C)
+    content = {
+        "palette.jpg": picture_bytes(colours),
+        "palette.png": picture_bytes(colours, "PNG"),
+        "palette.tiff": tiff_bytes(colours, tmp_path),
+        "grey8.tiff": tiff_bytes(colours[..., 0].copy(), tmp_path),
+        "truncated.jpg": flir[: len(flir) // 2],
+        "truncated.tiff": counts[: len(counts) // 2],
+        "truncated.npy": (tmp_path / "whole.npy").read_bytes()[:-9],
+        "truncated.png": bad_png(40, 30),
+        "zero.tiff": b"",
+        "zero.jpg": b"",
+        "wide.png": bad_png(30000, 4),
+        "wide.tiff": bad_tiff(30000, 4),
+        "wide.npy": bad_npy(30000, 4),
+        "wide.csv": b",".join([b"1.5"] * 30000),
+        "huge.png": bad_png(30000, 30000),
+        "text.tiff": b"Dear camera,\nplease",
+        "program.jpg": b"\x7fELF\2\1\1\0" + bytes(100),
+        "ragged.csv": b"1,2,3\n4,5",
+        "words.csv": b"warm,cold\nvery,not",
+    }
+    for name, data in content.items():
+        (tmp_path / name).write_bytes(data)
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_files_that_are_no_thermal_images_are_refused_by_name(hard_files, name):
+    said, remedy = HARD[name]
+    options = RadiometryOptions(camera="workswell") if name.endswith(("tiff", "png")) else None
+    with warnings.catch_warnings(), pytest.raises(ThermalFileError, match=said) as caught:
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        read_thermogram(hard_files / name, options)
+    message = str(caught.value)
+    assert isinstance(caught.value, SceneError)
+    assert str(hard_files / name) in message and "expected" in message and "got" in message and remedy in message
+
+
+def test_a_header_alone_allocates_nothing(tmp_path, monkeypatch):
+    def refuse(self: Image.Image) -> None:
+        raise AssertionError("pixels were decoded")
+
+    for name, content in (("a.png", bad_png(30000, 2000)), ("a.tiff", bad_tiff(30000, 2000))):
+        (tmp_path / name).write_bytes(content)
+        monkeypatch.setattr(Image.Image, "load", refuse)
+        with pytest.raises(ThermalFileError, match="30000 x 2000"):
+            read_thermogram(tmp_path / name, RadiometryOptions(camera="workswell"))
+
+
+def test_a_missing_file_and_a_folder_are_named(tmp_path):
+    for path in (tmp_path / "nowhere.tiff", tmp_path):
+        with pytest.raises(ThermalFileError, match="nothing there"):
+            read_thermogram(path)
+
+
+@pytest.mark.real_data
+def test_real_workswell_files_need_no_options(shared_data):
+    path = sorted((shared_data / "arco" / "thermal").glob("*.tiff"))[0]
+    got = read_thermogram(path)
+    counts = np.frombuffer(path.read_bytes()[392 : 392 + 655360], "<u2").reshape(512, 640)
+    np.testing.assert_allclose(got.temperature_c, counts * 0.025 - 100.0, atol=1e-5)
+    assert got.metadata.camera == "Workswell WIRIS Pro"
+
+
+@pytest.mark.real_data
+def test_real_photographs_are_refused(shared_data):
+    path = sorted((shared_data / "arco" / "visible").glob("*.jpg"))[0]
+    with pytest.raises(ThermalFileError, match="plain JPEG"):
+        read_thermogram(path)

@@ -1,0 +1,263 @@
+"""FLIR R-JPEG: what is read is what is in the file, checked by an independent computation."""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from datetime import datetime, timezone
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.data.flir_file import FlirFile, picture_bytes, smooth_counts
+from thermoxels_ns.data.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
+from thermoxels_ns.data.radiometry import RadiometryOptions, read_thermogram
+from thermoxels_ns.data.thermal_files import ThermalUnit, read_thermal_file
+from thermoxels_ns.errors import ThermalFileError
+
+REAL_SHAPES = {
+    "flir_b60_cc0.jpg": (180, 180),
+    "flir_e60_cc0.jpg": (240, 320),
+    "flir_i7_cc0.jpg": (120, 120),
+    "flir_infracam_cc0.jpg": (120, 120),
+    "flir_sc640_cc0.jpg": (240, 320),
+    "flir_t640_mit.jpg": (480, 640),
+}
+
+
+def write(folder: Path, file: FlirFile, name: str = "FLIR0001.jpg") -> Path:
+    path = folder / name
+    path.write_bytes(file.jpeg())
+    return path
+
+
+def expected_celsius(counts: np.ndarray, planck: dict[str, float], emissivity: float, reflected_k: float) -> np.ndarray:
+    """The formula for distance 0, written out once more."""
+    mirrored = planck["r1"] / (planck["r2"] * (math.exp(planck["b"] / reflected_k) - planck["f"])) - planck["o"]
+    own = (counts.astype(float) - (1 - emissivity) * mirrored) / emissivity
+    return planck["b"] / np.log(planck["r1"] / (planck["r2"] * (own + planck["o"])) + planck["f"]) - 273.15
+
+
+@pytest.mark.parametrize("storage", ["raw", "png", "swapped"])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_counts_survive_every_storage_and_byte_order(tmp_path, storage, order):
+    counts = smooth_counts()
+    flir = read_flir_jpeg(write(tmp_path, FlirFile(counts, order=order, storage=storage)))
+    np.testing.assert_array_equal(flir.counts, counts)
+    assert flir.camera.planck.b == 1400.0 and flir.camera.planck.o == -6000.0
+    assert flir.camera.conditions.emissivity == pytest.approx(0.95, abs=1e-7)
+
+
+def test_temperatures_are_those_of_the_formula(tmp_path):
+    file = FlirFile(smooth_counts())
+    file.settings |= {"distance": 0.0, "emissivity": 0.9, "reflected": 280.0}
+    got = read_thermogram(write(tmp_path, file))
+    emissivity, reflected_k = float(np.float32(0.9)), 280.0
+    np.testing.assert_allclose(
+        got.temperature_c, expected_celsius(file.counts, file.planck, emissivity, reflected_k), atol=2e-5
+    )
+    assert got.temperature_c.dtype == np.float32 and got.report.masked == 0
+
+
+def test_many_segments_are_joined_in_the_order_of_their_numbers(tmp_path):
+    file = FlirFile(smooth_counts(300, 200), segment_bytes=7000)
+    content = file.jpeg()
+    parts = re.findall(rb"\xff\xe1..FLIR\x00\x01..", content, re.DOTALL)
+    assert len(parts) > 15
+    np.testing.assert_array_equal(read_flir_jpeg(write(tmp_path, file)).counts, file.counts)
+
+
+def test_overrides_replace_the_cameras_settings(tmp_path):
+    file = FlirFile(smooth_counts())
+    path = write(tmp_path, file)
+    apparent = read_thermogram(path, RadiometryOptions(emissivity=1.0, distance_m=0.0))
+    np.testing.assert_allclose(
+        apparent.temperature_c, expected_celsius(file.counts, file.planck, 1.0, 293.15), atol=2e-5
+    )
+    as_stored, other = read_thermogram(path), read_thermogram(path, RadiometryOptions(emissivity=0.7))
+    assert other.metadata.conditions.emissivity == 0.7
+    assert other.metadata.conditions.air_c == as_stored.metadata.conditions.air_c
+    assert other.metadata.camera_conditions == as_stored.metadata.camera_conditions == as_stored.metadata.conditions
+    # Away from 20 degrees C, what is mirrored: warm pixels become warmer, cold ones colder.
+    change = other.temperature_c - as_stored.temperature_c
+    warm, cold = as_stored.temperature_c > 21.0, as_stored.temperature_c < 19.0
+    assert warm.any() and cold.any()
+    assert (change[warm] > 0).all() and (change[cold] < 0).all()
+
+
+def test_what_the_file_says_of_the_camera(tmp_path):
+    photograph = picture_bytes(np.full((20, 30, 3), 7, np.uint8))
+    file = FlirFile(smooth_counts(), photograph=photograph, alignment=(3.5, -144, -27))
+    flir = read_flir_jpeg(write(tmp_path, file))
+    assert flir.visible == photograph
+    metadata = read_thermogram(tmp_path / "FLIR0001.jpg").metadata
+    assert (metadata.format, metadata.camera, metadata.serial, metadata.lens) == (
+        "FLIR R-JPEG",
+        "FLIR T999",
+        "1234",
+        "FOL25",
+    )
+    assert metadata.taken_at == datetime(2020, 9, 13, 12, 26, 40, 250000, timezone.utc)
+    assert metadata.taken_at.utcoffset().total_seconds() == 7200
+    assert metadata.field_of_view_deg == 24.5
+    alignment = metadata.picture_in_picture
+    assert (alignment.real_to_thermal, alignment.offset_x, alignment.offset_y) == (3.5, -144, -27)
+
+
+def test_what_the_camera_does_not_say_is_none(tmp_path):
+    flir = read_flir_jpeg(write(tmp_path, FlirFile(smooth_counts(), seconds=0)))
+    assert flir.visible is None and flir.picture_in_picture is None and flir.camera.taken_at is None
+
+
+def test_humidity_in_percent_is_a_share(tmp_path):
+    share = read_flir_jpeg(write(tmp_path, FlirFile(smooth_counts(), humidity=0.4))).camera.conditions
+    percent = read_flir_jpeg(write(tmp_path, FlirFile(smooth_counts(), humidity=40.0))).camera.conditions
+    assert percent.relative_humidity == pytest.approx(share.relative_humidity, abs=1e-7)
+
+
+def test_counts_beyond_the_calibration_are_no_temperatures(tmp_path):
+    counts = smooth_counts()
+    counts[0, :3] = [11000, 11999, 16001]
+    got = read_thermogram(write(tmp_path, FlirFile(counts, raw_range=(12000, 16000))))
+    assert np.isnan(got.temperature_c[0, :3]).all() and got.report.saturated == 3 == got.report.masked
+    assert np.isfinite(got.temperature_c).sum() == counts.size - 3
+
+
+def test_training_reads_the_same_degrees_whatever_the_unit(tmp_path):
+    path = write(tmp_path, FlirFile(smooth_counts()))
+    expected = read_thermogram(path).temperature_c
+    for unit in (ThermalUnit.celsius(), ThermalUnit.bounds(0.0, 1.0), ThermalUnit.linear(0.1, 0.0)):
+        np.testing.assert_array_equal(read_thermal_file(path, unit).temperature_c, expected)
+
+
+def test_the_name_of_the_file_says_nothing(tmp_path):
+    path = write(tmp_path, FlirFile(smooth_counts()), name="thermal.tiff")
+    assert read_thermogram(path).metadata.format == "FLIR R-JPEG"
+
+
+def test_a_plain_jpeg_is_no_flir_file(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(picture_bytes() + b"\xff\xe1\0\x20FLI")
+    assert not is_flir_jpeg(tmp_path / "a.jpg")
+
+
+def test_a_file_cut_off_anywhere_is_refused_by_name(tmp_path):
+    content = FlirFile(smooth_counts(120, 90), segment_bytes=9000).jpeg()
+    path = tmp_path / "cut.jpg"
+    for share in (0.02, 0.1, 0.3, 0.5, 0.8, 0.99, 1.0):
+        path.write_bytes(content[: int(share * len(content)) - 2])  # at the end: without the end of the picture
+        with pytest.raises(ThermalFileError, match=r"cut\.jpg: expected .*(cut off|missing)"):
+            read_thermogram(path)
+
+
+def test_a_missing_segment_is_named(tmp_path):
+    content = FlirFile(smooth_counts(120, 90), segment_bytes=9000).jpeg()
+    start = content.index(b"FLIR\0\1\1") - 4
+    length = 2 + int.from_bytes(content[start + 2 : start + 4], "big")
+    (tmp_path / "a.jpg").write_bytes(content[:start] + content[start + length :])
+    with pytest.raises(ThermalFileError, match=r"a\.jpg.*missing: \[1\]"):
+        read_thermogram(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"size": (30000, 30)}, "30000 x 30"),
+        ({"size": (0, 30)}, "0 x 30"),
+        ({"size": (41, 30)}, "bytes of counts for 41 x 30"),
+        ({"size": (30, 40), "storage": "png"}, "PNG of"),
+        ({"planck": {"r1": 0.0, "b": 1400.0, "f": 1.0, "r2": 0.01, "o": -6000}}, "Planck constant R1"),
+        ({"settings": {"e": 0.0, "d": 1.0, "r": 293.0, "a": 293.0, "w": 293.0, "p": 1.0}}, "emissivity"),
+    ],
+)
+def test_records_that_cannot_be_are_refused(tmp_path, change, said):
+    with pytest.raises(ThermalFileError, match=f"FLIR0001.*{said}"):
+        read_thermogram(write(tmp_path, FlirFile(smooth_counts(), **change)))
+
+
+@pytest.mark.parametrize("lost", [0x01, 0x20])
+def test_a_file_without_counts_or_calibration_is_refused(tmp_path, lost):
+    content = FlirFile(smooth_counts()).jpeg()
+    entry = struct.pack(">HHII", lost, 1, 100, 1)
+    assert content.count(entry) == 1
+    (tmp_path / "a.jpg").write_bytes(content.replace(entry, struct.pack(">HHII", 0x7F, 1, 100, 1)))
+    with pytest.raises(ThermalFileError, match="no record with"):
+        read_thermogram(tmp_path / "a.jpg")
+
+
+def test_random_damage_never_ends_in_another_error(tmp_path):
+    content = bytearray(FlirFile(smooth_counts(), storage="swapped", alignment=(1.0, 0, 0)).jpeg())
+    rng = np.random.default_rng(5)
+    path = tmp_path / "a.jpg"
+    refused = 0
+    for _ in range(150):
+        damaged = bytearray(content)
+        for at in rng.integers(0, 1200, 4):
+            damaged[at] = int(rng.integers(256))
+        path.write_bytes(damaged)
+        try:
+            assert read_thermogram(path).temperature_c.shape == (30, 40)
+        except ThermalFileError as problem:
+            assert "a.jpg" in str(problem)
+            refused += 1
+    assert refused > 30
+
+
+def independent(content: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """Counts and degrees of an R-JPEG from its bytes: records are found by what they must hold, not by a directory."""
+    fff, at = b"", 0
+    while found := re.compile(rb"\xff\xe1(..)FLIR\x00\x01(..)", re.DOTALL).search(content, at):
+        length = int.from_bytes(found[1], "big")
+        fff += content[found.end() : found.start() + 2 + length]
+        at = found.start() + 2 + length
+        if found[2][0] == found[2][1]:
+            break
+    info = fff.index(struct.pack("<f", 0.01262)) - 0x74
+    get = lambda offset, code="f": struct.unpack_from("<" + code, fff, info + offset)[0]  # noqa: E731
+    width, height = get(2, "H"), get(4, "H")
+    png = fff.find(b"\x89PNG")
+    if png >= 0:
+        counts = cv2.imdecode(np.frombuffer(fff[png:], np.uint8), cv2.IMREAD_UNCHANGED).byteswap()
+    else:
+        heads = [m.start() for m in re.finditer(re.escape(struct.pack("<HHH", 2, width, height)), fff)]
+        (raw,) = [head for head in heads if head != info]
+        counts = np.frombuffer(fff, "<u2", width * height, raw + 32).reshape(height, width)
+    emissivity, distance, reflected_k, air_k = (get(offset) for offset in (0x20, 0x24, 0x28, 0x2C))
+    t = air_k - 273.15
+    water = math.sqrt(get(0x3C) * math.exp(1.5587 + 6.939e-2 * t - 2.7816e-4 * t**2 + 6.8455e-7 * t**3))
+    x, root = get(0x80), math.sqrt(distance)
+    tau = x * math.exp(-root * (get(0x70) + get(0x78) * water))
+    tau += (1 - x) * math.exp(-root * (get(0x74) + get(0x7C) * water))
+    r1, b, f, o, r2 = get(0x58), get(0x5C), get(0x60), get(0x308, "i"), get(0x30C)
+    black = lambda kelvin: r1 / r2 / (math.exp(b / kelvin) - f)  # noqa: E731
+    radiance = counts.astype(float) + o  # what is above the offset, so that the offset need not be taken along
+    own = (radiance - (1 - emissivity) * tau * black(reflected_k) - (1 - tau) * black(air_k)) / (emissivity * tau)
+    celsius = b / np.log(r1 / (r2 * own) + f) - 273.15
+    low, high = get(0x310, "H"), get(0x312, "H")
+    celsius[(counts < low) | (counts > high)] = np.nan
+    return counts, celsius
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("name", REAL_SHAPES)
+def test_real_cameras_agree_with_an_independent_computation(shared_data, name):
+    path = shared_data / "radiometric" / name
+    counts, celsius = independent(path.read_bytes())
+    got = read_thermogram(path)
+    assert got.temperature_c.shape == REAL_SHAPES[name] == counts.shape
+    np.testing.assert_array_equal(np.isnan(got.temperature_c), np.isnan(celsius))
+    np.testing.assert_allclose(got.temperature_c, celsius, atol=1e-4)
+    for statistic in (np.nanmin, np.nanmean, np.nanmax):
+        assert float(statistic(got.temperature_c.astype(float))) == pytest.approx(float(statistic(celsius)), abs=1e-4)
+    assert np.nanmin(celsius) > -65.0 and np.nanmax(celsius) < 130.0  # a cloudy sky, a hot contactor
+    assert np.nanpercentile(np.abs(np.diff(celsius, axis=1)), 50) < 1.0  # a wrong byte order would be noise
+
+
+@pytest.mark.real_data
+def test_real_pairs_have_their_photograph(shared_data):
+    flir = read_flir_jpeg(shared_data / "radiometric" / "flir_t640_mit.jpg")
+    assert cv2.imdecode(np.frombuffer(flir.visible, np.uint8), cv2.IMREAD_COLOR).shape == (1944, 2592, 3)
+    assert flir.picture_in_picture.real_to_thermal == pytest.approx(3.496, abs=1e-3)
+    assert flir.camera.taken_at == datetime(2020, 11, 10, 10, 39, 48, 232000, timezone.utc)

@@ -1,0 +1,211 @@
+"""The radiometric model: exact limits, round trips, and the laws that any such model obeys."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+
+from thermoxels_ns.data.planck_band import LONG_WAVE, PlanckBand
+from thermoxels_ns.data.radiometric_conditions import ConditionOverrides, Conditions
+from thermoxels_ns.data.radiometric_model import (
+    AirConstants,
+    PlanckConstants,
+    RadiometricModel,
+    corrected_temperature_c,
+)
+from thermoxels_ns.errors import ThermoxelsError
+
+E60 = PlanckConstants(r1=14985.93, r2=0.0112832, b=1398.1, f=1.0, o=-6233.0)
+I7 = PlanckConstants(r1=16327.72, r2=0.0231583, b=1424.8, f=1.35, o=-6872.0)
+SENSORS = [E60, I7, LONG_WAVE]
+TEMPERATURES_C = np.array([-30.0, -5.0, 0.0, 19.5, 20.0, 36.6, 120.0, 400.0])
+ROOM = Conditions(emissivity=0.93, reflected_c=14.0, distance_m=6.0, relative_humidity=0.6, air_c=18.0)
+
+emissivities = st.floats(0.3, 1.0)
+celsius = st.floats(-20.0, 80.0)
+distances = st.floats(0.0, 100.0)
+humidities = st.floats(0.0, 1.0)
+conditions = st.builds(
+    Conditions,
+    emissivity=emissivities,
+    reflected_c=celsius,
+    distance_m=distances,
+    relative_humidity=humidities,
+    air_c=celsius,
+    window_transmission=st.floats(0.5, 1.0),
+    window_c=celsius,
+)
+
+
+def test_a_count_becomes_the_temperature_computed_by_hand():
+    # S + O = 8000: R1 / (R2 * 8000) + F = 167.02 (14985.93 / 90.2656 + 1), and 1398.1 / ln 167.02 = 273.17 K.
+    assert E60.temperature_k(14233.0) == pytest.approx(
+        1398.1 / math.log(14985.93 / (0.0112832 * 8000.0) + 1.0), rel=1e-14
+    )
+    assert E60.temperature_k(14233.0) == pytest.approx(273.17, abs=0.02)
+
+
+def test_a_signal_below_the_offset_has_no_temperature():
+    assert np.isnan(E60.temperature_k([6233.0, 6000.0])).all()
+    assert np.isfinite(E60.temperature_k([6234.0])).all()
+
+
+@pytest.mark.parametrize("sensor", SENSORS, ids=["E60", "i7", "band"])
+def test_sensor_curves_rise_and_are_inverted(sensor):
+    kelvin = TEMPERATURES_C + 273.15
+    signal = sensor.signal(kelvin)
+    assert (np.diff(signal) > 0).all()
+    np.testing.assert_allclose(sensor.temperature_k(signal), kelvin, rtol=1e-12)
+
+
+def test_the_band_is_the_integral_of_planck():
+    def spectral(wavelength_um: float, kelvin: float) -> float:
+        h, c, k = 6.62607015e-34, 299792458.0, 1.380649e-23
+        metres = wavelength_um * 1e-6
+        return 2 * h * c**2 / metres**5 / math.expm1(h * c / (metres * k * kelvin)) * 1e-6
+
+    for kelvin in (200.0, 288.0, 300.0, 373.0, 900.0):
+        exact = quad(spectral, 8.0, 14.0, args=(kelvin,), epsrel=1e-11)[0]
+        assert PlanckBand(8.0, 14.0).signal(kelvin) == pytest.approx(exact, rel=1e-6)
+
+
+def test_a_band_signal_of_nothing_has_no_temperature():
+    assert np.isnan(LONG_WAVE.temperature_k([0.0, -1.0, 1e-30])).all()
+
+
+@pytest.mark.parametrize("sensor", SENSORS, ids=["E60", "i7", "band"])
+def test_a_black_body_close_by_shows_its_apparent_temperature(sensor):
+    near = RadiometricModel(Conditions(emissivity=1.0, distance_m=0.0), sensor)
+    np.testing.assert_allclose(near.signal(TEMPERATURES_C), sensor.signal(TEMPERATURES_C + 273.15), rtol=1e-14)
+    # Reflections, air and humidity cannot matter then.
+    other = RadiometricModel(Conditions(1.0, 77.0, 0.0, 0.9, -11.0), sensor)
+    np.testing.assert_array_equal(near.signal(TEMPERATURES_C), other.signal(TEMPERATURES_C))
+
+
+@pytest.mark.parametrize("sensor", SENSORS, ids=["E60", "i7", "band"])
+@pytest.mark.parametrize("emissivity", [0.05, 0.6, 0.95, 1.0])
+def test_in_surroundings_of_its_own_temperature_nothing_matters(sensor, emissivity):
+    """Kirchhoff: in an enclosure of one temperature every surface looks like a black body of it."""
+    oven = Conditions(emissivity, 35.0, 20.0, 0.7, 35.0, window_transmission=0.8, window_c=35.0)
+    signal = RadiometricModel(oven, sensor).signal(35.0)
+    assert signal == pytest.approx(float(sensor.signal(35.0 + 273.15)), rel=1e-12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(conditions, celsius)
+def test_there_and_back_again(given_conditions, temperature_c):
+    model = RadiometricModel(given_conditions, E60)
+    assert model.temperature_c(model.signal(temperature_c)) == pytest.approx(temperature_c, abs=1e-6)
+
+
+@settings(max_examples=60, deadline=None)
+@given(conditions, conditions, celsius)
+def test_changing_the_settings_and_changing_them_back_changes_nothing(before, after, temperature_c):
+    changed = corrected_temperature_c(temperature_c, before, after)
+    if np.isnan(changed):  # reflections alone would be brighter than what was seen
+        assert after.emissivity < 1 or after.distance_m > 0 or after.window_transmission < 1
+    else:
+        assert corrected_temperature_c(changed, after, before) == pytest.approx(temperature_c, abs=1e-5)
+
+
+@settings(max_examples=60, deadline=None)
+@given(emissivities, celsius, celsius)
+def test_a_lower_emissivity_moves_the_object_away_from_what_it_mirrors(emissivity, seen_c, reflected_c):
+    before, after = Conditions(), Conditions(emissivity=emissivity, reflected_c=reflected_c)
+    object_c = float(corrected_temperature_c(seen_c, before, after))
+    if math.isnan(object_c):
+        assert reflected_c > seen_c
+    else:
+        assert (object_c - seen_c) * (seen_c - reflected_c) >= -1e-9
+
+
+def test_offset_and_scale_of_a_sensor_do_not_change_a_correction():
+    scaled = PlanckConstants(r1=E60.r1 * 7.0, r2=E60.r2, b=E60.b, f=E60.f, o=1234.0)
+    after = Conditions(emissivity=0.8, reflected_c=5.0)
+    np.testing.assert_allclose(
+        corrected_temperature_c(TEMPERATURES_C[3:], ROOM, after, E60),
+        corrected_temperature_c(TEMPERATURES_C[3:], ROOM, after, scaled),
+        rtol=1e-10,
+    )
+
+
+def test_the_band_corrects_as_a_camera_does():
+    """Without a camera's constants the correction for a wall is right to a few hundredths of a kelvin."""
+    after = Conditions(emissivity=0.9, reflected_c=5.0)
+    seen_c = np.array([-5.0, 10.0, 20.0, 40.0])
+    by_camera = corrected_temperature_c(seen_c, Conditions(), after, E60)
+    by_band = corrected_temperature_c(seen_c, Conditions(), after)
+    assert np.abs(by_camera - seen_c).max() > 2.0
+    np.testing.assert_allclose(by_band, by_camera, atol=0.06)
+
+
+def test_air_lets_everything_through_at_no_distance_and_less_with_every_metre():
+    air = AirConstants()
+    tau = [air.transmission(d, 20.0, 0.5) for d in (0.0, 1.0, 10.0, 100.0, 1000.0)]
+    assert tau[0] == 1.0 and (np.diff(tau) < 0).all() and tau[-1] > 0.5
+    assert air.transmission(50.0, 20.0, 0.9) < air.transmission(50.0, 20.0, 0.2)
+    assert air.transmission(50.0, 35.0, 0.5) < air.transmission(50.0, 5.0, 0.5)
+    # By hand: w = 0.5 exp(1.5587 + 1.3878 - 0.111264 + 0.0054764) = 8.5532, so the rates at sqrt(10) m are
+    # 3.16228 (0.006569 - 0.002276 * 2.92458) = -0.0002759 and 3.16228 (0.01262 - 0.00667 * 2.92458) = -0.0217788.
+    expected = 1.9 * math.exp(0.0002759) - 0.9 * math.exp(0.0217788)
+    assert air.transmission(10.0, 20.0, 0.5) == pytest.approx(expected, abs=1e-5)
+
+
+def test_air_hides_an_object_behind_its_own_temperature():
+    foggy = Conditions(distance_m=2000.0, relative_humidity=1.0, air_c=25.0)
+    hot, cold = corrected_temperature_c([60.0, -10.0], foggy, Conditions())
+    assert 25.0 < hot < 60.0 and -10.0 < cold < 25.0
+
+
+@pytest.mark.parametrize(
+    ("values", "named"),
+    [
+        ({"emissivity": 0.0}, "emissivity"),
+        ({"emissivity": 1.01}, "emissivity"),
+        ({"emissivity": math.nan}, "emissivity"),
+        ({"emissivity": True}, "emissivity"),
+        ({"relative_humidity": 50.0}, "relative_humidity"),
+        ({"relative_humidity": -0.1}, "relative_humidity"),
+        ({"distance_m": -1.0}, "distance_m"),
+        ({"distance_m": math.inf}, "distance_m"),
+        ({"reflected_c": -300.0}, "reflected_c"),
+        ({"air_c": math.nan}, "air_c"),
+    ],
+)
+def test_impossible_settings_are_refused_by_name(values, named):
+    for kind in (Conditions, ConditionOverrides):
+        with pytest.raises(ThermoxelsError, match=f"{named}: expected.*--{named.replace('_', '-')}"):
+            kind(**values)
+
+
+@pytest.mark.parametrize(
+    ("values", "named"),
+    [({"emissivity": 0.9}, "reflected_c"), ({"distance_m": 3.0}, "air_c"), ({"window_transmission": 0.9}, "window_c")],
+)
+def test_a_temperature_that_is_needed_is_asked_for(values, named):
+    with pytest.raises(ThermoxelsError, match=f"{named}: expected a temperature, because"):
+        Conditions(**values)
+
+
+def test_overrides_replace_what_is_given_and_nothing_else():
+    after = ConditionOverrides(emissivity=0.8, distance_m=2.0).applied_to(ROOM)
+    assert (after.emissivity, after.distance_m) == (0.8, 2.0)
+    assert (after.reflected_c, after.air_c, after.relative_humidity) == (14.0, 18.0, 0.6)
+    assert ConditionOverrides().applied_to(ROOM) == ROOM
+
+
+def test_air_that_nothing_passes_is_refused():
+    with pytest.raises(ThermoxelsError, match="distance_m"):
+        RadiometricModel(Conditions(distance_m=1e5, relative_humidity=1.0, air_c=90.0), E60).signal(20.0)
+
+
+@pytest.mark.parametrize("name", ["r1", "r2", "b", "f", "o"])
+def test_constants_that_are_none_are_refused(name):
+    values = {"r1": 1.0, "r2": 1.0, "b": 1400.0, "f": 1.0, "o": 0.0, name: math.nan}
+    with pytest.raises(ThermoxelsError, match=f"Planck constant {name.upper()}"):
+        PlanckConstants(**values)

@@ -1,0 +1,115 @@
+"""CalculiX runs the input file as it is."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from thermoxels_ns.fem.assembly import HeatMatrices, assemble
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+from thermoxels_ns.fem.stepping import BackwardEuler
+from thermoxels_ns.mesh.abaqus_file import HeatStep, write_inp
+from thermoxels_ns.mesh.quality import facet_areas
+
+pytestmark = pytest.mark.external
+
+
+def printed_temperatures(path: Path) -> npt.NDArray[np.float64]:
+    """Temperatures that CalculiX prints after each step, shape (steps, n); nodes come in the order of their numbers."""
+    blocks = path.read_text().split("temperatures for set NALL and time")[1:]
+    tables = [np.array([line.split() for line in block.splitlines()[1:] if line.strip()], float) for block in blocks]
+    assert all(np.array_equal(table[:, 0], np.arange(1, len(table) + 1)) for table in tables)
+    return np.array([table[:, 1] for table in tables])
+
+
+def capacities(problem: HeatProblem) -> dict[str, HeatMatrices]:
+    """The ways to integrate the heat capacity of a linear tetrahedron of volume V.
+
+    "lumped" is V / 4 for each node, "consistent" V / 20 for each pair and once more for a node with itself. At one
+    point, the centre, all shape functions are 1 / 4: V / 16 for each pair, which is 5 / 4 consistent - 1 / 4 lumped.
+    """
+    lumped, consistent = (assemble(problem.mesh, problem.material, lumped=entry) for entry in (True, False))
+    one_point = HeatMatrices(
+        lumped.stiffness_w_k, 1.25 * consistent.mass_j_k - 0.25 * lumped.mass_j_k, lumped.nodal_mass_j_k
+    )
+    return {"lumped": lumped, "consistent": consistent, "one point": one_point}
+
+
+def our_steps(matrices: HeatMatrices, start_c: npt.NDArray[np.float64], time: TimeSteps) -> npt.NDArray[np.float64]:
+    """Our own time stepping and linear solver with given matrices, shape (steps, n)."""
+    stepper = BackwardEuler(matrices, time.step_seconds)
+    states = [start_c]
+    for _ in range(time.steps):
+        state, linear = stepper.advance(states[-1])
+        assert linear.converged
+        states.append(state)
+    return np.array(states[1:])
+
+
+def run_calculix(folder: Path, problem: HeatProblem, time: TimeSteps, ccx: str, run_in) -> npt.NDArray[np.float64]:
+    material = problem.material
+    step = HeatStep(
+        material.conductivity_w_mk,
+        material.density_kg_m3,
+        material.specific_heat_j_kgk,
+        steps=time.steps,
+        step_seconds=time.step_seconds,
+    )
+    write_inp(folder / "house.inp", problem.mesh, step)
+    said = run_in(folder, [ccx, "house"])
+    assert "Job finished" in said
+    assert "*WARNING" not in said and "*ERROR" not in said, said
+    return printed_temperatures(folder / "house.dat")
+
+
+def test_ten_steps_agree_with_ours(tmp_path, heat_problem, ten_steps, program, run_in):
+    """CalculiX takes backward Euler and integrates the capacity of its linear tetrahedra at one point."""
+    theirs = run_calculix(tmp_path, heat_problem, ten_steps, program("ccx", "calculix-ccx"), run_in)
+    start = heat_problem.start_c
+    assert theirs.shape == (10, len(start))
+    assert np.abs(theirs[-1] - start).max() > 0.1 * np.ptp(start)
+    difference = {
+        name: float(np.abs(our_steps(matrices, start, ten_steps) - theirs).max() / np.ptp(start))
+        for name, matrices in capacities(heat_problem).items()
+    }
+    assert difference["one point"] < 1e-5, f"differences relative to the span of temperatures: {difference}"
+    # The test sees which is which.
+    assert min(difference["lumped"], difference["consistent"]) > 1e-3, difference
+
+
+def test_steps_of_an_awkward_length_are_all_taken(tmp_path, heat_problem, program, run_in):
+    time = TimeSteps(7, 1000.1 / 3.0)
+    theirs = run_calculix(tmp_path, heat_problem, time, program("ccx", "calculix-ccx"), run_in)
+    ours = our_steps(capacities(heat_problem)["one point"], heat_problem.start_c, time)
+    assert theirs.shape == ours.shape
+    assert np.abs(theirs - ours).max() < 1e-5 * np.ptp(heat_problem.start_c)
+
+
+def test_surfaces_and_sets_are_the_patches(tmp_path, heat_problem, program, run_in):
+    """A heat flux on a surface brings what its area asks for; a node set holds its nodes at a temperature."""
+    mesh, seconds, flux_w_m2, held_c = heat_problem.mesh, 1e4, 50.0, -40.0
+    write_inp(tmp_path / "plain.inp", mesh, HeatStep(1.7, 2200.0, 880.0, steps=1, step_seconds=seconds))
+    plain, ccx = (tmp_path / "plain.inp").read_text(), program("ccx", "calculix-ccx")
+    surfaces = re.findall(r"\*SURFACE, NAME=([^,]+),", plain)
+    used = np.unique(mesh.boundary.patch)
+    assert len(surfaces) == len(used) > 1
+    nodal_mass = assemble(mesh, Material("concrete", 1.7, 2200.0, 880.0)).nodal_mass_j_k
+    areas = facet_areas(mesh.points_m, mesh.facets)
+    for name, patch in zip(surfaces, used):
+        facets = mesh.boundary.patch == patch
+        load = f"*DFLUX\n{name}, S, {flux_w_m2}\n*NODE PRINT"
+        (tmp_path / "flux.inp").write_text(plain.replace("*NODE PRINT", load))
+        run_in(tmp_path, [ccx, "flux"])
+        gained_j = nodal_mass @ (printed_temperatures(tmp_path / "flux.dat")[-1] - mesh.temperature_c)
+        assert gained_j == pytest.approx(flux_w_m2 * seconds * areas[facets].sum(), rel=1e-3), name
+
+        hold = f"*BOUNDARY\n{name}, 11, 11, {held_c}\n*NODE PRINT"
+        (tmp_path / "held.inp").write_text(plain.replace("*NODE PRINT", hold))
+        run_in(tmp_path, [ccx, "held"])
+        held = np.flatnonzero(printed_temperatures(tmp_path / "held.dat")[-1] == held_c)
+        assert np.array_equal(held, np.unique(mesh.facets[facets])), name

@@ -1,0 +1,101 @@
+"""FEniCSx reads the mesh with its tags and solves the same problem."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.mesh.quality import facet_areas
+from thermoxels_ns.mesh.tet_shapes import signed_volumes
+from thermoxels_ns.mesh.xdmf_file import write_xdmf
+
+pytestmark = pytest.mark.external
+
+SCRIPT = """
+import sys
+import numpy as np
+import dolfinx, ufl
+from dolfinx import fem
+from dolfinx.io import XDMFFile
+from mpi4py import MPI
+from petsc4py import PETSc
+
+folder, (conductivity, capacity, steps, seconds) = sys.argv[1], map(float, sys.argv[2:6])
+num_regions, num_patches = map(int, sys.argv[6:])
+with XDMFFile(MPI.COMM_WORLD, folder + "/house.xdmf", "r") as file:
+    mesh = file.read_mesh(name="mesh")
+    regions = file.read_meshtags(mesh, name="mesh")
+    mesh.topology.create_connectivity(2, 3)
+    patches = file.read_meshtags(mesh, name="facets")
+
+one = fem.Constant(mesh, PETSc.ScalarType(1.0))
+dx = ufl.Measure("dx", domain=mesh, subdomain_data=regions)
+ds = ufl.Measure("ds", domain=mesh, subdomain_data=patches)
+volumes = [fem.assemble_scalar(fem.form(one * dx(number))) for number in range(num_regions)]
+areas = [fem.assemble_scalar(fem.form(one * ds(number))) for number in range(num_patches)]
+
+space = fem.FunctionSpace(mesh, ("CG", 1))
+points = space.tabulate_dof_coordinates()
+u, v = ufl.TrialFunction(space), ufl.TestFunction(space)
+before = fem.Function(space)
+given = np.load(folder + "/start.npz")
+flat = lambda lists: np.ravel(getattr(lists, "array", lists))
+node = np.empty(len(points), dtype=int)
+node[flat(space.dofmap.list)] = np.asarray(mesh.geometry.input_global_indices)[flat(mesh.geometry.dofmap)]
+assert np.abs(given["points_m"][node] - points).max() < 1e-12
+before.x.array[:] = given["temperature_c"][node]
+
+form = capacity / seconds * u * v * ufl.dx + conductivity * ufl.dot(ufl.grad(u), ufl.grad(v)) * ufl.dx
+matrix = fem.petsc.assemble_matrix(fem.form(form))
+matrix.assemble()
+right = fem.form(capacity / seconds * before * v * ufl.dx)
+solver = PETSc.KSP().create(mesh.comm)
+solver.setOperators(matrix)
+solver.setType("preonly")
+solver.getPC().setType("lu")
+after = fem.Function(space)
+states = []
+for _ in range(int(steps)):
+    load = fem.petsc.assemble_vector(right)
+    solver.solve(load, after.vector)
+    before.x.array[:] = after.x.array
+    state = np.empty(len(points))
+    state[node] = after.x.array
+    states.append(state)
+np.savez(folder + "/result.npz", temperature_c=states, volumes_m3=volumes, areas_m2=areas)
+"""
+
+
+@pytest.fixture(scope="module")
+def fenicsx(tmp_path_factory, heat_problem, ten_steps, fenicsx_python, run_in):
+    """What FEniCSx reads and computes from our file."""
+    folder = tmp_path_factory.mktemp("fenicsx")
+    write_xdmf(folder / "house.xdmf", heat_problem.mesh)
+    np.savez(folder / "start.npz", points_m=heat_problem.mesh.points_m, temperature_c=heat_problem.start_c)
+    (folder / "solve.py").write_text(SCRIPT)
+    material, mesh = heat_problem.material, heat_problem.mesh
+    values = [material.conductivity_w_mk, material.heat_capacity_j_m3k, ten_steps.steps, ten_steps.step_seconds]
+    values += [len(mesh.region_names), len(mesh.boundary.patch_names)]
+    run_in(folder, [fenicsx_python, "solve.py", str(folder), *map(repr, values)])
+    with np.load(folder / "result.npz") as result:
+        return dict(result)
+
+
+def test_regions_and_patches_keep_their_size(fenicsx, solid_mesh):
+    volumes = signed_volumes(solid_mesh.points_m, solid_mesh.tets)
+    areas = facet_areas(solid_mesh.points_m, solid_mesh.facets)
+    region, patch = solid_mesh.region, solid_mesh.boundary.patch
+    expected_m3 = np.bincount(region, volumes, minlength=len(solid_mesh.region_names))
+    expected_m2 = np.bincount(patch, areas, minlength=len(solid_mesh.boundary.patch_names))
+    assert fenicsx["volumes_m3"] == pytest.approx(expected_m3, rel=1e-12)
+    assert fenicsx["areas_m2"] == pytest.approx(expected_m2, rel=1e-12)
+
+
+def test_ten_steps_agree_with_ours(fenicsx, heat_problem, ten_steps):
+    """Both: backward Euler, linear tetrahedra, consistent mass."""
+    theirs = fenicsx["temperature_c"]
+    ours = solve_heat(heat_problem, ten_steps, lumped=False).temperature_c
+    span = np.ptp(heat_problem.start_c)
+    assert np.abs(ours[-1] - ours[0]).max() > 0.1 * span
+    assert np.abs(theirs - ours[1:]).max() < 1e-9 * span

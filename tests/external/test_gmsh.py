@@ -1,0 +1,79 @@
+"""Gmsh reads the mesh with its physical groups."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+
+from thermoxels_ns.mesh.gmsh_file import write_msh
+
+pytestmark = pytest.mark.external
+
+
+def groups(file: meshio.Mesh) -> dict[tuple[str, int], int]:
+    """Number of elements by name and dimension of their physical group."""
+    numbers = {(number, dimension): name for name, (number, dimension) in file.field_data.items()}
+    found: dict[tuple[str, int], int] = {}
+    for block, tags in zip(file.cells, file.cell_data["gmsh:physical"]):
+        for tag, count in zip(*np.unique(tags, return_counts=True)):
+            key = (numbers[tag, block.dim], block.dim)
+            found[key] = found.get(key, 0) + int(count)
+    return found
+
+
+def element_tags(path: Path) -> list[int]:
+    """Tags of all elements of a text file, in its order."""
+    text = path.read_text(encoding="utf-8")
+    lines = text[text.index("$Elements") : text.index("$EndElements")].splitlines()[2:]
+    tags: list[int] = []
+    while lines:
+        count = int(lines[0].split()[3])
+        tags += [int(line.split()[0]) for line in lines[1 : count + 1]]
+        lines = lines[count + 1 :]
+    return tags
+
+
+def test_gmsh_finds_no_fault(tmp_path, solid_mesh, program, run_in):
+    write_msh(tmp_path / "house.msh", solid_mesh)
+    said = run_in(tmp_path, [program("gmsh", "gmsh"), "-check", "house.msh"])
+    assert f"{len(solid_mesh.points_m)} nodes" in said
+    assert f"{len(solid_mesh.tets) + len(solid_mesh.facets)} elements" in said
+    assert "Done checking mesh coherence" in said
+    assert "Error" not in said and "Warning" not in said, said
+
+
+def test_gmsh_keeps_the_physical_groups_when_it_saves_what_it_read(tmp_path, solid_mesh, program, run_in):
+    write_msh(tmp_path / "house.msh", solid_mesh)
+    text = ["-format", "msh41", "-setnumber", "Mesh.Binary", "0"]
+    run_in(tmp_path, [program("gmsh", "gmsh"), "house.msh", "-save", *text, "-o", "again.msh"])
+    again = meshio.read(tmp_path / "again.msh")
+    boundary = solid_mesh.boundary
+    expected = {
+        (name, 2): int(np.count_nonzero(boundary.patch == number)) for number, name in enumerate(boundary.patch_names)
+    } | {
+        (name, 3): int(np.count_nonzero(solid_mesh.region == number))
+        for number, name in enumerate(solid_mesh.region_names)
+    }
+    assert groups(again) == {key: count for key, count in expected.items() if count}
+    # Nodes come sorted by where they lie, tetrahedra by region: compare their corners.
+    tets = np.concatenate([block.data for block in again.cells if block.dim == 3])
+    order = np.argsort(solid_mesh.region, kind="stable")
+    ours = solid_mesh.points_m[solid_mesh.tets[order]]
+    assert np.abs(again.points[tets] - ours).max() < 1e-14
+    expected = [*(np.argsort(boundary.patch, kind="stable") + len(tets)), *order]
+    assert np.array_equal(element_tags(tmp_path / "again.msh"), np.array(expected) + 1)
+
+
+def test_gmsh_shows_the_temperatures(tmp_path, solid_mesh, program, run_in):
+    write_msh(tmp_path / "house.msh", solid_mesh)
+    (tmp_path / "show.geo").write_text(
+        'Merge "house.msh";\nPlugin(MinMax).View = 0;\nPlugin(MinMax).Run;\n'
+        'Save View[0] "view.pos";\nSave View[1] "min.txt";\nSave View[2] "max.txt";\n'
+    )
+    run_in(tmp_path, [program("gmsh", "gmsh"), "-parse_and_exit", "show.geo"])
+    assert (tmp_path / "view.pos").read_text().startswith('View "temperature_c"')
+    extremes = [float((tmp_path / f"{name}.txt").read_text().split()[-1]) for name in ("min", "max")]
+    assert extremes == pytest.approx([solid_mesh.temperature_c.min(), solid_mesh.temperature_c.max()], abs=1e-6)

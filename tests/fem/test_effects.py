@@ -1,0 +1,254 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.heat_meshes import SIDES, box_mesh
+from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.effects import (
+    STEFAN_BOLTZMANN_W_M2K4,
+    AbsorbedSolar,
+    Convection,
+    Effect,
+    FixedTemperature,
+    GroundContact,
+    HeatFlux,
+    InternalHeat,
+    Radiation,
+)
+from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.solution import HeatSolution
+from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+AREA_X, VOLUME = 0.3 * 0.2, 0.4 * 0.3 * 0.2
+
+
+@pytest.fixture
+def box() -> TetMesh:
+    """0.4 x 0.3 x 0.2 m at 20 degrees."""
+    return box_mesh(np.linspace(0, 0.4, 5), np.linspace(0, 0.3, 4), np.linspace(0, 0.2, 3))
+
+
+def at_once(mesh: TetMesh, material, *effects: Effect) -> HeatSolution:
+    """A step so short that no temperature changes: heat flows are those of the start."""
+    return solve_heat(HeatProblem(mesh, material, effects=effects), TimeSteps(1, 1e-6))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Convection("x0", 5.0, 20.0), r"patches: expected a tuple of names, got 'x0'.*patches=\(\"name\",\)"),
+        (lambda: Convection((), 5.0, 20.0), "patches: expected a tuple of names"),
+        (lambda: InternalHeat((" ",), 5.0), "regions: expected a tuple of names"),
+        (lambda: Convection(("*",), -1.0, 20.0), r"coefficient_w_m2k: expected a finite number of at least 0 \[W/\(m2 K"),
+        (lambda: Convection(("*",), 5.0, -274.0), r"air_c: expected a finite number of at least -273\.15"),
+        (lambda: FixedTemperature(("*",), float("nan")), "temperature_c: expected a finite number"),
+        (lambda: HeatFlux(("*",), float("inf")), "flux_w_m2: expected a finite number"),
+        (lambda: HeatFlux(("*",), True), "flux_w_m2: expected a finite number .*got True"),
+        (lambda: HeatFlux(("*",), "5"), "flux_w_m2: expected a number or a Varying, got '5'"),
+        (lambda: HeatFlux(("*",), np.ones(3)), "flux_w_m2: expected a number or a Varying"),
+        (lambda: HeatFlux(("*",), lambda places, time_s: 1.0), r"Wrap a function: Varying\(function"),
+        (lambda: Radiation(("*",), 1.01, 20.0), "emissivity: expected .*at least 0 and at most 1"),
+        (lambda: Radiation(("*",), 0.9, 20.0, -1.0), "stefan_boltzmann_w_m2k4: expected a finite number above 0"),
+        (lambda: AbsorbedSolar(("*",), 0.5, -1.0), "irradiance_w_m2: expected a finite number of at least 0"),
+        (lambda: GroundContact(("*",), 0.0, 10.0), "resistance_m2k_w: expected a finite number above 0"),
+        (lambda: GroundContact(("*",), Varying(lambda places, time_s: 1.0), 10.0), "expected a number, got Varying"),
+    ],
+)
+def test_impossible_values_are_refused(make, message) -> None:
+    with pytest.raises(HeatError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("effect", "watts"),
+    [
+        (HeatFlux(("x0",), 100.0), 100.0 * AREA_X),
+        (HeatFlux(("x0",), -100.0), -100.0 * AREA_X),
+        (Convection(("x0",), 8.0, 30.0), 8.0 * 10.0 * AREA_X),
+        (Convection(("x0",), 8.0, 5.0), -8.0 * 15.0 * AREA_X),
+        (Radiation(("x0",), 0.9, 40.0), 0.9 * STEFAN_BOLTZMANN_W_M2K4 * (313.15**4 - 293.15**4) * AREA_X),
+        (Radiation(("x0",), 0.9, -40.0), 0.9 * STEFAN_BOLTZMANN_W_M2K4 * (233.15**4 - 293.15**4) * AREA_X),
+        (Radiation(("x0",), 1.0, -273.15, 5.67e-8), -5.67e-8 * 293.15**4 * AREA_X),
+        (AbsorbedSolar(("x0",), 0.6, 800.0), 0.6 * 800.0 * AREA_X),
+        (GroundContact(("x0",), 2.5, 10.0), (10.0 - 20.0) / 2.5 * AREA_X),
+        (InternalHeat(("solid",), 50.0), 50.0 * VOLUME),
+        (InternalHeat(("*",), -50.0), -50.0 * VOLUME),
+    ],
+    ids=lambda value: value.label if isinstance(value, Effect) else "",
+)
+@pytest.mark.parametrize("lumped_boundary", [True, False])
+def test_positive_is_into_the_body(box, concrete, effect, watts, lumped_boundary) -> None:
+    """The sign and the size of each effect, at the temperatures of the start."""
+    problem = HeatProblem(box, concrete, effects=(effect,))
+    solution = solve_heat(problem, TimeSteps(1, 1e-6), lumped_boundary=lumped_boundary)
+    assert solution.effects[0].heat_w[0] == pytest.approx(watts, rel=1e-6)
+    assert solution.heat_w[0] == pytest.approx(watts, rel=1e-6)
+    longer = solve_heat(problem, TimeSteps(1, 60.0), lumped_boundary=lumped_boundary)
+    mean_change = (longer.temperature_c[1] - 20.0).mean()
+    assert np.sign(mean_change) == np.sign(watts)
+
+
+def test_a_fixed_temperature_draws_the_body_to_it(box, concrete) -> None:
+    for fixed_c in (5.0, 40.0):
+        solution = solve_heat(HeatProblem(box, concrete, effects=(FixedTemperature(("x0",), fixed_c),)), TimeSteps(3, 600))
+        at = np.isclose(box.points_m[:, 0], 0.0)
+        np.testing.assert_array_equal(solution.temperature_c[:, at], fixed_c)
+        assert np.all(np.sign(solution.effects[0].heat_w) == np.sign(fixed_c - 20.0))
+        assert np.all(np.sign(np.diff(solution.temperature_c[:, ~at].mean(axis=1))) == np.sign(fixed_c - 20.0))
+
+
+def test_a_given_flux_makes_its_own_gradient(box, concrete) -> None:
+    """k dT/dx = q across the box once it is steady: 100 W/m2 in at x0, out at x1."""
+    from thermoxels_ns.fem.steady import solve_steady
+
+    effects = (HeatFlux(("x0",), 100.0), FixedTemperature(("x1",), 0.0))
+    solution = solve_steady(HeatProblem(box, concrete, effects=effects))
+    np.testing.assert_allclose(solution.temperature_c, 100.0 / 1.7 * (0.4 - box.points_m[:, 0]), atol=1e-9)
+
+
+def test_effects_on_one_patch_add_up(box, concrete) -> None:
+    effects = (Convection(("x0",), 8.0, 30.0), Radiation(("x0",), 0.9, 0.0), AbsorbedSolar(("x0",), 0.5, 300.0))
+    together = at_once(box, concrete, *effects)
+    alone = [at_once(box, concrete, effect).heat_w[0] for effect in effects]
+    assert together.heat_w[0] == pytest.approx(sum(alone), rel=1e-6)
+    assert [heat.heat_w[0] for heat in together.effects] == pytest.approx(alone, rel=1e-6)
+
+
+def test_heat_per_patch(box, concrete) -> None:
+    """A pattern takes several patches, each with its own sum; the true area of a triangle counts."""
+    heat = at_once(box, concrete, HeatFlux(("x?", "z1"), 100.0)).effects[0]
+    assert heat.group_names == ("x0", "x1", "z1")
+    np.testing.assert_allclose(heat.group_heat_w[0], 100.0 * np.array([AREA_X, AREA_X, 0.12]), rtol=1e-12)
+    assert heat.heat_w[0] == pytest.approx(heat.group_heat_w.sum(), rel=1e-12)
+    tags = box.boundary
+    assert tags is not None
+    factor = np.where(tags.patch == SIDES.index("x1"), 0.5, 1.0)
+    scaled = at_once(
+        replace(box, boundary=replace(tags, area_factor=factor)),
+        concrete,
+        HeatFlux(("x?",), 100.0),
+        Convection(("x1",), 8.0, 30.0),
+        Radiation(("x1",), 0.9, 40.0),
+    )
+    np.testing.assert_allclose(scaled.effects[0].group_heat_w[0], 100.0 * np.array([AREA_X, 0.5 * AREA_X]), rtol=1e-12)
+    plain = at_once(box, concrete, Convection(("x1",), 8.0, 30.0), Radiation(("x1",), 0.9, 40.0))
+    for half, whole in zip(scaled.effects[1:], plain.effects):
+        assert half.heat_w[0] == pytest.approx(0.5 * whole.heat_w[0], rel=1e-6)
+
+
+def test_a_star_is_the_whole_boundary_also_without_tags(box, concrete) -> None:
+    area = 2 * (0.4 * 0.3 + 0.4 * 0.2 + 0.3 * 0.2)
+    for mesh in (box, replace(box, boundary=None)):
+        assert at_once(mesh, concrete, HeatFlux(("*",), 10.0)).heat_w[0] == pytest.approx(10.0 * area, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("effect", "message"),
+    [
+        (HeatFlux(("roof",), 1.0), r"patches: expected names or patterns of x0, x1, y0, y1, z0, z1, other, got 'roof'"),
+        (HeatFlux(("x0", "X?"), 1.0), "got 'X\\?'"),
+        (InternalHeat(("oven",), 1.0), "regions: expected names or patterns of solid, got 'oven'"),
+    ],
+)
+def test_unknown_names_are_refused(box, concrete, effect, message) -> None:
+    with pytest.raises(HeatError, match=message):
+        at_once(box, concrete, effect)
+
+
+def test_functions_are_told_where_they_are(box, concrete) -> None:
+    """Centroids and normals of triangles, the direction up, and the time at the end of the step."""
+    seen = {}
+
+    def flux(places, time_s):
+        seen[time_s] = places
+        return 100.0 * places.normals @ np.array(places.up)
+
+    problem = HeatProblem(box, concrete, effects=(HeatFlux(("z0", "z1"), Varying(flux)),), up=(0, 0, 2.0))
+    heat = solve_heat(problem, TimeSteps(2, 30.0)).effects[0]
+    np.testing.assert_allclose(heat.group_heat_w, np.outer([1, 1], [-12.0, 12.0]), rtol=1e-12)
+    assert set(seen) == {30.0, 60.0}
+    places = seen[30.0]
+    assert np.isin(np.round(places.points_m[:, 2], 12), [0.0, 0.2]).all() and len(places) == len(places.normals) == 48
+
+
+def test_sources_are_asked_at_tetrahedra(box, concrete) -> None:
+    source = Varying(lambda places, time_s: 100.0 * places.points_m[:, 0], in_time=False)
+    assert at_once(box, concrete, InternalHeat(("*",), source)).heat_w[0] == pytest.approx(100.0 * 0.2 * VOLUME, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda places, time_s: np.ones(3), r"function of coefficient_w_m2k: expected one number, or one per place"),
+        (lambda places, time_s: -1.0, "coefficient_w_m2k: expected a finite number of at least 0"),
+        (lambda places, time_s: np.full(len(places), np.nan), "coefficient_w_m2k: .*got .* that are not"),
+        (lambda places, time_s: "warm", "coefficient_w_m2k: expected a finite number"),
+    ],
+)
+def test_functions_must_return_usable_numbers(box, concrete, function, message) -> None:
+    with pytest.raises(HeatError, match=message):
+        at_once(box, concrete, Convection(("x0",), Varying(function), 20.0))
+
+
+def test_two_temperatures_at_one_node_are_refused(box, concrete) -> None:
+    clash = (FixedTemperature(("x0",), 5.0), FixedTemperature(("y0",), 7.0))
+    with pytest.raises(HeatError, match=r"5 C from fixed temperature on x0 and 7 C from .* on y0 at node 0 and 2 more"):
+        at_once(box, concrete, *clash)
+    same = (FixedTemperature(("x0",), 5.0), FixedTemperature(("y0",), 5.0))
+    heat = at_once(box, concrete, *same)
+    one = at_once(box, concrete, FixedTemperature(("x0", "y0"), 5.0))
+    np.testing.assert_array_equal(heat.temperature_c, one.temperature_c)
+    assert sum(part.heat_w[0] for part in heat.effects) == pytest.approx(one.effects[0].heat_w[0], rel=1e-9)
+    np.testing.assert_allclose([part.heat_w[0] for part in heat.effects], one.effects[0].group_heat_w[0], rtol=1e-9)
+
+
+def test_effects_of_one_kind_and_place_are_told_apart(box, concrete) -> None:
+    heat = at_once(box, concrete, HeatFlux(("x0",), 1.0), HeatFlux(("x0",), 2.0), HeatFlux(("x1",), 3.0)).effects
+    assert [part.effect for part in heat] == ["heat flux on x0", "heat flux on x0 (2)", "heat flux on x1"]
+    np.testing.assert_allclose([part.heat_w[0] for part in heat], AREA_X * np.array([1.0, 2.0, 3.0]), rtol=1e-9)
+
+
+EVERY = {
+    "fixed": FixedTemperature(("x0",), 10.0),
+    "robin": Convection(("x1",), 8.0, 5.0),
+    "flux": HeatFlux(("y0",), 20.0),
+    "radiation": Radiation(("y1",), 0.9, -10.0),
+    "source": InternalHeat(("*",), 100.0),
+}
+"""One effect for each kind of term."""
+
+
+def test_conduction_alone_assembles_nothing_else(box, concrete) -> None:
+    assert at_once(box, concrete).assembled.counts == {"stiffness": 1, "mass": 1}
+
+
+@pytest.mark.parametrize("absent", EVERY)
+def test_an_absent_effect_assembles_nothing(box, concrete, absent) -> None:
+    effects = tuple(effect for kind, effect in EVERY.items() if kind != absent)
+    bill = at_once(box, concrete, *effects).assembled
+    assert set(bill.counts) == {"stiffness", "mass", *EVERY} - {absent}
+    assert set(bill.seconds) == set(bill.counts)
+
+
+def test_an_effect_on_a_patch_without_triangles_assembles_nothing(box, concrete) -> None:
+    solution = at_once(box, concrete, Convection(("other",), 8.0, 5.0), Radiation(("other",), 0.9, 5.0))
+    assert solution.assembled.counts == {"stiffness": 1, "mass": 1}
+    assert [heat.heat_w.tolist() for heat in solution.effects] == [[0.0], [0.0]]
+
+
+def test_constant_effects_are_assembled_once(box, concrete) -> None:
+    effects = tuple(effect for kind, effect in EVERY.items() if kind != "radiation")
+    bill = solve_heat(HeatProblem(box, concrete, effects=effects), TimeSteps(20, 60.0)).assembled
+    assert bill.counts == {"stiffness": 1, "mass": 1, "fixed": 1, "robin": 2, "flux": 1, "source": 1}
+
+
+def test_what_is_left_out_is_said(box, concrete) -> None:
+    assert len(at_once(box, concrete).skipped_effects) == 3
+    assert at_once(box, concrete, *EVERY.values(), AbsorbedSolar(("x0",), 0.5, 1.0)).skipped_effects == ()
+    (sentence,) = at_once(box, concrete, EVERY["robin"], AbsorbedSolar(("x0",), 0.5, 1.0)).skipped_effects
+    assert sentence.startswith("Thermal radiation: not modelled")

@@ -1,0 +1,311 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import datetime, timezone
+
+import numpy as np
+import pytest
+
+from tests.scene_bodies import room, wall
+from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.effects import (
+    AbsorbedSolar,
+    Convection,
+    Effect,
+    FixedTemperature,
+    GroundContact,
+    HeatFlux,
+    InternalHeat,
+    Radiation,
+)
+from thermoxels_ns.fem.heat_scene import HeatScene
+from thermoxels_ns.fem.material_table import material
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.scene_fields import Ground, InsideAir, OutsideAir, Sky, Sun, Surface
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.sky import swinbank_sky_c
+from thermoxels_ns.fem.steady import solve_steady
+
+ALL = {"*": material("concrete")}
+INSIDE = InsideAir(20.0, "iso-6946-combined")
+OUTSIDE = OutsideAir(0.0, "iso-6946-combined")
+CONVECTION = OutsideAir(0.0, "iso-6946-convection", wind_m_s=4.0)
+SUN = Sun(towards=(0.0, 0.0, 1.0), direct_w_m2=800.0)
+
+
+def effects(mesh=None, adiabatic=("*",), **named) -> tuple[Effect, ...]:
+    return HeatScene(ALL, adiabatic=adiabatic, **named).effects(mesh or room())
+
+
+def test_what_is_not_named_is_not_built() -> None:
+    assert effects() == ()
+    (alone,) = effects(outside_air=OUTSIDE)
+    assert alone == Convection(("exterior-*",), 25.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("air", "h"),
+    [
+        (OutsideAir(0.0, coefficient_w_m2k=17.0), 17.0),
+        (OutsideAir(0.0, "iso-6946-combined"), 25.0),
+        (CONVECTION, 20.0),
+        (OutsideAir(0.0, "iso-6946-separate", wind_m_s=4.0, emissivity=0.9), 20.0 + 0.9 * 4.6223),
+        (OutsideAir(0.0, "thermoxels-original", wind_m_s=5.56), 18.6 * 5.56**0.605),
+    ],
+)
+def test_outside_air(air: OutsideAir, h: float) -> None:
+    (effect,) = effects(outside_air=air)
+    assert isinstance(effect, Convection)
+    assert effect.coefficient_w_m2k == pytest.approx(h, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("air", "ceiling_wall_floor"),
+    [
+        (InsideAir(20.0, coefficient_w_m2k=8.0), [8.0, 8.0, 8.0]),
+        (InsideAir(20.0, "iso-6946-combined"), [1 / 0.10, 1 / 0.13, 1 / 0.17]),
+        (InsideAir(20.0, "iso-6946-convection"), [5.0, 2.5, 0.7]),
+        (InsideAir(20.0, "iso-6946-convection", heat_flow="out-of-body"), [0.7, 2.5, 5.0]),
+        (InsideAir(10.0, "iso-6946-separate", emissivity=1.0), [10.149, 7.649, 5.849]),
+    ],
+)
+def test_inside_air_by_orientation(air: InsideAir, ceiling_wall_floor: list[float]) -> None:
+    mesh = room()
+    (effect,) = effects(mesh, inside_air=air)
+    selection = Selection(mesh)
+    for patch, h in zip(("interior-down", "interior-side", "interior-up"), ceiling_wall_floor):
+        places = selection.facet_places(selection.facets((patch,)))
+        assert len(places) == 8 * (4 if patch == "interior-side" else 1)
+        np.testing.assert_allclose(effect.bounded("coefficient_w_m2k").at(places, 0.0), h, rtol=1e-4)
+
+
+def test_surfaces_radiate_to_sky_and_ground_the_later_entry_holds() -> None:
+    mesh = room()
+    surfaces = (Surface(emissivity=0.9), Surface(emissivity=0.2, patches=("exterior-up",)))
+    found = effects(mesh, outside_air=CONVECTION, sky=Sky(below_air_k=6.0), ground=Ground(5.0), surfaces=surfaces)
+    radiation = {effect.patches: effect for effect in found if isinstance(effect, Radiation)}
+    assert set(radiation) == {("exterior-up",), ("exterior-side", "exterior-down")}
+    assert radiation[("exterior-up",)].emissivity == 0.2
+    selection = Selection(mesh)
+    places = selection.facet_places(selection.facets(("exterior-side", "exterior-down")))
+    around = radiation[("exterior-side", "exterior-down")].bounded("surroundings_c").at(places, 0.0) + 273.15
+    expected = np.where(places.normals[:, 2] < -0.5, 278.15**4, 0.5 * (278.15**4 + 267.15**4)) ** 0.25
+    np.testing.assert_allclose(around, expected)
+
+
+@pytest.mark.parametrize(
+    ("sky", "sky_c"),
+    [(Sky(temperature_c=-30.0), -30.0), (Sky(below_air_k=6.0), -6.0), (Sky(model="swinbank"), swinbank_sky_c(0.0))],
+)
+def test_sky_alone(sky: Sky, sky_c: float) -> None:
+    _, radiation = effects(outside_air=CONVECTION, sky=sky, surfaces=(Surface(emissivity=0.9),))
+    assert isinstance(radiation, Radiation)
+    assert radiation.surroundings_c == sky_c
+
+
+def test_sunlight_on_surfaces_that_absorb() -> None:
+    mesh = room()
+    surfaces = (Surface(absorptivity=0.6), Surface(absorptivity=0.3, patches=("*-side",)))
+    found = effects(mesh, sun=SUN, ground=Ground(reflectance=0.5), surfaces=surfaces)
+    assert [(effect.absorptivity, effect.patches) for effect in found if isinstance(effect, AbsorbedSolar)] == [
+        (0.6, ("exterior-up", "exterior-down")),
+        # Sunlight stays outside although the surface inside has an absorptivity.
+        (0.3, ("exterior-side",)),
+    ]
+    selection = Selection(mesh)
+    for effect, parts in zip(found, ({"exterior-up": 800.0, "exterior-down": 400.0}, {"exterior-side": 200.0})):
+        for patch, expected in parts.items():
+            places = selection.facet_places(selection.facets((patch,)))
+            np.testing.assert_allclose(effect.bounded("irradiance_w_m2").at(places, 0.0), expected)
+
+
+def test_the_sun_of_a_date_moves_and_that_of_a_direction_does_not() -> None:
+    start = datetime(2025, 6, 21, 4, tzinfo=timezone.utc)
+    moving = Sun(start=start, latitude_deg=47.0, longitude_deg=8.0, north=(0.0, 1.0, 0.0), clear_sky="meinel")
+    for sun, moves in ((moving, True), (SUN, False)):
+        (effect,) = effects(sun=sun, surfaces=(Surface(absorptivity=0.6),))
+        assert effect.bounded("irradiance_w_m2").in_time is moves
+
+
+def test_entries_are_effects_as_they_stand() -> None:
+    entries = {
+        "fixed_temperature": FixedTemperature(("cut",), 18.0),
+        "heat_flux": HeatFlux(("interior-up",), 10.0),
+        "convection": Convection(("interior-side",), 7.7, 15.0),
+        "radiation": Radiation(("interior-*",), 0.9, 20.0),
+        "absorbed_solar": AbsorbedSolar(("exterior-*",), 0.6, 1000.0),
+        "ground_contact": GroundContact(("exterior-down",), 1.5, 10.0),
+        "internal_heat": InternalHeat(("solid",), 5.0),
+    }
+    for key, effect in entries.items():
+        assert effects(**{key: (effect,)}) == (effect,)
+    assert effects(**{key: (effect,) for key, effect in entries.items()}) == tuple(entries.values())
+
+
+def test_every_patch_is_spoken_of() -> None:
+    with pytest.raises(HeatError, match="nothing on interior-up") as caught:
+        effects(adiabatic=("cut",), outside_air=OUTSIDE)
+    assert "interior-up (3.33 % of the surface)" in str(caught.value)
+    assert "write adiabatic: [cut, interior-up, interior-side, interior-down]." in str(caught.value)
+    assert len(effects(adiabatic=("cut",), outside_air=OUTSIDE, inside_air=INSIDE)) == 2
+    # A patch without surface may be forgotten.
+    assert len(effects(wall(), adiabatic=("cut",), outside_air=OUTSIDE, inside_air=INSIDE)) == 2
+    with pytest.raises(HeatError, match=r"nothing on cut \(13.3 % of the surface\)"):
+        effects(adiabatic=(), outside_air=OUTSIDE, inside_air=INSIDE)
+
+
+@pytest.mark.parametrize(
+    ("named", "message"),
+    [
+        (
+            {"outside_air": OUTSIDE, "sky": Sky(temperature_c=0.0), "surfaces": (Surface(emissivity=0.9),)},
+            "outside_air: expected radiation once on each patch, got sky and ground on exterior-down, .*"
+            "Set coefficient: iso-6946-convection in outside_air",
+        ),
+        (
+            {"inside_air": INSIDE, "radiation": (Radiation(("interior-up",), 0.9, 20.0),)},
+            "inside_air: expected radiation once on each patch, got radiation entry 1 on interior-up as well",
+        ),
+        (
+            {
+                "sky": Sky(temperature_c=0.0),
+                "ground": Ground(5.0),
+                "surfaces": (Surface(emissivity=0.9),),
+                "radiation": (Radiation(("exterior-side",), 0.5, 20.0),),
+            },
+            "sky and ground: expected radiation once on each patch, got radiation entry 1 on exterior-side",
+        ),
+        (
+            {"outside_air": OUTSIDE, "ground_contact": (GroundContact(("exterior-down",), 1.5, 10.0),)},
+            "outside_air: expected contact with air or ground once .*, got ground_contact entry 1 on exterior-down",
+        ),
+        (
+            {"convection": (Convection(("interior-*",), 8.0, 20.0), Convection(("*-up",), 8.0, 20.0))},
+            "convection entry 1: .*got convection entry 2 on interior-up as well. Give each of the two its own patches",
+        ),
+        (
+            {
+                "ground_contact": (GroundContact(("exterior-down",), 1.5, 10.0),),
+                "sun": SUN,
+                "surfaces": (Surface(absorptivity=0.6),),
+            },
+            "ground_contact entry 1: expected contact with the ground alone",
+        ),
+    ],
+)
+def test_nothing_is_counted_twice(named, message: str) -> None:
+    with pytest.raises(HeatError, match=message):
+        effects(**named)
+
+
+def test_the_sky_may_share_a_view_with_other_surroundings() -> None:
+    """A wall sees the sky by its tilt, and a house across the street by a view factor that the user gives."""
+    found = effects(
+        sky=Sky(temperature_c=0.0),
+        surfaces=(Surface(emissivity=0.9),),
+        radiation=(Radiation(("exterior-side",), 0.2, 10.0),),
+    )
+    assert len(found) == 2
+
+
+@pytest.mark.parametrize(
+    ("named", "message"),
+    [
+        ({"sky": Sky(model="swinbank"), "surfaces": (Surface(emissivity=0.9),)}, "sky: expected outside_air beside it"),
+        (
+            {"sky": Sky(temperature_c=0.0)},
+            "surfaces: emissivity: expected a number beside sky.* got none. Add surfaces",
+        ),
+        ({"ground": Ground(5.0)}, "surfaces: emissivity"),
+        ({"sun": SUN}, "surfaces: absorptivity: expected a number beside sun"),
+        ({"surfaces": (Surface(emissivity=0.9),)}, "surfaces: emissivity: expected sky, or ground with surface_c"),
+        ({"surfaces": (Surface(absorptivity=0.9),)}, "surfaces: absorptivity: expected sun beside it"),
+        ({"ground": Ground(reflectance=0.2)}, "ground: reflectance: expected a sun"),
+        ({"initial_c": -300.0}, "initial_c: expected a finite number of at least -273.15"),
+        ({"up": (0.0, 0.0, 0.0)}, "up: expected a direction"),
+    ],
+)
+def test_what_belongs_together(named, message: str) -> None:
+    with pytest.raises(HeatError, match=message):
+        HeatScene(ALL, **named)
+
+
+def test_patches_that_the_mesh_does_not_have_are_named() -> None:
+    with pytest.raises(HeatError, match=r"outside_air: patches: .*exterior-up, .*cut, got 'roof'. Correct the name"):
+        effects(outside_air=replace(OUTSIDE, patches=("roof",)))
+    with pytest.raises(HeatError, match="surfaces entry 2: patches"):
+        effects(sun=SUN, surfaces=(Surface(absorptivity=0.6), Surface(absorptivity=0.6, patches=("roof",))))
+    untagged = replace(room(), boundary=None)
+    with pytest.raises(HeatError, match="names or patterns of the patches boundary, got 'exterior-"):
+        effects(untagged, outside_air=OUTSIDE)
+    assert len(effects(untagged, outside_air=replace(OUTSIDE, patches=("*",)))) == 1
+
+
+def test_patch_names_with_the_letters_of_patterns() -> None:
+    mesh = room()
+    assert mesh.boundary is not None
+    names = tuple(f"{name} [*]" for name in mesh.boundary.patch_names)
+    mesh = replace(mesh, boundary=replace(mesh.boundary, patch_names=names))
+    (effect,) = effects(
+        mesh, sun=replace(SUN, patches=("*",)), surfaces=(Surface(absorptivity=0.6, patches=("*-up*",)),)
+    )
+    assert isinstance(effect, AbsorbedSolar)
+    selection = Selection(mesh)
+    assert set(selection.facet_patch[selection.facets(effect.patches)]) == {0, 3}
+
+
+def test_materials_by_region() -> None:
+    mesh = room()
+    two = replace(mesh, region=(mesh.points_m[mesh.tets].mean(axis=1)[:, 2] < 1.0).astype(np.int64))
+    brick, concrete = material("brick"), material("concrete")
+    scene = HeatScene({"*": brick, "slab": concrete}, adiabatic=("*",))
+    assert scene.problem(two).material == {"solid": brick, "slab": concrete}
+    # One material stays one, which is cheaper to assemble.
+    assert scene.problem(mesh).material == brick
+    assert HeatScene({"solid": brick, "slab": brick}, adiabatic=("*",)).problem(two).material == brick
+    with pytest.raises(HeatError, match="materials: expected names or patterns of the regions solid, slab, got 'roof'"):
+        HeatScene({"roof": brick}, adiabatic=("*",)).problem(mesh)
+    with pytest.raises(HeatError, match=r"materials: .* got none for solid. Add them, or '\*' for all others"):
+        HeatScene({"slab": brick}, adiabatic=("*",)).problem(two)
+    with pytest.raises(HeatError, match="materials: expected at least one, got none"):
+        HeatScene({})
+
+
+def test_start_and_up() -> None:
+    mesh = room()
+    scene = HeatScene(ALL, adiabatic=("*",))
+    np.testing.assert_array_equal(scene.problem(mesh).start_c, mesh.temperature_c)
+    np.testing.assert_array_equal(replace(scene, initial_c=3).problem(mesh).start_c, np.full(len(mesh.points_m), 3.0))
+    assert scene.problem(mesh).up == (0.0, 0.0, 1.0)
+    assert scene.problem(mesh, up=(0.0, 2.0, 0.0)).up == (0.0, 1.0, 0.0)
+    assert replace(scene, up=(3.0, 0.0, 0.0)).problem(mesh, up=(0.0, 1.0, 0.0)).up == (1.0, 0.0, 0.0)
+
+
+def test_heat_loss_of_a_wall_is_that_of_the_standard() -> None:
+    """q = 20 / (Rsi + d / k + Rse) through 0.2 m, exactly, because the temperature is linear in between."""
+    made_of = Material("block", 0.5, 1200.0, 1000.0)
+    scene = HeatScene({"*": made_of}, inside_air=INSIDE, outside_air=OUTSIDE)
+    assert scene.steady
+    mesh = wall()
+    solution = solve_steady(scene.problem(mesh))
+    u_value = 1.0 / (0.13 + 0.2 / 0.5 + 0.04)
+    room_side = mesh.points_m[:, 1] < 1e-9
+    np.testing.assert_allclose(solution.temperature_c[room_side], 20.0 - 20.0 * u_value * 0.13, rtol=1e-9)
+    np.testing.assert_allclose(
+        solution.temperature_c[mesh.points_m[:, 1] > 0.2 - 1e-9], 20.0 * u_value * 0.04, rtol=1e-9
+    )
+
+
+def test_quantities_that_do_not_change_are_asked_once() -> None:
+    found = effects(
+        inside_air=InsideAir(20.0, "iso-6946-convection"),
+        outside_air=CONVECTION,
+        sky=Sky(model="swinbank"),
+        ground=Ground(5.0, 0.2),
+        sun=SUN,
+        surfaces=(Surface(emissivity=0.9, absorptivity=0.6),),
+    )
+    varying = [value for effect in found for value in vars(effect).values() if isinstance(value, Varying)]
+    assert len(varying) == 3
+    assert not any(value.in_time for value in varying)

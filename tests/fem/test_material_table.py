@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+import pytest
+
+from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.material_table import load_material_table, material
+from thermoxels_ns.fem.presets import load_heat_preset
+
+ROW = "{conductivity_w_mk: 1.0, density_kg_m3: 2000, specific_heat_j_kgk: 900, source: a book}"
+
+
+def test_every_row_is_a_material_with_a_source() -> None:
+    table = load_material_table()
+    assert len(table) >= 25
+    assert list(table) == [material(name).name for name in table]
+    assert all(len(row.source) > 10 for row in table.values())
+    # Solids of a building: from foam to copper, from foam to lead, from lead to wood.
+    assert all(0.02 < row.conductivity_w_mk < 400 for row in table.values())
+    assert all(10 < row.density_kg_m3 < 12000 for row in table.values())
+    assert all(100 < row.specific_heat_j_kgk < 2000 for row in table.values())
+
+
+def test_concrete_means_the_same_everywhere() -> None:
+    assert material("concrete") == load_heat_preset("concrete").material
+
+
+@pytest.mark.parametrize(
+    ("name", "figures"),
+    [
+        ("concrete-2400", (2.0, 2400.0, 1000.0)),
+        ("reinforced-concrete-1-percent", (2.3, 2300.0, 1000.0)),
+        ("aluminium", (160.0, 2800.0, 880.0)),
+        ("glass", (1.0, 2500.0, 750.0)),
+        ("softwood", (0.13, 500.0, 1600.0)),
+        ("mineral-wool", (0.035, 20.0, 1030.0)),
+    ],
+)
+def test_published_rows(name: str, figures: tuple[float, float, float]) -> None:
+    found = material(name)
+    assert (found.conductivity_w_mk, found.density_kg_m3, found.specific_heat_j_kgk) == figures
+
+
+def test_an_unknown_material_lists_the_known_and_suggests_one() -> None:
+    with pytest.raises(
+        HeatError, match=r"^material: expected one of concrete, .*, got 'concret'. Did you mean concrete"
+    ):
+        material("concret")
+    with pytest.raises(HeatError, match="or give the three figures themselves"):
+        material("unobtainium")
+
+
+def test_a_table_of_ones_own(tmp_path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"adobe: {ROW}\n")
+    assert material("adobe", load_material_table(path)).density_kg_m3 == 2000.0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", r"^mine\.yaml: expected key: value lines, got nothing"),
+        ("- adobe\n", r"^mine\.yaml: expected key: value lines, got \['adobe'\]"),
+        ("adobe: [1\n", r"^mine\.yaml: expected a yaml file, got"),
+        (f"adobe: {ROW}\nadobe: {ROW}\n", "the key adobe twice"),
+        (f"7: {ROW}\n", r"^mine\.yaml: expected keys that are text, got 7\. Put it in quotes"),
+        (f"adobe: {ROW.replace('source: a book', 'source: 7')}\n", r"adobe: source: expected a text, got 7"),
+        (f"adobe: {ROW.replace('a book', ' ')}\n", r"^mine\.yaml: adobe: source: expected a text, got nothing"),
+        (f"adobe: {ROW.replace('a book', '  '.join(chr(34) * 2))}\n", r"^mine\.yaml: adobe: source: expected a text"),
+        (
+            f"adobe: {ROW.replace('2000', '-1')}\n",
+            r"^mine\.yaml: adobe: density_kg_m3: expected a finite number above 0",
+        ),
+        (f"adobe: {ROW.replace('2000', '2e3')}\n", r"density_kg_m3: expected a number, got '2e3'. Write 2000, without"),
+        (
+            f"adobe: {ROW.replace('density_kg_m3', 'density_g_cm3')}\n",
+            r"got density_g_cm3. Did you mean density_kg_m3\?",
+        ),
+        (f"adobe: {ROW.replace(', source: a book', '')}\n", r"^mine\.yaml: adobe: expected the key source, got cond"),
+    ],
+)
+def test_wrong_tables_are_refused(tmp_path, text: str, message: str) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(HeatError, match=message):
+        load_material_table(path)
+
+
+def test_a_missing_table_is_named(tmp_path) -> None:
+    with pytest.raises(HeatError, match=r"none\.yaml: expected a yaml file, got No such file"):
+        load_material_table(tmp_path / "none.yaml")

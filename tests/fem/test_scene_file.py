@@ -1,0 +1,254 @@
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from tests.scene_bodies import room
+from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.effects import (
+    AbsorbedSolar,
+    Convection,
+    FixedTemperature,
+    GroundContact,
+    HeatFlux,
+    InternalHeat,
+    Radiation,
+)
+from thermoxels_ns.fem.heat_scene import HeatScene
+from thermoxels_ns.fem.material_table import material
+from thermoxels_ns.fem.presets import load_heat_preset, presets_folder
+from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.scene_file import heat_scene_names, load_heat_scene
+from thermoxels_ns.fem.schemes import BACKWARD_EULER
+from thermoxels_ns.fem.stepping import solve_heat
+
+SMALL = 'materials: {"*": concrete}\nsteady: true\n'
+
+
+def scene(tmp_path: Path, text: str) -> HeatScene:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text, encoding="utf-8")
+    return load_heat_scene(path)
+
+
+def test_scenes_of_the_package() -> None:
+    assert heat_scene_names() == ["all-effects", "original", "winter-night"]
+
+
+@pytest.mark.parametrize("name", ["all-effects", "original", "winter-night"])
+def test_each_builds_a_problem_by_name_and_by_path(name: str) -> None:
+    mesh, found = room(), load_heat_scene(name)
+    problem = found.problem(mesh)
+    assert problem.effects and problem.material == material("concrete")
+    assert found.description
+    np.testing.assert_array_equal(problem.start_c, mesh.temperature_c)
+    again = load_heat_scene(str(presets_folder() / f"scene-{name}.yaml"))
+    assert again == found
+
+
+def test_the_original_s_transient_case() -> None:
+    found = load_heat_scene("original")
+    assert found.time == TimeSteps(10, 60.0)
+    inside, outside, radiation, solar = found.effects(room())
+    assert inside == Convection(("interior-*",), 8.0, 30.0)
+    assert isinstance(outside, Convection)
+    assert (outside.patches, outside.air_c) == (("exterior-*",), 10.0)
+    assert outside.coefficient_w_m2k == pytest.approx(18.6 * 5.56**0.605)
+    assert radiation == Radiation(("exterior-*",), 0.85, 10.0, 5.67e-8)
+    assert solar == AbsorbedSolar(("exterior-*",), 0.6, 1000.0)
+    assert found.problem(room()).material == load_heat_preset("concrete").material
+
+
+def test_the_original_s_case_runs() -> None:
+    """Sunlit concrete at 15 C warms outside although the air is colder: 600 W/m2 against 53 W/(m2 K) times 5 K."""
+    found, mesh = load_heat_scene("original"), room()
+    assert isinstance(found.time, TimeSteps)
+    solution = solve_heat(found.problem(mesh), TimeSteps(2, 60.0), scheme=BACKWARD_EULER)
+    corner = int(np.argmax(mesh.points_m @ [1.0, 1.0, 1.0]))
+    assert solution.converged
+    assert 15.0 < solution.temperature_c[1][corner] < solution.temperature_c[2][corner] < 25.0
+
+
+def test_winter_night() -> None:
+    found = load_heat_scene("winter-night")
+    assert found.steady
+    inside, outside = found.effects(room())
+    assert isinstance(inside, Convection) and isinstance(inside.coefficient_w_m2k, Varying)
+    assert outside == Convection(("exterior-*",), 25.0, 0.0)
+
+
+def test_all_effects() -> None:
+    found = load_heat_scene("all-effects")
+    assert found.time == AdaptiveSteps(86400.0, 0.05, 24)
+    kinds = {type(effect) for effect in found.effects(room())}
+    assert kinds == {
+        Convection,
+        Radiation,
+        AbsorbedSolar,
+        GroundContact,
+        HeatFlux,
+        InternalHeat,
+        FixedTemperature,
+    }
+    # It shows every key but one, and that one in a comment.
+    written = yaml.safe_load((presets_folder() / "scene-all-effects.yaml").read_text(encoding="utf-8"))
+    keys = {field.name for field in dataclasses.fields(HeatScene)} - {"initial_c"} | {"initial"}
+    assert keys - set(written) == {"convection"}
+
+
+def test_a_small_scene_has_the_defaults(tmp_path) -> None:
+    assert scene(tmp_path, SMALL) == HeatScene({"*": material("concrete")})
+
+
+def test_what_a_file_may_say(tmp_path) -> None:
+    found = scene(
+        tmp_path,
+        """
+materials:
+  "*": brick
+  slab: {conductivity_w_mk: 2.3, density_kg_m3: 2300, specific_heat_j_kgk: 1000}
+initial: {temperature_c: 12}
+time: {duration_s: 600}
+convection:
+  - {patches: [interior-up, stairs], coefficient_w_m2k: 7.7, air_c: 15}
+sun: {towards: [0, -1, 1], direct_w_m2: 700, diffuse_w_m2: 80}
+surfaces: [{absorptivity: 0.5}]
+adiabatic: []
+""",
+    )
+    assert found.materials["slab"].name == "slab"
+    assert found.materials["slab"].heat_capacity_j_m3k == 2.3e6
+    assert found.initial_c == 12.0
+    assert found.time == AdaptiveSteps(600.0)
+    assert found.convection[0].where == ("interior-up", "stairs")
+    assert found.sun is not None and found.sun.towards == (0.0, -1.0, 1.0)
+    assert found.adiabatic == ()
+
+
+AIR = SMALL + "outside_air: {air_c: 0, coefficient: iso-6946-combined}\n"
+SUNNY = (
+    SMALL + "surfaces: [{absorptivity: 0.5}]\n"
+    "sun: {start: 2025-06-21T12:00:00+02:00, latitude_deg: 47, longitude_deg: 8, north: [0, 1, 0], clear_sky: meinel}\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("steady: true\n", "mine.yaml: expected the key materials, got steady. Add materials"),
+        (
+            SMALL.replace("steady: true", "description: x"),
+            "mine.yaml: expected either steady: true or time, got neither",
+        ),
+        (SMALL + "time: {steps: 1, step_seconds: 1}\n", "either steady: true or time, got both"),
+        (SMALL.replace("true", "maybe"), "mine.yaml: steady: expected true or false, got 'maybe'"),
+        (SMALL.replace("concrete", "cheese"), "mine.yaml: materials: material: expected one of .*, got 'cheese'"),
+        (SMALL.replace("concrete", "7"), r"mine.yaml: materials: \*: expected key: value lines, got 7"),
+        (
+            SMALL.replace('{"*": concrete}', "concrete"),
+            "mine.yaml: materials: expected key: value lines, got 'concrete'",
+        ),
+        (
+            SMALL.replace("concrete", "{conductivity_w_mk: 1, density_kg_m3: 1}"),
+            r"mine.yaml: materials: \*: expected the key specific_heat_j_kgk",
+        ),
+        (
+            SMALL.replace("concrete", "{conductivity_w_mk: 0, density_kg_m3: 1, specific_heat_j_kgk: 1}"),
+            r"mine.yaml: materials: conductivity_w_mk: expected a finite number above 0, got 0",
+        ),
+        (SMALL + "initial: warm\n", "mine.yaml: initial: expected photographs, or a mapping .*, got 'warm'"),
+        (SMALL + "initial: {temperature_k: 300}\n", "initial: .* got temperature_k. Did you mean temperature_c"),
+        (SMALL + "initial: {temperature_c: -300}\n", "mine.yaml: initial_c: expected .* at least -273.15"),
+        (SMALL + "weather: nice\n", "mine.yaml: expected keys out of materials, .*, got weather. Correct or remove"),
+        (SMALL + "outside: {air_c: 0}\n", r"got outside. Did you mean outside_air\?"),
+        (SMALL + "steady: true\n", "mine.yaml: expected a yaml file, got .*the key steady twice"),
+        (AIR.replace("air_c", "air_k"), r"mine.yaml: outside_air: .* got air_k. Did you mean air_c\?"),
+        (AIR.replace("air_c: 0", "air_c: 0, wind_km_h: 20"), r"got wind_km_h. Did you mean wind_m_s\?"),
+        (AIR.replace("air_c: 0,", ""), "mine.yaml: outside_air: expected the key air_c, got coefficient. Add air_c"),
+        (AIR.replace("air_c: 0", "air_c: 0 C"), "outside_air: air_c: expected a number, got '0 C'. Write it without"),
+        (AIR.replace("air_c: 0", "air_c: 1e1"), "outside_air: air_c: expected a number, got '1e1'. Write 10, without"),
+        (AIR.replace("air_c: 0", "air_c: 2e-30"), r"Write 2\.0e-30, without quotes"),
+        (AIR.replace("air_c: 0", "air_c: nan"), "outside_air: air_c: expected a number, got 'nan'. Write it without"),
+        (AIR.replace("air_c: 0", "air_c: .nan"), "outside_air: air_c: expected a finite number"),
+        (AIR.replace("air_c: 0", "air_c: true"), "outside_air: air_c: expected a number, got True"),
+        (AIR.replace("air_c: 0", "air_c:"), "outside_air: air_c: expected a number, got nothing"),
+        (AIR.replace("iso-6946-combined", "windy"), "outside_air: coefficient: expected one of iso-6946-combined"),
+        (AIR.replace("iso-6946-combined", "[]"), r"outside_air: coefficient: expected one of .*, got \[\]"),
+        (AIR.replace("combined", "convection"), "mine.yaml: outside_air: wind_m_s: expected a number, because"),
+        (AIR.replace("air_c: 0", "air_c: 0, patches: roof"), r"patches: expected a list of names in square brackets"),
+        (
+            AIR.replace("air_c: 0", "air_c: 0, patches: [1]"),
+            "patches entry 1: expected a text, got 1. Put it in quotes",
+        ),
+        (AIR.replace("air_c: 0", "air_c: 0, patches: []"), r"outside_air: patches: expected a list of names"),
+        (SMALL + "outside_air:\n", "mine.yaml: outside_air: expected key: value lines, got nothing"),
+        (SMALL + "heat_flux: {patches: [cut]}\n", "mine.yaml: heat_flux: expected a list of entries, each with a dash"),
+        (
+            SMALL + "heat_flux: [{patches: [cut], flux_w_m2: 1}, {patches: [cut]}]\n",
+            "mine.yaml: heat_flux entry 2: expected the key flux_w_m2, got patches",
+        ),
+        (
+            SMALL + "ground_contact: [{patches: [cut], ground_c: 9, resistance_m2k_w: 0}]\n",
+            r"mine.yaml: ground_contact entry 1: resistance_m2k_w: expected a finite number above 0 \[m2 K/W\], got 0",
+        ),
+        (SMALL + "up: [0, 1]\n", r"mine.yaml: up: expected 3 numbers in square brackets, got \[0, 1\]"),
+        (SMALL + "up: [0, 0, one]\n", "mine.yaml: up: expected a number, got 'one'"),
+        (SMALL + "up: [0, 0, 0]\n", "mine.yaml: up: expected a direction"),
+        (
+            SUNNY.replace("+02:00", ""),
+            r"sun: start: expected a date and time with a time zone, got 2025-06-21T12:00:00",
+        ),
+        (SUNNY.replace("T12:00:00+02:00", ""), "sun: start: expected a date and a time, got 2025-06-21. Write"),
+        (SUNNY.replace("2025-06-21", "2025-13-21"), "mine.yaml: expected a yaml file with dates that exist, got month"),
+        (SUNNY.replace("2025-06-21T12:00:00+02:00", "noon"), "sun: start: expected a date and a time, got 'noon'"),
+        (SUNNY.replace("longitude_deg: 8", "longitude_deg: 200"), "sun: longitude_deg: .* at most 180"),
+        (SUNNY.replace(", north: [0, 1, 0]", ""), "sun: start: expected north beside it"),
+        (SMALL + "surfaces: [{absorptivity: 0.5}]\n", "mine.yaml: surfaces: absorptivity: expected sun beside it"),
+        (
+            SMALL.replace("steady: true", "time: {steps: 1}"),
+            "mine.yaml: time: expected the key step_seconds, got steps. Add step_seconds",
+        ),
+        (SMALL.replace("steady: true", "time: {tolerance_k: 1}"), "mine.yaml: time: expected the key duration_s"),
+        (
+            SMALL.replace("steady: true", "time: {steps: 1, duration_s: 9}"),
+            "mine.yaml: time: expected keys out of steps, step_seconds, got duration_s",
+        ),
+        (SMALL.replace("steady: true", "time: {hours: 1}"), "mine.yaml: time: expected keys out of .* got hours"),
+        (SMALL.replace("steady: true", "time: {steps: 1.5, step_seconds: 1}"), "time: steps: expected a whole number"),
+        (
+            SMALL.replace("steady: true", "time: {steps: 0, step_seconds: 1}"),
+            "mine.yaml: time: steps: expected a whole",
+        ),
+        (
+            SMALL.replace("steady: true", "time: {duration_s: 0}"),
+            "mine.yaml: time: duration_s: expected a finite number",
+        ),
+        (SMALL + "description: 7\n", "mine.yaml: description: expected a text, got 7"),
+        ("", "mine.yaml: expected key: value lines, got nothing"),
+        ("a: [\n", "mine.yaml: expected a yaml file"),
+    ],
+)
+def test_wrong_files_are_refused(tmp_path, text: str, message: str) -> None:
+    with pytest.raises(HeatError, match=message):
+        scene(tmp_path, text)
+
+
+def test_these_files_are_wrong_only_where_they_were_changed(tmp_path) -> None:
+    assert scene(tmp_path, AIR).outside_air is not None
+    assert scene(tmp_path, SUNNY).sun is not None
+
+
+def test_unknown_names_and_paths(tmp_path) -> None:
+    with pytest.raises(HeatError, match="heat scene: expected one of all-effects, original, winter-night, or the path"):
+        load_heat_scene("summer")
+    with pytest.raises(HeatError, match=r"summer\.yaml: expected a yaml file, got No such file"):
+        load_heat_scene(tmp_path / "summer.yaml")
+    binary = tmp_path / "binary.yaml"
+    binary.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(HeatError, match=r"^binary\.yaml: expected a yaml file"):
+        load_heat_scene(binary)

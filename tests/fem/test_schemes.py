@@ -1,0 +1,280 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.sparse.linalg import spsolve
+
+from tests.heat_meshes import box_mesh
+from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.assembly import assemble
+from thermoxels_ns.fem.effects import (
+    AbsorbedSolar,
+    Convection,
+    FixedTemperature,
+    HeatFlux,
+    InternalHeat,
+    Radiation,
+)
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Scheme, theta_scheme
+from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
+SCHEMES = (BACKWARD_EULER, theta_scheme(0.7), CRANK_NICOLSON, SDIRK2)
+H = 0.05
+STEP_S = H**2 / CONCRETE.diffusivity_m2_s
+"""Step after which heat has spread over one element, h^2 / alpha."""
+
+EVERY = (
+    FixedTemperature(("x0",), Varying(lambda places, time_s: 10.0 + places.points_m[:, 1] + 5.0 * np.sin(1e-3 * time_s))),
+    Convection(("x1", "y0"), Varying(lambda places, time_s: 5.0 + 3.0 * np.cos(1e-3 * time_s)), 30.0),
+    Convection(("z0",), 8.0, Varying(lambda places, time_s: 5.0 * np.sin(time_s / 600.0))),
+    Radiation(("z1", "y1"), 0.9, -40.0),
+    AbsorbedSolar(("z1",), 0.6, 700.0),
+    HeatFlux(("y1",), -30.0),
+    InternalHeat(("*",), Varying(lambda places, time_s: 300.0 * places.points_m[:, 0] + np.cos(1e-3 * time_s))),
+)
+"""All kinds of terms, many of them changing in time."""
+
+
+def bar(parts: int = 8, temperature_c=20.0) -> TetMesh:
+    return box_mesh(np.arange(parts + 1) * H, [0, H, 2 * H], [0, H, 2 * H], temperature_c=temperature_c)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES, ids=lambda scheme: scheme.name)
+def test_coefficients_meet_their_order_conditions(scheme: Scheme) -> None:
+    """Sums of the table that make a scheme of its order, row sums, stiff accuracy."""
+    a, c, b = np.array(scheme.weights), np.array(scheme.nodes), np.array(scheme.ends)
+    np.testing.assert_allclose(a.sum(axis=1), c, atol=1e-15)
+    assert b.sum() == pytest.approx(1.0, abs=1e-15) and c[-1] == 1.0
+    assert (abs(b @ c - 0.5) < 1e-15) == (scheme.order >= 2)
+    # At a very long step a decaying mode is left with this share of itself.
+    implicit = np.diag(a) > 0
+    infinite = 0.0 if implicit.all() else (a[-1, 0] - 0.0) / a[-1, -1]
+    assert infinite <= 1.0
+    if scheme.estimate is not None:
+        weights, start = np.array(scheme.estimate[1:]), scheme.estimate[0]
+        assert start + weights.sum() == pytest.approx(1.0, abs=1e-14)
+        assert weights @ c == pytest.approx(0.5, abs=1e-14)
+        assert weights @ a @ c == pytest.approx(1.0 / 6.0, abs=1e-14)
+
+
+@pytest.mark.parametrize("theta", [0.49, 1.01, float("nan")])
+def test_theta_out_of_range_is_refused(theta) -> None:
+    with pytest.raises(HeatError, match=r"theta: expected a number from 0\.5 to 1"):
+        theta_scheme(theta)
+    assert theta_scheme(1.0) is BACKWARD_EULER
+
+
+@pytest.mark.parametrize("scheme", SCHEMES, ids=lambda scheme: scheme.name)
+@pytest.mark.parametrize("lumped", [True, False])
+@pytest.mark.parametrize("lumped_boundary", [True, False])
+@pytest.mark.parametrize("fourier", [1e-3, 1.0, 1e3])
+def test_heat_is_conserved_by_every_scheme(scheme, lumped, lumped_boundary, fourier) -> None:
+    """Stored = in - out + sources to 1e-9, over every single step, with everything that can flow."""
+    mesh = bar(6, lambda p: 20.0 + 30.0 * np.sin(40.0 * p @ [1.0, 2.0, 3.0]))
+    problem, time = HeatProblem(mesh, CONCRETE, effects=EVERY), TimeSteps(4, fourier * STEP_S)
+    solution = solve_heat(problem, time, scheme=scheme, lumped=lumped, lumped_boundary=lumped_boundary)
+    supplied = sum(heat.heat_w for heat in solution.effects)
+    exchanged = sum(np.abs(heat.heat_w) for heat in solution.effects)
+    np.testing.assert_array_less(np.abs(solution.heat_w - supplied), 1e-9 * exchanged)
+    assert solution.energy_residual < 1e-9 and solution.energy_residual_of_spread < 1e-9
+    assert np.abs(solution.heat_w).max() > 1e-3
+    volume = 2200.0 * 880.0 * 4 * H * H * 6 * H
+    stored = np.diff(solution.heat_content_j)
+    mass = assemble(mesh, CONCRETE).nodal_mass_j_k
+    assert mass.sum() == pytest.approx(volume, rel=1e-12)
+    np.testing.assert_allclose(stored, np.diff(solution.temperature_c @ mass), rtol=1e-6)
+
+
+@pytest.mark.parametrize("theta", [1.0, 0.7, 0.5])
+def test_theta_steps_are_the_textbook_s(theta) -> None:
+    """(M + dt theta A) T1 = (M - dt (1 - theta) A) T0 + dt b, solved directly beside it."""
+    mesh = bar(6, lambda p: 20.0 + 30.0 * np.sin(40.0 * p[:, 0]))
+    air = Convection(("x1",), 9.0, 5.0)
+    problem = HeatProblem(mesh, CONCRETE, effects=(air,))
+    dt = 0.8 * STEP_S
+    solution = solve_heat(problem, TimeSteps(3, dt), scheme=theta_scheme(theta), lumped=False)
+    from thermoxels_ns.fem.system import HeatSystem
+
+    system = HeatSystem(problem, lumped=False)
+    a = system.matrix(0.0, np.inf)
+    b = 5.0 * (a @ np.ones(system.num_nodes))
+    mass = assemble(mesh, CONCRETE, lumped=False).mass_j_k
+    state = mesh.temperature_c
+    for computed in solution.temperature_c[1:]:
+        state = spsolve((mass + dt * theta * a).tocsc(), (mass - dt * (1 - theta) * a) @ state + dt * b)
+        np.testing.assert_allclose(computed, state, atol=1e-9)
+
+
+def test_fixed_surfaces_follow_their_function() -> None:
+    mesh = bar()
+    at = mesh.points_m[:, 0] == 0.0
+    warming = FixedTemperature(("x0",), Varying(lambda places, time_s: 30.0 + 0.1 * time_s))
+    for scheme in SCHEMES:
+        solution = solve_heat(HeatProblem(mesh, CONCRETE, effects=(warming,)), TimeSteps(3, 60.0), scheme=scheme)
+        expected = np.repeat(30.0 + 0.1 * solution.times_s[:, None], at.sum(), axis=1)
+        np.testing.assert_allclose(solution.temperature_c[:, at], expected, rtol=1e-14)
+        assert solution.energy_residual < 1e-12
+
+
+def jump(fourier: float, scheme: Scheme | None, **options) -> np.ndarray:
+    """A bar at 0 degrees whose end jumps to 1: temperatures of ten steps."""
+    problem = HeatProblem(bar(20, 0.0), CONCRETE, effects=(FixedTemperature(("x0",), 1.0),))
+    return solve_heat(problem, TimeSteps(10, fourier * STEP_S), scheme=scheme, **options).temperature_c
+
+
+@pytest.mark.parametrize("fourier", [1e-3, 1e-1, 1.0, 10.0, 100.0, 1e6])
+def test_the_default_never_overshoots(fourier) -> None:
+    states = jump(fourier, None)
+    assert states.min() >= -1e-12 and states.max() <= 1.0 + 1e-12
+
+
+def test_what_overshoots_instead() -> None:
+    """Why the defaults are what they are: after the jump others leave the range from 0 to 1."""
+    overshoot = {scheme.name: jump(100.0, scheme).max() - 1.0 for scheme in (CRANK_NICOLSON, SDIRK2)}
+    assert overshoot["Crank-Nicolson"] > 0.25, overshoot
+    assert 0.001 < overshoot["SDIRK2"] < 0.03, overshoot
+    assert jump(0.01, None, lumped=False).min() < -0.03
+
+
+@pytest.mark.parametrize("strength", [1e-6, 5.0, 1e6])
+@pytest.mark.parametrize("fourier", [1e-3, 1.0, 1e6])
+def test_surroundings_bound_the_temperature(strength, fourier) -> None:
+    """From next to insulated to strongly cooled, with radiation: nothing leaves the range of start and surroundings."""
+    mesh = bar(6, lambda p: np.random.default_rng(1).choice([-30.0, 20.0, 90.0], len(p)))
+    effects = (Convection(("x0", "y0"), strength, 120.0), Radiation(("x1", "y1"), 0.9, -60.0))
+    states = solve_heat(HeatProblem(mesh, CONCRETE, effects=effects), TimeSteps(5, fourier * STEP_S)).temperature_c
+    assert states.min() >= -60.0 - 1e-9 and states.max() <= 120.0 + 1e-9
+    assert np.isfinite(states).all()
+
+
+def test_a_body_radiates_from_1000_k_to_3_k() -> None:
+    """A thin plate in the dark: d T / dt = -2 sigma eps T^4 / (rho c d), T = (T0^-3 + 6 sigma eps t / (rho c d))^(-1/3)."""
+    thickness = 1e-3
+    mesh = box_mesh([0, 0.01, 0.02], [0, 0.01, 0.02], [0, thickness], temperature_c=1000.0 - 273.15)
+    steel = Material("steel", 50.0, 7800.0, 450.0)
+    problem = HeatProblem(mesh, steel, effects=(Radiation(("z0", "z1"), 1.0, -273.15),))
+    rate = 6.0 * 5.670374419e-8 / (7800.0 * 450.0 * thickness)
+    for duration, tolerance in ((600.0, 0.05), (1e9, 0.01)):
+        solution = solve_heat(problem, AdaptiveSteps(duration, tolerance))
+        exact = (1000.0**-3 + rate * solution.times_s) ** (-1.0 / 3.0) - 273.15
+        np.testing.assert_allclose(solution.temperature_c, np.broadcast_to(exact[:, None], (11, 18)), atol=tolerance)
+        assert solution.energy_residual < 1e-9 and solution.converged
+        assert np.all(np.diff(solution.temperature_c, axis=0) < 0.0)
+    assert solution.temperature_c[-1].max() < 3.0 - 273.15
+
+
+JUMPS = {
+    "fixed": (FixedTemperature(("x0",), 0.0),),
+    "cold air": (Convection(("x0",), 25.0, -10.0), Convection(("x1",), 7.69, 20.0)),
+    "day": (Convection(("x0",), 25.0, Varying(lambda places, time_s: 10.0 * np.sin(2e-4 * time_s))),),
+    "heater": (HeatFlux(("x1",), 500.0), Convection(("x0",), 10.0, 20.0)),
+    "sky": (Radiation(("x0",), 0.9, -80.0), InternalHeat(("*",), 300.0)),
+}
+
+
+@pytest.mark.parametrize("name", JUMPS)
+@pytest.mark.parametrize("tolerance_k", [0.5, 0.02])
+def test_adaptive_steps_keep_their_tolerance(name, tolerance_k) -> None:
+    """Against 1000 equal steps of second order on the same mesh: the error is below what was asked for."""
+    problem = HeatProblem(bar(10), CONCRETE, effects=JUMPS[name])
+    duration = 6 * 3600.0
+    fine = solve_heat(problem, TimeSteps(1000, duration / 1000), scheme=SDIRK2).temperature_c[::100]
+    adaptive = solve_heat(problem, AdaptiveSteps(duration, tolerance_k))
+    error = np.abs(adaptive.temperature_c - fine).max()
+    assert error < tolerance_k and error < adaptive.time_error_k, f"error {error}, {adaptive.status}"
+    assert adaptive.steps < 200 and adaptive.energy_residual_of_spread < 1e-9
+    np.testing.assert_allclose(adaptive.times_s, np.linspace(0.0, duration, 11))
+    assert f"All {adaptive.steps} steps converged" in adaptive.status
+
+
+def test_adaptive_steps_grow_and_shrink_with_what_happens() -> None:
+    """A body at rest takes one step per output; a jump of the air in the middle is found and does not overshoot."""
+    problem = HeatProblem(bar(12), CONCRETE, effects=(Convection(("x0",), 25.0, 20.0),))
+    assert solve_heat(problem, AdaptiveSteps(1e6, 0.1, outputs=3)).steps == 3
+    jump = Convection(("*",), 1e5, Varying(lambda places, time_s: 20.0 if time_s < 5e5 else -20.0))
+    solution = solve_heat(HeatProblem(bar(12), CONCRETE, effects=(jump,)), AdaptiveSteps(1e6, 0.1, outputs=10))
+    assert solution.temperature_c.min() >= -20.0 - 1e-6 and solution.temperature_c.max() <= 20.0 + 1e-6
+    np.testing.assert_allclose(solution.temperature_c[:5], 20.0, atol=1e-9)
+    np.testing.assert_allclose(solution.temperature_c[-1], -20.0, atol=0.1)
+    assert "repeated" in solution.status
+
+
+def test_a_step_that_would_overshoot_is_taken_with_backward_euler(monkeypatch) -> None:
+    """With a tolerance so loose that errors do not shorten the steps, only the range does."""
+    monkeypatch.setattr("thermoxels_ns.fem.marching.AdaptiveMarch._first_length", lambda march: 100.0 * STEP_S)
+    problem = HeatProblem(bar(20, 0.0), CONCRETE, effects=(FixedTemperature(("x0",), 1.0),))
+    solution = solve_heat(problem, AdaptiveSteps(1000 * STEP_S, 100.0))
+    assert "taken with backward Euler because SDIRK2 would have overshot" in solution.status
+    assert solution.temperature_c.max() <= 1.0 + 1e-9 and solution.temperature_c.min() >= -1e-9
+    assert solution.energy_residual_of_spread < 1e-12
+
+
+def test_a_scheme_without_estimate_cannot_adapt() -> None:
+    problem = HeatProblem(bar(), CONCRETE)
+    with pytest.raises(HeatError, match="scheme: expected one with an error estimate.*got Crank-Nicolson"):
+        solve_heat(problem, AdaptiveSteps(3600.0), scheme=CRANK_NICOLSON)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"duration_s": 0.0}, "duration_s: expected a finite number above 0"),
+        ({"duration_s": 60.0, "tolerance_k": -1.0}, "tolerance_k: expected a finite number above 0"),
+        ({"duration_s": 60.0, "outputs": 0}, "outputs: expected a whole number of at least 1"),
+        ({"duration_s": 60.0, "outputs": 1.5}, "outputs: expected a whole number"),
+    ],
+)
+def test_adaptive_options_are_checked(options, message) -> None:
+    with pytest.raises(HeatError, match=message):
+        AdaptiveSteps(**options)
+
+
+def test_cooling_below_absolute_zero_is_refused() -> None:
+    problem = HeatProblem(bar(), CONCRETE, effects=(HeatFlux(("x0",), -1e6),))
+    for time in (TimeSteps(10, 600.0), AdaptiveSteps(6000.0)):
+        with pytest.raises(HeatError, match="below absolute zero"):
+            solve_heat(problem, time)
+    stopped = solve_heat(problem, TimeSteps(10, 600.0), allow_unconverged=True)
+    assert not stopped.converged and len(stopped.times_s) == len(stopped.effects[0].heat_w) + 1 < 11
+    assert stopped.temperature_c.min() > -273.15
+
+
+def test_almost_no_heat_capacity() -> None:
+    """A body without inertia is at its steady state after any step."""
+    from thermoxels_ns.fem.steady import solve_steady
+
+    air = Material("nearly nothing", 1.7, 1e-6, 1e-3)
+    problem = HeatProblem(bar(), air, effects=JUMPS["cold air"] + JUMPS["sky"][:1])
+    steady = solve_steady(problem).temperature_c
+    for time in (TimeSteps(1, 60.0), AdaptiveSteps(60.0, 0.01, outputs=1)):
+        np.testing.assert_allclose(solve_heat(problem, time).temperature_c[-1], steady, atol=1e-6)
+
+
+def test_a_slab_forgets_its_start_and_becomes_steady() -> None:
+    from thermoxels_ns.fem.steady import solve_steady
+
+    problem = HeatProblem(bar(), CONCRETE, effects=EVERY[2:3] + EVERY[3:6])
+    late = HeatProblem(bar(), CONCRETE, effects=(Convection(("z0",), 8.0, 3.0), *EVERY[3:6]))
+    steady = solve_steady(late)
+    end = solve_heat(late, TimeSteps(3, 1e12))
+    np.testing.assert_allclose(end.temperature_c[-1], steady.temperature_c, atol=1e-6)
+    np.testing.assert_allclose([h.heat_w[-1] for h in end.effects], [h.heat_w[0] for h in steady.effects], rtol=1e-6)
+    assert solve_steady(problem, time_s=600.0 * np.arcsin(0.6)).temperature_c == pytest.approx(steady.temperature_c)
+
+
+def test_newton_steps_are_counted_and_conduction_has_none() -> None:
+    warm = solve_heat(HeatProblem(bar(), CONCRETE, effects=JUMPS["sky"]), TimeSteps(3, 600.0))
+    assert np.all((warm.newton_iterations >= 1) & (warm.newton_iterations <= 4)), warm.newton_iterations
+    plain = solve_heat(HeatProblem(bar(), CONCRETE, effects=JUMPS["cold air"]), TimeSteps(3, 600.0))
+    assert plain.newton_iterations.tolist() == [0, 0, 0]
+
+
+def test_two_runs_agree_to_the_bit() -> None:
+    runs = [solve_heat(HeatProblem(bar(), CONCRETE, effects=EVERY), AdaptiveSteps(3600.0)) for _ in range(2)]
+    np.testing.assert_array_equal(runs[0].temperature_c, runs[1].temperature_c)
+    assert runs[0].status == runs[1].status

@@ -1,0 +1,76 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.effects import STEFAN_BOLTZMANN_W_M2K4, Radiation
+from thermoxels_ns.fem.quantities import Places
+from thermoxels_ns.fem.sky import ground_view, outdoor_radiation, sky_view, swinbank_sky_c
+
+Z_UP = (0.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("air_k", [263.15, 273.15, 293.15, 303.15])
+def test_swinbank(air_k: float) -> None:
+    assert swinbank_sky_c(air_k - 273.15) + 273.15 == pytest.approx(0.0552 * air_k**1.5, rel=1e-12)
+
+
+def test_swinbank_at_300_kelvin() -> None:
+    """0.0552 * 300^1.5 = 286.83 K: 13 K below the air."""
+    assert swinbank_sky_c(26.85) == pytest.approx(13.68, abs=0.01)
+
+
+def test_view_factors_by_tilt() -> None:
+    tilt = np.radians([0.0, 60.0, 90.0, 120.0, 180.0])
+    normals = np.stack([np.sin(tilt), np.zeros(5), np.cos(tilt)], axis=1)
+    np.testing.assert_allclose(sky_view(normals, Z_UP), [1.0, 0.75, 0.5, 0.25, 0.0], atol=1e-15)
+    np.testing.assert_allclose(sky_view(normals, Z_UP) + ground_view(normals, Z_UP), 1.0)
+    np.testing.assert_allclose(sky_view(normals[:, [2, 0, 1]], (1.0, 0.0, 0.0)), sky_view(normals, Z_UP))
+
+
+def loss_w_m2(surface_k: float, places: Places, **temperatures: float) -> np.ndarray:
+    """What surfaces radiate away."""
+    effect = Radiation(("*",), *outdoor_radiation(0.8, **temperatures))
+    emissivity = effect.bounded("emissivity").at(places, 0.0)
+    around_k = effect.bounded("surroundings_c").at(places, 0.0) + 273.15
+    return STEFAN_BOLTZMANN_W_M2K4 * emissivity * (surface_k**4 - around_k**4)
+
+
+def test_sky_and_ground_together_are_the_sum_of_both() -> None:
+    directions = np.random.default_rng(3).normal(size=(20, 3))
+    normals = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    places = Places(np.zeros((20, 3)), normals, Z_UP)
+    both = loss_w_m2(290.0, places, sky_c=-20.0, ground_c=5.0)
+    alone = loss_w_m2(290.0, places, sky_c=-20.0) + loss_w_m2(290.0, places, ground_c=5.0)
+    np.testing.assert_allclose(both, alone, rtol=1e-11)
+
+
+def test_a_roof_sees_the_sky_and_a_wall_half_of_it() -> None:
+    places = Places(np.zeros((3, 3)), np.array([[0, 0, 1.0], [1, 0, 0], [0, 0, -1]]), Z_UP)
+    roof, wall, soffit = loss_w_m2(290.0, places, sky_c=-20.0)
+    assert roof == pytest.approx(0.8 * STEFAN_BOLTZMANN_W_M2K4 * (290.0**4 - 253.15**4))
+    assert (wall, soffit) == (pytest.approx(0.5 * roof), 0.0)
+
+
+def test_one_temperature_all_around_is_that_temperature() -> None:
+    emissivity, around = outdoor_radiation(0.9, sky_c=7.0, ground_c=7.0)
+    effect = Radiation(("*",), emissivity, around)
+    places = Places(np.zeros((2, 3)), np.array([[0.6, 0.0, 0.8], [0.0, -1.0, 0.0]]), Z_UP)
+    np.testing.assert_allclose(effect.bounded("surroundings_c").at(places, 0.0), 7.0, atol=1e-12)
+    assert not effect.bounded("surroundings_c").in_time
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: swinbank_sky_c(-300.0), "air_c"),
+        (lambda: outdoor_radiation(0.9), "expected sky_c, ground_c or both, got neither"),
+        (lambda: outdoor_radiation(1.5, sky_c=0.0), "emissivity"),
+        (lambda: outdoor_radiation(0.9, sky_c=-300.0), "sky_c: expected a finite number of at least -273.15"),
+        (lambda: outdoor_radiation(0.9, ground_c=float("inf")), "ground_c"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(call, message: str) -> None:
+    with pytest.raises(HeatError, match=message):
+        call()

@@ -1,0 +1,194 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import sparse
+
+from tests.heat_meshes import box_mesh, planes
+from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem import newton as newton_module
+from thermoxels_ns.fem import solver_choice
+from thermoxels_ns.fem.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.solver_choice import PATIENCE, LinearSolver
+from thermoxels_ns.fem.steady import solve_steady
+
+STEEL = Material("steel", 50.0, 7800.0, 450.0)
+SIGMA = 5.67e-8
+
+
+def slab(temperature_c=20.0, parts: int = 10):
+    return box_mesh(np.linspace(0, 0.1, parts + 1), [0, 0.02], [0, 0.02], temperature_c=temperature_c)
+
+
+def test_layers_between_two_airs_are_exact() -> None:
+    """Temperatures are linear in each layer, so P1 has them exactly: q = (20 - (-10)) / (1/h + sum d/k + 1/h)."""
+    regions = {"brick": lambda p: p[..., 0] < 0.2, "wool": lambda p: p[..., 0] > 0.2}
+    mesh = box_mesh(planes(0.0, 0.2, 0.3, step=0.05), [0, 0.1], [0, 0.1], regions=regions)
+    materials = {"brick": Material("brick", 0.7, 1600.0, 940.0), "wool": Material("wool", 0.04, 30.0, 1030.0)}
+    problem = HeatProblem(mesh, materials, effects=(Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, -10.0)))
+    for lumped_boundary in (True, False):
+        solution = solve_steady(problem, lumped_boundary=lumped_boundary)
+        flux = 30.0 / (1 / 8 + 0.2 / 0.7 + 0.1 / 0.04 + 1 / 25)
+        x = mesh.points_m[:, 0]
+        exact = 20.0 - flux / 8 - flux * (np.minimum(x, 0.2) / 0.7 + np.maximum(x - 0.2, 0.0) / 0.04)
+        np.testing.assert_allclose(solution.temperature_c, exact, atol=1e-9)
+        assert [heat.heat_w[0] for heat in solution.effects] == pytest.approx([0.01 * flux, -0.01 * flux], rel=1e-9)
+        assert solution.converged and solution.energy_residual < 1e-9 and solution.newton_iterations == 0
+        assert "mass" not in solution.assembled.counts
+
+
+def test_the_heat_of_fixed_surfaces_is_what_flows() -> None:
+    effects = (FixedTemperature(("x0",), 100.0), FixedTemperature(("x1",), 0.0), InternalHeat(("*",), 1e4))
+    solution = solve_steady(HeatProblem(slab(), STEEL, effects=effects))
+    source = 1e4 * 0.1 * 0.02**2
+    through = 50.0 * 100.0 / 0.1 * 0.02**2
+    heat = [part.heat_w[0] for part in solution.effects]
+    assert heat == pytest.approx([through - source / 2, -through - source / 2, source], rel=1e-9)
+    assert solution.energy_residual < 1e-12
+
+
+@pytest.mark.parametrize("start_c", [-273.15, -270.15, 20.0, 726.85, 5000.0])
+@pytest.mark.parametrize("sky_c", [-270.15, 20.0, 726.85])
+def test_newton_converges_from_anywhere(start_c, sky_c) -> None:
+    """Radiation at one end, 500 K at the other: k (500 - T) / L = sigma eps (T^4 - T_s^4) at the radiating end."""
+    effects = (FixedTemperature(("x0",), 226.85), Radiation(("x1",), 0.9, sky_c, SIGMA))
+    mesh = slab(start_c)
+    solution = solve_steady(HeatProblem(mesh, STEEL, effects=effects))
+    end_k = solution.temperature_c[mesh.points_m[:, 0] > 0.0999] + 273.15
+    sky_k = sky_c + 273.15
+    np.testing.assert_allclose(50.0 * (500.0 - end_k) / 0.1, 0.9 * SIGMA * (end_k**4 - sky_k**4), rtol=1e-8, atol=1e-9)
+    assert solution.converged and solution.energy_residual < 1e-9
+    assert 0 < solution.newton_iterations < 25, solution.status
+
+
+@pytest.mark.parametrize("start_c", [-273.15, -270.15, 20.0, 726.85])
+@pytest.mark.parametrize("sky_c", [-273.14, -270.15, 726.85])
+def test_radiation_alone_levels_the_body(start_c, sky_c) -> None:
+    """Held by nothing but radiation, from 1000 K and to 3 K: the body takes the temperature of what it sees."""
+    solution = solve_steady(HeatProblem(slab(start_c), STEEL, effects=(Radiation(("*",), 0.5, sky_c),)))
+    np.testing.assert_allclose(solution.temperature_c, sky_c, atol=1e-4)
+    assert solution.converged
+
+
+def test_without_radiation_newton_is_never_entered(monkeypatch) -> None:
+    def refuse(*_, **__):
+        raise AssertionError("entered")
+
+    monkeypatch.setattr("thermoxels_ns.fem.stage.newton", refuse)
+    air = Convection(("*",), 5.0, 10.0)
+    assert solve_steady(HeatProblem(slab(), STEEL, effects=(air,))).newton_iterations == 0
+    with pytest.raises(AssertionError, match="entered"):
+        solve_steady(HeatProblem(slab(), STEEL, effects=(air, Radiation(("x0",), 0.9, 0.0))))
+
+
+def test_too_few_newton_steps_are_a_status(monkeypatch) -> None:
+    monkeypatch.setattr(newton_module, "MAX_ITERATIONS", 2)
+    problem = HeatProblem(slab(900.0), STEEL, effects=(Radiation(("*",), 0.9, -270.0),))
+    with pytest.raises(HeatError, match=r"No steady state was found\. Newton's method stopped after 2 steps"):
+        solve_steady(problem)
+    solution = solve_steady(problem, allow_unconverged=True)
+    assert not solution.converged and "Newton's method stopped" in solution.status
+    assert np.isfinite(solution.temperature_c).all()
+
+
+@pytest.mark.parametrize("effects", [(), (HeatFlux(("*",), 1.0),), (Convection(("*",), 0.0, 20.0),)])
+def test_a_body_that_nothing_holds_has_no_steady_state(effects) -> None:
+    with pytest.raises(HeatError, match=r"steady heat problem: expected convection.*none on 1 of 1 pieces.*\(0, 0, 0\)"):
+        solve_steady(HeatProblem(slab(), STEEL, effects=effects))
+
+
+def test_a_loose_piece_is_named() -> None:
+    """Two blocks that do not touch, the second without any exchange."""
+    mesh = box_mesh(np.linspace(0, 0.5, 6), [0, 0.1], [0, 0.1], keep=lambda p: abs(p[..., 0] - 0.25) > 0.06)
+    problem = HeatProblem(mesh, STEEL, effects=(Convection(("x0",), 5.0, 10.0),))
+    with pytest.raises(HeatError, match=r"none on 1 of 2 pieces; the largest has 12 nodes in .*\(0\.3, 0, 0\) to \(0\.5,"):
+        solve_steady(problem)
+    both = HeatProblem(mesh, STEEL, effects=(Convection(("x?",), 5.0, 10.0),))
+    np.testing.assert_allclose(solve_steady(both).temperature_c, 10.0, atol=1e-9)
+
+
+def test_more_cooling_than_heat_is_refused() -> None:
+    effects = (FixedTemperature(("x0",), 0.0), HeatFlux(("x1",), -1e6))
+    with pytest.raises(HeatError, match=r"falls to -1726.* K, below absolute zero.*Check their sign"):
+        solve_steady(HeatProblem(slab(), STEEL, effects=effects))
+    radiating = (Radiation(("x0",), 0.9, 20.0), HeatFlux(("x1",), -1e6))
+    with pytest.raises(HeatError, match="below absolute zero"):
+        solve_steady(HeatProblem(slab(), STEEL, effects=radiating))
+
+
+@pytest.mark.parametrize("contrast", [1e-6, 1e6])
+def test_conductivity_contrast(contrast) -> None:
+    """A rod of another material through a block: flow and temperatures stay in range and balance."""
+    n = 12
+    rod = {"block": lambda p: p[..., 0] > -1, "rod": lambda p: np.hypot(p[..., 1] - 0.5, p[..., 2] - 0.5) < 0.2}
+    axis = np.linspace(0, 1, n + 1)
+    mesh = box_mesh(axis, axis, axis, regions=rod)
+    materials = {"block": Material("a", 1.0, 1000.0, 1000.0), "rod": Material("b", contrast, 1000.0, 1000.0)}
+    effects = (Convection(("x0",), 10.0, 20.0), FixedTemperature(("x1",), 0.0), Radiation(("z1",), 0.9, 10.0))
+    solution = solve_steady(HeatProblem(mesh, materials, effects=effects))
+    assert solution.converged and solution.energy_residual < 1e-9
+    assert solution.temperature_c.min() >= -1e-9 and solution.temperature_c.max() <= 20.0 + 1e-9
+
+
+def test_boundary_values_with_a_jump_by_one_effect() -> None:
+    """Where two temperatures meet, one function says which holds; the answer is symmetric."""
+    axis = np.linspace(0, 1, 9)
+    mesh = box_mesh(axis, axis, [0, 0.125])
+
+    def hot_below(places, time_s):
+        return np.where(places.points_m[:, 0] < 0.5 - 1e-9, 10.0, np.where(places.points_m[:, 0] > 0.5 + 1e-9, 0.0, 5.0))
+
+    fixed = FixedTemperature(("x?", "y?"), Varying(hot_below, in_time=False))
+    solution = solve_steady(HeatProblem(mesh, STEEL, effects=(fixed,)))
+    mirrored = np.lexsort((mesh.points_m[:, 2], mesh.points_m[:, 1], 1.0 - mesh.points_m[:, 0]))
+    straight = np.lexsort((mesh.points_m[:, 2], mesh.points_m[:, 1], mesh.points_m[:, 0]))
+    middle = solution.temperature_c[straight] + solution.temperature_c[mirrored]
+    np.testing.assert_allclose(middle, 10.0, atol=0.05)
+
+
+def chain(nodes: int) -> sparse.csr_matrix:
+    matrix = sparse.diags([-np.ones(nodes - 1), np.full(nodes, 2.0), -np.ones(nodes - 1)], [-1, 0, 1])
+    return sparse.csr_matrix(matrix)
+
+
+def test_multigrid_takes_over_where_plain_iterations_are_slow() -> None:
+    """A chain of n nodes takes n plain iterations: beyond the patience, multigrid ends it in a few."""
+    nodes = 3 * PATIENCE
+    matrix = chain(nodes)
+    exact = np.cos(np.arange(nodes) * 0.01)
+    solver = LinearSolver(matrix)
+    solution = solver.solve(matrix @ exact)
+    assert solution.converged and "multigrid" in solution.status and solver.name == "multigrid"
+    assert solution.iterations < 60
+    np.testing.assert_allclose(solution.x, exact, atol=1e-5)
+
+
+def test_what_was_slow_once_is_multigrid_the_next_time(monkeypatch) -> None:
+    monkeypatch.setattr(solver_choice, "PATIENCE_WHEN_REPEATED", 100)
+    matrix = chain(300)
+    solver = LinearSolver(matrix)
+    first, second = (solver.solve(matrix @ np.sin(np.arange(300.0) * k)) for k in (1, 2))
+    assert first.converged and "multigrid" not in first.status
+    assert second.converged and "multigrid" in second.status
+    easy = LinearSolver(sparse.csr_matrix(matrix + sparse.eye(300)))
+    assert [easy.solve(np.sin(np.arange(300.0) * k)).converged for k in (1, 2)] == [True, True]
+    assert easy.name == "diagonal"
+
+
+def test_multigrid_draws_the_same_numbers_and_leaves_the_generator_alone() -> None:
+    from thermoxels_ns.fem.multigrid import MultigridConjugateGradients
+
+    matrix, b = chain(2000), np.cos(np.arange(2000.0))
+    np.random.seed(3)
+    before = np.random.get_state()[1].copy()
+    first = MultigridConjugateGradients(matrix).solve(b)
+    np.testing.assert_array_equal(np.random.get_state()[1], before)
+    np.random.seed(4)
+    second = MultigridConjugateGradients(matrix).solve(b)
+    np.testing.assert_array_equal(first.x, second.x)
+    assert first.converged and first.iterations == second.iterations
+    few = MultigridConjugateGradients(matrix, max_iterations=2).solve(b)
+    assert not few.converged and "stopped after 2 iterations" in few.status

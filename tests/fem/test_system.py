@@ -1,0 +1,189 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.heat_meshes import SIDES, box_mesh
+from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.assembly import assemble
+from thermoxels_ns.fem.effects import (
+    AbsorbedSolar,
+    Convection,
+    FixedTemperature,
+    GroundContact,
+    HeatFlux,
+    InternalHeat,
+    Radiation,
+)
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+ALL = (
+    Convection(("x0", "y0"), Varying(lambda places, time_s: 5.0 + places.points_m[:, 2], in_time=False), 30.0),
+    GroundContact(("z0",), 2.5, 10.0),
+    Radiation(("x1", "z1"), 0.9, -20.0),
+    AbsorbedSolar(("z1",), 0.6, 500.0),
+    HeatFlux(("y1",), -30.0),
+    InternalHeat(("*",), 200.0),
+)
+
+
+@pytest.fixture
+def box() -> TetMesh:
+    axes = (np.linspace(0, 0.4, 5), np.linspace(0, 0.3, 4), np.linspace(0, 0.2, 3))
+    return box_mesh(*axes, temperature_c=lambda p: 20.0 + 30.0 * np.sin(9.0 * p @ [1.0, 2.0, 3.0]))
+
+
+@pytest.mark.parametrize("lumped_boundary", [True, False])
+def test_heat_of_the_nodes_is_heat_of_the_patches(box, concrete, lumped_boundary) -> None:
+    """What the equations feed to all nodes is what the report says of all patches, to round-off."""
+    system = HeatSystem(HeatProblem(box, concrete, effects=ALL), lumped_boundary=lumped_boundary)
+    relative = box.temperature_c - system.reference_c
+    heat, bound = system.net_heat(relative, 0.0)
+    flows = system.group_heat_w(relative, 0.0)
+    assert len(flows) == len(system.groups) == 8
+    assert heat.sum() == pytest.approx(flows.sum(), abs=1e-13 * bound.sum())
+    assert np.abs(heat - np.roll(heat, 1)).max() > 1e-3
+
+
+@pytest.mark.parametrize("lumped_boundary", [True, False])
+def test_the_slope_of_radiation_is_its_derivative(box, concrete, lumped_boundary) -> None:
+    system = HeatSystem(HeatProblem(box, concrete, effects=ALL), lumped_boundary=lumped_boundary)
+    relative = box.temperature_c - system.reference_c
+    direction = np.random.default_rng(0).uniform(-1.0, 1.0, len(relative))
+    change = system.radiation_load(relative + 1e-3 * direction, 0.0) - system.radiation_load(
+        relative - 1e-3 * direction, 0.0
+    )
+    slope = -system.radiation_slope(relative, 0.0) @ direction
+    np.testing.assert_allclose(change / 2e-3, slope, atol=1e-8 * np.abs(slope).max())
+    assert np.abs(slope).max() > 1e-3
+
+
+def test_exchange_over_the_triangles_is_exact(box, concrete) -> None:
+    """integral(h T u) for linear T and u on the side x1, by hand; at the nodes it is not, but for a constant."""
+    problem = HeatProblem(box, concrete, effects=(Convection(("x1",), 6.0, 20.0),))
+    t, u = box.points_m[:, 1], 1.0 + box.points_m[:, 2]
+    exact = 6.0 * (0.3**2 / 2) * (0.2 + 0.2**2 / 2)
+    stiffness = assemble(box, concrete).stiffness_w_k
+    consistent, lumped = (
+        HeatSystem(problem, lumped_boundary=entry).matrix(0.0, np.inf) - stiffness for entry in (False, True)
+    )
+    assert u @ consistent @ t == pytest.approx(exact, rel=1e-12)
+    assert abs(u @ lumped @ t - exact) < 0.05 * exact
+    assert consistent.sum() == pytest.approx(6.0 * 0.06, rel=1e-12)
+    assert lumped.sum() == pytest.approx(6.0 * 0.06, rel=1e-12)
+    assert lumped.nnz < consistent.nnz
+    np.testing.assert_array_equal(lumped.toarray(), np.diag(lumped.diagonal()))
+
+
+def test_radiation_over_the_triangles_is_exact_for_linear_temperatures(box, concrete) -> None:
+    """integral(T^4) of T = 300 + 100 y over the side x1 has degree 4, which the six points integrate."""
+    start = 300.0 - 273.15 + 100.0 * box.points_m[:, 1]
+    problem = HeatProblem(replace(box, temperature_c=start), concrete, effects=(Radiation(("x1",), 1.0, -273.15, 1e-8),))
+    system = HeatSystem(problem, lumped_boundary=False)
+    heat = system.group_heat_w(start - system.reference_c, 0.0)[0]
+    assert heat == pytest.approx(-1e-8 * 0.2 * (330.0**5 - 300.0**5) / 500.0, rel=1e-12)
+
+
+def test_the_default_matrix_is_an_m_matrix(box, concrete) -> None:
+    system = HeatSystem(HeatProblem(box, concrete, effects=ALL))
+    dense = (system.matrix(0.0, np.inf) + system.radiation_slope(box.temperature_c - system.reference_c, 0.0)).toarray()
+    np.testing.assert_array_equal(dense, dense.T)
+    assert (dense - np.diag(np.diag(dense))).max() <= 0.0
+    assert np.linalg.inv(dense).min() >= 0.0
+
+
+def test_materials_by_region(concrete) -> None:
+    """Two layers: the stiffness and the mass are the sums of the layers' own."""
+    wool = Material("wool", 0.04, 30.0, 1030.0)
+    layers = {"inner": lambda p: p[..., 0] < 0.25, "outer": lambda p: p[..., 0] > 0.25}
+    mesh = box_mesh(np.linspace(0, 0.5, 5), [0, 0.2], [0, 0.2], regions=layers)
+    both = HeatSystem(HeatProblem(mesh, {"inner": concrete, "outer": wool}))
+    gradient = mesh.points_m[:, 0]
+    energy = gradient @ both.matrix(0.0, np.inf) @ gradient
+    assert energy == pytest.approx((1.7 + 0.04) * 0.25 * 0.04, rel=1e-12)
+    assert both.nodal_mass_j_k.sum() == pytest.approx((2200 * 880 + 30 * 1030) * 0.25 * 0.04, rel=1e-12)
+    same = HeatSystem(HeatProblem(mesh, {"inner": concrete, "outer": concrete}))
+    one = HeatSystem(HeatProblem(mesh, concrete))
+    np.testing.assert_array_equal(same.matrix(0.0, np.inf).toarray(), one.matrix(0.0, np.inf).toarray())
+
+
+@pytest.mark.parametrize(
+    ("material", "message"),
+    [
+        ({}, "a Material for each of the regions inner, outer, got none for: inner, outer"),
+        ({"inner": 1}, "none for: outer; no Material for: inner"),
+        ("concrete", "expected a Material or a mapping, got 'concrete'"),
+    ],
+)
+def test_materials_must_fit_the_regions(concrete, material, message) -> None:
+    layers = {"inner": lambda p: p[..., 0] < 0.25, "outer": lambda p: p[..., 0] > 0.25}
+    mesh = box_mesh(np.linspace(0, 0.5, 5), [0, 0.2], [0, 0.2], regions=layers)
+    with pytest.raises(HeatError, match=message):
+        HeatProblem(mesh, material)
+    with pytest.raises(HeatError, match="unknown: roof"):
+        HeatProblem(mesh, {"inner": concrete, "outer": concrete, "roof": concrete})
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"effects": [HeatFlux(("x0",), 1.0)]}, "effects: expected a tuple of effects, got list"),
+        ({"effects": ("sun",)}, "effects: expected a tuple of effects, got str"),
+        ({"up": (0.0, 0.0, 0.0)}, "up: expected a direction"),
+        ({"up": (1.0, 2.0)}, "up: expected a direction"),
+    ],
+)
+def test_problems_must_make_sense(box, concrete, options, message) -> None:
+    with pytest.raises(HeatError, match=message):
+        HeatProblem(box, concrete, **options)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("area_factor", np.zeros(104), "boundary area_factor: expected numbers above 0"),
+        ("area_factor", np.ones(3), "boundary area_factor: expected shape"),
+        ("patch", np.full(104, 7), "boundary patch: expected numbers from 0 to 6"),
+        ("normal", np.full((104, 3), np.nan), "boundary normal: expected finite numbers"),
+    ],
+)
+def test_wrong_tags_are_refused(box, concrete, field, value, message) -> None:
+    assert len(box.facets) == 104
+    broken = replace(box, boundary=replace(box.boundary, **{field: value}))
+    with pytest.raises(HeatError, match=message):
+        HeatSystem(HeatProblem(broken, concrete))
+
+
+def test_what_changes_in_time_is_assembled_again(box, concrete) -> None:
+    """Only the parts that change: the air of one convection, the coefficient of another."""
+    air = Convection(("x0",), 5.0, Varying(lambda places, time_s: 20.0 + time_s))
+    wind = Convection(("x1",), Varying(lambda places, time_s: 5.0 + time_s), 20.0)
+    still = Convection(("y0",), 5.0, 20.0)
+    system = HeatSystem(HeatProblem(box, concrete, effects=(air, wind, still)))
+    matrices = [system.matrix(time_s, np.inf) for time_s in (0.0, 1.0)]
+    change = (matrices[1] - matrices[0]).sum()
+    assert change == pytest.approx(0.06, rel=1e-12)
+    loads = [system.load(time_s).sum() for time_s in (0.0, 1.0)]
+    relative = np.array([0.0, 1.0]) + 20.0 - system.reference_c
+    air_w = 5.0 * 0.06 * relative
+    wind_w = np.array([5.0, 6.0]) * 0.06 * (20.0 - system.reference_c)
+    still_w = 5.0 * 0.08 * (20.0 - system.reference_c)
+    np.testing.assert_allclose(loads, air_w + wind_w + still_w, rtol=1e-12)
+    # Matrix: 2 constant, 1 changing, twice. Load: 1 constant, 2 changing, twice.
+    assert system.assembled.counts["robin"] == (2 + 2) + (1 + 4)
+
+
+def test_shares_of_fixed_nodes_add_up(box, concrete) -> None:
+    system = HeatSystem(HeatProblem(box, concrete, effects=(FixedTemperature(("x?", "y0"), 20.0),)))
+    shares = system.fixed.shares
+    np.testing.assert_allclose(np.asarray(shares.sum(axis=0)).ravel(), 1.0, rtol=1e-12)
+    assert [patch for _, patch in system.fixed.groups] == ["x0", "x1", "y0"]
+    assert set(SIDES[:3]) == {"x0", "x1", "y0"}
+    edge = np.flatnonzero((box.points_m[system.fixed.nodes] == [0.0, 0.0, 0.1]).all(axis=1))
+    np.testing.assert_allclose(shares[:, edge].toarray().ravel(), [0.5, 0.0, 0.5], atol=0.01)

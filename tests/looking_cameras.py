@@ -1,0 +1,27 @@
+"""Cameras for tests that look at a point."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.snapshot import Views
+
+
+def looking_at(target: npt.ArrayLike, eyes: npt.ArrayLike, focal: float = 100.0, size: int = 200) -> Views:
+    """Square pinhole cameras at the given places, all turned to one point; 90 degrees wide unless told."""
+    poses = []
+    for eye in np.atleast_2d(np.asarray(eyes, dtype=np.float64)):
+        back = eye - np.asarray(target, dtype=np.float64)
+        back /= np.linalg.norm(back)
+        up = np.array([0.0, 0.0, 1.0]) if abs(back[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
+        right = np.cross(up, back)
+        right /= np.linalg.norm(right)
+        poses.append(np.column_stack((right, np.cross(back, right), back, eye)))
+    count = len(poses)
+    return Views(
+        np.array(poses),
+        np.full((count, 2), focal),
+        np.full((count, 2), 0.5 * size),
+        np.full((count, 2), size, dtype=np.int64),
+    )

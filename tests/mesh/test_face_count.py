@@ -1,0 +1,90 @@
+"""Faces and edges found by grouping are those found by sorting whole rows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.mesh.face_count import (
+    OUTWARD_FACES,
+    count_faces,
+    edges_of_rows,
+    group_edges,
+    group_faces,
+    group_pairs,
+)
+from thermoxels_ns.mesh.voxel_tets import OUTWARD_FACES as VOXEL_OUTWARD_FACES
+from thermoxels_ns.mesh.voxel_tets import kuhn_tets
+
+
+def faces_by_sorting(tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Faces and their owners as one sort of all rows finds them, outwards from the first owner."""
+    faces = tets[:, OUTWARD_FACES].reshape(-1, 3)
+    _, first, uses = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return faces[first], uses
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_faces_of_random_voxels_in_any_order(random_cells, seed):
+    random = np.random.default_rng(seed)
+    corners, tets = kuhn_tets(random_cells(seed))
+    names = random.permutation(3 * len(corners))[: len(corners)]  # numbers with gaps, in any order
+    tets = names[tets[random.permutation(len(tets))]]
+    faces, uses = count_faces(tets)
+    expected, owners = faces_by_sorting(tets)
+    np.testing.assert_array_equal(faces, expected)
+    np.testing.assert_array_equal(uses, owners)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_faces_of_nonsense_with_many_owners_and_repeated_nodes(seed):
+    tets = np.random.default_rng(seed).integers(0, 7, size=(200, 4))
+    faces, uses = count_faces(tets)
+    expected, owners = faces_by_sorting(tets)
+    assert owners.max() > 2
+    np.testing.assert_array_equal(faces, expected)
+    np.testing.assert_array_equal(uses, owners)
+
+
+def test_node_numbers_whose_triple_does_not_fit_in_64_bits():
+    low = np.array([[0, 1, 2, 3], [3, 2, 1, 4]])
+    faces, uses = count_faces(low + 2**22)  # three numbers of 23 bits
+    expected, owners = count_faces(low)
+    np.testing.assert_array_equal(faces - 2**22, expected)
+    assert uses.tolist() == owners.tolist() and sorted(uses.tolist()) == [1] * 6 + [2]
+
+
+def test_no_tetrahedra_have_no_faces():
+    faces, uses = count_faces(np.zeros((0, 4), dtype=np.int64))
+    assert faces.shape == (0, 3) and uses.shape == (0,)
+
+
+def test_outward_faces_are_those_of_the_voxel_mesh():
+    np.testing.assert_array_equal(OUTWARD_FACES, VOXEL_OUTWARD_FACES)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_edges_of_random_voxels(random_cells, seed):
+    _, tets = kuhn_tets(random_cells(seed))
+    groups = group_edges(tets)
+    found = np.sort(edges_of_rows(tets, groups.first), axis=1)
+    pairs = np.sort(tets[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]].reshape(-1, 2), axis=1)
+    expected, counts = np.unique(pairs, axis=0, return_counts=True)
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(groups.sizes, counts)
+
+
+def test_groups_number_their_rows_and_add_up_their_values():
+    first, second = np.array([4, 0, 4, 4, 0]), np.array([2, 10**17, 2, 1, 10**17])
+    groups = group_pairs(first, second)
+    assert groups.of_row.tolist() == [2, 0, 2, 1, 0]
+    assert groups.first.tolist() == [1, 3, 0]
+    assert groups.sums(np.array([1.0, 10.0, 100.0, 1000.0, 10000.0])).tolist() == [10010.0, 1000.0, 101.0]
+
+
+def test_rows_of_a_group_are_the_faces_of_its_tetrahedra():
+    groups = group_faces(np.array([[0, 1, 2, 3], [1, 3, 2, 4]]))
+    shared = np.flatnonzero(groups.sizes == 2)
+    assert len(shared) == 1
+    rows = groups.order[groups.start[shared[0]] :][:2]
+    assert sorted(rows.tolist()) == [0, 4 + 3]  # opposite node 0 of the first, opposite node 3 of the second

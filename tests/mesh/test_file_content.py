@@ -1,0 +1,142 @@
+"""What is refused before anything is written, for all formats alike."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.errors import MeshError, OutputError
+from thermoxels_ns.mesh.abaqus_file import HeatStep
+from thermoxels_ns.mesh.file_content import UNTAGGED_PATCH, file_content
+from thermoxels_ns.mesh.formats import MESH_FORMATS, mesh_file_paths, mesh_format, write_mesh
+
+STEP = HeatStep(1.7, 2200.0, 880.0, steps=10, step_seconds=60.0)
+SUFFIXES = sorted(MESH_FORMATS)
+
+
+def changed(array: np.ndarray, value: float) -> np.ndarray:
+    """A copy with another first entry."""
+    copy = array.copy()
+    copy.flat[0] = value
+    return copy
+
+
+def test_a_mesh_without_tags_is_one_patch(box_mesh):
+    content = file_content(box_mesh)
+    assert content.patch_names == (UNTAGGED_PATCH,)
+    assert content.patch.shape == (len(box_mesh.facets),)
+    assert not content.patch.any()
+    assert content.region_names == ("solid",)
+
+
+def test_tags_and_other_temperatures_are_taken(tagged_mesh):
+    content = file_content(tagged_mesh, tagged_mesh.temperature_c + 1.0)
+    assert np.array_equal(content.patch, tagged_mesh.boundary.patch)
+    assert content.patch_names == tagged_mesh.boundary.patch_names
+    assert np.array_equal(content.temperature_c, tagged_mesh.temperature_c + 1.0)
+
+
+@pytest.mark.parametrize(
+    ("field", "change", "message"),
+    [
+        ("points_m", lambda a: changed(a, np.nan), "points_m: expected finite"),
+        ("points_m", lambda a: a[:, :2], "points_m: expected shape"),
+        ("tets", lambda a: changed(a, len(a) * 9), "tets: expected whole numbers from 0"),
+        ("tets", lambda a: changed(a, -1), "tets: expected whole numbers from 0"),
+        ("tets", lambda a: a.astype(float), "tets: expected whole numbers"),
+        ("tets", lambda a: a[:0], "tets: expected at least one"),
+        ("facets", lambda a: changed(a, -1), "facets: expected whole numbers from 0"),
+        ("facet_tags", lambda a: a[1:], "facet_tags: expected shape"),
+        ("temperature_c", lambda a: changed(a, np.inf), "temperature_c: expected finite"),
+        ("temperature_c", lambda a: a[1:], "temperature_c: expected shape"),
+        ("observed", lambda a: a[1:], "observed: expected shape"),
+        ("region", lambda a: changed(a, 3), "region: expected whole numbers from 0 to 2"),
+        ("region", lambda a: a[1:], "region: expected shape"),
+        ("region_names", lambda a: (), "region_names: expected at least one name"),
+        ("region_names", lambda a: ("a", "b", "a"), "region_names: expected at least one name, all different"),
+        ("region_names", lambda a: ("a", "b", 'say "c"'), "region_names: expected names of printable"),
+        ("region_names", lambda a: ("a", "b", "c\n*STEP"), "region_names: expected names of printable"),
+        ("colour", lambda a: a[:, :2], "colour: expected shape"),
+        ("colour", lambda a: changed(a, np.nan), "colour: expected finite"),
+    ],
+)
+def test_a_damaged_mesh_is_refused(tagged_mesh, field, change, message):
+    damaged = dataclasses.replace(tagged_mesh, **{field: change(getattr(tagged_mesh, field))})
+    with pytest.raises(MeshError, match=message):
+        file_content(damaged)
+
+
+@pytest.mark.parametrize(
+    ("field", "change", "message"),
+    [
+        ("patch", lambda a: changed(a, 5), "boundary.patch: expected whole numbers from 0 to 4"),
+        ("patch", lambda a: a[1:], "boundary.patch: expected shape"),
+        ("patch_names", lambda a: (*a[:4], a[0]), "boundary.patch_names: expected at least one name, all different"),
+    ],
+)
+def test_damaged_tags_are_refused(tagged_mesh, field, change, message):
+    tags = dataclasses.replace(tagged_mesh.boundary, **{field: change(getattr(tagged_mesh.boundary, field))})
+    with pytest.raises(MeshError, match=message):
+        file_content(dataclasses.replace(tagged_mesh, boundary=tags))
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_every_format_writes_the_files_that_it_names(tmp_path, tagged_mesh, suffix):
+    path = tmp_path / "new folder" / f"house{suffix}"
+    assert write_mesh(path, tagged_mesh, heat_step=STEP) == mesh_file_paths(path)
+    assert {path, *mesh_file_paths(path)} == set(path.parent.iterdir())
+    assert all(file.stat().st_size for file in mesh_file_paths(path))
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_every_format_writes_a_mesh_without_tags_and_colours(tmp_path, box_mesh, suffix):
+    path = tmp_path / f"box{suffix}"
+    assert write_mesh(path, box_mesh, heat_step=STEP)[0] == path
+    assert path.is_file()
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_same_mesh_same_bytes(tmp_path, tagged_mesh, suffix):
+    written = [write_mesh(tmp_path / folder / f"house{suffix}", tagged_mesh, heat_step=STEP) for folder in "ab"]
+    for first, second in zip(*written):
+        assert first.read_bytes() == second.read_bytes()
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_mesh_that_is_refused_leaves_the_old_files(tmp_path, tagged_mesh, suffix):
+    path = tmp_path / f"house{suffix}"
+    for file in mesh_file_paths(path):
+        file.write_text("old")
+    damaged = dataclasses.replace(tagged_mesh, points_m=changed(tagged_mesh.points_m, np.nan))
+    with pytest.raises(MeshError, match="points_m"):
+        write_mesh(path, damaged, heat_step=STEP)
+    assert {file.read_text() for file in tmp_path.iterdir()} == {"old"}
+    assert set(tmp_path.iterdir()) == set(mesh_file_paths(path))
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_place_that_cannot_be_written_is_named(tmp_path, tagged_mesh, suffix):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="output folder"):
+        write_mesh(tmp_path / "file" / f"house{suffix}", tagged_mesh, heat_step=STEP)
+    (tmp_path / f"house{suffix}").mkdir()
+    with pytest.raises(OutputError, match=f"house{suffix}"):
+        write_mesh(tmp_path / f"house{suffix}", tagged_mesh, heat_step=STEP)
+    assert not [path for path in tmp_path.iterdir() if ".part" in path.name]
+
+
+def test_formats_are_found_by_their_ending():
+    assert set(MESH_FORMATS) == {".vtu", ".xdmf", ".msh", ".inp", ".stl", ".ply", ".glb"}
+    assert all(entry.suffix == suffix and "\n" not in entry.description for suffix, entry in MESH_FORMATS.items())
+    assert mesh_format(Path("a.b.msh")).suffix == ".msh"
+    with pytest.raises(OutputError, match=r"one of \.vtu, .*got house\.obj"):
+        mesh_format("house.obj")
+
+
+def test_an_input_file_needs_material_and_times(tmp_path, tagged_mesh):
+    with pytest.raises(MeshError, match="heat_step: expected material and times"):
+        write_mesh(tmp_path / "house.inp", tagged_mesh)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,62 @@
+"""Gmsh files as meshio reads them; Gmsh itself reads them in tests/external."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import meshio
+import numpy as np
+import pytest
+
+from thermoxels_ns.errors import MeshError
+from thermoxels_ns.mesh.gmsh_file import TEMPERATURE_VIEW, write_msh
+
+
+def test_groups_carry_names_numbers_and_elements(tmp_path, tagged_mesh):
+    write_msh(tmp_path / "house.msh", tagged_mesh)
+    read = meshio.read(tmp_path / "house.msh")
+    assert {name: tuple(entry) for name, entry in read.field_data.items()} == {
+        "up": (1, 2),
+        "down": (2, 2),
+        "inside": (3, 2),
+        "façade 1": (4, 2),
+        "walls": (1, 3),
+        "floor slab": (2, 3),
+    }
+    ours = {2: (tagged_mesh.facets, tagged_mesh.boundary.patch), 3: (tagged_mesh.tets, tagged_mesh.region)}
+    assert [block.dim for block in read.cells] == [2, 2, 2, 2, 3, 3]
+    for block, tags in zip(read.cells, read.cell_data["gmsh:physical"]):
+        cells, index = ours[block.dim]
+        assert len(set(tags)) == 1
+        expected = tagged_mesh.points_m[cells[index == tags[0] - 1]]
+        assert np.array_equal(read.points[block.data], expected)
+
+
+def test_temperatures_are_at_their_nodes(tmp_path, tagged_mesh):
+    shown = tagged_mesh.temperature_c[::-1].copy()
+    write_msh(tmp_path / "house.msh", tagged_mesh, temperature_c=shown)
+    read = meshio.read(tmp_path / "house.msh")
+    assert len(read.points) == len(tagged_mesh.points_m)
+    # The nodes come sorted by where they lie.
+    at = {tuple(point): number for number, point in enumerate(tagged_mesh.points_m)}
+    number = [at[tuple(point)] for point in read.points]
+    assert sorted(number) == list(range(len(at)))
+    assert np.array_equal(read.point_data[TEMPERATURE_VIEW].ravel(), shown[number])
+
+
+def test_nodes_lie_on_the_boundary_or_inside(tmp_path, box_mesh):
+    write_msh(tmp_path / "box.msh", box_mesh)
+    read = meshio.read(tmp_path / "box.msh")
+    dimension = read.point_data["gmsh:dim_tags"][:, 0]
+    low, high = box_mesh.points_m.min(axis=0), box_mesh.points_m.max(axis=0)
+    on_boundary = np.any((read.points == low) | (read.points == high), axis=1)
+    assert np.array_equal(dimension == 2, on_boundary)
+    assert np.array_equal(dimension == 3, ~on_boundary)
+    assert 0 < np.count_nonzero(dimension == 3) < len(dimension)
+
+
+def test_a_name_that_gmsh_would_cut_is_refused(tmp_path, tagged_mesh):
+    names = ("walls", "floor", "é" * 64)
+    with pytest.raises(MeshError, match=r"at most 127 bytes.*got 128 bytes"):
+        write_msh(tmp_path / "house.msh", dataclasses.replace(tagged_mesh, region_names=names))
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,153 @@
+"""The inside of bodies of which only a shell is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.looking_cameras import looking_at
+from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.mesh import interior as interior_module
+from thermoxels_ns.mesh.interior import interior
+
+N = 24
+LATTICE = Lattice((0.0, 0.0, 0.0), 1.0, (N + 1, N + 1, N + 1))
+MIDDLE = (N / 2, N / 2, N / 2)
+
+
+def box(lo: int, hi: int) -> np.ndarray:
+    cells = np.zeros((N, N, N), dtype=bool)
+    cells[lo:hi, lo:hi, lo:hi] = True
+    return cells
+
+
+def cup(walls: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """A box whose lower side is missing, as photographs from above leave it; and its inside."""
+    cells, inside = box(5, 19), box(5 + walls, 19 - walls)
+    inside[:, :, 5 : 5 + walls] = inside[:, :, [10]]
+    return cells & ~inside, inside
+
+
+def around(count: int = 12, height: float = 30.0) -> np.ndarray:
+    angle = 2 * np.pi * np.arange(count) / count
+    return np.column_stack((12 + 60 * np.cos(angle), 12 + 60 * np.sin(angle), np.full(count, height)))
+
+
+def test_a_closed_cavity_is_inside_with_or_without_cameras():
+    shell = box(5, 19) & ~box(7, 17)
+    for views in (None, looking_at(MIDDLE, around())):
+        found = interior(shell, LATTICE, views, 0)
+        assert np.array_equal(found.enclosed, box(7, 17)) and not found.hidden.any() and found.rooms == 0
+
+
+def test_a_cavity_with_a_camera_in_it_is_a_room():
+    rooms = box(2, 22) & ~box(3, 10)
+    rooms[13:20, 13:20, 13:20] = False  # a second one, without a camera
+    inside_one = looking_at((8.0, 8.0, 8.0), [(4.5, 5.0, 6.0), (8.5, 4.0, 6.0)])
+    found = interior(rooms, LATTICE, inside_one, 1)
+    assert found.rooms == 1
+    assert not (found.enclosed | found.hidden)[3:10, 3:10, 3:10].any()
+    assert found.enclosed[13:20, 13:20, 13:20].all() and found.enclosed.sum() == 7**3
+
+
+@pytest.mark.parametrize("eye", [(3.5, 3.5, 3.5), (6.5, 6.5, 6.5), (9.5, 6.5, 3.5)])
+@pytest.mark.parametrize("door", [0, 2])
+def test_a_camera_by_the_wall_of_a_room_is_in_it_too(eye, door):
+    rooms = box(2, 22) & ~box(3, 10)
+    rooms[:3, 5 : 5 + door, 5 : 5 + door] = False
+    found = interior(rooms, LATTICE, looking_at((15.0, 15.0, 15.0), [eye]), 2)
+    assert found.rooms == 1 and not found.enclosed.any()
+
+
+def test_a_camera_in_an_alcove_is_in_the_room():
+    rooms = box(2, 22) & ~box(6, 14)
+    rooms[14:18, 8:10, 8:10] = False
+    rooms[:6, 10, 10] = False  # the room has a keyhole, so that only sealing makes it a cavity
+    for end in (14.5, 15.5, 17.5):
+        found = interior(rooms, LATTICE, looking_at((10.0, 10.0, 10.0), (end, 9.0, 9.0)), 2)
+        assert found.rooms == 1 and not found.enclosed.any()
+
+
+def test_cavities_that_sealing_closes_are_inside():
+    solid = box(4, 20)
+    solid[10, 10, 10] = solid[14:17, 8:12, 8:12] = False
+    for seal in (0, 1, 2, 3):
+        assert np.array_equal(interior(solid, LATTICE, None, seal).enclosed, box(4, 20) & ~solid)
+
+
+@pytest.mark.parametrize("width", [1, 2, 3, 4, 5])
+def test_openings_are_sealed_up_to_twice_the_width(width):
+    shell = box(4, 20) & ~box(6, 18)
+    shell[4:6, 10 : 10 + width, 10 : 10 + width] = False
+    for seal in (1, 2):
+        found = interior(shell, LATTICE, None, seal).enclosed
+        if width > 2 * seal:
+            assert not found.any()
+        else:
+            assert (found | shell)[box(4, 20)].all() and not found[~box(4, 20)].any()
+    assert not interior(shell, LATTICE, None, 0).enclosed.any()
+
+
+def test_sealing_leaves_the_outside_alone():
+    """A notch in the outer side that is narrower than the seal is not part of the inside."""
+    shell = box(4, 20) & ~box(8, 16)
+    shell[4:6, 10:12, :] = False
+    found = interior(shell, LATTICE, None, 2)
+    assert np.array_equal(found.enclosed, box(8, 16))
+
+
+def test_what_the_shell_hides_from_all_cameras_is_inside_even_if_it_is_open_where_none_looks():
+    cells, inside = cup()
+    found = interior(cells, LATTICE, looking_at(MIDDLE, around()), 0)
+    assert not found.enclosed.any()
+    assert np.array_equal(found.hidden, inside)  # the shadow below it lies outside of its hull
+    assert not interior(cells, LATTICE, None, 2).enclosed.any()
+
+
+def test_what_cameras_look_into_is_not_inside():
+    cells, inside = cup()
+    from_below = looking_at(MIDDLE, around(height=-60.0))
+    found = interior(cells, LATTICE, from_below, 0)
+    assert found.hidden[inside].mean() < 0.35 and not found.hidden[11:13, 11:13, 5:12].any()
+
+
+def test_one_pinhole_that_single_cameras_look_through_does_not_empty_it():
+    cells, inside = cup()
+    cells[5:7, 11, 11] = False
+    eyes = np.vstack((around(20), [(-60.0, 11.5, 11.5)]))
+    found = interior(cells, LATTICE, looking_at(MIDDLE, eyes), 0)
+    assert found.hidden[inside].mean() > 0.99
+
+
+def test_a_plate_and_two_bodies_side_by_side_have_no_inside():
+    plate = np.zeros((N, N, N), dtype=bool)
+    plate[12] = True
+    one_side = looking_at(MIDDLE, [(60.0, 12.0, 12.0), (60.0, 20.0, 12.0)])
+    assert not interior(plate, LATTICE, one_side, 1).hidden.any()
+    two = box(3, 8)
+    two[14:19, 14:19, 14:19] = True
+    found = interior(two, LATTICE, looking_at(MIDDLE, [(-60.0, -60.0, -60.0)]), 1)
+    assert not (found.hidden | found.enclosed).any()  # the shadow between them is in neither hull
+
+
+def test_full_empty_and_checkerboard():
+    views = looking_at(MIDDLE, around())
+    checkerboard = np.indices((N, N, N)).sum(axis=0) % 2 == 0
+    for cells in (box(0, N), box(0, 0), checkerboard):
+        found = interior(cells, LATTICE, views, 2)
+        assert not ((found.enclosed | found.hidden) & cells).any() and not (found.enclosed & found.hidden).any()
+    assert not found.enclosed[0].any() and (checkerboard | found.enclosed | found.hidden)[3:-3, 3:-3, 3:-3].all()
+
+
+def test_blocks_give_the_same_inside(monkeypatch):
+    """Large lattices are looked at in blocks; no gap opens between the shell and what is filled, in odd places too."""
+    views = looking_at(MIDDLE, around())
+    cells, inside = cup(3)
+    for shift in ((0, 0, 0), (1, 0, 1)):
+        shell, expected = np.roll(cells, shift, (0, 1, 2)), np.roll(inside, shift, (0, 1, 2))
+        monkeypatch.setattr(interior_module, "LARGEST_PASS", N**3 - 1)
+        found = interior(shell, LATTICE, views, 0).hidden
+        assert not found[shell].any()
+        # Along the open side the hull ends in the middle of a block.
+        expected[:, :, : 6 + shift[2]] = found[:, :, : 6 + shift[2]] = False
+        assert np.array_equal(found, expected)

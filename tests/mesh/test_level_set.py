@@ -1,0 +1,107 @@
+"""The level on voxel centres: its sign is the choice of voxels, its zero the surface."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from thermoxels_ns.mesh.level_set import DEEP_RATIOS, level_of
+
+
+def crossings(level: np.ndarray) -> np.ndarray:
+    """Place of the sign changes along the first axis, in voxel centres, by linear interpolation."""
+    a, b = level[:-1], level[1:]
+    change = (a > 0) != (b > 0)
+    return (np.arange(len(a))[:, None, None] + a / np.where(change, a - b, 1.0))[change]
+
+
+def of(density: np.ndarray, threshold: float) -> np.ndarray:
+    dense = density >= threshold
+    return level_of(density, threshold, dense, dense)
+
+
+@pytest.mark.parametrize("offset", np.linspace(0.0, 0.9, 7))
+@pytest.mark.parametrize(
+    "ramp",
+    [
+        lambda d: 10.0 ** (-0.4 * d),
+        lambda d: 2.0**-d,
+        lambda d: np.maximum(1.0 - 0.2 * d, 0.0),
+        lambda d: 2.0 / (1.0 + np.exp(d)),
+    ],
+    ids=["decade in 2.5 voxels", "octave per voxel", "linear", "logistic"],
+)
+def test_the_surface_of_a_smooth_ramp_lies_within_a_tenth_of_a_voxel(ramp, offset):
+    distance = np.arange(20.0)[:, None, None] - (9.0 + offset) + np.zeros((1, 5, 5))
+    density = 7.0 * ramp(distance)  # the threshold is 7 at distance 0
+    found = crossings(of(density, 7.0))
+    assert len(found) == 25
+    assert np.abs(found - (9.0 + offset)).max() <= 0.1
+
+
+def test_the_surface_of_a_smooth_sphere_lies_within_a_tenth_of_a_voxel():
+    index = np.indices((25, 25, 25)) - np.array([12.2, 11.9, 12.4])[:, None, None, None]
+    radius = np.sqrt((index**2).sum(axis=0))
+    level = of(3.0 * 4.0 ** (8.0 - radius), 3.0)
+    found = []
+    for axis in range(3):
+        turned, r = np.moveaxis(level, axis, 0), np.moveaxis(radius, axis, 0)
+        change = (turned[:-1] > 0) != (turned[1:] > 0)
+        share = (turned[:-1] / np.where(change, turned[:-1] - turned[1:], 1.0))[change]
+        # The radius is close to linear between neighbours.
+        found.append(r[:-1][change] * (1 - share) + r[1:][change] * share)
+    error = np.concatenate(found) - 8.0
+    assert len(error) > 600 and np.abs(error).max() <= 0.1
+
+
+def test_pruned_fields_put_the_surface_half_way_or_closer_to_thin_voxels():
+    """Outside a trained surface density is exactly 0; a dense voxel next to it is all inside, a thin one partly."""
+    density = np.zeros((12, 5, 5))
+    density[6:] = 50.0 * DEEP_RATIOS[1]
+    assert crossings(of(density, 50.0)) == pytest.approx(5.5)
+    density[6] = 50.0 * 3.0
+    thin = crossings(of(density, 50.0))
+    assert (thin > 5.55).all() and (thin < 6.0).all()
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_walls_and_gaps_one_voxel_thick_keep_their_thickness(axis):
+    wall = np.zeros((9, 9, 9))
+    np.moveaxis(wall, axis, 0)[4] = 1e4
+    for density in (wall, 1e4 - wall):
+        ends = crossings(np.moveaxis(of(density, 1.0), axis, 0)).reshape(2, 81)
+        assert ends[0] == pytest.approx(3.5) and ends[1] == pytest.approx(4.5)
+
+
+def test_steps_override_density_deep_on_their_side():
+    density = np.where(np.arange(12)[:, None, None] < 6, 100.0, 0.0) * np.ones((12, 6, 6))
+    dense = density >= 1.0
+    cells = dense.copy()
+    cells[6:9] = True  # filled
+    cells[:2] = False  # a floater that went
+    level = level_of(density, 1.0, dense, cells)
+    assert np.array_equal(level > 0, cells) and level[7, 3, 3] == 1.0 and level[0, 3, 3] == -1.0
+    assert np.unique(crossings(level).round(6)).tolist() == [1.5, 8.5]
+
+
+def test_a_threshold_of_zero_takes_any_density_as_deep_inside():
+    density = np.zeros((5, 5, 5))
+    density[2:] = 1e-6
+    level = level_of(density, 0.0, density > 0, density > 0)
+    assert np.isfinite(level).all() and crossings(level) == pytest.approx(1.5)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), decades=st.sampled_from([0, 1, 30, 300]), share=st.floats(0.0, 1.0))
+def test_sign_range_and_type_hold_for_any_density(seed, decades, share):
+    random = np.random.default_rng(seed)
+    shape = tuple(random.integers(1, 7, size=3))
+    density = 10.0 ** (decades * random.uniform(-1.0, 1.0, shape)) * (random.random(shape) < 0.7)
+    dense = density >= 1.0
+    cells = dense ^ (random.random(shape) < 0.3 * share)
+    level = level_of(density, 1.0, dense, cells)
+    assert level.dtype == np.float32 and level.shape == shape
+    assert np.array_equal(level > 0, cells) and np.array_equal(level < 0, ~cells)
+    assert np.abs(level).max() <= 1.0 and np.abs(level).min() >= 0.004

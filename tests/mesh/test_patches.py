@@ -1,0 +1,321 @@
+"""Default patches, a user's rules for patches and regions, and the file that they stand in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.errors import MeshError
+from thermoxels_ns.mesh.patch_rules import DEFAULT_PATCHES, PatchRules, Rule, load_patch_rules
+from thermoxels_ns.mesh.patches import apply_patches, apply_regions, default_patches, facing
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "configs" / "patches-example.yaml"
+UP = (0.0, 0.0, 1.0)
+
+
+def tilted(degrees: float) -> np.ndarray:
+    """A normal that many degrees off the vertical."""
+    return np.array([np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))])
+
+
+def rules_of(tmp_path: Path, text: str) -> PatchRules:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text, encoding="utf-8")
+    return load_patch_rules(path)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "expected"),
+    [(0, "up"), (44.9, "up"), (45, "side"), (90, "side"), (135, "side"), (135.1, "down"), (180, "down")],
+)
+@pytest.mark.parametrize("length", [0.1, 1.0, 9.81])
+def test_facing_changes_at_45_and_135_degrees(degrees: float, expected: str, length: float) -> None:
+    assert facing(tilted(degrees)[None], np.array(UP) * length).tolist() == [["up", "side", "down"].index(expected)]
+
+
+def test_facing_follows_the_up_direction() -> None:
+    normals = np.concatenate([np.eye(3), -np.eye(3)])
+    assert facing(normals, (0, 1, 0)).tolist() == [1, 0, 1, 1, 2, 1]
+    assert facing(normals, (0, 0, -1)).tolist() == [1, 1, 2, 1, 1, 0]
+
+
+@pytest.mark.parametrize("up", [(0, 0, 0), (0, float("nan"), 1), (0, 1)])
+def test_no_direction_is_refused(up: tuple) -> None:
+    with pytest.raises(MeshError, match="up: expected three numbers that are not all 0"):
+        facing(np.zeros((0, 3)), up)
+
+
+def test_default_patches_are_named_by_side_and_direction() -> None:
+    normals = np.array([tilted(d) for d in (0, 90, 180, 0, 90, 180, 0)])
+    seen = np.array([True, True, True, False, False, False, True])
+    on_box = np.array([False] * 6 + [True])
+    patch, names = default_patches(normals, UP, seen, on_box)
+    assert [names[p] for p in patch] == [
+        "exterior-up",
+        "exterior-side",
+        "exterior-down",
+        "interior-up",
+        "interior-side",
+        "interior-down",
+        "cut",
+    ]
+    assert names == DEFAULT_PATCHES
+    assert patch.tolist() == list(range(7))
+
+
+FACETS = {
+    "centroids_m": np.array([[0.5, 0.5, 2], [0.5, 0.5, 0], [2.0, 0.5, 1], [0.1, 0.2, 1], [0.9, 0.9, 1.0], [5, 5, 5]]),
+    "normals": np.array([tilted(d) for d in (0, 180, 90, 90, 90, 0)]),
+    "up": UP,
+    "seen": np.array([True, False, True, True, False, True]),
+    "on_box": np.array([False, False, False, False, False, True]),
+}
+"""A roof, a floor inside, three walls of which one inside, and a cut that faces up."""
+BEFORE = ["exterior-up", "interior-down", "exterior-side", "exterior-side", "interior-side", "cut"]
+
+
+def named(rules: PatchRules, colours: np.ndarray | None = None) -> list[str]:
+    """Name of each facet's patch."""
+    patch, names = apply_patches(rules, **FACETS, colours=colours)
+    return [names[p] for p in patch]
+
+
+def test_without_rules_the_default_patches_come_back() -> None:
+    patch, names = apply_patches(PatchRules(), **FACETS)
+    expected, _ = default_patches(FACETS["normals"], UP, FACETS["seen"], FACETS["on_box"])
+    assert np.array_equal(patch, expected)
+    assert names == DEFAULT_PATCHES
+
+
+@pytest.mark.parametrize(
+    ("rule", "changed"),
+    [
+        ("box: {lower: [0, 0, 0], upper: [1, 1, 1]}", [1, 3, 4]),
+        ("box: {lower: [0, 0, .5], upper: [1, 1, 1]}", [3, 4]),
+        ("box: {lower: [-.inf, -.inf, 1.5], upper: [.inf, .inf, .inf]}", [0, 5]),
+        ("plane: {point: [0, 0, 1], normal: [0, 0, 7]}", [0, 2, 3, 4, 5]),
+        ("plane: {point: [0, 0, 1], normal: [0, 0, -1]}", [1, 2, 3, 4]),
+        ("plane: {point: [1, 0, 0], normal: [1, 0, 0]}", [2, 5]),
+        ("only: exterior", [0, 2, 3]),
+        ("only: interior", [1, 4]),
+        ("only: cut", [5]),
+        ("only: all", [0, 1, 2, 3, 4, 5]),
+        ("facing: up", [0, 5]),
+        ("facing: side", [2, 3, 4]),
+        ("facing: down", [1]),
+        ("facing: any", [0, 1, 2, 3, 4, 5]),
+        ("only: exterior, facing: side, box: {lower: [0, 0, 0], upper: [1, 1, 3]}", [3]),
+        ("box: {lower: [0, 0, 0], upper: [1, 1, 3]}, plane: {point: [0, 0, 1.5], normal: [0, 0, 1]}", [0]),
+        ("only: interior, facing: up", []),
+    ],
+)
+def test_all_conditions_of_a_rule_hold(tmp_path: Path, rule: str, changed: list[int]) -> None:
+    names = named(rules_of(tmp_path, f"patches: [{{name: mine, {rule}}}]"))
+    assert [n for n, name in enumerate(names) if name == "mine"] == changed
+    assert [n for n, name in enumerate(names) if name == BEFORE[n]] == [n for n in range(6) if n not in changed]
+
+
+def test_later_rules_win_and_equal_names_add_up(tmp_path: Path) -> None:
+    rules = rules_of(
+        tmp_path,
+        """
+patches:
+  - {name: wall, facing: side}
+  - {name: window, box: {lower: [0, 0, 0.9], upper: [0.5, 0.5, 1.1]}}
+  - {name: window, box: {lower: [1.5, 0, 0.9], upper: [2.5, 1.0, 1.1]}}
+  - {name: nowhere, box: {lower: [8, 8, 8], upper: [9, 9, 9]}}
+""",
+    )
+    assert named(rules) == ["exterior-up", "interior-down", "window", "window", "wall", "cut"]
+    assert apply_patches(rules, **FACETS)[1] == (*DEFAULT_PATCHES, "wall", "window", "nowhere")
+
+
+COLOURS = np.array([[1.0, 0, 0], [0.9, 0, 0], [0.5, 0, 0], [0.1, 0, 0], [0.0, 0, 0], [0.4, 0.3, 0.0]])
+
+
+def test_the_nearest_colour_wins_whatever_the_order(tmp_path: Path) -> None:
+    red = "{name: red, nearest_colour: {rgb: [255, 0, 0]}}"
+    black = "{name: black, nearest_colour: {rgb: [0.0, 0.0, 0.0]}}"
+    expected = ["red", "red", None, "black", "black", "black"]
+    for order in ([red, black], [black, red]):
+        found = named(rules_of(tmp_path, f"patches: [{', '.join(order)}]"), COLOURS)
+        assert [name for name, want in zip(found, expected) if want] == [want for want in expected if want]
+    # The third is exactly half-way: the later one has it.
+    assert found[2] == "red"
+
+
+@pytest.mark.parametrize(
+    "distance", ["rgb: [204, 0, 0], max_distance: 51.5", "rgb: [0.8, 0.0, 0.0], max_distance: 0.202"]
+)
+def test_a_colour_that_is_too_far_is_nobodys(tmp_path: Path, distance: str) -> None:
+    names = named(rules_of(tmp_path, f"patches: [{{name: red, nearest_colour: {{{distance}}}}}]"), COLOURS)
+    assert names == ["red", "red", *BEFORE[2:]]
+
+
+def test_a_colour_that_its_other_conditions_exclude_does_not_compete(tmp_path: Path) -> None:
+    rules = rules_of(
+        tmp_path,
+        """
+patches:
+  - {name: near, nearest_colour: {rgb: [230, 0, 0]}, facing: up}
+  - {name: far, nearest_colour: {rgb: [0, 0, 255]}, only: all}
+  - {name: roof, box: {lower: [0, 0, 1.9], upper: [1, 1, 2.1]}}
+""",
+    )
+    # The first would be nearest to the floor too, but does not face down. A later rule without colour wins as ever.
+    assert named(rules, COLOURS) == ["roof", "far", "far", "far", "far", "near"]
+
+
+def test_regions_go_by_box_plane_and_colour(tmp_path: Path) -> None:
+    rules = rules_of(
+        tmp_path,
+        """
+regions:
+  - {name: slab, box: {lower: [-.inf, -.inf, -.inf], upper: [.inf, .inf, 0.3]}}
+  - {name: east, plane: {point: [2, 0, 0], normal: [1, 0, 0]}}
+  - {name: brick, nearest_colour: {rgb: [255, 0, 0], max_distance: 30}}
+  - {name: slab, box: {lower: [9, 9, 9], upper: [10, 10, 10]}}
+""",
+    )
+    centroids = np.array([[0, 0, 0.2], [0, 0, 0.4], [3, 0, 0.2], [0, 0, 1.0], [9.5, 9.5, 9.5]])
+    colours = np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0.95, 0, 0], [1.0, 0, 0]], dtype=np.float32)
+    region, names = apply_regions(rules, centroids, colours)
+    assert names == ("solid", "slab", "east", "brick")
+    assert [names[r] for r in region] == ["slab", "solid", "east", "brick", "slab"]
+    assert apply_regions(PatchRules(), centroids)[0].tolist() == [0] * 5
+    assert apply_regions(PatchRules(), centroids)[1] == ("solid",)
+
+
+def test_rules_by_colour_need_colours() -> None:
+    rules = PatchRules((Rule("red", colour=(1.0, 0.0, 0.0)),), (Rule("red", colour=(1.0, 0.0, 0.0)),))
+    with pytest.raises(MeshError, match=r"patch red: expected a mesh with colours.*got a mesh without"):
+        named(rules)
+    with pytest.raises(MeshError, match="region red: expected a mesh with colours"):
+        apply_regions(rules, np.zeros((2, 3)))
+    with pytest.raises(MeshError, match="colours: expected shape"):
+        apply_regions(rules, np.zeros((2, 3)), np.zeros((1, 3)))
+
+
+def test_the_example_is_read_and_does_what_its_comments_say() -> None:
+    rules = load_patch_rules(EXAMPLE)
+    assert [rule.name for rule in rules.patches] == ["window", "window", "roof", "brick", "plaster"]
+    assert [rule.name for rule in rules.regions] == ["slab"]
+    facets = {
+        "centroids_m": np.array([[2.0, 0, 1.5], [4.0, 0, 1.5], [2.0, 0, 1.5], [1, 1, 3.2], [1, 1, 2.0], [1, 0, 2.5]]),
+        "normals": np.array([tilted(d) for d in (90, 90, 90, 30, 30, 90)]),
+        "up": UP,
+        "seen": np.array([True, True, False, True, True, True]),
+        "on_box": np.zeros(6, dtype=bool),
+        "colours": np.array([[0.2, 0.2, 0.3]] * 5 + [[0.6, 0.3, 0.25]]),
+    }
+    patch, names = apply_patches(rules, **facets)
+    assert [names[p] for p in patch] == ["window", "window", "interior-side", "roof", "exterior-up", "brick"]
+    region, regions = apply_regions(rules, np.array([[0, 0, 0.29], [0, 0, 0.31]]))
+    assert [regions[r] for r in region] == ["slab", "solid"]
+
+
+@pytest.mark.parametrize("text", ["patches: []", "regions: []", "{patches: [], regions: []}"])
+def test_empty_lists_are_no_rules(tmp_path: Path, text: str) -> None:
+    assert rules_of(tmp_path, text) == PatchRules()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", r"^mine\.yaml: expected the keys patches, regions, got nothing"),
+        ("[]", r"^mine\.yaml: expected the keys patches, regions, got \[\]"),
+        ("patches: [", r"^mine\.yaml: expected a yaml file, got"),
+        ("patch: []", r"^mine\.yaml: expected keys out of patches, regions, got 'patch'\. Correct or remove"),
+        ("patches:", r"mine\.yaml: patches: expected a list of entries.*got nothing"),
+        ("patches: {name: a}", "patches: expected a list of entries"),
+        ("patches: [a]", "patches entry 1: expected the keys name, box, plane, nearest_colour, only, facing, got 'a'"),
+        ("patches: [{facing: up}]", "patches entry 1: expected the key name, got facing. Add name"),
+        ("patches: [{name: a, facing: up}, {name: b}]", r"patches entry 2 \(b\): expected at least one of box, plane"),
+        ("patches: [{name: a, colour: 3}]", "entry 1: expected keys out of name, box.*got 'colour'"),
+        ("patches: [{name: 7, facing: up}]", "entry 1: name: expected up to 40 letters.*got 7"),
+        ("patches: [{name: a b, facing: up}]", "entry 1: name: expected up to 40 letters.*got 'a b'"),
+        ("patches: [{name: 2nd, facing: up}]", "name: expected up to 40 letters"),
+        ("patches: [{name: cut, facing: up}]", "entry 1: name: expected a name other than exterior-up.*got cut"),
+        ("patches: [{name: Exterior-Up, facing: up}]", "expected a name other than.*got Exterior-Up"),
+        ("regions: [{name: solid, box: {}}]", r"\(solid\): box: expected the keys lower, upper"),
+        (
+            "regions: [{name: solid, box: {lower: [0, 0, 0], upper: [1, 1, 1]}}]",
+            "entry 1: name: expected a name other than solid, got solid",
+        ),
+        (
+            "patches: [{name: wall, facing: up}, {name: Wall, facing: side}]",
+            "entry 2: name: expected wall, as above, or another name, got Wall",
+        ),
+        ("regions: [{name: a, facing: up}]", "regions entry 1: expected keys out of name, box, plane, nearest_colour"),
+        ("patches: [{name: a, facing: north}]", r"\(a\): facing: expected one of up, side, down, any, got 'north'"),
+        ("patches: [{name: a, only: seen}]", r"\(a\): only: expected one of exterior, interior, cut, all, got 'seen'"),
+        ("patches: [{name: a, only: [cut]}]", r"only: expected one of exterior, interior, cut, all, got \['cut'\]"),
+        ("patches: [{name: a, only: cut, only: all}]", "expected a yaml file, got the key only twice"),
+        ("patches: [{name: a, box: {lower: [0, 0, 0]}}]", r"\(a\): box: expected the key upper, got lower"),
+        (
+            "patches: [{name: a, box: {lower: [0, 0], upper: [1, 1, 1]}}]",
+            r"box\.lower: expected three numbers in square brackets, got \[0, 0\]",
+        ),
+        (
+            "patches: [{name: a, box: {lower: [0, 0, 1], upper: [1, 1, 1]}}]",
+            r"box: expected each number of lower below that of upper, got \[0.0, 0.0, 1.0\] and \[1.0, 1.0, 1.0\]",
+        ),
+        (
+            "patches: [{name: a, box: {lower: [0, 0, 1e-3], upper: [1, 1, 1]}}]",
+            r"box\.lower: expected a number, got '1e-3'\. Write it without quotes",
+        ),
+        ("patches: [{name: a, box: {lower: [0, 0, .nan], upper: [1, 1, 1]}}]", "expected a number, got nan"),
+        ("patches: [{name: a, box: {lower: [0, 0, true], upper: [1, 1, 1]}}]", "expected a number, got True"),
+        ("patches: [{name: a, box: {lower: [0, 0, 2 m], upper: [1, 1, 1]}}]", "expected a number, got '2 m'"),
+        (
+            "patches: [{name: a, plane: {point: [0, 0, 0], normal: [0, 0, 0]}}]",
+            r"plane\.normal: expected three numbers that are not all 0",
+        ),
+        (
+            "patches: [{name: a, plane: {point: [0, 0, .inf], normal: [0, 0, 1]}}]",
+            r"plane\.point: expected a finite number, got inf",
+        ),
+        (
+            "patches: [{name: a, nearest_colour: [1, 2, 3]}]",
+            "nearest_colour: expected the keys rgb, max_distance",
+        ),
+        (
+            "patches: [{name: a, nearest_colour: {rgb: [0, 0, 256]}}]",
+            r"nearest_colour\.rgb: expected three numbers from 0 to 255",
+        ),
+        ("patches: [{name: a, nearest_colour: {rgb: [0, 0, -1]}}]", "expected three numbers from 0 to 255"),
+        (
+            "patches: [{name: a, nearest_colour: {rgb: [1, 0, 0]}}]",
+            r"got \[1, 0, 0\], which may be either\. Write \[1\.0, 0\.0, 0\.0\] for a bright .* or \[0\.0039,",
+        ),
+        (
+            "patches: [{name: a, nearest_colour: {rgb: [9, 0, 0], max_distance: 0}}]",
+            r"max_distance: expected a number above 0, on the scale of rgb, got 0\.0",
+        ),
+    ],
+)
+def test_wrong_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(MeshError, match=f"(?s){message}"):
+        rules_of(tmp_path, text)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match=r"none\.yaml: expected a yaml file with patches and regions, got No such file"):
+        load_patch_rules(tmp_path / "none.yaml")
+
+
+@pytest.mark.parametrize(
+    ("rgb", "colour"),
+    [
+        ("[255, 0, 51]", (1.0, 0.0, 0.2)),
+        ("[1.0, 0, 0.5]", (1.0, 0.0, 0.5)),
+        ("[127.5, 0, 0]", (0.5, 0.0, 0.0)),
+        ("[0, 0, 0]", (0.0, 0.0, 0.0)),
+        ("[2, 1, 0]", (2 / 255, 1 / 255, 0.0)),
+    ],
+)
+def test_colours_are_whole_numbers_or_shares(tmp_path: Path, rgb: str, colour: tuple) -> None:
+    (rule,) = rules_of(tmp_path, f"patches: [{{name: a, nearest_colour: {{rgb: {rgb}}}}}]").patches
+    assert rule.colour == pytest.approx(colour)

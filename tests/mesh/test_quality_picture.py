@@ -1,0 +1,112 @@
+"""The picture of a mesh's quality is written whole, says what the report says, and nothing lies on anything else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+from thermoxels_ns.errors import OutputError
+from thermoxels_ns.mesh.quality_picture import picture_of_quality
+from thermoxels_ns.mesh.quality_report import QualityReport, quality_report
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A report, its picture's file and what was drawn."""
+
+    report: QualityReport
+    path: Path
+    figure: Figure
+
+
+def box_mesh() -> TetMesh:
+    """A box of 3 x 4 x 2 voxels of 0.5 m."""
+    corners, tets = kuhn_tets(np.ones((3, 4, 2), dtype=bool))
+    facets = boundary_facets(tets)
+    warm = np.full(len(corners), 20.0)
+    none = np.zeros(len(facets), dtype=np.int64)
+    return TetMesh(corners * 0.5, tets, warm, warm > 0, facets, none, np.zeros(len(tets), dtype=np.int64))
+
+
+def draw(path: Path, report: QualityReport, title: str = "") -> Drawn:
+    figures = []
+    save = Figure.savefig
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", lambda self, *a, **k: (figures.append(self), save(self, *a, **k))[1])
+        picture_of_quality(path, report, title)
+    return Drawn(report, path, figures[0])
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory) -> Drawn:
+    return draw(tmp_path_factory.mktemp("good") / "new" / "quality.png", quality_report(box_mesh(), "voxel"))
+
+
+@pytest.fixture(scope="module")
+def damaged(tmp_path_factory) -> Drawn:
+    """A mesh that breaks most promises, in numbers that take much room."""
+    mesh = box_mesh()
+    moved = mesh.points_m + np.random.default_rng(0).normal(size=mesh.points_m.shape) * 0.4
+    mesh = replace(mesh, points_m=moved, facets=mesh.facets[:-9], facet_tags=mesh.facet_tags[:-9])
+    report = quality_report(mesh, "conforming", length_unit="input unit")
+    report = replace(report, num_nodes=12_345_678, num_tets=71_234_567, num_facets=1_234_567, num_box_facets=123_456)
+    return draw(tmp_path_factory.mktemp("damaged") / "quality.png", report, "A title")
+
+
+def words_in(figure: Figure) -> list[str]:
+    return [text.get_text() for axis in figure.axes for text in axis.texts]
+
+
+def test_picture_is_one_png_and_nothing_else(good):
+    with Image.open(good.path) as picture:
+        assert picture.format == "PNG"
+        pixels = np.asarray(picture.convert("RGB"))
+    assert pixels.shape[0] > 800 and pixels.shape[1] > 1000
+    assert np.mean(np.all(pixels == 255, axis=-1)) > 0.5
+    assert np.mean(np.any(pixels < 200, axis=-1)) > 0.02
+    assert [p.name for p in good.path.parent.iterdir()] == ["quality.png"]
+
+
+def test_it_says_which_promises_are_broken(good, damaged):
+    kept, broken = words_in(good.figure), words_in(damaged.figure)
+    assert kept.count("yes") == 8 and "Promises: 8 of 8 kept" in kept and "45°" in kept
+    assert broken.count("no") == len(damaged.report.broken) >= 4 and "164.8°" in broken
+    assert "3 m³" in kept and "1; 1" in kept
+    assert damaged.figure.get_suptitle() == "A title" and "voxel" in good.figure.get_suptitle()
+
+
+@pytest.mark.parametrize("which", ["good", "damaged"])
+def test_no_words_overlap_or_leave_the_picture(request, which):
+    figure = request.getfixturevalue(which).figure
+    texts = [text for axis in figure.axes for text in axis.texts if text.get_text()]
+    boxes = [text.get_window_extent() for text in texts]
+    assert len(boxes) > 40
+    for number, box in enumerate(boxes):
+        words, page = texts[number].get_text(), figure.bbox
+        assert box.x0 >= page.x0 and box.x1 <= page.x1 and box.y0 >= page.y0, words
+        hidden = [texts[other].get_text() for other in range(number) if box.overlaps(boxes[other])]
+        assert not hidden, (words, hidden)
+
+
+def test_bars_are_the_counts(good):
+    angles, ratios = good.figure.axes[:2]
+    heights = {round(bar.get_x() + 2.5): bar.get_height() for bar in angles.patches if bar.get_height()}
+    assert heights == {45: 288, 60: 144, 90: 432}
+    tall = [(bar.get_x(), bar.get_height()) for bar in ratios.patches if bar.get_height()]
+    assert tall == [(pytest.approx(0.7), good.report.num_tets)]
+
+
+def test_a_name_that_is_no_png_and_a_place_that_is_no_folder(tmp_path, good):
+    with pytest.raises(OutputError, match=r"ends in \.png"):
+        picture_of_quality(tmp_path / "a.pdf", good.report)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="output folder"):
+        picture_of_quality(tmp_path / "file" / "a.png", good.report)
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]

@@ -1,0 +1,282 @@
+"""The quality report measures what is there, and each promise breaks for its own reason only."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import skfem
+from skfem.models.poisson import laplace
+
+from thermoxels_ns.errors import MeshError
+from thermoxels_ns.mesh.promises import Evidence, judge
+from thermoxels_ns.mesh.quality import check_mesh
+from thermoxels_ns.mesh.quality_report import QualityReport, quality_report
+from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
+from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
+
+NAMES = (
+    "volumes_positive",
+    "conforming",
+    "boundary_closed",
+    "dihedral_within_bounds",
+    "temperatures_in_range",
+    "non_obtuse",
+    "stiffness_monotone",
+    "boundary_manifold",
+)
+
+
+def mesh_from(points: np.ndarray, tets: np.ndarray) -> TetMesh:
+    facets = boundary_facets(tets)
+    none = np.zeros(len(facets), dtype=np.int64)
+    warm = np.full(len(points), 20.0)
+    return TetMesh(points, tets, warm, warm > 0, facets, none, np.zeros(len(tets), dtype=np.int64))
+
+
+def figure_of(report: QualityReport, name: str) -> float:
+    return next(promise.figure for promise in report.promises if promise.name == name)
+
+
+def test_a_voxel_mesh_keeps_every_promise(box_mesh):
+    report = quality_report(box_mesh, "voxel")
+    assert tuple(promise.name for promise in report.promises) == NAMES
+    assert report.broken == ()
+    # Edges of voxels, diagonals of their faces, diagonals of voxels.
+    assert (report.num_nodes, report.num_tets, report.num_edges) == (60, 144, 133 + 98 + 24)
+    assert report.volume_m3 == pytest.approx(3.0) and report.area_m2 == pytest.approx(13.0)
+    assert report.true_area_m2 is None
+    assert report.edge_length_m[0] == 0.5 and report.edge_length_m[2] == pytest.approx(0.5 * np.sqrt(3))
+    assert (report.bodies_by_node, report.bodies_by_face, report.genus, report.euler_characteristic) == (1, 1, 0, 2)
+    assert (len(report.components), report.num_cavities) == (1, 0)
+
+
+def test_histograms_of_a_voxel_mesh_by_hand(box_mesh):
+    report = quality_report(box_mesh, "voxel")
+    angles = {5 * number: count for number, count in enumerate(report.dihedral_counts) if count}
+    assert angles == {45: 2 * 144, 60: 144, 90: 3 * 144}  # of each tetrahedron
+    # Legs a, a, a at right angles in a row: r = 6 V / (2 A) with V = a^3 / 6, A = (1 + sqrt 2) a^2; R = sqrt(3) a / 2.
+    ratio = 3 * (1 / (2 * (1 + np.sqrt(2)))) / (np.sqrt(3) / 2)
+    assert report.radius_ratio_range == pytest.approx((ratio, ratio))
+    assert np.flatnonzero(report.radius_ratio_counts).tolist() == [int(ratio / 0.05)]
+    assert len(report.dihedral_counts) == 37 and len(report.radius_ratio_counts) == 20
+    assert sum(report.dihedral_counts) == 6 * 144 and sum(report.radius_ratio_counts) == 144
+
+
+def test_the_regular_tetrahedron_is_in_the_last_bin():
+    points = np.array([[1.0, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1]])
+    report = quality_report(mesh_from(points, np.array([[0, 1, 2, 3]])), "conforming")
+    assert report.radius_ratio_counts[-1] == 1 and report.radius_ratio_mean == pytest.approx(1.0)
+    assert report.dihedral_counts[14] == 6  # 70.5 degrees
+    assert report.broken == ()
+
+
+def test_figures_agree_with_the_mesh_check(mesh_of_cells, random_cells):
+    for seed in range(5):
+        mesh = mesh_of_cells(random_cells(seed))
+        quality, report = check_mesh(mesh), quality_report(mesh, "voxel")
+        assert report.num_non_manifold_edges == quality.num_non_manifold_edges
+        assert report.dihedral_range_deg == (quality.min_dihedral_deg, quality.max_dihedral_deg)
+        assert (report.volume_m3, report.area_m2) == (quality.volume_m3, quality.area_m2)
+        assert set(report.broken) <= {"boundary_manifold"}
+
+
+def test_true_area_is_area_times_factor(box_mesh):
+    num = len(box_mesh.facets)
+    factor = np.linspace(0.5, 1.0, num)
+    boundary = Boundary(np.zeros((num, 3)), factor, np.ones(num, bool), np.zeros(num, np.int64), ("all",))
+    report = quality_report(replace(box_mesh, boundary=boundary), "voxel")
+    assert report.true_area_m2 == pytest.approx(13.0 * 0.75)  # all triangles are equal
+    assert report.area_m2 == pytest.approx(13.0)
+
+
+def test_turned_over_tetrahedron_breaks_its_promises(box_mesh):
+    tets = box_mesh.tets.copy()
+    tets[5] = tets[5, [1, 0, 2, 3]]
+    report = quality_report(replace(box_mesh, tets=tets), "voxel")
+    assert "volumes_positive" in report.broken and "conforming" not in report.broken
+    assert figure_of(report, "volumes_positive") == pytest.approx(-(0.5**3) / 6)
+    assert report.radius_ratio_range[0] == 0.0
+
+
+def test_crack_twin_nodes_and_third_owner_are_not_conforming():
+    corners, tets = kuhn_tets(np.ones((2, 1, 1), dtype=bool))
+    number = {tuple(c): n for n, c in enumerate(corners.tolist())}
+    mirrored = np.array([[number[(x, 1 - y, z)] for x, y, z in corners[t].tolist()] for t in tets[6:]])
+    points = corners.astype(float)
+    crossed = np.vstack([tets[:6], mirrored[:, [0, 2, 1, 3]]])
+    report = quality_report(mesh_from(points, crossed), "voxel")
+    assert "conforming" in report.broken and "volumes_positive" not in report.broken
+    apart = tets.copy()
+    apart[6:] += len(points)
+    report = quality_report(mesh_from(np.vstack([points, points]), apart), "voxel")
+    # The two bodies have four positions in common, and lists of nodes that the other body uses.
+    assert report.broken == ("conforming",) and figure_of(report, "conforming") == len(points)
+    third = np.vstack([tets, tets[:1]])
+    assert "conforming" in quality_report(mesh_from(points, third), "voxel").broken
+
+
+def test_missing_boundary_triangle_breaks_closedness(box_mesh):
+    fewer = replace(box_mesh, facets=box_mesh.facets[1:], facet_tags=box_mesh.facet_tags[1:])
+    report = quality_report(fewer, "voxel")
+    assert report.broken == ("boundary_closed",)
+    assert figure_of(report, "boundary_closed") == 3 + 1  # open edges, wrong triangles
+    assert report.genus is None
+    none = replace(box_mesh, facets=box_mesh.facets[:0], facet_tags=box_mesh.facet_tags[:0])
+    assert quality_report(none, "voxel").broken == ("boundary_closed",)
+
+
+@pytest.mark.parametrize(("degrees", "broken"), [(10.8, False), (10.6, True)])
+def test_dihedral_bounds_depend_on_the_mode(degrees, broken):
+    # A right prism's corner with this angle at one edge and no obtuse one.
+    angle = np.radians(degrees)
+    points = np.array([[0.0, 0, 0], [0, 0, 1], [1, 0, 0], [1, np.tan(angle), 0]])
+    mesh = mesh_from(points, np.array([[0, 2, 3, 1]]))
+    report = quality_report(mesh, "conforming")
+    assert report.dihedral_range_deg[0] == pytest.approx(degrees)
+    assert figure_of(report, "dihedral_within_bounds") == pytest.approx(degrees - 10.7)
+    assert ("dihedral_within_bounds" in report.broken) == broken
+    assert "dihedral_within_bounds" in quality_report(mesh, "voxel").broken
+    assert "non_obtuse" not in report.broken
+
+
+def test_temperatures_outside_the_observed_range(box_mesh):
+    unseen = int(np.flatnonzero(~box_mesh.observed)[0])
+    for change, excess in ((40.0, 40.0), (-50.0, 50.0)):
+        warm = np.full(60, 20.0)
+        warm[unseen] += change
+        report = quality_report(replace(box_mesh, temperature_c=warm), "voxel")
+        assert report.broken == ("temperatures_in_range",)
+        assert figure_of(report, "temperatures_in_range") == excess
+        wider = quality_report(replace(box_mesh, temperature_c=warm), "voxel", observed_range_c=(-40.0, 60.0))
+        assert wider.broken == ()
+    assert quality_report(box_mesh, "voxel", observed_range_c=(20.0, 20.5)).broken == ("temperatures_in_range",)
+
+
+def test_obtuse_angles_break_the_maximum_principle_only_where_an_edge_sums_above_zero():
+    # Edges 0-3 and 1-2 cross above each other, so the angles there are obtuse and both edges are positive.
+    flat = np.array([[1.0, 0, 0.4], [0, 2, 0], [0, -2, 0], [-1, 0, 0.4]])
+    report = quality_report(mesh_from(flat, np.array([[0, 1, 2, 3]])), "conforming")
+    assert set(report.broken) == {"non_obtuse", "stiffness_monotone"}
+    assert (report.share_obtuse, report.share_positive_edges) == (1.0, pytest.approx(2 / 6))
+    # A voxel mesh whose inner node is moved a little: every tetrahedron around it, half of all, becomes obtuse, but
+    # at few edges do the neighbours not make up for it.
+    corners, tets = kuhn_tets(np.ones((2, 2, 2), dtype=bool))
+    points = corners.astype(float)
+    points[13] += [0.05, -0.02, 0.03]
+    report = quality_report(mesh_from(points, tets), "conforming")
+    assert np.all(corners[13] == 1) and report.share_obtuse == 0.5
+    stiffness = laplace.assemble(skfem.Basis(skfem.MeshTet(points.T, tets.T), skfem.ElementTetP1())).tocoo()
+    positive = np.count_nonzero((stiffness.row < stiffness.col) & (stiffness.data > 1e-12))
+    assert report.share_positive_edges == pytest.approx(positive / 98)
+    assert 0 < positive < 20
+
+
+def test_right_angles_are_not_obtuse_wherever_the_mesh_lies(box_mesh):
+    turn, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
+    turn *= np.sign(np.linalg.det(turn))
+    report = quality_report(replace(box_mesh, points_m=box_mesh.points_m @ turn.T * 0.37 + 11.0), "voxel")
+    assert report.broken == ()
+    assert (report.share_obtuse, report.share_positive_edges) == (0.0, 0.0)
+    assert np.count_nonzero(report.dihedral_counts) == 3
+
+
+def test_bodies_that_touch_are_counted_both_ways(mesh_of_cells):
+    cells = np.zeros((4, 2, 2), dtype=bool)
+    cells[0, 0, 0] = cells[1, 1, 1] = cells[3, 0, 0] = True
+    report = quality_report(mesh_of_cells(cells), "voxel")
+    assert (report.bodies_by_node, report.bodies_by_face) == (2, 3)
+    assert (report.num_non_manifold_edges, report.num_non_manifold_vertices) == (0, 1)
+    assert report.broken == ("boundary_manifold",)
+    assert (report.genus, len(report.components)) == (0, 3)
+
+
+def test_a_ring_has_a_handle_and_a_hollow_body_a_cavity(mesh_of_cells):
+    ring = np.ones((3, 3, 1), dtype=bool)
+    ring[1, 1] = False
+    assert quality_report(mesh_of_cells(ring), "voxel").genus == 1
+    hollow = np.ones((3, 3, 3), dtype=bool)
+    hollow[1, 1, 1] = False
+    report = quality_report(mesh_of_cells(hollow), "voxel")
+    assert (report.genus, report.num_cavities, report.euler_characteristic) == (0, 1, 4)
+
+
+def test_unused_nodes_are_no_bodies(box_mesh):
+    one = np.ones(1)
+    mesh = replace(
+        box_mesh,
+        points_m=np.vstack([[[9.0, 9.0, 9.0]], box_mesh.points_m]),
+        tets=box_mesh.tets + 1,
+        facets=box_mesh.facets + 1,
+        temperature_c=np.concatenate([20.0 * one, box_mesh.temperature_c]),
+        observed=np.concatenate([one > 0, box_mesh.observed]),
+    )
+    assert quality_report(mesh, "voxel").bodies_by_node == 1
+
+
+def test_mapping_is_json_and_complete(mesh_of_cells):
+    cells = np.zeros((60, 1, 1), dtype=bool)
+    cells[::2] = True  # 30 bodies
+    report = quality_report(mesh_of_cells(cells), "voxel", length_unit="input unit")
+    mapping = json.loads(json.dumps(report.as_mapping(), allow_nan=False))
+    assert len(mapping["largest_components"]) == 20 and mapping["num_components"] == 30
+    assert mapping["largest_components"][0] == {
+        "num_triangles": 12,
+        "euler_characteristic": 2,
+        "genus": 0,
+        "is_cavity": False,
+    }
+    assert mapping["dihedral_counts"]["bin_width"] == 5.0 and sum(mapping["dihedral_counts"]["counts"]) == 6 * 180
+    assert mapping["dihedral_range_deg"] == {"min": 45.0, "max": 90.0}
+    assert mapping["length_unit"] == "input unit"
+    assert [promise["name"] for promise in mapping["promises"]] == list(NAMES)
+    assert set(mapping["promises"][0]) == {"name", "sentence", "kept", "figure", "found"}
+    assert "input unit³" in mapping["promises"][0]["found"]
+
+
+def test_degenerate_mesh_is_reported_without_nan():
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 0]])
+    report = quality_report(mesh_from(points, np.array([[0, 1, 2, 3]])), "conforming")
+    assert {"volumes_positive", "dihedral_within_bounds"} <= set(report.broken)
+    json.dumps(report.as_mapping(), allow_nan=False)
+
+
+def test_bad_input_is_refused(box_mesh):
+    with pytest.raises(MeshError, match="boundary_mode: expected voxel or conforming, got 'smooth'"):
+        quality_report(box_mesh, "smooth")  # type: ignore[arg-type]
+    with pytest.raises(MeshError, match="mesh tets: expected node numbers"):
+        quality_report(replace(box_mesh, tets=box_mesh.tets + 1), "voxel")
+    for bad in ((30.0, 10.0), (np.nan, 10.0)):
+        with pytest.raises(MeshError, match="observed_range_c: expected two finite temperatures"):
+            quality_report(box_mesh, "voxel", observed_range_c=bad)
+    blind = replace(box_mesh, observed=np.zeros(60, dtype=bool))
+    with pytest.raises(MeshError, match="at least one node that a thermal ray saw"):
+        quality_report(blind, "voxel")
+    assert quality_report(blind, "voxel", observed_range_c=(0.0, 50.0)).broken == ()
+
+
+def test_shares_in_words_do_not_look_like_none_or_all():
+    evidence = Evidence(1.0, 0, 0, 0, 0, (45.0, 90.0), -1.0, 1e-9, 1.0 - 1e-9, 0)
+    found = {promise.name: promise.found for promise in judge(evidence, "voxel")}
+    assert found["non_obtuse"].startswith("< 0.01 %") and found["stiffness_monotone"].startswith("99.99 %")
+    assert {p.name for p in judge(evidence, "voxel") if not p.kept} == {"non_obtuse", "stiffness_monotone"}
+
+
+@pytest.mark.parametrize(
+    ("mode", "angles", "margin"),
+    [
+        ("conforming", (10.7, 164.8), 0.0),
+        ("conforming", (20.0, 164.9), -0.1),
+        ("conforming", (10.5, 120.0), -0.2),
+        ("voxel", (45.0, 90.0), 0.0),
+        ("voxel", (45.0 - 1e-9, 90.0 + 1e-9), -1e-9),
+        ("voxel", (45.0, 91.0), -1.0),
+    ],
+)
+def test_both_dihedral_bounds_count(mode, angles, margin):
+    promises = {p.name: p for p in judge(Evidence(1.0, 0, 0, 0, 0, angles, 0.0, 0.0, 0.0, 0), mode)}
+    promise = promises["dihedral_within_bounds"]
+    assert promise.figure == pytest.approx(margin, abs=1e-12)
+    assert promise.kept == (margin > -1e-6)

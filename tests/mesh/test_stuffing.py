@@ -1,0 +1,267 @@
+"""Isosurface stuffing: exact cases, laws, angles and errors."""
+
+from __future__ import annotations
+
+from itertools import combinations, product
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from tests.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, centres, euler_characteristic, num_bodies, tet_mesh
+from thermoxels_ns.errors import MeshError
+from thermoxels_ns.mesh.bcc_lattice import DIRECTIONS, LENGTHS, OPPOSITE, bcc_lattice
+from thermoxels_ns.mesh.quality import check_mesh, dihedral_range_deg
+from thermoxels_ns.mesh.stuffing import stuff
+from thermoxels_ns.mesh.stuffing_stencils import BUNDLE_EDGES, BUNDLE_POINTS, CODE_WEIGHTS, stencil_table
+from thermoxels_ns.mesh.stuffing_warp import ALPHA_INSIDE, ALPHA_OUTSIDE, warp
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (3, 2, 1), (1, 4, 5), (4, 3, 5)])
+def test_full_lattice_is_a_box_to_the_last_bit(shape):
+    solid = stuff(np.random.default_rng(1).uniform(0.1, 1.0, shape))
+    quality = check_mesh(tet_mesh(solid))
+    a, b, c = shape
+    assert quality.volume_m3 == pytest.approx(a * b * c, rel=1e-14)
+    assert quality.area_m2 == pytest.approx(2 * (a * b + b * c + a * c), rel=1e-14)
+    assert solid.on_box.all()
+    assert np.array_equal(solid.points.min(axis=0), [0, 0, 0]) and np.array_equal(solid.points.max(axis=0), shape)
+    assert (quality.min_dihedral_deg, quality.max_dihedral_deg) == pytest.approx((45.0, 90.0))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_linear_level_gives_its_plane_exactly(seed):
+    random = np.random.default_rng(seed)
+    normal = random.normal(size=3)
+    normal /= np.linalg.norm(normal)
+    solid = stuff(-(centres(12, 11, 10) @ normal + random.uniform(-1, 1)))
+    check_mesh(tet_mesh(solid))
+    # At the border the surface turns into the box within two voxels.
+    nodes = solid.points[np.unique(solid.facets[~solid.on_box])]
+    far = np.all((nodes > 2.0) & (nodes < np.array([10, 9, 8])), axis=1)
+    distance = (nodes - [6.0, 5.5, 5.0]) @ normal
+    assert np.count_nonzero(far) > 50
+    assert np.ptp(distance[far]) < 1e-12
+
+
+def test_binary_half_space_ends_on_the_voxel_faces():
+    level = np.full((6, 5, 4), -1.0)
+    level[:3] = 1.0
+    solid = stuff(level)
+    quality = check_mesh(tet_mesh(solid))
+    assert quality.volume_m3 == pytest.approx(3 * 5 * 4, rel=1e-14)
+    surface = solid.points[solid.facets[~solid.on_box]]
+    assert np.all(surface[..., 0] == 3.0)
+
+
+def test_level_at_corners_is_trilinear():
+    level = np.random.default_rng(3).normal(size=(4, 5, 6)).clip(-0.4)
+    level += 0.5
+    lattice = bcc_lattice(level)
+    corners = lattice.level[lattice.num_centres :].reshape(lattice.shape)
+    mean = np.mean([level[i : i + 3, j : j + 4, k : k + 5] for i, j, k in product((0, 1), repeat=3)], axis=0)
+    assert np.allclose(corners[1:4, 1:5, 1:6], mean, rtol=1e-14, atol=0.0)
+
+
+def test_directions_and_offsets_agree():
+    lattice = bcc_lattice(np.ones((2, 3, 4)))
+    assert np.array_equal(DIRECTIONS[OPPOSITE], -DIRECTIONS)
+    inner = np.flatnonzero(lattice.level > 0.0)
+    assert set(lattice.is_corner(inner)) == {0, 1}
+    steps = lattice.positions(lattice.neighbours(inner).ravel()).reshape(-1, 14, 3) - lattice.positions(inner)[:, None]
+    assert np.array_equal(steps, np.broadcast_to(DIRECTIONS, steps.shape))
+
+
+def test_only_ratios_of_levels_matter():
+    level = SHAPES["torus"].level(16)
+    first, second = stuff(level), stuff(level * 2.0**900)
+    assert np.array_equal(first.points, second.points) and np.array_equal(first.tets, second.tets)
+    single = stuff(level.astype(np.float32))
+    assert np.array_equal(single.tets, stuff(level.astype(np.float32).astype(np.float64)).tets)
+
+
+def test_place_in_the_lattice_does_not_matter():
+    level = SHAPES["torus"].level(16)
+    moved = stuff(np.pad(level, ((5, 0), (1, 7), (0, 3)), constant_values=-1.0))
+    here = stuff(level)
+    assert np.array_equal(here.tets, moved.tets) and np.array_equal(here.facets, moved.facets)
+    assert np.allclose(here.points, moved.points - np.array([5, 1, 0]), rtol=0.0, atol=1e-13)
+
+
+def test_axes_are_alike():
+    level = SHAPES["torus"].level(16)
+    here, turned, mirrored = stuff(level), stuff(level.transpose(1, 2, 0)), stuff(level[::-1])
+    for points, other in ((here.points[:, [1, 2, 0]], turned), (np.abs([16, 0, 0] - here.points), mirrored)):
+        assert len(points) == len(other.points) and len(here.tets) == len(other.tets)
+        assert KDTree(points).query(other.points)[0].max() < 1e-12
+
+
+def test_memory_order_does_not_matter():
+    level = np.random.default_rng(5).normal(size=(7, 8, 9))
+    first, second = stuff(level), stuff(np.asfortranarray(level))
+    assert all(np.array_equal(getattr(first, name), getattr(second, name)) for name in vars(first))
+
+
+def test_tags_of_nodes_and_triangles():
+    ball = 6.0 - np.linalg.norm(centres(10, 10, 10) - [1.0, 0.0, 0.0], axis=-1)
+    solid = stuff(ball.clip(-1, 1))
+    quality = check_mesh(tet_mesh(solid))
+    assert 0 < quality.num_box_facets < quality.num_facets
+    assert np.array_equal(np.flatnonzero(solid.on_surface), np.unique(solid.facets))
+    corners = solid.points[solid.facets]
+    flat = [(corners[:, :, axis] == side).all(axis=1) for axis in range(3) for side in (0.0, 10.0)]
+    assert np.array_equal(solid.on_box, np.any(flat, axis=0))
+    assert np.all((solid.points >= 0.0) & (solid.points <= 10.0))
+
+
+RANDOM_LEVELS = {
+    "white noise": lambda random, shape: random.normal(size=shape),
+    "twelve orders of magnitude": lambda random, shape: (
+        random.normal(size=shape) * 10.0 ** random.uniform(-12, 0, shape)
+    ),
+    "six hundred orders": lambda random, shape: random.normal(size=shape) * 10.0 ** random.uniform(-300, 307, shape),
+    "binary": lambda random, shape: np.where(random.random(shape) < random.uniform(0.1, 0.9), 1.0, -1.0),
+    "few values, many zeros": lambda random, shape: random.choice([-1.0, -0.5, 0.0, 0.0, 0.5, 1.0], size=shape),
+    "smooth": lambda random, shape: sum(
+        np.cos(centres(*shape) @ random.normal(size=3) * 0.7 + random.uniform(0, 6)) for _ in range(4)
+    ),
+    "single precision": lambda random, shape: (random.normal(size=shape) * 1e30 ** random.uniform(-1, 1, shape)).astype(
+        np.float32
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", RANDOM_LEVELS)
+@pytest.mark.parametrize("seed", range(4))
+def test_any_levels_give_a_sound_mesh(kind, seed):
+    random = np.random.default_rng(seed)
+    level = RANDOM_LEVELS[kind](random, tuple(random.integers(9, 14, size=3)))
+    solid = stuff(level)
+    quality = check_mesh(tet_mesh(solid))
+    assert ANGLE_BOUNDS_DEG[0] <= quality.min_dihedral_deg
+    assert quality.max_dihedral_deg <= ANGLE_BOUNDS_DEG[1]
+    assert np.all((solid.points >= 0.0) & (solid.points <= level.shape))
+
+
+def _tet_volumes(corners: np.ndarray) -> np.ndarray:
+    return np.linalg.det(corners[:, 1:] - corners[:, :1])
+
+
+@pytest.mark.parametrize("signs", [s for s in product((-1, 0, 1), repeat=4) if max(s) > 0], ids=str)
+def test_angles_of_every_stencil_at_the_ends_of_all_ranges(signs):
+    """Cuts and moved points independent of each other, at the ends of what `warp` allows: the bound for any levels."""
+    random = np.random.default_rng(7)
+    trials, points = 4000, (0, 1, 2, 3)
+    positions = np.zeros((trials, 19, 3))
+    positions[:, :6] = BUNDLE_POINTS
+    towards = {}
+    for v in points:
+        if signs[v] == 0:
+            step = random.integers(0, 15, trials)
+            target = BUNDLE_POINTS[v] + DIRECTIONS[step % 14]
+            # A point moves towards the other sign: within the tetrahedron that limits how far.
+            same = np.abs(target[:, None] - BUNDLE_POINTS[:4]).max(axis=-1) < 0.1
+            inside = same @ np.array(signs)
+            either = np.maximum(ALPHA_OUTSIDE, ALPHA_INSIDE)
+            most = np.choose(inside + 1, [alpha[step % 14] for alpha in (ALPHA_INSIDE, either, ALPHA_OUTSIDE)])
+            most *= step < 14
+            positions[:, v] += most[:, None] * DIRECTIONS[step % 14]
+            towards[v] = np.where((step < 14)[:, None], target, np.nan)
+    for edge, (a, b) in enumerate(BUNDLE_EDGES):
+        if a in points and b in points and signs[a] * signs[b] < 0:
+            a, b = (a, b) if signs[a] > 0 else (b, a)
+            way = np.argmin(np.abs(DIRECTIONS - (BUNDLE_POINTS[b] - BUNDLE_POINTS[a])).max(axis=1))
+            share = random.choice([ALPHA_INSIDE[way], 0.5, 1.0 - ALPHA_OUTSIDE[way]], trials)
+            positions[:, 6 + edge] = BUNDLE_POINTS[a] + share[:, None] * DIRECTIONS[way]
+    # Two points never move towards each other: one edge has one cut.
+    for v, w in combinations(towards, 2):
+        facing = np.all(towards[v] == BUNDLE_POINTS[w], axis=1) & np.all(towards[w] == BUNDLE_POINTS[v], axis=1)
+        positions = positions[~facing]
+        towards = {u: t[~facing] for u, t in towards.items()}
+
+    table = stencil_table()
+    # The face's other two corners are outside: only this tetrahedron of the bundle is asked about.
+    code = int(CODE_WEIGHTS @ (np.array([*signs, -1, -1]) + 1))
+    tets = table.tets[table.tet_start[code] : table.tet_start[code + 1]]
+    outside = set(range(19)) - {0, 1, 2, 3, 6, 7, 8, 11, 12, 15}
+    tets = np.array([tet for tet in tets if not outside & set(tet)])
+    assert len(tets) >= 1
+    for tet in tets:
+        corners = positions[:, tet]
+        assert _tet_volumes(corners).min() > 0.0
+        low, high = dihedral_range_deg(corners.reshape(-1, 3), np.arange(4 * len(corners)).reshape(-1, 4))
+        assert low > 10.94 and high < 163.75
+
+
+def test_tetrahedra_of_a_full_bundle_fill_it():
+    table = stencil_table()
+    full = len(table.tet_start) - 2
+    tets = table.tets[table.tet_start[full] :]
+    assert len(tets) == 4 and np.allclose(_tet_volumes(BUNDLE_POINTS[tets]), 0.5)
+    assert table.tet_start[1] == 0 and table.facet_start[1] == 0
+
+
+def test_cuts_keep_their_distance_from_all_points():
+    warped = warp(bcc_lattice(np.random.default_rng(2).normal(size=(12, 12, 12))))
+    cut = np.isfinite(warped.cuts)
+    assert cut.any(axis=1).all()
+    low, high = np.broadcast_to(ALPHA_INSIDE, cut.shape)[cut], 1.0 - np.broadcast_to(ALPHA_OUTSIDE, cut.shape)[cut]
+    assert np.all((warped.cuts[cut] >= low) & (warped.cuts[cut] <= high))
+    assert np.all(warped.sign[warped.moved] == 0) and np.all(warped.sign[warped.inner] == 1)
+
+
+def test_smooth_surface_moves_every_near_point():
+    """Holding cuts back costs accuracy: it must not happen where the solid is thick."""
+    for name in ("sphere", "torus"):
+        lattice = bcc_lattice(SHAPES[name].level(48))
+        warped = warp(lattice)
+        neighbour = lattice.level[lattice.neighbours(warped.cut_points)]
+        own = lattice.level[warped.cut_points][:, None]
+        cut = np.isfinite(warped.cuts)
+        assert len(warped.moved) > 1000
+        assert np.allclose(warped.cuts[cut], (own / (own - neighbour))[cut], rtol=1e-12), name
+
+
+def test_near_points_move_the_shortest_way():
+    level = np.full((5, 5, 5), -1.0)
+    level[:, :, :3] = 1.0
+    # The centre is 0.2 below its zero on the axis; all other edges are cut farther away.
+    level[2, 2, 2] = 0.25
+    warped = warp(bcc_lattice(level))
+    assert np.any(np.all(np.isclose(warped.moved_to, [2.5, 2.5, 2.7]), axis=1))
+    assert np.all(LENGTHS[:6] == 1.0) and np.allclose(LENGTHS[6:], np.sqrt(0.75))
+
+
+@pytest.mark.parametrize("cells", [(2, 3, 4), (1, 1, 1)])
+def test_a_voxel_with_a_tiny_level_stays(cells):
+    level = np.full((5, 6, 7), -1.0)
+    level[cells] = 1e-9
+    solid = stuff(level)
+    quality = check_mesh(tet_mesh(solid))
+    assert num_bodies(solid) == 1 and euler_characteristic(solid) == 2
+    assert np.all(np.abs(solid.points - np.add(cells, 0.5)) <= 0.5)
+    assert quality.volume_m3 > 0.05
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_levels_that_are_not_finite(bad):
+    level = np.ones((3, 3, 3))
+    level[1, 2, 0] = bad
+    with pytest.raises(MeshError, match="level: expected finite numbers only, got 1 of 27"):
+        stuff(level)
+
+
+@pytest.mark.parametrize("level", [np.full((3, 3, 3), -1.0), np.zeros((2, 2, 2)), np.ones((0, 4, 4))])
+def test_nothing_solid(level):
+    with pytest.raises(MeshError, match="level: expected solid voxels, with levels above 0, got none"):
+        stuff(level)
+
+
+def test_wrong_number_of_axes():
+    with pytest.raises(MeshError, match=r"level: expected shape \(n, n, n\), got \(4, 4\)"):
+        stuff(np.ones((4, 4)))
+
+
+def test_whole_numbers_are_levels_too():
+    level = np.where(np.random.default_rng(8).random((5, 5, 5)) < 0.5, 1, -1)
+    assert np.array_equal(stuff(level).points, stuff(level.astype(float)).points)

@@ -1,0 +1,87 @@
+"""Distances between a mesh's surface and the true one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.errors import MeshError
+from thermoxels_ns.mesh.surface_distance import sample_facets, surface_distances
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
+
+
+class Plane:
+    """Solid below z = height."""
+
+    def __init__(self, height: float):
+        self.height = height
+
+    def signed_distance(self, points):
+        return points[:, 2] - self.height
+
+    def surface_points(self, n, seed):
+        xy = np.random.default_rng(seed).random((n, 2))
+        return np.column_stack([xy, np.full(n, self.height)]), np.tile([0.0, 0.0, 1.0], (n, 1))
+
+
+def slab(mesh_of_cells, height_tag: bool = True) -> TetMesh:
+    """A slab of 4 x 4 x 1 voxels of 0.25 m; only its top counts as surface; temperature 10 + 4 x."""
+    mesh = mesh_of_cells(np.ones((4, 4, 1), dtype=bool), 0.25)
+    top = np.all(mesh.points_m[mesh.facets][:, :, 2] == 0.25, axis=1)
+    tags = np.where(top, mesh.facet_tags * 0, FACET_BOX) if height_tag else mesh.facet_tags
+    return TetMesh(
+        mesh.points_m, mesh.tets, 10.0 + 4.0 * mesh.points_m[:, 0], mesh.observed, mesh.facets, tags, mesh.region
+    )
+
+
+def test_parallel_planes_are_their_distance_apart(mesh_of_cells):
+    truth = Plane(0.20)
+    found = surface_distances(slab(mesh_of_cells), truth, truth.surface_points(500, 0)[0])
+    assert found is not None
+    distances = (found.mesh_to_truth, found.truth_to_mesh, found.chamfer, found.hausdorff)
+    assert distances == pytest.approx((0.05,) * 4, abs=1e-12)
+
+
+def test_temperatures_are_those_of_the_closest_point(mesh_of_cells):
+    truth = Plane(0.30)
+    points = truth.surface_points(500, 1)[0]
+    found = surface_distances(slab(mesh_of_cells), truth, points)
+    assert found is not None
+    assert found.closest_temperature_c == pytest.approx(10.0 + 4.0 * points[:, 0], abs=1e-6)
+
+
+def test_distances_are_in_units_of_the_truth(mesh_of_cells):
+    truth = Plane(0.5 * 0.20)
+    points = truth.surface_points(100, 0)[0] * [0.5, 0.5, 1.0]
+    found = surface_distances(slab(mesh_of_cells), truth, points, metres_per_unit=2.0)
+    assert found is not None
+    assert found.chamfer == pytest.approx(0.025, abs=1e-12)
+
+
+def test_a_missing_part_counts_from_the_truth_only(mesh_of_cells):
+    truth = Plane(0.25)
+    points = truth.surface_points(2000, 0)[0] * [2.0, 1.0, 1.0]  # twice as long as the mesh
+    found = surface_distances(slab(mesh_of_cells), truth, points)
+    assert found is not None
+    assert found.mesh_to_truth == pytest.approx(0.0, abs=1e-12)
+    assert found.truth_to_mesh == pytest.approx(0.25, rel=0.05)  # half of the points, 0.5 away on average
+
+
+def test_a_mesh_that_is_all_cut_by_the_box_has_no_surface(mesh_of_cells):
+    mesh = mesh_of_cells(np.ones((2, 2, 2), dtype=bool), 0.5)
+    assert np.all(mesh.facet_tags == FACET_BOX)
+    assert surface_distances(mesh, Plane(0.5), np.zeros((1, 3))) is None
+
+
+def test_samples_are_spread_by_area_and_lie_on_the_triangles(mesh_of_cells):
+    mesh = mesh_of_cells(np.ones((3, 1, 1), dtype=bool), 1.0)
+    samples = sample_facets(mesh.points_m, mesh.facets, 14_000)
+    at_end = np.abs(samples[:, 0]) < 1e-12
+    assert np.mean(at_end) == pytest.approx(1 / 14, rel=0.01)
+    on_some_face = np.isclose(samples, [0, 0, 0], atol=1e-12) | np.isclose(samples, [3, 1, 1], atol=1e-12)
+    assert on_some_face.any(axis=1).all()
+
+
+def test_triangles_without_area_cannot_be_sampled():
+    with pytest.raises(MeshError, match="boundary"):
+        sample_facets(np.zeros((3, 3)), np.array([[0, 1, 2]]), 10)

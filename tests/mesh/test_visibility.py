@@ -1,0 +1,271 @@
+"""Which surface the training cameras see."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.errors import MeshError
+from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.mesh.facet_normals import facet_normals_from_level
+from thermoxels_ns.mesh.quality import facet_normals
+from thermoxels_ns.mesh.visibility import _EmptySpace, seen_facets
+from thermoxels_ns.mesh.voxel_tets import kuhn_tets, voxel_facets
+from thermoxels_ns.snapshot import Views
+
+LATTICE = Lattice((2.0, -1.0, 0.5), 0.25, (33, 33, 33))
+H = LATTICE.voxel_size
+MIDDLE = LATTICE.index_to_world([16.0, 16.0, 16.0])
+
+
+def looking(centre: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """A pose [R | centre] that looks at a target: x right, y up, z back."""
+    back = (centre - target) / np.linalg.norm(centre - target)
+    right = np.cross([0.0, 0.0, 1.0] if abs(back[2]) < 0.9 else [0.0, 1.0, 0.0], back)
+    right /= np.linalg.norm(right)
+    return np.column_stack([right, np.cross(back, right), back, centre])
+
+
+def views(*centres: np.ndarray, target: np.ndarray = MIDDLE, focal: float = 100.0) -> Views:
+    """Cameras with images of 400 x 300 pixels, wide enough (126 degrees) unless told otherwise."""
+    number = len(centres)
+    return Views(
+        camera_to_world=np.array([looking(np.asarray(centre), target) for centre in centres]).reshape(number, 3, 4),
+        focal=np.full((number, 2), focal),
+        centre=np.tile([200.0, 150.0], (number, 1)),
+        size=np.tile([400, 300], (number, 1)),
+    )
+
+
+def voxel_surface(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centroids and outward normals of a voxel body's triangles, those of the faces themselves, in world units."""
+    points = LATTICE.index_to_world(kuhn_tets(cells)[0])
+    facets = voxel_facets(cells)
+    return points[facets].mean(axis=1), facet_normals(points, facets)
+
+
+def block(*spans: tuple[int, int]) -> np.ndarray:
+    cells = np.zeros(LATTICE.cell_shape, dtype=bool)
+    cells[tuple(slice(low, high) for low, high in spans)] = True
+    return cells
+
+
+WHOLE = (0, 32)
+
+
+def test_a_sphere_is_seen_up_to_its_horizon() -> None:
+    radius = 10.3
+    distance = np.linalg.norm((LATTICE.cell_centres() - MIDDLE) / H, axis=-1) - radius
+    cells, camera = distance < 0.0, MIDDLE + np.array([12.0, 3.0, -2.0])
+    points = kuhn_tets(cells)[0]
+    facets = voxel_facets(cells)
+    normals = facet_normals_from_level(np.clip(-distance, -1, 1), points, facets)
+    centroids = LATTICE.index_to_world(points[facets].mean(axis=1))
+    seen = seen_facets(cells, views(camera), LATTICE, centroids, normals)
+
+    outward = (centroids - MIDDLE) / np.linalg.norm(centroids - MIDDLE, axis=1, keepdims=True)
+    towards = camera - MIDDLE - radius * H * outward
+    elevation = np.degrees(np.arcsin(np.einsum("ij,ij->i", outward, towards) / np.linalg.norm(towards, axis=1)))
+    assert np.count_nonzero(elevation > 12.0) > 1000
+    assert seen[elevation > 12.0].all()
+    assert not seen[elevation < -9.0].any()  # as far as the normals of a staircase are off
+    share = (elevation > 0.0).mean()
+    assert seen.mean() == pytest.approx(share, abs=0.08)
+
+
+def test_a_plate_is_seen_from_the_side_of_the_cameras() -> None:
+    cells = block(WHOLE, WHOLE, (15, 16))
+    centroids, normals = voxel_surface(cells)
+    above = views(MIDDLE + np.array([1.0, 0.5, 7.0]), MIDDLE + np.array([-2.0, 2.0, 9.0]))
+    seen = seen_facets(cells, above, LATTICE, centroids, normals)
+    assert np.array_equal(seen, normals[:, 2] > 0.5)
+
+
+def test_an_obstacle_casts_its_shadow() -> None:
+    """A small block hangs over a plate; what lies behind its middle is hidden, what its outline clears is seen."""
+    cells = block(WHOLE, WHOLE, (2, 4)) | block((12, 20), (12, 20), (14, 16))
+    centroids, normals = voxel_surface(cells)
+    camera = LATTICE.index_to_world([16.0, 16.0, 40.0])
+    seen = seen_facets(cells, views(camera), LATTICE, centroids, normals)
+    index = LATTICE.world_to_index(centroids)
+    ground = (normals[:, 2] > 0.5) & (index[:, 2] < 5.0)
+    # The outline of the block's upper and lower side, seen from (16, 16, 40), on the plate at height 4.
+    off = np.abs(index[:, :2] - 16.0).max(axis=1)
+    inner, outer = 4.0 * 36.0 / 26.0, 4.0 * 36.0 / 24.0
+    assert not seen[ground & (off < inner - 1.0)].any()
+    assert seen[ground & (off > outer + 1.0)].all()
+    assert np.count_nonzero(ground & (off < inner - 1.0)) > 50
+    assert np.count_nonzero(ground & (off > outer + 1.0)) > 1000
+
+    beside = views(camera, LATTICE.index_to_world([44.0, 16.0, 30.0]), LATTICE.index_to_world([-12.0, 16.0, 30.0]))
+    assert seen_facets(cells, beside, LATTICE, centroids, normals)[ground].all()
+
+
+def test_the_image_ends_at_its_borders() -> None:
+    cells = block(WHOLE, WHOLE, (15, 16))
+    centroids, normals = voxel_surface(cells)
+    camera = LATTICE.index_to_world([16.0, 16.0, 36.0])
+    narrow = views(camera, target=LATTICE.index_to_world([16.0, 16.0, 16.0]), focal=500.0)
+    pose = narrow.camera_to_world[0]
+    seen = seen_facets(cells, narrow, LATTICE, centroids, normals)
+    # 20 voxels away, 400 x 300 pixels at a focal length of 500 pixels show 16 x 12 voxels around the middle.
+    right, up = ((centroids - camera) @ pose[:, k] / H for k in (0, 1))
+    upper = normals[:, 2] > 0.5
+    assert seen[upper & (np.abs(right) < 7.5) & (np.abs(up) < 5.5)].all()
+    assert not seen[upper & ((np.abs(right) > 8.5) | (np.abs(up) > 6.5))].any()
+    assert 2 * 15 * 11 <= np.count_nonzero(seen) <= 2 * 17 * 13
+
+
+def test_the_principal_point_moves_the_image() -> None:
+    """Columns count from the left, rows from the top: with its middle in a corner, an image shows one quarter."""
+    cells = block(WHOLE, WHOLE, (15, 16))
+    centroids, normals = voxel_surface(cells)
+    camera = LATTICE.index_to_world([16.0, 16.0, 36.0])
+    whole = views(camera, target=LATTICE.index_to_world([16.0, 16.0, 16.0]))
+    pose = whole.camera_to_world[0]
+    corner = Views(whole.camera_to_world, whole.focal, np.array([[400.0, 300.0]]), whole.size)
+    seen = seen_facets(cells, corner, LATTICE, centroids, normals)
+    right, up = ((centroids - camera) @ pose[:, k] / H for k in (0, 1))
+    upper = normals[:, 2] > 0.5
+    assert seen[upper & (right < -0.5) & (up > 0.5)].all()
+    assert not seen[upper & ((right > 0.5) | (up < -0.5))].any()
+
+
+def test_nothing_behind_a_camera_is_seen() -> None:
+    cells = block(WHOLE, WHOLE, (15, 16))
+    centroids, normals = voxel_surface(cells)
+    camera = LATTICE.index_to_world([16.0, 16.0, 36.0])
+    away = views(camera, target=LATTICE.index_to_world([16.0, 16.0, 50.0]))
+    assert not seen_facets(cells, away, LATTICE, centroids, normals).any()
+
+
+def room() -> np.ndarray:
+    return block((4, 28), (4, 28), (4, 28)) & ~block((7, 25), (7, 25), (7, 25))
+
+
+def test_a_camera_in_a_room_sees_its_walls_and_no_other() -> None:
+    cells = room()
+    centroids, normals = voxel_surface(cells)
+    camera = LATTICE.index_to_world([10.3, 12.1, 14.2])
+    around = [looking(camera, camera + d) for d in (*np.eye(3), *-np.eye(3))]
+    one = views(camera)
+    six = Views(np.array(around), np.full((6, 2), 100.0), np.tile([200.0, 150.0], (6, 1)), np.tile([400, 300], (6, 1)))
+    inner = np.abs(LATTICE.world_to_index(centroids) - 16.0).max(axis=1) < 9.5
+    assert np.array_equal(seen_facets(cells, six, LATTICE, centroids, normals), inner)
+    assert 0 < np.count_nonzero(seen_facets(cells, one, LATTICE, centroids, normals)) < np.count_nonzero(inner)
+
+
+def test_a_camera_outside_sees_into_a_room_only_through_its_window() -> None:
+    cells = room()
+    centroids, normals = voxel_surface(cells)
+    camera = LATTICE.index_to_world([60.0, 16.0, 16.0])
+    back = (normals[:, 0] > 0.5) & (LATTICE.world_to_index(centroids)[:, 0] < 8.0)
+    assert not seen_facets(cells, views(camera), LATTICE, centroids, normals)[back].any()
+    cells &= ~block((25, 28), (13, 19), (13, 19))
+    centroids, normals = voxel_surface(cells)
+    index = LATTICE.world_to_index(centroids)
+    back = (normals[:, 0] > 0.5) & (index[:, 0] < 8.0)
+    # From 32 voxels before the window's inner end and 53 before the wall, 6 voxels widen to at most 10.
+    off = np.abs(index[:, 1:] - 16.0).max(axis=1)
+    seen = seen_facets(cells, views(camera), LATTICE, centroids, normals)
+    assert seen[back & (off < 3.5)].all()
+    assert not seen[back & (off > 6.0)].any()
+
+
+def test_a_camera_deep_in_the_solid_sees_nothing() -> None:
+    cells = block((4, 28), (4, 28), (4, 28))
+    centroids, normals = voxel_surface(cells)
+    inside = views(MIDDLE, target=MIDDLE + np.array([1.0, 0.0, 0.0]))
+    assert not seen_facets(cells, inside, LATTICE, centroids, normals).any()
+
+
+def test_a_floater_at_a_camera_does_not_blind_it() -> None:
+    plate, camera = block(WHOLE, WHOLE, (2, 4)), LATTICE.index_to_world([16.5, 16.5, 20.5])
+    centroids, normals = voxel_surface(plate)
+    floater = plate | block((16, 17), (16, 17), (20, 21))
+    looks = views(camera, target=LATTICE.index_to_world([16.5, 16.5, 0.0]))
+    free = seen_facets(plate, looks, LATTICE, centroids, normals)
+    assert np.count_nonzero(free) > 500
+    assert np.array_equal(seen_facets(floater, looks, LATTICE, centroids, normals), free)
+
+
+def test_a_gap_of_one_voxel_can_be_looked_into() -> None:
+    cells = block(WHOLE, WHOLE, (10, 20)) & ~block((16, 17), WHOLE, (12, 20))
+    centroids, normals = voxel_surface(cells)
+    index = LATTICE.world_to_index(centroids)
+    walls = (np.abs(index[:, 0] - 16.5) < 0.6) & (np.abs(normals[:, 0]) > 0.5) & (index[:, 2] > 17.0)
+    # Straight above the gap: the middle of its walls lies half a voxel off the line of sight.
+    camera = LATTICE.index_to_world([16.5, 16.0, 40.0])
+    seen = seen_facets(cells, views(camera), LATTICE, centroids, normals)
+    assert np.count_nonzero(walls) > 100
+    assert seen[walls].mean() > 0.9
+
+
+def test_more_cameras_see_more_and_their_order_does_not_matter() -> None:
+    cells = room() & ~block((25, 28), (13, 19), (13, 19))
+    centroids, normals = voxel_surface(cells)
+    positions = [MIDDLE + 9.0 * np.array(d) for d in ([1, 0, 0], [0, 1, 0.2], [-0.5, -0.5, 1], [0.8, 0.1, 0.1])]
+    each = [seen_facets(cells, views(p), LATTICE, centroids, normals) for p in positions]
+    together = np.any(each, axis=0)
+    assert np.array_equal(seen_facets(cells, views(*positions), LATTICE, centroids, normals), together)
+    assert np.array_equal(seen_facets(cells, views(*positions[::-1]), LATTICE, centroids, normals), together)
+    assert together.sum() > max(s.sum() for s in each)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_lines_meet_the_voxels_that_they_cross(seed: int) -> None:
+    """Against the length of each line in each solid voxel, voxel by voxel."""
+    random = np.random.default_rng(seed)
+    shape = tuple(random.integers(1, 40, size=3))
+    cells = random.random(shape) < random.choice([0.002, 0.02, 0.3])
+    cells[tuple(random.integers(0, shape))] = True
+    size = np.array(shape)
+    start = random.uniform(-0.3, 1.3, (200, 3)) * size
+    end = random.uniform(-1.0, 2.0, 3) * size
+    start[:60, seed % 3] = end[seed % 3]  # lines within a plane of voxels,
+    start[:20, (seed + 1) % 3] = end[(seed + 1) % 3]  # along an axis,
+    start[20:30] = np.round(start[20:30])  # and from lattice corners
+
+    solid = np.argwhere(cells)
+    direction = end - start
+    length = np.linalg.norm(direction, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        near = (solid[None] - start[:, None]) / (direction / length[:, None])[:, None]
+        far = (solid[None] + 1 - start[:, None]) / (direction / length[:, None])[:, None]
+    near, far = np.fmin(near, far).max(axis=2), np.fmax(near, far).min(axis=2)
+    inside = np.minimum(far, (length - 1.5)[:, None]) - np.maximum(near, 0.0)
+    crossed, missed = inside.max(axis=1) > 1e-3, inside.max(axis=1) < -1e-3
+    free = _EmptySpace(cells).free_lines(start, end)
+    assert not free[crossed].any()
+    assert free[missed].all()
+    assert (crossed | missed).mean() > 0.9
+
+
+def test_without_cameras_or_facets_nothing_is_seen() -> None:
+    cells = block((4, 28), (4, 28), (4, 28))
+    centroids, normals = voxel_surface(cells)
+    assert not seen_facets(cells, views(), LATTICE, centroids, normals).any()
+    camera = MIDDLE + np.array([9.0, 0.0, 0.0])
+    assert seen_facets(cells, views(camera), LATTICE, centroids[:0], normals[:0]).shape == (0,)
+
+
+def test_only_what_faces_a_camera_is_seen() -> None:
+    """Also where nothing is in between."""
+    cells = block((4, 28), (4, 28), (4, 28))
+    centroids, normals = voxel_surface(cells)
+    camera = MIDDLE + np.array([9.0, 0.0, 0.0])
+    seen = seen_facets(np.zeros_like(cells), views(camera), LATTICE, centroids, normals)
+    assert np.array_equal(seen, normals[:, 0] > 0.5)
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    cells = block((4, 28), (4, 28), (4, 28))
+    centroids, normals = voxel_surface(cells)
+    camera = views(MIDDLE + np.array([9.0, 0.0, 0.0]))
+    with pytest.raises(MeshError, match=r"cells: expected shape \(32, 32, 32\), got \(31, 32, 32\)"):
+        seen_facets(cells[1:], camera, LATTICE, centroids, normals)
+    with pytest.raises(MeshError, match="normals_world: expected shape"):
+        seen_facets(cells, camera, LATTICE, centroids, normals[1:])
+    centroids[3, 1] = np.nan
+    with pytest.raises(MeshError, match="centroids_world: expected finite numbers only, got 1 of"):
+        seen_facets(cells, camera, LATTICE, centroids, normals)

@@ -1,0 +1,84 @@
+"""XDMF files as VTK (and so ParaView) reads them; FEniCSx reads them in tests/external."""
+
+from __future__ import annotations
+
+from xml.etree import ElementTree
+
+import h5py
+import numpy as np
+import pytest
+import pyvista as pv
+
+from thermoxels_ns.errors import OutputError
+from thermoxels_ns.mesh import xdmf_file
+from thermoxels_ns.mesh.xdmf_file import BODY_GRID, FACET_GRID, heavy_data_path, write_xdmf
+
+
+def read_grids(path) -> dict[str, pv.UnstructuredGrid]:
+    from vtkmodules.vtkIOXdmf2 import vtkXdmfReader
+
+    reader = vtkXdmfReader()
+    reader.SetFileName(str(path))
+    reader.Update()
+    blocks = pv.wrap(reader.GetOutputDataObject(0))
+    return {name: blocks[name] for name in blocks.keys()}  # noqa: SIM118
+
+
+def test_vtk_reads_body_and_boundary(tmp_path, tagged_mesh):
+    write_xdmf(tmp_path / "house.xdmf", tagged_mesh)
+    grids = read_grids(tmp_path / "house.xdmf")
+    assert set(grids) == {BODY_GRID, FACET_GRID}
+    body, boundary = grids[BODY_GRID], grids[FACET_GRID]
+    assert np.array_equal(body.points, tagged_mesh.points_m)
+    assert np.array_equal(body.cells_dict[pv.CellType.TETRA], tagged_mesh.tets)
+    assert np.array_equal(boundary.cells_dict[pv.CellType.TRIANGLE], tagged_mesh.facets)
+    assert np.array_equal(body.cell_data["region"], tagged_mesh.region)
+    assert np.array_equal(boundary.cell_data["patch"], tagged_mesh.boundary.patch)
+    for grid in grids.values():
+        assert np.array_equal(grid.point_data["temperature_c"], tagged_mesh.temperature_c)
+        assert np.array_equal(grid.point_data["temperature_k"], tagged_mesh.temperature_c + 273.15)
+        assert np.array_equal(grid.point_data["observed"], tagged_mesh.observed)
+        assert grid.point_data["colour"].shape == tagged_mesh.colour.shape
+
+
+def test_tags_come_first_and_their_names_are_in_the_file(tmp_path, tagged_mesh):
+    """FEniCSx takes the first attribute of a grid for its tags."""
+    write_xdmf(tmp_path / "house.xdmf", tagged_mesh)
+    grids = {grid.get("Name"): grid for grid in ElementTree.parse(tmp_path / "house.xdmf").iter("Grid")}
+    assert grids[BODY_GRID].find("Attribute").get("Name") == "region"
+    assert grids[FACET_GRID].find("Attribute").get("Name") == "patch"
+    assert grids[BODY_GRID].find("Information").get("Value") == "0 = walls; 1 = floor slab; 2 = roof"
+    names = "0 = up; 1 = down; 2 = inside; 3 = façade 1; 4 = cut by the box"
+    assert grids[FACET_GRID].find("Information").get("Value") == names
+
+
+def test_other_temperatures_replace_the_meshs_own(tmp_path, box_mesh):
+    write_xdmf(tmp_path / "box.xdmf", box_mesh, temperature_c=box_mesh.temperature_c - 5.0)
+    grids = read_grids(tmp_path / "box.xdmf")
+    assert np.array_equal(grids[BODY_GRID].point_data["temperature_c"], box_mesh.temperature_c - 5.0)
+
+
+def test_the_data_file_holds_no_times_of_day(tmp_path, box_mesh):
+    """They would make two files of one mesh differ."""
+    write_xdmf(tmp_path / "box.xdmf", box_mesh)
+    with h5py.File(heavy_data_path(tmp_path / "box.xdmf")) as file:
+        times = {name: h5py.h5g.get_objinfo(file.id, name.encode()).mtime for name in file}
+    assert len(times) == 8
+    assert not any(times.values()), times
+
+
+def test_an_index_never_points_at_data_of_another_mesh(tmp_path, box_mesh, tagged_mesh, monkeypatch):
+    """Interrupted between its two files, a new export leaves no index."""
+    path = tmp_path / "mesh.xdmf"
+    write_xdmf(path, box_mesh)
+
+    def full_disk(final):
+        if final.suffix == ".xdmf":
+            raise OutputError("no space")
+        return replace_when_done(final)
+
+    replace_when_done = xdmf_file.replace_when_done
+    monkeypatch.setattr(xdmf_file, "replace_when_done", full_disk)
+    with pytest.raises(OutputError, match="no space"):
+        write_xdmf(path, tagged_mesh)
+    assert [file.name for file in tmp_path.iterdir()] == ["mesh.h5"]

@@ -1,0 +1,69 @@
+"""Tagged bodies for the tests of heat scenes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from thermoxels_ns.mesh.patches import default_patches
+from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
+from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
+
+Z_UP = (0.0, 0.0, 1.0)
+
+
+def tagged_body(
+    cells: np.ndarray, voxel_m: float, outside: np.ndarray, cut_below_x: float = 0.0, temperature_c: float = 15.0
+) -> TetMesh:
+    """A body of voxels with the default patches and the regions solid and slab (empty).
+
+    Args:
+        cells: Which voxels are solid.
+        voxel_m: Their size.
+        outside: True for voxels beyond which photographs look, on a lattice two larger that starts one voxel earlier.
+        cut_below_x: Facets whose middle has an x below it, in voxels, are cut by the box around the scene.
+        temperature_c: Of all nodes.
+    """
+    corners, tets = kuhn_tets(cells)
+    facets = boundary_facets(tets)
+    corner = corners[facets]
+    normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).astype(float)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    middle = corner.mean(axis=1)
+    beyond = np.floor(middle + 0.5 * normals).astype(int) + 1
+    patch, names = default_patches(normals, Z_UP, outside[tuple(beyond.T)], middle[:, 0] < cut_below_x)
+    tags = Boundary(normals, np.ones(len(facets)), np.ones(len(facets), bool), patch, names)
+    return TetMesh(
+        points_m=corners * voxel_m,
+        tets=tets,
+        temperature_c=np.full(len(corners), temperature_c),
+        observed=np.ones(len(corners), bool),
+        facets=facets,
+        facet_tags=np.zeros(len(facets), np.int64),
+        region=np.zeros(len(tets), np.int64),
+        region_names=("solid", "slab"),
+        boundary=tags,
+    )
+
+
+def room() -> TetMesh:
+    """A closed room of 4 m with walls, floor and ceiling of 1 m; its side at x = 0 is cut by the box."""
+    cells = np.ones((4, 4, 4), dtype=bool)
+    cells[1:3, 1:3, 1:3] = False
+    outside = np.ones((6, 6, 6), dtype=bool)
+    outside[2:4, 2:4, 2:4] = False
+    return tagged_body(cells, 1.0, outside, cut_below_x=1e-6)
+
+
+def wall() -> TetMesh:
+    """A wall of 0.2 m that fills the box: outside at its larger y, the room at y = 0, the rest is cut."""
+    cells = np.ones((1, 4, 1), dtype=bool)
+    outside = np.zeros((3, 6, 3), dtype=bool)
+    outside[:, 5] = True
+    mesh = tagged_body(cells, 0.05, outside)
+    assert mesh.boundary is not None
+    across = np.abs(mesh.boundary.normal[:, 1]) < 0.5
+    patch = np.where(across, mesh.boundary.patch_names.index("cut"), mesh.boundary.patch)
+    tags = Boundary(
+        mesh.boundary.normal, mesh.boundary.area_factor, mesh.boundary.seen, patch, mesh.boundary.patch_names
+    )
+    return TetMesh(**{**vars(mesh), "boundary": tags})

@@ -1,0 +1,177 @@
+"""Levels that break a naive contour: walls of one voxel, bodies that touch, the border of the lattice, noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.stuffed_shapes import (
+    ANGLE_BOUNDS_DEG,
+    box_distance,
+    centres,
+    euler_characteristic,
+    num_bodies,
+    tet_mesh,
+    turn,
+)
+from thermoxels_ns.mesh.quality import MeshQuality, check_mesh, facet_areas
+from thermoxels_ns.mesh.stuffing import StuffedSolid, stuff
+
+
+def sound(solid: StuffedSolid) -> MeshQuality:
+    """Measures of a mesh that is conforming, closed and within the promised angles."""
+    quality = check_mesh(tet_mesh(solid))
+    assert ANGLE_BOUNDS_DEG[0] <= quality.min_dihedral_deg <= quality.max_dihedral_deg <= ANGLE_BOUNDS_DEG[1]
+    return quality
+
+
+def binary(*shape: int, solid: tuple[slice, ...] | list[tuple]) -> np.ndarray:
+    level = np.full(shape, -1.0)
+    for part in solid if isinstance(solid, list) else [solid]:
+        level[part] = 1.0
+    return level
+
+
+WALL = np.array([0.5, 8.0, 7.0])
+"""Half the sides of a wall one voxel thick."""
+
+
+@pytest.mark.parametrize("offset", [0.1, 0.25, 0.4, 0.5])
+@pytest.mark.parametrize("degrees", [0.0, 30.0, 45.0])
+def test_wall_one_voxel_thick_as_signed_distance(degrees, offset):
+    points = centres(24, 24, 24) - [offset, 0.03, 0.07]
+    solid = stuff(np.clip(-box_distance(points @ turn(degrees), WALL), -1.0, 1.0))
+    quality = sound(solid)
+    # At 45 degrees and a quarter of a voxel, two rims of the wall hang on voxels that share an edge only.
+    assert num_bodies(solid) <= 2
+    assert euler_characteristic(solid) == 2 * num_bodies(solid), "a hole through the wall"
+    assert quality.volume_m3 == pytest.approx(8 * WALL.prod(), rel=0.25)
+    assert quality.area_m2 == pytest.approx(8 * (WALL[0] * WALL[1] + WALL[1] * WALL[2] + WALL[0] * WALL[2]), rel=0.1)
+
+
+@pytest.mark.parametrize("offset", [0.1, 0.5])
+@pytest.mark.parametrize("degrees", [0.0, 30.0, 45.0])
+def test_wall_one_voxel_thick_as_cells(degrees, offset):
+    points = centres(24, 24, 24) - [offset, 0.03, 0.07]
+    cells = box_distance(points @ turn(degrees), WALL) < 0.0
+    solid = stuff(np.where(cells, 1.0, -1.0))
+    quality = sound(solid)
+    assert num_bodies(solid) == 1
+    assert 0.5 * np.count_nonzero(cells) < quality.volume_m3 < 1.1 * np.count_nonzero(cells)
+
+
+@pytest.mark.parametrize("tiny", [0.5, 0.1, 1e-3, 1e-9])
+def test_wall_of_one_layer_never_gets_holes(tiny):
+    """However shallow the level says the solid is."""
+    level = np.full((7, 12, 11), -1.0)
+    level[3, 1:-1, 1:-1] = tiny * np.random.default_rng(4).uniform(0.5, 1.0, (10, 9))
+    solid = stuff(level)
+    quality = sound(solid)
+    assert num_bodies(solid) == 1 and euler_characteristic(solid) == 2
+    assert quality.volume_m3 > 0.3 * 90
+
+
+@pytest.mark.parametrize("tiny", [0.5, 0.1, 1e-9])
+def test_gap_of_one_voxel_keeps_bodies_apart(tiny):
+    level = np.ones((9, 8, 7))
+    level[4] = -tiny * np.random.default_rng(5).uniform(0.5, 1.0, (8, 7))
+    solid = stuff(level)
+    sound(solid)
+    # The two bodies meet in points of the gap's border at most.
+    inner = solid.points[solid.facets[~solid.on_box]]
+    middle = np.abs(inner[..., 0] - 4.5)
+    assert middle.min() > 0.1
+    assert euler_characteristic(solid) == 4 and num_bodies(solid) == 2
+
+
+def test_cavity_of_one_voxel_stays():
+    level = np.ones((5, 5, 5))
+    level[2, 2, 2] = -1e-6
+    solid = stuff(level)
+    quality = sound(solid)
+    assert euler_characteristic(solid) == 4 and num_bodies(solid) == 1
+    assert 125.0 - 1.0 < quality.volume_m3 < 125.0 - 0.01
+
+
+def test_bodies_that_touch_along_an_edge():
+    solid = stuff(binary(8, 8, 6, solid=[np.s_[1:4, 1:4, 1:5], np.s_[4:7, 4:7, 1:5]]))
+    quality = sound(solid)
+    assert num_bodies(solid) == 1
+    assert 0.75 * 72 < quality.volume_m3 < 72
+
+
+def test_bodies_that_touch_at_a_corner():
+    solid = stuff(binary(8, 8, 8, solid=[np.s_[1:4, 1:4, 1:4], np.s_[4:7, 4:7, 4:7]]))
+    quality = sound(solid)
+    assert num_bodies(solid) == 2 and euler_characteristic(solid) == 4
+    assert 0.75 * 54 < quality.volume_m3 < 54
+
+
+@pytest.mark.parametrize(("centre", "share"), [((0, 8, 8), 2), ((0, 0, 8), 4), ((0, 0, 0), 8), ((16, 16, 0), 8)])
+def test_ball_cut_by_the_border(centre, share):
+    """On a face, an edge and the corners of the lattice."""
+    distance = np.linalg.norm(centres(16, 16, 16) + 8.0 - centre, axis=-1)
+    solid = stuff(np.clip((6.0 - distance) / 1.5, -1.0, 1.0))
+    quality = sound(solid)
+    assert num_bodies(solid) == 1 and euler_characteristic(solid) == 2
+    assert quality.volume_m3 == pytest.approx(4 / 3 * np.pi * 6.0**3 / share, rel=0.04)
+    # Where the surface meets the border the edge is a chamfer about half a voxel wide.
+    on_box = facet_areas(solid.points, solid.facets)[solid.on_box].sum()
+    fans = np.log2(share) * 2 / share
+    assert on_box == pytest.approx(fans * (np.pi * 6.0**2 - 0.5 * 2 * np.pi * 6.0), rel=0.1)
+    assert np.all((solid.points >= 0.0) & (solid.points <= 16.0))
+
+
+@pytest.mark.parametrize("cell", [(0, 0, 0), (0, 2, 4), (2, 2, 2), (4, 4, 4)])
+def test_single_voxel(cell):
+    solid = stuff(binary(5, 5, 5, solid=cell))
+    quality = sound(solid)
+    assert num_bodies(solid) == 1 and euler_characteristic(solid) == 2
+    assert np.all(np.abs(solid.points - np.add(cell, 0.5)) <= 0.5)
+    assert 0.2 < quality.volume_m3 <= 1.0
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 5, 7), (1, 1, 6), (6, 1, 1), (4, 1, 5)])
+def test_lattice_one_voxel_wide(shape):
+    full = stuff(np.full(shape, 0.3))
+    assert sound(full).volume_m3 == pytest.approx(np.prod(shape), rel=1e-14)
+    assert full.on_box.all()
+    random = np.random.default_rng(6).normal(size=shape)
+    random.flat[0] = 1.0
+    assert 0.0 < sound(stuff(random)).volume_m3 <= np.prod(shape)
+
+
+def test_checkerboard():
+    i, j, k = np.indices((7, 8, 9))
+    level = np.where((i + j + k) % 2 == 0, 1.0, -1.0)
+    quality = sound(stuff(level))
+    assert quality.volume_m3 == pytest.approx(0.5 * level.size, rel=0.1)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.7, 0.98])
+def test_random_cells(share):
+    cells = np.random.default_rng(9).random((12, 13, 14)) < share
+    solid = stuff(np.where(cells, 1.0, -1.0))
+    quality = sound(solid)
+    # Every solid voxel is there: its centre is a node inside the mesh.
+    inside = solid.points[~solid.on_surface]
+    inside = {tuple(point) for point in inside}
+    assert all(tuple(centre) in inside for centre in np.argwhere(cells) + 0.5)
+    assert quality.num_tets > 20 * np.count_nonzero(cells) * (1.0 - share)
+
+
+def test_every_level_zero_but_one():
+    level = np.zeros((5, 5, 5))
+    level[2, 2, 2] = 1.0
+    assert sound(stuff(level)).volume_m3 > 0.0
+
+
+def test_large_lattice():
+    """A ball of 20 voxels in 256^3: the cost is that of the ball and one pass."""
+    level = np.full((256, 256, 256), -1.0, dtype=np.float32)
+    ball = 10.0 - np.linalg.norm(centres(24, 24, 24), axis=-1)
+    level[200:224, 10:34, 100:124] = ball.clip(-1.0, 1.0)
+    solid = stuff(level)
+    small = stuff(ball.clip(-1.0, 1.0).astype(np.float32))
+    assert np.array_equal(solid.tets, small.tets)
+    assert np.allclose(small.points, solid.points - np.array([200, 10, 100]), rtol=0.0, atol=1e-12)

@@ -1,0 +1,184 @@
+"""Scale and up: where they come from, what they err, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.data.synthetic import make_scene, write_scene
+from thermoxels_ns.errors import SceneError, ThermoxelsError
+from thermoxels_ns.scene_scale import (
+    UP_ASSUMED,
+    SceneScale,
+    choose_scale,
+    scale_from_known_distance,
+    scale_from_option,
+    scale_from_scene_file,
+    up_from_scene_file,
+)
+
+
+def test_option_is_taken_as_it_is_and_its_error_is_not_known():
+    scale = scale_from_option(2.5)
+    assert (scale.metres_per_unit, scale.standard_error, scale.up) == (2.5, None, UP_ASSUMED)
+    assert "user" in scale.source and "assumed" in scale.up_source
+    assert scale.volume_standard_error(3.0) is None and scale.area_standard_error(3.0) is None
+
+
+def test_known_distance_by_hand():
+    scale = scale_from_known_distance([1, 2, 3], [1, 5, 7], 2.5, standard_error_m=0.05)
+    assert scale.metres_per_unit == 0.5
+    assert scale.standard_error == pytest.approx(0.01)  # 2 percent
+    assert "2.5 m" in scale.source and "(1, 5, 7)" in scale.source
+
+
+def test_errors_of_distance_and_points_add_in_quadrature():
+    tape = scale_from_known_distance((0, 0, 0), (5, 0, 0), 10.0, standard_error_m=0.3)
+    points = scale_from_known_distance((0, 0, 0), (5, 0, 0), 10.0, point_standard_error=0.2 / math.sqrt(2))
+    both = scale_from_known_distance((0, 0, 0), (5, 0, 0), 10.0, 0.3, 0.2 / math.sqrt(2))
+    assert tape.relative_standard_error == pytest.approx(0.03)
+    assert points.relative_standard_error == pytest.approx(0.04)
+    assert both.relative_standard_error == pytest.approx(0.05)
+    assert scale_from_known_distance((0, 0, 0), (5, 0, 0), 10.0).standard_error is None
+    assert scale_from_known_distance((0, 0, 0), (5, 0, 0), 10.0, 0.0).standard_error == 0.0
+
+
+def test_standard_errors_are_those_of_repeated_measurements():
+    random = np.random.default_rng(7)
+    a, b, distance, tape, spread = np.array([1.0, -2.0, 0.5]), np.array([3.0, 1.0, 4.0]), 8.0, 0.08, 0.02
+    stated = scale_from_known_distance(a, b, distance, tape, spread)
+    many = 200_000
+    apart = np.linalg.norm(
+        (b + spread * random.normal(size=(many, 3))) - (a + spread * random.normal(size=(many, 3))), axis=1
+    )
+    scales = (distance + tape * random.normal(size=many)) / apart
+    assert stated.standard_error == pytest.approx(scales.std(), rel=0.01)
+    volume, area = 4.0 * stated.metres_per_unit**3, 7.0 * stated.metres_per_unit**2
+    assert stated.volume_standard_error(volume) == pytest.approx((4.0 * scales**3).std(), rel=0.02)
+    assert stated.area_standard_error(area) == pytest.approx((7.0 * scales**2).std(), rel=0.02)
+
+
+def test_lengths_areas_and_volumes_err_once_twice_and_three_times():
+    scale = SceneScale(2.0, 0.02, "")
+    assert scale.length_standard_error(5.0) == pytest.approx(0.05)
+    assert scale.area_standard_error(5.0) == pytest.approx(0.10)
+    assert scale.volume_standard_error(5.0) == pytest.approx(0.15)
+
+
+@pytest.mark.parametrize("step", [1e-9, 1.0, 1e9])
+def test_scale_does_not_depend_on_the_unit_of_the_scene(step):
+    near = scale_from_known_distance((0, 0, 0), (0, 0, 2), 3.0, 0.1, 0.05)
+    far = scale_from_known_distance((0, 0, 0), (0, 0, 2 * step), 3.0, 0.1, 0.05 * step)
+    assert far.metres_per_unit * step == pytest.approx(near.metres_per_unit)
+    assert far.relative_standard_error == pytest.approx(near.relative_standard_error)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, True, "2"])
+def test_scale_and_distance_must_be_above_zero(value):
+    with pytest.raises(ThermoxelsError, match="metres_per_unit: expected a finite number above 0"):
+        scale_from_option(value)
+    with pytest.raises(ThermoxelsError, match="distance_m: expected a finite number above 0"):
+        scale_from_known_distance((0, 0, 0), (1, 0, 0), value)
+
+
+@pytest.mark.parametrize("other", [(1.0, 2.0, 3.0), (1.0, 2.0, 3.0 + 1e-13)])
+def test_points_that_coincide(other):
+    with pytest.raises(ThermoxelsError, match="expected two different points"):
+        scale_from_known_distance((1.0, 2.0, 3.0), other, 1.0)
+
+
+@pytest.mark.parametrize("bad", [(1.0, 2.0), (1.0, math.nan, 3.0), "door", (1.0, "x", 2.0), None])
+def test_points_that_are_no_points(bad):
+    with pytest.raises(ThermoxelsError, match="point_b: expected"):
+        scale_from_known_distance((0, 0, 0), bad, 1.0)
+
+
+@pytest.mark.parametrize("name", ["standard_error_m", "point_standard_error"])
+@pytest.mark.parametrize("bad", [-0.1, math.nan, "small"])
+def test_standard_errors_that_are_none(name, bad):
+    with pytest.raises(ThermoxelsError, match=f"{name}: expected a finite number of at least 0"):
+        scale_from_known_distance((0, 0, 0), (1, 0, 0), 1.0, **{name: bad})
+
+
+def test_scene_file():
+    meta = {"metres_per_unit": 0.25, "metres_per_unit_standard_error": 0.01, "up": [0, -3, 4]}
+    scale = scale_from_scene_file(meta)
+    assert scale is not None
+    assert (scale.metres_per_unit, scale.standard_error, scale.up) == (0.25, 0.01, (0.0, -0.6, 0.8))
+    assert "transforms.json" in scale.source and "transforms.json" in scale.up_source
+    assert scale_from_scene_file({}) is None
+    assert scale_from_scene_file({"up": [0, 1, 0]}) is None and up_from_scene_file({"up": [0, 1, 0]}) == (0, 1, 0)
+    assert up_from_scene_file({}) is None
+
+
+@pytest.mark.parametrize(
+    ("meta", "match"),
+    [
+        ({"metres_per_unit": 0}, "other.json: metres_per_unit: expected a finite number above 0, got 0"),
+        ({"metres_per_unit": "1"}, "other.json: metres_per_unit: expected a finite number above 0, got '1'"),
+        ({"metres_per_unit": True}, "other.json: metres_per_unit"),
+        (
+            {"metres_per_unit": 1, "metres_per_unit_standard_error": -1},
+            "standard_error: expected .* at least 0, got -1",
+        ),
+        ({"metres_per_unit": 1, "metres_per_unit_standard_error": [0]}, "standard_error: expected"),
+        ({"metres_per_unit_standard_error": 0.1}, "expected 'metres_per_unit' beside it"),
+        ({"metres_per_unit": 1, "up": [0, 0, 0]}, "other.json: up: expected three finite numbers, not all 0"),
+        ({"metres_per_unit": 1, "up": [0, 1]}, "other.json: up"),
+        ({"metres_per_unit": 1, "up": "z"}, "other.json: up"),
+        ({"metres_per_unit": 1, "up": [0, 0, math.nan]}, "other.json: up"),
+        ({"metres_per_unit": 1, "up": [0, 0, True]}, "other.json: up"),
+        ({"metres_per_unit": 1, "up": {"x": 1}}, "other.json: up"),
+    ],
+)
+def test_bad_scene_file(meta, match):
+    with pytest.raises(SceneError, match=match):
+        scale_from_scene_file(meta, "other.json")
+
+
+def test_the_user_goes_before_the_scene_file_and_it_says_so():
+    meta = {"metres_per_unit": 0.25, "up": [1, 0, 0]}
+    chosen = choose_scale(option=3.0, scene_file=meta)
+    assert chosen is not None
+    assert (chosen.metres_per_unit, chosen.up) == (3.0, (1.0, 0.0, 0.0))
+    assert "user" in chosen.source and "goes before the 0.25 m per unit of transforms.json" in chosen.source
+    measured = scale_from_known_distance((0, 0, 0), (2, 0, 0), 1.0, 0.1)
+    chosen = choose_scale(known_distance=measured, scene_file=meta)
+    assert chosen is not None
+    assert (chosen.metres_per_unit, chosen.standard_error, chosen.up) == (0.5, 0.05, (1.0, 0.0, 0.0))
+    assert "goes before" in chosen.source
+
+
+def test_choice_without_rivals():
+    assert choose_scale() is None and choose_scale(scene_file={"frames": []}) is None
+    assert choose_scale(option=2.0) == scale_from_option(2.0)
+    assert choose_scale(option=2.0, scene_file={}) == scale_from_option(2.0)
+    assert choose_scale(scene_file={"metres_per_unit": 4}) == scale_from_scene_file({"metres_per_unit": 4})
+
+
+def test_two_scales_at_once_from_the_user():
+    with pytest.raises(ThermoxelsError, match="scale: expected metres per unit or a known distance, got both"):
+        choose_scale(option=1.0, known_distance=scale_from_option(2.0))
+
+
+def test_a_damaged_scene_file_is_refused_even_if_the_user_gives_a_scale():
+    with pytest.raises(SceneError, match="metres_per_unit"):
+        choose_scale(option=1.0, scene_file={"metres_per_unit": -1})
+
+
+def test_mapping_is_json():
+    scale = scale_from_known_distance((0, 0, 0), (2, 0, 0), 1.0, 0.1)
+    mapping = json.loads(json.dumps(scale.as_mapping(), allow_nan=False))
+    assert mapping["metres_per_unit"] == 0.5 and mapping["standard_error"] == 0.05 and mapping["up"] == [0, 0, 1]
+    assert set(mapping) == {"metres_per_unit", "standard_error", "source", "up", "up_source"}
+
+
+def test_synthetic_scenes_are_in_metres_with_z_up(tmp_path):
+    write_scene(make_scene("hot-object"), tmp_path, num_train=1, num_eval=1, width=8, height=6, progress=False)
+    scale = choose_scale(scene_file=json.loads((tmp_path / "transforms.json").read_text()))
+    assert scale is not None
+    assert (scale.metres_per_unit, scale.standard_error, scale.up) == (1.0, None, (0.0, 0.0, 1.0))
+    assert "transforms.json" in scale.up_source

@@ -1,0 +1,174 @@
+"""The validation cases of ISO 10211 for programs that compute thermal bridges.
+
+A program is a three-dimensional steady-state high precision method if its temperatures are within 0.1 C of the listed
+ones, its heat flow is within 0.1 W/m in case 2 and within 1 % in case 3, and flows change by less than 1 % when the
+number of subdivisions is doubled. Case 4 (a bar through insulation) is not among them here.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.heat_meshes import box_mesh, graded, planes
+from thermoxels_ns.fem.effects import Convection, FixedTemperature
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.solution import SteadySolution
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+BOUNDARIES = pytest.mark.parametrize("lumped_boundary", [True, False])
+
+
+def conductor(name: str, conductivity_w_mk: float) -> Material:
+    return Material(name, conductivity_w_mk, 1000.0, 1000.0)
+
+
+def at(mesh: TetMesh, solution: SteadySolution, *position: float) -> float:
+    """Temperature of the node at a position."""
+    distance = np.linalg.norm(mesh.points_m - np.array(position), axis=1)
+    assert distance.min() < 1e-9
+    return float(solution.temperature_c[distance.argmin()])
+
+
+CASE_1 = """9.7 13.4 14.7 15.1
+5.3 8.6 10.3 10.8
+3.2 5.6 7.0 7.5
+2.0 3.6 4.7 5.0
+1.3 2.3 3.0 3.2
+0.7 1.4 1.8 1.9
+0.3 0.6 0.8 0.9"""
+
+
+def test_case_1_half_a_square_column() -> None:
+    """Half of a unit square, its top at 20 C, the other sides at 0 C: 28 points at a spacing of 1/8."""
+
+    def sides(places, time_s):
+        x, _, z = places.points_m.T
+        # In the corner the two temperatures meet; the mean spreads the jump evenly.
+        return np.where(z > 1.0 - 1e-9, np.where(x < 1e-9, 10.0, 20.0), 0.0)
+
+    mesh = box_mesh(np.linspace(0, 0.5, 25), [0, 1 / 48], np.linspace(0, 1, 49), temperature_c=5.0)
+    fixed = FixedTemperature(("x0", "z0", "z1"), Varying(sides, in_time=False))
+    solution = solve_steady(HeatProblem(mesh, conductor("any", 1.0), effects=(fixed,)))
+    for row, line in enumerate(CASE_1.splitlines(), start=1):
+        for column, listed in enumerate(line.split(), start=1):
+            computed = at(mesh, solution, column / 8, 0.0, 1 - row / 8)
+            assert computed == pytest.approx(float(listed), abs=0.1), f"row {row}, column {column}"
+
+
+CASE_2 = {
+    "A": (0.0, 47.5, 7.1),
+    "B": (500.0, 47.5, 0.8),
+    "C": (0.0, 41.5, 7.9),
+    "D": (15.0, 41.5, 6.3),
+    "E": (500.0, 41.5, 0.8),
+    "F": (0.0, 36.5, 16.4),
+    "G": (15.0, 36.5, 16.3),
+    "H": (0.0, 0.0, 16.8),
+    "I": (500.0, 0.0, 18.3),
+}
+"""x and z in mm, temperature in C."""
+
+
+@BOUNDARIES
+@pytest.mark.parametrize("parts", [1, 2])
+def test_case_2_metal_faced_wall(lumped_boundary, parts) -> None:
+    """Concrete, wood, insulation and an aluminium profile that bends into the wall; flow per metre of depth."""
+    x = 1e-3 * np.unique(np.concatenate([planes(0, 1.5, 15, step=3 / parts), planes(15, 60, step=5 / parts),
+                                         graded(60, 500, finest=8 / parts, growth=1.3, coarsest=60 / parts)]))
+    z = 1e-3 * planes(0, 1.5, 35, 36.5, 41.5, 47.5, step=4 / parts)
+    regions = {
+        "insulation": lambda p: p[..., 2] < 0.0415,
+        "concrete": lambda p: p[..., 2] > 0.0415,
+        "wood": lambda p: (p[..., 0] < 0.015) & (p[..., 2] > 0.0365) & (p[..., 2] < 0.0415),
+        "aluminium": lambda p: (p[..., 2] < 0.0015)
+        | ((p[..., 0] < 0.0015) & (p[..., 2] < 0.0365))
+        | ((p[..., 0] < 0.015) & (p[..., 2] > 0.035) & (p[..., 2] < 0.0365)),
+    }
+    depth = 0.01
+    mesh = box_mesh(x, [0, depth], z, regions=regions)
+    materials = {"insulation": 0.029, "concrete": 1.15, "wood": 0.12, "aluminium": 230.0}
+    effects = (Convection(("z1",), 1 / 0.06, 0.0), Convection(("z0",), 1 / 0.11, 20.0))
+    problem = HeatProblem(mesh, {name: conductor(name, k) for name, k in materials.items()}, effects=effects)
+    solution = solve_steady(problem, lumped_boundary=lumped_boundary)
+    flow_w_m = solution.effects[1].heat_w[0] / depth
+    assert flow_w_m == pytest.approx(9.5, abs=0.1) and solution.energy_residual < 1e-9
+    for name, (px, pz, listed) in CASE_2.items():
+        assert at(mesh, solution, 1e-3 * px, 0.0, 1e-3 * pz) == pytest.approx(listed, abs=0.1), name
+
+
+def balcony(finest: float) -> TetMesh:
+    """An outer corner of two insulated walls with a floor slab that goes through one of them to a balcony."""
+    step = {"finest": finest, "growth": 1.3, "coarsest": 0.2}
+    x, y, z = (
+        graded(*knots, **step)
+        for knots in ((-0.1, 0, 0.05, 0.2, 1.2), (-0.7, -0.1, 0, 0.05, 0.2, 1.2), (0, 1.0, 1.15, 1.2, 2.15))
+    )
+
+    def depth(p):
+        """How far inside the outer face of the nearer wall."""
+        return np.minimum(p[..., 0], p[..., 1])
+
+    regions = {
+        "inner wall": lambda p: depth(p) > 0.05,
+        "insulation": lambda p: (depth(p) > 0) & (depth(p) < 0.05),
+        "outer wall": lambda p: depth(p) < 0,
+        "floor": lambda p: (depth(p) > 0.2) & (p[..., 2] > 1.15),
+        "slab": lambda p: (p[..., 0] > 0.05) & (p[..., 2] > 1.0) & (p[..., 2] < 1.15),
+    }
+
+    def solid(p):
+        wall, slab = (depth(p) > -0.1) & (depth(p) < 0.2), regions["slab"](p)
+        return wall | slab | ((depth(p) > 0.2) & (p[..., 2] > 1.15) & (p[..., 2] < 1.2))
+
+    def cut(c):
+        return (c[:, 0] > 1.2 - 1e-9) | (c[:, 1] > 1.2 - 1e-9) | (c[:, 2] < 1e-9) | (c[:, 2] > 2.15 - 1e-9)
+
+    def room(c):
+        return ~cut(c) & (depth(c) > 0.2 - 1e-9)
+
+    patches = {
+        "cut": lambda c, n: cut(c),
+        "outside": lambda c, n: ~cut(c) & ~room(c),
+        "lower room": lambda c, n: room(c) & (c[:, 2] < 1.0 + 1e-9),
+        "upper room": lambda c, n: room(c) & (c[:, 2] > 1.15),
+    }
+    return box_mesh(x, y, z, regions=regions, patches=patches, keep=solid)
+
+
+CASE_3_W = {"lower room": 46.09, "upper room": 13.89, "outside": -59.98}
+CASE_3_COLDEST_C = {"lower room": 11.32, "upper room": 11.11}
+
+
+def case_3(finest: float, lumped_boundary: bool) -> tuple[TetMesh, SteadySolution]:
+    mesh = balcony(finest)
+    materials = {"inner wall": 0.7, "insulation": 0.04, "outer wall": 1.0, "floor": 1.0, "slab": 2.5}
+    effects = (
+        Convection(("lower room",), 5.0, 20.0),
+        Convection(("upper room",), 5.0, 15.0),
+        Convection(("outside",), 20.0, 0.0),
+    )
+    problem = HeatProblem(mesh, {name: conductor(name, k) for name, k in materials.items()}, effects=effects)
+    return mesh, solve_steady(problem, lumped_boundary=lumped_boundary)
+
+
+@BOUNDARIES
+def test_case_3_corner_with_a_balcony(lumped_boundary) -> None:
+    flows = []
+    for finest in (0.025, 0.0125):
+        mesh, solution = case_3(finest, lumped_boundary)
+        heat = {heat.group_names[0]: float(heat.heat_w[0]) for heat in solution.effects}
+        for patch, listed in CASE_3_W.items():
+            assert heat[patch] == pytest.approx(listed, rel=0.01), (patch, len(mesh.tets))
+        tags = mesh.boundary
+        assert tags is not None
+        for patch, listed in CASE_3_COLDEST_C.items():
+            nodes = np.unique(mesh.facets[tags.patch == tags.patch_names.index(patch)])
+            assert solution.temperature_c[nodes].min() == pytest.approx(listed, abs=0.1), (patch, len(mesh.tets))
+        assert solution.energy_residual < 1e-9
+        flows.append(heat["outside"])
+    assert flows[1] == pytest.approx(flows[0], rel=0.01)
+    assert abs(flows[1] + 59.98) < abs(flows[0] + 59.98)

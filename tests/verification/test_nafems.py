@@ -1,0 +1,89 @@
+"""NAFEMS benchmarks of heat transfer T2, T3 and T4 (The Standard NAFEMS Benchmarks, TNSB rev. 3, 1990)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.heat_meshes import box_mesh
+from thermoxels_ns.fem.effects import Convection, FixedTemperature, Radiation
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Scheme
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.fem.stepping import solve_heat
+
+
+@pytest.mark.parametrize(("conductivity", "exact_k"), [(55.6, 927.0076), (55.563, 926.9707)])
+@pytest.mark.parametrize("lumped_boundary", [True, False])
+@pytest.mark.parametrize("parts", [1, 7])
+def test_t2_radiation_at_the_end_of_a_rod(conductivity, exact_k, lumped_boundary, parts) -> None:
+    """0.1 m, one end at 1000 K, the other radiates with emissivity 0.98 to 300 K: target 927.0 K at that end."""
+    mesh = box_mesh(np.linspace(0, 0.1, parts + 1), [0, 0.01], [0, 0.01])
+    effects = (FixedTemperature(("x0",), 1000.0 - 273.15), Radiation(("x1",), 0.98, 300.0 - 273.15, 5.67e-8))
+    problem = HeatProblem(mesh, Material("rod", conductivity, 7850.0, 460.0), effects=effects)
+    solution = solve_steady(problem, lumped_boundary=lumped_boundary)
+    end_k = solution.temperature_c[mesh.points_m[:, 0] == 0.1] + 273.15
+    np.testing.assert_allclose(end_k, exact_k, atol=1e-4)
+    assert end_k[0] == pytest.approx(927.0, abs=0.05)
+
+
+T3_C = 36.60312
+"""Exact temperature of T3 at x = 0.08 m after 32 s; the printed target is 36.60."""
+
+
+def t3(parts: int) -> tuple[HeatProblem, np.ndarray]:
+    """A rod at 0 C, one end kept there, the other at 100 sin(pi t / 40); and the nodes at 0.08 m."""
+    mesh = box_mesh(np.linspace(0, 0.1, parts + 1), [0, 0.01], [0, 0.01], temperature_c=0.0)
+    swing = Varying(lambda places, time_s: 100.0 * np.sin(np.pi * time_s / 40.0))
+    effects = (FixedTemperature(("x0",), 0.0), FixedTemperature(("x1",), swing))
+    return HeatProblem(mesh, Material("steel", 35.0, 7200.0, 440.5), effects=effects), np.isclose(
+        mesh.points_m[:, 0], 0.08
+    )
+
+
+def t3_errors(parts: int, scheme: Scheme, step_s: float = 0.5, **options) -> float:
+    problem, nodes = t3(parts)
+    end = solve_heat(problem, TimeSteps(round(32 / step_s), step_s), scheme=scheme, **options).temperature_c[-1, nodes]
+    assert np.ptp(end) < 1e-9
+    return float(end[0]) - T3_C
+
+
+@pytest.mark.parametrize("scheme", [CRANK_NICOLSON, SDIRK2], ids=lambda scheme: scheme.name)
+def test_t3_rod_with_a_swinging_end(scheme) -> None:
+    """The error falls by four with each refinement and is within 0.1 K at 40 elements."""
+    errors = [abs(t3_errors(parts, scheme)) for parts in (10, 20, 40)]
+    assert errors[2] < 0.1, errors
+    assert 3.2 < errors[0] / errors[1] < 4.8 and 3.2 < errors[1] / errors[2] < 4.8, errors
+
+
+def test_t3_with_other_choices() -> None:
+    """Consistent masses err to the other side, backward Euler by its first-order error; both within known numbers."""
+    assert t3_errors(20, CRANK_NICOLSON, lumped=False) == pytest.approx(37.22 - T3_C, abs=0.02)
+    assert t3_errors(20, BACKWARD_EULER) == pytest.approx(36.18 - T3_C, abs=0.02)
+    assert t3_errors(20, BACKWARD_EULER, lumped=False) == pytest.approx(36.96 - T3_C, abs=0.02)
+
+
+def test_t3_with_a_tolerance() -> None:
+    problem, nodes = t3(40)
+    solution = solve_heat(problem, AdaptiveSteps(32.0, 0.02, outputs=1))
+    fine = t3_errors(40, SDIRK2, 0.1)
+    assert solution.temperature_c[-1, nodes][0] - T3_C == pytest.approx(fine, abs=0.02)
+    assert abs(solution.temperature_c[-1, nodes][0] - 36.60) < 0.1
+
+
+def test_t4_plate_with_convection() -> None:
+    """0.6 x 1.0 m: 100 C below, insulated left, convection right and above; target 18.3 C at (0.6, 0.2)."""
+    errors = []
+    for n in (10, 20, 40):
+        mesh = box_mesh(np.linspace(0, 0.6, 6 * n // 10 + 1), np.linspace(0, 1, n + 1), [0, 1 / n], temperature_c=50.0)
+        effects = (FixedTemperature(("y0",), 100.0), Convection(("x1", "y1"), 750.0, 0.0))
+        problem = HeatProblem(mesh, Material("plate", 52.0, 7850.0, 460.0), effects=effects)
+        solution = solve_steady(problem, lumped_boundary=False)
+        node = np.linalg.norm(mesh.points_m - [0.6, 0.2, 0.0], axis=1).argmin()
+        errors.append(float(solution.temperature_c[node]) - 18.25376)
+        assert solution.energy_residual < 1e-9
+    assert abs(errors[-1]) < 0.01 * 18.25376, errors
+    # The corner (0.6, 0) is singular: the order stays below 2.
+    assert abs(errors[1]) < 0.5 * abs(errors[0]) and abs(errors[2]) < 0.5 * abs(errors[1]), errors

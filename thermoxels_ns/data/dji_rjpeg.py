@@ -1,0 +1,208 @@
+"""DJI's radiometric JPEG, through DJI's own library.
+
+How DJI's counts become degrees is not public: the Thermal SDK's `libdirp` does it, may not be passed on with other
+programs, and is free to download. So the user names the library; without it the file is refused and says what to do.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from thermoxels_ns.data.exif_facts import ExifFacts, read_exif_facts
+from thermoxels_ns.data.jpeg_segments import APP1, APP3, JPEG_START, DamagedJpegError, jpeg_segments
+from thermoxels_ns.data.radiometric_conditions import ConditionOverrides, Conditions
+from thermoxels_ns.data.thermal_size import check_thermal_size
+from thermoxels_ns.errors import ThermalFileError, ThermoxelsError, explain
+
+_SDK = "the DJI Thermal SDK (www.dji.com/downloads/softwares/dji-thermal-sdk)"
+_STATUS = {
+    -1: "out of memory",
+    -2: "a null pointer",
+    -3: "parameters out of range",
+    -4: "no valid counts in the R-JPEG",
+    -5: "no valid header in the R-JPEG",
+    -6: "no valid calibration curve in the R-JPEG",
+    -7: "an R-JPEG that cannot be parsed",
+    -8: "a wrong size",
+    -9: "an invalid handle",
+    -10: "a wrong input format",
+    -11: "a wrong output format",
+}
+_SPARE_FLOATS = 12
+_LIMITS = "DJI's library takes distances of 1 to 25 m, humidities of 0.2 to 1 and emissivities of 0.1 to 1."
+
+
+class _Resolution(ctypes.Structure):
+    _fields_ = [("width", ctypes.c_int32), ("height", ctypes.c_int32)]
+
+
+class _Parameters(ctypes.Structure):
+    """Measurement parameters, with room behind them: newer libraries know the air temperature too."""
+
+    _fields_ = [
+        ("distance_m", ctypes.c_float),
+        ("humidity", ctypes.c_float),
+        ("emissivity", ctypes.c_float),
+        ("reflected_c", ctypes.c_float),
+        ("air_c", ctypes.c_float),
+        ("spare", ctypes.c_float * _SPARE_FLOATS),
+    ]
+
+
+@dataclass(frozen=True)
+class DjiImage:
+    """One R-JPEG of a DJI camera after reading."""
+
+    temperature_c: npt.NDArray[np.float32]
+    """Shape (height, width), [degrees C]."""
+    camera_conditions: Conditions
+    conditions: Conditions
+    exif: ExifFacts
+
+
+def is_dji_rjpeg(content: bytes) -> bool:
+    """Whether a JPEG is DJI's and holds counts: its photographs have the maker's name, but no APP3 segments."""
+    counts = made_by_dji = False
+    try:
+        for marker, payload in jpeg_segments(content):
+            made_by_dji |= marker == APP1 and b"DJI" in payload
+            counts |= marker == APP3
+    except DamagedJpegError:
+        pass  # what comes before the damage tells what the file was to be
+    return content.startswith(JPEG_START) and made_by_dji and counts
+
+
+def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrides) -> DjiImage:
+    """Read a DJI R-JPEG with `libdirp`.
+
+    Args:
+        path: The file.
+        library: Where `libdirp.so` or `libdirp.dll` is, in its folder of the SDK.
+        overrides: Measurement parameters that replace the file's.
+
+    Raises:
+        ThermalFileError: There is no library, it is another one, or it refuses the file or the parameters.
+    """
+    if library is None:
+        raise ThermalFileError(
+            explain(
+                str(path),
+                expected="DJI's library libdirp, the only one that turns the counts of a DJI R-JPEG into degrees",
+                got="no library",
+                remedy=f"Download {_SDK} and pass --dji-library with the path of libdirp.so (libdirp.dll on Windows).",
+            )
+        )
+    dirp = _load(library)
+    content = path.read_bytes()
+    data = (ctypes.c_uint8 * len(content)).from_buffer_copy(content)
+    handle = ctypes.c_void_p()
+
+    def call(function: str, *arguments: Any) -> None:
+        status = getattr(dirp, function)(*arguments)
+        if status != 0:
+            raise ThermalFileError(
+                explain(
+                    str(path),
+                    expected=f"{function} of {library.name} to take the file",
+                    got=f"status {status} ({_STATUS.get(status, 'unknown')})",
+                    remedy=f"Copy the file from the drone again, unedited; use a newer library. {_LIMITS}",
+                )
+            )
+
+    call("dirp_create_from_rjpeg", data, ctypes.c_int32(len(content)), ctypes.byref(handle))
+    try:
+        return _measure(path, call, handle, overrides)
+    finally:
+        dirp.dirp_destroy(handle)
+
+
+def _measure(path: Path, call: Callable[..., None], handle: ctypes.c_void_p, overrides: ConditionOverrides) -> DjiImage:
+    size = _Resolution()
+    call("dirp_get_rjpeg_resolution", handle, ctypes.byref(size))
+    check_thermal_size(path, size.width, size.height)
+    parameters = _Parameters(air_c=math.nan)  # a library that knows it writes over this
+    call("dirp_get_measurement_params", handle, ctypes.byref(parameters))
+    knows_air = not math.isnan(parameters.air_c)
+    percent = parameters.humidity > 1.0
+    try:
+        before = Conditions(
+            emissivity=parameters.emissivity,
+            reflected_c=parameters.reflected_c,
+            distance_m=parameters.distance_m,
+            relative_humidity=parameters.humidity / 100.0 if percent else parameters.humidity,
+            air_c=parameters.air_c if knows_air else parameters.reflected_c,
+        )
+    except ThermoxelsError as problem:
+        raise ThermalFileError(
+            explain(
+                str(path),
+                expected="possible measurement parameters",
+                got=str(problem),
+                remedy="Copy the file from the drone again, unedited.",
+            )
+        ) from problem
+    after = before
+    if overrides.given():
+        if overrides.air_c is not None and not knows_air:
+            raise ThermalFileError(
+                explain(
+                    "air_c",
+                    expected="a libdirp that knows the air temperature",
+                    got="one that takes the reflected temperature for it",
+                    remedy="Use a newer DJI Thermal SDK, or leave --air-c out.",
+                )
+            )
+        after = overrides.applied_to(before)
+        if not knows_air:
+            after = replace(after, air_c=after.reflected_c)
+        for name in ("distance_m", "emissivity", "reflected_c", *(("air_c",) if knows_air else ())):
+            setattr(parameters, name, getattr(after, name))
+        parameters.humidity = after.relative_humidity * (100.0 if percent else 1.0)
+        call("dirp_set_measurement_params", handle, ctypes.byref(parameters))
+    temperature_c = np.full((size.height, size.width), np.nan, dtype=np.float32)
+    pointer = temperature_c.ctypes.data_as(ctypes.POINTER(ctypes.c_float))
+    call("dirp_measure_ex", handle, pointer, ctypes.c_int32(temperature_c.nbytes))
+    with Image.open(path, formats=("JPEG", "MPO")) as image:
+        return DjiImage(temperature_c, before, after, read_exif_facts(image))
+
+
+def _load(library: Path) -> ctypes.CDLL:
+    wrong: object = None
+    dirp = None
+    if not library.is_file():
+        wrong = "nothing there"
+    else:
+        try:
+            dirp = ctypes.CDLL(str(library.resolve()))
+            for name in (
+                "dirp_create_from_rjpeg",
+                "dirp_get_rjpeg_resolution",
+                "dirp_get_measurement_params",
+                "dirp_set_measurement_params",
+                "dirp_measure_ex",
+                "dirp_destroy",
+            ):
+                getattr(dirp, name).restype = ctypes.c_int32
+        except OSError as problem:
+            wrong = f"a file that cannot be loaded ({problem})"
+        except AttributeError as problem:
+            wrong = f"another library ({problem})"
+    if dirp is None or wrong is not None:
+        raise ThermalFileError(
+            explain(
+                "dji_library",
+                expected=f"DJI's libdirp for this computer at {library}",
+                got=wrong,
+                remedy=f"Pass --dji-library with the path of the file in {_SDK}, and leave the libraries beside it.",
+            )
+        )
+    return dirp

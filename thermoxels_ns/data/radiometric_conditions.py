@@ -1,0 +1,100 @@
+"""What a temperature measurement assumes: how the object shines, what it mirrors, and the air between."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from thermoxels_ns.errors import ThermoxelsError, explain
+from thermoxels_ns.units import ZERO_CELSIUS_K
+
+DEFAULT_RELATIVE_HUMIDITY = 0.5
+"""Where neither file nor user says: what cameras assume; over a room's distances it changes less than their noise."""
+_COLDEST_AIR_C, _HOTTEST_AIR_C = -100.0, 150.0
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What a temperature was computed with; the defaults make it the apparent temperature (a black body, no air)."""
+
+    emissivity: float = 1.0
+    """Emissivity of the objects in the picture, above 0, at most 1. Plaster, brick, wood, paint: 0.90 to 0.96."""
+    reflected_c: float | None = None
+    """Apparent temperature of what the objects mirror, [degrees C]; needed where the emissivity is below 1."""
+    distance_m: float = 0.0
+    """From the camera to the objects, [m], at least 0."""
+    relative_humidity: float = DEFAULT_RELATIVE_HUMIDITY
+    """Of the air, 0 to 1."""
+    air_c: float | None = None
+    """Air temperature, [degrees C], -100 to 150; needed where the distance is above 0."""
+    window_transmission: float = 1.0
+    """Of a window or filter in front of the lens, above 0, at most 1 (1: none)."""
+    window_c: float | None = None
+    """Temperature of that window, [degrees C]; needed where it does not pass everything."""
+
+    def __post_init__(self) -> None:
+        for name in ("emissivity", "window_transmission"):
+            check_between(name, getattr(self, name), 0.0, 1.0, "above 0, at most 1", zero=False)
+        check_between("relative_humidity", self.relative_humidity, 0.0, 1.0, "from 0 to 1 (50 % is 0.5)")
+        check_between("distance_m", self.distance_m, 0.0, 1e5, "from 0 to 100000 m")
+        for name, needed, why in (
+            ("reflected_c", self.emissivity < 1, f"an emissivity of {self.emissivity:g}"),
+            ("air_c", self.distance_m > 0, f"a distance of {self.distance_m:g} m"),
+            ("window_c", self.window_transmission < 1, f"a window that passes {self.window_transmission:g}"),
+        ):
+            value = getattr(self, name)
+            if value is not None:
+                low, high = (_COLDEST_AIR_C, _HOTTEST_AIR_C) if name == "air_c" else (-ZERO_CELSIUS_K, 5000.0)
+                check_between(name, value, low, high, f"from {low:g} to {high:g} degrees C")
+            elif needed:
+                raise ThermoxelsError(
+                    explain(
+                        name,
+                        expected=f"a temperature, because {why} needs one",
+                        got="none",
+                        remedy=f"Pass --{name.replace('_', '-')} in degrees C; indoors the room's is a good guess.",
+                    )
+                )
+
+
+@dataclass(frozen=True)
+class ConditionOverrides:
+    """What the user knows better than the camera; None keeps what the file says."""
+
+    emissivity: float | None = None
+    """Emissivity of the objects in the picture, above 0, at most 1 (None: the camera's setting)."""
+    reflected_c: float | None = None
+    """Apparent temperature of what the objects mirror, [degrees C] (None: the camera's setting)."""
+    distance_m: float | None = None
+    """From the camera to the objects, [m] (None: the camera's setting)."""
+    relative_humidity: float | None = None
+    """Of the air, 0 to 1 (None: the camera's setting)."""
+    air_c: float | None = None
+    """Air temperature, [degrees C] (None: the camera's setting)."""
+
+    def __post_init__(self) -> None:
+        # With temperatures for all that may need one, only wrong values raise.
+        self.applied_to(Conditions(reflected_c=0.0, air_c=0.0))
+
+    def given(self) -> dict[str, float]:
+        """The settings that are not None, by name."""
+        names = [field.name for field in fields(ConditionOverrides)]
+        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+
+    def applied_to(self, conditions: Conditions) -> Conditions:
+        """Return `conditions` with the given settings in their place.
+
+        >>> ConditionOverrides(emissivity=0.9, reflected_c=15.0).applied_to(Conditions()).emissivity
+        0.9
+        """
+        return replace(conditions, **self.given())
+
+
+def check_between(name: str, value: float, low: float, high: float, expected: str, *, zero: bool = True) -> None:
+    """Raise a `ThermoxelsError` that names the setting if it is no number from `low` to `high` (or 0 and not `zero`)."""
+    number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+    if not (number and low <= value <= high and (zero or value > 0)):
+        raise ThermoxelsError(
+            explain(name, expected=expected, got=repr(value), remedy=f"Pass a right --{name.replace('_', '-')}.")
+        )

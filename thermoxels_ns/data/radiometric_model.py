@@ -1,0 +1,236 @@
+"""What a thermal camera measures: object, reflections and air, from counts to degrees and back.
+
+A sensor's signal for a black body of temperature T is the Planck curve of its calibration,
+``S(T) = R1 / (R2 (exp(B / T) - F)) - O``. In front of a real object it sees (FLIR's measurement formula, printed in
+the manuals of its cameras; Minkina and Dudzik, Infrared Thermography, 2009, equation 2.18)
+
+    S_total = emissivity tau S(T_object) + (1 - emissivity) tau S(T_reflected) + (1 - tau) S(T_air)
+
+with tau the transmission of the air. The weights add up to one, so a correction of temperatures does not depend on the
+offset and the scale of S: where a camera hides its constants, the shape of Planck's law in its band will do.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.checks import check_positive
+from thermoxels_ns.data.planck_band import LONG_WAVE
+from thermoxels_ns.data.radiometric_conditions import Conditions, check_between
+from thermoxels_ns.errors import ThermoxelsError, explain
+from thermoxels_ns.units import celsius_to_kelvin, kelvin_to_celsius
+
+_LARGEST_ATTENUATION, _LARGEST_WEIGHT = 1.0, 10.0
+_LARGEST_EXPONENT = 700.0
+
+Floats = npt.NDArray[np.floating]
+
+
+class SensorCurve(Protocol):
+    """A sensor's signal for black bodies, and its inverse."""
+
+    def signal(self, temperature_k: npt.ArrayLike) -> Floats:
+        """Signal of a black body; rises with temperature, [K]."""
+        ...
+
+    def temperature_k(self, signal: npt.ArrayLike) -> Floats:
+        """Temperature of a black body, [K]; NaN where there is none."""
+        ...
+
+
+@dataclass(frozen=True)
+class PlanckConstants:
+    """Calibration of a sensor: its signal as a function of a black body's temperature."""
+
+    r1: float
+    """Gain of the calibration."""
+    r2: float
+    """Second gain; only R1 / R2 matters."""
+    b: float
+    """Second radiation constant over the effective wavelength, [K]; 1300 to 1600 for 7.5 to 14 micrometres."""
+    f: float
+    """Shape; 1 in Planck's law at one wavelength."""
+    o: float
+    """Offset of the counts (negative in camera files)."""
+
+    def __post_init__(self) -> None:
+        for name in ("r1", "r2", "b", "f"):
+            check_positive(
+                f"Planck constant {name.upper()}", getattr(self, name), "Use the constants of the camera file."
+            )
+        if not math.isfinite(self.o):
+            raise ThermoxelsError(
+                explain(
+                    "Planck constant O",
+                    expected="a finite number",
+                    got=self.o,
+                    remedy="Use the constants of the camera file.",
+                )
+            )
+
+    def signal(self, temperature_k: npt.ArrayLike) -> Floats:
+        """Signal of a black body, S = R1 / (R2 (exp(B / T) - F)) - O.
+
+        Args:
+            temperature_k: Any shape, [K], above 0; below B / ln F where F is above 1 (thousands of kelvin).
+
+        Returns:
+            Counts, same shape, float64.
+        """
+        temperature_k = np.asarray(temperature_k, dtype=np.float64)
+        with np.errstate(divide="ignore", over="ignore"):  # near absolute zero: no signal but the offset
+            return self.r1 / (self.r2 * (np.exp(self.b / temperature_k) - self.f)) - self.o
+
+    def temperature_k(self, signal: npt.ArrayLike) -> Floats:
+        """Temperature of a black body, T = B / ln(R1 / (R2 (S + O)) + F), [K].
+
+        Args:
+            signal: Counts, any shape.
+
+        Returns:
+            Same shape, float64; NaN where no temperature gives so small a signal (S + O not above 0).
+        """
+        radiance = np.asarray(signal, dtype=np.float64) + self.o
+        radiance = np.where(radiance > 0, radiance, np.nan)
+        return self.b / np.log(self.r1 / (self.r2 * radiance) + self.f)
+
+
+@dataclass(frozen=True)
+class AirConstants:
+    """Transmission of humid air in the sensor's band; the defaults are those that FLIR's files of all cameras hold."""
+
+    alpha1: float = 0.006569
+    """Attenuation of the first part, [1/sqrt(m)]."""
+    alpha2: float = 0.01262
+    """Attenuation of the second part, [1/sqrt(m)]."""
+    beta1: float = -0.002276
+    """Part of the first attenuation that grows with the root of the water content."""
+    beta2: float = -0.00667
+    """Part of the second attenuation that grows with the root of the water content."""
+    x: float = 1.9
+    """Weight of the first part; the second has 1 - x."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            limit = _LARGEST_WEIGHT if field.name == "x" else _LARGEST_ATTENUATION
+            check_between(field.name, getattr(self, field.name), -limit, limit, f"from {-limit:g} to {limit:g}")
+
+    def transmission(self, distance_m: float, air_c: float, relative_humidity: float) -> float:
+        """Share of the object's radiation that reaches the camera, 1 at distance 0.
+
+        tau = X exp(-sqrt(d) (alpha1 + beta1 sqrt(w))) + (1 - X) exp(-sqrt(d) (alpha2 + beta2 sqrt(w))) with the water
+        content w = humidity exp(1.5587 + 0.06939 t - 2.7816e-4 t^2 + 6.8455e-7 t^3), t in degrees C (Minkina and
+        Dudzik 2009, section 2.3: the model of FLIR's cameras).
+
+        Args:
+            distance_m: Between object and camera, [m], at least 0.
+            air_c: Air temperature, [degrees C].
+            relative_humidity: 0 to 1.
+
+        >>> AirConstants().transmission(0.0, 20.0, 0.5)
+        1.0
+        >>> round(AirConstants().transmission(100.0, 20.0, 0.5), 3)
+        0.937
+        """
+        water = relative_humidity * math.exp(1.5587 + 0.06939 * air_c - 2.7816e-4 * air_c**2 + 6.8455e-7 * air_c**3)
+        root_d, root_w = math.sqrt(distance_m), math.sqrt(water)
+        first = math.exp(min(-root_d * (self.alpha1 + self.beta1 * root_w), _LARGEST_EXPONENT))
+        second = math.exp(min(-root_d * (self.alpha2 + self.beta2 * root_w), _LARGEST_EXPONENT))
+        return min(max(self.x * first + (1.0 - self.x) * second, 0.0), 1.0)
+
+
+@dataclass(frozen=True)
+class RadiometricModel:
+    """A sensor, the air in front of it, and the conditions of a measurement."""
+
+    conditions: Conditions
+    sensor: SensorCurve = LONG_WAVE
+    air: AirConstants = AirConstants()
+
+    def signal(self, temperature_c: npt.ArrayLike) -> Floats:
+        """Signal that the sensor gives in front of objects of these temperatures (the measurement formula above).
+
+        Args:
+            temperature_c: Any shape, [degrees C].
+
+        Returns:
+            Counts, same shape, float64.
+        """
+        weight, background = self._weights()
+        return weight * self.sensor.signal(_kelvin(temperature_c)) + background
+
+    def temperature_c(self, signal: npt.ArrayLike) -> Floats:
+        """Temperature of the objects that give this signal: the inverse of `signal`.
+
+        Args:
+            signal: Counts, any shape.
+
+        Returns:
+            Same shape, float64, [degrees C]; NaN where reflections and air alone would give more signal than there is.
+        """
+        weight, background = self._weights()
+        object_signal = (np.asarray(signal, dtype=np.float64) - background) / weight
+        return kelvin_to_celsius(self.sensor.temperature_k(object_signal))
+
+    def _weights(self) -> tuple[float, float]:
+        """Weight of the object's signal, and the signal of all else."""
+        given = self.conditions
+        tau = self.air.transmission(
+            given.distance_m, 0.0 if given.air_c is None else given.air_c, given.relative_humidity
+        )
+        optics = given.window_transmission
+        background = 0.0
+        for share, celsius in (
+            ((1.0 - given.emissivity) * tau * optics, given.reflected_c),
+            ((1.0 - tau) * optics, given.air_c),
+            (1.0 - optics, given.window_c),
+        ):
+            if share > 0 and celsius is not None:  # Conditions makes sure that there is one where it is needed
+                background += share * float(self.sensor.signal(_kelvin(celsius)))
+        weight = given.emissivity * tau * optics
+        if not weight > 0:
+            raise ThermoxelsError(
+                explain(
+                    "distance_m",
+                    expected="a distance that some radiation passes",
+                    got=f"{given.distance_m:g} m in air of {given.air_c} C and humidity {given.relative_humidity:g}",
+                    remedy="Check --distance-m, --air-c and --relative-humidity.",
+                )
+            )
+        return weight, background
+
+
+def corrected_temperature_c(
+    temperature_c: npt.ArrayLike,
+    before: Conditions,
+    after: Conditions,
+    sensor: SensorCurve = LONG_WAVE,
+    air: AirConstants = AirConstants(),
+) -> Floats:
+    """Temperatures as the camera would have shown them with other settings.
+
+    They are turned back into the signal that they were computed from with `before`, and read again with `after`.
+
+    Args:
+        temperature_c: Any shape, [degrees C], computed with the settings `before`.
+        before: The settings that the camera used.
+        after: The settings that are right.
+        sensor: Calibration of the sensor; its offset and scale do not matter.
+        air: Transmission of the air.
+
+    Returns:
+        Same shape, float64, [degrees C].
+    """
+    if before == after:
+        return np.asarray(temperature_c, dtype=np.float64)
+    signal = RadiometricModel(before, sensor, air).signal(temperature_c)
+    return RadiometricModel(after, sensor, air).temperature_c(signal)
+
+
+def _kelvin(temperature_c: npt.ArrayLike) -> Floats:
+    return celsius_to_kelvin(np.asarray(temperature_c, dtype=np.float64))

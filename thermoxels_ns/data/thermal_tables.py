@@ -1,0 +1,64 @@
+"""Temperatures as plain tables of numbers: ``.npy`` arrays and ``.csv`` text."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from thermoxels_ns.data.thermal_files import ThermalImage, ThermalUnit, read_thermal_file
+from thermoxels_ns.data.thermal_size import check_thermal_size
+from thermoxels_ns.errors import ThermalFileError, explain
+
+NPY_START = b"\x93NUMPY"
+_NUMBERS = re.compile(rb"(?:\xef\xbb\xbf)?[-+0-9.,;eE\s\"]|nan|na|n/a|null|none", re.IGNORECASE)
+_TEXT = re.compile(rb"[\t\n\r -~\xef\xbb\xbf]*")
+
+
+def looks_like_csv(head: bytes) -> bool:
+    """Whether the first bytes of a file are text that starts as a table of numbers does.
+
+    >>> looks_like_csv(b"21.5;21.6;21.4"), looks_like_csv(b"GIF89a"), looks_like_csv(b"")
+    (True, False, False)
+    """
+    return bool(_TEXT.fullmatch(head) and _NUMBERS.match(head) and re.search(rb"[0-9]", head))
+
+
+def read_csv(path: Path, valid_range_c: tuple[float, float]) -> ThermalImage:
+    """Read rows of degrees C, split by commas or semicolons.
+
+    Raises:
+        ThermalFileError: The table is larger than a thermal image, its rows differ in length, or a cell is no number.
+    """
+    with path.open("rb") as stream:
+        first = stream.readline(2**20)
+    check_thermal_size(path, 1 + max(first.count(b","), first.count(b";")), 1)
+    return read_thermal_file(path, ThermalUnit.celsius(), valid_range_c, suffix=".csv")
+
+
+def read_npy(path: Path, unit: ThermalUnit | None, valid_range_c: tuple[float, float]) -> ThermalImage:
+    """Read an array: degrees C where it holds fractions, else counts.
+
+    Args:
+        path: The file.
+        unit: Meaning of whole numbers; None: the user did not say.
+        valid_range_c: Temperatures outside are masked, [degrees C].
+
+    Raises:
+        ThermalFileError: Whole numbers without a unit, or an array that is no image.
+    """
+    try:
+        kind = np.load(path, mmap_mode="r", allow_pickle=False).dtype.kind
+    except Exception:  # the reader below says what is wrong with it
+        kind = "f"
+    if kind in "ui" and unit is None:
+        raise ThermalFileError(
+            explain(
+                str(path),
+                expected="an array of degrees C (float32 or float64), or whole numbers with a known unit",
+                got="whole numbers and no unit",
+                remedy="Pass --camera, or --celsius-per-count and --celsius-offset.",
+            )
+        )
+    return read_thermal_file(path, unit or ThermalUnit.celsius(), valid_range_c, suffix=".npy")

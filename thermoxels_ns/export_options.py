@@ -1,0 +1,176 @@
+"""Everything a mesh export can be told, and how pictures look at the mesh.
+
+Imports at the top are light: nerfstudio's exporter reads the options for ``--help`` of every subcommand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, TypeVar
+
+from thermoxels_ns.errors import MeshError, explain
+from thermoxels_ns.scene_scale import SceneScale, choose_scale, scale_from_known_distance, scale_from_option
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from typing import Any
+
+    from thermoxels_ns.fem.materials import Material
+    from thermoxels_ns.fem.presets import HeatPreset
+    from thermoxels_ns.fem.problem import TimeSteps
+    from thermoxels_ns.mesh.patch_rules import PatchRules
+    from thermoxels_ns.mesh.solid import SolidSelection
+
+Settings = TypeVar("Settings", "Material", "TimeSteps")
+FormatName = Literal["vtu", "xdmf", "msh", "inp", "stl", "ply", "glb"]
+
+
+@dataclass
+class ExportOptions:
+    """Everything an export can be told."""
+
+    boundary: Literal["conforming", "voxel"] = "conforming"
+    """conforming: the boundary follows the level set of the density; voxel: it follows voxel faces, as in the
+    Thermoxels paper, and every boundary triangle says how much true surface it stands for."""
+    voxel_optical_depth: float | None = None
+    """Voxels in which density times edge length is at least this are solid: at 0.5, light that crosses one loses 39 %.
+    Lower it if walls have holes, raise it if empty space turns solid. Left out, the threshold is automatic: such that
+    85 % of the training rays that end on something end in a solid voxel."""
+    density_percentile: float | None = None
+    """Voxels denser than this share of all voxels of the scene box are solid, [%], 0 to 100; the Thermoxels paper's
+    way, where 90 keeps the densest tenth. Takes the place of the optical depth."""
+    density_threshold: float | None = None
+    """Voxels at least this dense are solid, [1 / world unit]. Takes the place of both."""
+    close_gaps: int = 1
+    """Fill gaps and pinholes up to twice this many voxels wide; thin walls are not continuous without it. 0: none."""
+    smallest_body: float = 0.01
+    """Drop bodies (voxels that touch, if only by corners) of less than this share of the largest; mostly floaters."""
+    largest_component: bool = False
+    """Keep only the largest body of voxels that touch by faces."""
+    interior: Literal["solid", "hollow"] = "solid"
+    """What becomes of the inside of a body of which photographs only show the shell. solid: it is filled; a cavity with
+    a camera in it is a room and stays empty. hollow: the shell alone, as thick as the photographs happened to make
+    it."""
+    seal_openings: int = 2
+    """While looking for the inside, openings in the shell up to twice this many voxels wide count as closed."""
+    wall_thickness: float | None = None
+    """For facades seen from one side: make the seen surface this thick, [m], growing away from the cameras. Takes the
+    place of filling the interior."""
+    patches: Path | None = None
+    """A yaml file that names parts of the surface and regions of the volume by box, plane or colour; see
+    configs/patches-example.yaml."""
+    metres_per_unit: float | None = None
+    """Length of one unit of the input poses, [m]; 1 if the poses are in metres. Needed for heat, unless the scene's
+    json has metres_per_unit: without a scale the mesh is written in units of the input, without heat."""
+    known_distance: tuple[float, float, float, float, float, float, float] | None = None
+    """In place of metres per unit: two points in the coordinates of the input poses and the distance between them,
+    x y z x y z metres."""
+    formats: tuple[FormatName, ...] = ("vtu", "glb")
+    """Files to write the mesh to: vtu (ParaView), xdmf (FEniCSx), msh (Gmsh), inp (CalculiX, Abaqus), stl, ply
+    (surface), glb (browsers, phones)."""
+    heat_preset: str = "concrete"
+    """Material and time steps: the name of a preset, or the path of a yaml file like it."""
+    steps: int | None = None
+    """Number of time steps; the preset's by default (10 for concrete)."""
+    step_seconds: float | None = None
+    """Length of a time step, [s]; the preset's by default (60 for concrete)."""
+    conductivity_w_mk: float | None = None
+    """Thermal conductivity, [W / (m K)]; the preset's by default."""
+    density_kg_m3: float | None = None
+    """Mass density of the material, [kg / m3]; the preset's by default."""
+    specific_heat_j_kgk: float | None = None
+    """Specific heat capacity, [J / (kg K)]; the preset's by default."""
+    pictures: bool = True
+    """Write PNG pictures of the mesh coloured by temperature, and of its quality."""
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """How pictures look at the mesh, in the coordinates of the input poses."""
+
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Direction that points up."""
+    view_direction: tuple[float, float, float] | None = None
+    """Direction from the camera to the mesh; None: obliquely from above."""
+
+
+@dataclass(frozen=True)
+class CheckedOptions:
+    """What the options say, once they are known to be in range."""
+
+    selection: SolidSelection
+    """Which voxels are solid."""
+    preset: HeatPreset
+    """Material and time steps with the options' changes applied."""
+    rules: PatchRules
+    """Patches and regions of the user."""
+    distance: SceneScale | None
+    """The scale that the known distance gives."""
+
+
+def check_options(options: ExportOptions) -> CheckedOptions:
+    """Check every option, so that a wrong one is refused before anything slow runs.
+
+    Raises:
+        ThermoxelsError: An option is out of range, or a file cannot be read.
+    """
+    from thermoxels_ns.fem.presets import load_heat_preset
+    from thermoxels_ns.mesh.patch_rules import PatchRules, load_patch_rules
+    from thermoxels_ns.mesh.solid import SolidSelection
+
+    if options.metres_per_unit is not None:
+        scale_from_option(options.metres_per_unit)
+    distance = None
+    if options.known_distance is not None:
+        first, second, length = options.known_distance[:3], options.known_distance[3:6], options.known_distance[6]
+        distance = scale_from_known_distance(first, second, length)
+    choose_scale(options.metres_per_unit, distance)
+    if not options.formats or len(set(options.formats)) < len(options.formats):
+        raise MeshError(
+            explain(
+                "formats",
+                expected="at least one format, each once",
+                got=options.formats,
+                remedy="Pass --formats vtu glb, for example.",
+            )
+        )
+    selection = SolidSelection(**{field.name: getattr(options, field.name) for field in fields(SolidSelection)})
+    preset = load_heat_preset(options.heat_preset)
+    material = _with_options(preset.material, options)
+    if material != preset.material:
+        material = replace(material, name=f"{material.name} (changed)")
+    return CheckedOptions(
+        selection,
+        replace(preset, material=material, time=_with_options(preset.time, options)),
+        PatchRules() if options.patches is None else load_patch_rules(options.patches),
+        distance,
+    )
+
+
+def scale_of(
+    options: ExportOptions, checked: CheckedOptions, scene_file: Mapping[str, Any] | None
+) -> SceneScale | None:
+    """The scale of an export: what the user gives, else what the scene's json says; None if nobody does.
+
+    Raises:
+        ThermoxelsError: Something about the scale is out of range, or a format or option needs one and there is none.
+    """
+    scale = choose_scale(options.metres_per_unit, checked.distance, scene_file)
+    needs = [f"--formats {name}" for name in ("inp",) if name in options.formats]
+    if scale is None and needs:
+        raise MeshError(
+            explain(
+                "scale",
+                expected=f"a scene whose scale is known, for {needs[0]}",
+                got="none in the options or in the scene's json",
+                remedy="Pass --metres-per-unit, or --known-distance.",
+            )
+        )
+    return scale
+
+
+def _with_options(preset: Settings, options: ExportOptions) -> Settings:
+    """Replace a preset's values by the options of the same name that were given."""
+    given = {field.name: getattr(options, field.name, None) for field in fields(preset)}
+    return replace(preset, **{name: value for name, value in given.items() if value is not None})

@@ -1,0 +1,169 @@
+"""What summary.json says about an export."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermoxels_ns import __version__
+
+if TYPE_CHECKING:
+    from thermoxels_ns.fem.presets import HeatPreset
+    from thermoxels_ns.fem.solution import HeatSolution
+    from thermoxels_ns.mesh.build import BuiltMesh
+    from thermoxels_ns.mesh.quality_report import QualityReport
+    from thermoxels_ns.mesh.solid import SolidCells, SolidSelection
+    from thermoxels_ns.mesh.tetrahedra import TetMesh
+    from thermoxels_ns.scene_scale import SceneScale
+
+NO_SCALE = (
+    "The size of the scene is not known. Pass --metres-per-unit, the length in metres of one unit of the input poses "
+    "(1 if they are in metres), or --known-distance."
+)
+"""What an export without a scale says."""
+
+HEAT_SKIPPED = f"Heat step skipped: {NO_SCALE[0].lower()}{NO_SCALE[1:]}"
+"""The same, where the heat balance would be."""
+
+ONLY_THE_SHELL = (
+    "Space that no camera saw and that the mesh leaves empty, such as the inside of a building seen from outside with "
+    "--interior hollow. The heat content is that of the mesh."
+)
+"""What the heat balance of a reconstruction leaves out."""
+
+
+def mesh_summary(
+    built: BuiltMesh, report: QualityReport, selection: SolidSelection, scale: SceneScale | None, voxel_size: float
+) -> dict[str, Any]:
+    """Counts, sizes, and how the solid was found; lengths in the unit that the summary names.
+
+    Args:
+        built: The mesh and the solid it was made from.
+        report: Its quality.
+        selection: How the solid was selected.
+        scale: The scale; None if it is not known.
+        voxel_size: Edge of a voxel in the mesh, in its unit.
+    """
+    mesh, solid = built.mesh, built.solid
+    temperature = mesh.temperature_c
+    area = report.area_m2 if report.true_area_m2 is None else report.true_area_m2
+    return {
+        "boundary": report.boundary_mode,
+        "nodes": report.num_nodes,
+        "tets": report.num_tets,
+        "voxels": int(np.count_nonzero(solid.cells)),
+        "boundary_triangles": report.num_facets,
+        "boundary_triangles_on_box": report.num_box_facets,
+        "non_manifold_edges": report.num_non_manifold_edges,
+        "volume": report.volume_m3,
+        "volume_standard_error": None if scale is None else scale.volume_standard_error(report.volume_m3),
+        "area": area,
+        "area_standard_error": None if scale is None else scale.area_standard_error(area),
+        "area_of_triangles": report.area_m2,
+        "bounds": {"lower": mesh.points_m.min(axis=0), "upper": mesh.points_m.max(axis=0)},
+        "dihedral_angles_deg": {"min": report.dihedral_range_deg[0], "max": report.dihedral_range_deg[1]},
+        "density_threshold_used": solid.threshold,
+        "density_threshold_why": solid.explanation,
+        **_percentile_summary(solid, selection),
+        "solid_steps": [
+            {
+                "step": step.name,
+                "voxels_added": step.added,
+                "voxels_removed": step.removed,
+                **(
+                    {}
+                    if scale is None
+                    else {
+                        "litres_added": 1e3 * step.added * voxel_size**3,
+                        "litres_removed": 1e3 * step.removed * voxel_size**3,
+                    }
+                ),
+                "remark": step.remark,
+            }
+            for step in solid.steps
+        ],
+        "component_sizes_voxels": solid.component_sizes,
+        "parts_without_thermal_rays_left_out": built.unobserved_parts,
+        "voxels_without_thermal_rays_left_out": built.unobserved_voxels,
+        "share_of_nodes_observed": float(np.mean(mesh.observed)),
+        "share_of_area_not_fully_observed": _share_of_area_unobserved(mesh),
+        "patches": patch_areas(mesh),
+        "regions": region_volumes(mesh),
+        "temperature_c": {
+            "min": float(temperature.min()),
+            "max": float(temperature.max()),
+            "mean_of_nodes": float(temperature.mean()),
+        },
+        "promises": {promise.name: promise.kept for promise in report.promises},
+    }
+
+
+def patch_areas(mesh: TetMesh) -> dict[str, float]:
+    """True area of each patch that has a triangle, [unit^2]."""
+    boundary = mesh.boundary
+    assert boundary is not None
+    corner = mesh.points_m[mesh.facets]
+    area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    number = len(boundary.patch_names)
+    total = np.bincount(boundary.patch, weights=area * boundary.area_factor, minlength=number)
+    used = np.bincount(boundary.patch, minlength=number) > 0
+    return {name: float(total[n]) for n, name in enumerate(boundary.patch_names) if used[n]}
+
+
+def region_volumes(mesh: TetMesh) -> dict[str, float]:
+    """Volume of each region that has a tetrahedron, [unit^3]."""
+    corner = mesh.points_m[mesh.tets]
+    edges = corner[:, 1:] - corner[:, :1]
+    volume = np.einsum("ti,ti->t", edges[:, 0], np.cross(edges[:, 1], edges[:, 2])) / 6.0
+    total = np.bincount(mesh.region, weights=volume, minlength=len(mesh.region_names))
+    used = np.bincount(mesh.region, minlength=len(mesh.region_names)) > 0
+    return {name: float(total[n]) for n, name in enumerate(mesh.region_names) if used[n]}
+
+
+def _percentile_summary(solid: SolidCells, selection: SolidSelection) -> dict[str, float]:
+    """What a percentile asked for and what it got before small bodies were dropped: voxels without density, such as
+    pruned ones, are never solid.
+    """
+    if selection.density_percentile is None or selection.density_threshold is not None:
+        return {}
+    return {
+        "share_of_voxels_asked_for": 1.0 - selection.density_percentile / 100.0,
+        "share_of_voxels_kept": float(solid.component_sizes.sum()) / solid.cells.size,
+    }
+
+
+def _share_of_area_unobserved(mesh: TetMesh) -> float:
+    """Share of the boundary's area whose triangles have a node that no thermal ray saw, 0 to 1."""
+    corner = mesh.points_m[mesh.facets]
+    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    return float(area[~mesh.observed[mesh.facets].all(axis=1)].sum() / area.sum())
+
+
+def heat_summary(preset: HeatPreset, solution: HeatSolution) -> dict[str, Any]:
+    """The heat balance and how it was computed."""
+    return {
+        "computed": True,
+        **preset.as_mapping(),
+        "scheme": "P1 tetrahedra, lumped mass, backward Euler, conjugate gradients with Jacobi preconditioner",
+        "energy_before_j": float(solution.heat_content_j[0]),
+        "energy_after_j": float(solution.heat_content_j[-1]),
+        "energy_residual": solution.energy_residual,
+        "energy_residual_of_spread": solution.energy_residual_of_spread,
+        "largest_net_heat_flow_w": float(np.abs(solution.heat_w).max()),
+        "temperature_c": {
+            name: {"min": float(state.min()), "max": float(state.max())}
+            for name, state in (("before", solution.temperature_c[0]), ("after", solution.temperature_c[-1]))
+        },
+        "status": solution.status,
+        "iterations": solution.iterations,
+        "skipped_effects": [*solution.skipped_effects, ONLY_THE_SHELL],
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of what made the export."""
+    packages = ("numpy", "scipy", "torch", "nerfstudio", "pyvista", "scikit-fem")
+    return {"thermoxels": __version__, "python": platform.python_version()} | {name: version(name) for name in packages}

@@ -1,0 +1,217 @@
+"""What a scene may call for: each effect is checked SI input that knows its own terms and nothing of the solver.
+
+Temperatures are given in degrees Celsius; a positive heat flux goes into the body. A value is a number or a `Varying`,
+which is asked at the centroids of boundary triangles (sources: of tetrahedra; fixed temperatures: at nodes).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.quantities import Bounded, Bounds, Quantity
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.terms import FixedTerm, FluxTerm, RadiationTerm, RobinTerm, SourceTerm, Term
+from thermoxels_ns.units import ZERO_CELSIUS_K
+
+STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8
+"""Stefan-Boltzmann constant (CODATA 2018), [W / (m2 K4)]."""
+
+_ABSOLUTE_ZERO_C = -ZERO_CELSIUS_K
+
+
+class Effect(ABC):
+    """Something that a heat problem may contain besides conduction."""
+
+    kind: ClassVar[str]
+    """What it is called in reports."""
+    bounds: ClassVar[dict[str, Bounds]]
+    """Which fields are quantities, and their range."""
+
+    def __post_init__(self) -> None:
+        for name in ("patches", "regions"):
+            if hasattr(self, name):
+                object.__setattr__(self, name, _checked_names(name, getattr(self, name)))
+        for name, bounds in self.bounds.items():
+            object.__setattr__(self, name, bounds.check_quantity(getattr(self, name)))
+
+    @property
+    def where(self) -> tuple[str, ...]:
+        """Names or patterns of the patches, or of the regions, that it acts on."""
+        return getattr(self, "patches", None) or getattr(self, "regions", ())
+
+    @property
+    def label(self) -> str:
+        """Name for reports: what it is and where."""
+        return f"{self.kind} on {', '.join(self.where)}"
+
+    def bounded(self, name: str) -> Bounded:
+        """Give one of its quantities with its range."""
+        return Bounded(getattr(self, name), self.bounds[name])
+
+    @abstractmethod
+    def terms(self, selection: Selection) -> tuple[Term, ...]:
+        """Give the terms that it adds to the heat equation of a body.
+
+        Raises:
+            HeatError: The body has no such patch or region.
+        """
+
+
+@dataclass(frozen=True)
+class FixedTemperature(Effect):
+    """A surface kept at a temperature."""
+
+    patches: tuple[str, ...]
+    """Names of boundary patches, or patterns such as exterior-*; * is the whole boundary."""
+    temperature_c: Quantity
+    """Temperature of the surface, [degrees Celsius], at least -273.15. Asked at the nodes."""
+
+    kind = "fixed temperature"
+    bounds = {"temperature_c": Bounds("temperature_c", "degrees Celsius", _ABSOLUTE_ZERO_C)}
+
+    def terms(self, selection: Selection) -> tuple[Term, ...]:
+        """T = T_fixed at the nodes of the patches."""
+        return (FixedTerm(self.label, selection.facets(self.patches), self.bounded("temperature_c")),)
+
+
+@dataclass(frozen=True)
+class HeatFlux(Effect):
+    """A given heat flux through a surface."""
+
+    patches: tuple[str, ...]
+    """Names of boundary patches, or patterns such as exterior-*; * is the whole boundary."""
+    flux_w_m2: Quantity
+    """Heat flux, [W / m2], positive into the body."""
+
+    kind = "heat flux"
+    bounds = {"flux_w_m2": Bounds("flux_w_m2", "W/m2")}
+
+    def terms(self, selection: Selection) -> tuple[Term, ...]:
+        """k grad T . n = q."""
+        return (FluxTerm(self.label, selection.facets(self.patches), (self.bounded("flux_w_m2"),)),)
+
+
+@dataclass(frozen=True)
+class Convection(Effect):
+    """Heat exchange with air (Newton's law of cooling)."""
+
+    patches: tuple[str, ...]
+    """Names of boundary patches, or patterns such as exterior-*; * is the whole boundary."""
+    coefficient_w_m2k: Quantity
+    """Surface heat transfer coefficient h, [W / (m2 K)], at least 0."""
+    air_c: Quantity
+    """Temperature of the air, [degrees Celsius], at least -273.15."""
+
+    kind = "convection"
+    bounds = {
+        "coefficient_w_m2k": Bounds("coefficient_w_m2k", "W/(m2 K)", 0.0),
+        "air_c": Bounds("air_c", "degrees Celsius", _ABSOLUTE_ZERO_C),
+    }
+
+    def terms(self, selection: Selection) -> tuple[Term, ...]:
+        """k grad T . n = h (T_air - T)."""
+        facets = selection.facets(self.patches)
+        return (RobinTerm(self.label, facets, self.bounded("coefficient_w_m2k"), self.bounded("air_c")),)
+
+
+@dataclass(frozen=True)
+class Radiation(Effect):
+    """Long-wave exchange with large surroundings such as the sky, the ground or a room (Stefan-Boltzmann law)."""
+
+    patches: tuple[str, ...]
+    """Names of boundary patches, or patterns such as exterior-*; * is the whole boundary."""
+    emissivity: Quantity
+    """Emissivity of the surface, times the view factor of the surroundings if they do not fill its view; 0 to 1."""
+    surroundings_c: Quantity
+    """Radiant temperature of the surroundings, [degrees Celsius], at least -273.15."""
+    stefan_boltzmann_w_m2k4: float = STEFAN_BOLTZMANN_W_M2K4
+    """Stefan-Boltzmann constant, [W / (m2 K4)]; the default is CODATA 2018's. Published benchmarks use 5.67e-8."""
+
+    kind = "radiation"
+    bounds = {
+        "emissivity": Bounds("emissivity", "1", 0.0, 1.0),
+        "surroundings_c": Bounds("surroundings_c", "degrees Celsius", _ABSOLUTE_ZERO_C),
+        "stefan_boltzmann_w_m2k4": Bounds("stefan_boltzmann_w_m2k4", "W/(m2 K4)", 0.0, above_low=True, varies=False),
+    }
+
+    def terms(self, selection: Selection) -> tuple[Term, ...]:
+        """k grad T . n = sigma eps (T_s^4 - T^4), temperatures in kelvin."""
+        facets, sigma = selection.facets(self.patches), self.stefan_boltzmann_w_m2k4
+        return (RadiationTerm(self.label, facets, self.bounded("emissivity"), self.bounded("surroundings_c"), sigma),)
+
+
+@dataclass(frozen=True)
+class AbsorbedSolar(Effect):
+    """Sunlight that a surface takes up."""
+
+    patches: tuple[str, ...]
+    """Names of boundary patches, or patterns such as exterior-*; * is the whole boundary."""
+    absorptivity: Quantity
+    """Share of the sunlight that the surface absorbs, 0 to 1."""
+    irradiance_w_m2: Quantity
+    """Sunlight that falls on the surface, [W / m2] of the surface itself, at least 0."""
+
+    kind = "absorbed solar"
+    bounds = {
+        "absorptivity": Bounds("absorptivity", "1", 0.0, 1.0),
+        "irradiance_w_m2": Bounds("irradiance_w_m2", "W/m2", 0.0),
+    }
+
+    def terms(self, selection: Selection) -> tuple[Term, ...]:
+        """k grad T . n = absorptivity times irradiance."""
+        factors = self.bounded("absorptivity"), self.bounded("irradiance_w_m2")
+        return (FluxTerm(self.label, selection.facets(self.patches), factors),)
+
+
+@dataclass(frozen=True)
+class GroundContact(Effect):
+    """Heat exchange with the ground through a thermal resistance."""
+
+    patches: tuple[str, ...]
+    """Names of boundary patches, or patterns such as exterior-*; * is the whole boundary."""
+    resistance_m2k_w: float
+    """Thermal resistance between the surface and the undisturbed ground, [m2 K / W], above 0."""
+    ground_c: Quantity
+    """Temperature of the undisturbed ground, [degrees Celsius], at least -273.15."""
+
+    kind = "ground contact"
+    bounds = {
+        "resistance_m2k_w": Bounds("resistance_m2k_w", "m2 K/W", 0.0, above_low=True, varies=False),
+        "ground_c": Bounds("ground_c", "degrees Celsius", _ABSOLUTE_ZERO_C),
+    }
+
+    def terms(self, selection: Selection) -> tuple[Term, ...]:
+        """k grad T . n = (T_ground - T) / R."""
+        facets = selection.facets(self.patches)
+        coefficient = Bounds("1 / resistance_m2k_w", "W/(m2 K)", 0.0)
+        conductance = Bounded(coefficient.check_quantity(1.0 / self.resistance_m2k_w), coefficient)
+        return (RobinTerm(self.label, facets, conductance, self.bounded("ground_c")),)
+
+
+@dataclass(frozen=True)
+class InternalHeat(Effect):
+    """Heat set free inside the body."""
+
+    regions: tuple[str, ...]
+    """Names of regions, or patterns; * is the whole body."""
+    source_w_m3: Quantity
+    """Heat source, [W / m3]; negative takes heat out."""
+
+    kind = "internal heat"
+    bounds = {"source_w_m3": Bounds("source_w_m3", "W/m3")}
+
+    def terms(self, selection: Selection) -> tuple[Term, ...]:
+        """Rho c dT/dt = div(k grad T) + s."""
+        return (SourceTerm(self.label, selection.tets(self.regions), self.bounded("source_w_m3")),)
+
+
+def _checked_names(field: str, names: object) -> tuple[str, ...]:
+    """Return names as a tuple; a single text is refused because its letters would be taken for names."""
+    listed = tuple(names) if isinstance(names, (tuple, list)) else ()
+    if not listed or not all(isinstance(name, str) and name.strip() for name in listed):
+        remedy = f'Write {field}=("name",), for example.'
+        raise HeatError(explain(field, expected="a tuple of names", got=repr(names), remedy=remedy))
+    return listed

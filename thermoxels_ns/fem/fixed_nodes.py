@@ -1,0 +1,81 @@
+"""Nodes whose temperature is given, and the heat that keeps it so."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.forms import FixedForm
+
+Vector = npt.NDArray[np.float64]
+
+_SAME_TEMPERATURE_K = 1e-9
+"""Two effects may fix the same node if their temperatures differ by no more than this, [K]."""
+
+
+class FixedNodes:
+    """All nodes that any effect fixes."""
+
+    def __init__(self, forms: Sequence[FixedForm], num_nodes: int) -> None:
+        """Merge the nodes of the forms.
+
+        Args:
+            forms: One per effect that fixes temperatures.
+            num_nodes: Number of nodes of the body.
+        """
+        self._forms = tuple(forms)
+        self.nodes: npt.NDArray[np.int64] = np.unique(
+            np.concatenate([np.zeros(0, np.int64), *(f.nodes for f in forms)])
+        )
+        """Their numbers, ascending, shape (d,)."""
+        self.groups: tuple[tuple[str, str], ...] = tuple(
+            (form.effect, patch) for form in forms for patch in form.groups
+        )
+        """Effect and patch of each row of `shares`."""
+        areas = [form.node_area_m2[:, self.nodes] for form in forms]
+        area = sparse.vstack(areas).tocsr() if areas else sparse.csr_matrix((0, len(self.nodes)))
+        total = np.asarray(area.sum(axis=0)).ravel()
+        self.shares: sparse.csr_matrix = sparse.csr_matrix(area @ sparse.diags(1.0 / total))
+        """Share of each node's heat that belongs to each group, by the area around the node, shape (g, d)."""
+        free = np.ones(num_nodes, dtype=bool)
+        free[self.nodes] = False
+        self.free: npt.NDArray[np.int64] = np.flatnonzero(free)
+        """Nodes that are not fixed, ascending."""
+        self.in_time = any(form.in_time for form in forms)
+        """Whether a temperature changes with time."""
+
+    def temperature_k(self, time_s: float) -> Vector:
+        """Temperatures of `nodes`, relative to the reference, shape (d,), [K].
+
+        Raises:
+            HeatError: Two effects fix different temperatures at one node.
+        """
+        fixed = np.full(len(self.nodes), np.nan)
+        for number, form in enumerate(self._forms):
+            place, wanted = np.searchsorted(self.nodes, form.nodes), form.temperature_k(time_s)
+            clash = np.abs(fixed[place] - wanted) > _SAME_TEMPERATURE_K
+            if clash.any():
+                raise HeatError(self._explain_clash(number, form.nodes[clash], wanted[clash], time_s))
+            fixed[place] = wanted
+        return fixed
+
+    def _explain_clash(self, number: int, nodes: npt.NDArray[np.int64], wanted: Vector, time_s: float) -> str:
+        form = self._forms[number]
+        for other in self._forms[:number]:
+            place = np.flatnonzero(np.isin(other.nodes, nodes))
+            if len(place):
+                break
+        node = int(other.nodes[place[0]])
+        first = other.temperature_k(time_s)[place[0]] + other.reference_c
+        second = wanted[np.flatnonzero(nodes == node)[0]] + form.reference_c
+        return explain(
+            "fixed temperature",
+            expected="one temperature at each node",
+            got=f"{first:g} C from {other.effect} and {second:g} C from {form.effect} at node {node} "
+            f"and {len(nodes) - 1} more",
+            remedy="Let one effect fix all patches that meet, with a Varying that says what holds where they do.",
+        )

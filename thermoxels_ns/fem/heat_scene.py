@@ -1,0 +1,291 @@
+"""A heat scene: what a body is made of, what is around it, and for how long; it becomes a problem on a mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import TypeVar
+
+import numpy as np
+
+from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.effects import (
+    AbsorbedSolar,
+    Convection,
+    Effect,
+    FixedTemperature,
+    GroundContact,
+    HeatFlux,
+    InternalHeat,
+    Radiation,
+)
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.quantities import Quantity, Varying
+from thermoxels_ns.fem.scene_fields import (
+    WITH_RADIATION,
+    Ground,
+    InsideAir,
+    OutsideAir,
+    Sky,
+    Sun,
+    Surface,
+    check_direction,
+    field_bounds,
+)
+from thermoxels_ns.fem.scene_patches import ScenePatches, check_disjoint
+from thermoxels_ns.fem.sky import Vector, outdoor_radiation, swinbank_sky_c
+from thermoxels_ns.fem.sun import Sunlight, fixed_sun, moving_sun
+from thermoxels_ns.fem.surface_coefficients import (
+    inside_combined,
+    inside_convection,
+    inside_separate,
+    outside_combined,
+    outside_convection,
+    radiative_coefficient,
+    thermoxels_original,
+)
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+Value = TypeVar("Value")
+
+_Z_UP: Vector = (0.0, 0.0, 1.0)
+_PATCHES_OF_THEIR_OWN = "Give each of the two its own patches: [names]."
+
+
+@dataclass(frozen=True)
+class HeatScene:
+    """What a scene file names. What it does not name is not built."""
+
+    materials: Mapping[str, Material]
+    """What regions of the mesh are made of, by name or pattern; of several that match a region, the last one holds."""
+    time: TimeSteps | AdaptiveSteps | None = None
+    """How the body is followed through time; None: its steady state is asked for."""
+    initial_c: float | None = None
+    """Temperature of the whole body at the start, [degrees Celsius]; None: that of the photographs."""
+    up: Vector | None = None
+    """Direction that points up in the coordinates of the mesh; None: as the mesh says."""
+    inside_air: InsideAir | None = None
+    """The air of a room."""
+    outside_air: OutsideAir | None = None
+    """The open air and its wind."""
+    surfaces: tuple[Surface, ...] = ()
+    """How surfaces radiate to sky and ground and absorb sunlight; later entries hold."""
+    sky: Sky | None = None
+    """The sky that surfaces radiate to."""
+    ground: Ground | None = None
+    """The ground that surfaces see."""
+    sun: Sun | None = None
+    """The sun."""
+    fixed_temperature: tuple[FixedTemperature, ...] = ()
+    """Surfaces kept at a temperature."""
+    heat_flux: tuple[HeatFlux, ...] = ()
+    """Given heat fluxes, positive into the body."""
+    convection: tuple[Convection, ...] = ()
+    """Further air, such as a second room, with given coefficients."""
+    radiation: tuple[Radiation, ...] = ()
+    """Long-wave exchange with surroundings of one temperature."""
+    absorbed_solar: tuple[AbsorbedSolar, ...] = ()
+    """Sunlight that falls on surfaces alike, wherever they face."""
+    ground_contact: tuple[GroundContact, ...] = ()
+    """Surfaces that touch the ground."""
+    internal_heat: tuple[InternalHeat, ...] = ()
+    """Heat set free inside."""
+    adiabatic: tuple[str, ...] = ("cut",)
+    """Patches that no heat crosses, by name or pattern. Every patch is named here or has something act on it."""
+    description: str = ""
+    """What the scene is, for reports."""
+
+    def __post_init__(self) -> None:
+        if not self.materials:
+            remedy = "Name one for all regions, as in {'*': Material(...)}."
+            raise _wrong("materials", "at least one", "none", remedy)
+        check_direction("up", self.up)
+        if self.initial_c is not None:
+            object.__setattr__(self, "initial_c", float(field_bounds("initial_c").check(self.initial_c)))
+        self._check_what_belongs_together()
+
+    @property
+    def steady(self) -> bool:
+        """Whether the steady state is asked for."""
+        return self.time is None
+
+    def problem(self, mesh: TetMesh, *, up: Vector | None = None) -> HeatProblem:
+        """Put the scene around a body.
+
+        Args:
+            mesh: The body.
+            up: Direction that points up in the coordinates of the mesh, if the scene does not say; None: z.
+
+        Returns:
+            The problem; the scene's `time` says how to solve it.
+
+        Raises:
+            HeatError: The mesh lacks a patch or region that the scene names, or has one that the scene says nothing
+                about.
+        """
+        initial = None if self.initial_c is None else np.full(len(mesh.points_m), self.initial_c)
+        return HeatProblem(mesh, self._material(mesh), initial, self.effects(mesh), self.up or up or _Z_UP)
+
+    def effects(self, mesh: TetMesh) -> tuple[Effect, ...]:
+        """Build what the scene names, and nothing else.
+
+        Raises:
+            HeatError: The mesh lacks a patch that the scene names, a patch has nothing act on it and is not named
+                adiabatic, or two entries count the same exchange.
+        """
+        patches = ScenePatches(mesh)
+        named = self._named_effects(patches)
+        where = [(name, patches.matching(name, effect.where)) for name, effect in named]
+        self._check_counted_once(where)
+        patches.check_all_named(set().union(*(chosen for _, chosen in where)), self.adiabatic)
+        return (*(effect for _, effect in named), *self.internal_heat)
+
+    def _named_effects(self, patches: ScenePatches) -> list[tuple[str, Effect]]:
+        """Effects on the surface, each with the entry of the scene that it comes from."""
+        named: list[tuple[str, Effect]] = []
+        if self.inside_air is not None:
+            named.append(("inside_air", _inside(self.inside_air)))
+        if self.outside_air is not None:
+            named.append(("outside_air", _outside(self.outside_air)))
+        named += [("sky and ground", effect) for effect in self._sky_and_ground(patches)]
+        named += [("sun", effect) for effect in self._sunlight(patches)]
+        for key in ("fixed_temperature", "heat_flux", "convection", "radiation", "absorbed_solar", "ground_contact"):
+            entries = getattr(self, key)
+            named += [(f"{key} entry {number}", effect) for number, effect in enumerate(entries, start=1)]
+        return named
+
+    def _material(self, mesh: TetMesh) -> Material | dict[str, Material]:
+        chosen: dict[str, Material] = {}
+        for pattern, made_of in self.materials.items():
+            matching = [name for name in mesh.region_names if fnmatchcase(name, pattern)]
+            if not matching:
+                expected = f"names or patterns of the regions {', '.join(mesh.region_names)}"
+                raise _wrong("materials", expected, repr(pattern), "Correct the name, or use '*' for all regions.")
+            chosen = dict.fromkeys(matching, made_of) | chosen
+        used = {mesh.region_names[number] for number in np.unique(mesh.region)}
+        missing = sorted(used - set(chosen))
+        if missing:
+            expected = f"a material for each of the regions {', '.join(sorted(used))}"
+            raise _wrong("materials", expected, f"none for {', '.join(missing)}", "Add them, or '*' for all others.")
+        different = {chosen[name] for name in used}
+        return different.pop() if len(different) == 1 else chosen
+
+    def _sky_and_ground(self, patches: ScenePatches) -> list[Radiation]:
+        sky_c = None if self.sky is None else self._sky_c(self.sky)
+        ground_c = None if self.ground is None else self.ground.surface_c
+        if sky_c is None and ground_c is None:
+            return []
+        return [
+            Radiation(where, *outdoor_radiation(emissivity, sky_c=sky_c, ground_c=ground_c))
+            for where, emissivity in patches.of_surfaces(self.surfaces, lambda surface: surface.emissivity)
+        ]
+
+    def _sunlight(self, patches: ScenePatches) -> list[AbsorbedSolar]:
+        if self.sun is None:
+            return []
+        reflectance = self.ground.reflectance if self.ground is not None and self.ground.reflectance else 0.0
+        irradiance = _irradiance(self.sun, reflectance)
+        reached = patches.matching("sun", self.sun.patches)
+        lit = patches.of_surfaces(self.surfaces, lambda surface: surface.absorptivity, reached)
+        return [AbsorbedSolar(where, absorptivity, irradiance) for where, absorptivity in lit]
+
+    def _sky_c(self, sky: Sky) -> float:
+        if sky.temperature_c is not None:
+            return sky.temperature_c
+        assert self.outside_air is not None, "checked when the scene was made"
+        if sky.below_air_k is not None:
+            return self.outside_air.air_c - sky.below_air_k
+        return swinbank_sky_c(self.outside_air.air_c)
+
+    def _check_what_belongs_together(self) -> None:
+        if self.sky is not None and self.sky.needs_air and self.outside_air is None:
+            remedy = "Add outside_air, or give the sky's temperature_c."
+            raise _wrong("sky", "outside_air beside it, whose temperature it follows", "none", remedy)
+        radiates = self.sky is not None or (self.ground is not None and self.ground.surface_c is not None)
+        for key, source, there in (
+            ("emissivity", "sky, or ground with surface_c", radiates),
+            ("absorptivity", "sun", self.sun is not None),
+        ):
+            has = any(getattr(surface, key) is not None for surface in self.surfaces)
+            if there and not has:
+                remedy = f"Add surfaces: [{{{key}: 0.6}}], for example."
+                raise _wrong(f"surfaces: {key}", f"a number beside {source}", "none", remedy)
+            if has and not there:
+                raise _wrong(f"surfaces: {key}", f"{source} beside it", "none", f"Add it, or remove {key}.")
+        if self.ground is not None and self.ground.reflectance is not None and self.sun is None:
+            raise _wrong("ground: reflectance", "a sun to reflect", "none", "Add sun, or remove reflectance.")
+
+    def _check_counted_once(self, where: list[tuple[str, set[str]]]) -> None:
+        """Refuse two kinds of air on one patch, and radiation in a coefficient beside radiation of its own."""
+        touching = ("inside_air", "outside_air", "convection", "ground_contact")
+        contacts = [(name, patches) for name, patches in where if name.startswith(touching)]
+        check_disjoint("contact with air or ground", contacts, _PATCHES_OF_THEIR_OWN)
+        buried = [(name, patches) for name, patches in where if name.startswith("ground_contact")]
+        for name, patches in where:
+            if name.startswith(("sky and ground", "radiation", "sun")):
+                for contact in buried:
+                    check_disjoint("contact with the ground alone", [contact, (name, patches)], _PATCHES_OF_THEIR_OWN)
+        airs = {"inside_air": self.inside_air, "outside_air": self.outside_air}
+        linear = {name for name, air in airs.items() if air is not None and air.coefficient in WITH_RADIATION}
+        full = self.sky is not None and self.ground is not None and self.ground.surface_c is not None
+        for name, chosen in where:
+            if name not in linear and not (full and name == "sky and ground"):
+                continue
+            for other, elsewhere in where:
+                if other.startswith(("sky and ground", "radiation")) and other != name:
+                    remedy = "Remove one of the two, or name other patches."
+                    if name in linear:
+                        remedy = f"Set coefficient: iso-6946-convection in {name}, which leaves radiation out."
+                    check_disjoint("radiation", [(name, chosen), (other, elsewhere)], remedy)
+
+
+def _inside(air: InsideAir) -> Convection:
+    coefficient: Quantity
+    if air.coefficient == "iso-6946-combined":
+        coefficient = inside_combined(air.heat_flow)
+    elif air.coefficient == "iso-6946-convection":
+        coefficient = inside_convection(air.heat_flow)
+    elif air.coefficient == "iso-6946-separate":
+        coefficient = inside_separate(air.air_c, _given(air.emissivity), air.heat_flow)
+    else:
+        coefficient = _given(air.coefficient_w_m2k)
+    return Convection(air.patches, coefficient, air.air_c)
+
+
+def _outside(air: OutsideAir) -> Convection:
+    if air.coefficient == "iso-6946-combined":
+        coefficient = outside_combined()
+    elif air.coefficient == "iso-6946-convection":
+        coefficient = outside_convection(_given(air.wind_m_s))
+    elif air.coefficient == "iso-6946-separate":
+        radiative = radiative_coefficient(air.air_c, _given(air.emissivity))
+        coefficient = outside_convection(_given(air.wind_m_s)) + radiative
+    elif air.coefficient == "thermoxels-original":
+        coefficient = thermoxels_original(_given(air.wind_m_s))
+    else:
+        coefficient = _given(air.coefficient_w_m2k)
+    return Convection(air.patches, coefficient, air.air_c)
+
+
+def _irradiance(sun: Sun, reflectance: float) -> Varying:
+    light = None if sun.direct_w_m2 is None else Sunlight(sun.direct_w_m2, sun.diffuse_w_m2)
+    if sun.start is None:
+        return fixed_sun(_given(sun.towards), _given(light), reflectance)
+    place = _given(sun.latitude_deg), _given(sun.longitude_deg)
+    return moving_sun(sun.start, *place, _given(sun.north), light, reflectance)
+
+
+def _given(value: Value | None) -> Value:
+    assert value is not None, "checked when the section was made"
+    return value
+
+
+def _literal(name: str) -> str:
+    """Make a pattern that matches a name and nothing else."""
+    return "".join(f"[{letter}]" if letter in "*?[" else letter for letter in name)
+
+
+def _wrong(name: str, expected: str, got: object, remedy: str) -> HeatError:
+    return HeatError(explain(name, expected=expected, got=got, remedy=remedy))

@@ -1,0 +1,188 @@
+"""From step to step: equal ones, or as long as a tolerance allows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
+from thermoxels_ns.fem.schemes import BACKWARD_EULER, Scheme
+from thermoxels_ns.fem.stepper import Step, Stepper
+from thermoxels_ns.fem.system import HeatSystem
+
+Vector = npt.NDArray[np.float64]
+
+STEP_SHARE = 0.1
+"""Share of the tolerance that one step may use. Conduction forgets errors, so that those of many steps do not add up
+to their sum."""
+_SAFETY = 0.9
+_SHRINK, _GROW = 0.2, 5.0
+_KEEP_BELOW = 1.25
+"""A step that could be longer by less than this stays as it is, and so do its matrices."""
+_SHORTEST = 1e-18
+"""Shortest step as a share of the duration; bodies with next to no heat capacity need short ones after a jump."""
+_RANGE_ROUND_OFF = 1e-9
+"""How far out of its range a temperature may be, as a share of the range."""
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A step that counts."""
+
+    step: Step
+    """Its outcome."""
+    step_s: float
+    """Its length, [s]."""
+    ends_interval: bool
+    """Whether temperatures are kept at its end."""
+    failure: str = ""
+    """Why the computation ends here; then the step does not count."""
+
+
+def equal_steps(
+    system: HeatSystem, scheme: Scheme, start_k: Vector, time: TimeSteps, tolerance: float
+) -> Iterator[Taken]:
+    """Take equal steps.
+
+    Args:
+        system: The equations.
+        scheme: The scheme in time.
+        start_k: Temperatures at the start, relative to the system's reference, shape (n,), [K].
+        time: The steps.
+        tolerance: Relative tolerance of the linear solver.
+
+    Yields:
+        Every step; the last one may be a failure.
+    """
+    stepper, relative_k = Stepper(system, scheme, relative_tolerance=tolerance), start_k
+    for number, begin_s in enumerate(time.times_s[:-1]):
+        step = stepper.step(relative_k, float(begin_s), time.step_seconds)
+        failure = "" if step.converged else f"Step {number + 1} of {time.steps} failed. {step.status}"
+        yield Taken(step, time.step_seconds, True, failure)
+        relative_k = step.relative_k
+
+
+class AdaptiveMarch:
+    """Steps as long as a tolerance allows, by the estimate of an embedded scheme.
+
+    A step whose result leaves the range that temperatures may have, that of its start and of all surroundings, is
+    taken with backward Euler instead, which never leaves it on meshes without obtuse angles; the difference between
+    both is then the estimate. So nothing overshoots, and second order returns as soon as it is safe.
+    """
+
+    def __init__(
+        self, system: HeatSystem, scheme: Scheme, start_k: Vector, time: AdaptiveSteps, *, relative_tolerance: float
+    ) -> None:
+        """Prepare.
+
+        Args:
+            system: The equations.
+            scheme: A scheme with an error estimate.
+            start_k: Temperatures at the start, relative to the system's reference, shape (n,), [K].
+            time: Duration, tolerance and outputs.
+            relative_tolerance: Of the linear solver.
+        """
+        self._system, self._time, self._start_k = system, time, start_k
+        self._scheme = Stepper(system, scheme, relative_tolerance=relative_tolerance)
+        self._safe = Stepper(system, BACKWARD_EULER, relative_tolerance=relative_tolerance)
+        self._allowed_k = STEP_SHARE * time.tolerance_k
+        self.repeated = 0
+        """Steps that had to be repeated with a shorter length."""
+        self.made_safe = 0
+        """Steps taken with backward Euler."""
+        self.out_of_range = 0
+        """Steps whose result is out of range whatever the scheme, which obtuse angles or consistent masses do."""
+
+    def steps(self) -> Iterator[Taken]:
+        """Take steps to the end.
+
+        Yields:
+            Every step that counts; the last one may be a failure.
+        """
+        relative_k, now_s, wished_s = self._start_k, 0.0, self._first_length()
+        for end_s in self._time.times_s[1:]:
+            while now_s < end_s:
+                left_s = end_s - now_s
+                # Two even steps to the end of an interval rather than a long and a tiny one.
+                step_s = (
+                    left_s
+                    if wished_s >= left_s
+                    else min(wished_s, 0.5 * left_s)
+                    if wished_s > 0.5 * left_s
+                    else wished_s
+                )
+                step, order = self._try(relative_k, now_s, step_s)
+                factor = self._factor(step, order)
+                if not step.converged or step.error_k > self._allowed_k:
+                    self.repeated += 1
+                    wished_s = step_s * min(factor, 0.9)
+                    if wished_s < _SHORTEST * self._time.duration_s or now_s + 0.25 * wished_s == now_s:
+                        yield Taken(step, step_s, False, self._failure(step, now_s))
+                        return
+                    continue
+                last = step_s == left_s
+                now_s = float(end_s) if last else now_s + step_s
+                relative_k = step.relative_k
+                # A step cut short by an interval's end says nothing against the length wished for.
+                grown_s = step_s * factor if factor > _KEEP_BELOW else step_s * min(factor, 1.0)
+                wished_s = max(grown_s, wished_s) if step_s < wished_s and factor >= 1.0 else grown_s
+                yield Taken(step, step_s, last)
+
+    def _first_length(self) -> float:
+        system, time = self._system, self._time
+        rate = system.net_heat(self._start_k, 0.0)[0] / system.nodal_mass_j_k
+        fastest = float(np.max(np.abs(rate[system.fixed.free]), initial=0.0))
+        interval_s = time.duration_s / time.outputs
+        return (
+            interval_s if fastest == 0.0 else float(np.clip(time.tolerance_k / fastest, _SHORTEST * time.duration_s, interval_s))
+        )
+
+    def _try(self, start_k: Vector, now_s: float, step_s: float) -> tuple[Step, int]:
+        """Take a step, and the order of its error estimate in the step length."""
+        step = self._scheme.step(start_k, now_s, step_s, estimate=True)
+        order = self._scheme.scheme.order + 1
+        if not step.converged or step.error_k > self._allowed_k or self._in_range(step, start_k, now_s, step_s):
+            return step, order
+        safe = self._safe.step(start_k, now_s, step_s)
+        if not safe.converged or not self._in_range(safe, start_k, now_s, step_s):
+            self.out_of_range += 1
+            return step, order
+        self.made_safe += 1
+        return _with_error(safe, float(np.max(np.abs(safe.relative_k - step.relative_k))), step), 2
+
+    def _in_range(self, step: Step, start_k: Vector, now_s: float, step_s: float) -> bool:
+        times = (now_s, *(now_s + node * step_s for node in self._scheme.scheme.nodes))
+        low, high = self._system.allowed_range_k(start_k, times)
+        slack = _RANGE_ROUND_OFF * (high - low) if np.isfinite(high - low) else _RANGE_ROUND_OFF
+        return low - slack <= float(step.relative_k.min()) and float(step.relative_k.max()) <= high + slack
+
+    def _factor(self, step: Step, order: int) -> float:
+        """How much longer the next step may be."""
+        if not step.converged or not np.isfinite(step.error_k):
+            return _SHRINK
+        if step.error_k == 0.0:
+            return _GROW
+        return float(np.clip(_SAFETY * (self._allowed_k / step.error_k) ** (1.0 / order), _SHRINK, _GROW))
+
+    def _failure(self, step: Step, now_s: float) -> str:
+        if not step.converged:
+            return f"At {now_s:.6g} s no step however short succeeds. {step.status}"
+        return (
+            f"At {now_s:.6g} s no step however short keeps within {self._time.tolerance_k:g} K. Something jumps in "
+            "time: end an interval there, or raise the tolerance."
+        )
+
+
+def _with_error(safe: Step, error_k: float, other: Step) -> Step:
+    return Step(
+        safe.relative_k,
+        safe.group_heat_w,
+        safe.iterations + other.iterations,
+        safe.newton_iterations + other.newton_iterations,
+        error_k,
+        True,
+        safe.status,
+    )

@@ -1,0 +1,137 @@
+"""Values that physics is made of: one number, or a function of place and time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.errors import HeatError, explain
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where a quantity is asked for: centroids of boundary triangles or of tetrahedra, or nodes."""
+
+    points_m: npt.NDArray[np.float64]
+    """Positions, shape (k, 3), [m]."""
+    normals: npt.NDArray[np.float64]
+    """Outward unit normals of the true surface, shape (k, 3); 0 inside the body."""
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Unit vector that points up."""
+
+    def __len__(self) -> int:
+        return len(self.points_m)
+
+
+@dataclass(frozen=True)
+class Varying:
+    """A quantity that differs from place to place or changes with time.
+
+    >>> sunrise = Varying(lambda places, time_s: 100.0 * min(time_s / 3600.0, 1.0))
+    >>> sunrise.function(Places(np.zeros((2, 3)), np.zeros((2, 3))), 1800.0)
+    50.0
+    """
+
+    function: Callable[[Places, float], npt.ArrayLike]
+    """Takes the places and the time in seconds since the start; returns one number per place, shape (k,), or one for
+    all."""
+    in_time: bool = True
+    """Whether the numbers change with time. False: they are asked for once, at the time 0."""
+
+
+Quantity: TypeAlias = float | Varying
+"""One number for all places and times, or a function."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """The values that a quantity may have, by its name and unit."""
+
+    name: str
+    """Name of the field, for messages."""
+    unit: str
+    """Its unit, for messages."""
+    low: float = -math.inf
+    """Smallest value."""
+    high: float = math.inf
+    """Largest value."""
+    above_low: bool = False
+    """Whether `low` itself is refused."""
+    varies: bool = True
+    """Whether it may be a `Varying`."""
+
+    def check(self, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """Return the values as an array if all are finite and in range, else raise `HeatError`."""
+        try:
+            values = np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            values = np.array([np.nan])
+        fits = np.isfinite(values) & (values <= self.high)
+        fits &= (values > self.low) if self.above_low else (values >= self.low)
+        if np.asarray(value).dtype == np.bool_ or not np.all(fits):
+            got = repr(value) if np.ndim(value) == 0 else f"{np.count_nonzero(~fits)} of {values.size} that are not"
+            raise HeatError(explain(self.name, expected=self._expected(), got=got, remedy=self._remedy()))
+        return values
+
+    def check_quantity(self, quantity: Quantity) -> Quantity:
+        """Return a number as a float if it is in range, a `Varying` as it is, and raise `HeatError` for all else."""
+        if isinstance(quantity, Varying) and self.varies:
+            return quantity
+        if callable(quantity) or isinstance(quantity, (Varying, str)) or np.ndim(quantity) != 0:
+            expected, remedy = "a number", self._remedy()
+            if self.varies:
+                expected = "a number or a Varying"
+                remedy = "Wrap a function: Varying(function, in_time=True), or in_time=False if time does not matter."
+            raise HeatError(explain(self.name, expected=expected, got=repr(quantity), remedy=remedy))
+        return float(self.check(quantity))
+
+    def _remedy(self) -> str:
+        return f"Correct {self.name}." if self.unit == "1" else f"Give {self.name} in {self.unit}."
+
+    def _expected(self) -> str:
+        parts = ["a finite number"]
+        if self.low > -math.inf:
+            parts.append(f"{'above' if self.above_low else 'of at least'} {self.low:g}")
+        if self.high < math.inf:
+            parts.append(f"{'and ' if len(parts) > 1 else ''}at most {self.high:g}")
+        return " ".join(parts) + f" [{self.unit}]"
+
+
+@dataclass(frozen=True)
+class Bounded:
+    """A quantity with its range, ready to be asked."""
+
+    quantity: Quantity
+    """A number or a function."""
+    bounds: Bounds
+    """What it may be."""
+
+    @property
+    def in_time(self) -> bool:
+        """Whether it changes with time."""
+        return isinstance(self.quantity, Varying) and self.quantity.in_time
+
+    def at(self, places: Places, time_s: float) -> npt.NDArray[np.float64]:
+        """Compute the quantity at places, shape (k,).
+
+        Raises:
+            HeatError: A function returned the wrong shape, or values out of range.
+        """
+        if not isinstance(self.quantity, Varying):
+            return np.full(len(places), self.quantity, dtype=np.float64)
+        values = self.bounds.check(self.quantity.function(places, time_s if self.in_time else 0.0))
+        if values.shape not in ((), (len(places),)):
+            raise HeatError(
+                explain(
+                    f"function of {self.bounds.name}",
+                    expected=f"one number, or one per place, shape ({len(places)},)",
+                    got=values.shape,
+                    remedy="Correct the function given to Varying.",
+                )
+            )
+        return np.broadcast_to(values, (len(places),)).copy()

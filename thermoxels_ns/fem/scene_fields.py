@@ -1,0 +1,257 @@
+"""The sections of a heat scene: what is around a body, in fields whose names carry their units.
+
+Each section is checked when it is made. What acts on the body follows from them in `heat_scene.py`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from datetime import datetime
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.quantities import Bounds
+from thermoxels_ns.fem.sky import Vector
+from thermoxels_ns.fem.surface_coefficients import HeatFlow
+from thermoxels_ns.units import ZERO_CELSIUS_K
+
+OUTSIDE = ("exterior-*",)
+"""Patches that what is outside acts on, unless others are named."""
+INSIDE = ("interior-*",)
+"""Patches that the air inside acts on, unless others are named."""
+
+InsideCoefficient = Literal["iso-6946-combined", "iso-6946-separate", "iso-6946-convection"]
+OutsideCoefficient = Literal["iso-6946-combined", "iso-6946-separate", "iso-6946-convection", "thermoxels-original"]
+
+WITH_RADIATION = ("iso-6946-combined", "iso-6946-separate")
+"""Coefficients that hold radiation as well."""
+
+_RANGES: dict[str, Bounds] = {
+    "emissivity": Bounds("emissivity", "1", 0.0, 1.0),
+    "absorptivity": Bounds("absorptivity", "1", 0.0, 1.0),
+    "reflectance": Bounds("reflectance", "1", 0.0, 1.0),
+    "latitude_deg": Bounds("latitude_deg", "degrees", -90.0, 90.0),
+    "longitude_deg": Bounds("longitude_deg", "degrees", -180.0, 180.0),
+}
+_UNITS: dict[str, tuple[str, float]] = {
+    "_w_m2k": ("W/(m2 K)", 0.0),
+    "_w_m2": ("W/m2", 0.0),
+    "_m_s": ("m/s", 0.0),
+    "_c": ("degrees Celsius", -ZERO_CELSIUS_K),
+    "_k": ("kelvin", 0.0),
+}
+
+
+def field_bounds(name: str) -> Bounds:
+    """Give the range of a number by the name of its field, which ends with its unit.
+
+    >>> field_bounds("wind_m_s").unit
+    'm/s'
+    """
+    if name in _RANGES:
+        return _RANGES[name]
+    ending = next(ending for ending in _UNITS if name.endswith(ending))
+    unit, low = _UNITS[ending]
+    return Bounds(name, unit, low)
+
+
+class Section:
+    """Checks the fields of a section: numbers by their names, choices, and names of patches."""
+
+    def __post_init__(self) -> None:
+        hints = get_type_hints(type(self))
+        for field in fields(self):  # type: ignore[arg-type]
+            value: Any = getattr(self, field.name)
+            kinds = (hints[field.name], *get_args(hints[field.name]))
+            choices = next((get_args(kind) for kind in kinds if get_origin(kind) is Literal), ())
+            if value is None and type(None) in kinds:
+                continue
+            if float in kinds:
+                object.__setattr__(self, field.name, float(field_bounds(field.name).check(value)))
+            if choices and value not in choices:
+                raise _unclear(field.name, f"one of {', '.join(choices)}", repr(value), "Correct it.")
+            if field.name == "patches" and (not value or isinstance(value, str)):
+                raise _unclear("patches", "a list of names or patterns", repr(value), "Name at least one, in a list.")
+        self._check()
+
+    def _check(self) -> None:
+        """Check what concerns several fields."""
+
+
+@dataclass(frozen=True)
+class InsideAir(Section):
+    """The air of a room."""
+
+    air_c: float
+    """Temperature of the air, [degrees Celsius], at least -273.15."""
+    coefficient: InsideCoefficient | None = None
+    """Heat transfer coefficient by the orientation of each surface, after ISO 6946: iso-6946-combined (1 / Rsi,
+    convection and radiation together), iso-6946-separate (hci + 4 eps sigma T^3 at the temperature of the air), or
+    iso-6946-convection (hci alone, for scenes that name radiation themselves)."""
+    coefficient_w_m2k: float | None = None
+    """The coefficient itself, [W / (m2 K)], instead of a named one."""
+    emissivity: float | None = None
+    """Emissivity of the surfaces, 0 to 1, for iso-6946-separate and for nothing else."""
+    heat_flow: HeatFlow = "into-body"
+    """into-body: the air is warmer than the surfaces, as in a heated room, and loses most to the ceiling; out-of-body:
+    it is colder. Named coefficients depend on it."""
+    patches: tuple[str, ...] = INSIDE
+    """Patches that it acts on, by name or pattern."""
+
+    def _check(self) -> None:
+        _check_coefficient(self.coefficient, self.coefficient_w_m2k, self.emissivity)
+
+
+@dataclass(frozen=True)
+class OutsideAir(Section):
+    """The open air."""
+
+    air_c: float
+    """Temperature of the air, [degrees Celsius], at least -273.15."""
+    coefficient: OutsideCoefficient | None = None
+    """Heat transfer coefficient: iso-6946-combined (1 / Rse = 25, convection and radiation together), iso-6946-separate
+    (4 + 4 v, and 4 eps sigma T^3 at the temperature of the air), iso-6946-convection (4 + 4 v alone, for scenes that
+    name radiation themselves), or thermoxels-original (18.6 v^0.605, convection alone)."""
+    coefficient_w_m2k: float | None = None
+    """The coefficient itself, [W / (m2 K)], instead of a named one."""
+    wind_m_s: float | None = None
+    """Wind speed beside the surfaces, [m / s], for the coefficients that depend on it and for no other."""
+    emissivity: float | None = None
+    """Emissivity of the surfaces, 0 to 1, for iso-6946-separate and for nothing else."""
+    patches: tuple[str, ...] = OUTSIDE
+    """Patches that it acts on, by name or pattern."""
+
+    def _check(self) -> None:
+        _check_coefficient(self.coefficient, self.coefficient_w_m2k, self.emissivity)
+        windy = self.coefficient not in (None, "iso-6946-combined")
+        _check_only_if("wind_m_s", self.wind_m_s, windy, self.coefficient or "coefficient_w_m2k")
+
+
+@dataclass(frozen=True)
+class Surface(Section):
+    """How surfaces radiate and absorb; sky, ground and sun act on those that are named so."""
+
+    emissivity: float | None = None
+    """Emissivity for long-wave radiation, 0 to 1; without it they do not radiate to sky and ground."""
+    absorptivity: float | None = None
+    """Share of the sunlight that they absorb, 0 to 1; without it they take up none."""
+    patches: tuple[str, ...] = OUTSIDE
+    """Patches, by name or pattern; of several entries for one patch, the later one holds."""
+
+    def _check(self) -> None:
+        if self.emissivity is None and self.absorptivity is None:
+            raise _unclear("surface", "emissivity, absorptivity or both", "neither", "Give one of them.")
+
+
+@dataclass(frozen=True)
+class Sky(Section):
+    """The sky that surfaces radiate to. One of the three ways to give its temperature is needed."""
+
+    temperature_c: float | None = None
+    """Its effective temperature, [degrees Celsius], at least -273.15."""
+    model: Literal["swinbank"] | None = None
+    """swinbank: a clear sky, 0.0552 T^1.5 of the outside air in kelvin."""
+    below_air_k: float | None = None
+    """How much colder it is than the outside air, [K]; 6 is common for skies with some clouds (Whillier 1967)."""
+
+    def _check(self) -> None:
+        _check_one(temperature_c=self.temperature_c, model=self.model, below_air_k=self.below_air_k)
+
+    @property
+    def needs_air(self) -> bool:
+        """Whether its temperature follows from that of the outside air."""
+        return self.temperature_c is None
+
+
+@dataclass(frozen=True)
+class Ground(Section):
+    """The ground that surfaces see."""
+
+    surface_c: float | None = None
+    """Temperature of its surface, [degrees Celsius], at least -273.15; without it nothing radiates to the ground."""
+    reflectance: float | None = None
+    """Share of the sunlight that it reflects, 0 to 1 (grass 0.2, fresh snow 0.8); without it, it reflects none."""
+
+    def _check(self) -> None:
+        if self.surface_c is None and self.reflectance is None:
+            raise _unclear("ground", "surface_c, reflectance or both", "neither", "Give one of them.")
+
+
+@dataclass(frozen=True)
+class Sun(Section):
+    """Sunlight: from a date and place, or from a direction; as strong as given, or as under a clear sky.
+
+    No part of the body shades another.
+    """
+
+    start: datetime | None = None
+    """Date and time of the scene's start, with a time zone, such as 2025-06-21T12:00:00+02:00; the sun moves on."""
+    latitude_deg: float | None = None
+    """Latitude of the place, north positive, [degrees], -90 to 90; goes with `start`."""
+    longitude_deg: float | None = None
+    """Longitude of the place, east positive, [degrees], -180 to 180; goes with `start`."""
+    north: Vector | None = None
+    """Direction that points north in the coordinates of the mesh; goes with `start`."""
+    towards: Vector | None = None
+    """Direction from the mesh to the sun in the coordinates of the mesh, instead of date and place."""
+    clear_sky: Literal["meinel"] | None = None
+    """meinel: direct and diffuse light under a clear sky at sea level by the height of the sun; goes with `start`."""
+    direct_w_m2: float | None = None
+    """Direct light on a surface that faces the sun, [W / m2], at least 0, as long as the sun is up."""
+    diffuse_w_m2: float = 0.0
+    """Light from the sky on a surface that faces up, [W / m2], at least 0, as long as the sun is up."""
+    patches: tuple[str, ...] = OUTSIDE
+    """Patches that it may reach, by name or pattern."""
+
+    def _check(self) -> None:
+        _check_one(start=self.start, towards=self.towards)
+        for name in ("latitude_deg", "longitude_deg", "north"):
+            given = getattr(self, name)
+            if self.start is None and given is not None:
+                raise _unclear(name, "a date and time in start beside it", "none", f"Add start or remove {name}.")
+            if self.start is not None and given is None:
+                raise _unclear("start", f"{name} beside it", "none", f"Add {name}.")
+        _check_one(clear_sky=self.clear_sky, direct_w_m2=self.direct_w_m2)
+        if self.clear_sky is not None and self.start is None:
+            raise _unclear("clear_sky", "a date and time in start beside it", "none", "Give direct_w_m2 instead.")
+        if self.clear_sky is not None and self.diffuse_w_m2 > 0.0:
+            got = f"{self.diffuse_w_m2:g}"
+            raise _unclear("diffuse_w_m2", "none beside clear_sky", got, "Remove one of the two.")
+        if self.start is not None and self.start.utcoffset() is None:
+            remedy = f"Write {self.start.isoformat()}+01:00, for example, or Z at its end for universal time."
+            raise _unclear("start", "a date and time with a time zone", self.start.isoformat(), remedy)
+        for name in ("north", "towards"):
+            check_direction(name, getattr(self, name))
+
+
+def check_direction(name: str, vector: Vector | None) -> None:
+    """Refuse three numbers that are no direction."""
+    if vector is not None and not 0.0 < math.hypot(*vector) < math.inf:
+        raise _unclear(name, "a direction", list(vector), "Give three numbers, such as [0, 1, 0].")
+
+
+def _check_coefficient(named: str | None, number: float | None, emissivity: float | None) -> None:
+    _check_one(coefficient=named, coefficient_w_m2k=number)
+    _check_only_if("emissivity", emissivity, named == "iso-6946-separate", named or "coefficient_w_m2k")
+
+
+def _check_one(**values: object) -> None:
+    """Exactly one of the fields must be given."""
+    given = [name for name, value in values.items() if value is not None]
+    if len(given) != 1:
+        names = list(values)
+        expected = f"one of {', '.join(names)}"
+        remedy = f"Remove all but one: {', '.join(given)}." if given else f"Add {names[0]}, for example."
+        raise _unclear(" or ".join(names), expected, " and ".join(given) or "none", remedy)
+
+
+def _check_only_if(name: str, value: float | None, needed: bool, coefficient: str) -> None:
+    if needed and value is None:
+        raise _unclear(name, f"a number, because {coefficient} depends on it", "none", f"Add {name}.")
+    if not needed and value is not None:
+        raise _unclear(name, f"none, because {coefficient} does not depend on it", f"{value:g}", f"Remove {name}.")
+
+
+def _unclear(name: str, expected: str, got: object, remedy: str) -> HeatError:
+    return HeatError(explain(name, expected=expected, got=got, remedy=remedy))

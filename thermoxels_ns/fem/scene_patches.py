@@ -1,0 +1,129 @@
+"""Which patches of a mesh the entries of a heat scene act on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from fnmatch import fnmatchcase
+from itertools import combinations
+
+import numpy as np
+
+from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.scene_fields import Surface
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+
+class ScenePatches:
+    """The patches of a mesh by name, and how much surface each has."""
+
+    def __init__(self, mesh: TetMesh) -> None:
+        """Read the tags of a mesh.
+
+        Raises:
+            HeatError: They have the wrong shape or refer to what is not there.
+        """
+        selection = Selection(mesh)
+        area = np.bincount(selection.facet_patch, weights=selection.facet_area_m2, minlength=len(selection.patch_names))
+        self.area_m2: dict[str, float] = dict(zip(selection.patch_names, area.tolist()))
+        """True area of each patch by its name, [m2]."""
+
+    def matching(self, name: str, patterns: Sequence[str]) -> set[str]:
+        """Give the patches that match any pattern.
+
+        Args:
+            name: The entry of the scene that names them, for messages.
+            patterns: Names or patterns.
+
+        Raises:
+            HeatError: A pattern matches no patch.
+        """
+        found: set[str] = set()
+        for pattern in patterns:
+            matches = {patch for patch in self.area_m2 if fnmatchcase(patch, pattern)}
+            if not matches:
+                expected = f"names or patterns of the patches {', '.join(self.area_m2)}"
+                remedy = "Correct the name, or tag the mesh so that it has such a patch."
+                raise HeatError(explain(f"{name}: patches", expected=expected, got=repr(pattern), remedy=remedy))
+            found |= matches
+        return found
+
+    def of_surfaces(
+        self,
+        surfaces: Sequence[Surface],
+        value: Callable[[Surface], float | None],
+        allowed: set[str] | None = None,
+    ) -> list[tuple[tuple[str, ...], float]]:
+        """Group the patches by a property of their surfaces.
+
+        Args:
+            surfaces: Entries of the scene; the last one that gives a patch the property holds.
+            value: The property of a surface, None if it has none.
+            allowed: The patches that count; None: all.
+
+        Returns:
+            Names of patches, written as patterns, and the value that they have.
+
+        Raises:
+            HeatError: A surface names a patch that the mesh does not have.
+        """
+        chosen: dict[str, float] = {}
+        for number, surface in enumerate(surfaces, start=1):
+            given = value(surface)
+            if given is not None:
+                chosen |= dict.fromkeys(self.matching(f"surfaces entry {number}", surface.patches), given)
+        groups: dict[float, list[str]] = {}
+        for patch in self.area_m2:
+            if patch in chosen and (allowed is None or patch in allowed):
+                groups.setdefault(chosen[patch], []).append(_as_pattern(patch))
+        return [(tuple(names), number) for number, names in groups.items()]
+
+    def check_all_named(self, acting: set[str], adiabatic: Sequence[str]) -> None:
+        """Refuse a patch that a scene says nothing about: it would be insulated without anyone having said so.
+
+        Args:
+            acting: Patches on which something acts.
+            adiabatic: Names or patterns of those that no heat crosses.
+
+        Raises:
+            HeatError: There is another patch with some surface.
+        """
+        whole = sum(self.area_m2.values())
+        forgotten = [
+            patch
+            for patch, area in self.area_m2.items()
+            if area > 0.0 and patch not in acting and not any(fnmatchcase(patch, pattern) for pattern in adiabatic)
+        ]
+        if forgotten:
+            shares = (f"{patch} ({100.0 * self.area_m2[patch] / whole:.3g} % of the surface)" for patch in forgotten)
+            raise HeatError(
+                explain(
+                    "heat scene",
+                    expected="something that acts on every patch, or the patch named adiabatic",
+                    got=f"nothing on {', '.join(shares)}",
+                    remedy=f"Add what acts there, or write adiabatic: [{', '.join((*adiabatic, *forgotten))}].",
+                )
+            )
+
+
+def check_disjoint(what: str, entries: Sequence[tuple[str, set[str]]], remedy: str) -> None:
+    """Refuse entries of which two act on one patch.
+
+    Args:
+        what: What would be counted twice, for the message.
+        entries: Names of entries of the scene and the patches they act on.
+        remedy: What to do about it.
+
+    Raises:
+        HeatError: Two entries share a patch.
+    """
+    for (first, where), (second, elsewhere) in combinations(entries, 2):
+        both = sorted(where & elsewhere)
+        if both:
+            got = f"{second} on {', '.join(both)} as well"
+            raise HeatError(explain(first, expected=f"{what} once on each patch", got=got, remedy=remedy))
+
+
+def _as_pattern(name: str) -> str:
+    """Make a pattern that matches a name and nothing else."""
+    return "".join(f"[{letter}]" if letter in "*?[" else letter for letter in name)

@@ -1,0 +1,120 @@
+"""Where effects act: patches of the boundary and regions of the body, by name, with their places."""
+
+from __future__ import annotations
+
+from fnmatch import fnmatchcase
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.checks import check_finite, check_shape
+from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.quantities import Places
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+WHOLE_BOUNDARY = "boundary"
+"""What the boundary of a mesh without patches is called in reports."""
+
+
+class Selection:
+    """The named parts of a mesh and their geometry."""
+
+    def __init__(self, mesh: TetMesh, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> None:
+        """Check the tags of a mesh.
+
+        Args:
+            mesh: The body.
+            up: Unit vector that points up; functions of place are told.
+
+        Raises:
+            HeatError: Facets or tags have the wrong shape, or refer to what is not there.
+        """
+        self.mesh = mesh
+        self.up = up
+        self._check()
+        corner = mesh.points_m[mesh.facets]
+        cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        area = 0.5 * np.sqrt(np.einsum("fi,fi->f", cross, cross))
+        tags = mesh.boundary
+        self.facet_area_m2: npt.NDArray[np.float64] = area if tags is None else area * tags.area_factor
+        """True area that each boundary triangle stands for, shape (f,), [m2]."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            own = np.nan_to_num(cross / (2.0 * area)[:, None], nan=0.0, posinf=0.0, neginf=0.0)
+        self.facet_normal: npt.NDArray[np.float64] = own if tags is None else tags.normal
+        """Outward unit normal of the true surface, shape (f, 3)."""
+        self.patch_names: tuple[str, ...] = (WHOLE_BOUNDARY,) if tags is None else tags.patch_names
+        """Names of the patches."""
+        self.facet_patch: npt.NDArray[np.int64] = np.zeros(len(area), np.int64) if tags is None else tags.patch
+        """Index into `patch_names`, shape (f,)."""
+
+    def facets(self, patterns: tuple[str, ...]) -> npt.NDArray[np.int64]:
+        """Number the boundary triangles of the patches that match any pattern; patches may be without triangles.
+
+        Raises:
+            HeatError: A pattern matches no patch.
+        """
+        chosen = _matching("patches", patterns, self.patch_names)
+        return np.flatnonzero(chosen[self.facet_patch])
+
+    def tets(self, patterns: tuple[str, ...]) -> npt.NDArray[np.int64]:
+        """Number the tetrahedra of the regions that match any pattern.
+
+        Raises:
+            HeatError: A pattern matches no region.
+        """
+        chosen = _matching("regions", patterns, self.mesh.region_names)
+        return np.flatnonzero(chosen[self.mesh.region])
+
+    def facet_places(self, facets: npt.NDArray[np.int64]) -> Places:
+        """Give the centroids of boundary triangles."""
+        centroids = self.mesh.points_m[self.mesh.facets[facets]].mean(axis=1)
+        return Places(centroids, self.facet_normal[facets], self.up)
+
+    def tet_places(self, tets: npt.NDArray[np.int64]) -> Places:
+        """Give the centroids of tetrahedra."""
+        centroids = self.mesh.points_m[self.mesh.tets[tets]].mean(axis=1)
+        return Places(centroids, np.zeros_like(centroids), self.up)
+
+    def _check(self) -> None:
+        mesh, remedy = self.mesh, "Build the mesh with thermoxels_ns.mesh."
+        num_nodes, num_facets = len(mesh.points_m), len(mesh.facets)
+        check_shape("mesh facets", mesh.facets, (None, 3), remedy, HeatError)
+        _check_indices("mesh facets", mesh.facets, num_nodes, remedy)
+        check_shape("mesh region", mesh.region, (len(mesh.tets),), remedy, HeatError)
+        _check_indices("mesh region", mesh.region, len(mesh.region_names), remedy)
+        tags = mesh.boundary
+        if tags is None:
+            return
+        check_shape("boundary normal", tags.normal, (num_facets, 3), remedy, HeatError)
+        check_finite("boundary normal", tags.normal, remedy, HeatError)
+        check_shape("boundary area_factor", tags.area_factor, (num_facets,), remedy, HeatError)
+        check_finite("boundary area_factor", tags.area_factor, remedy, HeatError)
+        if num_facets and tags.area_factor.min() <= 0.0:
+            got = f"{tags.area_factor.min():g}"
+            raise HeatError(explain("boundary area_factor", expected="numbers above 0", got=got, remedy=remedy))
+        check_shape("boundary patch", tags.patch, (num_facets,), remedy, HeatError)
+        _check_indices("boundary patch", tags.patch, len(tags.patch_names), remedy)
+
+
+def _check_indices(name: str, indices: npt.NDArray[np.int64], count: int, remedy: str) -> None:
+    if indices.size and (indices.min() < 0 or indices.max() >= count):
+        got = f"{indices.min()} to {indices.max()}"
+        raise HeatError(explain(name, expected=f"numbers from 0 to {count - 1}", got=got, remedy=remedy))
+
+
+def _matching(field: str, patterns: tuple[str, ...], names: tuple[str, ...]) -> npt.NDArray[np.bool_]:
+    """Mark the names that match any pattern; each pattern must match one. Letters count as upper and lower case."""
+    chosen = np.zeros(len(names), dtype=bool)
+    for pattern in patterns:
+        matches = np.array([fnmatchcase(name, pattern) for name in names], dtype=bool)
+        if not matches.any():
+            raise HeatError(
+                explain(
+                    field,
+                    expected=f"names or patterns of {', '.join(names)}",
+                    got=repr(pattern),
+                    remedy="Correct the name, or tag the mesh so that it has such a part.",
+                )
+            )
+        chosen |= matches
+    return chosen

@@ -1,0 +1,99 @@
+"""Long-wave exchange with the sky and the ground: how warm the sky seems, and how much of it a surface sees."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.quantities import Bounds, Places, Quantity, Varying
+from thermoxels_ns.units import ZERO_CELSIUS_K, celsius_to_kelvin, kelvin_to_celsius
+
+Vector = tuple[float, float, float]
+
+_TEMPERATURES = {name: Bounds(name, "degrees Celsius", -ZERO_CELSIUS_K) for name in ("air_c", "sky_c", "ground_c")}
+_EMISSIVITY = Bounds("emissivity", "1", 0.0, 1.0)
+
+
+def swinbank_sky_c(air_c: float) -> float:
+    """Temperature of a clear sky from that of the air, T_sky = 0.0552 T_air^1.5 in kelvin (Swinbank 1963).
+
+    A cloudy sky is nearly as warm as the air.
+
+    Args:
+        air_c: Temperature of the air near the ground, [degrees Celsius].
+
+    Returns:
+        The temperature of a black sky that radiates as much, [degrees Celsius].
+
+    Raises:
+        HeatError: It is below absolute zero.
+
+    >>> round(swinbank_sky_c(20.0), 2)
+    3.91
+    """
+    return kelvin_to_celsius(0.0552 * celsius_to_kelvin(float(_TEMPERATURES["air_c"].check(air_c))) ** 1.5)
+
+
+def sky_view(normals: npt.NDArray[np.float64], up: Vector) -> npt.NDArray[np.float64]:
+    """Share of a surface's view that is sky if nothing but the ground hides it, (1 + cos tilt) / 2, shape (k,).
+
+    Args:
+        normals: Outward unit normals, shape (k, 3).
+        up: Unit vector that points up.
+
+    >>> sky_view(np.array([[0, 0, 1.0], [1, 0, 0], [0, 0, -1]]), (0.0, 0.0, 1.0)).tolist()
+    [1.0, 0.5, 0.0]
+    """
+    return np.clip(0.5 * (1.0 + normals @ np.array(up)), 0.0, 1.0)
+
+
+def ground_view(normals: npt.NDArray[np.float64], up: Vector) -> npt.NDArray[np.float64]:
+    """Share of a surface's view that is ground, (1 - cos tilt) / 2, shape (k,).
+
+    Args:
+        normals: Outward unit normals, shape (k, 3).
+        up: Unit vector that points up.
+    """
+    return 1.0 - sky_view(normals, up)
+
+
+def outdoor_radiation(
+    emissivity: float, *, sky_c: float | None = None, ground_c: float | None = None
+) -> tuple[Quantity, Quantity]:
+    """Make the two quantities of a `Radiation` to the sky, the ground or both.
+
+    With both, T_s^4 = F_sky T_sky^4 + F_ground T_ground^4: one effect that is exactly the sum of two. With one alone,
+    the emissivity is multiplied by its view factor, and the rest of the view exchanges nothing.
+
+    Args:
+        emissivity: Emissivity of the surface, 0 to 1.
+        sky_c: Temperature of the sky, [degrees Celsius]; None: it is left out.
+        ground_c: Temperature of the ground's surface, [degrees Celsius]; None: it is left out.
+
+    Returns:
+        emissivity: For `Radiation.emissivity`.
+        surroundings_c: For `Radiation.surroundings_c`.
+
+    Raises:
+        HeatError: A number is out of range, or there is neither.
+    """
+    emissivity = float(_EMISSIVITY.check(emissivity))
+    for name, value in (("sky_c", sky_c), ("ground_c", ground_c)):
+        if value is not None:
+            _TEMPERATURES[name].check(value)
+    if sky_c is not None and ground_c is not None:
+        sky, ground = celsius_to_kelvin(sky_c) ** 4, celsius_to_kelvin(ground_c) ** 4
+
+        def mean(places: Places, time_s: float) -> npt.NDArray[np.float64]:
+            seen = sky_view(places.normals, places.up)
+            return kelvin_to_celsius((seen * sky + (1.0 - seen) * ground) ** 0.25)
+
+        return emissivity, Varying(mean, in_time=False)
+    if sky_c is not None:
+        return Varying(lambda places, _: emissivity * sky_view(places.normals, places.up), in_time=False), sky_c
+    if ground_c is not None:
+        return Varying(lambda places, _: emissivity * ground_view(places.normals, places.up), in_time=False), ground_c
+    raise HeatError(
+        explain("outdoor radiation", expected="sky_c, ground_c or both", got="neither", remedy="Give one of them.")
+    )

@@ -1,0 +1,242 @@
+"""One implicit stage of a time step, or a steady state: where heat flow and storage balance at every free node."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from thermoxels_ns.fem.linear_solver import LinearSolution
+from thermoxels_ns.fem.newton import Residual, newton
+from thermoxels_ns.fem.solver_choice import LinearSolver
+from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.units import ZERO_CELSIUS_K
+
+Vector = npt.NDArray[np.float64]
+
+_ESTIMATE_TOLERANCE = 1e-3
+"""Relative tolerance of the linear solver for error estimates."""
+_NEWTON_TOLERANCE = 1e-6
+"""Relative tolerance of the linear solver in a step of Newton's method: the next step corrects the rest."""
+ROUND_OFF = 8.0 * np.finfo(np.float64).eps
+"""Round-off of a sum as a share of the sum of sizes."""
+
+
+@dataclass(frozen=True)
+class StageSolution:
+    """Temperatures at the end of a stage."""
+
+    relative_k: Vector
+    """Relative to the system's reference, shape (n,), [K]."""
+    iterations: int
+    """Iterations of the linear solver."""
+    newton_iterations: int
+    """Steps of Newton's method; 0 without radiation."""
+    converged: bool
+    """Whether the equations hold to tolerance."""
+    status: str
+    """The outcome as a sentence."""
+
+
+class Stage:
+    """Solver of M (T - T_0) / step = given + load - (K + R) T + radiation(T); step = inf: the steady state.
+
+    The unknown is the change T - T_0, which keeps round-off relative to the change. Where radiation is absent the
+    matrix and its preconditioner are made once and serve every stage of the same length.
+
+    Conduction moves heat within a connected piece and never out of it, because the rows of K sum to 0. The sum of the
+    equations over a piece without fixed nodes is therefore a balance of what it stores and exchanges, in which K does
+    not appear. The mean change of each such piece is set by this balance instead of being left to the linear solver,
+    and what round-off of K T puts into the right-hand side's own sum is taken out: where a piece is insulated or held
+    by next to nothing and the step is long, the matrix is all but singular, and the mean would be lost.
+    """
+
+    def __init__(self, system: HeatSystem, time_s: float, step_s: float, *, relative_tolerance: float) -> None:
+        """Assemble the matrix.
+
+        Args:
+            system: The equations.
+            time_s: Time at which what acts on the body is taken; it matters here only if the matrix changes with time.
+            step_s: Length of the stage, [s]; infinite for a steady state.
+            relative_tolerance: Of the linear solver, and of Newton's method.
+        """
+        self.system = system
+        self.step_s = step_s
+        self._relative_tolerance = relative_tolerance
+        self._free = system.fixed.free if len(system.fixed.nodes) else None
+        matrix = system.matrix(time_s, step_s)
+        self.matrix: sparse.csr_matrix = self.free_block(matrix)
+        """M / step + K + R between free nodes."""
+        self.held_w_k: Vector = system.held_w_k(time_s, step_s)
+        """Row sums of M / step + R, shape (n,), [W / K]."""
+        self.floating: npt.NDArray[np.bool_] = ~system.pieces.touched(system.fixed.nodes)
+        """Pieces without fixed nodes, shape (p,)."""
+        self._solver: LinearSolver | None = None
+
+    def solve(
+        self,
+        start_k: Vector,
+        time_s: float,
+        given_w: Vector | None = None,
+        given_to_pieces_w: Vector | None = None,
+    ) -> StageSolution:
+        """Find the temperatures at the end.
+
+        Args:
+            start_k: T_0, shape (n,), [K].
+            time_s: Time at the end.
+            given_w: Heat from earlier stages, shape (n,), [W].
+            given_to_pieces_w: Its sum over each piece without the round-off of conduction, shape (p,), [W].
+        """
+        balance = _Balance(self, start_k, time_s, given_w, given_to_pieces_w)
+        first = balance.residual()
+        if first.is_round_off:
+            return StageSolution(balance.base_k, 0, 0, True, "The temperature is level: nothing flows.")
+        if self.system.nonlinear:
+            found = newton(balance, len(first.heat_w), relative_tolerance=self._relative_tolerance)
+            end_k = balance.base_k + self.everywhere(found.u)
+            return StageSolution(end_k, found.linear_iterations, found.iterations, found.converged, found.status)
+        if self._solver is None:
+            self._solver = LinearSolver(self.matrix, relative_tolerance=self._relative_tolerance)
+        change, linear = self.correction(self._solver, self.held_w_k, first)
+        return StageSolution(
+            balance.base_k + self.everywhere(change), linear.iterations, 0, linear.converged, linear.status
+        )
+
+    def damped(self, heat_w: Vector, relative_k: Vector, time_s: float) -> Vector:
+        """Solve (M / step + K + R + slope of radiation) e = heat roughly, for error estimates; shape (n,), [K].
+
+        Args:
+            heat_w: Shape (n,), [W].
+            relative_k: Temperatures at which the slope of radiation is taken, shape (n,), [K].
+            time_s: Time at which it is taken.
+        """
+        matrix = self.matrix
+        if self.system.nonlinear:
+            matrix = sparse.csr_matrix(matrix + self.free_block(self.system.radiation_slope(relative_k, time_s)))
+        solver = LinearSolver(matrix, relative_tolerance=_ESTIMATE_TOLERANCE)
+        return self.everywhere(solver.solve(self.at_free(heat_w)).x)
+
+    def correction(self, solver: LinearSolver, held_w_k: Vector, residual: Residual) -> tuple[Vector, LinearSolution]:
+        """Solve for a change of the free nodes, its mean over floating pieces by their balance.
+
+        Args:
+            solver: Of the matrix.
+            held_w_k: The matrix's row sums, exactly, shape (n,).
+            residual: What is to be balanced.
+        """
+        if not self.floating.any():
+            linear = solver.solve(residual.heat_w)
+            return linear.x, linear
+        pieces, full_w = self.system.pieces, self.everywhere(residual.heat_w)
+        held = np.where(self.floating, pieces.sums(held_w_k), 1.0)
+        # In multiples of the row sums, this shifts the solution by a constant in each piece. The second time takes out
+        # the round-off of the first.
+        rest_w = full_w
+        for _ in range(2):
+            surplus = np.where(self.floating, pieces.sums(rest_w) / held, 0.0)
+            rest_w = rest_w - pieces.at_nodes(surplus) * held_w_k
+        rest_w, round_off_w = self.at_free(rest_w), residual.round_off_w + ROUND_OFF * np.abs(residual.heat_w)
+        if np.all(np.abs(rest_w) <= round_off_w):
+            linear = LinearSolution(np.zeros_like(rest_w), 0, 0.0, True, "Each piece changes as a whole.")
+        else:
+            linear = solver.solve(rest_w)
+        full_k = self.everywhere(linear.x)
+        shift = np.where(self.floating, (residual.piece_heat_w - pieces.sums(held_w_k * full_k)) / held, 0.0)
+        return self.at_free(full_k + pieces.at_nodes(shift)), linear
+
+    def at_free(self, nodal: Vector) -> Vector:
+        """Values at the nodes that are not fixed."""
+        return nodal if self._free is None else nodal[self._free]
+
+    def free_block(self, matrix: sparse.csr_matrix) -> sparse.csr_matrix:
+        """Rows and columns of the nodes that are not fixed."""
+        return matrix if self._free is None else sparse.csr_matrix(matrix[self._free][:, self._free])
+
+    def everywhere(self, free: Vector) -> Vector:
+        """Put 0 at the fixed nodes."""
+        if self._free is None:
+            return free
+        full = np.zeros(self.system.num_nodes)
+        full[self._free] = free
+        return full
+
+
+class _Balance:
+    """The heat balance of a stage as a function of the change of the free nodes."""
+
+    def __init__(
+        self, stage: Stage, start_k: Vector, time_s: float, given_w: Vector | None, given_to_pieces_w: Vector | None
+    ) -> None:
+        system = stage.system
+        self._stage, self._time_s = stage, time_s
+        self._given_w, self._given_to_pieces_w = given_w, given_to_pieces_w
+        self.base_k = start_k
+        if len(system.fixed.nodes):
+            self.base_k = start_k.copy()
+            self.base_k[system.fixed.nodes] = system.fixed.temperature_k(time_s)
+            if np.isfinite(stage.step_s):
+                moved_w = system.mass_product(self.base_k - start_k) / stage.step_s
+                self._given_w = -moved_w if given_w is None else given_w - moved_w
+
+    def residual(self, u: Vector | None = None) -> Residual:
+        """Heat that is not balanced at a change of the temperature; None: at no change."""
+        stage, system, pieces = self._stage, self._stage.system, self._stage.system.pieces
+        now_k = self.base_k if u is None else self.base_k + stage.everywhere(u)
+        heat_w, bound_w = system.exchanged_heat(now_k, self._time_s)
+        piece_w, piece_bound_w = pieces.sums(heat_w), pieces.sums(bound_w)
+        if self._given_to_pieces_w is not None:
+            piece_w += self._given_to_pieces_w
+            piece_bound_w += np.abs(self._given_to_pieces_w)
+        conducted_w, conducted_bound_w = system.conducted_heat(now_k)
+        heat_w -= conducted_w
+        bound_w += conducted_bound_w
+        if self._given_w is not None:
+            heat_w += self._given_w
+            bound_w += np.abs(self._given_w)
+        if u is not None and np.isfinite(stage.step_s):
+            stored_w = system.mass_product(stage.everywhere(u)) / stage.step_s
+            heat_w -= stored_w
+            bound_w += np.abs(stored_w)
+            piece_w -= pieces.sums(stored_w)
+            piece_bound_w += pieces.sums(np.abs(stored_w))
+        return Residual(
+            stage.at_free(heat_w),
+            np.where(stage.floating, piece_w, 0.0),
+            ROUND_OFF * stage.at_free(bound_w),
+            ROUND_OFF * piece_bound_w,
+        )
+
+    def correction(self, u: Vector, residual: Residual) -> tuple[Vector, LinearSolution]:
+        """Newton's direction."""
+        stage, system = self._stage, self._stage.system
+        slope = system.radiation_slope(self._now(u), self._time_s)
+        held_w_k = stage.held_w_k + slope @ np.ones(system.num_nodes)
+        matrix = sparse.csr_matrix(stage.matrix + stage.free_block(slope))
+        return stage.correction(LinearSolver(matrix, relative_tolerance=_NEWTON_TOLERANCE), held_w_k, residual)
+
+    def is_short(self, u: Vector, direction: Vector, share: float) -> bool:
+        """Whether no absolute temperature changes by more than a share of it."""
+        kelvin = self._stage.at_free(self._now(u)) + self._stage.system.reference_c + ZERO_CELSIUS_K
+        return bool(np.all(np.abs(direction) <= share * np.abs(kelvin)))
+
+    def rise(self, u: Vector, direction: Vector) -> Callable[[float], float]:
+        """Slope of the energy along a direction: minus the power of the residual."""
+        linear_w = self.residual(u).heat_w - self._radiated(u)
+        constant = float(np.sum(direction * linear_w))
+        curvature = float(np.sum(direction * (self._stage.matrix @ direction)))
+
+        def along(length: float) -> float:
+            radiated_w = self._radiated(u + length * direction)
+            return length * curvature - constant - float(np.sum(direction * radiated_w))
+
+        return along
+
+    def _radiated(self, u: Vector) -> Vector:
+        return self._stage.at_free(self._stage.system.radiation_load(self._now(u), self._time_s))
+
+    def _now(self, u: Vector) -> Vector:
+        return self.base_k + self._stage.everywhere(u)

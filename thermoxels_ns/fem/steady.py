@@ -1,0 +1,104 @@
+"""Steady states: where heat flow balances at every node, without steps in time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.solution import SteadySolution, heat_by_effect
+from thermoxels_ns.fem.stage import Stage, StageSolution
+from thermoxels_ns.fem.system import HeatSystem, effect_labels
+from thermoxels_ns.units import ZERO_CELSIUS_K
+
+
+def solve_steady(
+    problem: HeatProblem,
+    *,
+    time_s: float = 0.0,
+    lumped_boundary: bool = True,
+    relative_tolerance: float = 1e-12,
+    allow_unconverged: bool = False,
+) -> SteadySolution:
+    """Find the temperatures at which the effects of a problem balance, div(k grad T) + s = 0.
+
+    Args:
+        problem: Body, materials and effects. Its initial temperatures are where iterations start.
+        time_s: Time at which effects that change are taken, [s].
+        lumped_boundary: Evaluate convection and radiation at the nodes, which keeps temperatures in the range of the
+            surroundings on meshes without obtuse angles. False integrates them over each triangle: on smooth
+            problems the error is smaller by a constant.
+        relative_tolerance: Of the linear solver, and of Newton's method if there is radiation.
+        allow_unconverged: Return what was computed, with `converged` False and the reason in `status`, instead of
+            raising.
+
+    Returns:
+        Temperatures and heat flows.
+
+    Raises:
+        HeatError: A piece of the body exchanges heat with nothing whose temperature is known, two effects fix one node
+            differently, or the solver does not converge.
+    """
+    system = HeatSystem(problem, lumped_boundary=lumped_boundary)
+    _check_held(system, time_s)
+    start_k = problem.start_c - system.reference_c
+    stage = Stage(system, time_s, np.inf, relative_tolerance=relative_tolerance)
+    solution = stage.solve(start_k, time_s)
+    failure = _failure(system, solution)
+    if failure and not allow_unconverged:
+        raise HeatError(failure)
+    relative_k = solution.relative_k
+    flows = system.group_heat_w(relative_k, time_s)
+    kept = -system.net_heat_at_fixed(relative_k, time_s)
+    group_heat = np.concatenate([flows, system.fixed.shares @ kept])
+    # Of the nodes, not of the groups: opposite flows through one patch cancel in its sum.
+    size = float(np.abs(group_heat).sum())
+    surplus = abs(float(group_heat.sum()))
+    return SteadySolution(
+        temperature_c=relative_k + system.reference_c,
+        effects=heat_by_effect(effect_labels(problem), system.groups, group_heat[None]),
+        energy_residual=surplus / size if size > 0.0 else 0.0,
+        status=failure or f"The steady state was found. {solution.status}",
+        converged=not failure,
+        iterations=solution.iterations,
+        newton_iterations=solution.newton_iterations,
+        assembled=system.assembled,
+    )
+
+
+def _failure(system: HeatSystem, solution: StageSolution) -> str:
+    """Say why a solution is none, or nothing."""
+    if not solution.converged:
+        return f"No steady state was found. {solution.status} Check the mesh's quality and the effects."
+    return too_cold(system, solution.relative_k)
+
+
+def too_cold(system: HeatSystem, relative_k: np.ndarray) -> str:
+    """Say that temperatures are impossible, or nothing."""
+    coldest_k = float(relative_k.min()) + system.reference_c + ZERO_CELSIUS_K
+    if coldest_k >= -1e-6:
+        return ""
+    return (
+        f"The temperature falls to {coldest_k:.6g} K, below absolute zero: the given fluxes or sources take out more "
+        "heat than can flow in. Check their sign (positive is into the body)."
+    )
+
+
+def _check_held(system: HeatSystem, time_s: float) -> None:
+    """Refuse a body of which a piece may have any temperature."""
+    loose = np.flatnonzero(~system.exchanging_pieces(time_s))
+    if len(loose) == 0:
+        return
+    sizes = np.bincount(system.pieces.number, minlength=system.pieces.count)
+    piece = int(loose[np.argmax(sizes[loose])])
+    points = system.problem.mesh.points_m[system.pieces.number == piece]
+    low, high = (", ".join(f"{part:.4g}" for part in corner) for corner in (points.min(axis=0), points.max(axis=0)))
+    raise HeatError(
+        explain(
+            "steady heat problem",
+            expected="convection, radiation, ground contact or a fixed temperature on every connected piece of a body",
+            got=f"none on {len(loose)} of {system.pieces.count} pieces; the largest has {sizes[piece]} nodes in the "
+            f"box from ({low}) to ({high}) m",
+            remedy="Remove the piece, give its boundary an effect, or follow it through time instead.",
+        )
+    )

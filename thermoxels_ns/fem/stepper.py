@@ -1,0 +1,136 @@
+"""One time step of any scheme, with the heat that flowed during it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.fem.schemes import Scheme
+from thermoxels_ns.fem.stage import Stage
+from thermoxels_ns.fem.system import HeatSystem
+
+Vector = npt.NDArray[np.float64]
+
+_KEPT_STAGES = 2
+"""Lengths of stages whose matrices are kept."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """The outcome of a step."""
+
+    relative_k: Vector
+    """Temperatures at its end, relative to the system's reference, shape (n,), [K]."""
+    group_heat_w: Vector
+    """Mean heat flow into the body of each group of the system, shape (g,), [W]."""
+    iterations: int
+    """Iterations of the linear solver."""
+    newton_iterations: int
+    """Steps of Newton's method."""
+    error_k: float
+    """Estimated largest error that the step made, [K]; NaN if the scheme has no estimate or none was asked for."""
+    converged: bool
+    """Whether all stages were solved."""
+    status: str
+    """The outcome as a sentence."""
+
+
+class Stepper:
+    """Takes steps of any length; matrices and preconditioners of the lengths used last are kept."""
+
+    def __init__(self, system: HeatSystem, scheme: Scheme, *, relative_tolerance: float) -> None:
+        """Choose a scheme.
+
+        Args:
+            system: The equations.
+            scheme: The scheme in time.
+            relative_tolerance: Of the linear solver.
+        """
+        self.scheme = scheme
+        self._system = system
+        self._relative_tolerance = relative_tolerance
+        self._stages: dict[tuple[float, float], Stage] = {}
+
+    def step(self, start_k: Vector, time_s: float, step_s: float, *, estimate: bool = False) -> Step:
+        """Take one step.
+
+        Args:
+            start_k: Temperatures at the start, relative to the system's reference, shape (n,), [K].
+            time_s: Time at the start.
+            step_s: Length, [s].
+            estimate: Whether to estimate the error.
+        """
+        system, scheme = self._system, self.scheme
+        states: list[Vector] = []
+        inner_w: list[Vector] = []
+        pieces_w: list[Vector] = []
+        iterations = newton_iterations = 0
+        status = ""
+        for number, (row, node) in enumerate(zip(scheme.weights, scheme.nodes)):
+            now_s, implicit = time_s + node * step_s, row[number]
+            if implicit == 0.0:
+                states.append(start_k)
+                inner_w.append(system.net_heat(start_k, now_s)[0])
+                pieces_w.append(system.pieces.sums(system.exchanged_heat(start_k, now_s)[0]))
+                continue
+            shares = [weight / implicit for weight in row[:number]]
+            given_w = _weighted(shares, inner_w)
+            stage = self._stage(now_s, implicit * step_s)
+            solution = stage.solve(start_k, now_s, given_w, _weighted(shares, pieces_w))
+            iterations += solution.iterations
+            newton_iterations += solution.newton_iterations
+            status = solution.status
+            states.append(solution.relative_k)
+            if not solution.converged:
+                unknown = np.full(len(system.groups), np.nan)
+                return Step(solution.relative_k, unknown, iterations, newton_iterations, np.nan, False, status)
+            if estimate or number + 1 < len(scheme.nodes):
+                stored_w = system.mass_product(solution.relative_k - start_k) / (implicit * step_s)
+                inner_w.append(stored_w if given_w is None else stored_w - given_w)
+                pieces_w.append(system.pieces.sums(system.exchanged_heat(solution.relative_k, now_s)[0]))
+        heat_w = self._heat(start_k, states, time_s, step_s)
+        error_k = self._error(start_k, inner_w, time_s, step_s) if estimate and scheme.estimate else np.nan
+        return Step(states[-1], heat_w, iterations, newton_iterations, error_k, True, status)
+
+    def _heat(self, start_k: Vector, states: list[Vector], time_s: float, step_s: float) -> Vector:
+        """Mean heat flow of each group: the stages' flows, and what the balance of the fixed nodes leaves."""
+        system, scheme = self._system, self.scheme
+        flows, fixed = np.zeros(len(system.groups) - len(system.fixed.groups)), system.fixed
+        kept_w = system.mass_product(states[-1] - start_k)[fixed.nodes] / step_s if len(fixed.nodes) else np.zeros(0)
+        for weight, node, state in zip(scheme.ends, scheme.nodes, states):
+            if weight != 0.0:
+                flows += weight * system.group_heat_w(state, time_s + node * step_s)
+                kept_w -= weight * system.net_heat_at_fixed(state, time_s + node * step_s)
+        return np.concatenate([flows, fixed.shares @ kept_w])
+
+    def _error(self, start_k: Vector, inner_w: list[Vector], time_s: float, step_s: float) -> float:
+        """Largest error by the scheme of the next order, damped as the stages are."""
+        system, scheme = self._system, self.scheme
+        assert scheme.estimate is not None
+        more = np.array(scheme.estimate) - np.array([0.0, *scheme.ends])
+        difference_w = _weighted(list(more), [system.net_heat(start_k, time_s)[0], *inner_w])
+        assert difference_w is not None
+        implicit = scheme.weights[-1][-1]
+        end_s = time_s + scheme.nodes[-1] * step_s
+        error = self._stage(end_s, implicit * step_s).damped(difference_w / implicit, start_k, end_s)
+        return float(np.max(np.abs(error)))
+
+    def _stage(self, time_s: float, step_s: float) -> Stage:
+        key = (time_s if self._system.matrix_in_time else 0.0, step_s)
+        stage = self._stages.pop(key, None)
+        if stage is None:
+            stage = Stage(self._system, time_s, step_s, relative_tolerance=self._relative_tolerance)
+        self._stages[key] = stage
+        while len(self._stages) > _KEPT_STAGES:
+            del self._stages[next(iter(self._stages))]
+        return stage
+
+
+def _weighted(weights: list[float], vectors: list[Vector]) -> Vector | None:
+    """Weighted sum, None of nothing."""
+    total: Vector | None = None
+    for weight, vector in zip(weights, vectors):
+        total = weight * vector if total is None else total + weight * vector
+    return total

@@ -1,0 +1,281 @@
+"""Sunlight on surfaces: where the sun stands, how strong it is, and what reaches a facet.
+
+No surface shades another: what other parts of the body or neighbours hide is counted as sunlit.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.quantities import Bounds, Places, Varying
+from thermoxels_ns.fem.sky import Vector, ground_view, sky_view
+
+SOLAR_CONSTANT_W_M2 = 1353.0
+"""Sunlight above the air at the mean distance of the sun, [W / m2]: the value that Meinel's fit was made with. (Today's
+is 1361.)"""
+
+_EPOCH = datetime(2000, 1, 1, 12, tzinfo=timezone.utc)
+_LATITUDE = Bounds("latitude_deg", "degrees", -90.0, 90.0)
+_LONGITUDE = Bounds("longitude_deg", "degrees", -180.0, 180.0)
+_REFLECTANCE = Bounds("ground reflectance", "1", 0.0, 1.0)
+_IRRADIANCE = {name: Bounds(name, "W/m2", 0.0) for name in ("direct_w_m2", "diffuse_w_m2")}
+
+
+@dataclass(frozen=True)
+class SunCoordinates:
+    """The sun among the stars."""
+
+    right_ascension_deg: float
+    """Apparent right ascension, [degrees], 0 to 360."""
+    declination_deg: float
+    """Apparent declination, [degrees]."""
+    distance_au: float
+    """Distance, [astronomical units]."""
+
+
+@dataclass(frozen=True)
+class SunPosition:
+    """The sun as seen from a place."""
+
+    azimuth_deg: float
+    """Direction along the horizon, clockwise from north, [degrees], 0 to 360."""
+    elevation_deg: float
+    """Height over the horizon, [degrees]; refraction, which lifts it by 0.5 degrees at the horizon and by 0.1 at 10
+    degrees, is left out."""
+    distance_au: float
+    """Distance, [astronomical units]."""
+
+
+@dataclass(frozen=True)
+class Sunlight:
+    """Strength of the sunlight."""
+
+    direct_w_m2: float
+    """On a surface that faces the sun, [W / m2], at least 0."""
+    diffuse_w_m2: float
+    """From the sky on a surface that faces up, [W / m2], at least 0."""
+
+    def __post_init__(self) -> None:
+        for name, bounds in _IRRADIANCE.items():
+            object.__setattr__(self, name, float(bounds.check(getattr(self, name))))
+
+
+def sun_coordinates(moment: datetime) -> SunCoordinates:
+    """Compute the sun's coordinates by the low-precision formulae of the Astronomical Almanac (US Naval Observatory).
+
+    They are within 1 arc minute from 1800 to 2200.
+
+    Args:
+        moment: Date and time with a time zone.
+
+    Raises:
+        HeatError: It has no time zone.
+    """
+    days = _days(moment)
+    anomaly = math.radians(357.529 + 0.98560028 * days)
+    longitude = 280.459 + 0.98564736 * days + 1.915 * math.sin(anomaly) + 0.020 * math.sin(2.0 * anomaly)
+    along, obliquity = math.radians(longitude), math.radians(23.439 - 0.00000036 * days)
+    right_ascension = math.atan2(math.cos(obliquity) * math.sin(along), math.cos(along))
+    declination = math.asin(math.sin(obliquity) * math.sin(along))
+    distance = 1.00014 - 0.01671 * math.cos(anomaly) - 0.00014 * math.cos(2.0 * anomaly)
+    return SunCoordinates(math.degrees(right_ascension) % 360.0, math.degrees(declination), distance)
+
+
+def sun_position(moment: datetime, latitude_deg: float, longitude_deg: float) -> SunPosition:
+    """Compute where the sun stands, within 0.02 degrees from 1800 to 2200.
+
+    Args:
+        moment: Date and time with a time zone.
+        latitude_deg: North positive, [degrees], -90 to 90.
+        longitude_deg: East positive, [degrees], -180 to 180.
+
+    Raises:
+        HeatError: The moment has no time zone, or the place is out of range.
+
+    >>> noon = sun_position(datetime(2025, 6, 21, 12, 2, tzinfo=timezone.utc), 47.0, 0.0)
+    >>> round(noon.azimuth_deg), round(noon.elevation_deg, 1)
+    (180, 66.4)
+    """
+    latitude = math.radians(float(_LATITUDE.check(latitude_deg)))
+    longitude_deg = float(_LONGITUDE.check(longitude_deg))
+    sun = sun_coordinates(moment)
+    # Greenwich mean sidereal time (US Naval Observatory), in degrees.
+    sidereal = 280.460625 + 360.98564736578 * _days(moment)
+    hour = math.radians((sidereal + longitude_deg - sun.right_ascension_deg) % 360.0)
+    declination = math.radians(sun.declination_deg)
+    east = -math.cos(declination) * math.sin(hour)
+    north = math.sin(declination) * math.cos(latitude) - math.cos(declination) * math.cos(hour) * math.sin(latitude)
+    height = math.sin(declination) * math.sin(latitude) + math.cos(declination) * math.cos(hour) * math.cos(latitude)
+    azimuth = math.degrees(math.atan2(east, north)) % 360.0
+    return SunPosition(azimuth, math.degrees(math.atan2(height, math.hypot(east, north))), sun.distance_au)
+
+
+def towards_sun(position: SunPosition, up: Vector, north: Vector) -> Vector:
+    """Turn a position into a direction in the coordinates of a mesh.
+
+    Args:
+        position: Where the sun stands.
+        up: Direction that points up, of any length.
+        north: Direction that points north; its part along `up` is left out.
+
+    Returns:
+        Unit vector from the mesh to the sun.
+
+    Raises:
+        HeatError: `up` or `north` is no direction, or they are parallel.
+    """
+    upward, northward = _unit("up", up), _unit("north", north)
+    level = northward - (northward @ upward) * upward
+    if float(np.linalg.norm(level)) < 1e-6:
+        raise HeatError(
+            explain(
+                "north", expected="a direction other than up", got=list(north), remedy="Give north along the ground."
+            )
+        )
+    level /= np.linalg.norm(level)
+    azimuth, elevation = math.radians(position.azimuth_deg), math.radians(position.elevation_deg)
+    horizontal = math.cos(azimuth) * level + math.sin(azimuth) * np.cross(level, upward)
+    x, y, z = math.cos(elevation) * horizontal + math.sin(elevation) * upward
+    return float(x), float(y), float(z)
+
+
+def air_mass(elevation_deg: float) -> float:
+    """Length of the sunlight's way through the air, relative to the zenith (Kasten and Young 1989).
+
+    Args:
+        elevation_deg: Height of the sun, [degrees], 0 to 90.
+    """
+    return 1.0 / (math.sin(math.radians(elevation_deg)) + 0.50572 * (elevation_deg + 6.07995) ** -1.6364)
+
+
+def meinel_clear_sky(elevation_deg: float, distance_au: float = 1.0) -> Sunlight:
+    """Estimate the sunlight under a clear sky at sea level.
+
+    Direct: E0 * 0.7^(AM^0.678) with air mass AM (Meinel and Meinel 1976). Diffuse: E0 sin(h) (0.271 - 0.294 tau), tau
+    being the transmitted share of the direct light (Liu and Jordan 1960). Real clear days differ from it by a tenth.
+
+    Args:
+        elevation_deg: Height h of the sun, [degrees].
+        distance_au: Distance of the sun, [astronomical units].
+
+    Returns:
+        The sunlight; none if the sun is below the horizon.
+    """
+    if elevation_deg <= 0.0:
+        return Sunlight(0.0, 0.0)
+    above_air = SOLAR_CONSTANT_W_M2 / distance_au**2
+    transmitted = 0.7 ** (air_mass(elevation_deg) ** 0.678)
+    diffuse = above_air * math.sin(math.radians(elevation_deg)) * (0.271 - 0.294 * transmitted)
+    return Sunlight(above_air * transmitted, diffuse)
+
+
+def facet_irradiance(
+    normals: npt.NDArray[np.float64],
+    up: Vector,
+    towards: Vector,
+    sunlight: Sunlight,
+    ground_reflectance: float = 0.0,
+) -> npt.NDArray[np.float64]:
+    """Compute the sunlight that falls on facets.
+
+    Direct light by the cosine of its angle; diffuse light alike from all of the sky, by (1 + cos tilt) / 2; what the
+    ground reflects, alike to all sides, by (1 - cos tilt) / 2 (Liu and Jordan 1963).
+
+    Args:
+        normals: Outward unit normals, shape (k, 3).
+        up: Unit vector that points up.
+        towards: Unit vector that points to the sun.
+        sunlight: How strong it is.
+        ground_reflectance: Share of the sunlight that the ground reflects, 0 to 1.
+
+    Returns:
+        Irradiance, [W / m2] of the facet, shape (k,); 0 if the sun is below the horizon.
+    """
+    height = float(np.dot(up, towards))
+    if height <= 0.0:
+        return np.zeros(len(normals))
+    direct = sunlight.direct_w_m2 * np.maximum(normals @ np.array(towards), 0.0)
+    diffuse = sunlight.diffuse_w_m2 * sky_view(normals, up)
+    on_ground = sunlight.direct_w_m2 * height + sunlight.diffuse_w_m2
+    return direct + diffuse + ground_reflectance * on_ground * ground_view(normals, up)
+
+
+def fixed_sun(towards: Vector, sunlight: Sunlight, ground_reflectance: float = 0.0) -> Varying:
+    """Make the irradiance of facets by a sun that stands still, for `AbsorbedSolar.irradiance_w_m2`.
+
+    Args:
+        towards: Direction to the sun in the coordinates of the mesh, of any length.
+        sunlight: How strong it is.
+        ground_reflectance: Share of the sunlight that the ground reflects, 0 to 1.
+
+    Raises:
+        HeatError: The direction is none, or the reflectance is out of range.
+    """
+    x, y, z = (float(part) for part in _unit("towards", towards))
+    reflectance = float(_REFLECTANCE.check(ground_reflectance))
+    return Varying(
+        lambda places, _: facet_irradiance(places.normals, places.up, (x, y, z), sunlight, reflectance), in_time=False
+    )
+
+
+def moving_sun(
+    start: datetime,
+    latitude_deg: float,
+    longitude_deg: float,
+    north: Vector,
+    sunlight: Sunlight | None = None,
+    ground_reflectance: float = 0.0,
+) -> Varying:
+    """Make the irradiance of facets by the sun at a date and place, for `AbsorbedSolar.irradiance_w_m2`.
+
+    Args:
+        start: Date and time, with a time zone, of the time 0.
+        latitude_deg: North positive, [degrees], -90 to 90.
+        longitude_deg: East positive, [degrees], -180 to 180.
+        north: Direction that points north in the coordinates of the mesh.
+        sunlight: How strong it is as long as the sun is up; None: as `meinel_clear_sky` estimates.
+        ground_reflectance: Share of the sunlight that the ground reflects, 0 to 1.
+
+    Raises:
+        HeatError: The start has no time zone, the place is out of range, or north is no direction.
+    """
+    sun_position(start, latitude_deg, longitude_deg)
+    _unit("north", north)
+    reflectance = float(_REFLECTANCE.check(ground_reflectance))
+
+    def irradiance(places: Places, time_s: float) -> npt.NDArray[np.float64]:
+        position = sun_position(start + timedelta(seconds=time_s), latitude_deg, longitude_deg)
+        light = sunlight or meinel_clear_sky(position.elevation_deg, position.distance_au)
+        towards = towards_sun(position, places.up, north)
+        return facet_irradiance(places.normals, places.up, towards, light, reflectance)
+
+    return Varying(irradiance)
+
+
+def _days(moment: datetime) -> float:
+    """Days since noon of 1 January 2000."""
+    if moment.tzinfo is None or moment.utcoffset() is None:
+        raise HeatError(
+            explain(
+                "date and time",
+                expected="one with a time zone",
+                got=moment.isoformat(),
+                remedy=f"Write {moment.isoformat()}+01:00, for example, or Z at its end for universal time.",
+            )
+        )
+    return (moment - _EPOCH).total_seconds() / 86400.0
+
+
+def _unit(name: str, direction: Vector) -> npt.NDArray[np.float64]:
+    vector = np.asarray(direction, dtype=np.float64)
+    length = float(np.linalg.norm(vector))
+    if vector.shape != (3,) or not (math.isfinite(length) and length > 0.0):
+        remedy = "Give three numbers, such as [0, 1, 0]."
+        raise HeatError(explain(name, expected="a direction", got=vector.tolist(), remedy=remedy))
+    return vector / length

@@ -1,0 +1,275 @@
+"""The discrete heat equation: M dT/dt + (K + R) T = load + radiation(T), with some temperatures fixed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from thermoxels_ns.fem.account import Assembled
+from thermoxels_ns.fem.fixed_nodes import FixedNodes
+from thermoxels_ns.fem.forms import FixedForm, FluxForm, Form, RadiationForm, RobinForm, SourceForm
+from thermoxels_ns.fem.linear_space import LinearSpace
+from thermoxels_ns.fem.pieces import Pieces
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.sparsity import product_and_bound
+from thermoxels_ns.fem.terms import FluxTerm, RadiationTerm, RobinTerm, SourceTerm, Term
+
+Vector = npt.NDArray[np.float64]
+
+
+class HeatSystem:
+    """What schemes and the steady solver ask of a problem. Constant parts are assembled once, when first asked for.
+
+    Temperatures are held relative to `reference_c`, so that round-off is relative to their differences.
+    """
+
+    def __init__(self, problem: HeatProblem, *, lumped: bool = True, lumped_boundary: bool = True) -> None:
+        """Turn effects into terms, terms into forms, and assemble the stiffness.
+
+        Args:
+            problem: The body, its materials and the effects.
+            lumped: Lump the mass matrix.
+            lumped_boundary: Evaluate boundary exchange at the nodes.
+
+        Raises:
+            HeatError: An effect names what the mesh does not have.
+        """
+        self.problem = problem
+        self.assembled = Assembled()
+        start = problem.start_c
+        # The middle of the range, not the mean: exact for a uniform temperature.
+        self.reference_c: float = 0.5 * (float(start.min()) + float(start.max()))
+        """What temperatures are relative to, [degrees Celsius]."""
+        selection = Selection(problem.mesh, problem.up)
+        self._space = LinearSpace(selection, lumped=lumped, lumped_boundary=lumped_boundary)
+        self._robin: list[RobinForm] = []
+        self._loads: list[FluxForm | SourceForm] = []
+        self._radiation: list[RadiationForm] = []
+        fixed: list[FixedForm] = []
+        for label, effect in zip(effect_labels(problem), problem.effects):
+            for term in effect.terms(selection):
+                self._add(replace(term, effect=label), fixed)
+        self.fixed: FixedNodes = FixedNodes(fixed, self.num_nodes)
+        """Nodes whose temperature is given."""
+        with self.assembled.form("stiffness"):
+            self._stiffness = self._space.stiffness(problem.conductivity_w_mk)
+        self.pieces: Pieces = Pieces(self._stiffness)
+        """Connected pieces of the body."""
+        self.matrix_in_time: bool = any(form.matrix_in_time for form in self._robin)
+        """Whether the matrix of the linear part changes with time."""
+        self.nonlinear: bool = bool(self._radiation)
+        """Whether there is radiation."""
+        self._forms: tuple[Form, ...] = (*self._robin, *self._loads, *self._radiation)
+        self.groups: tuple[tuple[str, str], ...] = (
+            *((form.effect, group) for form in self._forms for group in form.groups),
+            *self.fixed.groups,
+        )
+        """Effect and patch or region of each heat flow of `group_heat_w`, then of each of the fixed nodes."""
+        self._mass: tuple[sparse.csr_matrix | None, Vector] | None = None
+        self._kept_exchange: sparse.csr_matrix | None = None
+        self._kept_load: Vector | None = None
+        self._fixed_rows: sparse.csr_matrix | None = None
+
+    @property
+    def num_nodes(self) -> int:
+        """Number of nodes."""
+        return self._space.num_nodes
+
+    @property
+    def nodal_mass_j_k(self) -> Vector:
+        """Row sums of the mass matrix, shape (n,), [J / K]."""
+        return self._masses()[1]
+
+    def mass_product(self, relative_k: Vector) -> Vector:
+        """M T, shape (n,), [J]."""
+        matrix, nodal = self._masses()
+        return nodal * relative_k if matrix is None else matrix @ relative_k
+
+    def exchange_matrix(self, time_s: float) -> sparse.csr_matrix | None:
+        """R, heat that convection takes from each node per kelvin, shape (n, n), [W / K]; None without convection."""
+        if self._kept_exchange is None:
+            self._kept_exchange = self._sum_of_exchange(False, 0.0)
+        if not self.matrix_in_time:
+            return self._kept_exchange
+        return _sum_of(self._kept_exchange, self._sum_of_exchange(True, time_s))
+
+    def matrix(self, time_s: float, step_s: float) -> sparse.csr_matrix:
+        """M / step + K + R, shape (n, n), [W / K]; without M for a step without end."""
+        exchange = self.exchange_matrix(time_s)
+        matrix = self._stiffness if exchange is None else sparse.csr_matrix(self._stiffness + exchange)
+        if np.isinf(step_s):
+            return matrix
+        mass, nodal = self._masses()
+        per_second = sparse.diags(nodal / step_s, format="csr") if mass is None else mass / step_s
+        return sparse.csr_matrix(matrix + per_second)
+
+    def held_w_k(self, time_s: float, step_s: float) -> Vector:
+        """Row sums of M / step + R, shape (n,), [W / K]: of the matrix too, because those of K are 0, but exact."""
+        held = self.nodal_mass_j_k / step_s if np.isfinite(step_s) else np.zeros(self.num_nodes)
+        exchange = self.exchange_matrix(time_s)
+        return held if exchange is None else held + exchange @ np.ones(self.num_nodes)
+
+    def load(self, time_s: float) -> Vector:
+        """Heat that does not depend on the temperature: R T_ambient, fluxes and sources, shape (n,), [W]."""
+        if self._kept_load is None:
+            self._kept_load = self._sum_of_loads(False, 0.0)
+        if not any(form.load_in_time for form in (*self._robin, *self._loads)):
+            return self._kept_load
+        return self._kept_load + self._sum_of_loads(True, time_s)
+
+    def radiation_load(self, relative_k: Vector, time_s: float) -> Vector:
+        """Heat radiated into the body, shape (n,), [W]."""
+        total = np.zeros(self.num_nodes)
+        for form in self._radiation:
+            with self.assembled.form("radiation"):
+                total += form.load(relative_k, time_s)
+        return total
+
+    def radiation_slope(self, relative_k: Vector, time_s: float) -> sparse.csr_matrix:
+        """Minus the exact derivative of `radiation_load`, shape (n, n), [W / K]."""
+        total = sparse.csr_matrix((self.num_nodes, self.num_nodes))
+        for form in self._radiation:
+            with self.assembled.form("radiation"):
+                total = sparse.csr_matrix(total + form.slope(relative_k, time_s))
+        return total
+
+    def exchanged_heat(self, relative_k: Vector, time_s: float) -> tuple[Vector, Vector]:
+        """Heat that flows into each node from outside the body, load - R T + radiation(T).
+
+        Returns:
+            heat: Shape (n,), [W].
+            bound: Sum of the sizes of all that was added up; round-off in `heat` is a few eps of it. Shape (n,), [W].
+        """
+        heat = self.load(time_s).copy()
+        bound = np.abs(heat)
+        exchange = self.exchange_matrix(time_s)
+        if exchange is not None:
+            lost, size = product_and_bound(exchange, relative_k)
+            heat -= lost
+            bound += size
+        if self.nonlinear:
+            heat += self.radiation_load(relative_k, time_s)
+            bound += self.radiation_magnitude(relative_k, time_s)
+        return heat, bound
+
+    def net_heat(self, relative_k: Vector, time_s: float) -> tuple[Vector, Vector]:
+        """Heat that flows into each node from outside and from its neighbours, `exchanged_heat` - K T.
+
+        What keeps fixed nodes fixed is not in it.
+
+        Returns:
+            heat: Shape (n,), [W].
+            bound: As in `exchanged_heat`.
+        """
+        heat, bound = self.exchanged_heat(relative_k, time_s)
+        conducted, size = self.conducted_heat(relative_k)
+        return heat - conducted, bound + size
+
+    def conducted_heat(self, relative_k: Vector) -> tuple[Vector, Vector]:
+        """Heat that flows from each node to its neighbours, K T, and its bound as in `exchanged_heat`."""
+        return product_and_bound(self._stiffness, relative_k)
+
+    def net_heat_at_fixed(self, relative_k: Vector, time_s: float) -> Vector:
+        """`net_heat` at the fixed nodes only, shape (d,), [W]."""
+        nodes = self.fixed.nodes
+        if len(nodes) == 0:
+            return np.zeros(0)
+        if self._fixed_rows is None:
+            self._fixed_rows = sparse.csr_matrix(self._stiffness[nodes])
+        return self.exchanged_heat(relative_k, time_s)[0][nodes] - self._fixed_rows @ relative_k
+
+    def radiation_magnitude(self, relative_k: Vector, time_s: float) -> Vector:
+        """Sum of the sizes of what `radiation_load` adds up, shape (n,), [W]."""
+        total = np.zeros(self.num_nodes)
+        for form in self._radiation:
+            total += form.magnitude(relative_k, time_s)
+        return total
+
+    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
+        """Heat flow into the body of each group but those of fixed nodes, [W]."""
+        return np.concatenate([np.zeros(0), *(form.group_heat_w(relative_k, time_s) for form in self._forms)])
+
+    def exchanging_pieces(self, time_s: float) -> npt.NDArray[np.bool_]:
+        """Mark the pieces whose temperature convection, radiation or fixed nodes hold, shape (p,)."""
+        marks = self.pieces.touched(self.fixed.nodes)
+        for form in (*self._robin, *self._radiation):
+            marks |= self.pieces.touched(form.exchanging_nodes(time_s))
+        return marks
+
+    def allowed_range_k(self, relative_k: Vector, times_s: tuple[float, ...]) -> tuple[float, float]:
+        """Range that temperatures cannot leave in a step: that of the start and of all surroundings at these times.
+
+        A source or flux opens it on the side that it pushes to.
+        """
+        low, high = float(relative_k.min()), float(relative_k.max())
+        for time_s in times_s:
+            ambients = [form.ambient_k(time_s) for form in self._robin]
+            ambients += [form.surroundings_k(time_s) for form in self._radiation]
+            ambients += [self.fixed.temperature_k(time_s)] if len(self.fixed.nodes) else []
+            for ambient in ambients:
+                low, high = min(low, float(ambient.min())), max(high, float(ambient.max()))
+            for form in self._loads:
+                cools, heats = form.signs(time_s)
+                low, high = -np.inf if cools else low, np.inf if heats else high
+        return low, high
+
+    def _add(self, term: Term, fixed: list[FixedForm]) -> None:
+        """Make the form of a term, unless it acts nowhere."""
+        if len(term.tets if isinstance(term, SourceTerm) else term.facets) == 0:
+            return
+        if isinstance(term, RobinTerm):
+            self._robin.append(RobinForm(term, self._space, self.reference_c))
+        elif isinstance(term, FluxTerm):
+            self._loads.append(FluxForm(term, self._space))
+        elif isinstance(term, SourceTerm):
+            self._loads.append(SourceForm(term, self._space))
+        elif isinstance(term, RadiationTerm):
+            self._radiation.append(RadiationForm(term, self._space, self.reference_c))
+        else:
+            with self.assembled.form("fixed"):
+                fixed.append(FixedForm(term, self._space, self.reference_c))
+
+    def _masses(self) -> tuple[sparse.csr_matrix | None, Vector]:
+        if self._mass is None:
+            with self.assembled.form("mass"):
+                self._mass = self._space.mass(self.problem.heat_capacity_j_m3k)
+        return self._mass
+
+    def _sum_of_exchange(self, in_time: bool, time_s: float) -> sparse.csr_matrix | None:
+        total: sparse.csr_matrix | None = None
+        for form in self._robin:
+            if form.matrix_in_time == in_time:
+                with self.assembled.form("robin"):
+                    total = _sum_of(total, form.robin_matrix(time_s))
+        return total
+
+    def _sum_of_loads(self, in_time: bool, time_s: float) -> Vector:
+        total = np.zeros(self.num_nodes)
+        for kind, form in self._kinds_of_loads():
+            if form.load_in_time == in_time:
+                with self.assembled.form(kind):
+                    total += form.load(time_s)
+        return total
+
+    def _kinds_of_loads(self) -> list[tuple[str, RobinForm | FluxForm | SourceForm]]:
+        kinds: list[tuple[str, RobinForm | FluxForm | SourceForm]] = [("robin", form) for form in self._robin]
+        return kinds + [("source" if isinstance(form, SourceForm) else "flux", form) for form in self._loads]
+
+
+def _sum_of(first: sparse.csr_matrix | None, second: sparse.csr_matrix | None) -> sparse.csr_matrix | None:
+    if first is None or second is None:
+        return second if first is None else first
+    return sparse.csr_matrix(first + second)
+
+
+def effect_labels(problem: HeatProblem) -> tuple[str, ...]:
+    """Names of a problem's effects for reports, all different: a second one of the same kind and place is numbered."""
+    labels: list[str] = []
+    for effect in problem.effects:
+        same = sum(label == effect.label or label.startswith(f"{effect.label} (") for label in labels)
+        labels.append(f"{effect.label} ({same + 1})" if same else effect.label)
+    return tuple(labels)

@@ -1,0 +1,195 @@
+"""Meshes as input files of CalculiX and Abaqus, with a heat transfer step that runs."""
+
+from __future__ import annotations
+
+import numbers
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.checks import check_positive, replace_when_done, writable_folder
+from thermoxels_ns.errors import HeatError, MeshError, explain
+from thermoxels_ns.mesh.facet_owners import facet_owners
+from thermoxels_ns.mesh.file_content import FileContent, check_suffix, file_content
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.units import ZERO_CELSIUS_K
+
+STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8
+"""Stefan-Boltzmann constant (CODATA 2018, exact to the digits given), [W / (m2 K4)]."""
+
+_FACE_OPPOSITE: npt.NDArray[np.int64] = np.array([3, 4, 2, 1], dtype=np.int64)
+"""Number of the face opposite each node: S1 has the nodes 1 2 3, S2 1 4 2, S3 2 4 3 and S4 3 4 1."""
+
+_LONGEST_NAME = 60
+_NUMBERS_PER_LINE = 16
+_CHUNK = 1 << 15
+# Fields are at most 20 characters.
+_REAL = "%.12E"
+
+
+@dataclass(frozen=True)
+class HeatStep:
+    """Conduction in a body of one material, insulated all round, in equal steps of time."""
+
+    conductivity_w_mk: float
+    """Thermal conductivity, [W / (m K)], above 0."""
+    density_kg_m3: float
+    """Mass density, [kg / m3], above 0."""
+    specific_heat_j_kgk: float
+    """Specific heat capacity, [J / (kg K)], above 0."""
+    steps: int
+    """Number of steps, at least 1."""
+    step_seconds: float
+    """Length of a step, [s], above 0."""
+
+    def __post_init__(self) -> None:
+        for field in ("conductivity_w_mk", "density_kg_m3", "specific_heat_j_kgk", "step_seconds"):
+            remedy = "Give it in the unit that its name ends in."
+            object.__setattr__(self, field, check_positive(field, getattr(self, field), remedy, HeatError))
+        whole = isinstance(self.steps, numbers.Integral) and not isinstance(self.steps, bool)
+        if not whole or self.steps < 1:
+            raise HeatError(
+                explain(
+                    "steps",
+                    expected="a whole number of at least 1",
+                    got=repr(self.steps),
+                    remedy="Pass 10, for example.",
+                )
+            )
+
+
+def write_inp(
+    path: Path | str, mesh: TetMesh, heat_step: HeatStep, *, temperature_c: npt.NDArray[np.floating] | None = None
+) -> None:
+    """Write a mesh as an input file of CalculiX and Abaqus that runs as it is: ``ccx NAME`` for ``NAME.inp``.
+
+    Metres, kilograms, seconds and degrees Celsius; absolute zero and the Stefan-Boltzmann constant are in the file,
+    so that radiation can be added. Node and tetrahedron k of the mesh have the number k + 1. In the file:
+
+    - ``NALL`` and ``EALL``: all nodes and all elements. The elements are called DC3D4, which Abaqus asks for in heat
+      transfer and CalculiX takes for C3D4.
+    - ``REGION-<name>``: elements of a region; ``MATERIAL-<name>``: its material, the same for all regions.
+    - ``PATCH-<name>``: nodes of a boundary patch, and under the same name its element faces as a surface.
+    - ``OBSERVED``: the nodes whose temperature was measured, if there are any.
+    - Initial temperatures, and a heat transfer step without boundary conditions that prints temperatures (``NT``).
+
+    Names are in capitals; what is neither letter, digit nor underscore becomes an underscore. Empty regions and
+    patches are left out, because an empty set stops a solver.
+
+    Args:
+        path: File to write, ending in .inp; its folder is made if need be.
+        mesh: The mesh.
+        heat_step: Material and times.
+        temperature_c: Temperatures at the start in place of the mesh's own, shape (n,), [degrees Celsius].
+
+    Raises:
+        MeshError: An array does not fit the mesh or is not finite, or two names become one.
+        OutputError: The file cannot be written.
+    """
+    path = check_suffix(path, ".inp")
+    content = file_content(mesh, temperature_c)
+    regions = _set_names("region_names", content.region_names)
+    patches = _set_names("boundary.patch_names", content.patch_names)
+    # All that can fail on a bad mesh comes before the file is opened.
+    owner, opposite = facet_owners(content.tets, content.facets)
+    writable_folder(path.parent)
+    with replace_when_done(path) as temporary, open(temporary, "w", encoding="ascii", newline="\n") as file:
+        file.write("*HEADING\nTetrahedral mesh with measured temperatures; metres, seconds, degrees Celsius\n")
+        file.writelines(_nodes_and_elements(content, mesh.observed, regions))
+        file.writelines(_surfaces(content, patches, owner, _FACE_OPPOSITE[opposite]))
+        file.writelines(_materials(content, regions, heat_step))
+        file.write("*INITIAL CONDITIONS, TYPE=TEMPERATURE\n")
+        numbers_from_1 = np.arange(1, len(content.points_m) + 1)
+        file.writelines(_rows(f"%d, {_REAL}\n", numbers_from_1, content.temperature_c))
+        file.write(_step(heat_step))
+
+
+def _set_names(name: str, names: Sequence[str]) -> list[str]:
+    """Names that every reader of .inp files takes."""
+    written = [re.sub(r"[^A-Za-z0-9_]+", "_", entry).upper() for entry in names]
+    if len(set(written)) != len(written) or max(map(len, written)) > _LONGEST_NAME:
+        raise MeshError(
+            explain(
+                name,
+                expected="names that differ in their letters and digits (capitals or not), of at most "
+                f"{_LONGEST_NAME} characters, as .inp files ask for",
+                got=list(names),
+                remedy="Rename them.",
+            )
+        )
+    return written
+
+
+def _parts(index: npt.NDArray[np.int64], names: Sequence[str]) -> Iterator[tuple[str, npt.NDArray[np.int64]]]:
+    """Name and members, rising, of every part that is not empty."""
+    for part, name in enumerate(names):
+        members = np.flatnonzero(index == part)
+        if len(members):
+            yield name, members
+
+
+def _rows(row: str, *columns: npt.NDArray) -> Iterator[str]:
+    """Text of a table, in chunks: Python formats many rows at once much faster than one by one."""
+    for start in range(0, len(columns[0]), _CHUNK):
+        chunk = [column[start : start + _CHUNK].tolist() for column in columns]
+        yield row * len(chunk[0]) % tuple(chain.from_iterable(zip(*chunk)))
+
+
+def _number_lines(values: npt.NDArray[np.int64]) -> Iterator[str]:
+    """Numbers of a set, 16 per line."""
+    full = len(values) // _NUMBERS_PER_LINE * _NUMBERS_PER_LINE
+    table = values[:full].reshape(-1, _NUMBERS_PER_LINE)
+    yield from _rows(", ".join(["%d"] * _NUMBERS_PER_LINE) + "\n", *table.T)
+    if full < len(values):
+        yield ", ".join(map(str, values[full:].tolist())) + "\n"
+
+
+def _nodes_and_elements(content: FileContent, observed: npt.NDArray[np.bool_], regions: Sequence[str]) -> Iterator[str]:
+    yield "*NODE, NSET=NALL\n"
+    yield from _rows(f"%d, {_REAL}, {_REAL}, {_REAL}\n", np.arange(1, len(content.points_m) + 1), *content.points_m.T)
+    used = list(_parts(content.region, regions))
+    for name, members in used:
+        yield f"*ELEMENT, TYPE=DC3D4, ELSET=REGION-{name}\n"
+        yield from _rows("%d, %d, %d, %d, %d\n", members + 1, *(content.tets[members] + 1).T)
+    yield "*ELSET, ELSET=EALL\n"
+    yield "".join(f"REGION-{name}\n" for name, _ in used)
+    if observed.any():
+        yield "*NSET, NSET=OBSERVED\n"
+        yield from _number_lines(np.flatnonzero(observed) + 1)
+
+
+def _surfaces(
+    content: FileContent, patches: Sequence[str], owner: npt.NDArray[np.int64], face: npt.NDArray[np.int64]
+) -> Iterator[str]:
+    for name, members in _parts(content.patch, patches):
+        yield f"*NSET, NSET=PATCH-{name}\n"
+        yield from _number_lines(np.unique(content.facets[members]) + 1)
+        yield f"*SURFACE, NAME=PATCH-{name}, TYPE=ELEMENT\n"
+        yield from _rows("%d, S%d\n", owner[members] + 1, face[members])
+
+
+def _materials(content: FileContent, regions: Sequence[str], step: HeatStep) -> Iterator[str]:
+    used = [name for name, _ in _parts(content.region, regions)]
+    yield f"*PHYSICAL CONSTANTS, ABSOLUTE ZERO={-ZERO_CELSIUS_K}, STEFAN BOLTZMANN={STEFAN_BOLTZMANN_W_M2K4:.9E}\n"
+    for name in used:
+        yield f"*MATERIAL, NAME=MATERIAL-{name}\n"
+        yield f"*DENSITY\n{_REAL}\n" % step.density_kg_m3
+        yield f"*CONDUCTIVITY\n{_REAL}\n" % step.conductivity_w_mk
+        yield f"*SPECIFIC HEAT\n{_REAL}\n" % step.specific_heat_j_kgk
+    for name in used:
+        yield f"*SOLID SECTION, ELSET=REGION-{name}, MATERIAL=MATERIAL-{name}\n"
+
+
+def _step(step: HeatStep) -> str:
+    """Equal steps: the shortest and the longest that the solver may take are the one asked for."""
+    length = _REAL % step.step_seconds
+    total = _REAL % (step.steps * step.step_seconds)
+    return (
+        f"*STEP, INC={step.steps}\n*HEAT TRANSFER\n{length}, {total}, {length}, {length}\n"
+        "*NODE PRINT, NSET=NALL\nNT\n*NODE FILE\nNT\n*END STEP\n"
+    )

@@ -1,0 +1,136 @@
+"""Which faces and edges a tetrahedral mesh has, and which tetrahedra share them.
+
+Rows of node numbers are matched in two stages, both linear in memory: a counting sort by the smallest node (turning a
+sparse row into columns), then a sort of the few rows that share it. On a million tetrahedra this is several times
+faster than one sort of all rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+IntArray = npt.NDArray[np.int64]
+
+OUTWARD_FACES: IntArray = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
+"""Faces of a positively oriented tetrahedron; face f lies opposite node f, its right-hand normal points outwards."""
+TET_EDGES: IntArray = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]], dtype=np.int64)
+"""Positions of a tetrahedron's nodes at the ends of its six edges, shape (6, 2)."""
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Rows put together by equality; group g is `order[start[g]:start[g + 1]]`, the last one ends with `order`."""
+
+    order: IntArray
+    """Row numbers, those of a group in a row; within a group in no particular order. Shape (rows,)."""
+    start: IntArray
+    """Where each group starts in `order`, shape (groups,); groups go by their first and then their second number."""
+
+    @property
+    def sizes(self) -> IntArray:
+        """Number of rows in each group, shape (groups,)."""
+        return np.diff(np.append(self.start, len(self.order)))
+
+    @property
+    def first(self) -> IntArray:
+        """Smallest row number of each group, shape (groups,)."""
+        return np.minimum.reduceat(self.order, self.start) if len(self.start) else self.start
+
+    @property
+    def of_row(self) -> IntArray:
+        """Number of the group that each row is in, shape (rows,)."""
+        group = np.empty(len(self.order), dtype=np.int64)
+        group[self.order] = np.repeat(np.arange(len(self.start)), self.sizes)
+        return group
+
+    def sums(self, values: npt.NDArray) -> npt.NDArray:
+        """Sum of a value per row over each group, shape (groups,)."""
+        return np.add.reduceat(values[self.order], self.start) if len(self.start) else values[:0]
+
+
+def group_pairs(first: IntArray, second: IntArray) -> Groups:
+    """Find the rows in which a pair of whole numbers of at least 0 is the same.
+
+    Args:
+        first: First numbers, shape (rows,); the work space grows with the largest of them.
+        second: Second numbers, below 2^63 - 1, shape (rows,).
+
+    >>> groups = group_pairs(np.array([5, 2, 5, 2]), np.array([1, 9, 1, 0]))
+    >>> groups.sizes, groups.first
+    (array([1, 1, 2]), array([3, 1, 0]))
+    """
+    rows = len(first)
+    if rows == 0:
+        empty = np.zeros(0, dtype=np.int64)
+        return Groups(empty, empty)
+    shape = (int(first.max()) + 1, int(second.max()) + 1)
+    by_first = sparse.csr_array((np.arange(rows), first, np.array([0, rows])), shape=(1, shape[0])).tocsc()
+    rows_by_first = np.asarray(by_first.data, dtype=np.int64)
+    starts = np.asarray(by_first.indptr, dtype=np.int64)
+    by_both = sparse.csr_array((rows_by_first, second[rows_by_first], starts), shape=shape)
+    by_both.sort_indices()
+    new = np.empty(rows, dtype=bool)
+    new[0] = True
+    np.not_equal(by_both.indices[1:], by_both.indices[:-1], out=new[1:])
+    new[starts[:-1][np.diff(starts) > 0]] = True
+    return Groups(np.asarray(by_both.data, dtype=np.int64), np.flatnonzero(new))
+
+
+def group_faces(tets: IntArray) -> Groups:
+    """Find the faces that tetrahedra share; row 4 t + f is the face of tetrahedron t opposite its node f."""
+    node = [np.ascontiguousarray(tets[:, n]) for n in range(4)]
+    s0, s1, s2, s3 = _sorted_four(node)
+    size = int(s3.max()) + 1 if len(tets) else 1
+    lowest, others = np.empty((len(tets), 4), dtype=np.int64), np.empty((len(tets), 4), dtype=np.int64)
+    for n, left_out in enumerate(node):
+        lowest[:, n] = np.where(left_out == s0, s1, s0)
+        others[:, n] = np.where(left_out <= s1, s2, s1) * size + np.where(left_out == s3, s2, s3)
+    return group_pairs(lowest.ravel(), others.ravel())
+
+
+def count_faces(tets: npt.NDArray[np.integer]) -> tuple[IntArray, IntArray]:
+    """All different triangles of a mesh, and how many tetrahedra own each.
+
+    Args:
+        tets: Node numbers of positively oriented tetrahedra, shape (t, 4).
+
+    Returns:
+        faces: Node numbers, shape (f, 3), oriented outwards from the first owner, ordered by their sorted node numbers.
+        uses: Number of owners, shape (f,); 1 on the boundary, 2 inside a conforming mesh.
+
+    >>> faces, uses = count_faces(np.array([[0, 1, 2, 3], [1, 3, 2, 4]]))
+    >>> faces[uses == 2], len(faces)
+    (array([[1, 2, 3]]), 7)
+    """
+    tets = np.asarray(tets, dtype=np.int64)
+    groups = group_faces(tets)
+    return faces_of_rows(tets, groups.first), groups.sizes
+
+
+def faces_of_rows(tets: IntArray, rows: IntArray) -> IntArray:
+    """Node numbers of faces numbered as in `group_faces`, outwards from the tetrahedron, shape (rows, 3)."""
+    return tets.ravel().take((rows & ~3)[:, None] + OUTWARD_FACES[rows & 3])
+
+
+def group_edges(tets: IntArray) -> Groups:
+    """Find the edges that tetrahedra share; row 6 t + e is edge `TET_EDGES[e]` of tetrahedron t."""
+    ends = [tets[:, TET_EDGES[:, side]] for side in range(2)]
+    return group_pairs(np.minimum(*ends).ravel(), np.maximum(*ends).ravel())
+
+
+def edges_of_rows(tets: IntArray, rows: IntArray) -> IntArray:
+    """Node numbers of the ends of edges numbered as in `group_edges`, shape (rows, 2)."""
+    tet, edge = np.divmod(rows, 6)
+    return tets[tet[:, None], TET_EDGES[edge]]
+
+
+def _sorted_four(values: list[IntArray]) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Sort four numbers element by element with five comparisons."""
+    a, b = np.minimum(values[0], values[1]), np.maximum(values[0], values[1])
+    c, d = np.minimum(values[2], values[3]), np.maximum(values[2], values[3])
+    m, n = np.maximum(a, c), np.minimum(b, d)
+    return np.minimum(a, c), np.minimum(m, n), np.maximum(m, n), np.maximum(b, d)

@@ -1,0 +1,138 @@
+"""What every file format writes of a mesh, checked once for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.checks import check_finite, check_shape
+from thermoxels_ns.errors import MeshError, OutputError, explain
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+UNTAGGED_PATCH = "boundary"
+"""Name of the one patch that a mesh without tags is written with."""
+
+_REMEDY = "Build the mesh with thermoxels_ns.mesh.build."
+
+
+@dataclass(frozen=True)
+class FileContent:
+    """A mesh's arrays with a temperature for every node and a name for every part."""
+
+    points_m: npt.NDArray[np.float64]
+    """Nodes, shape (n, 3), [m]."""
+    tets: npt.NDArray[np.int64]
+    """Node indices, shape (t, 4)."""
+    temperature_c: npt.NDArray[np.float64]
+    """Nodal temperature, shape (n,), [degrees Celsius]."""
+    region: npt.NDArray[np.int64]
+    """Index into `region_names`, shape (t,)."""
+    region_names: tuple[str, ...]
+    """Names of the regions, all different; some may have no tetrahedron."""
+    facets: npt.NDArray[np.int64]
+    """Boundary triangles, shape (f, 3), right-hand normals outwards."""
+    patch: npt.NDArray[np.int64]
+    """Index into `patch_names`, shape (f,)."""
+    patch_names: tuple[str, ...]
+    """Names of the patches, all different; some may have no triangle."""
+
+
+def file_content(mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None = None) -> FileContent:
+    """Check what is to be written; a mesh without boundary tags gets one patch, `UNTAGGED_PATCH`, of all triangles.
+
+    Args:
+        mesh: The mesh.
+        temperature_c: Temperatures to write in place of the mesh's own, shape (n,), [degrees Celsius].
+
+    Raises:
+        MeshError: An array has another shape than the mesh asks for, is not finite or points at what is not there,
+            or two parts have one name.
+    """
+    points = check_shape("points_m", np.asarray(mesh.points_m, dtype=np.float64), (None, 3), _REMEDY, MeshError)
+    check_finite("points_m", points, _REMEDY, MeshError)
+    tets = check_shape("tets", np.asarray(mesh.tets), (None, 4), _REMEDY, MeshError)
+    facets = check_shape("facets", np.asarray(mesh.facets), (None, 3), _REMEDY, MeshError)
+    check_shape("facet_tags", np.asarray(mesh.facet_tags), (len(facets),), _REMEDY, MeshError)
+    remedy = "Pass one finite value per mesh node."
+    temperature = np.asarray(mesh.temperature_c if temperature_c is None else temperature_c, dtype=np.float64)
+    check_shape("temperature_c", temperature, (len(points),), remedy, MeshError)
+    check_finite("temperature_c", temperature, remedy, MeshError)
+    check_shape("observed", np.asarray(mesh.observed), (len(points),), remedy, MeshError)
+    if mesh.colour is not None:
+        check_shape("colour", np.asarray(mesh.colour), (len(points), 3), remedy, MeshError)
+        check_finite("colour", np.asarray(mesh.colour), remedy, MeshError)
+    if not len(tets):
+        raise MeshError(explain("tets", expected="at least one tetrahedron", got="none", remedy=_REMEDY))
+    _check_indices("tets", tets, len(points))
+    _check_indices("facets", facets, len(points))
+
+    region = check_shape("region", np.asarray(mesh.region), (len(tets),), _REMEDY, MeshError)
+    _check_names("region_names", mesh.region_names)
+    _check_indices("region", region, len(mesh.region_names))
+    if mesh.boundary is None:
+        patch, patch_names = np.zeros(len(facets), dtype=np.int64), (UNTAGGED_PATCH,)
+    else:
+        patch, patch_names = np.asarray(mesh.boundary.patch), mesh.boundary.patch_names
+        check_shape("boundary.patch", patch, (len(facets),), _REMEDY, MeshError)
+        _check_names("boundary.patch_names", patch_names)
+        _check_indices("boundary.patch", patch, len(patch_names))
+    return FileContent(
+        points_m=points,
+        tets=tets,
+        temperature_c=temperature,
+        region=region,
+        region_names=tuple(mesh.region_names),
+        facets=facets,
+        patch=patch,
+        patch_names=tuple(patch_names),
+    )
+
+
+def check_suffix(path: Path | str, suffix: str) -> Path:
+    """Return `path` if its name ends in `suffix`, else raise `OutputError`."""
+    path = Path(path)
+    if path.suffix != suffix:
+        raise OutputError(
+            explain("mesh file", expected=f"a name that ends in {suffix}", got=path.name, remedy="Rename the file.")
+        )
+    return path
+
+
+def colour_bytes(colour: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
+    """Turn colours in [0, 1] into bytes; what is outside is clipped.
+
+    >>> colour_bytes(np.array([[0.0, 0.5, 1.2]])).tolist()
+    [[0, 128, 255]]
+    """
+    return np.floor(np.clip(colour, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def _check_indices(name: str, values: npt.NDArray, count: int) -> None:
+    if not np.issubdtype(values.dtype, np.integer) or (len(values) and (values.min() < 0 or values.max() >= count)):
+        got = f"{values.min()} to {values.max()}" if len(values) else "nothing"
+        raise MeshError(
+            explain(
+                name, expected=f"whole numbers from 0 to {count - 1}", got=f"{got} ({values.dtype})", remedy=_REMEDY
+            )
+        )
+
+
+def _check_names(name: str, names: Sequence[str]) -> None:
+    for entry in names:
+        if not (isinstance(entry, str) and entry.strip() and entry.isprintable() and '"' not in entry):
+            raise MeshError(
+                explain(
+                    name,
+                    expected="names of printable characters without a double quote",
+                    got=repr(entry),
+                    remedy="Rename it.",
+                )
+            )
+    if len(set(names)) != len(names) or not names:
+        raise MeshError(
+            explain(name, expected="at least one name, all different", got=list(names), remedy="Rename them.")
+        )

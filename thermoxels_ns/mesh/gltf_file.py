@@ -1,0 +1,144 @@
+"""The surface of a mesh as binary glTF (.glb), which browsers, phones and office programs show."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.checks import replace_when_done, writable_folder
+from thermoxels_ns.errors import MeshError, explain
+from thermoxels_ns.mesh.file_content import check_suffix, file_content
+from thermoxels_ns.mesh.surface import Colouring, surface_colours, surface_of, surface_range_c
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+_MAGIC, _VERSION, _JSON_CHUNK, _BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
+_UNSIGNED_SHORT, _UNSIGNED_INT, _FLOAT = 5123, 5125, 5126
+_VERTICES, _INDICES = 34962, 34963
+
+
+def write_glb(
+    path: Path | str,
+    mesh: TetMesh,
+    *,
+    temperature_c: npt.NDArray[np.floating] | None = None,
+    colouring: Colouring = "temperature",
+    up: Sequence[float] = (0.0, 0.0, 1.0),
+) -> None:
+    """Write the boundary as binary glTF 2.0 with a colour per node; lengths are metres.
+
+    glTF's up is +y: the file holds mesh coordinates and a rotation that turns `up` to it. Colours are stored as light
+    intensities (linear), as glTF asks for, and shown as they are, without lamps (``KHR_materials_unlit``), so that a
+    colour stands for one temperature. The vertex attribute ``_TEMPERATURE_C`` holds the temperatures themselves, and
+    the ends of the colour map are in the mesh's ``extras``.
+
+    Layout: glTF 2.0 specification, Khronos Group (ISO/IEC 12113:2022).
+
+    Args:
+        path: File to write, ending in .glb; its folder is made if need be.
+        mesh: The mesh.
+        temperature_c: Temperatures to show in place of the mesh's own, shape (n,), [degrees Celsius].
+        colouring: What the colours show.
+        up: Direction that points up, in mesh coordinates.
+
+    Raises:
+        MeshError: An array does not fit the mesh or is not finite, `up` is no direction, or the mesh has no colours
+            from photographs.
+        OutputError: The file cannot be written.
+    """
+    path = check_suffix(path, ".glb")
+    content = file_content(mesh, temperature_c)
+    surface = surface_of(content.points_m, content.facets)
+    if not len(surface.triangles):
+        raise MeshError(
+            explain("facets", expected="at least one triangle", got="none", remedy="Build the mesh with its boundary.")
+        )
+    rotation = _turn_to_y(up)
+    light = _linear(surface_colours(mesh, surface, content.temperature_c, colouring))
+    colours = np.full((len(light), 4), 65535, dtype="<u2")
+    colours[:, :3] = np.floor(light * 65535.0 + 0.5)
+    positions = surface.points_m.astype("<f4")
+    blocks = {
+        "POSITION": (positions, _FLOAT, "VEC3"),
+        "COLOR_0": (colours, _UNSIGNED_SHORT, "VEC4"),
+        "_TEMPERATURE_C": (content.temperature_c[surface.nodes].astype("<f4"), _FLOAT, "SCALAR"),
+        "indices": (surface.triangles.astype("<u4").reshape(-1), _UNSIGNED_INT, "SCALAR"),
+    }
+    views, accessors, data = [], [], b""
+    for number, (name, (values, kind, shape)) in enumerate(blocks.items()):
+        target = _INDICES if name == "indices" else _VERTICES
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": values.nbytes, "target": target})
+        accessors.append({"bufferView": number, "componentType": kind, "count": len(values), "type": shape})
+        data += values.tobytes()
+    # The specification asks for the bounds of positions as they are stored.
+    accessors[0] |= {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
+    accessors[1]["normalized"] = True
+
+    low, high = surface_range_c(surface, content.temperature_c)
+    attributes = {name: number for number, name in enumerate(blocks) if name != "indices"}
+    scene: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "thermoxels"},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "surface", "mesh": 0, "rotation": rotation}],
+        "meshes": [
+            {
+                "name": "surface",
+                "primitives": [{"attributes": attributes, "indices": len(attributes), "material": 0}],
+                "extras": {"colours": colouring, "lowest_c": low, "highest_c": high},
+            }
+        ],
+        "materials": [
+            {
+                "name": colouring,
+                "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
+                "extensions": {"KHR_materials_unlit": {}},
+            }
+        ],
+        "buffers": [{"byteLength": len(data)}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+    _write(path, json.dumps(scene, separators=(",", ":"), allow_nan=False).encode("ascii"), data)
+
+
+def _write(path: Path, text: bytes, data: bytes) -> None:
+    """Put both parts, filled up to multiples of 4 bytes, behind their headers."""
+    text += b" " * (-len(text) % 4)
+    data += b"\0" * (-len(data) % 4)
+    header = np.array([_MAGIC, _VERSION, 12 + 8 + len(text) + 8 + len(data)], dtype="<u4").tobytes()
+    writable_folder(path.parent)
+    with replace_when_done(path) as temporary, open(temporary, "wb") as file:
+        file.writelines([header, np.array([len(text), _JSON_CHUNK], dtype="<u4").tobytes(), text])
+        file.writelines([np.array([len(data), _BINARY_CHUNK], dtype="<u4").tobytes(), data])
+
+
+def _linear(colours: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Light intensity of screen colours (IEC 61966-2-1, sRGB), both in [0, 1]."""
+    return np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+
+
+def _turn_to_y(up: Sequence[float]) -> list[float]:
+    """Quaternion (x, y, z, w) of the smallest rotation that turns `up` to +y.
+
+    >>> [round(entry, 6) for entry in _turn_to_y((0.0, 0.0, 2.0))]
+    [-0.707107, 0.0, 0.0, 0.707107]
+    """
+    direction = np.asarray(up, dtype=np.float64)
+    length = float(np.linalg.norm(direction)) if direction.shape == (3,) else math.nan
+    if not (math.isfinite(length) and length > 0.0):
+        raise MeshError(
+            explain("up", expected="three finite numbers, not all 0", got=up, remedy="Pass for instance (0, 0, 1).")
+        )
+    x, y, z = map(float, direction)
+    # About up x y; about any level axis if up is +y or -y itself.
+    level = math.hypot(x, z)
+    axis_x, axis_z = (-z / level, x / level) if level > 0.0 else (1.0, 0.0)
+    half = 0.5 * math.atan2(level, y)
+    return [axis_x * math.sin(half), 0.0, axis_z * math.sin(half), math.cos(half)]

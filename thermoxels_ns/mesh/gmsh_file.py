@@ -1,0 +1,170 @@
+"""Meshes as Gmsh's .msh files with physical groups."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.checks import replace_when_done, writable_folder
+from thermoxels_ns.errors import MeshError, explain
+from thermoxels_ns.mesh.facet_owners import facet_owners
+from thermoxels_ns.mesh.file_content import FileContent, check_suffix, file_content
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+TEMPERATURE_VIEW = "temperature_c"
+"""Name of the view of nodal temperatures, [degrees Celsius]."""
+
+_LONGEST_NAME = 127
+_TRIANGLE, _TETRAHEDRON = 2, 4
+_SIZE, _INT, _DOUBLE = np.dtype("<u8"), np.dtype("<i4"), np.dtype("<f8")
+
+
+def write_msh(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.floating] | None = None) -> None:
+    """Write a mesh as a Gmsh file, MSH 4.1, binary, with one physical group per region and per patch.
+
+    Regions are physical volumes and patches are physical surfaces, both numbered from 1 in the order of their names;
+    one that is empty is left out. Nodal temperatures are a view, "temperature_c". Tetrahedron k of the mesh has the
+    tag k + 1, and the boundary triangles follow. Nodes are numbered anew: Gmsh wants them sorted by the patch or
+    region they lie on, and meshio takes a node's place in the file for its number.
+
+    Layout: "MSH file format", Gmsh reference manual, version 4.1 of the format.
+
+    Args:
+        path: File to write, ending in .msh; its folder is made if need be.
+        mesh: The mesh.
+        temperature_c: Temperatures to write in place of the mesh's own, shape (n,), [degrees Celsius].
+
+    Raises:
+        MeshError: An array does not fit the mesh or is not finite, or a name is longer than 127 bytes.
+        OutputError: The file cannot be written.
+    """
+    path = check_suffix(path, ".msh")
+    content = file_content(mesh, temperature_c)
+    for name in (*content.region_names, *content.patch_names):
+        if len(name.encode()) > _LONGEST_NAME:
+            raise MeshError(
+                explain(
+                    "name of a region or patch",
+                    expected=f"at most {_LONGEST_NAME} bytes, which is what Gmsh reads",
+                    got=f"{len(name.encode())} bytes: {name!r}",
+                    remedy="Rename it.",
+                )
+            )
+    # All that can fail on a bad mesh comes before the file is opened.
+    owner, _ = facet_owners(content.tets, content.facets)
+    blocks = _node_blocks(content)
+    order = np.concatenate([nodes for *_, nodes in blocks])
+    tag = np.empty_like(order)
+    tag[order] = np.arange(1, len(order) + 1)
+    writable_folder(path.parent)
+    with replace_when_done(path) as temporary, open(temporary, "wb") as file:
+        file.write(b"$MeshFormat\n4.1 1 8\n" + _ints(1) + b"\n$EndMeshFormat\n")
+        file.write(_physical_names(content))
+        for section, parts in (
+            ("Entities", _entities(content, owner)),
+            ("Nodes", _nodes(blocks, content)),
+            ("Elements", _elements(content, tag)),
+        ):
+            file.write(f"${section}\n".encode())
+            file.writelines(parts)
+            file.write(f"\n$End{section}\n".encode())
+        file.writelines(_node_data(content.temperature_c[order]))
+
+
+def _ints(*values: int) -> bytes:
+    return np.array(values, dtype=_INT).tobytes()
+
+
+def _sizes(*values: int) -> bytes:
+    return np.array(values, dtype=_SIZE).tobytes()
+
+
+def _used(index: npt.NDArray[np.int64]) -> list[int]:
+    """Numbers of the parts that are not empty."""
+    return np.flatnonzero(np.bincount(index)).tolist() if len(index) else []
+
+
+def _physical_names(content: FileContent) -> bytes:
+    lines = [f'2 {part + 1} "{content.patch_names[part]}"' for part in _used(content.patch)]
+    lines += [f'3 {part + 1} "{content.region_names[part]}"' for part in _used(content.region)]
+    return "\n".join(["$PhysicalNames", str(len(lines)), *lines, "$EndPhysicalNames", ""]).encode()
+
+
+def _bounds(content: FileContent, nodes: npt.NDArray[np.int64]) -> bytes:
+    points = content.points_m[nodes.ravel()]
+    return np.concatenate([points.min(axis=0), points.max(axis=0)]).astype(_DOUBLE).tobytes()
+
+
+def _entities(content: FileContent, owner: npt.NDArray[np.int64]) -> Iterator[bytes]:
+    """One surface per patch and one volume per region, each in the physical group of its own number."""
+    patches, regions = _used(content.patch), _used(content.region)
+    yield _sizes(0, 0, len(patches), len(regions))
+    for part in patches:
+        yield _ints(part + 1) + _bounds(content, content.facets[content.patch == part])
+        yield _sizes(1) + _ints(part + 1) + _sizes(0)
+    for part in regions:
+        around = _used(content.patch[content.region[owner] == part])
+        yield _ints(part + 1) + _bounds(content, content.tets[content.region == part])
+        yield _sizes(1) + _ints(part + 1) + _sizes(len(around)) + _ints(*(patch + 1 for patch in around))
+
+
+def _node_blocks(content: FileContent) -> list[tuple[int, int, npt.NDArray[np.int64]]]:
+    """Dimension, number and nodes of every entity that nodes lie on: the first patch that uses them, else the region.
+
+    Together the blocks hold every node once.
+    """
+    num_patches = len(content.patch_names)
+    regions = _used(content.region)
+    # A node in no tetrahedron goes with the first region.
+    entity = np.full(len(content.points_m), num_patches + regions[0])
+    for part in reversed(regions):
+        entity[content.tets[content.region == part]] = num_patches + part
+    for part in reversed(_used(content.patch)):
+        entity[content.facets[content.patch == part]] = part
+    blocks = []
+    for block in _used(entity):
+        dimension, part = (2, block) if block < num_patches else (3, block - num_patches)
+        blocks.append((dimension, part + 1, np.flatnonzero(entity == block)))
+    return blocks
+
+
+def _nodes(blocks: list[tuple[int, int, npt.NDArray[np.int64]]], content: FileContent) -> Iterator[bytes]:
+    count = len(content.points_m)
+    yield _sizes(len(blocks), count, 1, count)
+    first = 1
+    for dimension, tag, nodes in blocks:
+        yield _ints(dimension, tag, 0) + _sizes(len(nodes))
+        yield np.arange(first, first + len(nodes), dtype=_SIZE).tobytes()
+        yield content.points_m[nodes].astype(_DOUBLE).tobytes()
+        first += len(nodes)
+
+
+def _elements(content: FileContent, tag: npt.NDArray[np.int64]) -> Iterator[bytes]:
+    patches, regions = _used(content.patch), _used(content.region)
+    count = len(content.tets) + len(content.facets)
+    yield _sizes(len(patches) + len(regions), count, 1, count)
+    for dimension, kind, parts, cells, index, before in (
+        (2, _TRIANGLE, patches, content.facets, content.patch, len(content.tets)),
+        (3, _TETRAHEDRON, regions, content.tets, content.region, 0),
+    ):
+        for part in parts:
+            rows = np.flatnonzero(index == part)
+            yield _ints(dimension, part + 1, kind) + _sizes(len(rows))
+            table = np.empty((len(rows), 1 + cells.shape[1]), dtype=_SIZE)
+            table[:, 0] = rows + (before + 1)
+            table[:, 1:] = tag[cells[rows]]
+            yield table.tobytes()
+
+
+def _node_data(temperature_c: npt.NDArray[np.float64]) -> Iterator[bytes]:
+    """One view of temperatures in the order of the tags: name, time 0, then step 0, one component, number of nodes."""
+    count = len(temperature_c)
+    yield f'$NodeData\n1\n"{TEMPERATURE_VIEW}"\n1\n0.0\n3\n0\n1\n{count}\n'.encode()
+    table = np.empty(count, dtype=[("tag", _INT), ("value", _DOUBLE)])
+    table["tag"] = np.arange(1, count + 1)
+    table["value"] = temperature_c
+    yield table.tobytes()
+    yield b"\n$EndNodeData\n"

@@ -1,0 +1,137 @@
+"""Empty space that belongs to a solid: cavities, and what cameras cannot look into."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.mesh.free_space import look
+from thermoxels_ns.mesh.morphology import close_gaps, connected, convex_hull, face_connected
+from thermoxels_ns.snapshot import Views
+
+BoolArray = npt.NDArray[np.bool_]
+
+LARGEST_PASS = 4_000_000
+"""Lattices with more voxels than this are looked at in blocks of 2^3, 4^3, ... voxels."""
+
+
+@dataclass(frozen=True)
+class Interior:
+    """Empty voxels that lie inside a solid."""
+
+    enclosed: BoolArray
+    """Voxels of cavities: no way out through voxel faces, and no camera in them."""
+    hidden: BoolArray
+    """Other voxels that cameras cannot look into, within the convex hull of a body."""
+    rooms: int
+    """Cavities left empty because a camera stands in them."""
+
+
+def interior(cells: BoolArray, lattice: Lattice, views: Views | None, seal: int) -> Interior:
+    """Find the inside of bodies of which only a shell was reconstructed.
+
+    A body is what touches once openings are sealed. Its inside are cavities of the sealed shell and, if the cameras
+    are known, the space within its convex hull that they should see but do not, because the shell stands in front of
+    it (see `thermoxels_ns.mesh.free_space`). The hull bounds the shadow behind bodies seen from one side.
+
+    Args:
+        cells: Solid voxels, shape `lattice.cell_shape`.
+        lattice: Where they are.
+        views: The training cameras, if they are known.
+        seal: Openings up to twice this many voxels wide are no way out and cannot be looked through.
+
+    Returns:
+        The inside; none of it is in `cells`.
+    """
+    sealed = close_gaps(cells, seal)
+    enclosed, rooms = _enclosed(cells, sealed, lattice, views, seal)
+    if views is None or len(views.focal) == 0:
+        return Interior(enclosed, np.zeros_like(cells), rooms)
+    return Interior(enclosed, _hidden(sealed, lattice, views) & ~cells & ~enclosed, rooms)
+
+
+def _enclosed(
+    cells: BoolArray, sealed: BoolArray, lattice: Lattice, views: Views | None, seal: int
+) -> tuple[BoolArray, int]:
+    """Cavities without a camera, of the shell and of the sealed shell, and the number of those with one."""
+    everywhere = np.ones((3, 3, 3), dtype=bool)
+    cameras = _camera_voxels(cells, lattice, views)
+    # Sealing takes the alcoves and corridors of a cavity, where cameras may stand as well.
+    if seal and cameras.any():
+        cameras = np.asarray(ndimage.binary_dilation(cameras, everywhere, iterations=2 * seal, mask=~cells), dtype=bool)
+    cavity, room = _cavities(cells, cameras)
+    if seal:
+        wide, wide_room = _cavities(sealed, cameras)
+        room |= wide_room
+        if wide.any():
+            # It also rounds corners off and plugs openings; both belong to the cavity.
+            taken = wide | (sealed & ~cells)
+            wide = np.asarray(ndimage.binary_dilation(wide, everywhere, iterations=2 * seal, mask=taken), dtype=bool)
+        cavity = (cavity | wide) & ~room
+    return cavity, int(face_connected(room).max()) if room.any() else 0
+
+
+def _camera_voxels(cells: BoolArray, lattice: Lattice, views: Views | None) -> BoolArray:
+    cameras = np.zeros_like(cells)
+    if views is not None:
+        at = np.floor(lattice.world_to_index(views.camera_to_world[:, :, 3])).astype(np.int64)
+        cameras[tuple(at[np.all((at >= 0) & (at < cells.shape), axis=1)].T)] = True
+    return cameras
+
+
+def _cavities(shell: BoolArray, cameras: BoolArray) -> tuple[BoolArray, BoolArray]:
+    """Empty voxels without a way out through voxel faces, in cavities without a camera and with one."""
+    labels = face_connected(np.pad(~shell, 1, constant_values=True))
+    kept = np.ones(int(labels.max()) + 1, dtype=bool)
+    kept[[0, labels[0, 0, 0]]] = False
+    labels = labels[1:-1, 1:-1, 1:-1]
+    rooms = np.zeros_like(kept)
+    rooms[labels[cameras]] = True
+    rooms &= kept
+    return (kept & ~rooms)[labels], rooms[labels]
+
+
+def _hidden(sealed: BoolArray, lattice: Lattice, views: Views) -> BoolArray:
+    """Voxels that are not seen, within the convex hull of a body."""
+    block = 1
+    while sealed.size > LARGEST_PASS * block**3:
+        block *= 2
+    if block > 1:
+        return _hidden_in_blocks(sealed, lattice, views, block)
+    hull = _hulls(sealed)
+    return look(sealed, lattice, views).hidden & hull if hull.any() else hull
+
+
+def _hidden_in_blocks(sealed: BoolArray, lattice: Lattice, views: Views, block: int) -> BoolArray:
+    """The same, where a block of voxels has one answer."""
+    shape = sealed.shape
+    padded = np.pad(sealed, [(0, -n % block) for n in shape])
+    cx, cy, cz = (n // block for n in padded.shape)
+    coarse = padded.reshape(cx, block, cy, block, cz, block).any(axis=(1, 3, 5))
+    coarse_lattice = Lattice(lattice.lo, lattice.voxel_size * block, (cx + 1, cy + 1, cz + 1))
+    hidden = _hidden(coarse, coarse_lattice, views)
+
+    def fine(cells: BoolArray) -> BoolArray:
+        for axis in range(3):
+            cells = np.repeat(cells, block, axis=axis)
+        return cells[: shape[0], : shape[1], : shape[2]]
+
+    # A block that holds a piece of the shell has an inner and an outer side; its empty voxels go with what they touch.
+    seeds, partly = fine(hidden & ~coarse), fine(coarse) & ~sealed
+    touching = ndimage.generate_binary_structure(3, 1)
+    # In a corner of the shell the way is longest: across the block along all three axes.
+    inner = ndimage.binary_dilation(seeds, touching, iterations=3 * (block - 1), mask=partly)
+    return np.logical_or(seeds, inner)
+
+
+def _hulls(cells: BoolArray) -> BoolArray:
+    """Voxels within the convex hull of a body."""
+    labels = connected(cells)
+    hull = np.zeros_like(cells)
+    for number, box in enumerate(ndimage.find_objects(labels), start=1):
+        hull[box] |= convex_hull(labels[box] == number)
+    return hull

@@ -1,0 +1,118 @@
+"""Operations on sets of voxels: bodies, gaps, what is enclosed, convex hulls."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+from scipy.spatial import ConvexHull
+
+BoolArray = npt.NDArray[np.bool_]
+
+_PLANES_AT_A_TIME = 64
+
+
+def face_connected(cells: BoolArray) -> npt.NDArray[np.int32]:
+    """Number the bodies whose voxels touch by faces: 1, 2, ... in C order of their first voxel, 0 elsewhere."""
+    labels = np.zeros(cells.shape, dtype=np.int32)
+    ndimage.label(cells, output=labels)
+    return labels
+
+
+def connected(cells: BoolArray) -> npt.NDArray[np.int32]:
+    """Number the bodies whose voxels touch by faces, edges or corners, as `face_connected` does."""
+    labels = np.zeros(cells.shape, dtype=np.int32)
+    ndimage.label(cells, structure=np.ones((3, 3, 3)), output=labels)
+    return labels
+
+
+def grow(cells: BoolArray, by: int) -> BoolArray:
+    """Add all voxels that a cube of 2 `by` + 1 voxels around a solid one reaches.
+
+    >>> grow(np.array([[[False, False, False, True]]]), 2)[0, 0].tolist()
+    [False, True, True, True]
+    """
+    grown = cells
+    for axis in range(3):
+        grown = _spread(grown, axis, by)
+    return grown
+
+
+def close_gaps(cells: BoolArray, by: int) -> BoolArray:
+    """Fill what a cube of 2 `by` + 1 voxels, made of empty voxels, cannot reach; nothing solid goes.
+
+    >>> close_gaps(np.array([[[True, False, True]]]), 1)[0, 0].tolist()
+    [True, True, True]
+    """
+    if by == 0:
+        return cells
+    # Where the box cuts the scene, what is solid goes on behind it; far enough out all is as if it were solid.
+    grown = grow(np.pad(cells, by, mode="edge"), by)
+    closed = ~grow(~grown, by)
+    return np.logical_or(closed[by:-by, by:-by, by:-by], cells)
+
+
+def fill_enclosed(cells: BoolArray) -> BoolArray:
+    """Make solid all empty voxels that have no way to the outside of the box through voxel faces.
+
+    >>> cells = np.ones((3, 3, 3), dtype=bool)
+    >>> cells[1, 1, 1] = False
+    >>> bool(fill_enclosed(cells).all())
+    True
+    """
+    empty = np.pad(~np.asarray(cells, dtype=bool), 1, constant_values=True)
+    labels = face_connected(empty)
+    return (labels != labels[0, 0, 0])[1:-1, 1:-1, 1:-1]
+
+
+def convex_hull(cells: BoolArray) -> BoolArray:
+    """Find the voxels whose centres lie in the convex hull of the solid voxels (cubes, not just their centres).
+
+    The hull meets every column of voxels in one interval, so it costs one comparison per column and plane.
+    """
+    columns = np.argwhere(cells.any(axis=2))
+    if len(columns) == 0:
+        return np.zeros_like(cells)
+    column = cells[columns[:, 0], columns[:, 1]]
+    first = column.argmax(axis=1)
+    last = column.shape[1] - column[:, ::-1].argmax(axis=1)
+    steps = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
+    corners = np.concatenate(
+        [np.column_stack((columns + step, ends)) for step in steps for ends in (first, last)]
+    ).astype(np.float64)
+    planes = ConvexHull(corners).equations
+
+    nx, ny, nz = cells.shape
+    x, y = np.arange(nx)[:, None] + 0.5, np.arange(ny)[None, :] + 0.5
+    low, high = np.full((nx, ny), -np.inf), np.full((nx, ny), np.inf)
+    for start in range(0, len(planes), _PLANES_AT_A_TIME):
+        a, b, c, d = (v[:, None, None] for v in planes[start : start + _PLANES_AT_A_TIME].T)
+        # a x + b y + c z + d <= 0 inside; planes along the columns bound no z, but may leave a column out.
+        rest = a * x + b * y + d
+        upright = np.abs(c) < 1e-9
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = -rest / c
+        high = np.minimum(
+            high,
+            np.where(upright, np.where(rest > 1e-9, -np.inf, np.inf), z).min(
+                axis=0, where=(c > 0) | upright, initial=np.inf
+            ),
+        )
+        low = np.maximum(low, z.max(axis=0, where=(c < 0) & ~upright, initial=-np.inf))
+    centre = np.arange(nz) + 0.5
+    return (centre >= low[..., None] - 1e-9) & (centre <= high[..., None] + 1e-9)
+
+
+def _spread(cells: BoolArray, axis: int, by: int) -> BoolArray:
+    """Grow along one axis, by doubling steps."""
+    grown = cells.copy()
+    reach = 0
+    while reach < by:
+        step = min(reach + 1, by - reach)
+        near, far = [slice(None)] * 3, [slice(None)] * 3
+        near[axis], far[axis] = slice(step, None), slice(None, -step)
+        before = grown.copy()
+        grown[tuple(near)] |= before[tuple(far)]
+        grown[tuple(far)] |= before[tuple(near)]
+        reach += step
+    return grown

@@ -1,0 +1,193 @@
+"""Patches of boundary triangles and regions of tetrahedra: by where they face, and by a user's rules."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.checks import check_finite, check_shape
+from thermoxels_ns.errors import MeshError, explain
+from thermoxels_ns.mesh.patch_rules import DEFAULT_PATCHES, DEFAULT_REGION, FACINGS, PatchRules, Rule
+
+_COS_45 = math.sqrt(0.5) + 1e-9
+"""A little above the cosine of 45 degrees, so that a roof of exactly 45 degrees is a side whatever its rounding."""
+
+
+def facing(normals: npt.NDArray[np.float64], up: npt.ArrayLike) -> npt.NDArray[np.int64]:
+    """Where normals point: index into `FACINGS`.
+
+    Up is less than 45 degrees off the up direction, down more than 135 degrees, all else is side.
+
+    Args:
+        normals: Unit normals, shape (f, 3).
+        up: Up direction of any length above 0 in the same axes, shape (3,).
+
+    Returns:
+        0 up, 1 side, 2 down; shape (f,).
+
+    Raises:
+        MeshError: `up` is no direction.
+
+    >>> facing(np.array([[0, 0, 1.0], [1, 0, 0], [0, 0.6, -0.8]]), up=(0, 0, 2)).tolist()
+    [0, 1, 2]
+    """
+    direction = np.asarray(up, dtype=np.float64)
+    length = float(np.linalg.norm(direction))
+    if direction.shape != (3,) or not (math.isfinite(length) and length > 0.0):
+        raise MeshError(
+            explain(
+                "up",
+                expected="three numbers that are not all 0",
+                got=direction.tolist(),
+                remedy="Pass the direction away from the ground.",
+            )
+        )
+    cosine = np.asarray(normals) @ (direction / length)
+    return np.where(cosine > _COS_45, 0, np.where(cosine < -_COS_45, 2, 1)).astype(np.int64)
+
+
+def default_patches(
+    normals: npt.NDArray[np.float64],
+    up: npt.ArrayLike,
+    seen: npt.NDArray[np.bool_],
+    on_box: npt.NDArray[np.bool_],
+) -> tuple[npt.NDArray[np.int64], tuple[str, ...]]:
+    """Patches that need no rules: cut by the scene box, else exterior (seen) or interior, facing up, sideways or down.
+
+    Args:
+        normals: Outward unit normals of the true surface, shape (f, 3).
+        up: Up direction in the same axes.
+        seen: True where some camera sees the triangle, shape (f,).
+        on_box: True where the scene box cuts the solid, shape (f,).
+
+    Returns:
+        Index of each triangle's patch, shape (f,), and the names of all patches, `DEFAULT_PATCHES`.
+
+    Raises:
+        MeshError: `up` is no direction.
+    """
+    patch = np.where(seen, 0, len(FACINGS)) + facing(normals, up)
+    return np.where(on_box, DEFAULT_PATCHES.index("cut"), patch).astype(np.int64), DEFAULT_PATCHES
+
+
+def apply_patches(
+    rules: PatchRules,
+    *,
+    centroids_m: npt.NDArray[np.float64],
+    normals: npt.NDArray[np.float64],
+    up: npt.ArrayLike,
+    seen: npt.NDArray[np.bool_],
+    on_box: npt.NDArray[np.bool_],
+    colours: npt.NDArray | None = None,
+) -> tuple[npt.NDArray[np.int64], tuple[str, ...]]:
+    """Default patches with a user's rules over them.
+
+    Args:
+        rules: The user's rules; without any, the default patches come back.
+        centroids_m: Middle of each boundary triangle, shape (f, 3), [m].
+        normals: Outward unit normals of the true surface in the same axes, shape (f, 3).
+        up: Up direction in the same axes.
+        seen: True where some camera sees the triangle, shape (f,).
+        on_box: True where the scene box cuts the solid, shape (f,).
+        colours: Red, green, blue in [0, 1] of each triangle, shape (f, 3); None if not known.
+
+    Returns:
+        Index of each triangle's patch, shape (f,), and the names: the default ones, then the rules' in their order.
+
+    Raises:
+        MeshError: A rule asks for colours and there are none, `up` is no direction, or shapes do not fit.
+    """
+    patch, names = default_patches(normals, up, seen, on_box)
+    direction = facing(normals, up)
+    parts = {
+        "exterior": ~on_box & seen,
+        "interior": ~on_box & ~seen,
+        "cut": on_box,
+        "all": np.ones(len(patch), dtype=bool),
+    }
+    allowed = [
+        parts[rule.only] & (True if rule.facing == "any" else direction == FACINGS.index(rule.facing))
+        for rule in rules.patches
+    ]
+    return _apply(rules.patches, "patch", allowed, patch, names, centroids_m, colours)
+
+
+def apply_regions(
+    rules: PatchRules, tet_centroids: npt.NDArray[np.float64], tet_colours: npt.NDArray | None = None
+) -> tuple[npt.NDArray[np.int64], tuple[str, ...]]:
+    """Regions of tetrahedra by a user's rules; what no rule claims is region 0, "solid".
+
+    Args:
+        rules: The user's rules.
+        tet_centroids: Middle of each tetrahedron, shape (t, 3), [m].
+        tet_colours: Red, green, blue in [0, 1] of each tetrahedron, shape (t, 3); None if not known.
+
+    Returns:
+        Index of each tetrahedron's region, shape (t,), and the names of all regions.
+
+    Raises:
+        MeshError: A rule asks for colours and there are none, or shapes do not fit.
+    """
+    start = np.zeros(len(tet_centroids), dtype=np.int64)
+    allowed = [np.ones(len(start), dtype=bool)] * len(rules.regions)
+    return _apply(rules.regions, "region", allowed, start, (DEFAULT_REGION,), tet_centroids, tet_colours)
+
+
+def _apply(
+    rules: Sequence[Rule],
+    kind: str,
+    allowed: Sequence[npt.NDArray[np.bool_]],
+    start: npt.NDArray[np.int64],
+    names: tuple[str, ...],
+    centroids: npt.NDArray[np.float64],
+    colours: npt.NDArray | None,
+) -> tuple[npt.NDArray[np.int64], tuple[str, ...]]:
+    """Overwrite `start` rule by rule; `allowed` says for each rule where `only` and `facing` hold."""
+    remedy = f"Pass one centroid and one colour per element that gets a {kind}."
+    check_shape("centroids", centroids, (len(start), 3), remedy, MeshError)
+    check_finite("centroids", centroids, remedy, MeshError)
+    matches = [mask & _in_space(rule, centroids) for rule, mask in zip(rules, allowed)]
+
+    coloured = [number for number, rule in enumerate(rules) if rule.colour is not None]
+    if coloured:
+        if colours is None:
+            raise MeshError(
+                explain(
+                    f"{kind} {rules[coloured[0]].name}",
+                    expected="a mesh with colours, because its rule is by nearest_colour",
+                    got="a mesh without",
+                    remedy="Use box or plane, or a model that was trained on colour photographs.",
+                )
+            )
+        check_shape("colours", colours, (len(start), 3), remedy, MeshError)
+        closest = np.full(len(start), np.inf)
+        winner = np.full(len(start), -1)
+        for number in coloured:
+            rule = rules[number]
+            distance = np.linalg.norm(colours - rule.colour, axis=1)
+            wins = matches[number] & (distance <= rule.max_colour_distance) & (distance <= closest)
+            closest[wins], winner[wins] = distance[wins], number
+        for number in coloured:
+            matches[number] = winner == number
+
+    index = start.copy()
+    for rule, match in zip(rules, matches):
+        if rule.name not in names:
+            names = (*names, rule.name)
+        index[match] = names.index(rule.name)
+    return index, names
+
+
+def _in_space(rule: Rule, centroids: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Where a rule's box and plane hold, their borders included."""
+    inside = np.ones(len(centroids), dtype=bool)
+    if rule.box is not None:
+        lower, upper = rule.box
+        inside &= np.all((centroids >= lower) & (centroids <= upper), axis=1)
+    if rule.plane is not None:
+        point, normal = rule.plane
+        inside &= (centroids - point) @ np.array(normal) >= 0.0
+    return inside

@@ -1,0 +1,135 @@
+"""What a mesh should keep so that solvers and people can rely on it, each with the figure that says whether it does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+BoundaryMode = Literal["voxel", "conforming"]
+"""How the boundary was made: of voxel faces, or along the level set."""
+
+DIHEDRAL_BOUNDS_DEG: dict[BoundaryMode, tuple[float, float]] = {"voxel": (45.0, 90.0), "conforming": (10.7, 164.8)}
+"""Bounds of the angles between two faces of a tetrahedron, [degrees]: six equal tetrahedra per voxel have angles of 45,
+60 and 90 degrees; for isosurface stuffing see Labelle and Shewchuk (2007)."""
+ANGLE_TOLERANCE_DEG = 1e-6
+"""What rounding may add to an angle, [degrees]."""
+TEMPERATURE_TOLERANCE_K = 1e-6
+"""What rounding may add to a temperature, [K]."""
+
+
+@dataclass(frozen=True)
+class Promise:
+    """One thing that the mesher promises, and whether this mesh keeps it."""
+
+    name: str
+    """Short name, the same for every mesh."""
+    sentence: str
+    """What is promised."""
+    kept: bool
+    """Whether it holds."""
+    figure: float
+    """The number that decides."""
+    found: str
+    """The number in words."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What decides about the promises."""
+
+    min_volume_m3: float
+    """Smallest signed volume of a tetrahedron, [m^3]."""
+    num_non_positive: int
+    """Tetrahedra whose volume is not above 0."""
+    num_mismatches: int
+    """Faces with more than two owners, pairs of boundary triangles upon each other, and nodes at one place."""
+    num_open_edges: int
+    """Edges that the boundary's triangles do not pass equally often in both directions."""
+    num_wrong_facets: int
+    """Boundary triangles that are missing, too many or turned over."""
+    dihedral_range_deg: tuple[float, float]
+    """Smallest and largest angle between two faces of a tetrahedron, [degrees]."""
+    temperature_excess_k: float
+    """How far the hottest or coldest node lies outside the observed range, [K]; 0 or less if inside."""
+    share_obtuse: float
+    """Share of tetrahedra with an obtuse angle between two faces, 0 to 1."""
+    share_positive_edges: float
+    """Share of edges whose entry of the stiffness matrix is positive, 0 to 1."""
+    num_non_manifold: int
+    """Edges and vertices where the boundary touches itself."""
+
+
+def judge(evidence: Evidence, boundary_mode: BoundaryMode, length_unit: str = "m") -> tuple[Promise, ...]:
+    """Hold the promises of a boundary mode against the evidence; the unit of lengths is only named."""
+    smallest, largest = evidence.dihedral_range_deg
+    low, high = DIHEDRAL_BOUNDS_DEG[boundary_mode]
+    inside = min(smallest - low, high - largest)
+    open_or_wrong = evidence.num_open_edges + evidence.num_wrong_facets
+    excess = max(evidence.temperature_excess_k, 0.0)
+    return (
+        Promise(
+            "volumes_positive",
+            "Every tetrahedron has a volume above 0.",
+            evidence.num_non_positive == 0,
+            evidence.min_volume_m3,
+            f"{evidence.num_non_positive:,} at or below 0"
+            if evidence.num_non_positive
+            else f"smallest {evidence.min_volume_m3:.3g} {length_unit}³",
+        ),
+        Promise(
+            "conforming",
+            "Neighbours share whole faces: no crack, no face with three owners, no nodes at one place.",
+            evidence.num_mismatches == 0,
+            float(evidence.num_mismatches),
+            f"{evidence.num_mismatches:,} mismatches",
+        ),
+        Promise(
+            "boundary_closed",
+            "The boundary is closed: just the faces with one owner, normals outwards.",
+            open_or_wrong == 0,
+            float(open_or_wrong),
+            f"{evidence.num_open_edges:,} open edges, {evidence.num_wrong_facets:,} triangles wrong",
+        ),
+        Promise(
+            "dihedral_within_bounds",
+            f"Angles between two faces of a tetrahedron lie within {low:g} to {high:g} degrees.",
+            inside >= -ANGLE_TOLERANCE_DEG,
+            inside,
+            f"{smallest:.2f}° to {largest:.2f}°",
+        ),
+        Promise(
+            "temperatures_in_range",
+            "No node is colder than the coldest or hotter than the hottest observation.",
+            excess <= TEMPERATURE_TOLERANCE_K,
+            excess,
+            f"{excess:.2g} K outside" if excess > TEMPERATURE_TOLERANCE_K else "none outside",
+        ),
+        Promise(
+            "non_obtuse",
+            "No obtuse angle between faces: heat with lumped mass keeps the maximum principle.",
+            evidence.share_obtuse == 0.0,
+            evidence.share_obtuse,
+            f"{_percent(evidence.share_obtuse)} of tetrahedra obtuse",
+        ),
+        Promise(
+            "stiffness_monotone",
+            "No stiffness entry of an edge is positive: all that the maximum principle needs.",
+            evidence.share_positive_edges == 0.0,
+            evidence.share_positive_edges,
+            f"{_percent(evidence.share_positive_edges)} of edges positive",
+        ),
+        Promise(
+            "boundary_manifold",
+            "The boundary nowhere touches itself along an edge or at a point.",
+            evidence.num_non_manifold == 0,
+            float(evidence.num_non_manifold),
+            f"{evidence.num_non_manifold:,} edges and vertices",
+        ),
+    )
+
+
+def _percent(share: float) -> str:
+    """A share in percent that does not look like none, or all, unless it is."""
+    if share in (0.0, 1.0):
+        return f"{100 * share:.0f} %"
+    return "< 0.01 %" if share < 1e-4 else f"{min(100.0 * share, 99.99):.2f} %"

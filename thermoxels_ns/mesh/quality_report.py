@@ -1,0 +1,283 @@
+"""All figures of a mesh's quality in one report: shapes, sizes, how it hangs together, and which promises it keeps."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.errors import MeshError, explain
+from thermoxels_ns.mesh.face_count import IntArray, edges_of_rows, group_edges, group_faces
+from thermoxels_ns.mesh.promises import BoundaryMode, Evidence, Promise, judge
+from thermoxels_ns.mesh.quality import check_arrays, count_overlaps, count_twin_nodes, count_wrong_facets, facet_areas
+from thermoxels_ns.mesh.tet_shapes import shapes_in_chunks
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
+from thermoxels_ns.mesh.topology import (
+    SurfaceComponent,
+    count_bodies,
+    group_sides,
+    surface_topology,
+    tets_across_faces,
+)
+
+DIHEDRAL_BIN_DEG = 5.0
+"""Width of the bins of the dihedral angles, [degrees]; centred on 0, 5, ..., 180, as lattice tetrahedra have angles
+of 45, 60 and 90 degrees."""
+RATIO_BIN = 0.05
+"""Width of the bins of the radius ratio; 20 of them from 0 to 1, the last includes 1."""
+
+_MOST_COMPONENTS = 20
+_CANCELLED = 1e-9
+"""Sums over an edge below this share of their terms' sizes are 0."""
+
+
+@dataclass(frozen=True)
+class QualityReport:
+    """Figures of a mesh and the promises it keeps."""
+
+    boundary_mode: BoundaryMode
+    """How the boundary was made, by which the promises differ."""
+    length_unit: str
+    """Unit of the nodes' positions; if it is not "m", [m] below stands for it."""
+    num_nodes: int
+    """Nodes."""
+    num_tets: int
+    """Tetrahedra."""
+    num_edges: int
+    """Edges."""
+    num_facets: int
+    """Boundary triangles."""
+    num_box_facets: int
+    """Boundary triangles where the scene box cuts the solid."""
+    volume_m3: float
+    """Sum of the signed volumes, [m^3]."""
+    area_m2: float
+    """Sum of the boundary triangles' areas, [m^2]."""
+    true_area_m2: float | None
+    """Area of the surface that the boundary triangles stand for: each times its area factor, [m^2]; None for a mesh
+    whose boundary was not tagged."""
+    edge_length_m: tuple[float, float, float]
+    """Shortest, mean and longest edge, [m]."""
+    dihedral_range_deg: tuple[float, float]
+    """Smallest and largest angle between two faces of a tetrahedron, [degrees]."""
+    dihedral_counts: tuple[int, ...]
+    """Number of these angles, six per tetrahedron, in bins 5 degrees wide around 0, 5, ..., 180."""
+    radius_ratio_range: tuple[float, float]
+    """Smallest and largest of 3 r / R with the radii of the inscribed and the circumscribed sphere, 1 at best; 0 where
+    the volume is not above 0."""
+    radius_ratio_mean: float
+    """Mean radius ratio."""
+    radius_ratio_counts: tuple[int, ...]
+    """Number of tetrahedra by radius ratio in bins of 0.05 from 0 to 1; the last includes 1."""
+    share_obtuse: float
+    """Share of tetrahedra with an obtuse angle between two faces, 0 to 1."""
+    share_positive_edges: float
+    """Share of edges whose off-diagonal entry of the linear stiffness matrix, summed over the tetrahedra around the
+    edge at conductivity 1, is positive: there the discrete maximum principle can fail, 0 to 1."""
+    bodies_by_node: int
+    """Parts of the mesh that share no node."""
+    bodies_by_face: int
+    """Parts of the mesh between which no heat is conducted through a face: they share nodes or edges at most."""
+    euler_characteristic: int
+    """Vertices - edges + triangles of the boundary."""
+    genus: int | None
+    """Handles of all boundary components together; None if one of them is not a closed manifold."""
+    components: tuple[SurfaceComponent, ...]
+    """Boundary components (triangles that hang together by edges), largest first."""
+    num_non_manifold_edges: int
+    """Boundary edges with more than two boundary triangles."""
+    num_non_manifold_vertices: int
+    """Boundary vertices whose triangles are not one fan."""
+    promises: tuple[Promise, ...]
+    """What the mesher promises, and whether this mesh keeps it."""
+
+    @property
+    def num_cavities(self) -> int:
+        """Boundary components around a hole inside a body."""
+        return sum(component.is_cavity for component in self.components)
+
+    @property
+    def broken(self) -> tuple[str, ...]:
+        """Names of the promises that this mesh does not keep."""
+        return tuple(promise.name for promise in self.promises if not promise.kept)
+
+    def as_mapping(self) -> dict[str, Any]:
+        """The report as json can hold it; of the boundary's components the 20 largest are listed."""
+        mapping = asdict(self)
+        listed, promises = mapping.pop("components"), mapping.pop("promises")
+        bins = (("dihedral_counts", 0.0, DIHEDRAL_BIN_DEG), ("radius_ratio_counts", 0.5 * RATIO_BIN, RATIO_BIN))
+        for name, first, width in bins:
+            mapping[name] = {"first_centre": first, "bin_width": width, "counts": list(mapping[name])}
+        for name in ("dihedral_range_deg", "radius_ratio_range"):
+            mapping[name] = dict(zip(("min", "max"), mapping[name]))
+        mapping["edge_length_m"] = dict(zip(("min", "mean", "max"), mapping["edge_length_m"]))
+        mapping["num_components"] = len(self.components)
+        mapping["num_cavities"] = self.num_cavities
+        mapping["largest_components"] = list(listed[:_MOST_COMPONENTS])
+        mapping["promises"] = list(promises)
+        return mapping
+
+
+def quality_report(
+    mesh: TetMesh,
+    boundary_mode: BoundaryMode,
+    observed_range_c: tuple[float, float] | None = None,
+    length_unit: str = "m",
+) -> QualityReport:
+    """Measure a mesh and hold it against what the mesher promises. A broken promise is reported, it does not raise.
+
+    Args:
+        mesh: The mesh, damaged or not.
+        boundary_mode: How its boundary was made.
+        observed_range_c: Lowest and highest observed temperature, [degrees Celsius]; those of the mesh's observed nodes
+            if left out.
+        length_unit: Name of the unit of the nodes' positions.
+
+    Raises:
+        MeshError: The arrays do not fit each other or are not finite, the mode is unknown, or no node is observed and
+            no range is given.
+    """
+    if boundary_mode not in get_args(BoundaryMode):
+        modes = " or ".join(get_args(BoundaryMode))
+        raise MeshError(explain("boundary_mode", expected=modes, got=repr(boundary_mode), remedy="Pass one of these."))
+    check_arrays(mesh)
+    low_c, high_c = _observed_range(mesh, observed_range_c)
+    shapes = _measure_shapes(mesh)
+    edges = group_edges(mesh.tets)
+    ends = edges_of_rows(mesh.tets, edges.order[edges.start])
+    lengths = np.linalg.norm(mesh.points_m[ends[:, 0]] - mesh.points_m[ends[:, 1]], axis=1)
+    entries, sizes = edges.sums(shapes.stiffness), edges.sums(np.abs(shapes.stiffness))
+    share_positive = float(np.mean(entries > _CANCELLED * sizes))
+
+    faces = group_faces(mesh.tets)
+    sides = group_sides(mesh.facets)
+    surface = surface_topology(mesh.points_m, mesh.facets, sides)
+    genera = [component.genus for component in surface.components]
+    areas = facet_areas(mesh.points_m, mesh.facets)
+    overlaps = count_overlaps(mesh.points_m, mesh.facets, sides)
+    temperature = mesh.temperature_c
+    evidence = Evidence(
+        min_volume_m3=shapes.min_volume_m3,
+        num_non_positive=shapes.num_non_positive,
+        num_mismatches=int(np.count_nonzero(faces.sizes > 2)) + overlaps + count_twin_nodes(mesh.points_m),
+        num_open_edges=surface.num_open_edges,
+        num_wrong_facets=count_wrong_facets(mesh, faces),
+        dihedral_range_deg=shapes.dihedral_range_deg,
+        temperature_excess_k=float(max(low_c - temperature.min(), temperature.max() - high_c)),
+        share_obtuse=shapes.share_obtuse,
+        share_positive_edges=share_positive,
+        num_non_manifold=surface.num_non_manifold_edges + surface.num_non_manifold_vertices,
+    )
+    return QualityReport(
+        boundary_mode=boundary_mode,
+        length_unit=length_unit,
+        num_nodes=len(mesh.points_m),
+        num_tets=len(mesh.tets),
+        num_edges=len(ends),
+        num_facets=len(mesh.facets),
+        num_box_facets=int(np.count_nonzero(mesh.facet_tags == FACET_BOX)),
+        volume_m3=shapes.volume_m3,
+        area_m2=float(areas.sum()),
+        true_area_m2=None if mesh.boundary is None else float(areas @ mesh.boundary.area_factor),
+        edge_length_m=(float(lengths.min()), float(lengths.mean()), float(lengths.max())),
+        dihedral_range_deg=shapes.dihedral_range_deg,
+        dihedral_counts=tuple(shapes.dihedral_counts.tolist()),
+        radius_ratio_range=shapes.radius_ratio_range,
+        radius_ratio_mean=shapes.radius_ratio_mean,
+        radius_ratio_counts=tuple(shapes.radius_ratio_counts.tolist()),
+        share_obtuse=shapes.share_obtuse,
+        share_positive_edges=share_positive,
+        bodies_by_node=_bodies_by_node(mesh.tets, ends),
+        bodies_by_face=count_bodies(len(mesh.tets), tets_across_faces(faces)),
+        euler_characteristic=surface.euler_characteristic,
+        genus=None if None in genera else sum(genus for genus in genera if genus is not None),
+        components=surface.components,
+        num_non_manifold_edges=surface.num_non_manifold_edges,
+        num_non_manifold_vertices=surface.num_non_manifold_vertices,
+        promises=judge(evidence, boundary_mode, length_unit),
+    )
+
+
+@dataclass(frozen=True)
+class _Shapes:
+    """What one pass over the tetrahedra gives."""
+
+    volume_m3: float
+    min_volume_m3: float
+    num_non_positive: int
+    share_obtuse: float
+    dihedral_range_deg: tuple[float, float]
+    dihedral_counts: IntArray
+    radius_ratio_range: tuple[float, float]
+    radius_ratio_mean: float
+    radius_ratio_counts: IntArray
+    stiffness: npt.NDArray[np.float64]
+    """Rows as in `face_count.group_edges`, shape (6 t,)."""
+
+
+def _measure_shapes(mesh: TetMesh) -> _Shapes:
+    num = len(mesh.tets)
+    volumes, ratios, stiffness = np.empty(num), np.empty(num), np.empty((num, 6))
+    angle_counts = np.zeros(round(180.0 / DIHEDRAL_BIN_DEG) + 1, dtype=np.int64)
+    smallest, largest, obtuse = 180.0, 0.0, 0
+    for which, shapes in shapes_in_chunks(mesh.points_m, mesh.tets):
+        cosines = shapes.dihedral_cosines()
+        angles = np.degrees(np.arccos(cosines))
+        angle_counts += _histogram(angles.ravel() / DIHEDRAL_BIN_DEG + 0.5, len(angle_counts))
+        smallest, largest = min(smallest, float(angles.min())), max(largest, float(angles.max()))
+        obtuse += int(np.count_nonzero(cosines.min(axis=0) < 0.0))
+        volumes[which], ratios[which] = shapes.volumes, shapes.radius_ratios()
+        stiffness[which] = shapes.stiffness(cosines).T
+    return _Shapes(
+        volume_m3=float(volumes.sum()),
+        min_volume_m3=float(volumes.min()),
+        num_non_positive=int(np.count_nonzero(~(volumes > 0.0))),
+        share_obtuse=obtuse / num,
+        dihedral_range_deg=(smallest, largest),
+        dihedral_counts=angle_counts,
+        radius_ratio_range=(float(ratios.min()), float(ratios.max())),
+        radius_ratio_mean=float(ratios.mean()),
+        radius_ratio_counts=_histogram(ratios / RATIO_BIN, round(1.0 / RATIO_BIN)),
+        stiffness=stiffness.ravel(),
+    )
+
+
+def _histogram(bin_of: npt.NDArray[np.float64], bins: int) -> IntArray:
+    """Counts of numbers of at least 0 by their whole part; what lies beyond the last bin counts in it."""
+    return np.bincount(np.minimum(bin_of.astype(np.int64), bins - 1), minlength=bins)
+
+
+def _observed_range(mesh: TetMesh, given: tuple[float, float] | None) -> tuple[float, float]:
+    """Lowest and highest observed temperature, [degrees Celsius]."""
+    if given is not None:
+        low, high = (float(value) for value in given)
+        if not (np.isfinite([low, high]).all() and low <= high):
+            raise MeshError(
+                explain(
+                    "observed_range_c",
+                    expected="two finite temperatures, the lower one first",
+                    got=given,
+                    remedy="Pass the lowest and the highest observed temperature.",
+                )
+            )
+        return low, high
+    observed = mesh.temperature_c[np.asarray(mesh.observed, dtype=bool)]
+    if len(observed) == 0:
+        raise MeshError(
+            explain(
+                "mesh observed",
+                expected="at least one node that a thermal ray saw",
+                got="none",
+                remedy="Pass observed_range_c, the lowest and the highest observed temperature.",
+            )
+        )
+    return float(observed.min()), float(observed.max())
+
+
+def _bodies_by_node(tets: IntArray, edges: IntArray) -> int:
+    """Parts that share no node; nodes without a tetrahedron are no part."""
+    used = np.zeros(int(tets.max()) + 1, dtype=bool)
+    used[tets.ravel()] = True
+    return count_bodies(len(used), edges) - int(np.count_nonzero(~used))

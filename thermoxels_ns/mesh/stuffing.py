@@ -1,0 +1,216 @@
+"""Isosurface stuffing: tetrahedra that follow the zero level of a lattice of voxel centres."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.checks import check_finite, check_shape
+from thermoxels_ns.errors import MeshError, explain
+from thermoxels_ns.mesh.bcc_lattice import DIRECTIONS, BccLattice, bcc_lattice
+from thermoxels_ns.mesh.stuffing_stencils import (
+    BUNDLE_EDGES,
+    BUNDLE_POINTS,
+    CODE_WEIGHTS,
+    NUM_BUNDLE_NODES,
+    SIDES_OUTWARD,
+    stencil_table,
+)
+from thermoxels_ns.mesh.stuffing_warp import WarpedLattice, warp
+
+_CHUNK = 1 << 16
+
+
+@dataclass(frozen=True)
+class StuffedSolid:
+    """Tetrahedra that fill a solid up to its surface, in fractional corner indices of the voxel lattice."""
+
+    points: npt.NDArray[np.float64]
+    """Nodes, shape (n, 3), all different and all used; each coordinate is from 0 to the number of voxels."""
+    tets: npt.NDArray[np.int64]
+    """Node numbers, shape (t, 4), positively oriented."""
+    facets: npt.NDArray[np.int64]
+    """Boundary triangles, shape (f, 3), right-hand normal out of the solid."""
+    on_surface: npt.NDArray[np.bool_]
+    """True for nodes of boundary triangles, shape (n,)."""
+    on_box: npt.NDArray[np.bool_]
+    """True for boundary triangles on the border of the voxel lattice, exactly on its plane, shape (f,)."""
+
+
+def stuff(level: npt.NDArray[np.floating]) -> StuffedSolid:
+    """Fill the part of a voxel lattice where the level is above 0 with tetrahedra up to the zero level.
+
+    Isosurface stuffing (Labelle and Shewchuk 2007, ACM Transactions on Graphics 26(3), article 57) on a uniform
+    body-centred cubic lattice of one voxel. All dihedral angles are between 10.9 and 163.8 degrees, whatever the
+    levels are; where the solid is away from the surface they are 60 and 90.
+
+    The surface is exact in the second order of the voxel size where the level is linear over the voxels next to it.
+    Levels that stop at -1 and 1 should therefore not do so closer than 1.5 voxels to the surface: at 0.5 voxels the
+    area of a sphere comes out 1.5 % too large at every resolution, and 13 % with -1 and 1 alone. Sharp edges, those
+    where the surface meets the border included, become chamfers about half a voxel wide. Solid voxels that share a
+    face stay in one piece, and walls and gaps of one voxel get no holes.
+
+    Args:
+        level: Levels at the voxel centres, above 0 in solid voxels, shape (cx, cy, cz). Only their ratios matter.
+
+    Returns:
+        The mesh. Where solid voxels touch the border of the lattice, it ends on the border.
+
+    Raises:
+        MeshError: A level is NaN or infinite, or none is above 0.
+
+    >>> solid = stuff(np.ones((1, 1, 1)))
+    >>> len(solid.points), len(solid.tets), len(solid.facets), bool(solid.on_box.all())
+    (15, 24, 24, True)
+    """
+    level = _checked(level)
+    lattice = bcc_lattice(level)
+    warped = warp(lattice)
+    nodes = _number_nodes(lattice, warped)
+    parts = [_fill(bundles, warped.sign, nodes) for bundles in _solid_bundles(lattice, warped.sign)]
+    tets, facets = (np.concatenate(part).astype(np.int64) for part in zip(*parts))
+    on_surface = np.zeros(len(nodes.points), dtype=bool)
+    on_surface[facets] = True
+    return StuffedSolid(nodes.points, tets, facets, on_surface, _on_border(nodes.points, facets, level.shape))
+
+
+def _checked(level: npt.NDArray) -> npt.NDArray[np.floating]:
+    level = np.asarray(level)
+    if level.dtype not in (np.float32, np.float64):
+        level = level.astype(np.float64)
+    remedy = "Pass one level for every voxel of the lattice."
+    check_shape("level", level, (None, None, None), remedy, MeshError)
+    check_finite("level", level, remedy, MeshError)
+    if not np.any(level > 0.0):
+        raise MeshError(
+            explain("level", expected="solid voxels, with levels above 0", got="none", remedy="Lower the threshold.")
+        )
+    return level
+
+
+@dataclass(frozen=True)
+class _Nodes:
+    """The nodes: points inside that have cuts, other points inside, points on the surface, cuts."""
+
+    points: npt.NDArray[np.float64]
+    """Positions, shape (n, 3)."""
+    of_point: npt.NDArray[np.integer]
+    """Node number of every lattice point, -1 where it is no node."""
+    of_cut: npt.NDArray[np.integer]
+    """Node numbers of the cuts on the 14 edges of the first nodes, -1 where no cut is."""
+
+
+def _number_nodes(lattice: BccLattice, warped: WarpedLattice) -> _Nodes:
+    inner, sign = warped.inner, warped.sign
+    has_cut = np.zeros(len(sign), dtype=bool)
+    has_cut[warped.cut_points] = True
+    # A point on the surface is a node if one of its neighbours is inside: they share a tetrahedron.
+    touched = np.zeros(len(sign), dtype=bool)
+    for neighbour in lattice.each_neighbour(inner):
+        touched[neighbour[sign[neighbour] == 0]] = True
+    kept = np.concatenate([warped.cut_points, inner[~has_cut[inner]], np.flatnonzero(touched)])
+    row, direction = np.nonzero(np.isfinite(warped.cuts))
+
+    total = len(kept) + len(row)
+    integer = np.int32 if total < 2**31 else np.int64
+    of_point = np.full(len(sign), -1, dtype=integer)
+    of_point[kept] = np.arange(len(kept))
+    of_cut = np.full(warped.cuts.shape, -1, dtype=integer)
+    of_cut[row, direction] = np.arange(len(kept), total)
+
+    points = np.empty((total, 3))
+    points[: len(kept)] = lattice.positions(kept)
+    moved = touched[warped.moved]
+    points[of_point[warped.moved[moved]]] = warped.moved_to[moved]
+    points[len(kept) :] = points[row] + warped.cuts[row, direction, None] * DIRECTIONS[direction]
+    return _Nodes(points, of_point, of_cut)
+
+
+@dataclass(frozen=True)
+class _Bundles:
+    """Some of the voxel faces of one axis, each with the four lattice tetrahedra around it."""
+
+    points: npt.NDArray[np.int64]
+    """Flat lattice indices of the six points of each bundle, shape (6, b)."""
+    sides: npt.NDArray[np.int64]
+    """Flat steps from a centre to the one beyond each side of the face, shape (4,)."""
+    directions: npt.NDArray[np.int64]
+    """Lattice direction of each edge of a bundle, there and back, shape (13, 2)."""
+
+
+def _solid_bundles(lattice: BccLattice, sign: npt.NDArray[np.int8]) -> Iterator[_Bundles]:
+    """All bundles with a point inside the solid, a chunk at a time."""
+    inner = sign > 0
+    first, second = np.array(BUNDLE_EDGES).T
+    for axis in range(3):
+        # Bundles are written for the x axis; x, y, z turn into the axes from here on in their order.
+        strides = np.roll(lattice.strides, -axis)
+        corners = np.where(BUNDLE_POINTS[2:] > 0.0, 0, -1) @ strides + lattice.num_centres
+        offsets = np.concatenate([[0, strides[0]], corners])
+        steps = np.roll(BUNDLE_POINTS[second] - BUNDLE_POINTS[first], axis, axis=1)
+        ways = np.stack([steps, -steps], axis=1)
+        directions = np.argmin(np.abs(ways[:, :, None, :] - DIRECTIONS).max(axis=-1), axis=-1)
+
+        # Where a step leaves a row, a layer or a block it ends in the padding, where nothing is inside.
+        active = np.zeros(lattice.num_centres, dtype=bool)
+        for offset in offsets:
+            active |= inner[offset : offset + len(active)]
+        below = np.flatnonzero(active)
+        for start in range(0, len(below), _CHUNK):
+            yield _Bundles(below[start : start + _CHUNK] + offsets[:, None], SIDES_OUTWARD @ strides, directions)
+
+
+def _fill(
+    bundles: _Bundles, sign: npt.NDArray[np.int8], nodes: _Nodes
+) -> tuple[npt.NDArray[np.integer], npt.NDArray[np.integer]]:
+    """Tetrahedra and boundary triangles in the bundles."""
+    table = stencil_table()
+    count = bundles.points.shape[1]
+    signs = sign[bundles.points]
+    code = CODE_WEIGHTS @ (signs + np.int16(1))
+
+    number = np.empty((NUM_BUNDLE_NODES, count), dtype=nodes.of_point.dtype)
+    number[:6] = nodes.of_point[bundles.points]
+    for edge, (a, b) in enumerate(BUNDLE_EDGES):
+        cut = np.flatnonzero(signs[a] * signs[b] < 0)
+        from_a = signs[a, cut] > 0
+        row = np.where(from_a, number[a, cut], number[b, cut])
+        number[6 + edge, cut] = nodes.of_cut[row, np.where(from_a, *bundles.directions[edge])]
+    number = number.reshape(-1)
+
+    bundle, row = _rows(table.tet_start, code)
+    tets = number[table.tets[row] * count + bundle[:, None]]
+
+    bundle, row = _rows(table.facet_start, code)
+    behind = table.facet_behind[row]
+    asks = np.flatnonzero(behind >= 0)
+    centre, side = np.divmod(behind[asks], 4)
+    beyond = bundles.points[centre, bundle[asks]] + bundles.sides[side]
+    keep = np.ones(len(row), dtype=bool)
+    keep[asks] = sign[beyond] <= 0
+    facets = number[table.facets[row[keep]] * count + bundle[keep, None]]
+    return tets, facets
+
+
+def _rows(
+    start: npt.NDArray[np.int64], code: npt.NDArray[np.int16]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Bundle and table row of everything that the codes of the bundles call for."""
+    counts = start[code + 1] - start[code]
+    bundle = np.repeat(np.arange(len(code)), counts)
+    shift = start[code] + counts - np.cumsum(counts)
+    return bundle, np.arange(len(bundle)) + shift[bundle]
+
+
+def _on_border(
+    points: npt.NDArray[np.float64], facets: npt.NDArray[np.int64], shape: tuple[int, ...]
+) -> npt.NDArray[np.bool_]:
+    """True for triangles with all nodes on the same side of the box."""
+    planes = np.zeros(len(points), dtype=np.uint8)
+    for axis in range(3):
+        planes |= (points[:, axis] == 0.0).astype(np.uint8) << (2 * axis)
+        planes |= (points[:, axis] == shape[axis]).astype(np.uint8) << (2 * axis + 1)
+    return np.bitwise_and.reduce(planes[facets], axis=1) != 0

@@ -1,0 +1,107 @@
+"""The surface of a mesh as .stl (shape only) and .ply (shape, colours and temperatures)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.checks import replace_when_done, writable_folder
+from thermoxels_ns.mesh.file_content import check_suffix, colour_bytes, file_content
+from thermoxels_ns.mesh.quality import facet_area_vectors
+from thermoxels_ns.mesh.surface import COLOUR_MAP, Colouring, surface_colours, surface_of, surface_range_c
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+_STL_HEADER = b"Surface of a tetrahedral mesh, metres".ljust(80)
+_STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+def write_stl(path: Path | str, mesh: TetMesh) -> None:
+    """Write the boundary triangles as binary STL, which knows nothing but shapes; lengths are metres.
+
+    Args:
+        path: File to write, ending in .stl; its folder is made if need be.
+        mesh: The mesh.
+
+    Raises:
+        MeshError: An array does not fit the mesh or is not finite.
+        OutputError: The file cannot be written.
+    """
+    path = check_suffix(path, ".stl")
+    content = file_content(mesh)
+    vectors = facet_area_vectors(content.points_m, content.facets)
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    triangles = np.zeros(len(content.facets), dtype=_STL_TRIANGLE)
+    triangles["normal"] = vectors / np.where(lengths > 0.0, lengths, 1.0)
+    triangles["corners"] = content.points_m[content.facets]
+    _write(path, _STL_HEADER, np.uint32(len(triangles)).astype("<u4").tobytes(), triangles.tobytes())
+
+
+def write_ply(
+    path: Path | str,
+    mesh: TetMesh,
+    *,
+    temperature_c: npt.NDArray[np.floating] | None = None,
+    colouring: Colouring | None = None,
+) -> None:
+    """Write the boundary as binary PLY with colours and temperatures (read by MeshLab, CloudCompare, Blender).
+
+    Vertex properties: x, y, z [m], red, green, blue, `temperature_c` [degrees Celsius] and `observed` (1: measured,
+    0: extended). A comment says what the colours show.
+
+    Args:
+        path: File to write, ending in .ply; its folder is made if need be.
+        mesh: The mesh.
+        temperature_c: Temperatures to write in place of the mesh's own, shape (n,), [degrees Celsius].
+        colouring: What the colours show; None: the photographs if the mesh has their colours, else temperatures.
+
+    Raises:
+        MeshError: An array does not fit the mesh or is not finite, or the mesh has no colours from photographs.
+        OutputError: The file cannot be written.
+    """
+    path = check_suffix(path, ".ply")
+    content = file_content(mesh, temperature_c)
+    surface = surface_of(content.points_m, content.facets)
+    if colouring is None:
+        colouring = "temperature" if mesh.colour is None else "photographs"
+    colours = colour_bytes(surface_colours(mesh, surface, content.temperature_c, colouring))
+    columns = {
+        "x": ("double", "<f8", surface.points_m[:, 0]),
+        "y": ("double", "<f8", surface.points_m[:, 1]),
+        "z": ("double", "<f8", surface.points_m[:, 2]),
+        "red": ("uchar", "u1", colours[:, 0]),
+        "green": ("uchar", "u1", colours[:, 1]),
+        "blue": ("uchar", "u1", colours[:, 2]),
+        "temperature_c": ("float", "<f4", content.temperature_c[surface.nodes]),
+        "observed": ("uchar", "u1", mesh.observed[surface.nodes]),
+    }
+    vertices = np.empty(len(surface.nodes), dtype=[(name, kind) for name, (_, kind, _) in columns.items()])
+    for name, (_, _, values) in columns.items():
+        vertices[name] = values
+    faces = np.empty(len(surface.triangles), dtype=[("count", "u1"), ("nodes", "<i4", 3)])
+    faces["count"] = 3
+    faces["nodes"] = surface.triangles
+
+    low, high = surface_range_c(surface, content.temperature_c)
+    shown = (
+        "photographs" if colouring == "photographs" else f"{COLOUR_MAP} from {low:.6g} to {high:.6g} degrees Celsius"
+    )
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment surface of a tetrahedral mesh, metres",
+        f"comment colours: {shown}",
+        f"element vertex {len(vertices)}",
+        *(f"property {kind} {name}" for name, (kind, _, _) in columns.items()),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header\n",
+    ]
+    _write(path, "\n".join(header).encode("ascii"), vertices.tobytes(), faces.tobytes())
+
+
+def _write(path: Path, *parts: bytes) -> None:
+    writable_folder(path.parent)
+    with replace_when_done(path) as temporary, open(temporary, "wb") as file:
+        file.writelines(parts)

@@ -1,0 +1,126 @@
+"""Shapes of tetrahedra: volumes, angles between faces, radius ratios and what they add to the stiffness matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+_CHUNK = 1 << 14
+"""Tetrahedra at a time: what is worked on stays in the processor's cache."""
+_FACE_PAIRS = ((2, 3), (1, 3), (1, 2), (0, 3), (0, 2), (0, 1))
+"""Faces (by the node opposite) that meet in edge e of `face_count.TET_EDGES`."""
+_RIGHT_ANGLE = 1e-9
+"""Cosines below this are those of a right angle, up to rounding."""
+
+
+@dataclass(frozen=True)
+class TetShapes:
+    """Tetrahedra in the form from which all figures of their shape follow, one column per tetrahedron."""
+
+    sides: tuple[FloatArray, FloatArray, FloatArray]
+    """Vectors from node 0 to nodes 1, 2 and 3, each of shape (3, t), [m]."""
+    normals: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+    """Inward normal of the face opposite each node, twice the face's area long, each of shape (3, t), [m^2]."""
+    six_volumes: FloatArray
+    """Six times the signed volume, shape (t,), [m^3]."""
+
+    @property
+    def volumes(self) -> FloatArray:
+        """Signed volumes, negative if a tetrahedron is turned over, shape (t,), [m^3]."""
+        return self.six_volumes / 6.0
+
+    def dihedral_cosines(self) -> FloatArray:
+        """Cosines of the inner angles between two faces, shape (6, t), at the edges of `face_count.TET_EDGES`.
+
+        The angle at a face without area counts as 0 degrees; those of right angles are exactly 0.
+        """
+        lengths = [np.sqrt(_dot(normal, normal)) for normal in self.normals]
+        cosines = np.empty((6, len(self.six_volumes)))
+        for edge, (i, j) in enumerate(_FACE_PAIRS):
+            scale = lengths[i] * lengths[j]
+            cosine = np.divide(-_dot(self.normals[i], self.normals[j]), scale, out=cosines[edge], where=scale > 0.0)
+            cosine[scale == 0.0] = 1.0
+        cosines[np.abs(cosines) < _RIGHT_ANGLE] = 0.0
+        return np.clip(cosines, -1.0, 1.0, out=cosines)
+
+    def radius_ratios(self) -> FloatArray:
+        """Three times the radius of the inscribed over that of the circumscribed sphere, shape (t,).
+
+        1 for the regular tetrahedron, towards 0 for a degenerate one; 0 where the volume is not above 0. The radii are
+        r = 3 V / A and R = | |a|^2 b x c + |b|^2 c x a + |c|^2 a x b | / (12 V), with sides a, b, c and area A.
+        """
+        double_areas = np.sum([np.sqrt(_dot(normal, normal)) for normal in self.normals], axis=0)
+        centre = np.sum([_dot(side, side) * normal for side, normal in zip(self.sides, self.normals[1:])], axis=0)
+        scale = double_areas * np.sqrt(_dot(centre, centre))
+        ratios = np.zeros_like(self.six_volumes)
+        np.divide(6.0 * self.six_volumes**2, scale, out=ratios, where=(self.six_volumes > 0.0) & (scale > 0.0))
+        return np.minimum(ratios, 1.0, out=ratios)
+
+    def stiffness(self, cosines: FloatArray) -> FloatArray:
+        """What each tetrahedron adds to the stiffness of its edges at conductivity 1, shape (6, t), [m].
+
+        V grad(lambda_i) . grad(lambda_j) = n_i . n_j / (36 V) for the linear element, which is the cotangent of the
+        angle at the opposite edge times minus a sixth of that edge's length. Positive where that angle is obtuse; 0
+        where the volume is.
+
+        Args:
+            cosines: What `dihedral_cosines` returned.
+        """
+        entries = np.empty_like(cosines)
+        weight = np.zeros_like(self.six_volumes)
+        np.divide(1.0, 6.0 * self.six_volumes, out=weight, where=self.six_volumes != 0.0)
+        # Nodes i and j lie opposite the two faces that meet in the opposite edge, 5 - e.
+        for edge, (i, j) in enumerate(reversed(_FACE_PAIRS)):
+            np.multiply(_dot(self.normals[i], self.normals[j]), weight, out=entries[edge])
+        entries[cosines[::-1] == 0.0] = 0.0
+        return entries
+
+
+def shapes_in_chunks(points: FloatArray, tets: npt.NDArray[np.int64]) -> Iterator[tuple[slice, TetShapes]]:
+    """Go through tetrahedra a chunk at a time, so that memory does not grow with their number.
+
+    Args:
+        points: Nodes, shape (n, 3), [m].
+        tets: Node numbers, shape (t, 4).
+
+    Yields:
+        Which tetrahedra, and their shapes.
+    """
+    columns = np.ascontiguousarray(np.asarray(points, dtype=np.float64).T)
+    for start in range(0, len(tets), _CHUNK):
+        which = slice(start, min(start + _CHUNK, len(tets)))
+        nodes = np.ascontiguousarray(tets[which].T)
+        origin = columns.take(nodes[0], axis=1)
+        a, b, c = (columns.take(nodes[n], axis=1) - origin for n in (1, 2, 3))
+        one, two, three = _cross(b, c), _cross(c, a), _cross(a, b)
+        yield which, TetShapes((a, b, c), (-(one + two + three), one, two, three), _dot(a, one))
+
+
+def signed_volumes(points: FloatArray, tets: npt.NDArray[np.int64]) -> FloatArray:
+    """Volumes det(p1 - p0, p2 - p0, p3 - p0) / 6, shape (t,), [m^3]; negative if a tetrahedron is turned over."""
+    volumes = np.empty(len(tets))
+    for which, shapes in shapes_in_chunks(points, tets):
+        volumes[which] = shapes.volumes
+    return volumes
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross products of columns, shape (3, t)."""
+    out = np.empty_like(a)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        np.multiply(a[j], b[k], out=out[i])
+        out[i] -= a[k] * b[j]
+    return out
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Dot products of columns, shape (t,)."""
+    out = a[0] * b[0]
+    out += a[1] * b[1]
+    out += a[2] * b[2]
+    return out

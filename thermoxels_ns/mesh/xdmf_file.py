@@ -1,0 +1,136 @@
+"""Meshes as XDMF with HDF5, which FEniCSx reads with its tags and ParaView with its temperatures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.checks import remove_file, replace_when_done, writable_folder
+from thermoxels_ns.mesh.file_content import FileContent, check_suffix, colour_bytes, file_content
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.units import celsius_to_kelvin
+
+BODY_GRID = "mesh"
+"""Name of the grid of tetrahedra: what `read_mesh` of FEniCSx asks for unless told otherwise."""
+FACET_GRID = "facets"
+"""Name of the grid of boundary triangles."""
+
+_NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UChar"}
+
+
+def heavy_data_path(path: Path | str) -> Path:
+    """Name the HDF5 file that belongs to an .xdmf file.
+
+    >>> heavy_data_path("house/mesh.xdmf").as_posix()
+    'house/mesh.h5'
+    """
+    return Path(path).with_suffix(".h5")
+
+
+def write_xdmf(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.floating] | None = None) -> None:
+    """Write a mesh as ``NAME.xdmf`` and ``NAME.h5``.
+
+    The grid "mesh" holds the tetrahedra with `region` per cell and `temperature_c`, `temperature_k`, `observed` and,
+    if the mesh has them, `colour` per node; the grid "facets" holds the boundary triangles with `patch` per triangle.
+    Region and patch are numbers from 0; the file says their names in ``Information`` elements of their grids. In
+    FEniCSx::
+
+        with dolfinx.io.XDMFFile(comm, "mesh.xdmf", "r") as file:
+            mesh = file.read_mesh(name="mesh")
+            regions = file.read_meshtags(mesh, name="mesh")
+            mesh.topology.create_connectivity(2, 3)
+            patches = file.read_meshtags(mesh, name="facets")
+
+    The .h5 comes first and the .xdmf, which points at it, last; in between there is no .xdmf.
+
+    Args:
+        path: File to write, ending in .xdmf; its folder is made if need be.
+        mesh: The mesh.
+        temperature_c: Temperatures to write in place of the mesh's own, shape (n,), [degrees Celsius].
+
+    Raises:
+        MeshError: An array does not fit the mesh or is not finite.
+        OutputError: A file cannot be written.
+    """
+    import h5py
+
+    path = check_suffix(path, ".xdmf")
+    content = file_content(mesh, temperature_c)
+    arrays: dict[str, npt.NDArray] = {
+        "points_m": content.points_m,
+        "tets": content.tets.astype(np.int64),
+        "region": content.region.astype(np.int32),
+        "facets": content.facets.astype(np.int64),
+        "patch": content.patch.astype(np.int32),
+        "temperature_c": content.temperature_c,
+        "temperature_k": celsius_to_kelvin(content.temperature_c),
+        "observed": mesh.observed.astype(np.uint8),
+    }
+    if mesh.colour is not None:
+        arrays["colour"] = colour_bytes(mesh.colour)
+    data_file = heavy_data_path(path)
+    text = _index(content, arrays, data_file.name)
+
+    writable_folder(path.parent)
+    with replace_when_done(data_file) as temporary:
+        with h5py.File(temporary, "w") as file:
+            for name, values in arrays.items():
+                # Times of day would make two files of one mesh differ.
+                file.create_dataset(name, data=values, track_times=False)
+        # An index of the old data does not fit the new.
+        remove_file(path)
+    with replace_when_done(path) as temporary:
+        temporary.write_bytes(text)
+
+
+def _index(content: FileContent, arrays: dict[str, npt.NDArray], data_file: str) -> bytes:
+    """Text of the .xdmf file."""
+    root = ElementTree.Element("Xdmf", Version="3.0")
+    domain = ElementTree.SubElement(root, "Domain")
+
+    def add_data(parent: ElementTree.Element, name: str) -> None:
+        values = arrays[name]
+        item = ElementTree.SubElement(
+            parent,
+            "DataItem",
+            Format="HDF",
+            Dimensions=" ".join(map(str, values.shape)),
+            NumberType=_NUMBER_TYPES[values.dtype.kind],
+            Precision=str(values.dtype.itemsize),
+        )
+        item.text = f"{data_file}:/{name}"
+
+    def add_grid(name: str, cells: str, kind: str, names_of: str, names: Sequence[str]) -> ElementTree.Element:
+        grid = ElementTree.SubElement(domain, "Grid", Name=name, GridType="Uniform")
+        numbered = "; ".join(f"{number} = {entry}" for number, entry in enumerate(names))
+        ElementTree.SubElement(grid, "Information", Name=names_of, Value=numbered)
+        topology = ElementTree.SubElement(
+            grid,
+            "Topology",
+            TopologyType=kind,
+            NumberOfElements=str(len(arrays[cells])),
+            NodesPerElement=str(arrays[cells].shape[1]),
+        )
+        add_data(topology, cells)
+        add_data(ElementTree.SubElement(grid, "Geometry", GeometryType="XYZ"), "points_m")
+        return grid
+
+    def add_values(grid: ElementTree.Element, name: str, centre: str, kind: str = "Scalar") -> None:
+        add_data(ElementTree.SubElement(grid, "Attribute", Name=name, AttributeType=kind, Center=centre), name)
+
+    body = add_grid(BODY_GRID, "tets", "Tetrahedron", "region_names", content.region_names)
+    boundary = add_grid(FACET_GRID, "facets", "Triangle", "patch_names", content.patch_names)
+    # FEniCSx takes the first attribute of a grid for its tags.
+    add_values(body, "region", "Cell")
+    add_values(boundary, "patch", "Cell")
+    for grid in (body, boundary):
+        for name in ("temperature_c", "temperature_k", "observed"):
+            add_values(grid, name, "Node")
+        if "colour" in arrays:
+            add_values(grid, "colour", "Node", "Vector")
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"

@@ -1,0 +1,262 @@
+"""How long a unit of the scene is in metres, how well that is known, and which way is up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.checks import check_finite, check_positive, check_shape
+from thermoxels_ns.errors import SceneError, ThermoxelsError, explain
+
+Vector = tuple[float, float, float]
+
+UP_ASSUMED: Vector = (0.0, 0.0, 1.0)
+"""Up of a scene that does not say: structure from motion that levels its scenes puts z up."""
+
+_KEY, _ERROR_KEY, _UP_KEY = "metres_per_unit", "metres_per_unit_standard_error", "up"
+
+
+@dataclass(frozen=True)
+class SceneScale:
+    """Metres per unit of the scene's coordinates, with its standard error, and the direction that is up."""
+
+    metres_per_unit: float
+    """Length of one input unit, above 0, [m]."""
+    standard_error: float | None
+    """Standard error of `metres_per_unit`, at least 0, [m]; None where nobody knows it."""
+    source: str
+    """Where the scale comes from: a sentence."""
+    up: Vector = UP_ASSUMED
+    """Unit vector that points up, in input coordinates."""
+    up_source: str = "Up is assumed to be z."
+    """Where the direction comes from: a sentence."""
+
+    @property
+    def relative_standard_error(self) -> float | None:
+        """Standard error over scale; None where it is not known."""
+        return None if self.standard_error is None else self.standard_error / self.metres_per_unit
+
+    def length_standard_error(self, length_m: float) -> float | None:
+        """What the scale's error makes of a length, [m]; None where it is not known."""
+        return self._share(1, length_m)
+
+    def area_standard_error(self, area_m2: float) -> float | None:
+        """What the scale's error makes of an area, twice its relative error, [m^2]; None where it is not known."""
+        return self._share(2, area_m2)
+
+    def volume_standard_error(self, volume_m3: float) -> float | None:
+        """What the scale's error makes of a volume, three times its relative error, [m^3]; None where it is not known.
+
+        >>> SceneScale(2.0, 0.02, "").volume_standard_error(10.0)
+        0.3
+        """
+        return self._share(3, volume_m3)
+
+    def as_mapping(self) -> dict[str, Any]:
+        """The scale as json can hold it."""
+        return {
+            "metres_per_unit": self.metres_per_unit,
+            "standard_error": self.standard_error,
+            "source": self.source,
+            "up": list(self.up),
+            "up_source": self.up_source,
+        }
+
+    def _share(self, power: int, size: float) -> float | None:
+        """Standard error of a quantity that grows with a power of the scale, to first order."""
+        relative = self.relative_standard_error
+        return None if relative is None else power * relative * abs(size)
+
+
+def scale_from_option(metres_per_unit: float) -> SceneScale:
+    """Take the scale as the user gives it; its error is not known.
+
+    Raises:
+        ThermoxelsError: It is no finite number above 0.
+    """
+    check_positive(_KEY, metres_per_unit, "Pass the length of one input unit in metres, such as 1.")
+    return SceneScale(float(metres_per_unit), None, f"Given by the user: {metres_per_unit:g} m per unit.")
+
+
+def scale_from_known_distance(
+    point_a: npt.ArrayLike,
+    point_b: npt.ArrayLike,
+    distance_m: float,
+    standard_error_m: float | None = None,
+    point_standard_error: float | None = None,
+) -> SceneScale:
+    """Find the scale from two points of the scene whose distance was measured.
+
+    scale = D / d with the measured distance D and the distance d between the points. To first order its relative
+    standard error is sqrt((s_D / D)^2 + 2 (s_p / d)^2): only what the points err along the line between them counts,
+    each of them once. An error that is not given counts as 0 if the other one is.
+
+    Args:
+        point_a: First point, three numbers, [input units].
+        point_b: Second point, three numbers, [input units].
+        distance_m: Their distance, above 0, [m].
+        standard_error_m: Standard error of the distance, at least 0, [m].
+        point_standard_error: Standard error of each coordinate of each point, at least 0, [input units].
+
+    Raises:
+        ThermoxelsError: A number is out of range, or the points coincide.
+
+    >>> scale_from_known_distance((0, 0, 0), (0, 3, 4), 10.0, standard_error_m=0.1).standard_error
+    0.02
+    """
+    a, b = _point("point_a", point_a), _point("point_b", point_b)
+    check_positive("distance_m", distance_m, "Pass the measured distance between the points in metres.")
+    for name, error in (("standard_error_m", standard_error_m), ("point_standard_error", point_standard_error)):
+        if error is not None:
+            _check_not_negative(name, error, "Pass a standard error, or leave it out.", ThermoxelsError)
+    apart = float(np.linalg.norm(b - a))
+    if not apart > 1e-12 * max(float(np.abs(a).max()), float(np.abs(b).max())):
+        raise ThermoxelsError(
+            explain(
+                "known distance",
+                expected="two different points",
+                got=f"{_in_words(a)} and {_in_words(b)}",
+                remedy="Pass two points far from each other, in the coordinates of transforms.json.",
+            )
+        )
+    error = None
+    if standard_error_m is not None or point_standard_error is not None:
+        of_distance = (standard_error_m or 0.0) / distance_m
+        of_points = math.sqrt(2.0) * (point_standard_error or 0.0) / apart
+        error = math.hypot(of_distance, of_points) * distance_m / apart
+    source = f"From {distance_m:g} m measured between {_in_words(a)} and {_in_words(b)}, {apart:.6g} units apart."
+    return SceneScale(float(distance_m) / apart, error, source)
+
+
+def scale_from_scene_file(meta: Mapping[str, Any], name: str = "transforms.json") -> SceneScale | None:
+    """Read scale, standard error and up from a scene's json.
+
+    Args:
+        meta: The json; the keys are "metres_per_unit" (above 0), "metres_per_unit_standard_error" (at least 0,
+            optional) and "up" (three numbers, optional).
+        name: The json's name, for messages.
+
+    Returns:
+        The scale, or None if the json has none.
+
+    Raises:
+        SceneError: A value is no such number, or there is a standard error without a scale.
+    """
+    value, error = meta.get(_KEY), meta.get(_ERROR_KEY)
+    if value is None:
+        if error is not None:
+            raise SceneError(
+                explain(
+                    f"{name}: {_ERROR_KEY}",
+                    expected=f"'{_KEY}' beside it",
+                    got="none",
+                    remedy=f"Add '{_KEY}' or remove '{_ERROR_KEY}'.",
+                )
+            )
+        return None
+    check_positive(f"{name}: {_KEY}", value, "Correct the json, or remove the key.", SceneError)
+    if error is not None:
+        _check_not_negative(f"{name}: {_ERROR_KEY}", error, "Correct the json, or remove the key.", SceneError)
+    scale = SceneScale(float(value), None if error is None else float(error), f"From {name}: {value:g} m per unit.")
+    return _with_up(scale, meta, name)
+
+
+def up_from_scene_file(meta: Mapping[str, Any], name: str = "transforms.json") -> Vector | None:
+    """Read the direction that is up from a scene's json and make it a unit vector; None if the json has none.
+
+    Raises:
+        SceneError: "up" is not three finite numbers, or all of them are 0.
+
+    >>> up_from_scene_file({"up": [0, 0, 2]})
+    (0.0, 0.0, 1.0)
+    """
+    value = meta.get(_UP_KEY)
+    if value is None:
+        return None
+    numbers = isinstance(value, list | tuple) and all(_is_number(v) and math.isfinite(v) for v in value)
+    length = math.hypot(*value) if numbers else 0.0
+    if not numbers or len(value) != 3 or not 0.0 < length < math.inf:
+        raise SceneError(
+            explain(
+                f"{name}: {_UP_KEY}",
+                expected="three finite numbers, not all 0",
+                got=repr(value),
+                remedy="Correct the json, for instance to [0, 0, 1], or remove the key.",
+            )
+        )
+    x, y, z = (float(v) / length for v in value)
+    return (x, y, z)
+
+
+def choose_scale(
+    option: float | None = None,
+    known_distance: SceneScale | None = None,
+    scene_file: Mapping[str, Any] | None = None,
+    name: str = "transforms.json",
+) -> SceneScale | None:
+    """Choose between what the user gives and what the scene's json says; the user goes before the json.
+
+    Up comes from the json if it says so, whatever the scale comes from.
+
+    Args:
+        option: Metres per unit given by the user.
+        known_distance: What `scale_from_known_distance` made of a distance given by the user.
+        scene_file: The scene's json, if there is one.
+        name: The json's name, for messages.
+
+    Returns:
+        The scale, whose source says what it was preferred to; None if nobody gives one.
+
+    Raises:
+        ThermoxelsError: The user gives both a scale and a distance, or a value is out of range.
+    """
+    if option is not None and known_distance is not None:
+        raise ThermoxelsError(
+            explain(
+                "scale",
+                expected="metres per unit or a known distance",
+                got=f"both: {option} m per unit, and {known_distance.metres_per_unit:g} from the distance",
+                remedy="Leave one of them out.",
+            )
+        )
+    meta = {} if scene_file is None else scene_file
+    in_file = scale_from_scene_file(meta, name)
+    given = known_distance if option is None else scale_from_option(option)
+    if given is None:
+        return in_file
+    if in_file is not None:
+        source = f"{given.source} It goes before the {in_file.metres_per_unit:g} m per unit of {name}."
+        given = replace(given, source=source)
+    return _with_up(given, meta, name)
+
+
+def _with_up(scale: SceneScale, meta: Mapping[str, Any], name: str) -> SceneScale:
+    up = up_from_scene_file(meta, name)
+    return scale if up is None else replace(scale, up=up, up_source=f"From {name}.")
+
+
+def _point(name: str, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    remedy = "Pass three finite numbers in the coordinates of transforms.json."
+    try:
+        point = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as problem:
+        raise ThermoxelsError(explain(name, expected="three numbers", got=repr(value), remedy=remedy)) from problem
+    return check_finite(name, check_shape(name, point, (3,), remedy), remedy)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _check_not_negative(name: str, value: object, remedy: str, error: type[ThermoxelsError]) -> None:
+    if not (isinstance(value, int | float) and _is_number(value) and math.isfinite(value) and value >= 0.0):
+        raise error(explain(name, expected="a finite number of at least 0", got=repr(value), remedy=remedy))
+
+
+def _in_words(point: npt.NDArray[np.float64]) -> str:
+    return "(" + ", ".join(f"{float(x):.6g}" for x in point) + ")"
