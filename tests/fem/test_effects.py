@@ -44,7 +44,10 @@ def at_once(mesh: TetMesh, material, *effects: Effect) -> HeatSolution:
         (lambda: Convection("x0", 5.0, 20.0), r"patches: expected a tuple of names, got 'x0'.*patches=\(\"name\",\)"),
         (lambda: Convection((), 5.0, 20.0), "patches: expected a tuple of names"),
         (lambda: InternalHeat((" ",), 5.0), "regions: expected a tuple of names"),
-        (lambda: Convection(("*",), -1.0, 20.0), r"coefficient_w_m2k: expected a finite number of at least 0 \[W/\(m2 K"),
+        (
+            lambda: Convection(("*",), -1.0, 20.0),
+            r"coefficient_w_m2k: expected a finite number of at least 0 \[W/\(m2 K",
+        ),
         (lambda: Convection(("*",), 5.0, -274.0), r"air_c: expected a finite number of at least -273\.15"),
         (lambda: FixedTemperature(("*",), float("nan")), "temperature_c: expected a finite number"),
         (lambda: HeatFlux(("*",), float("inf")), "flux_w_m2: expected a finite number"),
@@ -95,7 +98,9 @@ def test_positive_is_into_the_body(box, concrete, effect, watts, lumped_boundary
 
 def test_a_fixed_temperature_draws_the_body_to_it(box, concrete) -> None:
     for fixed_c in (5.0, 40.0):
-        solution = solve_heat(HeatProblem(box, concrete, effects=(FixedTemperature(("x0",), fixed_c),)), TimeSteps(3, 600))
+        solution = solve_heat(
+            HeatProblem(box, concrete, effects=(FixedTemperature(("x0",), fixed_c),)), TimeSteps(3, 600)
+        )
         at = np.isclose(box.points_m[:, 0], 0.0)
         np.testing.assert_array_equal(solution.temperature_c[:, at], fixed_c)
         assert np.all(np.sign(solution.effects[0].heat_w) == np.sign(fixed_c - 20.0))
@@ -178,7 +183,9 @@ def test_functions_are_told_where_they_are(box, concrete) -> None:
 
 def test_sources_are_asked_at_tetrahedra(box, concrete) -> None:
     source = Varying(lambda places, time_s: 100.0 * places.points_m[:, 0], in_time=False)
-    assert at_once(box, concrete, InternalHeat(("*",), source)).heat_w[0] == pytest.approx(100.0 * 0.2 * VOLUME, rel=1e-9)
+    assert at_once(box, concrete, InternalHeat(("*",), source)).heat_w[0] == pytest.approx(
+        100.0 * 0.2 * VOLUME, rel=1e-9
+    )
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,9 @@ STEP_S = H**2 / CONCRETE.diffusivity_m2_s
 """Step after which heat has spread over one element, h^2 / alpha."""
 
 EVERY = (
-    FixedTemperature(("x0",), Varying(lambda places, time_s: 10.0 + places.points_m[:, 1] + 5.0 * np.sin(1e-3 * time_s))),
+    FixedTemperature(
+        ("x0",), Varying(lambda places, time_s: 10.0 + places.points_m[:, 1] + 5.0 * np.sin(1e-3 * time_s))
+    ),
     Convection(("x1", "y0"), Varying(lambda places, time_s: 5.0 + 3.0 * np.cos(1e-3 * time_s)), 30.0),
     Convection(("z0",), 8.0, Varying(lambda places, time_s: 5.0 * np.sin(time_s / 600.0))),
     Radiation(("z1", "y1"), 0.9, -40.0),

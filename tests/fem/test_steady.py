@@ -96,7 +96,9 @@ def test_too_few_newton_steps_are_a_status(monkeypatch) -> None:
 
 @pytest.mark.parametrize("effects", [(), (HeatFlux(("*",), 1.0),), (Convection(("*",), 0.0, 20.0),)])
 def test_a_body_that_nothing_holds_has_no_steady_state(effects) -> None:
-    with pytest.raises(HeatError, match=r"steady heat problem: expected convection.*none on 1 of 1 pieces.*\(0, 0, 0\)"):
+    with pytest.raises(
+        HeatError, match=r"steady heat problem: expected convection.*none on 1 of 1 pieces.*\(0, 0, 0\)"
+    ):
         solve_steady(HeatProblem(slab(), STEEL, effects=effects))
 
 
@@ -104,7 +106,9 @@ def test_a_loose_piece_is_named() -> None:
     """Two blocks that do not touch, the second without any exchange."""
     mesh = box_mesh(np.linspace(0, 0.5, 6), [0, 0.1], [0, 0.1], keep=lambda p: abs(p[..., 0] - 0.25) > 0.06)
     problem = HeatProblem(mesh, STEEL, effects=(Convection(("x0",), 5.0, 10.0),))
-    with pytest.raises(HeatError, match=r"none on 1 of 2 pieces; the largest has 12 nodes in .*\(0\.3, 0, 0\) to \(0\.5,"):
+    with pytest.raises(
+        HeatError, match=r"none on 1 of 2 pieces; the largest has 12 nodes in .*\(0\.3, 0, 0\) to \(0\.5,"
+    ):
         solve_steady(problem)
     both = HeatProblem(mesh, STEEL, effects=(Convection(("x?",), 5.0, 10.0),))
     np.testing.assert_allclose(solve_steady(both).temperature_c, 10.0, atol=1e-9)
@@ -139,7 +143,9 @@ def test_boundary_values_with_a_jump_by_one_effect() -> None:
     mesh = box_mesh(axis, axis, [0, 0.125])
 
     def hot_below(places, time_s):
-        return np.where(places.points_m[:, 0] < 0.5 - 1e-9, 10.0, np.where(places.points_m[:, 0] > 0.5 + 1e-9, 0.0, 5.0))
+        return np.where(
+            places.points_m[:, 0] < 0.5 - 1e-9, 10.0, np.where(places.points_m[:, 0] > 0.5 + 1e-9, 0.0, 5.0)
+        )
 
     fixed = FixedTemperature(("x?", "y?"), Varying(hot_below, in_time=False))
     solution = solve_steady(HeatProblem(mesh, STEEL, effects=(fixed,)))

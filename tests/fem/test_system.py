@@ -84,7 +84,9 @@ def test_exchange_over_the_triangles_is_exact(box, concrete) -> None:
 def test_radiation_over_the_triangles_is_exact_for_linear_temperatures(box, concrete) -> None:
     """integral(T^4) of T = 300 + 100 y over the side x1 has degree 4, which the six points integrate."""
     start = 300.0 - 273.15 + 100.0 * box.points_m[:, 1]
-    problem = HeatProblem(replace(box, temperature_c=start), concrete, effects=(Radiation(("x1",), 1.0, -273.15, 1e-8),))
+    problem = HeatProblem(
+        replace(box, temperature_c=start), concrete, effects=(Radiation(("x1",), 1.0, -273.15, 1e-8),)
+    )
     system = HeatSystem(problem, lumped_boundary=False)
     heat = system.group_heat_w(start - system.reference_c, 0.0)[0]
     assert heat == pytest.approx(-1e-8 * 0.2 * (330.0**5 - 300.0**5) / 500.0, rel=1e-12)

@@ -77,16 +77,25 @@ CASE_2 = {
 @pytest.mark.parametrize("parts", [1, 2])
 def test_case_2_metal_faced_wall(lumped_boundary, parts) -> None:
     """Concrete, wood, insulation and an aluminium profile that bends into the wall; flow per metre of depth."""
-    x = 1e-3 * np.unique(np.concatenate([planes(0, 1.5, 15, step=3 / parts), planes(15, 60, step=5 / parts),
-                                         graded(60, 500, finest=8 / parts, growth=1.3, coarsest=60 / parts)]))
+    x = 1e-3 * np.unique(
+        np.concatenate(
+            [
+                planes(0, 1.5, 15, step=3 / parts),
+                planes(15, 60, step=5 / parts),
+                graded(60, 500, finest=8 / parts, growth=1.3, coarsest=60 / parts),
+            ]
+        )
+    )
     z = 1e-3 * planes(0, 1.5, 35, 36.5, 41.5, 47.5, step=4 / parts)
     regions = {
         "insulation": lambda p: p[..., 2] < 0.0415,
         "concrete": lambda p: p[..., 2] > 0.0415,
         "wood": lambda p: (p[..., 0] < 0.015) & (p[..., 2] > 0.0365) & (p[..., 2] < 0.0415),
-        "aluminium": lambda p: (p[..., 2] < 0.0015)
-        | ((p[..., 0] < 0.0015) & (p[..., 2] < 0.0365))
-        | ((p[..., 0] < 0.015) & (p[..., 2] > 0.035) & (p[..., 2] < 0.0365)),
+        "aluminium": lambda p: (
+            (p[..., 2] < 0.0015)
+            | ((p[..., 0] < 0.0015) & (p[..., 2] < 0.0365))
+            | ((p[..., 0] < 0.015) & (p[..., 2] > 0.035) & (p[..., 2] < 0.0365))
+        ),
     }
     depth = 0.01
     mesh = box_mesh(x, [0, depth], z, regions=regions)

@@ -92,7 +92,7 @@ class ConditionOverrides:
 
 
 def check_between(name: str, value: float, low: float, high: float, expected: str, *, zero: bool = True) -> None:
-    """Raise a `ThermoxelsError` that names the setting if it is no number from `low` to `high` (or 0 and not `zero`)."""
+    """Raise a `ThermoxelsError` that names the setting if it is no number from `low` to `high` (0 only if `zero`)."""
     number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
     if not (number and low <= value <= high and (zero or value > 0)):
         raise ThermoxelsError(

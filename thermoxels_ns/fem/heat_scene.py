@@ -163,7 +163,7 @@ class HeatScene:
             if not matching:
                 expected = f"names or patterns of the regions {', '.join(mesh.region_names)}"
                 raise _wrong("materials", expected, repr(pattern), "Correct the name, or use '*' for all regions.")
-            chosen = dict.fromkeys(matching, made_of) | chosen
+            chosen |= dict.fromkeys(matching, made_of)
         used = {mesh.region_names[number] for number in np.unique(mesh.region)}
         missing = sorted(used - set(chosen))
         if missing:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from datetime import datetime
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
 
 from thermoxels_ns.errors import HeatError, explain
 from thermoxels_ns.fem.quantities import Bounds
@@ -62,13 +62,14 @@ class Section:
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self))
         for field in fields(self):  # type: ignore[arg-type]
-            value: Any = getattr(self, field.name)
+            value = getattr(self, field.name)
             kinds = (hints[field.name], *get_args(hints[field.name]))
             choices = next((get_args(kind) for kind in kinds if get_origin(kind) is Literal), ())
             if value is None and type(None) in kinds:
                 continue
             if float in kinds:
-                object.__setattr__(self, field.name, float(field_bounds(field.name).check(value)))
+                number = field_bounds(field.name).check(cast(Any, value))
+                object.__setattr__(self, field.name, float(number))
             if choices and value not in choices:
                 raise _unclear(field.name, f"one of {', '.join(choices)}", repr(value), "Correct it.")
             if field.name == "patches" and (not value or isinstance(value, str)):

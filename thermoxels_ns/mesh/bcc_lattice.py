@@ -103,7 +103,7 @@ def bcc_lattice(level: npt.NDArray[np.floating]) -> BccLattice:
     Returns:
         The lattice around the solid voxels; what is farther than two voxels from all of them is left out.
     """
-    first, last = _solid_box(level > 0.0)
+    first, last = index_box(level > 0.0)
     first = np.maximum(first - 2, 0)
     last = np.minimum(last + 2, np.array(level.shape) - 1)
     inner = level[tuple(slice(a, b + 1) for a, b in zip(first, last))]
@@ -153,11 +153,11 @@ def _keep_sheets(centres: npt.NDArray[np.floating], corners: npt.NDArray[np.floa
                 corner[square] = 0.0
 
 
-def _solid_box(solid: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """First and last index along each axis where anything is solid."""
+def index_box(cells: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """First and last index along each axis where anything is True; something must be."""
     ends = []
     for axis in range(3):
         others = tuple({0, 1, 2} - {axis})
-        ends.append(np.flatnonzero(solid.any(axis=others))[[0, -1]])
+        ends.append(np.flatnonzero(cells.any(axis=others))[[0, -1]])
     box = np.array(ends, dtype=np.int64)
     return box[:, 0], box[:, 1]

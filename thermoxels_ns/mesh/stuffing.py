@@ -11,6 +11,7 @@ import numpy.typing as npt
 from thermoxels_ns.checks import check_finite, check_shape
 from thermoxels_ns.errors import MeshError, explain
 from thermoxels_ns.mesh.bcc_lattice import DIRECTIONS, BccLattice, bcc_lattice
+from thermoxels_ns.mesh.stuffing_interior import CoarseInterior, coarse_interior
 from thermoxels_ns.mesh.stuffing_stencils import (
     BUNDLE_EDGES,
     BUNDLE_POINTS,
@@ -40,7 +41,7 @@ class StuffedSolid:
     """True for boundary triangles on the border of the voxel lattice, exactly on its plane, shape (f,)."""
 
 
-def stuff(level: npt.NDArray[np.floating]) -> StuffedSolid:
+def stuff(level: npt.NDArray[np.floating], coarsest: int = 8) -> StuffedSolid:
     """Fill the part of a voxel lattice where the level is above 0 with tetrahedra up to the zero level.
 
     Isosurface stuffing (Labelle and Shewchuk 2007, ACM Transactions on Graphics 26(3), article 57) on a uniform
@@ -68,10 +69,14 @@ def stuff(level: npt.NDArray[np.floating]) -> StuffedSolid:
     """
     level = _checked(level)
     lattice = bcc_lattice(level)
-    warped = warp(lattice)
-    nodes = _number_nodes(lattice, warped)
-    parts = [_fill(bundles, warped.sign, nodes) for bundles in _solid_bundles(lattice, warped.sign)]
-    tets, facets = (np.concatenate(part).astype(np.int64) for part in zip(*parts))
+    interior = coarse_interior(lattice, coarsest)
+    warped = warp(lattice, None if interior is None else interior.buried(lattice))
+    nodes = _number_nodes(lattice, warped, interior)
+    parts = [_fill(bundles, warped.sign, nodes) for bundles in _solid_bundles(lattice, warped.sign, interior)]
+    tets, facets = (list(part) for part in zip(*parts))
+    if interior is not None:
+        tets.append(nodes.of_point[interior.tets])
+    tets, facets = (np.concatenate(part, dtype=np.int64) for part in (tets, facets))
     on_surface = np.zeros(len(nodes.points), dtype=bool)
     on_surface[facets] = True
     return StuffedSolid(nodes.points, tets, facets, on_surface, _on_border(nodes.points, facets, level.shape))
@@ -103,15 +108,18 @@ class _Nodes:
     """Node numbers of the cuts on the 14 edges of the first nodes, -1 where no cut is."""
 
 
-def _number_nodes(lattice: BccLattice, warped: WarpedLattice) -> _Nodes:
+def _number_nodes(lattice: BccLattice, warped: WarpedLattice, interior: CoarseInterior | None) -> _Nodes:
     inner, sign = warped.inner, warped.sign
-    has_cut = np.zeros(len(sign), dtype=bool)
-    has_cut[warped.cut_points] = True
     # A point on the surface is a node if one of its neighbours is inside: they share a tetrahedron.
     touched = np.zeros(len(sign), dtype=bool)
     for neighbour in lattice.each_neighbour(inner):
         touched[neighbour[sign[neighbour] == 0]] = True
-    kept = np.concatenate([warped.cut_points, inner[~has_cut[inner]], np.flatnonzero(touched)])
+    plain = np.zeros(len(sign), dtype=bool)
+    plain[inner] = True
+    plain[warped.cut_points] = False
+    if interior is not None:
+        plain[interior.tets] = True
+    kept = np.concatenate([warped.cut_points, np.flatnonzero(plain), np.flatnonzero(touched)])
     row, direction = np.nonzero(np.isfinite(warped.cuts))
 
     total = len(kept) + len(row)
@@ -141,8 +149,10 @@ class _Bundles:
     """Lattice direction of each edge of a bundle, there and back, shape (13, 2)."""
 
 
-def _solid_bundles(lattice: BccLattice, sign: npt.NDArray[np.int8]) -> Iterator[_Bundles]:
-    """All bundles with a point inside the solid, a chunk at a time."""
+def _solid_bundles(
+    lattice: BccLattice, sign: npt.NDArray[np.int8], interior: CoarseInterior | None
+) -> Iterator[_Bundles]:
+    """All bundles with a point inside the solid but none in larger cubes, a chunk at a time."""
     inner = sign > 0
     first, second = np.array(BUNDLE_EDGES).T
     for axis in range(3):
@@ -158,6 +168,9 @@ def _solid_bundles(lattice: BccLattice, sign: npt.NDArray[np.int8]) -> Iterator[
         active = np.zeros(lattice.num_centres, dtype=bool)
         for offset in offsets:
             active |= inner[offset : offset + len(active)]
+        if interior is not None:
+            active &= ~interior.covered
+            active[: -strides[0]] &= ~interior.covered[strides[0] :]
         below = np.flatnonzero(active)
         for start in range(0, len(below), _CHUNK):
             yield _Bundles(below[start : start + _CHUNK] + offsets[:, None], SIDES_OUTWARD @ strides, directions)

@@ -56,14 +56,14 @@ class WarpedLattice:
     moved_to: npt.NDArray[np.float64]
     """Where they are now, fractional corner indices, shape (m, 3)."""
     inner: npt.NDArray[np.int64]
-    """Points with sign +1, ascending; shape (p,)."""
+    """Points with sign +1 that are not buried, ascending; shape (p,)."""
     cut_points: npt.NDArray[np.int64]
     """Those of them that have a cut edge, ascending; shape (s,)."""
     cuts: npt.NDArray[np.float64]
     """How far along each of their edges the surface is, as a share of the edge, NaN where no cut is; shape (s, 14)."""
 
 
-def warp(lattice: BccLattice) -> WarpedLattice:
+def warp(lattice: BccLattice, buried: npt.NDArray[np.bool_] | None = None) -> WarpedLattice:
     """Find the cuts and move points that are too close to one onto the surface.
 
     A cut is where linear interpolation along an edge between two opposite signs is 0. A point with cuts within alpha
@@ -77,6 +77,7 @@ def warp(lattice: BccLattice) -> WarpedLattice:
 
     Args:
         lattice: Levels on the lattice, above 0 somewhere.
+        buried: True for points that need not be looked at, because they and all their neighbours are inside.
 
     Returns:
         Signs, moved points and the remaining cuts, all within [alpha, 1 - alpha].
@@ -84,7 +85,7 @@ def warp(lattice: BccLattice) -> WarpedLattice:
     level = lattice.level
     sign = (level > 0.0).astype(np.int8)
     sign -= level < 0.0
-    inner = np.flatnonzero(sign > 0)
+    inner = np.flatnonzero(sign > 0 if buried is None else (sign > 0) & ~buried)
     inside, outside = _ends_of_cut_edges(lattice, sign, inner)
 
     moved, moved_to = [], []

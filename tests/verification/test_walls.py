@@ -1,0 +1,141 @@
+"""Walls, shells and slabs with convection against closed solutions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.heat_meshes import box_mesh, graded, planes
+from thermoxels_ns.fem.effects import Convection, FixedTemperature
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.schemes import SDIRK2
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
+
+LAYERS = {"plaster": (0.015, 0.40), "concrete": (0.20, 2.0), "insulation": (0.12, 0.035), "mortar": (0.01, 1.0)}
+"""Thickness, [m], and conductivity, [W / (m K)], from inside to outside."""
+
+
+@pytest.mark.parametrize("lumped_boundary", [True, False])
+def test_u_value_of_a_wall(lumped_boundary) -> None:
+    """R_si 0.13 and R_se 0.04: U = 0.266946 W/(m2 K), q = 8.00839 W/m2 between 20 and -10 C."""
+    ends = np.concatenate([[0.0], np.cumsum([thickness for thickness, _ in LAYERS.values()])])
+    regions = {
+        name: lambda p, low=low, high=high: (p[..., 0] > low) & (p[..., 0] < high)
+        for name, low, high in zip(LAYERS, ends, ends[1:])
+    }
+    mesh = box_mesh(planes(*ends, step=0.03), [0, 0.5, 1.0], [0, 1.0], regions=regions)
+    materials = {name: Material(name, k, 1000.0, 1000.0) for name, (_, k) in LAYERS.items()}
+    effects = (Convection(("x0",), 1 / 0.13, 20.0), Convection(("x1",), 1 / 0.04, -10.0))
+    solution = solve_steady(HeatProblem(mesh, materials, effects=effects), lumped_boundary=lumped_boundary)
+    flux = solution.effects[0].heat_w[0] / 1.0
+    assert flux == pytest.approx(8.00839, abs=1e-5) and flux / 30.0 == pytest.approx(0.266946, abs=1e-6)
+    assert solution.effects[1].heat_w[0] == pytest.approx(-flux, rel=1e-9)
+    x = mesh.points_m[:, 0]
+    np.testing.assert_allclose(solution.temperature_c[x == 0.0], 18.95891, atol=1e-5)
+    np.testing.assert_allclose(solution.temperature_c[x == ends[-1]], -9.67966, atol=1e-5)
+
+
+def sixth_of_a_shell(inner_m: float, outer_m: float, parts: int) -> TetMesh:
+    """What lies between two spheres above one face of a cube; by symmetry nothing flows through its sides."""
+    side = np.linspace(-1.0, 1.0, parts + 1)
+    mesh = box_mesh(side, side, np.linspace(inner_m, outer_m, max(parts // 8, 1) + 1))
+    u, v, r = mesh.points_m.T
+    ray = np.stack([np.tan(0.25 * np.pi * u), np.tan(0.25 * np.pi * v), np.ones_like(u)], axis=1)
+    return replace(mesh, points_m=ray * (r / np.linalg.norm(ray, axis=1))[:, None])
+
+
+@pytest.mark.parametrize("lumped_boundary", [True, False])
+def test_spherical_shell(lumped_boundary) -> None:
+    """a = 0.5, b = 0.6, k = 1.7, 7.69 at 20 C inside, 25 at -10 C outside: 455.6634 W, second order in the mesh."""
+    errors = []
+    for parts in (8, 16, 32):
+        mesh = sixth_of_a_shell(0.5, 0.6, parts)
+        effects = (Convection(("z0",), 7.69, 20.0), Convection(("z1",), 25.0, -10.0))
+        solution = solve_steady(HeatProblem(mesh, CONCRETE, effects=effects), lumped_boundary=lumped_boundary)
+        assert solution.energy_residual < 1e-9
+        errors.append(6.0 * solution.effects[0].heat_w[0] / 455.6634 - 1.0)
+    radius = np.linalg.norm(mesh.points_m, axis=1)
+    inner, outer = (solution.temperature_c[np.abs(radius - r) < 1e-9] for r in (0.5, 0.6))
+    assert [inner.mean(), outer.mean()] == pytest.approx([1.13886, -5.97105], abs=0.01)
+    assert max(np.ptp(inner), np.ptp(outer)) < 0.15
+    orders = np.log2(np.abs(errors[:-1]) / np.abs(errors[1:]))
+    assert abs(errors[-1]) < 3e-3, f"relative errors {errors}"
+    assert np.all(np.abs(orders - 2.0) < 0.15), f"observed orders {orders}, relative errors {errors}"
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "time_s", "exact"), [(0.05, 3600.0, 0.5294616), (0.10, 3600.0, 0.2085161), (0.10, 14400.0, 0.5294616)]
+)
+def test_semi_infinite_solid(depth_m, time_s, exact) -> None:
+    """The surface jumps from 0 to 1: T = erfc(x / (2 sqrt(a t)))."""
+    assert math.erfc(depth_m / (2 * math.sqrt(CONCRETE.diffusivity_m2_s * time_s))) == pytest.approx(exact, abs=1e-7)
+    x = np.unique(
+        np.concatenate([planes(0, 0.2, step=0.0025), graded(0.2, 1.2, finest=0.005, growth=1.3, coarsest=0.1)])
+    )
+    mesh = box_mesh(x, [0, 0.05], [0, 0.05], temperature_c=0.0)
+    problem = HeatProblem(mesh, CONCRETE, effects=(FixedTemperature(("x0",), 1.0),))
+    solution = solve_heat(problem, AdaptiveSteps(time_s, 1e-3, outputs=1))
+    at = np.isclose(mesh.points_m[:, 0], depth_m)
+    np.testing.assert_allclose(solution.temperature_c[-1, at], exact, atol=1e-3)
+    assert solution.temperature_c.min() >= -1e-9 and solution.temperature_c.max() <= 1.0 + 1e-9
+    assert solution.energy_residual_of_spread < 1e-9
+
+
+SLAB = {
+    # Biot number: Fourier number, centre, surface
+    0.1: [(1.0, 0.92239, 0.87813)],
+    1.0: [(1.0, 0.53386, 0.34818), (0.2, 0.95064, 0.64339)],
+    10.0: [(1.0, 0.16382, 0.02317)],
+}
+
+
+@pytest.mark.parametrize(
+    ("biot", "fourier", "centre", "surface"), [(b, *row) for b, rows in SLAB.items() for row in rows]
+)
+def test_slab_with_convection(biot, fourier, centre, surface) -> None:
+    """Half of a slab at 1 in air at 0; series of Carslaw and Jaeger."""
+    half = 0.1
+    mesh = box_mesh(np.linspace(0, half, 41), [0, 0.01], [0, 0.01], temperature_c=1.0)
+    duration = fourier * half**2 / CONCRETE.diffusivity_m2_s
+    effects = (Convection(("x1",), biot * CONCRETE.conductivity_w_mk / half, 0.0),)
+    problem = HeatProblem(mesh, CONCRETE, effects=effects)
+    x = mesh.points_m[:, 0]
+    for time in (TimeSteps(200, duration / 200), AdaptiveSteps(duration, 1e-3)):
+        scheme = SDIRK2 if isinstance(time, TimeSteps) else None
+        solution = solve_heat(problem, time, scheme=scheme)
+        end = solution.temperature_c[-1]
+        np.testing.assert_allclose(end[x == 0.0], centre, atol=5e-4)
+        np.testing.assert_allclose(end[x == half], surface, atol=5e-4)
+        assert solution.energy_residual_of_spread < 1e-9
+
+
+def test_a_small_sphere_cools_as_a_whole() -> None:
+    """r = 1 cm, h = 10, rho c = 1.936e6, one hour: exp(-3 h t / (rho c r)) = 0.00377818 (Biot number 0.02)."""
+    parts = 12
+    axis = np.linspace(-1.0, 1.0, parts + 1)
+    cube = box_mesh(axis, axis, axis, temperature_c=1.0)
+    # Each shell of the cube becomes a sphere.
+    size = np.abs(cube.points_m).max(axis=1)
+    length = np.linalg.norm(cube.points_m, axis=1)
+    stretched = cube.points_m * np.divide(size, length, out=np.zeros_like(size), where=length > 0)[:, None]
+    mesh = replace(cube, points_m=0.01 * stretched)
+    copper = Material("copper-like", 200.0, 2200.0, 880.0)
+    problem = HeatProblem(mesh, copper, effects=(Convection(("*",), 10.0, 0.0),))
+    solution = solve_heat(problem, AdaptiveSteps(3600.0, 1e-4, outputs=2))
+    assert math.exp(-3 * 10 * 3600 / (2200 * 880 * 0.01)) == pytest.approx(0.00377818, abs=1e-8)
+    # Area over volume of the faceted ball, larger than 3 / r by the facets.
+    area = np.linalg.norm(np.cross(*(np.diff(mesh.points_m[mesh.facets], axis=1).transpose(1, 0, 2))), axis=1).sum() / 2
+    corner = mesh.points_m[mesh.tets]
+    volume = np.linalg.det(corner[:, 1:] - corner[:, :1]).sum() / 6
+    assert area / volume == pytest.approx(300.0, rel=0.015)
+    faceted = math.exp(-10 * 3600 * area / (volume * 2200 * 880))
+    np.testing.assert_allclose(solution.temperature_c[-1], faceted, atol=1e-4)
+    np.testing.assert_allclose(solution.temperature_c[-1], 0.00377818, atol=5e-4)
