@@ -24,10 +24,6 @@ import numpy.typing as npt
 from thermoxels_ns.mesh.bcc_lattice import BccLattice, index_box
 from thermoxels_ns.mesh.octree import BoolArray, balanced_octree, eroded, split_in_eight
 
-BAND = 2
-"""Voxels with one outside the solid at most this many voxels away, along all axes at once, stay single. With fewer than
-two, tetrahedra would be lost that touch points which move onto the surface."""
-
 # The sides of a face lie between its corners 0-1, 1-2, 2-3 and 3-0, counter-clockwise seen from where its axis points.
 _CORNERS = np.array([[0, 0, 0], [0, 1, 0], [0, 1, 1], [0, 0, 1]])
 _OUTWARD = np.array([[0, 0, -1], [0, 1, 0], [0, 0, 1], [0, -1, 0]])
@@ -91,18 +87,43 @@ def coarse_interior(lattice: BccLattice, largest: int) -> CoarseInterior | None:
 
 
 def _far_from_surface(lattice: BccLattice) -> BoolArray:
-    """Voxels around which no point moves and no edge is cut; shape of the block of centres."""
+    """Voxels on whose six faces no bundle has a point that moves or an edge with a cut; shape of the block of centres.
+
+    A point of a cut edge has a neighbour outside. So the voxel's centre and corners and the centres next to it must be
+    inside, and no neighbour of these points outside: no centre next to a centre next to it, no corner of a voxel
+    next to it, and no centre at one of its own corners.
+    """
     centres, corners = lattice.level.reshape(2, *lattice.shape)
-    deep = eroded(centres > 0.0, BAND)
+    inside = centres > 0.0
+    deep = _with_next(_with_next(inside))
     if not deep.any():
         return deep
-    # The mean of levels above 0 is above 0, unless they are as small as numbers can be.
-    inside = corners > 0.0
-    for axis in range(3):
-        row = np.moveaxis(inside, axis, 0)
-        inside = np.moveaxis(row[1:] & row[:-1], 0, axis)
-    deep[1:, 1:, 1:] &= inside
+    deep &= eroded(inside, 1)
+    deep &= _with_next(_at_all_corners(corners >= 0.0))
+    deep &= _at_all_corners(corners > 0.0)
     return deep
+
+
+def _with_next(centres: BoolArray) -> BoolArray:
+    """True where a centre and the six next to it are in the set; nothing beyond the array is."""
+    found = np.zeros_like(centres)
+    inner = found[1:-1, 1:-1, 1:-1]
+    inner[...] = centres[1:-1, 1:-1, 1:-1]
+    for axis in range(3):
+        row = np.moveaxis(centres, axis, 0)
+        across = np.moveaxis(row[2:] & row[:-2], 0, axis)
+        inner &= across[tuple(slice(None) if a == axis else slice(1, -1) for a in range(3))]
+    return found
+
+
+def _at_all_corners(corners: BoolArray) -> BoolArray:
+    """True for the centres whose eight corners are in the set."""
+    found = np.zeros_like(corners)
+    for axis in range(3):
+        row = np.moveaxis(corners, axis, 0)
+        corners = np.moveaxis(row[1:] & row[:-1], 0, axis)
+    found[1:, 1:, 1:] = corners
+    return found
 
 
 @dataclass(frozen=True)
