@@ -19,7 +19,7 @@ from thermoxels_ns.units import ZERO_CELSIUS_K
 
 Vector = npt.NDArray[np.float64]
 
-_COLDEST_SLOPE_K = 1e-2
+COLDEST_SLOPE_K = 1e-2
 """Below this temperature the slope of radiation is that at it, so that no Newton matrix is singular, [K]."""
 
 
@@ -187,14 +187,20 @@ class RadiationForm(_Boundary):
 
     def slope(self, relative_k: Vector, time_s: float) -> sparse.csr_matrix:
         """Minus the derivative of the load, entries integral(4 sigma eps T^3 phi_i phi_j), [W / K]."""
-        kelvin = np.maximum(np.abs(self._surface_k(relative_k) + self._reference_k), _COLDEST_SLOPE_K)
+        kelvin = np.maximum(np.abs(self._surface_k(relative_k) + self._reference_k), COLDEST_SLOPE_K)
         return self.matrix(4.0 * self._strength(time_s)[:, None] * self.rule.weights * kelvin**3)
 
     def magnitude(self, relative_k: Vector, time_s: float) -> Vector:
-        """Entries integral(sigma eps (T_s^4 + T^4) phi_i), [W]: round-off of the load is a few eps of it."""
-        kelvin = self._surface_k(relative_k) + self._reference_k
-        around = (self.surroundings_k(time_s) + self._reference_k)[:, None]
-        point = self._strength(time_s)[:, None] * self.rule.weights * (around**4 + kelvin**4)
+        """Entries integral(sigma eps (T_s^4 + T^4) phi_i) and what round-off of the differences from the reference adds.
+
+        Round-off of the load is a few eps of it, [W].
+        """
+        surface, around = self._surface_k(relative_k), self.surroundings_k(time_s)[:, None]
+        size = sum(
+            (part + self._reference_k) ** 4 + 4.0 * np.abs(part + self._reference_k) ** 3 * np.abs(part)
+            for part in (surface, around)
+        )
+        point = self._strength(time_s)[:, None] * self.rule.weights * size
         return sums_by_number(self.nodes.ravel(), (point @ self.rule.shapes).ravel(), self.num_nodes)
 
     def surroundings_k(self, time_s: float) -> Vector:

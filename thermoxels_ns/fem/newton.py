@@ -52,10 +52,10 @@ class Residual:
         nodes = np.all(np.abs(self.heat_w) <= self.round_off_w)
         return bool(nodes and np.all(np.abs(self.piece_heat_w) <= self.piece_round_off_w))
 
-    def is_small(self, heat_w: float, piece_heat_w: Vector) -> bool:
-        """Whether it is within a tolerance for nodes and pieces, or within round-off."""
+    def is_small(self, heat_w: float) -> bool:
+        """Whether it is within a tolerance or round-off at the nodes, and balanced to round-off over each piece."""
         nodes = _norm(self.heat_w) <= max(heat_w, _norm(self.round_off_w))
-        return nodes and bool(np.all(np.abs(self.piece_heat_w) <= np.maximum(piece_heat_w, self.piece_round_off_w)))
+        return nodes and bool(np.all(np.abs(self.piece_heat_w) <= self.piece_round_off_w))
 
 
 class Equations(Protocol):
@@ -104,10 +104,10 @@ def newton(equations: Equations, num_unknowns: int, *, relative_tolerance: float
     """
     u = np.zeros(num_unknowns)
     residual = equations.residual(u)
-    first, first_of_pieces = _norm(residual.heat_w), np.abs(residual.piece_heat_w)
+    first = _norm(residual.heat_w)
     spent, reason, count = 0, f"stopped after {MAX_ITERATIONS} steps", 0
     settled = False
-    while not (settled and residual.is_small(relative_tolerance * first, relative_tolerance * first_of_pieces)):
+    while not (settled and residual.is_small(relative_tolerance * first)):
         if count == MAX_ITERATIONS or not np.isfinite(_norm(residual.heat_w)):
             share = _norm(residual.heat_w) / first if first > 0.0 else np.inf
             status = f"Newton's method {reason}, at a relative residual of {share:.1e}."

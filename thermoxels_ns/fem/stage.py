@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from thermoxels_ns.fem.forms import COLDEST_SLOPE_K
 from thermoxels_ns.fem.linear_solver import LinearSolution
 from thermoxels_ns.fem.newton import Residual, newton
 from thermoxels_ns.fem.solver_choice import LinearSolver
@@ -221,7 +222,7 @@ class _Balance:
     def is_short(self, u: Vector, direction: Vector, share: float) -> bool:
         """Whether no absolute temperature changes by more than a share of it."""
         kelvin = self._stage.at_free(self._now(u)) + self._stage.system.reference_c + ZERO_CELSIUS_K
-        return bool(np.all(np.abs(direction) <= share * np.abs(kelvin)))
+        return bool(np.all(np.abs(direction) <= share * np.maximum(np.abs(kelvin), COLDEST_SLOPE_K)))
 
     def rise(self, u: Vector, direction: Vector) -> Callable[[float], float]:
         """Slope of the energy along a direction: minus the power of the residual."""

@@ -19,6 +19,8 @@ LEAST_LEVEL = 0.02
 """No voxel is nearer to 0 than this before smoothing: a surface never passes through a voxel's centre."""
 LEAST_SHARE = 0.25
 """Smoothing leaves at least this share of a voxel's level, with its sign."""
+MARGIN = 4
+"""Voxels farther from the solid than this, along an axis, have level -1 without a look at their density."""
 LEAST_SHARE_THIN = 0.5
 """The same in walls and gaps one voxel thick; they keep their thickness."""
 
@@ -41,13 +43,35 @@ def level_of(density: npt.NDArray[np.floating], threshold: float, dense: BoolArr
             are not solid were removed on purpose and lie far outside.
 
     Returns:
-        The level, shape of `cells`, in [-1, 1], never 0.
+        The level, shape of `cells`, in [-1, 1], never 0; -1 far outside.
     """
+    level = np.full(cells.shape, -1.0, dtype=np.float32)
+    near = _around(cells)
+    level[near] = _level_nearby(
+        density[near], threshold, _deep_ratio(density[dense], threshold), dense[near], cells[near]
+    )
+    return level
+
+
+def _around(cells: BoolArray) -> tuple[slice, ...]:
+    """The box of voxels that holds all solid ones and `MARGIN` more to each side, as slices."""
+    slices = []
+    for axis in range(3):
+        others = tuple({0, 1, 2} - {axis})
+        used = np.flatnonzero(cells.any(axis=others))
+        slices.append(slice(max(int(used[0]) - MARGIN, 0), int(used[-1]) + 1 + MARGIN) if len(used) else slice(0, 0))
+    return tuple(slices)
+
+
+def _level_nearby(
+    density: npt.NDArray[np.floating], threshold: float, deep_ratio: float, dense: BoolArray, cells: BoolArray
+) -> FloatArray:
+    """The level in a part of the lattice; `deep_ratio` is that of the whole."""
     level = np.full(cells.shape, -1.0, dtype=np.float32)
     positive = density > 0.0
     # A threshold of 0 asks for any density at all; what has some is then deep inside.
     smallest = max(threshold, float(np.finfo(np.float64).tiny))
-    share = (np.log(density[positive]) - math.log(smallest)) / math.log(_deep_ratio(density[dense], smallest))
+    share = (np.log(density[positive]) - math.log(smallest)) / math.log(deep_ratio)
     level[positive] = np.where(share < 0.0, np.expm1(share), share)
     np.clip(level, -1.0, 1.0, out=level)
     level[cells & ~dense] = 1.0
@@ -67,7 +91,8 @@ def _deep_ratio(dense: npt.NDArray[np.floating], threshold: float) -> float:
     if len(dense) == 0:
         return DEEP_RATIOS[1]
     # In a logarithm the ratio of the largest to the smallest number does not overflow.
-    logarithm = math.log(float(np.quantile(dense, DEEP_QUANTILE, method="higher"))) - math.log(threshold)
+    smallest = max(threshold, float(np.finfo(np.float64).tiny))
+    logarithm = math.log(float(np.quantile(dense, DEEP_QUANTILE, method="higher"))) - math.log(smallest)
     low, high = map(math.log, DEEP_RATIOS)
     return math.exp(min(max(logarithm, low), high))
 

@@ -13,8 +13,8 @@ def eroded(cells: BoolArray, by: int) -> BoolArray:
 
     What lies beyond the array is not in the set.
 
-    >>> eroded(np.ones((5, 5, 5), dtype=bool), 1).sum()
-    np.int64(27)
+    >>> np.count_nonzero(eroded(np.ones((5, 5, 5), dtype=bool), 1))
+    27
     """
     for axis in range(3):
         row = np.moveaxis(cells, axis, 0)
@@ -45,8 +45,8 @@ def balanced_octree(cells: BoolArray, largest: int) -> tuple[BoolArray, ...]:
         so that nothing in it is smaller. Its shape is half that before, rounded up. Sizes without any cube are left
         out at the end.
 
-    >>> [level.shape for level in balanced_octree(np.ones((9, 8, 8), dtype=bool), 8)]
-    [(5, 4, 4), (3, 2, 2)]
+    >>> [np.count_nonzero(level) for level in balanced_octree(np.ones((12, 12, 12), dtype=bool), 8)]
+    [216, 1]
     """
     levels: list[BoolArray] = []
     size, whole = 1, cells

@@ -44,9 +44,11 @@ class StuffedSolid:
 def stuff(level: npt.NDArray[np.floating], coarsest: int = 8) -> StuffedSolid:
     """Fill the part of a voxel lattice where the level is above 0 with tetrahedra up to the zero level.
 
-    Isosurface stuffing (Labelle and Shewchuk 2007, ACM Transactions on Graphics 26(3), article 57) on a uniform
-    body-centred cubic lattice of one voxel. All dihedral angles are between 10.9 and 163.8 degrees, whatever the
-    levels are; where the solid is away from the surface they are 60 and 90.
+    Isosurface stuffing (Labelle and Shewchuk 2007, ACM Transactions on Graphics 26(3), article 57) on a body-centred
+    cubic lattice: of one voxel near the surface, of cubes that double in size from there on inwards. All dihedral
+    angles are between 10.9 and 163.8 degrees, whatever the levels are; where the solid is away from the surface they
+    are between 45 and 120, and 60 and 90 in cells of one voxel. The surface is the same to the last bit whatever the
+    size of the cells inside.
 
     The surface is exact in the second order of the voxel size where the level is linear over the voxels next to it.
     Levels that stop at -1 and 1 should therefore not do so closer than 1.5 voxels to the surface: at 0.5 voxels the
@@ -56,17 +58,22 @@ def stuff(level: npt.NDArray[np.floating], coarsest: int = 8) -> StuffedSolid:
 
     Args:
         level: Levels at the voxel centres, above 0 in solid voxels, shape (cx, cy, cz). Only their ratios matter.
+        coarsest: Edge of the largest cells inside the solid, [voxels], a power of two; 1 makes all cells alike. Cells
+            of 8 or more are rare: between them and the surface lie two voxels and a layer of every size between.
 
     Returns:
         The mesh. Where solid voxels touch the border of the lattice, it ends on the border.
 
     Raises:
-        MeshError: A level is NaN or infinite, or none is above 0.
+        MeshError: A level is NaN or infinite, none is above 0, or the largest edge is no power of two.
 
     >>> solid = stuff(np.ones((1, 1, 1)))
     >>> len(solid.points), len(solid.tets), len(solid.facets), bool(solid.on_box.all())
     (15, 24, 24, True)
+    >>> [len(stuff(np.ones((30, 30, 30)), coarsest).tets) for coarsest in (1, 2, 4, 8)]
+    [334800, 151632, 127440, 126888]
     """
+    _check_coarsest(coarsest)
     level = _checked(level)
     lattice = bcc_lattice(level)
     interior = coarse_interior(lattice, coarsest)
@@ -80,6 +87,19 @@ def stuff(level: npt.NDArray[np.floating], coarsest: int = 8) -> StuffedSolid:
     on_surface = np.zeros(len(nodes.points), dtype=bool)
     on_surface[facets] = True
     return StuffedSolid(nodes.points, tets, facets, on_surface, _on_border(nodes.points, facets, level.shape))
+
+
+def _check_coarsest(coarsest: int) -> None:
+    whole = isinstance(coarsest, (int, np.integer)) and not isinstance(coarsest, bool)
+    if not (whole and coarsest >= 1 and coarsest & (coarsest - 1) == 0):
+        raise MeshError(
+            explain(
+                "coarsest",
+                expected="a power of two from 1 on, [voxels]",
+                got=repr(coarsest),
+                remedy="Pass 8, or 1 for cells of one voxel throughout.",
+            )
+        )
 
 
 def _checked(level: npt.NDArray) -> npt.NDArray[np.floating]:

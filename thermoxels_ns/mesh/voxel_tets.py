@@ -72,20 +72,17 @@ def lattice_edges(cells: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.int64], 
     """
     cells = _as_cells(cells)
     number = _node_numbers(cells)
+    flat_number = number.ravel()
+    strides = (number.shape[1] * number.shape[2], number.shape[2], 1)
     edges, counts = [], []
     for axis in range(3):
-        around = cells.astype(np.int64)
-        for other in {0, 1, 2} - {axis}:
-            width = [(0, 0)] * 3
-            width[other] = (1, 1)
-            padded = np.pad(around, width)
-            lower = np.take(padded, range(padded.shape[other] - 1), axis=other)
-            around = lower + np.take(padded, range(1, padded.shape[other]), axis=other)
-        start = np.argwhere(around > 0)
-        end = start.copy()
-        end[:, axis] += 1
-        edges.append(np.stack([number[tuple(start.T)], number[tuple(end.T)]], axis=-1))
-        counts.append(around[around > 0])
+        # Of the edge that starts in each corner.
+        around = np.zeros(number.shape, dtype=np.uint8)
+        for offset in CORNER_OFFSETS[CORNER_OFFSETS[:, axis] == 0]:
+            around[tuple(slice(o, o + n) for o, n in zip(offset, cells.shape))] += cells
+        start = np.flatnonzero(around)
+        edges.append(np.stack([flat_number[start], flat_number[start + strides[axis]]], axis=-1))
+        counts.append(around.ravel()[start].astype(np.int64))
     return np.concatenate(edges), np.concatenate(counts)
 
 
