@@ -24,7 +24,7 @@ def compile_kernels(say: Callable[[str], None]) -> None:
         say: Told what is going on if it takes longer than `SILENT_SECONDS`.
     """
     notice = threading.Timer(
-        SILENT_SECONDS, say, ("compiling the kernels for this processor: about half a minute, once",)
+        SILENT_SECONDS, say, ("compiling the kernels for this processor: 10 to 30 s, the first time",)
     )
     notice.daemon = True
     notice.start()

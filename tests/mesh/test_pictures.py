@@ -131,3 +131,13 @@ def test_bad_input_is_refused(tmp_path, box_mesh):
     with pytest.raises(OutputError, match=r"ends in \.png"):
         picture_of_mesh(tmp_path / "a.bmp", box_mesh)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_few_hot_nodes_do_not_take_all_the_colours() -> None:
+    from thermoxels_ns.mesh.pictures import _colour_limits, _without_outliers
+
+    level = np.linspace(10.0, 12.0, 1000)
+    with_lamp = np.append(level, [77.0, 78.0])
+    assert _colour_limits(_without_outliers(with_lamp)) == pytest.approx((10.0, 12.0), abs=0.05)
+    assert _colour_limits(_without_outliers(level)) == (10.0, 12.0)
+    assert _colour_limits(_without_outliers(np.append(np.full(1000, 5.0), 9.0))) == (5.0, 9.0)

@@ -57,7 +57,9 @@ def picture_of_mesh(
         temperature_c: Nodal values to show, shape (n,), [degrees Celsius] unless `bar_title` says otherwise; the
             mesh's own temperatures if left out.
         title: Text above the picture.
-        clim: Values at the ends of the colour bar; the data's extremes if left out.
+        clim: Values at the ends of the colour bar. If left out, the data's extremes; or, where a few nodes stretch
+            the range to more than twice that of the middle 99 %, the range of those, and the words below the picture
+            give the extremes.
         up: Direction that points up in the picture, in mesh coordinates.
         view_direction: Direction from the camera to the mesh; obliquely from above if left out.
         grey_unobserved: Draw triangles with a node that no thermal ray saw in grey.
@@ -87,7 +89,10 @@ def picture_of_mesh(
     check_shape("temperature_c", values, (len(mesh.points_m),), remedy, MeshError)
     check_finite("temperature_c", values, remedy, MeshError)
     right, true_up, towards_camera = _view_axes(up, view_direction)
-    low, high = _colour_limits(values[np.unique(mesh.facets)] if clim is None else np.asarray(clim, dtype=np.float64))
+    shown = values[np.unique(mesh.facets)]
+    low, high = _colour_limits(_without_outliers(shown) if clim is None else np.asarray(clim, dtype=np.float64))
+    beyond = clim is None and (float(shown.min()) < low or float(shown.max()) > high)
+    extremes = (float(shown.min()), float(shown.max())) if beyond else None
 
     unseen = ~mesh.observed[mesh.facets].all(axis=1) if grey_unobserved else np.zeros(len(mesh.facets), dtype=bool)
     folder = writable_folder(path.parent)
@@ -115,7 +120,7 @@ def picture_of_mesh(
             if unseen.any():
                 surface = pv.PolyData.from_regular_faces(mesh.points_m, mesh.facets[unseen])
                 plotter.add_mesh(surface, color=_GREY, **edges, **matter)
-            _add_words(plotter, mesh, title, font, length_unit, unseen=bool(unseen.any()))
+            _add_words(plotter, mesh, title, font, length_unit, unseen=bool(unseen.any()), extremes=extremes)
             _frame(plotter, mesh.points_m[np.unique(mesh.facets)], right, true_up, towards_camera)
             plotter.screenshot(str(temporary), return_img=False)
         finally:
@@ -148,6 +153,13 @@ def _unit(name: str, vector: npt.ArrayLike) -> npt.NDArray[np.float64]:
             explain(name, expected="three finite numbers, not all 0", got=vector, remedy="Pass for instance (0, 0, 1).")
         )
     return array / length
+
+
+def _without_outliers(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """The values, or the middle 99 % of them where the others stretch their range to more than twice as much."""
+    low, high = np.quantile(values, (0.005, 0.995))
+    few = np.ptp(values) > 2.0 * (high - low) > 0.0
+    return values[(values >= low) & (values <= high)] if few else values
 
 
 def _colour_limits(values: npt.NDArray[np.float64]) -> tuple[float, float]:
@@ -215,8 +227,17 @@ def _add_lights(plotter: pv.Plotter, right: npt.NDArray, up: npt.NDArray, toward
         plotter.add_light(light)
 
 
-def _add_words(plotter: pv.Plotter, mesh: TetMesh, title: str, font: str, length_unit: str, *, unseen: bool) -> None:
-    """Title, size of the mesh, axes, and what grey means."""
+def _add_words(
+    plotter: pv.Plotter,
+    mesh: TetMesh,
+    title: str,
+    font: str,
+    length_unit: str,
+    *,
+    unseen: bool,
+    extremes: tuple[float, float] | None,
+) -> None:
+    """Title, size of the mesh, axes, what grey means, and extremes that the colours do not reach."""
     height = plotter.window_size[1]
     if title:
         plotter.add_text(
@@ -226,6 +247,8 @@ def _add_words(plotter: pv.Plotter, mesh: TetMesh, title: str, font: str, length
     words = f"{size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} {length_unit}, {len(mesh.tets):,} tetrahedra"
     if unseen:
         words += "; grey: no thermal ray"
+    if extremes is not None:
+        words += f"\ncolours: middle 99 %; all: {extremes[0]:.1f} to {extremes[1]:.1f}"
     plotter.add_text(
         words, position=(0.17, 0.04), viewport=True, font_size=round(height / 90), color=_INK, font_file=font
     )
