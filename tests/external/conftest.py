@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.demo_mesh import demo_mesh
 from tests.house_mesh import house_mesh
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
@@ -18,10 +19,10 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 _LONGEST_RUN_S = 300
 
 
-@pytest.fixture(scope="session")
-def solid_mesh() -> TetMesh:
-    """The mesh that is handed to every program."""
-    return house_mesh()
+@pytest.fixture(scope="session", params=["house", "hot-object"])
+def solid_mesh(request: pytest.FixtureRequest) -> TetMesh:
+    """The meshes that are handed to every program: a shaken house of voxels, and a demo scene's conforming mesh."""
+    return house_mesh() if request.param == "house" else demo_mesh("hot-object", 24)
 
 
 @pytest.fixture(scope="session")
