@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +25,7 @@ def planes(*knots: float, step: float) -> npt.NDArray[np.float64]:
     """
     parts = [
         np.linspace(low, high, max(int(np.ceil((high - low) / step - 1e-9)), 1), endpoint=False)
-        for low, high in zip(knots, knots[1:])
+        for low, high in pairwise(knots)
     ]
     return np.concatenate([*parts, knots[-1:]])
 
@@ -36,7 +37,7 @@ def graded(*knots: float, finest: float, growth: float, coarsest: float) -> npt.
     [0.0, 1.0, 3.0, 5.0, 6.0]
     """
     parts = []
-    for low, high in zip(knots, knots[1:]):
+    for low, high in pairwise(knots):
         half = [finest]
         while 2.0 * sum(half) < (high - low) * (1.0 - 1e-9):
             half.append(min(half[-1] * growth, coarsest))

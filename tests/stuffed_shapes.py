@@ -43,6 +43,17 @@ def euler_characteristic(solid: StuffedSolid) -> int:
     return len(np.unique(solid.facets)) - len(np.unique(sides, axis=0)) + len(solid.facets)
 
 
+def stiffness(points: np.ndarray, tets: np.ndarray) -> sparse.csr_array:
+    """Stiffness matrix of linear elements for a conductivity of 1."""
+    corners = points[tets]
+    matrices = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    gradients = np.linalg.inv(matrices)
+    gradients = np.concatenate([-gradients.sum(axis=1, keepdims=True), gradients], axis=1)
+    local = np.linalg.det(matrices)[:, None, None] / 6.0 * (gradients @ np.swapaxes(gradients, 1, 2))
+    place = (np.repeat(tets, 4, axis=1).ravel(), np.tile(tets, (1, 4)).ravel())
+    return sparse.coo_array((local.ravel(), place), shape=(len(points), len(points))).tocsr()
+
+
 def turn(degrees: float) -> np.ndarray:
     """Rotation about the z axis."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))

@@ -221,7 +221,7 @@ def test_mesh_of_the_exact_voxels_is_near_the_truth_in_shape_and_temperature(sph
     result = compare(cells, lattice, IDENTITY, truth, mesh)
     assert 0.1 < result["chamfer_voxels"] < 0.8
     assert result["chamfer_m"] == pytest.approx(result["chamfer_voxels"] * lattice.voxel_size)
-    assert result["chamfer_m"] < result["hausdorff_m"] < 1.5 * lattice.voxel_size
+    assert result["chamfer_m"] < result["hausdorff_m"] < 2.0 * lattice.voxel_size
     assert result["share_of_seen_reached"] == 1.0 and result["temperature_seen_mae_c"] < 0.5
     assert result["mesh_volume_m3"] == pytest.approx(result["volume_m3"])
     # The staircase has 1.5 times the sphere's area; what its triangles stand for is the sphere's.

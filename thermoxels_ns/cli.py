@@ -15,6 +15,7 @@ import tyro
 from thermoxels_ns.cost import Cost
 from thermoxels_ns.demo import Demo, SceneName
 from thermoxels_ns.errors import ThermoxelsError
+from thermoxels_ns.heat_command import Heat
 
 
 @dataclass
@@ -85,6 +86,7 @@ Commands = tyro.conf.FlagConversionOff[
         Annotated[Demo, tyro.conf.subcommand(name="demo")],
         Annotated[Synthetic, tyro.conf.subcommand(name="synthetic")],
         Annotated[Cost, tyro.conf.subcommand(name="cost")],
+        Annotated[Heat, tyro.conf.subcommand(name="heat")],
     ]
 ]
 

@@ -57,6 +57,8 @@ class ExportOptions:
     wall_thickness: float | None = None
     """For facades seen from one side: make the seen surface this thick, [m], growing away from the cameras. Takes the
     place of filling the interior."""
+    coarsest_cell: int = 4
+    """Edge of the largest cells deep inside a conforming mesh, a power of two, [voxels]; 1: as fine as the surface."""
     patches: Path | None = None
     """A yaml file that names parts of the surface and regions of the volume by box, plane or colour; see
     configs/patches-example.yaml."""

@@ -123,7 +123,10 @@ def export_snapshot(
     folder = prepare_folder(output_dir, heat=scale is not None)
     to_mesh = np.diag([metres, metres, metres, 1.0]) @ world_to_input
     built = build_mesh(
-        snapshot, checked.selection, to_mesh, MeshOptions(boundary=options.boundary, up=up, rules=checked.rules)
+        snapshot,
+        checked.selection,
+        to_mesh,
+        MeshOptions(options.boundary, options.coarsest_cell, up=up, rules=checked.rules),
     )
     mesh = built.mesh
     voxel_size = snapshot.lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(to_mesh[:3, :3]))))

@@ -1,4 +1,4 @@
-"""Measured orders of isosurface stuffing: 2 in the voxel size on smooth bodies, and what sharp edges cost."""
+"""Measured orders of isosurface stuffing: 2 in the voxel size where all is smooth; what edges and larger cells cost."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy import sparse
+from scipy.sparse.linalg import cg
 
-from tests.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, tet_mesh
-from thermoxels_ns.mesh.quality import MeshQuality, check_mesh, facet_areas
+from tests.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, stiffness, tet_mesh
+from thermoxels_ns.mesh.quality import MeshQuality, check_mesh, facet_areas, facet_normals
 from thermoxels_ns.mesh.stuffing import stuff
 from thermoxels_ns.mesh.tet_shapes import signed_volumes
 
@@ -74,3 +76,47 @@ def test_levels_that_stop_near_the_surface_make_it_rough(voxels_to_one, least, m
     """The area of a sphere in 48 voxels, relative; `stuff` documents it."""
     relative = quality("sphere", 48, voxels_to_one).area_m2 / SHAPES["sphere"].area - 1.0
     assert least < relative < most
+
+
+def _solved(matrix: sparse.csr_array, load: np.ndarray) -> np.ndarray:
+    found, status = cg(matrix, load, rtol=1e-10, atol=0.0, M=sparse.diags_array(1.0 / matrix.diagonal()))
+    assert status == 0
+    return found
+
+
+def _conduction_error(cells: int, coarsest: int) -> float:
+    """Root mean square error of a harmonic temperature in a ball, its surface held at the exact one."""
+    solid = stuff(SHAPES["sphere"].level(cells), coarsest)
+    points = solid.points * (2.0 / cells) - 1.0
+    exact = np.exp(1.5 * points[:, 0]) * np.sin(1.5 * points[:, 1])
+    matrix = stiffness(points, solid.tets)
+    free, fixed = np.flatnonzero(~solid.on_surface), np.flatnonzero(solid.on_surface)
+    error = np.zeros(len(points))
+    error[free] = _solved(matrix[free][:, free], -matrix[free][:, fixed] @ exact[fixed]) - exact[free]
+    share = np.repeat(signed_volumes(points, solid.tets) / 4.0, 4)
+    return float(np.sqrt(np.bincount(solid.tets.ravel(), share) @ error**2 / share.sum()))
+
+
+@pytest.mark.parametrize(("coarsest", "order"), [(1, 1.9), (2, 1.5)])
+def test_conduction_on_stuffed_meshes(coarsest, order):
+    """Second order in the cells' size; with larger cells the share of the ball that they fill grows as well."""
+    error = np.array([_conduction_error(cells, coarsest) for cells in (12, 24, 48)])
+    orders = np.log2(error[:-1] / error[1:])
+    assert orders.min() > order, f"largest cells {coarsest}: observed orders {orders}, errors {error}"
+    assert error[-1] < 3e-4, f"largest cells {coarsest}: errors {error}"
+
+
+def test_surface_temperatures_hardly_feel_larger_cells_inside():
+    """A ball heated on one side that loses heat all around, as in the sun: what the mesher's default changes."""
+    found = []
+    for coarsest in (1, 4):
+        solid = stuff(SHAPES["sphere"].level(36), coarsest)
+        points = solid.points * (2.0 / 36) - 1.0
+        third = facet_areas(points, solid.facets) / 3.0
+        sun = np.maximum(facet_normals(points, solid.facets)[:, 0], 0.0)
+        load, loss = (np.bincount(solid.facets.ravel(), np.repeat(rate * third, 3), len(points)) for rate in (sun, 2.0))
+        matrix = stiffness(points, solid.tets) + sparse.diags_array(loss)
+        found.append((len(solid.tets), _solved(matrix.tocsr(), load)[solid.on_surface]))
+    (uniform_tets, uniform), (graded_tets, graded) = found
+    assert graded_tets < 0.6 * uniform_tets
+    assert np.abs(graded - uniform).max() < 1e-3 * np.ptp(uniform)

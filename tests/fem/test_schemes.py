@@ -155,7 +155,7 @@ def test_surroundings_bound_the_temperature(strength, fourier) -> None:
 
 
 def test_a_body_radiates_from_1000_k_to_3_k() -> None:
-    """A thin plate in the dark: d T / dt = -2 sigma eps T^4 / (rho c d), T = (T0^-3 + 6 sigma eps t / (rho c d))^(-1/3)."""
+    """A thin plate in the dark: rho c d dT/dt = -2 sigma T^4, so T = (T0^-3 + 6 sigma t / (rho c d))^(-1/3)."""
     thickness = 1e-3
     mesh = box_mesh([0, 0.01, 0.02], [0, 0.01, 0.02], [0, thickness], temperature_c=1000.0 - 273.15)
     steel = Material("steel", 50.0, 7800.0, 450.0)
@@ -218,7 +218,7 @@ def test_a_step_that_would_overshoot_is_taken_with_backward_euler(monkeypatch) -
 
 def test_a_scheme_without_estimate_cannot_adapt() -> None:
     problem = HeatProblem(bar(), CONCRETE)
-    with pytest.raises(HeatError, match="scheme: expected one with an error estimate.*got Crank-Nicolson"):
+    with pytest.raises(HeatError, match=r"scheme: expected one with an error estimate.*got Crank-Nicolson"):
         solve_heat(problem, AdaptiveSteps(3600.0), scheme=CRANK_NICOLSON)
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from thermoxels_ns.errors import MeshError
 from thermoxels_ns.mesh import temperature
+from thermoxels_ns.mesh.stuffing import stuff
 from thermoxels_ns.mesh.temperature import extend_harmonically
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets, lattice_edges
 
@@ -141,3 +142,25 @@ def test_a_solver_that_fails_is_reported(monkeypatch):
         extend_harmonically(
             np.array([[0, 1], [1, 2], [1, 3]]), np.array([10.0, 0.0, 30.0, 40.0]), np.array([True, False, True, True])
         )
+
+
+def test_linear_temperatures_are_extended_through_tetrahedra_of_any_size():
+    """A graded mesh: a uniform edge weight would be off by percents where the size of the tetrahedra changes."""
+    level = 9.3 - np.linalg.norm(np.indices((20, 20, 20)).transpose(1, 2, 3, 0) - 9.5, axis=-1)
+    solid = stuff(np.clip(level / 1.5, -1.0, 1.0), 4)
+    linear = 20.0 + solid.points @ [1.0, -2.0, 0.5]
+    edges, conductance = temperature.tet_conductances(solid.points, solid.tets)
+    filled = extend_harmonically(edges, np.where(solid.on_surface, linear, 0.0), solid.on_surface, conductance)
+    lengths = np.linalg.norm(solid.points[solid.tets[:, 0]] - solid.points[solid.tets[:, 1]], axis=1)
+    assert lengths.max() > 1.9  # there are coarse tetrahedra
+    worst = np.abs(filled - linear).max() / np.ptp(linear)
+    uniform = extend_harmonically(edges, np.where(solid.on_surface, linear, 0.0), solid.on_surface)
+    assert worst < 0.01 < 0.03 < np.abs(uniform - linear).max() / np.ptp(linear)
+
+
+def test_an_edge_with_negative_conductance_does_not_break_the_maximum_principle():
+    edges = np.array([[0, 1], [1, 2], [0, 2], [1, 3]])
+    filled = extend_harmonically(
+        edges, np.array([10.0, 0.0, 30.0, 0.0]), np.array([True, False, True, False]), np.array([1.0, 1.0, 1.0, -5.0])
+    )
+    assert filled.tolist() == pytest.approx([10.0, 20.0, 30.0, 20.0])

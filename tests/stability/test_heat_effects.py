@@ -10,7 +10,7 @@ import pytest
 from tests.heat_meshes import box_mesh
 from thermoxels_ns.errors import HeatError
 from thermoxels_ns.fem.assembly import assemble
-from thermoxels_ns.fem.effects import Convection, Effect, FixedTemperature, HeatFlux, Radiation
+from thermoxels_ns.fem.effects import Convection, Effect, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.steady import solve_steady
@@ -25,7 +25,7 @@ SHAPES = ("regular", "carved", "shaken")
 
 
 def body(shape: str, temperature_c=20.0, size: int = 6) -> TetMesh:
-    """A block; one with a third of its voxels taken out at random; one with its nodes moved, so that angles are obtuse."""
+    """A block; one with a third of its voxels taken out; one with its nodes moved, so that angles are obtuse."""
     keep = None
     if shape == "carved":
         keep = lambda p: np.random.default_rng(5).random(p.shape[:3]) < 0.65  # noqa: E731
@@ -116,7 +116,7 @@ def test_near_absolute_zero(temperature_c) -> None:
 
 
 def test_next_to_no_exchange_keeps_the_mean_exact() -> None:
-    """h = 1e-12 on a good conductor over a long time: the mean follows exp(-h A t / C), which the matrix all but loses."""
+    """h = 1e-12 on a good conductor over long steps: the matrix all but loses what holds the mean."""
     copper = Material("copper", 380.0, 8900.0, 380.0)
     mesh = body("carved", spots, size=5)
     capacity = 8900.0 * 380.0 * H**3 * len(mesh.tets) / 6
@@ -179,4 +179,16 @@ def test_meshes_at_the_angle_bounds(degrees) -> None:
         assert low > -60.0 and high < 120.0
     end = solve_steady(problem)
     assert end.converged and end.energy_residual < 1e-9
-    assert 0.0 < end.temperature_c.min() and end.temperature_c.max() < 20.0
+    assert end.temperature_c.min() > 0.0 and end.temperature_c.max() < 20.0
+
+
+def test_an_even_source_leaves_no_round_off_for_the_linear_solver() -> None:
+    """A strong source moves each piece as a whole; its round-off is not what the iterations are spent on."""
+    mesh = body("regular", lambda points: 20.0 + 1e-9 * spots(points), size=8)
+    quiet, loud = (
+        solve_heat(HeatProblem(mesh, CONCRETE, effects=(InternalHeat(("*",), watts),)), TimeSteps(1, 1e12))
+        for watts in (1e-3, 1e8)
+    )
+    assert loud.iterations[0] <= quiet.iterations[0] + 10, (loud.iterations, quiet.iterations)
+    warmer = 1e8 * 1e12 / (2200.0 * 880.0)
+    np.testing.assert_allclose(loud.temperature_c[-1], 20.0 + warmer, rtol=1e-12)

@@ -151,7 +151,7 @@ def test_checkerboard():
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.7, 0.98])
 def test_random_cells(share):
     cells = np.random.default_rng(9).random((12, 13, 14)) < share
-    solid = stuff(np.where(cells, 1.0, -1.0))
+    solid = stuff(np.where(cells, 1.0, -1.0), coarsest=1)
     quality = sound(solid)
     # Every solid voxel is there: its centre is a node inside the mesh.
     inside = solid.points[~solid.on_surface]

@@ -191,9 +191,9 @@ class RadiationForm(_Boundary):
         return self.matrix(4.0 * self._strength(time_s)[:, None] * self.rule.weights * kelvin**3)
 
     def magnitude(self, relative_k: Vector, time_s: float) -> Vector:
-        """Entries integral(sigma eps (T_s^4 + T^4) phi_i) and what round-off of the differences from the reference adds.
+        """Sizes of what the load adds up, with those of the temperatures' differences from the reference, [W].
 
-        Round-off of the load is a few eps of it, [W].
+        Round-off of the load is a few eps of it.
         """
         surface, around = self._surface_k(relative_k), self.surroundings_k(time_s)[:, None]
         size = sum(

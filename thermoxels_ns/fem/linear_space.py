@@ -61,6 +61,19 @@ class LinearSpace:
         """Number of unknowns."""
         return len(self.selection.mesh.points_m)
 
+    @property
+    def points_m(self) -> npt.NDArray[np.float64]:
+        """Positions of the unknowns, shape (n, 3), [m]."""
+        return self.selection.mesh.points_m
+
+    def from_mesh_nodes(self, nodal: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Give unknowns the values that the mesh's nodes have, shape (n, ...)."""
+        return nodal
+
+    def to_mesh_nodes(self, heat_w: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Move heat to the mesh's nodes; the transpose of `from_mesh_nodes`."""
+        return heat_w
+
     def stiffness(self, conductivity_w_mk: float | npt.NDArray[np.float64]) -> sparse.csr_matrix:
         """K, entries integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]."""
         mesh = self.selection.mesh
@@ -96,15 +109,16 @@ class LinearSpace:
     def node_places(self, nodes: npt.NDArray[np.int64]) -> Places:
         """Give the positions of nodes, with the mean normal of the boundary around them."""
         selection = self.selection
-        facets = selection.mesh.facets
+        owners = self.facet_nodes(np.arange(len(selection.mesh.facets)))
+        width = owners.shape[1]
         weighted = selection.facet_normal * selection.facet_area_m2[:, None]
         total = np.stack(
-            [sums_by_number(facets.ravel(), np.repeat(weighted[:, i], 3), self.num_nodes)[nodes] for i in range(3)],
+            [sums_by_number(owners.ravel(), np.repeat(weighted[:, i], width), self.num_nodes)[nodes] for i in range(3)],
             axis=1,
         )
         length = np.sqrt(np.einsum("ki,ki->k", total, total))[:, None]
         normals = np.divide(total, length, out=np.zeros_like(total), where=length > 0.0)
-        return Places(selection.mesh.points_m[nodes], normals, selection.up)
+        return Places(self.points_m[nodes], normals, selection.up)
 
 
 def sums_by_number(numbers: npt.NDArray[np.int64], values: npt.NDArray, count: int) -> npt.NDArray[np.float64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -60,9 +60,26 @@ def equal_steps(
     stepper, relative_k = Stepper(system, scheme, relative_tolerance=tolerance), start_k
     for number, begin_s in enumerate(time.times_s[:-1]):
         step = stepper.step(relative_k, float(begin_s), time.step_seconds)
-        failure = "" if step.converged else f"Step {number + 1} of {time.steps} failed. {step.status}"
+        failure = ""
+        if not step.converged:
+            remedy = "Use shorter steps (--step-seconds) or check the mesh's quality."
+            failure = f"Step {number + 1} of {time.steps} failed. {step.status} {remedy}"
         yield Taken(step, time.step_seconds, True, failure)
         relative_k = step.relative_k
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """A step that may count, if its error is small enough."""
+
+    step: Step
+    """Its outcome."""
+    error_order: int
+    """Power of the step length that its error estimate grows with."""
+    made_safe: int = 0
+    """1 if it was taken with backward Euler."""
+    out_of_range: int = 0
+    """1 if a temperature left its range."""
 
 
 class AdaptiveMarch:
@@ -85,6 +102,8 @@ class AdaptiveMarch:
             time: Duration, tolerance and outputs.
             relative_tolerance: Of the linear solver.
         """
+        self.name = scheme.name
+        """Name of the scheme."""
         self._system, self._time, self._start_k = system, time, start_k
         self._scheme = Stepper(system, scheme, relative_tolerance=relative_tolerance)
         self._safe = Stepper(system, BACKWARD_EULER, relative_tolerance=relative_tolerance)
@@ -105,53 +124,50 @@ class AdaptiveMarch:
         relative_k, now_s, wished_s = self._start_k, 0.0, self._first_length()
         for end_s in self._time.times_s[1:]:
             while now_s < end_s:
-                left_s = end_s - now_s
-                # Two even steps to the end of an interval rather than a long and a tiny one.
-                step_s = (
-                    left_s
-                    if wished_s >= left_s
-                    else min(wished_s, 0.5 * left_s)
-                    if wished_s > 0.5 * left_s
-                    else wished_s
-                )
-                step, order = self._try(relative_k, now_s, step_s)
-                factor = self._factor(step, order)
-                if not step.converged or step.error_k > self._allowed_k:
+                left_s = float(end_s) - now_s
+                step_s = _fitted(wished_s, left_s)
+                attempt = self._try(relative_k, now_s, step_s)
+                factor = self._factor(attempt)
+                if not attempt.step.converged or attempt.step.error_k > self._allowed_k:
                     self.repeated += 1
-                    wished_s = step_s * min(factor, 0.9)
+                    wished_s = step_s * min(factor, _SAFETY)
                     if wished_s < _SHORTEST * self._time.duration_s or now_s + 0.25 * wished_s == now_s:
-                        yield Taken(step, step_s, False, self._failure(step, now_s))
+                        yield Taken(attempt.step, step_s, False, self._failure(attempt.step, now_s))
                         return
                     continue
-                last = step_s == left_s
-                now_s = float(end_s) if last else now_s + step_s
-                relative_k = step.relative_k
+                self.made_safe += attempt.made_safe
+                self.out_of_range += attempt.out_of_range
+                now_s = float(end_s) if step_s == left_s else now_s + step_s
+                relative_k = attempt.step.relative_k
+                next_s = step_s * (factor if factor > _KEEP_BELOW else min(factor, 1.0))
                 # A step cut short by an interval's end says nothing against the length wished for.
-                grown_s = step_s * factor if factor > _KEEP_BELOW else step_s * min(factor, 1.0)
-                wished_s = max(grown_s, wished_s) if step_s < wished_s and factor >= 1.0 else grown_s
-                yield Taken(step, step_s, last)
+                wished_s = max(next_s, wished_s) if step_s < wished_s and factor >= 1.0 else next_s
+                yield Taken(attempt.step, step_s, now_s == end_s)
 
     def _first_length(self) -> float:
         system, time = self._system, self._time
         rate = system.net_heat(self._start_k, 0.0)[0] / system.nodal_mass_j_k
         fastest = float(np.max(np.abs(rate[system.fixed.free]), initial=0.0))
         interval_s = time.duration_s / time.outputs
-        return (
-            interval_s if fastest == 0.0 else float(np.clip(time.tolerance_k / fastest, _SHORTEST * time.duration_s, interval_s))
-        )
+        if fastest == 0.0:
+            return interval_s
+        return float(np.clip(time.tolerance_k / fastest, _SHORTEST * time.duration_s, interval_s))
 
-    def _try(self, start_k: Vector, now_s: float, step_s: float) -> tuple[Step, int]:
-        """Take a step, and the order of its error estimate in the step length."""
+    def _try(self, start_k: Vector, now_s: float, step_s: float) -> _Attempt:
         step = self._scheme.step(start_k, now_s, step_s, estimate=True)
-        order = self._scheme.scheme.order + 1
+        plain = _Attempt(step, self._scheme.scheme.order + 1)
         if not step.converged or step.error_k > self._allowed_k or self._in_range(step, start_k, now_s, step_s):
-            return step, order
+            return plain
         safe = self._safe.step(start_k, now_s, step_s)
         if not safe.converged or not self._in_range(safe, start_k, now_s, step_s):
-            self.out_of_range += 1
-            return step, order
-        self.made_safe += 1
-        return _with_error(safe, float(np.max(np.abs(safe.relative_k - step.relative_k))), step), 2
+            return replace(plain, out_of_range=1)
+        safe = replace(
+            safe,
+            error_k=float(np.max(np.abs(safe.relative_k - step.relative_k))),
+            iterations=safe.iterations + step.iterations,
+            newton_iterations=safe.newton_iterations + step.newton_iterations,
+        )
+        return _Attempt(safe, BACKWARD_EULER.order + 1, made_safe=1)
 
     def _in_range(self, step: Step, start_k: Vector, now_s: float, step_s: float) -> bool:
         times = (now_s, *(now_s + node * step_s for node in self._scheme.scheme.nodes))
@@ -159,30 +175,30 @@ class AdaptiveMarch:
         slack = _RANGE_ROUND_OFF * (high - low) if np.isfinite(high - low) else _RANGE_ROUND_OFF
         return low - slack <= float(step.relative_k.min()) and float(step.relative_k.max()) <= high + slack
 
-    def _factor(self, step: Step, order: int) -> float:
+    def _factor(self, attempt: _Attempt) -> float:
         """How much longer the next step may be."""
+        step = attempt.step
         if not step.converged or not np.isfinite(step.error_k):
             return _SHRINK
         if step.error_k == 0.0:
             return _GROW
-        return float(np.clip(_SAFETY * (self._allowed_k / step.error_k) ** (1.0 / order), _SHRINK, _GROW))
+        return float(np.clip(_SAFETY * (self._allowed_k / step.error_k) ** (1.0 / attempt.error_order), _SHRINK, _GROW))
 
     def _failure(self, step: Step, now_s: float) -> str:
         if not step.converged:
-            return f"At {now_s:.6g} s no step however short succeeds. {step.status}"
+            return f"At {now_s:.6g} s no step however short succeeds. {step.status} Check the mesh's quality."
         return (
             f"At {now_s:.6g} s no step however short keeps within {self._time.tolerance_k:g} K. Something jumps in "
             "time: end an interval there, or raise the tolerance."
         )
 
 
-def _with_error(safe: Step, error_k: float, other: Step) -> Step:
-    return Step(
-        safe.relative_k,
-        safe.group_heat_w,
-        safe.iterations + other.iterations,
-        safe.newton_iterations + other.newton_iterations,
-        error_k,
-        True,
-        safe.status,
-    )
+def _fitted(wished_s: float, left_s: float) -> float:
+    """Fit a step into what is left of an interval: two even steps to its end rather than a long and a tiny one.
+
+    >>> [_fitted(wished, 10.0) for wished in (12.0, 8.0, 3.0)]
+    [10.0, 5.0, 3.0]
+    """
+    if wished_s >= left_s:
+        return left_s
+    return min(wished_s, 0.5 * left_s)

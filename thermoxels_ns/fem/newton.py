@@ -52,10 +52,15 @@ class Residual:
         nodes = np.all(np.abs(self.heat_w) <= self.round_off_w)
         return bool(nodes and np.all(np.abs(self.piece_heat_w) <= self.piece_round_off_w))
 
-    def is_small(self, heat_w: float) -> bool:
-        """Whether it is within a tolerance or round-off at the nodes, and balanced to round-off over each piece."""
+    def is_small(self, heat_w: float, before: Residual) -> bool:
+        """Whether it is within a tolerance or round-off at the nodes, and each piece is balanced.
+
+        A piece is balanced to round-off, or if it is not much better than it was a step `before`.
+        """
         nodes = _norm(self.heat_w) <= max(heat_w, _norm(self.round_off_w))
-        return nodes and bool(np.all(np.abs(self.piece_heat_w) <= self.piece_round_off_w))
+        piece_w = np.abs(self.piece_heat_w)
+        balanced = (piece_w <= self.piece_round_off_w) | (piece_w > 0.5 * np.abs(before.piece_heat_w))
+        return nodes and bool(np.all(balanced))
 
 
 class Equations(Protocol):
@@ -106,8 +111,8 @@ def newton(equations: Equations, num_unknowns: int, *, relative_tolerance: float
     residual = equations.residual(u)
     first = _norm(residual.heat_w)
     spent, reason, count = 0, f"stopped after {MAX_ITERATIONS} steps", 0
-    settled = False
-    while not (settled and residual.is_small(relative_tolerance * first)):
+    settled, before = False, residual
+    while not (settled and residual.is_small(relative_tolerance * first, before)):
         if count == MAX_ITERATIONS or not np.isfinite(_norm(residual.heat_w)):
             share = _norm(residual.heat_w) / first if first > 0.0 else np.inf
             status = f"Newton's method {reason}, at a relative residual of {share:.1e}."
@@ -120,7 +125,7 @@ def newton(equations: Equations, num_unknowns: int, *, relative_tolerance: float
             )
         settled = equations.is_short(u, direction, _SETTLED)
         u = u + _length(equations, u, direction) * direction
-        residual = equations.residual(u)
+        before, residual = residual, equations.residual(u)
         count += 1
     return NewtonSolution(u, count, spent, True, f"Newton's method converged in {count} steps.")
 

@@ -78,7 +78,7 @@ class SteadySolution:
     """Temperatures that no longer change, and the account of the heat."""
 
     temperature_c: npt.NDArray[np.float64]
-    """Nodal temperatures, shape (n,), [degrees Celsius]."""
+    """Temperatures of the mesh's nodes, shape (n,), [degrees Celsius]."""
     effects: tuple[EffectHeat, ...]
     """Heat that each effect of the problem brings, in the order of the problem; they add up to 0."""
     energy_residual: float
@@ -93,6 +93,9 @@ class SteadySolution:
     """Steps of Newton's method; 0 without radiation."""
     assembled: Assembled
     """What was assembled."""
+    edge_temperature_c: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    """Temperatures of the middles of the mesh's edges, in the order of `mesh_edges`, shape (e,), [degrees Celsius];
+    empty with linear tetrahedra."""
 
 
 def heat_by_effect(

@@ -16,7 +16,8 @@ def solve_steady(
     problem: HeatProblem,
     *,
     time_s: float = 0.0,
-    lumped_boundary: bool = True,
+    order: int = 1,
+    lumped_boundary: bool | None = None,
     relative_tolerance: float = 1e-12,
     allow_unconverged: bool = False,
 ) -> SteadySolution:
@@ -25,9 +26,12 @@ def solve_steady(
     Args:
         problem: Body, materials and effects. Its initial temperatures are where iterations start.
         time_s: Time at which effects that change are taken, [s].
+        order: 1 for linear tetrahedra; 2 for quadratic ones, which have eight times as many unknowns and an error that
+            falls with the cube of the mesh size where the solution is smooth, but may overshoot the surroundings.
         lumped_boundary: Evaluate convection and radiation at the nodes, which keeps temperatures in the range of the
             surroundings on meshes without obtuse angles. False integrates them over each triangle: on smooth
-            problems the error is smaller by a constant.
+            problems the error is smaller by a constant. None: at the nodes of linear tetrahedra; quadratic ones are
+            always integrated.
         relative_tolerance: Of the linear solver, and of Newton's method if there is radiation.
         allow_unconverged: Return what was computed, with `converged` False and the reason in `status`, instead of
             raising.
@@ -37,25 +41,24 @@ def solve_steady(
 
     Raises:
         HeatError: A piece of the body exchanges heat with nothing whose temperature is known, two effects fix one node
-            differently, or the solver does not converge.
+            differently, quadratic tetrahedra are to be lumped, or the solver does not converge.
     """
-    system = HeatSystem(problem, lumped_boundary=lumped_boundary)
+    system = HeatSystem(problem, lumped=order == 1, lumped_boundary=lumped_boundary, order=order)
     _check_held(system, time_s)
-    start_k = problem.start_c - system.reference_c
+    start_k = system.start_k
     stage = Stage(system, time_s, np.inf, relative_tolerance=relative_tolerance)
     solution = stage.solve(start_k, time_s)
     failure = _failure(system, solution)
     if failure and not allow_unconverged:
         raise HeatError(failure)
     relative_k = solution.relative_k
-    flows = system.group_heat_w(relative_k, time_s)
-    kept = -system.net_heat_at_fixed(relative_k, time_s)
-    group_heat = np.concatenate([flows, system.fixed.shares @ kept])
+    group_heat = heat_of_groups_w(system, relative_k, time_s)
     # Of the nodes, not of the groups: opposite flows through one patch cancel in its sum.
     size = float(np.abs(group_heat).sum())
     surplus = abs(float(group_heat.sum()))
+    num_mesh_nodes = len(problem.mesh.points_m)
     return SteadySolution(
-        temperature_c=relative_k + system.reference_c,
+        temperature_c=relative_k[:num_mesh_nodes] + system.reference_c,
         effects=heat_by_effect(effect_labels(problem), system.groups, group_heat[None]),
         energy_residual=surplus / size if size > 0.0 else 0.0,
         status=failure or f"The steady state was found. {solution.status}",
@@ -63,7 +66,25 @@ def solve_steady(
         iterations=solution.iterations,
         newton_iterations=solution.newton_iterations,
         assembled=system.assembled,
+        edge_temperature_c=relative_k[num_mesh_nodes:] + system.reference_c,
     )
+
+
+def heat_of_groups_w(
+    system: HeatSystem, relative_k: np.ndarray, time_s: float, stored_w: np.ndarray | None = None
+) -> np.ndarray:
+    """Heat flow into the body of each group of a system, fixed nodes included, shape (g,), [W].
+
+    Args:
+        system: The equations.
+        relative_k: Temperatures, relative to the system's reference, shape (n,), [K].
+        time_s: Time.
+        stored_w: Heat that each node stores, shape (n,), [W]; None: a steady state.
+    """
+    kept = -system.net_heat_at_fixed(relative_k, time_s)
+    if stored_w is not None:
+        kept = kept + stored_w[system.fixed.nodes]
+    return np.concatenate([system.group_heat_w(relative_k, time_s), system.fixed.shares @ kept])
 
 
 def _failure(system: HeatSystem, solution: StageSolution) -> str:
@@ -91,7 +112,7 @@ def _check_held(system: HeatSystem, time_s: float) -> None:
         return
     sizes = np.bincount(system.pieces.number, minlength=system.pieces.count)
     piece = int(loose[np.argmax(sizes[loose])])
-    points = system.problem.mesh.points_m[system.pieces.number == piece]
+    points = system.points_m[system.pieces.number == piece]
     low, high = (", ".join(f"{part:.4g}" for part in corner) for corner in (points.min(axis=0), points.max(axis=0)))
     raise HeatError(
         explain(

@@ -75,7 +75,7 @@ def solve_heat(
             break
         account.add(taken)
     if failure and not allow_unconverged:
-        raise HeatError(f"{failure} Use shorter steps (--step-seconds) or check the mesh's quality.")
+        raise HeatError(failure)
     return account.close(failure or account.success(march), not failure, adaptive=march is not None)
 
 
@@ -111,7 +111,7 @@ class _Account:
         if march.repeated:
             sentence += f" {march.repeated} more were repeated with a shorter length."
         if march.made_safe:
-            sentence += f" {march.made_safe} were taken with backward Euler because SDIRK2 would have overshot."
+            sentence += f" {march.made_safe} were taken with backward Euler because {march.name} would have overshot."
         if march.out_of_range:
             sentence += (
                 f" In {march.out_of_range} a temperature left its range, which happens on meshes with obtuse angles "

@@ -8,12 +8,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from thermoxels_ns.errors import HeatError, explain
 from thermoxels_ns.fem.account import Assembled
 from thermoxels_ns.fem.fixed_nodes import FixedNodes
 from thermoxels_ns.fem.forms import FixedForm, FluxForm, Form, RadiationForm, RobinForm, SourceForm
 from thermoxels_ns.fem.linear_space import LinearSpace
 from thermoxels_ns.fem.pieces import Pieces
 from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.quadratic_space import QuadraticSpace
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.sparsity import product_and_bound
 from thermoxels_ns.fem.terms import FluxTerm, RadiationTerm, RobinTerm, SourceTerm, Term
@@ -27,16 +29,19 @@ class HeatSystem:
     Temperatures are held relative to `reference_c`, so that round-off is relative to their differences.
     """
 
-    def __init__(self, problem: HeatProblem, *, lumped: bool = True, lumped_boundary: bool = True) -> None:
+    def __init__(
+        self, problem: HeatProblem, *, lumped: bool = True, lumped_boundary: bool | None = None, order: int = 1
+    ) -> None:
         """Turn effects into terms, terms into forms, and assemble the stiffness.
 
         Args:
             problem: The body, its materials and the effects.
-            lumped: Lump the mass matrix.
-            lumped_boundary: Evaluate boundary exchange at the nodes.
+            lumped: Lump the mass matrix; of linear tetrahedra only.
+            lumped_boundary: Evaluate boundary exchange at the nodes; None: on linear tetrahedra.
+            order: 1 for linear tetrahedra, 2 for quadratic ones.
 
         Raises:
-            HeatError: An effect names what the mesh does not have.
+            HeatError: An effect names what the mesh does not have, or quadratic tetrahedra are to be lumped.
         """
         self.problem = problem
         self.assembled = Assembled()
@@ -45,7 +50,7 @@ class HeatSystem:
         self.reference_c: float = 0.5 * (float(start.min()) + float(start.max()))
         """What temperatures are relative to, [degrees Celsius]."""
         selection = Selection(problem.mesh, problem.up)
-        self._space = LinearSpace(selection, lumped=lumped, lumped_boundary=lumped_boundary)
+        self._space = _space(selection, lumped, lumped_boundary, order)
         self._robin: list[RobinForm] = []
         self._loads: list[FluxForm | SourceForm] = []
         self._radiation: list[RadiationForm] = []
@@ -76,8 +81,23 @@ class HeatSystem:
 
     @property
     def num_nodes(self) -> int:
-        """Number of nodes."""
+        """Number of nodes; with quadratic tetrahedra the mesh's nodes come first and then its edges."""
         return self._space.num_nodes
+
+    @property
+    def space(self) -> LinearSpace:
+        """The nodes, and how what happens becomes numbers on them."""
+        return self._space
+
+    @property
+    def points_m(self) -> npt.NDArray[np.float64]:
+        """Positions of the nodes, shape (n, 3), [m]."""
+        return self._space.points_m
+
+    @property
+    def start_k(self) -> Vector:
+        """Temperatures at the start, relative to the reference, shape (n,), [K]."""
+        return self._space.from_mesh_nodes(self.problem.start_c - self.reference_c)
 
     @property
     def nodal_mass_j_k(self) -> Vector:
@@ -258,6 +278,19 @@ class HeatSystem:
     def _kinds_of_loads(self) -> list[tuple[str, RobinForm | FluxForm | SourceForm]]:
         kinds: list[tuple[str, RobinForm | FluxForm | SourceForm]] = [("robin", form) for form in self._robin]
         return kinds + [("source" if isinstance(form, SourceForm) else "flux", form) for form in self._loads]
+
+
+def _space(selection: Selection, lumped: bool, lumped_boundary: bool | None, order: int) -> LinearSpace:
+    if order == 1:
+        return LinearSpace(selection, lumped=lumped, lumped_boundary=lumped_boundary is not False)
+    if order != 2:
+        remedy = "Use 1 for linear tetrahedra or 2 for quadratic ones."
+        raise HeatError(explain("order", expected="1 or 2", got=repr(order), remedy=remedy))
+    if lumped or lumped_boundary:
+        got = "lumped=True" if lumped else "lumped_boundary=True"
+        remedy = "Leave it out: lumped, a quadratic tetrahedron would have negative masses at its corners."
+        raise HeatError(explain("order 2", expected="integrals that are not lumped", got=got, remedy=remedy))
+    return QuadraticSpace(selection)
 
 
 def _sum_of(first: sparse.csr_matrix | None, second: sparse.csr_matrix | None) -> sparse.csr_matrix | None:

@@ -18,7 +18,7 @@ from thermoxels_ns.mesh.patch_rules import PatchRules
 from thermoxels_ns.mesh.patches import apply_regions
 from thermoxels_ns.mesh.solid import SolidCells, SolidSelection, select_solid
 from thermoxels_ns.mesh.stuffing import stuff
-from thermoxels_ns.mesh.temperature import MIN_OBSERVED_WEIGHT, extend_harmonically, tet_edges
+from thermoxels_ns.mesh.temperature import MIN_OBSERVED_WEIGHT, extend_harmonically, tet_conductances
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, lattice_edges, voxel_facets
 from thermoxels_ns.snapshot import GridSnapshot
@@ -31,6 +31,8 @@ class MeshOptions:
     boundary: BoundaryMode = "conforming"
     """conforming: the boundary follows the level set of the density (isosurface stuffing); voxel: it follows voxel
     faces, and every boundary triangle says how much true surface it stands for."""
+    coarsest_cell: int = 4
+    """Edge of the largest cells deep inside a conforming mesh, a power of two, [voxels]; 1: as fine as the surface."""
     min_observed_weight: float = MIN_OBSERVED_WEIGHT
     """Nodes with less thermal ray weight than this are not measurements, [rays], at least 0; 0 keeps every node that
     any ray touched."""
@@ -113,15 +115,15 @@ def build_mesh(
     if options.boundary == "voxel":
         shape = _voxel_shape(solid.cells)
         temperature_c, weight = _measured(snapshot, shape.points)
-        edges, around = lattice_edges(solid.cells)
+        edges, conductance = lattice_edges(solid.cells)
     else:
-        shape = _stuffed_shape(solid.level)
+        shape = _stuffed_shape(solid.level, options.coarsest_cell)
         temperature_c, weight = _measured(snapshot, shape.points)
         shape, stays = _with_a_measurement(shape, weight >= least)
         temperature_c, weight = temperature_c[stays], weight[stays]
-        edges, around = tet_edges(shape.tets), None
+        edges, conductance = tet_conductances(shape.points, shape.tets)
     observed = weight >= least
-    temperature_c = extend_harmonically(edges, temperature_c, observed, edge_weights=around)
+    temperature_c = extend_harmonically(edges, temperature_c, observed, edge_weights=conductance)
 
     tets, facets = shape.tets, shape.facets
     if np.linalg.det(transform[:3, :3]) < 0.0:
@@ -164,8 +166,8 @@ def _voxel_shape(cells: npt.NDArray[np.bool_]) -> _Shape:
     return _Shape(corners.astype(np.float64), tets, facets, tags)
 
 
-def _stuffed_shape(level: npt.NDArray[np.floating]) -> _Shape:
-    stuffed = stuff(level)
+def _stuffed_shape(level: npt.NDArray[np.floating], coarsest_cell: int) -> _Shape:
+    stuffed = stuff(level, coarsest_cell)
     tags = np.where(stuffed.on_box, FACET_BOX, FACET_SURFACE).astype(np.int64)
     return _Shape(stuffed.points, stuffed.tets, stuffed.facets, tags)
 

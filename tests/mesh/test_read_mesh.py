@@ -1,0 +1,117 @@
+"""What is written comes back."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.errors import MeshError
+from thermoxels_ns.mesh.file_content import colour_bytes
+from thermoxels_ns.mesh.formats import write_mesh
+from thermoxels_ns.mesh.read_mesh import read_mesh
+from thermoxels_ns.mesh.tetrahedra import Boundary
+
+
+def assert_same(read, written) -> None:
+    for field in dataclasses.fields(written):
+        ours, theirs = getattr(written, field.name), getattr(read, field.name)
+        if isinstance(ours, np.ndarray) and field.name != "colour":
+            assert theirs.dtype == ours.dtype, field.name
+            assert np.array_equal(ours, theirs), field.name
+        elif isinstance(ours, Boundary):
+            assert_same(theirs, ours)
+        elif field.name != "colour":
+            assert ours == theirs, field.name
+
+
+@pytest.mark.parametrize("name", ["mesh.vtu", "my house.vtu"])
+def test_a_tagged_mesh_comes_back_bit_for_bit(tmp_path, tagged_mesh, name) -> None:
+    write_mesh(tmp_path / name, tagged_mesh)
+    read = read_mesh(tmp_path / name)
+    assert_same(read, tagged_mesh)
+    assert read.colour.dtype == np.float32 and np.abs(read.colour - tagged_mesh.colour).max() <= 0.5 / 255 + 1e-7
+    assert np.array_equal(colour_bytes(read.colour), colour_bytes(tagged_mesh.colour))
+
+
+def test_an_untagged_mesh_stays_untagged(tmp_path, box_mesh) -> None:
+    write_mesh(tmp_path / "box.vtu", box_mesh)
+    read = read_mesh(tmp_path / "box.vtu")
+    assert_same(read, box_mesh)
+    assert read.boundary is None and read.colour is None
+
+
+def test_regions_keep_their_order_beyond_ten(tmp_path, box_mesh) -> None:
+    names = tuple(f"part {number}" for number in range(12))
+    many = dataclasses.replace(box_mesh, region_names=names, region=np.arange(len(box_mesh.tets)) % 12)
+    write_mesh(tmp_path / "box.vtu", many)
+    assert read_mesh(tmp_path / "box.vtu").region_names == names
+
+
+def test_missing_files_are_named(tmp_path, box_mesh) -> None:
+    with pytest.raises(MeshError, match=r"box\.vtu: expected a file at .*box\.vtu, got none\. Export"):
+        read_mesh(tmp_path / "box.vtu")
+    write_mesh(tmp_path / "box.vtu", box_mesh)
+    (tmp_path / "box-boundary.vtp").unlink()
+    with pytest.raises(MeshError, match=r"box-boundary\.vtp: expected a file at"):
+        read_mesh(tmp_path / "box.vtu")
+    with pytest.raises(MeshError, match=r"mesh file: expected a name that ends in \.vtu, got box\.msh"):
+        read_mesh(tmp_path / "box.msh")
+
+
+@pytest.mark.parametrize("name", ["box.vtu", "box-boundary.vtp"])
+@pytest.mark.parametrize("damage", ["cut short", "text", "empty", "other kind"])
+def test_damaged_files_are_refused(tmp_path, box_mesh, name, damage, capfd) -> None:
+    write_mesh(tmp_path / "box.vtu", box_mesh)
+    file, other = tmp_path / name, tmp_path / ("box-boundary.vtp" if name == "box.vtu" else "box.vtu")
+    content = file.read_bytes()
+    if damage == "other kind":
+        shutil.copy(other, file)
+    else:
+        file.write_bytes({"cut short": content[: len(content) // 2], "text": b"not a mesh", "empty": b""}[damage])
+    with pytest.raises(MeshError, match=rf"{name}: expected a VTK file .*, got a damaged or empty one\. Export"):
+        read_mesh(tmp_path / "box.vtu")
+    assert capfd.readouterr().err == ""
+
+
+def test_a_changed_byte_is_never_read_as_something_else(tmp_path, box_mesh) -> None:
+    """Whatever byte is damaged, the mesh is refused or comes back as it was."""
+    write_mesh(tmp_path / "box.vtu", box_mesh)
+    file, random = tmp_path / "box.vtu", np.random.default_rng(5)
+    content, refused = bytearray(file.read_bytes()), 0
+    start = content.index(b"<AppendedData") + 60
+    for place in random.integers(start, len(content), 40):
+        changed = content.copy()
+        changed[place] ^= 0x55
+        file.write_bytes(changed)
+        try:
+            assert_same(read_mesh(file), box_mesh)
+        except MeshError:
+            refused += 1
+    assert refused > 20
+
+
+def test_the_boundary_of_another_mesh_is_refused(tmp_path, box_mesh) -> None:
+    moved = dataclasses.replace(box_mesh, points_m=box_mesh.points_m + 1e-3)
+    write_mesh(tmp_path / "box.vtu", box_mesh)
+    write_mesh(tmp_path / "moved.vtu", moved)
+    shutil.copy(tmp_path / "moved-boundary.vtp", tmp_path / "box-boundary.vtp")
+    with pytest.raises(MeshError, match=r"box-boundary\.vtp: expected the boundary of the mesh beside it"):
+        read_mesh(tmp_path / "box.vtu")
+
+
+def test_a_file_without_our_arrays_is_refused(tmp_path, box_mesh) -> None:
+    import pyvista as pv
+
+    write_mesh(tmp_path / "box.vtu", box_mesh)
+    grid = pv.UnstructuredGrid({pv.CellType.TETRA: box_mesh.tets}, box_mesh.points_m)
+    grid.save(tmp_path / "box.vtu")
+    with pytest.raises(MeshError, match=r"box\.vtu: expected field arrays region:NAME numbered from 0, got none"):
+        read_mesh(tmp_path / "box.vtu")
+    grid.field_data["region:solid"] = [0]
+    grid.cell_data["region"] = np.zeros(len(box_mesh.tets), np.int64)
+    grid.save(tmp_path / "box.vtu")
+    with pytest.raises(MeshError, match=r"box\.vtu: expected an array temperature_c, got none"):
+        read_mesh(tmp_path / "box.vtu")

@@ -1,0 +1,201 @@
+"""Larger cells inside a stuffed solid: the surface stays, nothing cracks, and a linear field is one."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from scipy.sparse.linalg import spsolve
+
+from tests.stuffed_shapes import ANGLE_BOUNDS_DEG, box_distance, centres, stiffness, tet_mesh, turn
+from thermoxels_ns.errors import MeshError
+from thermoxels_ns.mesh.bcc_lattice import bcc_lattice
+from thermoxels_ns.mesh.quality import check_mesh, dihedral_range_deg
+from thermoxels_ns.mesh.stuffing import StuffedSolid, stuff
+from thermoxels_ns.mesh.stuffing_interior import coarse_interior
+from thermoxels_ns.mesh.tet_shapes import signed_volumes
+
+
+def ball(cells: int, radius: float, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+    distance = np.linalg.norm(centres(cells, cells, cells) - offset, axis=-1)
+    return np.clip((radius - distance) / 1.5, -1.0, 1.0)
+
+
+def blobs(random: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    level = ndimage.gaussian_filter(random.normal(size=shape), 6.0, mode="wrap")
+    return np.clip(level / np.abs(level).max() * 4.0 + 0.8, -1.0, 1.0)
+
+
+def pinholes(random: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Levels without order, some not above 0: points move and edges are cut wherever they may."""
+    level = random.uniform(size=shape) ** 8 + 1e-12
+    return np.where(random.random(shape) < 6e-4, -random.choice([0.0, 1e-9, 0.5, 100.0], size=shape), level)
+
+
+def smallest_numbers(random: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Levels above 0 whose means are 0 by rounding, here and there in a solid."""
+    return np.where(ndimage.gaussian_filter(random.normal(size=shape), 1.5) > 0.06, 5e-324, 0.5)
+
+
+def turned_box(random: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    points = centres(*shape) @ turn(random.uniform(0, 90)).T
+    return np.clip(-box_distance(points, random.uniform(8, 14, size=3)) / 1.5, -1.0, 1.0)
+
+
+def at_the_border(random: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    distance = np.linalg.norm(centres(*shape) - random.choice([-13.0, 0.0, 13.0], size=3), axis=-1)
+    return np.clip((16.0 - distance) / 1.5, -1.0, 1.0).astype(np.float32)
+
+
+LEVELS = (blobs, pinholes, smallest_numbers, turned_box, at_the_border)
+
+
+def same_surface(first: StuffedSolid, second: StuffedSolid) -> bool:
+    """Whether boundary triangles and their points are the same bits and in the same order, up to node numbers."""
+    return (
+        np.array_equal(first.points[first.facets], second.points[second.facets])
+        and np.array_equal(first.on_box, second.on_box)
+        and np.array_equal(first.points[first.on_surface], second.points[second.on_surface])
+    )
+
+
+@pytest.mark.parametrize("kind", LEVELS, ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("seed", range(3))
+def test_the_inside_changes_and_the_surface_does_not(kind, seed):
+    random = np.random.default_rng(seed)
+    level = kind(random, tuple(random.integers(27, 34, size=3)))
+    uniform = stuff(level, coarsest=1)
+    volume = signed_volumes(uniform.points, uniform.tets).sum()
+    count = len(uniform.tets)
+    for coarsest in (2, 4, 8):
+        graded = stuff(level, coarsest)
+        quality = check_mesh(tet_mesh(graded))
+        assert same_surface(graded, uniform)
+        assert quality.volume_m3 == pytest.approx(volume, rel=1e-13)
+        assert ANGLE_BOUNDS_DEG[0] <= quality.min_dihedral_deg <= quality.max_dihedral_deg <= ANGLE_BOUNDS_DEG[1]
+        assert quality.num_tets <= count
+        count = quality.num_tets
+    assert count < 0.9 * len(uniform.tets)
+
+
+@pytest.mark.parametrize("radius", [6.2, 7.9, 9.5, 11.3, 12.8])
+def test_balls_anywhere(radius):
+    random = np.random.default_rng(int(10 * radius))
+    level = ball(31, radius, tuple(random.uniform(-1, 1, size=3)))
+    graded, uniform = stuff(level), stuff(level, coarsest=1)
+    quality = check_mesh(tet_mesh(graded))
+    assert same_surface(graded, uniform)
+    assert quality.volume_m3 == pytest.approx(signed_volumes(uniform.points, uniform.tets).sum(), rel=1e-13)
+    assert quality.num_tets < len(uniform.tets)
+
+
+@pytest.mark.parametrize("coarsest", [2, 4, 8, 16])
+def test_angles_of_the_coarse_part(coarsest):
+    lattice = bcc_lattice(ball(64, 31.0))
+    interior = coarse_interior(lattice, coarsest)
+    assert interior is not None
+    points, tets = lattice.positions(np.arange(len(lattice.level))), interior.tets
+    edges = np.linalg.norm(points[tets[:, 1:]] - points[tets[:, :1]], axis=-1)
+    assert min(8, coarsest) <= edges.max() <= coarsest
+    assert signed_volumes(points, tets).min() > 0.0
+    assert dihedral_range_deg(points, tets) == pytest.approx((45.0, 120.0), abs=1e-9)
+
+
+def test_full_box_by_hand():
+    """A box of 8 voxels with eight cubes of two in its middle, and nothing larger."""
+    solid, uniform = stuff(np.ones((8, 8, 8))), stuff(np.ones((8, 8, 8)), coarsest=1)
+    quality = check_mesh(tet_mesh(solid))
+    # Gone: four around each face of the 4^3 voxels. New: four at each outer face of them, and between the cubes, at
+    # each of 12 faces, one at two sides inside and two at the other two.
+    assert len(uniform.tets) - len(solid.tets) == 4 * (3 * 4 * 4 * 5) - 4 * 6 * 4 * 4 - 12 * 6
+    # Gone: the voxels' centres, and the voxel corners in the middle of the 12 faces between the cubes and of their 6
+    # common edges. The middles of the cubes are voxel corners too and stay.
+    assert len(uniform.points) - len(solid.points) == 4**3 + 12 + 6
+    assert quality.volume_m3 == pytest.approx(512.0, rel=1e-14)
+    assert solid.on_box.all() and same_surface(solid, uniform)
+
+
+@pytest.mark.parametrize("name", ["wall", "rod", "small box", "noise"])
+def test_nothing_deep_leaves_the_mesh_as_it_is(name):
+    level = np.full((16, 17, 18), -1.0)
+    if name == "wall":
+        level[5:10, 1:-1, 1:-1] = 1.0
+    elif name == "rod":
+        level[6:11, 6:11] = 1.0
+    elif name == "small box":
+        level[5:10, 5:10, 5:10] = 1.0
+    else:
+        level = np.random.default_rng(1).normal(size=level.shape)
+    graded, uniform = stuff(level), stuff(level, coarsest=1)
+    for item in fields(StuffedSolid):
+        assert np.array_equal(getattr(graded, item.name), getattr(uniform, item.name)), item.name
+
+
+def test_place_in_the_lattice_does_not_matter():
+    level = ball(30, 13.0, (0.3, 0.2, 0.1))
+    here = stuff(level)
+    moved = stuff(np.pad(level, ((5, 0), (1, 7), (0, 3)), constant_values=-1.0))
+    assert len(here.tets) < 0.7 * len(stuff(level, coarsest=1).tets)
+    assert np.array_equal(here.tets, moved.tets) and np.array_equal(here.facets, moved.facets)
+    assert np.allclose(here.points, moved.points - np.array([5, 1, 0]), rtol=0.0, atol=1e-13)
+
+
+def test_turning_the_axes_turns_the_mesh():
+    level = ball(30, 13.0, (0.3, 0.2, 0.1))
+    here, turned = stuff(level), stuff(level.transpose(1, 2, 0))
+    assert len(here.tets) == len(turned.tets)
+
+    def ordered(points: np.ndarray) -> np.ndarray:
+        points = points.round(9)
+        return points[np.lexsort(points.T)]
+
+    assert np.allclose(ordered(here.points[:, [1, 2, 0]]), ordered(turned.points), rtol=0.0, atol=1e-8)
+
+
+@pytest.mark.parametrize("level", [ball(23, 10.0), np.ones((15, 16, 17))], ids=["ball", "box"])
+def test_linear_temperature_is_reproduced(level):
+    """Steady conduction between nodes of the surface at linear temperatures: the patch test of conforming elements."""
+    solid = stuff(level)
+    assert len(solid.tets) < len(stuff(level, coarsest=1).tets)
+    exact = solid.points @ [1.0, -2.0, 0.5] + 3.0
+    matrix = stiffness(solid.points, solid.tets)
+    free, fixed = np.flatnonzero(~solid.on_surface), np.flatnonzero(solid.on_surface)
+    found = spsolve(matrix[free][:, free].tocsc(), -matrix[free][:, fixed] @ exact[fixed])
+    assert np.abs(found - exact[free]).max() < 1e-10
+
+
+def test_coarse_cells_only_where_nothing_is_cut_or_moved():
+    level = pinholes(np.random.default_rng(4), (30, 30, 30))
+    uniform, graded = stuff(level, coarsest=1), stuff(level)
+    off_lattice = [np.any(solid.points * 2 % 1 != 0, axis=1) for solid in (uniform, graded)]
+    assert np.array_equal(uniform.points[off_lattice[0]], graded.points[off_lattice[1]])
+    assert np.count_nonzero(off_lattice[0]) > 100 and len(graded.tets) < len(uniform.tets)
+
+
+def test_buried_points_are_those_with_larger_cubes_all_around():
+    lattice = bcc_lattice(pinholes(np.random.default_rng(6), (28, 29, 30)))
+    interior = coarse_interior(lattice, 4)
+    assert interior is not None
+    buried = interior.buried(lattice)
+    points = np.flatnonzero(lattice.level > 0.0)
+    # A corner touches the voxels of its eight diagonal neighbours, a centre only its own.
+    around = np.where(lattice.is_corner(points)[:, None] == 1, lattice.neighbours(points)[:, 6:], points[:, None])
+    assert np.array_equal(buried[points], interior.covered[around].all(axis=1))
+    assert buried.sum() == buried[points].sum() > 1000
+    assert np.all(lattice.level[lattice.neighbours(np.flatnonzero(buried))] > 0.0)
+
+
+@pytest.mark.parametrize("bad", [0, 3, 6, -2, 2.0, True, None, "4"])
+def test_edges_that_are_no_power_of_two(bad):
+    with pytest.raises(
+        MeshError, match=r"coarsest: expected a power of two from 1 on, \[voxels\], got .* Pass 4, or 1"
+    ):
+        stuff(np.ones((3, 3, 3)), coarsest=bad)
+
+
+def test_no_edge_is_too_large():
+    level = ball(30, 13.0)
+    assert np.array_equal(stuff(level, coarsest=2**40).tets, stuff(level, coarsest=64).tets)
+    assert np.array_equal(stuff(level, coarsest=np.int64(4)).tets, stuff(level).tets)

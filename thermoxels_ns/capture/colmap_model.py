@@ -1,0 +1,121 @@
+"""COLMAP's models as ours."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thermoxels_ns.capture.contract import OPENGL_FROM_OPENCV, CameraModel
+from thermoxels_ns.capture.sfm_model import SfmModel
+from thermoxels_ns.errors import SceneError, explain
+
+_FIELDS = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fl_x", "fl_y", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
+}
+"""COLMAP's lens models that ours can hold, and the order of their numbers."""
+
+
+def camera_of_colmap(camera: Any) -> CameraModel:
+    """Turn a pycolmap camera into ours.
+
+    Raises:
+        SceneError: Its lens model has terms that ours does not have.
+    """
+    name = camera.model.name
+    if name not in _FIELDS:
+        raise SceneError(
+            explain(
+                "COLMAP camera",
+                expected="a lens model out of " + ", ".join(_FIELDS),
+                got=name,
+                remedy="Run COLMAP with --ImageReader.camera_model OPENCV, or let thermoxels capture find the poses.",
+            )
+        )
+    values = dict(zip(_FIELDS[name], map(float, camera.params)))
+    focal = values.pop("f", None)
+    if focal is not None:
+        values |= {"fl_x": focal, "fl_y": focal}
+    return CameraModel(int(camera.width), int(camera.height), **values)
+
+
+def model_of_colmap(
+    reconstruction: Any, frame_of_image: Mapping[str, str], size: tuple[int, int] | None = None
+) -> SfmModel:
+    """Turn a pycolmap reconstruction into our model.
+
+    Args:
+        reconstruction: `pycolmap.Reconstruction`.
+        frame_of_image: Frame of an image, by the image's name; images that are not in it are left out.
+        size: Width and height of the photographs, where the model was made from smaller ones.
+
+    Raises:
+        SceneError: No frame has a pose, or there are several cameras or an unknown lens model.
+    """
+    posed = {i: image for i, image in reconstruction.images.items() if image.has_pose and image.name in frame_of_image}
+    posed = dict(sorted(posed.items(), key=lambda item: frame_of_image[item[1].name]))
+    cameras = {image.camera_id for image in posed.values()}
+    if len(cameras) != 1:
+        raise SceneError(
+            explain(
+                "COLMAP model",
+                expected="photographs of one camera",
+                got=f"{len(posed)} of the {len(frame_of_image)} photographs, of {len(cameras)} cameras",
+                remedy="Give a model of these photographs with one camera (--ImageReader.single_camera 1).",
+            )
+        )
+    found = camera_of_colmap(reconstruction.cameras[cameras.pop()])
+    size = size or (found.width, found.height)
+    factor = np.array([size[0] / found.width, size[1] / found.height])
+    ids = sorted(reconstruction.points3D)
+    points = [reconstruction.points3D[i] for i in ids]
+    number = {i: n for n, i in enumerate(ids)}
+    poses, frames, seen, pixels = [], [], [], []
+    for index, image in enumerate(posed.values()):
+        pose = np.eye(4)
+        pose[:3] = image.cam_from_world().inverse().matrix()
+        poses.append(pose @ OPENGL_FROM_OPENCV)
+        # A track may hold two features of one photograph; the first one is kept.
+        own = {number[f.point3D_id]: f.xy for f in reversed(image.points2D) if f.has_point3D()}
+        order = sorted(own)
+        frames += [index] * len(order)
+        seen += order
+        pixels += [own[point] for point in order]
+    return SfmModel(
+        frames=tuple(frame_of_image[image.name] for image in posed.values()),
+        camera=found.resized(*size),
+        camera_to_world=np.stack(poses),
+        points=np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
+        colours=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+        point_error_px=np.array([point.error for point in points], dtype=np.float64) * float(factor.mean()),
+        sighting_frame=np.array(frames, dtype=np.int64),
+        sighting_point=np.array(seen, dtype=np.int64),
+        sighting_pixel=np.array(pixels, dtype=np.float64).reshape(-1, 2) * factor,
+    )
+
+
+def read_colmap(folder: Path) -> Any:
+    """Read a COLMAP model's folder.
+
+    Raises:
+        SceneError: It holds no readable model.
+    """
+    import pycolmap
+
+    try:
+        return pycolmap.Reconstruction(str(folder))
+    except Exception as problem:  # pycolmap raises RuntimeError, ValueError, IndexError by version
+        raise SceneError(
+            explain(
+                str(folder),
+                expected="a COLMAP model (cameras, images and points3D as .bin or .txt)",
+                got=str(problem).splitlines()[0][:200] if str(problem) else type(problem).__name__,
+                remedy="Pass --poses the folder that holds them, such as sparse/0.",
+            )
+        ) from problem

@@ -1,0 +1,166 @@
+"""Drift and vignetting of a thermal camera, from scene points that many images show.
+
+An uncooled camera reads some kelvin too high or too low from image to image, and warmer or colder towards the
+corners. A scene point has one temperature, so what its readings differ by shows both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from thermoxels_ns.capture.contract import CameraModel, DriftEstimate, RigFrame
+from thermoxels_ns.capture.drift_samples import DriftSamples, sample_shared_points
+
+FloatArray = npt.NDArray[np.float64]
+
+_RADIAL_TERMS = 2
+_HUBER = 1.345
+_MAD_TO_SIGMA = 1.4826
+_ITERATIONS = 30
+_CONVERGED_K = 1e-5
+_HELD_OUT_EVERY = 5
+_MOST_LAG = 6
+_FEWEST_POINTS = 50
+_GAIN_OF_OFFSETS, _GAIN_OF_RADIAL = 0.05, 0.01
+_RIDGE = 1e-9
+
+
+def estimate_drift(
+    frames: Sequence[RigFrame], thermal_camera: CameraModel, visible_to_thermal: npt.ArrayLike
+) -> DriftEstimate:
+    """Find one offset per thermal image and a radial term, if the images call for them.
+
+    Reading of point i in frame f = temperature_i + offset_f + c1 r^2 + c2 r^4 + error. Robust least squares (Huber's
+    loss, reweighted), the points' temperatures eliminated, mean offset 0. The correction is fitted to four fifths of
+    the points and kept only if it lowers the disagreement at the others.
+
+    Args:
+        frames: Pairs with poses and scene points.
+        thermal_camera: Thermal intrinsics.
+        visible_to_thermal: x_thermal = visible_to_thermal @ x_visible, shape (4, 4), OpenCV axes.
+
+    Returns:
+        The correction; all zeros with `used` False and the reason where there is nothing to gain.
+
+    Raises:
+        SceneError: A thermal image cannot be read or has not the camera's size.
+    """
+    if len(frames) < 2:
+        return _nothing(len(frames), np.nan, f"{len(frames)} frame: there is nothing to compare it with")
+    return drift_of_samples(sample_shared_points(frames, thermal_camera, np.asarray(visible_to_thermal, np.float64)))
+
+
+def drift_of_samples(samples: DriftSamples) -> DriftEstimate:
+    """Find the drift from readings of scene points; see `estimate_drift`."""
+    frames = samples.num_frames
+    if samples.num_points < _FEWEST_POINTS:
+        reason = f"only {samples.num_points} scene points are seen by two thermal images (at least {_FEWEST_POINTS})"
+        return _nothing(frames, np.nan, reason)
+    held_out = np.arange(samples.num_points) % _HELD_OUT_EVERY == _HELD_OUT_EVERY - 1
+    fit_to, test_on = samples.of_points(~held_out), samples.of_points(held_out)
+    before_k = _disagreement_k(test_on, np.zeros(len(test_on.point)))
+    plain, full = _fit(fit_to, 0), _fit(fit_to, _RADIAL_TERMS)
+    plain_k, full_k = (_disagreement_k(test_on, fit.at(test_on)) for fit in (plain, full))
+    radial = full_k < (1.0 - _GAIN_OF_RADIAL) * plain_k
+    after_k = full_k if radial else plain_k
+    if not after_k < (1.0 - _GAIN_OF_OFFSETS) * before_k:
+        reason = (
+            f"two images differ by {before_k:.3g} K at shared points, and by {after_k:.3g} K with the best "
+            f"correction, at points it was not fitted to"
+        )
+        return _nothing(frames, before_k, reason)
+    best = _fit(samples, _RADIAL_TERMS if radial else 0)
+    groups = _groups(samples)
+    corner_k = sum(best.radial)
+    explanation = (
+        f"Two images differ by {before_k:.3g} K at shared scene points (median), after the correction by {after_k:.3g} "
+        f"K at points it was not fitted to; offsets from {best.offsets_k.min():+.2f} to {best.offsets_k.max():+.2f} K"
+        + (f", image corners read {corner_k:+.2f} K" if radial else ", no radial term")
+        + (f"; {groups} groups of images share no points, each has mean offset 0" if groups > 1 else "")
+        + "."
+    )
+    return DriftEstimate(best.offsets_k, tuple(map(float, best.radial)), before_k, after_k, True, explanation)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    offsets_k: FloatArray
+    radial: FloatArray
+
+    def at(self, samples: DriftSamples) -> FloatArray:
+        """What readings are too high by, shape (n,) [K]."""
+        powers = samples.radius2[:, None] ** np.arange(1, len(self.radial) + 1)
+        return self.offsets_k[samples.frame] + powers @ self.radial
+
+
+def _fit(samples: DriftSamples, radial_terms: int) -> _Fit:
+    """Iteratively reweighted least squares with the points' temperatures eliminated (Schur complement)."""
+    count, frames = len(samples.point), samples.num_frames
+    row = np.arange(count)
+    design = np.zeros((count, radial_terms))
+    for power in range(radial_terms):
+        design[:, power] = samples.radius2 ** (power + 1)
+    incidence = csr_matrix((np.ones(count), (row, samples.point)), shape=(count, samples.num_points))
+    in_frame = csr_matrix((np.ones(count), (row, samples.frame)), shape=(count, frames))
+    weight = np.ones(count)
+    solution = np.zeros(frames + radial_terms)
+    for _ in range(_ITERATIONS):
+        mass = np.maximum(incidence.T @ weight, 1e-12)
+
+        def centred(values: FloatArray, mass: FloatArray = mass, weight: FloatArray = weight) -> FloatArray:
+            return values - incidence @ ((incidence.T @ (weight[:, None] * values)) / mass[:, None])
+
+        shared = incidence.T @ in_frame.multiply(weight[:, None]).tocsr()  # weight of frame f in point i
+        normal = np.zeros((frames + radial_terms,) * 2)
+        normal[:frames, :frames] = (
+            np.diag(in_frame.T @ weight) - (shared.T @ shared.multiply(1 / mass[:, None])).toarray()
+        )
+        flat = centred(np.column_stack([design, samples.temperature_c]))
+        side = in_frame.T @ (weight[:, None] * flat)
+        normal[:frames, frames:], normal[frames:, :frames] = side[:, :-1], side[:, :-1].T
+        within = flat.T @ (weight[:, None] * flat)
+        normal[frames:, frames:] = within[:-1, :-1]
+        right = np.concatenate([side[:, -1], within[:-1, -1]])
+        # Minimum norm: every group of frames that shares points gets mean offset 0.
+        updated = np.linalg.lstsq(normal, right, rcond=_RIDGE)[0]
+        moved = float(np.abs(updated - solution).max())
+        solution = updated
+        wrong = solution[samples.frame] + design @ solution[frames:]
+        residual = centred((samples.temperature_c - wrong)[:, None])[:, 0]
+        sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(residual))), 1e-9)
+        weight = np.minimum(1.0, _HUBER * sigma / np.maximum(np.abs(residual), 1e-12))
+        if moved < _CONVERGED_K:
+            break
+    offsets = solution[:frames]
+    return _Fit(offsets - offsets.mean(), solution[frames:])
+
+
+def _disagreement_k(samples: DriftSamples, wrong: FloatArray) -> float:
+    """Median difference of two readings of one point, over pairs of frames that see it [K]."""
+    reading = samples.temperature_c - wrong
+    differences = [np.zeros(0)]
+    for lag in range(1, _MOST_LAG + 1):
+        same = samples.point[lag:] == samples.point[:-lag]
+        differences.append(np.abs(reading[lag:] - reading[:-lag])[same])
+    every = np.concatenate(differences)
+    return float(np.median(every)) if len(every) else float("nan")
+
+
+def _groups(samples: DriftSamples) -> int:
+    """How many groups of frames there are that share no point with another group."""
+    frames, points = samples.num_frames, samples.num_points
+    links = csr_matrix(
+        (np.ones(len(samples.point)), (samples.frame, frames + samples.point)), shape=(frames + points,) * 2
+    )
+    _, label = connected_components(links, directed=False)
+    return len(np.unique(label[:frames]))
+
+
+def _nothing(frames: int, before_k: float, reason: str) -> DriftEstimate:
+    return DriftEstimate(np.zeros(frames), (), before_k, before_k, False, f"No correction: {reason}.")

@@ -1,0 +1,148 @@
+"""Features of the photographs and their matches, in COLMAP's database."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.capture.contract import CameraModel
+
+Matching = Literal["auto", "exhaustive", "sequential"]
+LensModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV"]
+
+EXHAUSTIVE_UP_TO = 80
+"""Photographs up to which every pair is matched; the time grows with the square of their number."""
+_NEIGHBOURS = 8
+"""Sequential matching: each photograph is matched with so many that follow it, and with those 2, 4, 8, ... times as far
+away."""
+_ANCHORS = 40
+"""Sequential matching: so many photographs spread over the capture are matched with each other, so that a path that
+returns to its start is closed."""
+_CHUNK = 8
+_PAIR_CHUNK = 200
+
+
+@dataclass(frozen=True)
+class FeatureOptions:
+    """How many features are looked for and which photographs are compared."""
+
+    max_features: int
+    """Per photograph."""
+    matching: Matching
+    lens: LensModel
+    seed: int
+    threads: int
+    """Of features and matching."""
+
+
+def image_pairs(count: int, matching: Matching) -> npt.NDArray[np.int64]:
+    """Choose which photographs are compared.
+
+    Args:
+        count: Number of photographs, in the order they were taken.
+        matching: Every pair (exhaustive); neighbours in time and some far ones (sequential); or by their number.
+
+    Returns:
+        Pairs of numbers (p, 2), the smaller one first, sorted, without repeats.
+
+    >>> image_pairs(3, "exhaustive").tolist()
+    [[0, 1], [0, 2], [1, 2]]
+    """
+    if matching == "exhaustive" or (matching == "auto" and count <= EXHAUSTIVE_UP_TO):
+        return np.stack(np.triu_indices(count, 1), axis=1)
+    steps = [*range(1, _NEIGHBOURS + 1)]
+    while steps[-1] * 2 < count:
+        steps.append(steps[-1] * 2)
+    first, step = (grid.ravel() for grid in np.meshgrid(np.arange(count), steps, indexing="ij"))
+    near = np.stack([first, first + step], axis=1)
+    anchors = np.unique(np.linspace(0, count - 1, min(_ANCHORS, count)).round().astype(np.int64))
+    far = anchors[np.stack(np.triu_indices(len(anchors), 1), axis=1)]
+    return np.unique(np.concatenate([near[near[:, 1] < count], far]), axis=0)
+
+
+def fill_database(
+    database: Path,
+    images: Path,
+    names: Sequence[str],
+    camera: CameraModel,
+    known_focal: bool,
+    masks: Path | None,
+    options: FeatureOptions,
+    say: Callable[[str], None],
+) -> None:
+    """Find features in photographs and match them; what an interrupted run has done is not done again.
+
+    Args:
+        database: COLMAP's file, made where it does not exist.
+        images: Folder of the photographs, all of one size.
+        names: Their names in it, in the order they were taken.
+        camera: Start value of their lens, at their size.
+        known_focal: Whether the focal length is more than a guess.
+        masks: Folder of pictures that are black where no feature is looked for; None: everywhere.
+        options: How much and what is compared.
+        say: Told how far it is.
+    """
+    import pycolmap
+
+    _add_camera(database, camera, options.lens, known_focal)
+    reader = pycolmap.ImageReaderOptions(camera_model=options.lens, existing_camera_id=1)
+    if masks is not None:
+        reader.mask_path = str(masks)
+    extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=options.threads)
+    extraction.sift.max_num_features = options.max_features
+    todo = _without_features(database, names)
+    for start in range(0, len(todo), _CHUNK):
+        pycolmap.extract_features(
+            database, images, todo[start : start + _CHUNK], reader_options=reader, extraction_options=extraction
+        )
+        say(f"features: {len(names) - len(todo) + min(start + _CHUNK, len(todo))} of {len(names)} photographs")
+    matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=options.threads)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = options.seed
+    pairs = image_pairs(len(names), options.matching)
+    listed = database.with_name("pairs.txt")
+    for start in range(0, len(pairs), _PAIR_CHUNK):
+        some = pairs[start : start + _PAIR_CHUNK]
+        listed.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in some), encoding="utf-8")
+        pairing: Any = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = str(listed)
+        pycolmap.match_image_pairs(database, matching, pairing, verification)
+        say(f"matches: {start + len(some)} of {len(pairs)} pairs of photographs")
+
+
+def lens_parameters(camera: CameraModel, lens: LensModel) -> list[float]:
+    """The numbers of one of COLMAP's lens models."""
+    if lens == "SIMPLE_RADIAL":
+        return [camera.fl_x, camera.cx, camera.cy, camera.k1]
+    if lens == "RADIAL":
+        return [camera.fl_x, camera.cx, camera.cy, camera.k1, camera.k2]
+    return [camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.k1, camera.k2, camera.p1, camera.p2]
+
+
+def _add_camera(database: Path, camera: CameraModel, lens: LensModel, known_focal: bool) -> None:
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        if opened.num_cameras() == 0:
+            opened.write_camera(
+                pycolmap.Camera(
+                    model=lens,
+                    width=camera.width,
+                    height=camera.height,
+                    params=lens_parameters(camera, lens),
+                    has_prior_focal_length=known_focal,
+                )
+            )
+
+
+def _without_features(database: Path, names: Sequence[str]) -> list[str]:
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        done = {image.name for image in opened.read_all_images() if opened.num_keypoints_for_image(image.image_id) > 0}
+    return [name for name in names if name not in done]

@@ -1,0 +1,244 @@
+"""The pairs after reading: photographs that can be decoded, temperatures, and what their files say."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.capture.masks import read_mask
+from thermoxels_ns.capture.pairs import Pair
+from thermoxels_ns.capture.photograph import GpsFix, open_photograph, read_photograph_facts
+from thermoxels_ns.capture.stages import read_json, write_json
+from thermoxels_ns.data.dead_pixels import find_dead_pixels
+from thermoxels_ns.data.flir_records import PictureInPicture
+from thermoxels_ns.data.flir_rjpeg import read_flir_jpeg
+from thermoxels_ns.data.radiometry import RadiometryOptions, read_thermogram
+from thermoxels_ns.errors import SceneError, ThermoxelsError, explain
+
+_LIST = "frames.json"
+_MOST_FOR_DEAD_PIXELS = 60
+"""Frames that stuck pixels are looked for in: more need memory and say nothing new."""
+
+
+@dataclass(frozen=True)
+class CaptureFrame:
+    """One pair, read."""
+
+    name: str
+    photograph: Path
+    """A file that holds the photograph alone."""
+    thermal: Path
+    """A .npy file of float32 degrees C, NaN where there is none."""
+    photograph_source: str
+    """The camera's file, relative to the capture."""
+    thermal_source: str
+    camera: str | None = None
+    """Maker and model of the thermal camera."""
+    lens: str | None = None
+    taken_at: str | None = None
+    """When the photograph was taken, as ISO 8601."""
+    focal_px: float | None = None
+    """Focal length that the photograph states, [pixels]."""
+    orientation: int = 1
+    """EXIF's orientation of the photograph."""
+    gps: GpsFix | None = None
+    gimbal_deg: tuple[float, float] | None = None
+    """Pitch and roll of the camera, [degrees]."""
+    thermal_focal_px: float | None = None
+    """Focal length that the thermal file states, [thermal pixels]."""
+    thermal_field_of_view_deg: float | None = None
+    """Horizontal, as the camera states it, [degrees]."""
+    picture_in_picture: PictureInPicture | None = None
+    """Factory alignment of FLIR cameras."""
+    celsius_per_count: float | None = None
+    masked: int = 0
+    """Thermal pixels without a temperature."""
+
+
+@dataclass(frozen=True)
+class CaptureFrames:
+    """The frames that could be read, and why the others could not."""
+
+    frames: tuple[CaptureFrame, ...]
+    thermal_size: tuple[int, int]
+    """Width and height of all thermal images."""
+    dead_pixels: int
+    """Thermal pixels that are stuck at one value in all frames; they are NaN in every frame."""
+    dropped: dict[str, str] = field(default_factory=dict)
+    """Why, by the frame's name."""
+
+    def save(self, folder: Path) -> None:
+        """Write the list of frames into a folder; their images lie there already."""
+        content = asdict(self)
+        for row in content["frames"]:
+            row |= {"photograph": str(row["photograph"]), "thermal": str(row["thermal"])}
+        write_json(folder / _LIST, content)
+
+    @classmethod
+    def load(cls, folder: Path) -> CaptureFrames:
+        """Read the list of frames from a folder."""
+        content = read_json(folder / _LIST)
+        return cls(
+            tuple(_frame_of(row) for row in content["frames"]),
+            (content["thermal_size"][0], content["thermal_size"][1]),
+            content["dead_pixels"],
+            content["dropped"],
+        )
+
+
+def read_frames(
+    pairs: Sequence[Pair],
+    root: Path,
+    folder: Path,
+    radiometry: RadiometryOptions,
+    skip_bad: bool,
+    thermal_mask: Path | None = None,
+    say: Callable[[str], None] = lambda _: None,
+) -> CaptureFrames:
+    """Read all pairs: degrees from thermal files, photographs out of files that hold both.
+
+    Pixels of the thermal sensor that are stuck at one value, and those that the user's mask shuts out, become NaN.
+
+    Args:
+        pairs: What belongs together.
+        root: The capture's folder.
+        folder: For what is read; frames are written here.
+        radiometry: How files become degrees.
+        skip_bad: Leave a pair out and say why, where one of its files cannot be read; else that is an error.
+        thermal_mask: Picture of the thermal images' size, black where there is no measurement.
+        say: Told how far it is.
+
+    Raises:
+        ThermoxelsError: A file cannot be read and `skip_bad` is off, or no pair is left.
+    """
+    (folder / "thermal").mkdir(exist_ok=True)
+    (folder / "photographs").mkdir(exist_ok=True)
+    frames, dropped, sizes = [], dict[str, str](), []
+    for number, pair in enumerate(pairs, start=1):
+        try:
+            frame, shape = _read(pair, root, folder, radiometry)
+            frames.append(frame)
+            sizes.append(shape)
+        except (ThermoxelsError, OSError) as problem:
+            if not skip_bad:
+                raise
+            dropped[pair.name] = str(problem)
+        if number % 20 == 0:
+            say(f"read: {number} of {len(pairs)} pairs")
+    if not frames:
+        raise SceneError(
+            explain(
+                "pairs",
+                expected="at least one pair whose files can be read",
+                got=f"none of {len(pairs)}: " + (next(iter(dropped.values())) if dropped else "there are no pairs"),
+                remedy="Look at the files, or at the pairs that were found in capture.html.",
+            )
+        )
+    height, width = Counter(sizes).most_common(1)[0][0]
+    for frame, shape in zip(frames, sizes):
+        if shape != (height, width):
+            dropped[frame.name] = (
+                f"{frame.thermal_source} has {shape[1]} x {shape[0]} pixels, most have {width} x {height}: another "
+                "thermal camera"
+            )
+    kept = [frame for frame in frames if frame.name not in dropped]
+    dead, kept = _without_stuck_pixels(kept, (height, width), thermal_mask)
+    result = CaptureFrames(tuple(kept), (width, height), dead, dropped)
+    result.save(folder)
+    return result
+
+
+def _read(
+    pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions
+) -> tuple[CaptureFrame, tuple[int, int]]:
+    thermogram = read_thermogram(pair.thermal, radiometry)
+    photograph, thermal_focal = pair.photograph, None
+    if pair.in_one_file:
+        content = read_flir_jpeg(pair.photograph).visible
+        if content is None:
+            raise SceneError(
+                explain(
+                    str(pair.photograph),
+                    expected="a photograph inside the file",
+                    got="none in a form that is known",
+                    remedy="Export the photograph with the camera's program and put it beside the file.",
+                )
+            )
+        photograph = folder / "photographs" / (pair.name + (".jpg" if content.startswith(b"\xff\xd8") else ".png"))
+        photograph.write_bytes(content)
+    elif thermogram.metadata.format in ("TIFF", "DJI R-JPEG"):
+        thermal_focal = read_photograph_facts(pair.thermal).focal_px
+    open_photograph(photograph).close()  # a file that is cut off shows only when it is decoded
+    facts = read_photograph_facts(photograph)
+    holder = read_photograph_facts(pair.thermal) if pair.in_one_file else facts
+    thermal = folder / "thermal" / f"{pair.name}.npy"
+    np.save(thermal, thermogram.temperature_c)
+    metadata = thermogram.metadata
+    taken_at = facts.taken_at or holder.taken_at or metadata.taken_at
+    frame = CaptureFrame(
+        name=pair.name,
+        photograph=photograph.resolve(),
+        thermal=thermal.resolve(),
+        photograph_source=_relative(pair.photograph, root),
+        thermal_source=_relative(pair.thermal, root),
+        camera=metadata.camera or facts.exif.camera,
+        lens=metadata.lens,
+        taken_at=None if taken_at is None else taken_at.isoformat(),
+        focal_px=facts.focal_px,
+        orientation=facts.orientation,
+        gps=facts.gps or holder.gps,
+        gimbal_deg=facts.gimbal_deg or holder.gimbal_deg,
+        thermal_focal_px=thermal_focal,
+        thermal_field_of_view_deg=metadata.field_of_view_deg,
+        picture_in_picture=metadata.picture_in_picture,
+        celsius_per_count=metadata.celsius_per_count,
+        masked=thermogram.report.masked,
+    )
+    height, width = thermogram.temperature_c.shape
+    return frame, (height, width)
+
+
+def _relative(path: Path, root: Path) -> str:
+    real, root = path.resolve(), root.resolve()
+    return real.relative_to(root).as_posix() if real.is_relative_to(root) else path.name
+
+
+def _without_stuck_pixels(
+    frames: list[CaptureFrame], shape: tuple[int, int], thermal_mask: Path | None
+) -> tuple[int, list[CaptureFrame]]:
+    """Set stuck and masked pixels to NaN in all frames; return how many are stuck."""
+    bad: npt.NDArray[np.bool_] = np.zeros(shape, dtype=bool)
+    dead = 0
+    if frames:
+        some = np.linspace(0, len(frames) - 1, min(len(frames), _MOST_FOR_DEAD_PIXELS)).round().astype(int)
+        bad |= find_dead_pixels(np.stack([np.load(frames[i].thermal) for i in some]))
+        dead = int(bad.sum())
+    if thermal_mask is not None:
+        bad |= ~read_mask(thermal_mask, shape[1], shape[0])
+    if not bad.any():
+        return dead, frames
+    changed = []
+    for frame in frames:
+        temperature_c = np.load(frame.thermal)
+        temperature_c[bad] = np.nan
+        np.save(frame.thermal, temperature_c)
+        changed.append(replace(frame, masked=int(np.isnan(temperature_c).sum())))
+    return dead, changed
+
+
+def _frame_of(row: dict[str, Any]) -> CaptureFrame:
+    row = dict(row)
+    row |= {"photograph": Path(row["photograph"]), "thermal": Path(row["thermal"])}
+    if row["gps"] is not None:
+        row["gps"] = GpsFix(**row["gps"])
+    if row["gimbal_deg"] is not None:
+        row["gimbal_deg"] = (row["gimbal_deg"][0], row["gimbal_deg"][1])
+    if row["picture_in_picture"] is not None:
+        row["picture_in_picture"] = PictureInPicture(**row["picture_in_picture"])
+    return CaptureFrame(**row)

@@ -1,0 +1,145 @@
+"""Poses that the user brings along: a COLMAP model, or the transforms.json of another program."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+import numpy as np
+
+from thermoxels_ns.capture.colmap_model import model_of_colmap, read_colmap
+from thermoxels_ns.capture.contract import CameraModel
+from thermoxels_ns.capture.poses import Poses
+from thermoxels_ns.capture.sfm_model import SfmModel
+from thermoxels_ns.capture.stages import read_json
+from thermoxels_ns.data.folder_walls import path_inside
+from thermoxels_ns.data.pose_file_cameras import read_intrinsics, read_pose
+from thermoxels_ns.errors import SceneError, explain
+
+
+def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
+    """Read poses; their world stays as it is.
+
+    Args:
+        path: Folder of a COLMAP model, or a transforms.json.
+        photographs: The camera's files, relative to the capture, by the frame's name.
+
+    Returns:
+        The poses, and the frames that have none. The model of a transforms.json has no points.
+
+    Raises:
+        SceneError: Nothing readable is there, no photograph is in it, it has several cameras, or a name in it leads
+            out of its folder.
+    """
+    if path.is_dir():
+        reconstruction = read_colmap(path)
+        names = [image.name for image in reconstruction.images.values()]
+        model = model_of_colmap(reconstruction, _frames_of(names, photographs, path))
+    elif path.is_file():
+        model = _read_transforms(path, photographs)
+    else:
+        raise SceneError(
+            explain(
+                "poses",
+                expected="a COLMAP model's folder or a transforms.json",
+                got=f"nothing at {path}",
+                remedy="Check the path.",
+            )
+        )
+    order = {name: number for number, name in enumerate(photographs)}
+    missing = {name: f"{path.name} has no pose of it" for name in photographs if name not in model.frames}
+    return Poses(in_order(model, lambda name: order[name]), missing)
+
+
+def in_order(model: SfmModel, key: Callable[[str], Any]) -> SfmModel:
+    """Same model with its frames sorted by a key of their names."""
+    order = sorted(range(len(model.frames)), key=lambda index: key(model.frames[index]))
+    number = np.argsort(order)[model.sighting_frame] if len(model.sighting_frame) else model.sighting_frame
+    rows = np.argsort(number, kind="stable")
+    return replace(
+        model,
+        frames=tuple(model.frames[index] for index in order),
+        camera_to_world=model.camera_to_world[order],
+        sighting_frame=number[rows],
+        sighting_point=model.sighting_point[rows],
+        sighting_pixel=model.sighting_pixel[rows],
+    )
+
+
+def _read_transforms(path: Path, photographs: Mapping[str, str]) -> SfmModel:
+    content: Any = read_json(path)
+    entries = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise SceneError(
+            explain(str(path), expected="a list 'frames'", got="none", remedy="Pass another transforms.json.")
+        )
+    names = []
+    for index, entry in enumerate(entries):
+        where = f"{path.name}: frame {index}"
+        name = str(entry.get("file_path", ""))
+        path_inside(path.parent, name, where)
+        names.append(name)
+    frame_of = _frames_of(names, photographs, path)
+    frames, poses, cameras = [], [], set()
+    for index, (name, entry) in enumerate(zip(names, entries)):
+        if name not in frame_of:
+            continue
+        where = f"{path.name}: frame {index}"
+        lens = read_intrinsics(content, entry, None, where)
+        k1, k2, k3, k4, p1, p2 = lens.distortion
+        if k3 or k4:
+            raise SceneError(
+                explain(where, expected="distortion k1, k2, p1, p2", got=f"k3 {k3}, k4 {k4}", remedy="Undistort first.")
+            )
+        cameras.add(CameraModel(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, k1, k2, p1, p2))
+        frames.append(frame_of[name])
+        poses.append(read_pose(entry.get("transform_matrix"), f"{where}: transform_matrix"))
+    if len(cameras) != 1:
+        raise SceneError(
+            explain(
+                str(path),
+                expected="photographs of one camera",
+                got=f"{len(frames)} photographs of {len(cameras)} cameras",
+                remedy="Give one set of intrinsics for all frames, or let thermoxels capture find the poses.",
+            )
+        )
+    return SfmModel(
+        tuple(frames),
+        cameras.pop(),
+        np.stack(poses),
+        points=np.zeros((0, 3)),
+        colours=np.zeros((0, 3), dtype=np.uint8),
+        point_error_px=np.zeros(0),
+        sighting_frame=np.zeros(0, dtype=np.int64),
+        sighting_point=np.zeros(0, dtype=np.int64),
+        sighting_pixel=np.zeros((0, 2)),
+    )
+
+
+def _frames_of(names: list[str], photographs: Mapping[str, str], path: Path) -> dict[str, str]:
+    """Frame of every name in a file of poses: by the photograph's name, or by its stem where that is clear."""
+    by_file: dict[str, list[str]] = {}
+    for frame, source in photographs.items():
+        for key in {source, PurePosixPath(source).name, PurePosixPath(source).stem, frame}:
+            by_file.setdefault(key.lower(), []).append(frame)
+    found: dict[str, str] = {}
+    for name in names:
+        plain = PureWindowsPath(name).as_posix()
+        for key in (plain, PurePosixPath(plain).name, PurePosixPath(plain).stem):
+            frames = by_file.get(key.lower(), [])
+            if len(frames) == 1:
+                found[name] = frames[0]
+                break
+    twice = {frame for frame in found.values() if list(found.values()).count(frame) > 1}
+    if not found or twice:
+        raise SceneError(
+            explain(
+                str(path),
+                expected="names of the capture's photographs",
+                got=f"{sorted(twice)[0]} twice" if twice else f"{names[0] if names else 'no name'} and no known one",
+                remedy="Pass the poses of these photographs; they are recognised by their file names.",
+            )
+        )
+    return found

@@ -1,0 +1,134 @@
+"""Parts of images that are no picture of the scene: text and logos that the camera drew, fingers, sky."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from thermoxels_ns.capture.photograph import open_photograph
+from thermoxels_ns.errors import SceneError, explain
+
+MIN_FRAMES = 6
+"""Fewer photographs cannot tell what is drawn over them from what they all happen to show."""
+_SIDE = 800
+"""Longest side at which overlays are looked for, [pixels]."""
+_STILL = 4.0
+"""Grey levels (of 255) that what is drawn changes by, from JPEG's compression alone."""
+_ALIVE = 12.0
+"""Grey levels that the surroundings change by at least."""
+_EDGE = 25.0
+"""Grey levels by which what is drawn stands out from its surroundings in the mean picture."""
+_AROUND_SHARE = 0.12
+"""Width of the surroundings, as a share of the longest side."""
+_MOST_SHARE = 0.2
+"""More of the picture than this is no overlay but a scene that does not change."""
+
+
+@dataclass(frozen=True)
+class PhotographMasks:
+    """Where photographs may be used: everywhere but under what the camera drew and what the user shut out."""
+
+    size: tuple[int, int]
+    """Width and height of the photographs, [pixels]."""
+    overlay: npt.NDArray[np.bool_] | None = None
+    """False where the camera drew over all photographs, shape (height, width); None: nowhere."""
+    files: Mapping[str, Path] = field(default_factory=dict)
+    """Masks that the user gives, by frame; frames without one may be used everywhere."""
+
+    @property
+    def any(self) -> bool:
+        """Whether anything is masked in any photograph."""
+        return self.overlay is not None or bool(self.files)
+
+    def of(self, frame: str) -> npt.NDArray[np.bool_]:
+        """True where a frame's photograph may be used, shape (height, width).
+
+        Raises:
+            SceneError: The user's mask cannot be read or has another size.
+        """
+        width, height = self.size
+        use = np.ones((height, width), dtype=bool) if self.overlay is None else self.overlay.copy()
+        return use & read_mask(self.files[frame], width, height) if frame in self.files else use
+
+
+def find_overlay(photographs: Sequence[Path]) -> npt.NDArray[np.bool_] | None:
+    """Find what the camera drew over all photographs: text, scales and logos, at the same place in each.
+
+    A pixel belongs to an overlay if it stays the same in all photographs, stands out from its surroundings in their
+    mean, and the surroundings change. Numbers that change from frame to frame are found by their outlines only.
+
+    Args:
+        photographs: Files of one size.
+
+    Returns:
+        True where the scene shows, shape (height, width) of the photographs; None where nothing is drawn, or where
+        there are too few photographs or they are too much alike to tell.
+    """
+    if len(photographs) < MIN_FRAMES:
+        return None
+    stack, size = [], (0, 0)
+    for path in photographs:
+        picture = open_photograph(path).convert("L")
+        size = picture.size
+        factor = min(1.0, _SIDE / max(size))
+        small = (max(1, round(size[0] * factor)), max(1, round(size[1] * factor)))
+        stack.append(np.asarray(picture.resize(small, Image.Resampling.BOX), dtype=np.float32))
+    if len({grey.shape for grey in stack}) != 1:
+        return None
+    spread = _spread(np.stack(stack))
+    mean = np.mean(stack, axis=0)
+    width = int(_AROUND_SHARE * max(mean.shape)) | 1
+    around = cv2.blur(spread, (width, width))
+    stands_out = np.abs(mean - cv2.blur(mean, (width, width))) > _EDGE
+    drawn = (spread < _STILL) & (around > _ALIVE) & stands_out
+    drawn &= cv2.blur(drawn.astype(np.float32), (3, 3)) > 0.3  # single pixels are chance
+    if not drawn.any() or drawn.mean() > _MOST_SHARE:
+        return None
+    grown = cv2.dilate(drawn.astype(np.uint8), np.ones((9, 9), np.uint8))
+    return cv2.resize(grown, size, interpolation=cv2.INTER_NEAREST) == 0
+
+
+def read_mask(path: Path, width: int, height: int) -> npt.NDArray[np.bool_]:
+    """Read a mask: white (128 and more) where the image may be used.
+
+    Raises:
+        SceneError: It cannot be read, or has another size than the images.
+    """
+    mask = np.asarray(open_photograph(path).convert("L")) >= 128
+    if mask.shape != (height, width):
+        raise SceneError(
+            explain(
+                str(path),
+                expected=f"a mask of {width} x {height} pixels, as the images have",
+                got=f"{mask.shape[1]} x {mask.shape[0]}",
+                remedy="Draw it on one of the images: white where they may be used, black elsewhere.",
+            )
+        )
+    return mask
+
+
+def mask_files(folder: Path) -> dict[str, Path]:
+    """Masks in a folder by the stem of their names (of the photograph or of the frame), in small letters.
+
+    Raises:
+        SceneError: There is no such folder.
+    """
+    if not folder.is_dir():
+        raise SceneError(
+            explain("masks", expected="a folder of masks", got=f"no folder at {folder}", remedy="Check the path.")
+        )
+    return {
+        path.stem.lower(): path for path in sorted(folder.iterdir()) if path.suffix.lower() in (".png", ".jpg", ".jpeg")
+    }
+
+
+def _spread(stack: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """How much a pixel changes: from the second lowest to the second highest value, so that one odd frame is nothing."""
+    ordered = np.sort(stack, axis=0)
+    return ordered[-2] - ordered[1]

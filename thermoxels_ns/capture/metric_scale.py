@@ -1,0 +1,298 @@
+"""How long a unit of the model is in metres: from GPS, a measured distance, or a marker of known size."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.capture.contract import FloatArray
+from thermoxels_ns.capture.photograph import GpsFix, open_photograph
+from thermoxels_ns.capture.sfm_model import SfmModel
+from thermoxels_ns.checks import check_positive
+from thermoxels_ns.errors import SceneError, explain
+
+_EARTH_RADIUS_M, _FLATTENING = 6378137.0, 1.0 / 298.257223563
+_WORST_GPS = 0.3
+"""Relative standard error above which GPS says nothing of the scale."""
+_LEAST_FIXES = 4
+_NEAR_POINTS = 12
+"""Scene points around a pixel that its depth is taken from."""
+_NEAR_SHARE = 0.08
+"""How far they may lie from it, as a share of the photograph's longest side."""
+_MARKER_DICTIONARY = cv2.aruco.DICT_4X4_50
+_MARKER_ERROR_PX = 2.0
+"""Corners of a marker that miss their rays by more than this (median) are no marker at rest, [pixels]."""
+
+
+@dataclass(frozen=True)
+class MetricScale:
+    """Metres per unit of the model."""
+
+    metres_per_unit: float
+    standard_error: float | None
+    """[m per unit]; None where nobody knows it."""
+    source: str
+    """A sentence."""
+
+
+@dataclass(frozen=True)
+class MeasuredDistance:
+    """Two pixels of one photograph, and how far apart the points that they show are."""
+
+    photograph: str
+    """Name of the frame, or of its photograph."""
+    first: tuple[float, float]
+    """[pixels], x to the right and y down from the upper left corner."""
+    second: tuple[float, float]
+    distance_m: float
+    standard_error_m: float | None = None
+
+
+def scale_from_gps(centres: FloatArray, fixes: Sequence[GpsFix | None]) -> tuple[MetricScale | None, str]:
+    """Fit the cameras' places to their GPS fixes by a similarity, robustly.
+
+    Closed-form least squares (Umeyama 1991, equation 42) with Huber's weights. The standard error is that of the scale
+    in the linearised fit, from the scatter of the residuals.
+
+    Args:
+        centres: The cameras' places in the model, shape (n, 3).
+        fixes: What GPS says, per camera.
+
+    Returns:
+        The scale, or None and why there is none.
+    """
+    known = [i for i, fix in enumerate(fixes) if fix is not None]
+    if not known:
+        return None, "no photograph has a GPS position"
+    if len(known) < _LEAST_FIXES:
+        return None, f"{len(known)} photographs have a GPS position, {_LEAST_FIXES} are needed"
+    local = local_metres([fix for fix in fixes if fix is not None])
+    model = centres[known]
+    weight = np.ones(len(known))
+    scale, residual = 0.0, np.zeros(len(known))
+    for _ in range(20):
+        scale, residual = _similarity(model, local, weight)
+        limit = 1.345 * 1.4826 * float(np.median(residual)) + 1e-9
+        weight = np.minimum(1.0, limit / np.maximum(residual, 1e-12))
+    spread = float((weight * ((model - np.average(model, axis=0, weights=weight)) ** 2).sum(axis=1)).sum())
+    freedom = max(3 * len(known) - 7, 1)
+    if not (scale > 0 and spread > 0):
+        return None, "the GPS positions do not follow the cameras"
+    error = math.sqrt(float((weight * residual**2).sum()) / freedom / spread)
+    if error > _WORST_GPS * scale:
+        return None, f"the GPS positions scatter too much for the size of the path ({100 * error / scale:.0f} % error)"
+    source = (
+        f"From the GPS positions of {len(known)} photographs, which differ from the cameras' path by "
+        f"{math.sqrt(float((residual**2).mean())):.2f} m (root mean square)."
+    )
+    return MetricScale(scale, error, source), ""
+
+
+def local_metres(fixes: Sequence[GpsFix]) -> FloatArray:
+    """Positions east, north and up of the mean of all fixes, shape (n, 3), [m]; the earth is an ellipsoid (WGS 84)."""
+    latitude = np.radians([fix.latitude_deg for fix in fixes])
+    longitude = np.radians([fix.longitude_deg for fix in fixes])
+    heights = [fix.altitude_m for fix in fixes]
+    known = [height for height in heights if height is not None]
+    usual = float(np.mean(known)) if known else 0.0
+    altitude = np.array([usual if height is None else height for height in heights])
+    middle = float(latitude.mean())
+    squared = _FLATTENING * (2.0 - _FLATTENING)
+    bend = 1.0 - squared * math.sin(middle) ** 2
+    north_radius = _EARTH_RADIUS_M * (1.0 - squared) / bend**1.5
+    east_radius = _EARTH_RADIUS_M / math.sqrt(bend) * math.cos(middle)
+    turned = np.angle(np.exp(1j * (longitude - longitude[0])))  # also across the date line
+    east = east_radius * (turned - turned.mean())
+    return np.stack([east, north_radius * (latitude - middle), altitude - altitude.mean()], axis=1)
+
+
+def scale_from_distance(model: SfmModel, measured: MeasuredDistance, photograph_of: Mapping[str, str]) -> MetricScale:
+    """Find the scale from a length that was measured between two points that one photograph shows.
+
+    The depth at a pixel is that of a plane through the scene points around it: inverse depth is linear in the pixel,
+    fitted by weighted least squares.
+
+    Args:
+        model: Poses and points.
+        measured: Pixels and distance.
+        photograph_of: Name of the photograph's file by frame.
+
+    Raises:
+        ThermoxelsError: The photograph has no pose, a pixel lies outside or has no scene points around it, or the
+            distance is no length.
+    """
+    check_positive("known distance", measured.distance_m, "Pass the measured length in metres.")
+    index = _frame_named(model, measured.photograph, photograph_of)
+    ends, errors = [], []
+    for pixel in (measured.first, measured.second):
+        end, error = _surface_point(model, index, pixel)
+        ends.append(end)
+        errors.append(error)
+    apart = float(np.linalg.norm(ends[0] - ends[1]))
+    if not apart > 0:
+        raise SceneError(
+            explain("known distance", expected="two different points", got="one", remedy="Pass two pixels.")
+        )
+    along = (ends[1] - ends[0]) / apart
+    of_points = math.hypot(*(float(np.abs(error @ along)) for error in errors)) / apart
+    of_tape = (measured.standard_error_m or 0.0) / measured.distance_m
+    scale = measured.distance_m / apart
+    source = f"From {measured.distance_m:g} m measured between two points in {measured.photograph}."
+    return MetricScale(scale, scale * math.hypot(of_points, of_tape), source)
+
+
+def scale_from_markers(
+    model: SfmModel, photographs: Mapping[str, Path], side_m: float, standard_error_m: float | None = None
+) -> tuple[MetricScale | None, str]:
+    """Find the scale from printed ArUco markers (4 x 4 cells, numbers 0 to 49) of known side.
+
+    A marker's corners are triangulated from all photographs that show it (linear least squares of the rays). Every
+    marker gives four sides; the standard error is that of their mean, or of the corners' scatter where that is larger.
+
+    Args:
+        model: Poses.
+        photographs: Files by frame.
+        side_m: Side of the black square, [m].
+        standard_error_m: Of the side, [m].
+
+    Returns:
+        The scale, or None and why there is none.
+    """
+    check_positive("marker side", side_m, "Pass the side of the black square in metres.")
+    seen: dict[int, list[tuple[int, FloatArray]]] = {}
+    detector = _detector()
+    for index, name in enumerate(model.frames):
+        grey = np.asarray(open_photograph(photographs[name]).convert("L"))
+        corners, ids, _ = detector.detectMarkers(grey)
+        for four, marker in zip(corners, [] if ids is None else ids.ravel()):
+            seen.setdefault(int(marker), []).append((index, np.asarray(four, dtype=np.float64).reshape(4, 2) + 0.5))
+    sides, offs, used = [], [], []
+    for marker, views in sorted(seen.items()):
+        if len(views) < 2:
+            continue
+        placed = [_triangulate(model, [(index, four[corner]) for index, four in views]) for corner in range(4)]
+        missed = float(np.median(np.concatenate([error for _, error in placed])))
+        if missed > _MARKER_ERROR_PX:
+            continue
+        square = np.stack([point for point, _ in placed])
+        sides.append(np.linalg.norm(square - np.roll(square, 1, axis=0), axis=1))
+        offs.append(missed)
+        used.append(marker)
+    if not used:
+        if not seen:
+            return None, "no photograph shows an ArUco marker of 4 x 4 cells"
+        return None, f"markers {sorted(seen)} are in one photograph only, or moved between photographs"
+    lengths = np.concatenate(sides)
+    mean = float(lengths.mean())
+    relative = float(lengths.std(ddof=1)) / mean / math.sqrt(len(lengths))
+    relative = math.hypot(relative, (standard_error_m or 0.0) / side_m)
+    scale = side_m / mean
+    source = (
+        f"From {len(used)} ArUco marker{'s' * (len(used) != 1)} of {side_m:g} m "
+        f"({', '.join(map(str, used))}), whose corners miss their rays by {np.mean(offs):.2f} pixels."
+    )
+    return MetricScale(scale, scale * relative, source), ""
+
+
+def _similarity(model: FloatArray, metres: FloatArray, weight: FloatArray) -> tuple[float, FloatArray]:
+    """Scale of the best similarity from model to metres, and each point's distance from it, [m]."""
+    share = weight / weight.sum()
+    a, b = model - share @ model, metres - share @ metres
+    left, size, right = np.linalg.svd((b * share[:, None]).T @ a)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    variance = float(share @ (a * a).sum(axis=1))
+    if not variance > 0:
+        return 0.0, np.zeros(len(model))
+    scale = float(size @ sign) / variance
+    rotated = a @ (left * sign @ right).T
+    return scale, np.linalg.norm(b - scale * rotated, axis=1)
+
+
+def _frame_named(model: SfmModel, name: str, photograph_of: Mapping[str, str]) -> int:
+    for index, frame in enumerate(model.frames):
+        file = photograph_of.get(frame, frame)
+        if name in (frame, file, Path(file).name, Path(file).stem):
+            return index
+    raise SceneError(
+        explain(
+            "known distance",
+            expected="a photograph whose pose was found",
+            got=name,
+            remedy=f"Pass one of them, such as {photograph_of.get(model.frames[0], model.frames[0])}.",
+        )
+    )
+
+
+def _surface_point(model: SfmModel, index: int, pixel: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
+    """World point that a pixel shows, and its standard error along the ray as a vector."""
+    camera = model.camera
+    if not (0 <= pixel[0] <= camera.width and 0 <= pixel[1] <= camera.height):
+        raise SceneError(
+            explain(
+                "known distance",
+                expected=f"pixels inside {camera.width} x {camera.height}",
+                got=pixel,
+                remedy="Count x to the right and y down from the upper left corner.",
+            )
+        )
+    points, pixels = model.seen_by(index)
+    apart = np.linalg.norm(pixels - pixel, axis=1)
+    near = np.argsort(apart, kind="stable")[:_NEAR_POINTS]
+    near = near[apart[near] <= _NEAR_SHARE * max(camera.width, camera.height)]
+    if len(near) < 4:
+        raise SceneError(
+            explain(
+                "known distance",
+                expected=f"scene points around pixel {pixel}",
+                got=len(near),
+                remedy="Measure between points with texture around them.",
+            )
+        )
+    depth = model.in_camera(index, model.points[points[near]])[:, 2]
+    weight = 1.0 / (1.0 + apart[near] / (np.median(apart[near]) + 1e-9))
+    table = np.column_stack([np.ones(len(near)), pixels[near] - pixel])
+    scale = np.array([1.0, 1.0 / camera.width, 1.0 / camera.width])
+    inverse, keep = 1.0 / depth, np.ones(len(near), dtype=bool)
+    solution = np.zeros(3)
+    for _ in range(3):
+        w = weight * keep
+        left = (table * w[:, None]) / scale
+        solution = np.linalg.lstsq(left, inverse * w, rcond=1e-6)[0] / scale
+        off = np.abs(table @ solution - inverse)
+        keep = off <= 3.0 * 1.4826 * float(np.median(off)) + 1e-12
+    at, scatter = float(solution[0]), float(np.sqrt(np.mean((table @ solution - inverse)[keep] ** 2)))
+    if not at > 0.25 * float(np.median(inverse)):
+        at = float(np.median(inverse))
+    pose = model.camera_to_world[index]
+    ray = camera.rays(np.array([pixel]))[0] * (1.0, -1.0, -1.0) @ pose[:3, :3].T
+    error = scatter / at**2 / math.sqrt(max(int(keep.sum()) - 3, 1))
+    return pose[:3, 3] + ray / at, ray * error
+
+
+def _detector() -> cv2.aruco.ArucoDetector:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(_MARKER_DICTIONARY), parameters)
+
+
+def _triangulate(model: SfmModel, views: Sequence[tuple[int, npt.NDArray]]) -> tuple[FloatArray, FloatArray]:
+    """Point nearest to all rays, shape (3,), and how far it projects from each pixel, shape (views,), [pixels]."""
+    normal, right = np.zeros((3, 3)), np.zeros(3)
+    for index, pixel in views:
+        pose = model.camera_to_world[index]
+        ray = model.camera.rays(pixel[None])[0] * (1.0, -1.0, -1.0) @ pose[:3, :3].T
+        ray /= np.linalg.norm(ray)
+        across = np.eye(3) - np.outer(ray, ray)
+        normal += across
+        right += across @ pose[:3, 3]
+    point = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
+    off = [
+        np.linalg.norm(model.camera.project(model.in_camera(index, point[None]))[0] - pixel) for index, pixel in views
+    ]
+    return point, np.nan_to_num(np.array(off), nan=np.inf)

@@ -1,0 +1,98 @@
+"""Thermal images laid over the photographs, for a person to judge whether they fit."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from thermoxels_ns.capture.contract import CameraModel, RigEstimate, RigFrame
+from thermoxels_ns.capture.photograph import open_photograph
+from thermoxels_ns.capture.sparse_depth import SparseDepth
+
+_WIDTH = 640
+_COLOUR_SHARE = 0.55
+"""How much of the thermal colours covers the photograph."""
+_PERCENTILES = (2.0, 98.0)
+
+
+def thermal_in_photograph(
+    frame: RigFrame, temperature_c: npt.NDArray, visible: CameraModel, rig: RigEstimate, width: int = _WIDTH
+) -> npt.NDArray[np.float32]:
+    """Carry a thermal image into the photograph's view, through the depth of the scene points.
+
+    Args:
+        frame: The pair.
+        temperature_c: Its temperatures, [degrees C].
+        visible: The photographs' camera.
+        rig: The thermal camera and where it is.
+        width: Of the result, [pixels].
+
+    Returns:
+        Temperatures by pixel of the reduced photograph, [degrees C], NaN where the thermal image does not reach.
+    """
+    height = max(1, round(visible.height * width / visible.width))
+    small = visible.resized(width, height)
+    grid = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
+    rays = small.rays(grid)
+    depth, _ = SparseDepth(frame.points_visible()).at(rays)
+    rotation, shift = rig.visible_to_thermal[:3, :3], rig.visible_to_thermal[:3, 3]
+    parallax = np.divide(1.0, depth, out=np.zeros_like(depth), where=np.isfinite(depth))
+    local = rays @ rotation.T + parallax[:, None] * shift  # a point times its inverse depth projects alike
+    pixels = rig.thermal_camera.project(local).reshape(height, width, 2).astype(np.float32) - np.float32(0.5)
+    return cv2.remap(
+        temperature_c.astype(np.float32),
+        np.nan_to_num(pixels[..., 0], nan=-1e6),
+        np.nan_to_num(pixels[..., 1], nan=-1e6),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=float("nan"),  # type: ignore[arg-type]
+    )
+
+
+def overlay(frame: RigFrame, temperature_c: npt.NDArray, visible: CameraModel, rig: RigEstimate) -> npt.NDArray:
+    """Photograph in grey with its edges, thermal image in colours over it, shape (height, width, 3) of uint8."""
+    carried = thermal_in_photograph(frame, temperature_c, visible, rig)
+    height, width = carried.shape
+    if isinstance(frame.photograph, np.ndarray):
+        picture = Image.fromarray(frame.photograph.astype(np.uint8)).convert("L")
+    else:
+        picture = open_photograph(frame.photograph).convert("L")
+    grey = np.asarray(picture.resize((width, height), Image.Resampling.BOX))
+    base = np.repeat(grey[..., None], 3, axis=2).astype(np.float32)
+    known = np.isfinite(carried)
+    mixed = np.where(known[..., None], (1 - _COLOUR_SHARE) * base + _COLOUR_SHARE * colours(carried), base)
+    edges = cv2.Canny(cv2.GaussianBlur(grey, (0, 0), 1.5), 40, 100) > 0
+    mixed[edges & known] = 255.0
+    return np.clip(mixed, 0, 255).astype(np.uint8)
+
+
+def colours(temperature_c: npt.NDArray, limits: tuple[float, float] | None = None) -> npt.NDArray[np.float32]:
+    """Temperatures as red, green and blue 0 to 255, black where NaN; `limits` by default those of the middle 96 %."""
+    known = np.isfinite(temperature_c)
+    if limits is None:
+        low, high = np.percentile(temperature_c[known], _PERCENTILES) if known.any() else (0.0, 1.0)
+    else:
+        low, high = limits
+    share = np.nan_to_num((temperature_c - low) / max(float(high - low), 1e-6))
+    levels = np.clip(255 * share, 0, 255).astype(np.uint8)
+    shown = cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO)[..., ::-1].astype(np.float32)
+    shown[~known] = 0.0
+    return shown
+
+
+def data_url(picture: npt.NDArray[np.uint8], quality: int = 82) -> str:
+    """A picture as a url that holds it, for a page that needs no other file."""
+    stream = io.BytesIO()
+    Image.fromarray(picture).save(stream, format="JPEG", quality=quality)
+    return "data:image/jpeg;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
+
+
+def spread_out(count: int, shown: int) -> Sequence[int]:
+    """Numbers of at most `shown` items evenly spread over `count`."""
+    return np.unique(np.linspace(0, count - 1, min(shown, count)).round().astype(int)).tolist() if count else []

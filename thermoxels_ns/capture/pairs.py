@@ -1,0 +1,312 @@
+"""Which thermal image belongs to which photograph."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from thermoxels_ns.capture.camera_files import ROLE_WORDS, CameraFile, CameraFolder, natural_key, words_of
+from thermoxels_ns.data.folder_walls import path_inside
+from thermoxels_ns.errors import SceneError, explain
+
+_DJI = re.compile(r"^(?P<head>.*?dji)_(?:(?P<time>\d{14})_)?(?P<number>\d{3,})_(?P<role>[a-z])(?P<tail>.*)$")
+_DJI_LATE_S = 3.0
+"""The two images of one shot may carry time stamps that differ by so much, [s]."""
+_DJI_PHOTOGRAPHS = ("v", "w")
+"""Letters of DJI's photographs in the order they are taken in; z is a zoom, whose focal length varies."""
+_LAST_LETTERS = frozenset({"t", "v", "w", "r"})
+_CLEARLY_NEARER = 2.0
+_CLOCK_STEP_S = 0.5
+"""A second candidate must be farther than twice the first one's distance plus half a step of a camera's clock."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One photograph and its thermal image."""
+
+    name: str
+    """Name of the frame, all different; letters, digits, dot, dash and underscore."""
+    photograph: Path
+    thermal: Path
+    """The same file where the camera writes both into one."""
+    how: str
+    """How they were found to belong together."""
+
+    @property
+    def in_one_file(self) -> bool:
+        """Whether the photograph lies inside the thermal file."""
+        return self.photograph == self.thermal
+
+
+@dataclass(frozen=True)
+class PairSearch:
+    """All pairs of a folder, and why the other files are in none."""
+
+    pairs: tuple[Pair, ...]
+    """In the order they were taken, as far as names tell."""
+    unpaired: dict[Path, str] = field(default_factory=dict)
+    """Why, by file."""
+
+
+@dataclass(frozen=True)
+class PairOptions:
+    """How partners are recognised."""
+
+    time_limit_s: float = 1.5
+    """Longest time between the exposures of a pair that is found by time alone, [s]."""
+    clock_offset_s: float = 0.0
+    """How far the thermal camera's clock is ahead of the photographs', [s]."""
+
+
+def find_pairs(found: CameraFolder, options: PairOptions | None = None) -> PairSearch:
+    """Pair photographs and thermal images: inside one file, by DJI's names, by equal names, by time.
+
+    Equal names are equal after words for the kind of image are dropped: ``10-58-15-636-visible.jpg`` and
+    ``10-58-15-636-radiometric.tiff``, or ``visible/a7.jpg`` and ``thermal/a7.npy``. By time: each the other's nearest,
+    within the limit, and no second candidate about as near.
+
+    Args:
+        found: What the folder holds.
+        options: Limits.
+    """
+    options = options or PairOptions()
+    pairs: list[tuple[CameraFile, CameraFile, str]] = []
+    unpaired: dict[Path, str] = {}
+    both = [file for file in found.files if file.role == "both"]
+    pairs += [(file, file, "both in one file") for file in both]
+    photographs = [file for file in found.files if file.role == "photograph"]
+    thermal = [file for file in found.files if file.role in ("thermal", "thermal picture")]
+    for step in (_by_dji_names, _by_names(found.folder)):
+        matched, explained = step(photographs, thermal)
+        pairs += matched
+        unpaired |= explained
+        used = {file.path for pair in matched for file in pair[:2]} | set(explained)
+        photographs = [file for file in photographs if file.path not in used]
+        thermal = [file for file in thermal if file.path not in used]
+    matched, explained = _by_time(photographs, thermal, options)
+    pairs += matched
+    unpaired |= explained
+    ordered = sorted(pairs, key=lambda pair: natural_key(pair[0].path.relative_to(found.folder)))
+    names = _names([photograph.path for photograph, _, _ in ordered], found.folder)
+    return PairSearch(
+        tuple(Pair(name, photo.path, hot.path, how) for name, (photo, hot, how) in zip(names, ordered)),
+        dict(sorted(unpaired.items(), key=lambda item: natural_key(item[0]))),
+    )
+
+
+def read_pair_list(file: Path, folder: Path) -> PairSearch:
+    """Read pairs that the user lists: a CSV file with one photograph and its thermal image per line.
+
+    Args:
+        file: The list; names are relative to `folder`. A first line without files in it is taken for a heading.
+        folder: The capture.
+
+    Raises:
+        SceneError: The list cannot be read, names a file twice, one that is not there, or one outside the folder.
+    """
+    try:
+        rows = [row for row in csv.reader(file.read_text(encoding="utf-8-sig").splitlines()) if any(row)]
+    except (OSError, UnicodeDecodeError, csv.Error) as problem:
+        raise SceneError(
+            explain(str(file), expected="a CSV file of pairs", got=str(problem), remedy="Write it again.")
+        ) from problem
+    pairs = []
+    for number, row in enumerate(rows, start=1):
+        where = f"{file.name}: line {number}"
+        if len(row) != 2:
+            raise SceneError(
+                explain(where, expected="photograph,thermal", got=",".join(row), remedy="Write two names per line.")
+            )
+        photograph, thermal = (path_inside(folder, name.strip(), where) for name in row)
+        missing = [path for path in (photograph, thermal) if not path.is_file()]
+        if missing and number == 1 and len(missing) == 2:
+            continue
+        if missing:
+            raise SceneError(
+                explain(where, expected=f"a file {missing[0]}", got="none", remedy="Correct the name in the list.")
+            )
+        pairs.append((photograph, thermal))
+    twice = [
+        path.name for side in zip(*pairs) for path, count in Counter(side).items() if count > 1
+    ]
+    if twice or not pairs:
+        raise SceneError(
+            explain(
+                str(file),
+                expected="at least one pair, and every file in one pair only",
+                got=f"{twice[0]} twice" if twice else "no pair",
+                remedy="Correct the list.",
+            )
+        )
+    root = folder.resolve()
+    names = _names([photograph for photograph, _ in pairs], root)
+    return PairSearch(tuple(Pair(n, p, t, f"listed in {file.name}") for n, (p, t) in zip(names, pairs)))
+
+
+_Found = tuple[list[tuple[CameraFile, CameraFile, str]], dict[Path, str]]
+
+
+def _by_dji_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile]) -> _Found:
+    """DJI_0001_T with DJI_0001_V (or _W); where names carry a time, the two may differ by a few seconds."""
+    taken: dict[tuple, list[tuple[re.Match[str], CameraFile]]] = defaultdict(list)
+    for file in (*photographs, *thermal):
+        match = _DJI.match(file.path.stem.lower())
+        if match:
+            taken[(file.path.parent, match["head"], match["number"], match["tail"])].append((match, file))
+    pairs, explained = [], dict[Path, str]()
+    for group in taken.values():
+        hot = [(m, f) for m, f in group if m["role"] == "t" and f.role != "photograph"]
+        for match, file in hot:
+            near = [(m, f) for m, f in group if f.role == "photograph" and _seconds_apart(m, match) <= _DJI_LATE_S]
+            sides = [[f for m, f in near if m["role"] == letter] for letter in _DJI_PHOTOGRAPHS]
+            best = next((side for side in sides if side), [])
+            if len(best) == 1 and best[0].path not in explained:
+                pairs.append((best[0], file, "DJI's names"))
+                chosen = best[0]
+                for _, other in near:
+                    if other is not chosen:
+                        explained[other.path] = f"{chosen.path.name} is the partner of {file.path.name}"
+    counted = Counter(photo.path for photo, _, _ in pairs)
+    clear = [pair for pair in pairs if counted[pair[0].path] == 1]
+    return clear, {path: why for path, why in explained.items() if path not in {p.path for p, _, _ in clear}}
+
+
+def _seconds_apart(first: re.Match[str], second: re.Match[str]) -> float:
+    if not first["time"] or not second["time"]:
+        return 0.0 if first["time"] == second["time"] else np.inf
+
+    def seconds(digits: str) -> int:
+        return int(digits[6:8]) * 86400 + int(digits[8:10]) * 3600 + int(digits[10:12]) * 60 + int(digits[12:])
+
+    return abs(seconds(first["time"]) - seconds(second["time"]))
+
+
+def _by_names(folder: Path) -> Callable[[Sequence[CameraFile], Sequence[CameraFile]], _Found]:
+    def match(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile]) -> _Found:
+        pairs, explained = [], dict[Path, str]()
+        for group in _groups((*photographs, *thermal), lambda file: _shot(file.path.stem)):
+            for part in _parted(group, folder):
+                photos = [file for file in part if file.role == "photograph"]
+                hot = [file for file in part if file.role == "thermal"]
+                pictures = [file for file in part if file.role == "thermal picture"]
+                for picture in pictures if hot else []:
+                    explained[picture.path] = f"a picture for the eye; the temperatures are in {hot[0].path.name}"
+                hot = hot or pictures
+                if len(photos) == 1 and len(hot) == 1:
+                    pairs.append((photos[0], hot[0], "equal names"))
+                elif photos and hot:
+                    listed = ", ".join(file.path.name for file in (*photos, *hot))
+                    why = f"ambiguous: {len(photos)} photographs and {len(hot)} thermal images share a name ({listed})"
+                    explained |= {file.path: why for file in (*photos, *hot)}
+        return pairs, explained
+
+    return match
+
+
+def _groups(files: Iterable[CameraFile], key: Callable[[CameraFile], tuple]) -> list[list[CameraFile]]:
+    grouped: dict[tuple, list[CameraFile]] = defaultdict(list)
+    for file in files:
+        grouped[key(file)].append(file)
+    return list(grouped.values())
+
+
+def _parted(group: list[CameraFile], folder: Path) -> list[list[CameraFile]]:
+    """Files of one name, by the folder they lie in where one name occurs in several places."""
+    photos = sum(file.role == "photograph" for file in group)
+    if photos <= 1 and sum(file.role == "thermal" for file in group) <= 1:
+        return [group]
+
+    def place(file: CameraFile) -> tuple[str, ...]:
+        parents = file.path.relative_to(folder).parts[:-1]
+        return tuple(word for part in parents for word in words_of(part) if word not in ROLE_WORDS)
+
+    return _groups(group, place)
+
+
+def _shot(stem: str) -> tuple[str, ...]:
+    """What a name says of the shot: its words without those for the kind of image."""
+    words = words_of(stem)
+    kept = tuple(word for word in words if word not in ROLE_WORDS)
+    if len(kept) > 1 and kept[-1] in _LAST_LETTERS:
+        kept = kept[:-1]
+    return kept or words
+
+
+def _by_time(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], options: PairOptions) -> _Found:
+    explained = {file.path: "no partner of this name, and no time in the file" for file in (*photographs, *thermal)}
+    photos = [file for file in photographs if file.taken_at is not None]
+    hot = [file for file in thermal if file.taken_at is not None]
+    if not photos or not hot:
+        for file in (*photos, *hot):
+            explained[file.path] = "no partner of this name, and none with a time in its file"
+        return [], explained
+    epoch = min(file.taken_at for file in (*photos, *hot) if file.taken_at is not None)
+    at = [np.array([(f.taken_at - epoch).total_seconds() for f in side if f.taken_at]) for side in (photos, hot)]
+    apart = np.abs(at[0][:, None] - (at[1][None, :] - options.clock_offset_s))
+    pairs = []
+    for side, files, other_files, table in (("rows", photos, hot, apart), ("columns", hot, photos, apart.T)):
+        for index, file in enumerate(files):
+            order = np.argsort(table[index], kind="stable")
+            nearest = float(table[index, order[0]])
+            second = float(table[index, order[1]]) if len(order) > 1 else np.inf
+            partner = other_files[order[0]]
+            if nearest > options.time_limit_s:
+                explained[file.path] = (
+                    f"no partner of this name; the nearest in time, {partner.path.name}, is {nearest:.1f} s away"
+                )
+            elif second <= _CLEARLY_NEARER * nearest + _CLOCK_STEP_S and second <= options.time_limit_s:
+                other = other_files[order[1]]
+                explained[file.path] = (
+                    f"ambiguous: {partner.path.name} ({nearest:.1f} s) and {other.path.name} ({second:.1f} s) are "
+                    "about as near in time"
+                )
+            elif table[:, order[0]].argmin() != index:
+                explained[file.path] = f"{partner.path.name}, the nearest in time, is nearer to another"
+            elif side == "rows":
+                pairs.append((file, partner, f"taken {nearest:.1f} s apart"))
+            else:
+                explained[file.path] = f"{partner.path.name}, the nearest in time, has no clear partner"
+    # A pair counts only if neither side is ambiguous.
+    clear = [pair for pair in pairs if not explained[pair[1].path].startswith("ambiguous")]
+    for photo, partner, _ in pairs:
+        if explained[partner.path].startswith("ambiguous"):
+            explained[photo.path] = f"{partner.path.name}, the nearest in time, is ambiguous itself"
+    done = {file.path for pair in clear for file in pair[:2]}
+    return clear, {path: why for path, why in explained.items() if path not in done}
+
+
+def _names(photographs: Sequence[Path], folder: Path) -> list[str]:
+    """Names for frames: the shot's, with its folder where two are the same, with a number where that is not enough."""
+
+    def slug(text: str) -> str:
+        return re.sub(r"[^A-Za-z0-9._-]+", "_", text).strip("._-")[:100] or "frame"
+
+    stems = [slug(_without_role(path.stem)) for path in photographs]
+    counted = Counter(stems)
+    longer = [
+        stem
+        if counted[stem] == 1
+        else slug("-".join((*path.relative_to(folder).parts[:-1], _without_role(path.stem))))
+        for stem, path in zip(stems, photographs)
+    ]
+    seen: Counter[str] = Counter()
+    names = []
+    for name in longer:
+        seen[name] += 1
+        names.append(name if seen[name] == 1 else f"{name}-{seen[name]}")
+    return names
+
+
+def _without_role(stem: str) -> str:
+    cut = re.split(r"([^A-Za-z0-9]+)", stem)
+    words = [word for word in cut[::2]]
+    while len(words) > 1 and (words[-1].lower() in ROLE_WORDS or words[-1].lower() in _LAST_LETTERS):
+        words.pop()
+        cut = cut[:-2]
+    return "".join(cut)

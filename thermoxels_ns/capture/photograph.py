@@ -1,0 +1,205 @@
+"""What a photograph's file says besides its pixels: when, where, with which lens, and how the camera was held."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from thermoxels_ns.data.exif_facts import ExifFacts, read_exif_facts
+from thermoxels_ns.errors import SceneError, explain
+
+LARGEST_SIDE = 30000
+"""Pixels along a side of a photograph that is believed; a header that claims more is damaged."""
+_LARGEST_PIXELS = 400_000_000
+_EXIF, _GPS = 34665, 34853
+_ORIENTATION, _SUBSECOND = 274, (37521, 37520)
+_FOCAL_MM, _FOCAL_35MM, _PLANE_X, _PLANE_UNIT = 37386, 41989, 41486, 41488
+_MM_PER_PLANE_UNIT = {1: 25.4, 2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_FILM_WIDTH_MM = 36.0
+_XMP_ANGLE = {
+    "pitch": re.compile(rb"""GimbalPitchDegree(?:=["']|>)\s*([-+0-9.eE]+)"""),
+    "roll": re.compile(rb"""GimbalRollDegree(?:=["']|>)\s*([-+0-9.eE]+)"""),
+}
+
+
+@dataclass(frozen=True)
+class GpsFix:
+    """Where a camera says that it was."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float | None
+
+
+@dataclass(frozen=True)
+class PhotographFacts:
+    """None: the file does not say."""
+
+    width: int
+    height: int
+    exif: ExifFacts
+    taken_at: datetime | None
+    """With fractions of a second where the file has them, as the camera's clock showed it."""
+    focal_px: float | None
+    """Focal length, [pixels], from the lens and the pitch of the sensor, or from its equivalent on 35 mm film."""
+    orientation: int
+    """EXIF's 1 to 8: how to turn the pixels so that the picture stands upright; 1 where the file does not say."""
+    gps: GpsFix | None
+    gimbal_deg: tuple[float, float] | None
+    """Pitch (0 level, -90 straight down) and roll of the camera against gravity, [degrees]."""
+
+
+def read_photograph_facts(path: Path, content: bytes | None = None) -> PhotographFacts:
+    """Read a photograph's header.
+
+    Args:
+        path: The file, or the one that `content` was cut from.
+        content: The photograph's bytes, where it lies inside another file.
+
+    Raises:
+        SceneError: It is no picture that can be read, or a header claims an absurd size.
+    """
+    try:
+        with Image.open(io.BytesIO(content) if content is not None else path) as image:
+            width, height = image.size
+            facts = read_exif_facts(image)
+            exif = image.getexif()
+            tags, gps = {**exif, **exif.get_ifd(_EXIF)}, exif.get_ifd(_GPS)
+        head = content if content is not None else _head(path)
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as problem:
+        raise _unreadable(path, problem) from problem
+    check_photograph_size(path, width, height)
+    orientation = tags.get(_ORIENTATION, 1)
+    return PhotographFacts(
+        width=width,
+        height=height,
+        exif=facts,
+        taken_at=_with_fraction(facts.taken_at, tags),
+        focal_px=_focal_px(tags, width, height),
+        orientation=orientation if orientation in range(1, 9) else 1,
+        gps=_gps_fix(gps),
+        gimbal_deg=_gimbal(head),
+    )
+
+
+def check_photograph_size(path: Path, width: int, height: int) -> None:
+    """Raise a `SceneError` if a photograph's header claims more pixels than cameras have."""
+    if not (0 < width < LARGEST_SIDE and 0 < height < LARGEST_SIDE and width * height <= _LARGEST_PIXELS):
+        raise SceneError(
+            explain(
+                str(path),
+                expected=f"a photograph below {LARGEST_SIDE} pixels a side and {_LARGEST_PIXELS} in all",
+                got=f"a header that says {width} x {height}",
+                remedy="The header is damaged; copy the file from the camera again.",
+            )
+        )
+
+
+def open_photograph(path: Path, content: bytes | None = None) -> Image.Image:
+    """Decode a photograph as red, green and blue, as its pixels are stored (EXIF's orientation is not applied).
+
+    Raises:
+        SceneError: It is no picture, is cut off, or claims an absurd size.
+    """
+    try:
+        with Image.open(io.BytesIO(content) if content is not None else path) as image:
+            check_photograph_size(path, *image.size)
+            return image.convert("RGB")
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as problem:
+        if isinstance(problem, SceneError):
+            raise
+        raise _unreadable(path, problem) from problem
+
+
+def _unreadable(path: Path, problem: Exception) -> SceneError:
+    return SceneError(
+        explain(
+            str(path),
+            expected="a photograph that can be decoded",
+            got=str(problem) or type(problem).__name__,
+            remedy="The file is damaged; copy it from the camera again, or go on without it with --skip-bad True.",
+        )
+    )
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as stream:
+        return stream.read(2**18)
+
+
+def _number(value: object) -> float | None:
+    """A finite number of a tag, also of a fraction; None for what is none."""
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _with_fraction(taken_at: datetime | None, tags: Mapping[int, Any]) -> datetime | None:
+    """Add the fraction of a second, written as digits after the point or as a fraction."""
+    if taken_at is None:
+        return None
+    for tag in _SUBSECOND:
+        text = str(tags.get(tag, "")).split("\0")[0].strip()
+        try:
+            top, slash, bottom = text.partition("/")
+            share = float(top) / float(bottom) if slash else float(f"0.{text}") if text.isdigit() else None
+        except (ValueError, ZeroDivisionError):
+            share = None
+        if share is not None and 0.0 <= share < 1.0:
+            return taken_at + timedelta(seconds=share)
+    return taken_at
+
+
+def _focal_px(tags: Mapping[int, Any], width: int, height: int) -> float | None:
+    longest = max(width, height)
+    focal_mm, per_unit = _number(tags.get(_FOCAL_MM)), _number(tags.get(_PLANE_X))
+    unit_mm = _MM_PER_PLANE_UNIT.get(tags.get(_PLANE_UNIT, 2))
+    film_mm = _number(tags.get(_FOCAL_35MM))
+    candidates = []
+    if focal_mm and per_unit and unit_mm:
+        candidates.append(focal_mm * per_unit / unit_mm)
+    if film_mm:
+        candidates.append(film_mm / _FILM_WIDTH_MM * longest)
+    # A lens of 8 to 160 degrees; what is outside was written for another resolution, or is nonsense.
+    return next((px for px in candidates if 0.1 * longest < px < 8.0 * longest), None)
+
+
+def _gps_fix(gps: Mapping[int, Any]) -> GpsFix | None:
+    latitude = _degrees(gps.get(2), gps.get(1), "S")
+    longitude = _degrees(gps.get(4), gps.get(3), "W")
+    if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
+        return None
+    if latitude == 0.0 and longitude == 0.0:  # what cameras without a fix write
+        return None
+    altitude = _number(gps.get(6))
+    below = gps.get(5) in (1, b"\x01")
+    return GpsFix(latitude, longitude, -altitude if altitude is not None and below else altitude)
+
+
+def _degrees(parts: object, side: object, negative: str) -> float | None:
+    if not isinstance(parts, tuple) or len(parts) != 3:
+        return None
+    numbers = [_number(part) for part in parts]
+    if any(number is None for number in numbers):
+        return None
+    value = sum(number / 60.0**power for power, number in enumerate(numbers) if number is not None)
+    return -value if str(side).strip("\0 ").upper() == negative else value
+
+
+def _gimbal(head: bytes) -> tuple[float, float] | None:
+    found = {name: pattern.search(head) for name, pattern in _XMP_ANGLE.items()}
+    values = {name: _number(match.group(1)) if match else None for name, match in found.items()}
+    pitch, roll = values["pitch"], values["roll"]
+    if pitch is None or abs(pitch) > 180.0:
+        return None
+    return pitch, roll if roll is not None and abs(roll) <= 180.0 else 0.0

@@ -1,0 +1,308 @@
+"""Where the camera stood: structure from motion on the photographs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from thermoxels_ns.capture.colmap_model import model_of_colmap
+from thermoxels_ns.capture.contract import CameraModel
+from thermoxels_ns.capture.feature_matching import FeatureOptions, LensModel, Matching, fill_database, lens_parameters
+from thermoxels_ns.capture.masks import PhotographMasks
+from thermoxels_ns.capture.photograph import open_photograph
+from thermoxels_ns.capture.sfm_model import SfmModel
+from thermoxels_ns.errors import SceneError, explain
+
+_GUESSED_FOCAL = 1.0
+"""Of the longest side, where the photograph does not say: a lens of 53 degrees."""
+_JPEG_QUALITY = 95
+MIN_FRAMES = 3
+"""Fewer photographs are no reconstruction."""
+_DATABASE = "features.db"
+
+
+@dataclass(frozen=True)
+class PoseOptions:
+    """How poses are found."""
+
+    image_size: int = 1600
+    """Longest side to which photographs are reduced for features, [pixels]."""
+    max_features: int = 4000
+    """Features per photograph."""
+    matching: Matching = "auto"
+    """Which photographs are compared."""
+    lens: LensModel = "SIMPLE_RADIAL"
+    """Lens model."""
+    seed: int = 0
+    threads: int = 2
+
+
+@dataclass(frozen=True)
+class Poses:
+    """The poses found, and the photographs without one."""
+
+    model: SfmModel
+    dropped: Mapping[str, str]
+    """Why, by the frame's name."""
+
+
+def find_poses(
+    photographs: Mapping[str, Path],
+    folder: Path,
+    focal_px: float | None = None,
+    masks: PhotographMasks | None = None,
+    options: PoseOptions | None = None,
+    say: Callable[[str], None] = lambda _: None,
+) -> Poses:
+    """Find camera and poses from photographs of one camera alone (incremental structure from motion by COLMAP).
+
+    Args:
+        photographs: Files by the frame's name, in the order they were taken.
+        folder: For features, matches and reduced photographs; what an interrupted run left is used.
+        focal_px: Focal length that the photographs state, [pixels]; None: unknown.
+        masks: Where photographs may be used; None: everywhere.
+        options: Sizes and limits.
+        say: Told how far it is.
+
+    Returns:
+        The largest group of photographs that fit together, and why the others are not in it.
+
+    Raises:
+        SceneError: Fewer than 3 photographs fit together, or a photograph cannot be decoded.
+    """
+    options = options or PoseOptions()
+    size, other = _common_size(photographs)
+    dropped = {
+        name: f"{w} x {h} pixels, the others {size[0]} x {size[1]}: another camera or mode"
+        for name, (w, h) in other.items()
+    }
+    names = [name for name in photographs if name not in dropped]
+    if len(names) < MIN_FRAMES:
+        raise _too_few(len(names), "photographs of one size")
+    images = _reduced(photographs, names, folder / "images", size, options.image_size)
+    mask_folder = _write_masks(masks, images, folder / "masks")
+    start = start_camera(size, focal_px).resized(*images.camera_size)
+    database = folder / _DATABASE
+    features = FeatureOptions(options.max_features, options.matching, options.lens, options.seed, options.threads)
+    fill_database(
+        database, folder / "images", list(images.files), start, focal_px is not None, mask_folder, features, say
+    )
+    models = _map(database, folder, options, len(names), say)
+    if not models:
+        raise _too_few(0, "photographs that fit together")
+    models.sort(key=lambda model: (-model.num_reg_images(), -len(model.points3D)))
+    model = model_of_colmap(models[0], images.files, size)
+    if len(model.frames) < MIN_FRAMES:
+        raise _too_few(len(model.frames), "photographs that fit together")
+    elsewhere = {
+        images.files[image.name]: f"fits only to {part.num_reg_images() - 1} others, in a part of its own"
+        for part in models[1:]
+        for image in part.images.values()
+        if image.has_pose
+    }
+    for name in names:
+        if name not in model.frames:
+            dropped[name] = elsewhere.get(name, "too few matches with the other photographs")
+    return Poses(model, dropped)
+
+
+def add_points(
+    given: SfmModel,
+    photographs: Mapping[str, Path],
+    folder: Path,
+    masks: PhotographMasks | None = None,
+    options: PoseOptions | None = None,
+    say: Callable[[str], None] = lambda _: None,
+) -> SfmModel:
+    """Find the points that photographs with known poses share; camera and poses stay as they are.
+
+    Args:
+        given: Camera and poses; its points are replaced.
+        photographs: Files by the frame's name; at least those of `given`.
+        folder: For features, matches and reduced photographs.
+        masks: Where photographs may be used; None: everywhere.
+        options: Sizes and limits.
+        say: Told how far it is.
+
+    Raises:
+        SceneError: The photographs are of another size than the camera's.
+    """
+    import pycolmap
+
+    options = options or PoseOptions()
+    names = list(given.frames)
+    size, other = _common_size({name: photographs[name] for name in names})
+    if other or size != (given.camera.width, given.camera.height):
+        raise SceneError(
+            explain(
+                "given poses",
+                expected=f"photographs of {given.camera.width} x {given.camera.height} pixels, as their camera has",
+                got=f"{size[0]} x {size[1]}",
+                remedy="Use the photographs that the poses were computed from.",
+            )
+        )
+    images = _reduced(photographs, names, folder / "images", size, options.image_size)
+    mask_folder = _write_masks(masks, images, folder / "masks")
+    camera = given.camera.resized(*images.camera_size)
+    database = folder / _DATABASE
+    features = FeatureOptions(options.max_features, options.matching, "OPENCV", options.seed, options.threads)
+    fill_database(database, folder / "images", list(images.files), camera, True, mask_folder, features, say)
+    posed = pycolmap.Reconstruction()
+    opencv = pycolmap.Camera(
+        model="OPENCV", width=camera.width, height=camera.height, params=lens_parameters(camera, "OPENCV"), camera_id=1
+    )
+    posed.add_camera_with_trivial_rig(opencv)
+    with pycolmap.Database.open(database) as opened:
+        ids = {image.name: image.image_id for image in opened.read_all_images()}
+    for index, file in enumerate(images.files):
+        inverse = np.linalg.inv(given.camera_to_world[index] @ np.diag([1.0, -1.0, -1.0, 1.0]))
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(inverse[:3, :3]), inverse[:3, 3])
+        image = pycolmap.Image(name=file, camera_id=1, image_id=ids[file])
+        posed.add_image_with_trivial_frame(image, pose)
+    pycolmap.set_random_seed(options.seed)
+    mapping = _mapping_options(options)
+    mapping.ba_refine_focal_length = mapping.ba_refine_extra_params = False
+    mapping.constant_cameras = {1}
+    mapping.fix_existing_frames = True
+    with _quiet(pycolmap):
+        found = pycolmap.triangulate_points(
+            posed, database, folder / "images", folder, clear_points=True, options=mapping, refine_intrinsics=False
+        )
+    model = model_of_colmap(found, images.files, size)
+    return SfmModel(
+        given.frames,
+        given.camera,
+        given.camera_to_world,
+        model.points,
+        model.colours,
+        model.point_error_px,
+        np.array([given.frames.index(model.frames[i]) for i in range(len(model.frames))])[model.sighting_frame],
+        model.sighting_point,
+        model.sighting_pixel,
+    )
+
+
+def start_camera(size: tuple[int, int], focal_px: float | None) -> CameraModel:
+    """A camera to begin with: the photographs' own focal length or a usual one, the principal point at the centre."""
+    focal = focal_px or _GUESSED_FOCAL * max(size)
+    return CameraModel(size[0], size[1], focal, focal, size[0] / 2.0, size[1] / 2.0)
+
+
+@dataclass(frozen=True)
+class _ReducedImages:
+    files: dict[str, str]
+    """Frame by the file's name, in order."""
+    camera_size: tuple[int, int]
+
+
+def _common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[str, tuple[int, int]]]:
+    """The size that most photographs have, and the frames of another size with theirs."""
+    sizes = {}
+    for name, path in photographs.items():
+        with Image.open(path) as image:
+            sizes[name] = image.size
+    if not sizes:
+        raise _too_few(0, "photographs")
+    counted = list(sizes.values())
+    common = max(dict.fromkeys(counted), key=counted.count)
+    return common, {name: size for name, size in sizes.items() if size != common}
+
+
+def _reduced(
+    photographs: Mapping[str, Path], names: Sequence[str], folder: Path, size: tuple[int, int], longest: int
+) -> _ReducedImages:
+    """Write the photographs for COLMAP: smaller, and without EXIF, by which it would turn them."""
+    factor = min(1.0, longest / max(size))
+    small = (max(1, round(size[0] * factor)), max(1, round(size[1] * factor)))
+    folder.mkdir(exist_ok=True)
+    digits = max(4, int(math.log10(max(len(names), 1))) + 1)
+    files = {}
+    for index, name in enumerate(names):
+        file = f"{index:0{digits}d}.jpg"
+        files[file] = name
+        if not (folder / file).is_file():
+            picture = open_photograph(photographs[name])
+            if small != size:
+                picture = picture.resize(small, Image.Resampling.BOX if factor < 0.5 else Image.Resampling.LANCZOS)
+            temporary = folder / f".{file}"
+            picture.save(temporary, format="JPEG", quality=_JPEG_QUALITY)
+            temporary.replace(folder / file)
+    return _ReducedImages(files, small)
+
+
+def _write_masks(masks: PhotographMasks | None, images: _ReducedImages, folder: Path) -> Path | None:
+    """Write masks as COLMAP looks for them: the photograph's name with .png behind it."""
+    if masks is None or not masks.any:
+        return None
+    folder.mkdir(exist_ok=True)
+    for file, frame in images.files.items():
+        use = Image.fromarray(np.where(masks.of(frame), np.uint8(255), np.uint8(0)))
+        use.resize(images.camera_size, Image.Resampling.NEAREST).save(folder / f"{file}.png")
+    return folder
+
+
+def _mapping_options(options: PoseOptions) -> Any:
+    import pycolmap
+
+    mapping = pycolmap.IncrementalPipelineOptions()
+    mapping.random_seed = options.seed
+    mapping.mapper.random_seed = options.seed
+    mapping.triangulation.random_seed = options.seed
+    mapping.num_threads = options.threads
+    mapping.mapper.num_threads = options.threads
+    mapping.min_model_size = MIN_FRAMES
+    return mapping
+
+
+def _map(
+    database: Path, folder: Path, options: PoseOptions, count: int, say: Callable[[str], None]
+) -> list[Any]:
+    import pycolmap
+
+    found = [2]  # the first pair comes without a call
+
+    def next_image() -> None:
+        found[0] += 1
+        if found[0] % 10 == 0:
+            say(f"poses: {min(found[0], count)} of {count} photographs")
+
+    pycolmap.set_random_seed(options.seed)
+    mapping = _mapping_options(options)
+    models: dict[int, Any] = {}
+    with _quiet(pycolmap):
+        models = pycolmap.incremental_mapping(
+            database, folder / "images", folder, mapping, next_image_callback=next_image
+        )
+    return list(models.values())
+
+
+class _quiet:
+    """COLMAP's own log, of which only errors are shown while it runs."""
+
+    def __init__(self, pycolmap: Any) -> None:
+        self._logging = pycolmap.logging
+
+    def __enter__(self) -> None:
+        self._before = self._logging.minloglevel
+        self._logging.minloglevel = 2
+
+    def __exit__(self, *_: object) -> None:
+        self._logging.minloglevel = self._before
+
+
+def _too_few(got: int, what: str) -> SceneError:
+    return SceneError(
+        explain(
+            "poses",
+            expected=f"at least {MIN_FRAMES} {what}",
+            got=got,
+            remedy="Take more photographs with more overlap (each part of the scene in three or more), in focus and "
+            "with texture; or give poses with --poses.",
+        )
+    )

@@ -1,0 +1,158 @@
+"""Where the thermal camera sits beside the visible one, and its lens: found from the images alone.
+
+The photographs' edges are carried into the thermal images through the scene points of structure from motion, and
+the rig is moved until they lie on the thermal edges, coarse to fine, over all frames together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.capture.contract import CameraModel, RigEstimate, RigFrame, RigStart
+from thermoxels_ns.capture.rig_fit import RigClimber
+from thermoxels_ns.capture.rig_levels import PreparedFrames, prepare_frames
+from thermoxels_ns.capture.rig_parameters import PARAMETERS, RigModel, prior_sigmas
+from thermoxels_ns.capture.rig_start import RoughSearch
+from thermoxels_ns.errors import SceneError, explain
+
+FloatArray = npt.NDArray[np.float64]
+
+_FEWEST_FRAMES = 3
+_MOST_FRAMES = 40
+_BLUR_PX = 1.5
+_ABOVE_CHANCE = 1.5
+_FARTHEST_SIGMAS = 5.0
+_WORTH_A_CLIMB = 0.8
+_SMALLEST_ERROR_PX, _LARGEST_ERROR_SHARE = 1.5, 0.005
+_PROBE_STEP = 1e-4
+_PROBES = 500
+
+
+def estimate_rig(
+    frames: Sequence[RigFrame],
+    visible: CameraModel,
+    start: RigStart,
+    progress: Callable[[str, float], None] = lambda message, share: None,
+) -> RigEstimate:
+    """Find the thermal camera's intrinsics and the fixed transform from the visible to the thermal camera.
+
+    Args:
+        frames: Pairs with poses and scene points, in the order they were taken; of more than 40 an even choice.
+        visible: Intrinsics of the photographs.
+        start: First guess and how far it can be off.
+        progress: Told what is being done and which share of the work is behind (0 to 1).
+
+    Returns:
+        The rig; the start with `determined` False and the reason where the images cannot tell.
+
+    Raises:
+        SceneError: No frames, or images that do not have the size of their camera.
+    """
+    if not frames:
+        raise SceneError(
+            explain(
+                "rig",
+                expected="frames with a pose and a thermal partner",
+                got="none",
+                remedy="Check that structure from motion registered the photographs.",
+            )
+        )
+    chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _MOST_FRAMES)).astype(int))]
+    progress("Reading the frames", 0.0)
+    prepared = prepare_frames(chosen, visible, start.thermal_camera)
+    return _RigSearch(prepared, start, progress).run()
+
+
+@dataclass(frozen=True, eq=False)
+class _RigSearch:
+    prepared: PreparedFrames
+    start: RigStart
+    progress: Callable[[str, float], None]
+
+    def run(self) -> RigEstimate:
+        depth = self.prepared.median_depth
+        sigmas = prior_sigmas(self.start, depth)
+        rig = RigModel(self.start.thermal_camera, np.asarray(self.start.visible_to_thermal, dtype=np.float64))
+        unchanged = np.zeros(len(PARAMETERS))
+        sizes = self.prepared.sizes()
+        coarse = self.prepared.score(rig, unchanged, sizes[0], _BLUR_PX)
+        before = coarse.value(unchanged)
+        if len(self.prepared.frames) < _FEWEST_FRAMES:
+            reason = f"{len(self.prepared.frames)} frames are too few to tell; at least {_FEWEST_FRAMES} are needed"
+            return self._kept(rig, sigmas, before, reason)
+        self.progress("Comparing edges, all directions", 0.1)
+        search = RoughSearch(coarse, sigmas, depth)
+        rough, chance = search.best(), search.best_by_chance()
+        if not rough or rough[0].score < _ABOVE_CHANCE * chance:
+            best = rough[0].score if rough else 0.0
+            reason = (
+                f"the thermal edges agree with those of the photographs no better ({best:.3f}) than chance "
+                f"({chance:.3f}): the thermal images are too flat or show other things"
+            )
+            return self._kept(rig, sigmas, before, reason)
+        climber = RigClimber(coarse, sigmas, depth)
+        tops = [climber.climb(one.change) for one in rough if one.score >= _WORTH_A_CLIMB * rough[0].score]
+        change = max(tops, key=lambda top: top.log_posterior).change
+        score = coarse
+        for number, size in enumerate(sizes[1:]):
+            self.progress(f"Comparing edges, {size[0]} x {size[1]} pixels", 0.3 + 0.6 * number / len(sizes))
+            score = self.prepared.score(rig, change, size, _BLUR_PX)
+            climber = RigClimber(score, sigmas, depth)
+            change = climber.climb(change).change
+        covariance = climber.covariance(change)
+        self.progress("Rig found", 1.0)
+        before, after = score.value(unchanged), score.value(change)
+        error_px = self._projection_sigma(rig, change, covariance)
+        reason = self._doubt(change, sigmas, before, after, error_px)
+        if reason is not None:
+            return self._kept(rig, sigmas, before, reason)
+        camera, transform = rig.changed(change)
+        turn_deg = np.degrees(np.arccos(np.clip(0.5 * (np.trace(transform[:3, :3]) - 1.0), -1.0, 1.0)))
+        explanation = (
+            f"Found from {len(self.prepared.frames)} frames: focal length {camera.fl_x:.1f} pixels, "
+            f"{turn_deg:.2f} degrees and {np.linalg.norm(transform[:3, 3]):.3g} world units from the visible camera; "
+            f"scene points fall within {error_px:.2f} thermal pixels (standard error). Start: {self.start.source}."
+        )
+        return RigEstimate(camera, transform, PARAMETERS, covariance, True, explanation, before, after, error_px)
+
+    def _doubt(
+        self, change: FloatArray, sigmas: FloatArray, before: float, after: float, error_px: float
+    ) -> str | None:
+        """Why the result is not to be trusted; None if nothing speaks against it."""
+        free = sigmas > 0.0
+        far = np.abs(change[free]) / sigmas[free]
+        if far.max() > _FARTHEST_SIGMAS:
+            name = np.array(PARAMETERS)[free][int(far.argmax())]
+            return f"the best agreement needs {name} {far.max():.0f} standard deviations from the start"
+        if after < before:
+            return "the start agrees better than all that was tried"
+        limit = max(_SMALLEST_ERROR_PX, _LARGEST_ERROR_SHARE * self.prepared.thermal.width)
+        if error_px > limit:
+            return f"scene points would be uncertain by {error_px:.1f} thermal pixels (limit {limit:.1f})"
+        return None
+
+    def _kept(self, rig: RigModel, sigmas: FloatArray, score: float, reason: str) -> RigEstimate:
+        """The start as the result."""
+        covariance = np.diag(sigmas**2)
+        error_px = self._projection_sigma(rig, np.zeros(len(sigmas)), covariance)
+        text = f"Not determined, the start value is kept ({self.start.source}): {reason}."
+        return RigEstimate(rig.camera, rig.transform, PARAMETERS, covariance, False, text, score, score, error_px)
+
+    def _projection_sigma(self, rig: RigModel, change: FloatArray, covariance: FloatArray) -> float:
+        """Median standard error of where scene points fall [thermal pixels], both axes together."""
+        camera = self.prepared.thermal
+        across, down = np.meshgrid(np.linspace(0.05, 0.95, 12), np.linspace(0.05, 0.95, 12))
+        rays = camera.rays(np.column_stack([across.ravel() * camera.width, down.ravel() * camera.height]))
+        points = rays * self.prepared.median_depth
+        here = rig.project(change, points)
+        slopes = np.empty((len(PARAMETERS), *here.shape))
+        for number in range(len(PARAMETERS)):
+            moved = change.copy()
+            moved[number] += _PROBE_STEP
+            slopes[number] = (rig.project(moved, points) - here) / _PROBE_STEP
+        variance = np.einsum("inx,ij,jnx->n", slopes, covariance, slopes)
+        return float(np.sqrt(np.nanmedian(variance)))

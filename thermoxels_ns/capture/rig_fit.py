@@ -1,0 +1,100 @@
+"""Climb the rig score from a start value, held by what was known before, and say how well the top is determined."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+
+from thermoxels_ns.capture.rig_score import RigScore
+
+FloatArray = npt.NDArray[np.float64]
+
+_DIFFERENCE_PX = 0.05
+_MOST_STEPS = 20
+_GRADIENT_TOLERANCE = 3e-2
+
+
+@dataclass(frozen=True, eq=False)
+class RigFit:
+    """A top of the score."""
+
+    change: FloatArray
+    """The ten changes."""
+    score: float
+    log_posterior: float
+    """Score times its weight less half the squared distance from the start in standard deviations."""
+
+
+class RigClimber:
+    """Maximises weight * score - 0.5 * sum((change / sigma)^2) over the changes whose sigma is above 0.
+
+    The weight makes the score's curvature H the information that it carries: with G the scatter of the frames'
+    contributions to the slope, the covariance of the top alone is H^-1 G H^-1 (the sandwich of M-estimators, Huber
+    1967, frames taken as independent), which (weight * H)^-1 equals if weight * G = H. The median over H's principal
+    directions is taken, because those that the images hardly determine have no reliable ratio.
+    """
+
+    def __init__(self, score: RigScore, sigmas: FloatArray, median_depth: float) -> None:
+        """Take the score at one size, the prior standard deviations and the scene's median depth."""
+        self._score = score
+        self._sigmas = sigmas
+        self._free = np.flatnonzero(sigmas > 0.0)
+        self._scale = sigmas[self._free]
+        focal = score.rig.camera.fl_x
+        reach = 0.5 * score.rig.camera.width
+        per_pixel = np.array([1 / focal] * 3 + [median_depth / focal] * 3 + [1 / reach] + [1.0] * 2 + [0.2])
+        self._step = _DIFFERENCE_PX * per_pixel[self._free] / self._scale
+
+    def climb(self, change: FloatArray) -> RigFit:
+        """Go up from `change`."""
+        z = change[self._free] / self._scale
+        weight, information, _ = self._information(z)
+        root = np.linalg.cholesky(np.linalg.inv(weight * information + np.eye(len(z))))
+
+        def negative(y: FloatArray) -> tuple[float, FloatArray]:
+            point = z + root @ y
+            value, slopes = self._score.with_slopes(self._full(point))
+            slope = weight * slopes.sum(axis=0)[self._free] * self._scale - point
+            return -(weight * value - 0.5 * float(point @ point)), -(root.T @ slope)
+
+        options = {"maxiter": _MOST_STEPS, "gtol": _GRADIENT_TOLERANCE}
+        best = minimize(negative, np.zeros(len(z)), jac=True, method="BFGS", options=options)
+        z = z + root @ best.x
+        change = self._full(z)
+        return RigFit(change, self._score.value(change), -float(best.fun))
+
+    def covariance(self, change: FloatArray) -> FloatArray:
+        """Covariance of the ten changes at a top, shape (10, 10); 0 for those that are kept fixed."""
+        weight, information, scatter = self._information(change[self._free] / self._scale)
+        posterior = np.linalg.inv(weight * information + np.eye(len(self._free)))
+        spread = posterior @ (weight**2 * scatter + np.eye(len(self._free))) @ posterior
+        result = np.zeros((len(change), len(change)))
+        result[np.ix_(self._free, self._free)] = spread * np.outer(self._scale, self._scale)
+        return result
+
+    def _full(self, z: FloatArray) -> FloatArray:
+        change = np.zeros(len(self._sigmas))
+        change[self._free] = z * self._scale
+        return change
+
+    def _information(self, z: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Weight, curvature made positive and scatter of the frames' slopes, in standard deviations of the start."""
+        _, slopes = self._score.with_slopes(self._full(z))
+        own = slopes[:, self._free] * self._scale
+        total, frames = own.sum(axis=0), len(own)
+        centred = own - own.mean(axis=0)
+        scatter = centred.T @ centred * (frames / max(frames - 1, 1))
+        curvature = np.empty((len(z), len(z)))
+        for number, step in enumerate(self._step):
+            moved = z.copy()
+            moved[number] += step
+            ahead = self._score.with_slopes(self._full(moved))[1].sum(axis=0)[self._free] * self._scale
+            curvature[number] = (total - ahead) / step
+        values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
+        values = np.maximum(np.abs(values), 1e-6 * max(float(np.abs(values).max()), 1e-12))
+        ratio = np.einsum("ij,ik,kj->j", vectors, scatter, vectors) / values
+        weight = 1.0 / max(float(np.median(ratio)), 1e-9)
+        return weight, (vectors * values) @ vectors.T, scatter

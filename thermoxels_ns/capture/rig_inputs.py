@@ -1,0 +1,157 @@
+"""What the search for the rig starts from: pairs with their scene points, and what files say of the thermal camera."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from thermoxels_ns.capture.contract import CameraModel, RigEstimate, RigFrame, RigStart
+from thermoxels_ns.capture.frames import CaptureFrame
+from thermoxels_ns.capture.sfm_model import SfmModel
+from thermoxels_ns.capture.stages import read_json
+from thermoxels_ns.errors import SceneError, explain
+
+_MOST_ERROR_PX = 4.0
+"""Points that project farther than this from where they were seen are not used, [pixels of the photographs]."""
+_FROM_LENS, _FROM_FLIR, _FROM_ANGLE, _FROM_USER, _GUESSED = 0.03, 0.06, 0.1, 0.05, 0.25
+"""Standard deviations of the thermal focal length by where it comes from, as shares of it."""
+_BELIEVED_DEG = (3.0, 150.0)
+"""Angles of view that are believed; some cameras state nonsense."""
+
+
+def rig_frames(model: SfmModel, frames: Sequence[CaptureFrame]) -> list[RigFrame]:
+    """Pairs with their poses and the scene points that they see, in the order of the model's frames."""
+    by_name = {frame.name: frame for frame in frames}
+    good = model.point_error_px <= _MOST_ERROR_PX
+    result = []
+    for index, name in enumerate(model.frames):
+        seen, _ = model.seen_by(index)
+        seen = seen[good[seen]]
+        result.append(
+            RigFrame(
+                name=name,
+                photograph=by_name[name].photograph,
+                temperature_c=by_name[name].thermal,
+                camera_to_world=model.camera_to_world[index],
+                points_world=model.points[seen],
+                point_ids=seen,
+            )
+        )
+    return result
+
+
+def rig_start(
+    frames: Sequence[CaptureFrame],
+    visible: CameraModel,
+    thermal_size: tuple[int, int],
+    field_of_view_deg: float | None = None,
+) -> RigStart:
+    """Guess the thermal camera from the user's angle of view, its lens, FLIR's alignment or its angle of view.
+
+    Args:
+        frames: What the files say.
+        visible: The photographs' camera.
+        thermal_size: Width and height of the thermal images.
+        field_of_view_deg: Horizontal angle of view of the thermal lens that the user gives, [degrees].
+    """
+    width, height = thermal_size
+    transform = np.eye(4)
+    lens = [frame.thermal_focal_px for frame in frames if frame.thermal_focal_px]
+    flir = [frame.picture_in_picture for frame in frames if frame.picture_in_picture]
+    angles = [frame.thermal_field_of_view_deg for frame in frames if frame.thermal_field_of_view_deg]
+    angles = [angle for angle in angles if _BELIEVED_DEG[0] < angle < _BELIEVED_DEG[1]]
+    if field_of_view_deg is not None:
+        camera = CameraModel.from_field_of_view(width, height, field_of_view_deg)
+        sigma, source = _FROM_USER, f"the angle of view that was given, {field_of_view_deg:g} degrees"
+    elif lens:
+        focal = median(lens)
+        camera = CameraModel(width, height, focal, focal, width / 2, height / 2)
+        sigma, source = _FROM_LENS, f"the thermal files' focal length and pixel pitch, {focal:.1f} pixels"
+    elif flir:
+        ratio = median(each.real_to_thermal for each in flir)
+        focal = visible.fl_x * width / visible.width * ratio
+        camera = CameraModel(width, height, focal, focal, width / 2, height / 2)
+        x, y = (median(getattr(each, name) for each in flir) for name in ("offset_x", "offset_y"))
+        # The thermal image's centre lies at the photograph's centre plus the offset.
+        transform[:3, :3] = _turn(x / visible.fl_x, y / visible.fl_y)
+        sigma, source = _FROM_FLIR, f"FLIR's alignment of the pictures (Real2IR {ratio:.3f}, offset {x:g}, {y:g})"
+    elif angles:
+        angle = median(angles)
+        camera = CameraModel.from_field_of_view(width, height, angle)
+        sigma, source = _FROM_ANGLE, f"the thermal files' angle of view, {angle:g} degrees"
+    else:
+        focal = visible.fl_x * width / visible.width
+        camera = CameraModel(width, height, focal, focal, width / 2, height / 2)
+        sigma, source = _GUESSED, "a guess: the photographs' angle of view"
+    return RigStart(thermal_camera=camera, visible_to_thermal=transform, focal_sigma=sigma, source=source)
+
+
+def read_rig(file: Path) -> RigEstimate:
+    """Read a rig that was found before: ``thermal_camera`` and ``rig`` of a transforms.json.
+
+    Raises:
+        SceneError: One of them is missing or no camera, or no rotation and shift.
+    """
+    content: Any = read_json(file)
+    remedy = "Pass the transforms.json of an earlier capture with the same camera."
+    try:
+        entries = content["thermal_camera"]
+        names = ("fl_x", "fl_y", "cx", "cy")
+        lens = {name: float(entries.get(name, 0.0)) for name in ("k1", "k2", "p1", "p2")}
+        camera = CameraModel(
+            int(entries["w"]), int(entries["h"]), **{name: float(entries[name]) for name in names}, **lens
+        )
+        transform = np.array(content["rig"], dtype=np.float64)
+    except (KeyError, TypeError, ValueError, AttributeError) as problem:
+        if isinstance(problem, SceneError):
+            raise
+        raise SceneError(
+            explain(str(file), expected="'thermal_camera' and 'rig'", got=f"no {problem}", remedy=remedy)
+        ) from problem
+    rotation = transform[:3, :3] if transform.shape == (4, 4) else np.zeros((3, 3))
+    if not np.isfinite(transform).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2:
+        raise SceneError(
+            explain(
+                f"{file}: rig", expected="4 x 4 numbers, a rotation and a shift", got=transform.tolist(), remedy=remedy
+            )
+        )
+    return RigEstimate(
+        thermal_camera=camera,
+        visible_to_thermal=transform,
+        parameters=(),
+        covariance=np.zeros((0, 0)),
+        determined=True,
+        explanation=f"Given in {file.name}.",
+        score_before=math.nan,
+        score_after=math.nan,
+        projection_sigma_px=math.nan,
+    )
+
+
+def kept_start(start: RigStart, why: str) -> RigEstimate:
+    """The start value as an estimate, where nothing can be compared."""
+    return RigEstimate(
+        thermal_camera=start.thermal_camera,
+        visible_to_thermal=start.visible_to_thermal,
+        parameters=(),
+        covariance=np.zeros((0, 0)),
+        determined=False,
+        explanation=f"{why} The start value is kept: {start.source}.",
+        score_before=math.nan,
+        score_after=math.nan,
+        projection_sigma_px=math.nan,
+    )
+
+
+def _turn(right: float, down: float) -> np.ndarray:
+    """Rotation from visible to thermal axes of a thermal camera that looks that far to the right and down, [rad]."""
+    ahead = np.array([right, down, 1.0])
+    ahead /= np.linalg.norm(ahead)
+    x = np.cross([0.0, 1.0, 0.0], ahead)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(ahead, x), ahead])

@@ -1,0 +1,168 @@
+"""Photographs and thermal images of all frames at one size after another, coarse to fine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.capture.contract import CameraModel, RigFrame
+from thermoxels_ns.capture.edge_structure import edge_field, without_fixed_pattern
+from thermoxels_ns.capture.rig_parameters import RigModel
+from thermoxels_ns.capture.rig_score import EdgePoints, RigScore, ThermalEdges
+from thermoxels_ns.capture.sparse_depth import SparseDepth
+from thermoxels_ns.errors import SceneError, explain
+
+FloatImage = npt.NDArray[np.float32]
+
+_COARSEST_WIDTH = 80
+_MOST_POINTS = 6_000
+_STRONGEST_SHARE = 0.35
+_WEAKEST_EDGE = 0.05
+_FARTHEST_FROM_POINT = 0.06
+"""Distance on the plane at depth 1 to the next scene point, beyond which an edge's depth is not known."""
+_MARGIN_SHARE = 0.15
+_ASPECT_TOLERANCE = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedFrame:
+    """One frame, read and checked."""
+
+    name: str
+    grey: FloatImage
+    """Photograph, shape (height, width)."""
+    contrast: FloatImage
+    """Local contrast of the temperatures, shape (height, width) of the thermal camera [K]."""
+    depth: SparseDepth
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedFrames:
+    """All frames and both cameras, ready to be compared at any size."""
+
+    frames: tuple[PreparedFrame, ...]
+    visible: CameraModel
+    thermal: CameraModel
+    pattern_correlation: float
+    """How far two halves of the frames agree on a pattern that stays in place in the thermal images."""
+    median_depth: float
+    """Of all scene points [world units]."""
+
+    def sizes(self) -> list[tuple[int, int]]:
+        """Sizes of the thermal images to go through, coarse to fine; the last one is the full size."""
+        width, height = self.thermal.width, self.thermal.height
+        halvings = max(round(np.log2(max(width / _COARSEST_WIDTH, 1.0))), 0)
+        return [(round(width / 2**k), round(height / 2**k)) for k in range(halvings, -1, -1)]
+
+    def score(self, rig: RigModel, change: npt.NDArray, size: tuple[int, int], blur_px: float) -> RigScore:
+        """Make the score at one size; `change` only says which part of a photograph can be in the thermal image."""
+        level = rig.at_size(*size)
+        edges, thermal = [], []
+        for frame in self.frames:
+            small = cv2.resize(frame.contrast, size, interpolation=cv2.INTER_AREA)
+            thermal.append(ThermalEdges(edge_field(small, blur_px)))
+            edges.append(self._edge_points(frame, level, change, blur_px))
+        return RigScore(edges, thermal, level)
+
+    def _edge_points(self, frame: PreparedFrame, level: RigModel, change: npt.NDArray, blur_px: float) -> EdgePoints:
+        """The strongest edges of a photograph, at about the thermal image's pixel size."""
+        height, width = frame.grey.shape
+        scale = min(level.camera.fl_x / self.visible.resized(width, height).fl_x, 1.0)
+        size = max(round(width * scale), 8), max(round(height * scale), 8)
+        small = cv2.resize(frame.grey, size, interpolation=cv2.INTER_AREA)
+        field = edge_field(small, blur_px)
+        rows, columns = np.nonzero(np.abs(field) > _WEAKEST_EDGE)
+        rays = self.visible.resized(*size).rays(np.column_stack([columns + 0.5, rows + 0.5]))
+        seen = level.project(change, rays * self.median_depth)
+        margin = _MARGIN_SHARE * level.camera.width
+        near = level.camera.contains(seen, -margin)
+        rows, columns, rays = rows[near], columns[near], rays[near]
+        value = field[rows, columns]
+        most = min(_MOST_POINTS, int(_STRONGEST_SHARE * field.size))
+        if len(value) > most:
+            keep = np.sort(np.argsort(-np.abs(value), kind="stable")[:most])
+            value, rays = value[keep], rays[keep]
+        depth, distance = frame.depth.at(rays)
+        known = distance < _FARTHEST_FROM_POINT
+        turn = level.transform[:3, :3]
+        roll = np.exp(2j * np.arctan2(turn[1, 0], turn[0, 0])).astype(np.complex64)
+        return EdgePoints(rays[known] * depth[known, None], value[known] * roll)
+
+
+def prepare_frames(frames: Sequence[RigFrame], visible: CameraModel, thermal: CameraModel) -> PreparedFrames:
+    """Read the images of all frames, take out the thermal camera's fixed pattern and check sizes.
+
+    Raises:
+        SceneError: An image cannot be read or has not the size of its camera; a frame has no scene points.
+    """
+    temperatures = [read_temperatures(frame, thermal) for frame in frames]
+    contrasts, correlation = without_fixed_pattern(temperatures)
+    prepared, depths = [], []
+    for frame, contrast in zip(frames, contrasts):
+        points = frame.points_visible()
+        ahead = points[:, 2] > 0.0
+        if not ahead.any():
+            raise SceneError(
+                explain(
+                    f"{frame.name}: scene points",
+                    expected="points that the photograph sees",
+                    got=f"{len(points)}, none of them ahead of the camera",
+                    remedy="Leave the frame out, or check that its pose is in OpenGL axes.",
+                )
+            )
+        depths.append(points[ahead, 2])
+        prepared.append(PreparedFrame(frame.name, read_photograph(frame, visible), contrast, SparseDepth(points)))
+    return PreparedFrames(tuple(prepared), visible, thermal, correlation, float(np.median(np.concatenate(depths))))
+
+
+def read_temperatures(frame: RigFrame, camera: CameraModel) -> FloatImage:
+    """Temperatures of a frame as an array of the thermal camera's size [degrees C]."""
+    source = frame.temperature_c
+    image = np.load(source, allow_pickle=False) if isinstance(source, Path) else np.asarray(source)
+    if image.shape != (camera.height, camera.width):
+        raise SceneError(
+            explain(
+                f"{frame.name}: temperatures",
+                expected=f"the thermal camera's {camera.height} rows and {camera.width} columns",
+                got=image.shape,
+                remedy="Leave the frame out, or give the camera that took it.",
+            )
+        )
+    return image.astype(np.float32)
+
+
+def read_photograph(frame: RigFrame, camera: CameraModel) -> FloatImage:
+    """Photograph of a frame as grey values; EXIF's orientation is not applied, as in structure from motion."""
+    source = frame.photograph
+    if isinstance(source, Path):
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        encoded = np.frombuffer(source.read_bytes(), np.uint8)
+        image = cv2.imdecode(encoded, flags) if len(encoded) else None
+        if image is None:
+            raise SceneError(
+                explain(
+                    f"{frame.name}: {source.name}",
+                    expected="a readable photograph",
+                    got="a file that is damaged or no image",
+                    remedy="Copy it from the camera again or leave the frame out.",
+                )
+            )
+    else:
+        image = np.asarray(source)
+        image = image[..., :3].mean(axis=2) if image.ndim == 3 else image
+    height, width = image.shape
+    if abs(width * camera.height / (height * camera.width) - 1.0) > _ASPECT_TOLERANCE:
+        raise SceneError(
+            explain(
+                f"{frame.name}: photograph",
+                expected=f"the aspect of the visible camera, {camera.width} x {camera.height}",
+                got=f"{width} x {height} pixels",
+                remedy="Use the photographs that the poses were computed from.",
+            )
+        )
+    return image.astype(np.float32)

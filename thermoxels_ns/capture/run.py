@@ -1,0 +1,399 @@
+"""All stages of a capture in order: from a folder of camera files to a scene and a page about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from thermoxels_ns.capture import results
+from thermoxels_ns.capture.camera_files import SUFFIXES, scan_folder
+from thermoxels_ns.capture.contract import DriftEstimate, RigEstimate
+from thermoxels_ns.capture.drift import estimate_drift
+from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames
+from thermoxels_ns.capture.given_poses import in_order, read_given_poses
+from thermoxels_ns.capture.gravity import Up, find_up, level_rotation
+from thermoxels_ns.capture.masks import PhotographMasks, find_overlay, mask_files
+from thermoxels_ns.capture.metric_scale import (
+    MeasuredDistance,
+    MetricScale,
+    scale_from_distance,
+    scale_from_gps,
+    scale_from_markers,
+)
+from thermoxels_ns.capture.pairs import Pair, PairOptions, find_pairs, read_pair_list
+from thermoxels_ns.capture.photograph import read_photograph_facts
+from thermoxels_ns.capture.poses import PoseOptions, add_points, find_poses
+from thermoxels_ns.capture.report import Findings, report_page
+from thermoxels_ns.capture.rig import estimate_rig
+from thermoxels_ns.capture.rig_inputs import kept_start, read_rig, rig_frames, rig_start
+from thermoxels_ns.capture.scene_writer import JSON_NAME, Scene, write_scene_folder
+from thermoxels_ns.capture.settings import CaptureSettings
+from thermoxels_ns.capture.sfm_model import SfmModel
+from thermoxels_ns.capture.stages import StageCache, fingerprint, prepare_output, read_json, write_json
+from thermoxels_ns.data.radiometry import RadiometryOptions
+from thermoxels_ns.errors import SceneError, explain
+
+PAGE_NAME = "capture.html"
+_OVERLAY_FRAMES = 40
+"""Photographs that overlays are looked for in."""
+_LEAST_POINTS = 50
+"""Sightings of scene points below which thermal images and photographs cannot be compared."""
+_OVERLAY_FILE = "overlay.npy"
+
+
+@dataclass(frozen=True)
+class CaptureResult:
+    """What a capture wrote, and the figures to judge it by."""
+
+    scene: Path
+    """transforms.json."""
+    page: Path
+    pairs: int
+    frames: int
+    """In the scene."""
+    dropped: dict[str, str]
+    """Files and frames that are not in it, and why."""
+    rig: RigEstimate
+    drift: DriftEstimate
+    scale: MetricScale | None
+    scale_missing: str
+    """Why there is no scale, where there is none."""
+
+
+def run_capture(
+    source: Path, output: Path, settings: CaptureSettings, say: Callable[[str], None] = lambda _: None
+) -> CaptureResult:
+    """Turn a folder of camera files into a scene.
+
+    Args:
+        source: The folder; nothing is written to it, unless the output lies in it.
+        output: For the scene, the page and the stages' results.
+        settings: How.
+        say: Told how far it is, one line at a time.
+
+    Raises:
+        ThermoxelsError: A file cannot be read, there are no pairs or no poses, or an option is out of range.
+    """
+    if not source.is_dir():
+        scan_folder(source)  # says what is wrong
+    if output.resolve() == source.resolve():
+        raise SceneError(
+            explain(
+                "output",
+                expected="another folder than the input",
+                got=output,
+                remedy="Pass a new folder with --output; the camera's files stay as they are.",
+            )
+        )
+    folder = prepare_output(output)
+    return _Run(source, folder, settings, StageCache(folder, settings.from_stage, say), say).all()
+
+
+@dataclass
+class _Run:
+    source: Path
+    output: Path
+    settings: CaptureSettings
+    cache: StageCache
+    say: Callable[[str], None]
+    dropped: dict[str, str] = field(default_factory=dict)
+
+    def all(self) -> CaptureResult:
+        settings = self.settings
+        pairs = self.find_pairs()
+        read = self.read_temperatures(pairs)
+        found = self.find_poses(read)
+        model, scale, missing, up = self.find_scale(found, read)
+        by_name = {frame.name: frame for frame in read.frames}
+        frames = [by_name[name] for name in model.frames]
+        rig, start = self.find_rig(model, frames, read)
+        drift = self.find_drift(model, frames, rig)
+        scene = Scene(frames, model, rig, drift, scale, up, self.masks(frames, model))
+        # The stage's folder holds nothing: its result lies in the output folder.
+        written = [self.output / JSON_NAME, self.output / "images", self.output / "thermal"]
+        there = all(path.exists() for path in written)
+        self.cache.run("scene", {"there": there or None}, lambda _: self._write_scene(scene))
+        findings = Findings(
+            source=self.source,
+            pairs=pairs,
+            dropped=self.dropped,
+            read=read,
+            scene=scene,
+            start=start,
+            scale_missing=missing,
+            poses_source=self._poses_source(),
+            seconds=self.cache.seconds,
+        )
+        page = self.output / PAGE_NAME
+        self.cache.run(
+            "page", {"there": page.is_file() or None}, lambda _: report_page(findings, page)
+        )
+        del settings
+        return CaptureResult(
+            self.output / JSON_NAME, page, len(pairs), len(frames), self.dropped, rig, drift, scale, missing
+        )
+
+    def find_pairs(self) -> tuple[Pair, ...]:
+        settings = self.settings
+        options = PairOptions(settings.time_limit_s, settings.clock_offset_s)
+        listed = [] if settings.pairs is None else [settings.pairs]
+        inside = [path for path in self.source.rglob("*") if path.is_file() and path.suffix.lower() in SUFFIXES]
+        inside = [path for path in inside if not path.resolve().is_relative_to(self.output.resolve())]
+        depends = {
+            "options": options,
+            "files": fingerprint(inside, self.source),
+            "list": _fingerprints(listed),
+            "skip_bad": settings.skip_bad,
+        }
+
+        def work(folder: Path) -> None:
+            if settings.pairs is not None:
+                search, unreadable = read_pair_list(settings.pairs, self.source), {}
+            else:
+                found = scan_folder(self.source, [self.output], self.say)
+                search, unreadable = find_pairs(found, options), found.unreadable
+            if unreadable and not settings.skip_bad:
+                first = next(iter(unreadable.values()))
+                more = f" {len(unreadable) - 1} more cannot be read." if len(unreadable) > 1 else ""
+                raise SceneError(f"{first}{more} To go on without such files, pass --skip-bad True.")
+            results.save_pairs(folder, search, self.source)
+            write_json(folder / "unreadable.json", {path.name: why for path, why in unreadable.items()})
+            if not search.pairs:
+                example = next(iter(search.unpaired.items()), None)
+                got = "no camera files" if example is None else f"none; {Path(example[0]).name}: {example[1]}"
+                raise SceneError(
+                    explain(
+                        str(self.source),
+                        expected="photographs with thermal images",
+                        got=got,
+                        remedy="Give both of a shot the same name or time, or list them in a file with --pairs.",
+                    )
+                )
+            self.say(f"pairs: {len(search.pairs)}, files without a partner: {len(search.unpaired)}")
+
+        folder = self.cache.run("pairs", depends, work)
+        pairs, unpaired = results.load_pairs(folder, self.source)
+        self.dropped |= read_json(folder / "unreadable.json") | unpaired
+        return pairs
+
+    def read_temperatures(self, pairs: tuple[Pair, ...]) -> CaptureFrames:
+        settings = self.settings
+        options = RadiometryOptions(
+            camera=settings.camera,
+            celsius_per_count=settings.celsius_per_count,
+            celsius_offset=settings.celsius_offset,
+            dji_library=settings.dji_library,
+            emissivity=settings.emissivity,
+            reflected_c=settings.reflected_c,
+            distance_m=settings.distance_m,
+            relative_humidity=settings.relative_humidity,
+            air_c=settings.air_c,
+        )
+        depends = {"options": options, "skip_bad": settings.skip_bad, "mask": _fingerprints([settings.thermal_mask])}
+
+        def work(folder: Path) -> None:
+            read = read_frames(
+                pairs, self.source, folder, options, settings.skip_bad, settings.thermal_mask, self.say
+            )
+            self.say(f"temperatures: {len(read.frames)} thermal images of {read.thermal_size[0]} x "
+                     f"{read.thermal_size[1]} pixels")
+
+        read = CaptureFrames.load(self.cache.run("temperatures", depends, work))
+        self.dropped |= read.dropped
+        return read
+
+    def find_poses(self, read: CaptureFrames) -> SfmModel:
+        settings = self.settings
+        options = PoseOptions(
+            settings.image_size, settings.max_features, settings.matching, settings.lens, settings.seed, settings.threads
+        )
+        given = [] if settings.poses is None else _files_of(settings.poses)
+        masks = [] if settings.masks is None else list(mask_files(settings.masks).values())
+        depends = {
+            "options": options,
+            "poses": _fingerprints(given),
+            "masks": _fingerprints(masks),
+            "overlays": settings.find_overlays,
+        }
+
+        def work(folder: Path) -> None:
+            photographs = {frame.name: frame.photograph for frame in read.frames}
+            mask = self._find_masks(read, folder)
+            if settings.poses is None:
+                focal = [frame.focal_px for frame in read.frames if frame.focal_px]
+                poses = find_poses(
+                    photographs, folder, float(np.median(focal)) if focal else None, mask, options, self.say
+                )
+                order = {name: number for number, name in enumerate(photographs)}
+                model = in_order(poses.model, lambda name: order[name])
+            else:
+                poses = read_given_poses(settings.poses, {f.name: f.photograph_source for f in read.frames})
+                model = poses.model
+                if not len(model.points):
+                    model = add_points(model, photographs, folder, mask, options, self.say)
+            results.save_model(folder, model)
+            write_json(folder / "dropped.json", dict(poses.dropped))
+            self.say(f"poses: {len(model.frames)} of {len(read.frames)} frames, {len(model.points)} points")
+
+        folder = self.cache.run("poses", depends, work)
+        self.dropped |= read_json(folder / "dropped.json")
+        return results.load_model(folder)
+
+    def find_scale(
+        self, found: SfmModel, read: CaptureFrames
+    ) -> tuple[SfmModel, MetricScale | None, str, Up]:
+        settings = self.settings
+        depends = {
+            "known": [settings.known_distance, settings.known_distance_error_m],
+            "markers": [settings.marker_side_m, settings.marker_error_m],
+        }
+        by_name = {frame.name: frame for frame in read.frames}
+        frames = [by_name[name] for name in found.frames]
+
+        def work(folder: Path) -> None:
+            scale, missing = self._metric_scale(found, frames)
+            up = find_up(
+                found.camera_to_world, [frame.gimbal_deg for frame in frames], [frame.orientation for frame in frames]
+            )
+            model = found
+            if settings.poses is None:
+                rotation = level_rotation(up.direction, -found.camera_to_world[:, :3, 2].mean(axis=0))
+                origin = np.median(found.points, axis=0) if len(found.points) else found.centres.mean(axis=0)
+                model = found.moved(rotation, origin)
+                up = Up(rotation @ up.direction, up.source, up.spread_deg)
+            results.save_model(folder, model)
+            results.save_scale(folder, scale, missing, up)
+            self.say(f"scale: {missing}" if scale is None else f"scale: {scale.metres_per_unit:.5g} m per unit")
+
+        folder = self.cache.run("scale", depends, work)
+        return results.load_model(folder), *results.load_scale(folder)
+
+    def find_rig(
+        self, model: SfmModel, frames: list[CaptureFrame], read: CaptureFrames
+    ) -> tuple[RigEstimate, RigEstimate]:
+        settings = self.settings
+        depends = {"angle": settings.thermal_field_of_view_deg, "rig": _fingerprints([settings.rig])}
+
+        def work(folder: Path) -> None:
+            begin = rig_start(frames, model.camera, read.thermal_size, settings.thermal_field_of_view_deg)
+            results.save_rig(folder, kept_start(begin, "Where the search begins."), "start")
+            if settings.rig is not None:
+                rig = read_rig(settings.rig)
+                size = (rig.thermal_camera.width, rig.thermal_camera.height)
+                if size != read.thermal_size:
+                    raise SceneError(
+                        explain(
+                            f"{settings.rig.name}: thermal_camera",
+                            expected=f"{read.thermal_size[0]} x {read.thermal_size[1]} pixels, as the images have",
+                            got=f"{size[0]} x {size[1]}",
+                            remedy="Pass the rig of the same camera and mode.",
+                        )
+                    )
+            elif len(model.sighting_frame) < _LEAST_POINTS:
+                rig = kept_start(begin, "There are no scene points to compare the images at.")
+            else:
+                rig = estimate_rig(
+                    rig_frames(model, frames),
+                    model.camera,
+                    begin,
+                    lambda message, share: self.say(f"rig: {message} ({100 * share:.0f} %)"),
+                )
+            results.save_rig(folder, rig)
+            self.say(f"rig: {rig.explanation}")
+
+        folder = self.cache.run("rig", depends, work)
+        return results.load_rig(folder), results.load_rig(folder, "start")
+
+    def find_drift(self, model: SfmModel, frames: list[CaptureFrame], rig: RigEstimate) -> DriftEstimate:
+        def work(folder: Path) -> None:
+            if self.settings.drift == "off" or len(model.sighting_frame) < _LEAST_POINTS:
+                why = "Switched off." if self.settings.drift == "off" else "There are no scene points to compare at."
+                drift = DriftEstimate(np.zeros(len(frames)), (), np.nan, np.nan, False, why)
+            else:
+                drift = estimate_drift(rig_frames(model, frames), model.camera, rig)
+            results.save_drift(folder, drift)
+            self.say(f"drift: {drift.explanation}")
+
+        return results.load_drift(self.cache.run("drift", {"drift": self.settings.drift}, work))
+
+    def masks(self, frames: list[CaptureFrame], model: SfmModel) -> PhotographMasks:
+        size = (model.camera.width, model.camera.height)
+        file = self.output / ".capture" / "poses" / _OVERLAY_FILE
+        drawn = np.load(file) if file.is_file() else None
+        if drawn is not None and drawn.shape != (size[1], size[0]):
+            drawn = None
+        return PhotographMasks(size, drawn, self._user_masks(frames))
+
+    def _user_masks(self, frames: list[CaptureFrame] | tuple[CaptureFrame, ...]) -> dict[str, Path]:
+        if self.settings.masks is None:
+            return {}
+        files = mask_files(self.settings.masks)
+        found = {}
+        for frame in frames:
+            for name in (Path(frame.photograph_source).stem, frame.name):
+                if name.lower() in files:
+                    found[frame.name] = files[name.lower()]
+                    break
+        if not found:
+            raise SceneError(
+                explain(
+                    "masks",
+                    expected="masks named like photographs",
+                    got=f"{len(files)} pictures in {self.settings.masks}, none of them named so",
+                    remedy=f"Name them like {Path(frames[0].photograph_source).stem}.png.",
+                )
+            )
+        return found
+
+    def _find_masks(self, read: CaptureFrames, folder: Path) -> PhotographMasks:
+        sizes = {}
+        for frame in read.frames:
+            facts = read_photograph_facts(frame.photograph)
+            sizes[frame.name] = (facts.width, facts.height)
+        size = max(dict.fromkeys(sizes.values()), key=list(sizes.values()).count)
+        same = [frame for frame in read.frames if sizes[frame.name] == size]
+        drawn = None
+        if self.settings.find_overlays:
+            some = np.linspace(0, len(same) - 1, min(len(same), _OVERLAY_FRAMES)).round().astype(int)
+            drawn = find_overlay([same[i].photograph for i in np.unique(some)])
+        if drawn is not None:
+            np.save(folder / _OVERLAY_FILE, drawn)
+            self.say(f"masks: {100 * (1 - drawn.mean()):.1f} % of every photograph is drawn over by the camera")
+        return PhotographMasks(size, drawn, self._user_masks(same))
+
+    def _metric_scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[MetricScale | None, str]:
+        settings = self.settings
+        if settings.known_distance is not None:
+            name, x0, y0, x1, y1, metres = settings.known_distance
+            measured = MeasuredDistance(name, (x0, y0), (x1, y1), metres, settings.known_distance_error_m)
+            return scale_from_distance(model, measured, {f.name: f.photograph_source for f in frames}), ""
+        if settings.marker_side_m is not None:
+            photographs = {frame.name: frame.photograph for frame in frames}
+            return scale_from_markers(model, photographs, settings.marker_side_m, settings.marker_error_m)
+        return scale_from_gps(model.centres, [frame.gps for frame in frames])
+
+    def _write_scene(self, scene: Scene) -> None:
+        write_scene_folder(scene, self.output, self.say)
+
+    def _poses_source(self) -> str:
+        if self.settings.poses is not None:
+            return f"Given in {self.settings.poses.name}."
+        return "Structure from motion on the photographs (COLMAP)."
+
+
+def _fingerprints(paths: list[Path] | list[Path | None]) -> list[tuple[str, int, int]]:
+    """Fingerprints of files that the user names, which need not lie in the capture."""
+    there = [path for path in paths if path is not None]
+    for path in there:
+        if not path.is_file():
+            raise SceneError(
+                explain(str(path), expected="a file", got="nothing there", remedy="Check the path, or leave it out.")
+            )
+    return fingerprint(there, Path("/")) if there else []
+
+
+def _files_of(path: Path) -> list[Path]:
+    return sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else [path]

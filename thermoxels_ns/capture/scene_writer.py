@@ -1,0 +1,176 @@
+"""The scene folder that the dataparser reads: photographs, temperatures, masks, points and transforms.json."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from thermoxels_ns.capture.contract import CameraModel, DriftEstimate, FloatArray, RigEstimate
+from thermoxels_ns.capture.frames import CaptureFrame
+from thermoxels_ns.capture.gravity import Up
+from thermoxels_ns.capture.masks import PhotographMasks
+from thermoxels_ns.capture.metric_scale import MetricScale
+from thermoxels_ns.capture.photograph import open_photograph
+from thermoxels_ns.capture.sfm_model import SfmModel
+from thermoxels_ns.capture.stages import CACHE_FOLDER, write_json
+from thermoxels_ns.checks import remove_file, replace_when_done, writable_folder
+
+JSON_NAME = "transforms.json"
+_POINTS_NAME = "sparse_points.ply"
+_FOLDERS = ("images", "thermal", "masks")
+_COPIED = {"JPEG": ".jpg", "PNG": ".png"}
+_MOST_POINT_ERROR_PX = 2.0
+_LEAST_SIGHTINGS = 3
+EVAL_INTERVAL = 8
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything that a scene is written from; frames are in the order of the model's."""
+
+    frames: Sequence[CaptureFrame]
+    model: SfmModel
+    rig: RigEstimate
+    drift: DriftEstimate
+    scale: MetricScale | None
+    up: Up
+    masks: PhotographMasks
+
+
+def scene_names(count: int) -> list[str]:
+    """Names of a scene's frames, without ending; every 8th evaluates, the ends of the capture train.
+
+    >>> scene_names(5)[3:]
+    ['frame_train_00004', 'frame_eval_00005']
+    """
+    offset = min(EVAL_INTERVAL // 2, max(count - 2, 0)) if count > 1 else -1
+    digits = max(5, len(str(count)))
+    return [
+        f"frame_{'eval' if number % EVAL_INTERVAL == offset else 'train'}_{number + 1:0{digits}d}"
+        for number in range(count)
+    ]
+
+
+def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = lambda _: None) -> Path:
+    """Write a scene; until its last file, transforms.json, is in place the folder holds no scene.
+
+    Args:
+        scene: What is written.
+        output: The capture's output folder; an earlier scene in it is replaced.
+        say: Told how far it is.
+
+    Returns:
+        The path of transforms.json.
+
+    Raises:
+        OutputError: The folder cannot be written to.
+    """
+    new = output / CACHE_FOLDER / "new_scene"
+    shutil.rmtree(new, ignore_errors=True)
+    for name in _FOLDERS if scene.masks.any else _FOLDERS[:2]:
+        writable_folder(new / name)
+    entries = []
+    for number, (frame, name) in enumerate(zip(scene.frames, scene_names(len(scene.frames)))):
+        entries.append(_write_frame(scene, number, frame, name, new))
+        if (number + 1) % 20 == 0:
+            say(f"scene: {number + 1} of {len(scene.frames)} frames")
+    write_points(new / _POINTS_NAME, *_good_points(scene.model))
+    write_json(new / JSON_NAME, _content(scene, entries))
+    remove_file(output / JSON_NAME)
+    for name in _FOLDERS:
+        shutil.rmtree(output / name, ignore_errors=True)
+        if (new / name).is_dir():
+            (new / name).rename(output / name)
+    for name in (_POINTS_NAME, JSON_NAME):
+        (new / name).replace(output / name)
+    shutil.rmtree(new, ignore_errors=True)
+    return output / JSON_NAME
+
+
+def write_points(path: Path, points: FloatArray, colours: npt.NDArray[np.uint8]) -> None:
+    """Write points (n, 3) and their colours (n, 3) as a binary PLY file."""
+    rows = np.zeros(len(points), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    rows["xyz"], rows["rgb"] = points, colours
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    lines += [f"property float {axis}" for axis in "xyz"]
+    lines += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
+    with replace_when_done(path) as temporary:
+        temporary.write_bytes(("\n".join([*lines, "end_header"]) + "\n").encode("ascii") + rows.tobytes())
+
+
+def camera_entries(camera: CameraModel) -> dict[str, Any]:
+    """A camera as transforms.json has it."""
+    names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+    values = {name: getattr(camera, name) for name in names}
+    return {"camera_model": "OPENCV", "w": camera.width, "h": camera.height, **values}
+
+
+def _write_frame(scene: Scene, number: int, frame: CaptureFrame, name: str, folder: Path) -> dict[str, Any]:
+    with Image.open(frame.photograph) as image:
+        suffix = _COPIED.get(image.format or "") if image.mode == "RGB" else None
+    photograph = folder / "images" / f"{name}{suffix or '.png'}"
+    if suffix is not None:
+        shutil.copyfile(frame.photograph, photograph)
+    else:
+        open_photograph(frame.photograph).save(photograph)
+    temperature_c = scene.drift.corrected(number, np.load(frame.thermal))
+    Image.fromarray(temperature_c.astype(np.float32)).save(folder / "thermal" / f"{name}.tiff")
+    pose = scene.model.camera_to_world[number]
+    entry: dict[str, Any] = {
+        "file_path": f"images/{photograph.name}",
+        "thermal_file_path": f"thermal/{name}.tiff",
+        "transform_matrix": pose.tolist(),
+        "thermal_transform_matrix": scene.rig.thermal_pose(pose).tolist(),
+        "source": frame.photograph_source,
+        "thermal_source": frame.thermal_source,
+    }
+    if scene.masks.any:
+        mask = np.where(scene.masks.of(frame.name), np.uint8(255), np.uint8(0))
+        Image.fromarray(mask).save(folder / "masks" / f"{name}.png")
+        entry["mask_path"] = f"masks/{name}.png"
+    return entry
+
+
+def _good_points(model: SfmModel) -> tuple[FloatArray, npt.NDArray[np.uint8]]:
+    sightings = np.bincount(model.sighting_point, minlength=len(model.points))
+    good = (sightings >= _LEAST_SIGHTINGS) & (model.point_error_px <= _MOST_POINT_ERROR_PX)
+    if np.count_nonzero(good) < 100:
+        good = np.ones(len(model.points), dtype=bool)
+    return model.points[good], model.colours[good]
+
+
+def _content(scene: Scene, entries: list[dict[str, Any]]) -> dict[str, Any]:
+    rig, drift = scene.rig, scene.drift
+    content: dict[str, Any] = {
+        **camera_entries(scene.model.camera),
+        "thermal_camera": camera_entries(rig.thermal_camera),
+        "pixel_convention": "the centre of the top left pixel is at (0.5, 0.5)",
+        "up": scene.up.direction.tolist(),
+        "rig": rig.visible_to_thermal.tolist(),
+        "rig_info": {
+            "meaning": "x_thermal = rig @ x_visible, both in OpenCV camera axes, translation in units of the scene",
+            "determined": rig.determined,
+            "explanation": rig.explanation,
+            "standard_errors": {k: v for k, v in rig.standard_errors.items() if np.isfinite(v)},
+        },
+        "drift": {
+            "corrected": drift.used,
+            "offsets_k": drift.offsets_k.tolist(),
+            "radial_k": list(drift.radial),
+            "explanation": drift.explanation,
+        },
+    }
+    if len(scene.model.points):
+        content["ply_file_path"] = _POINTS_NAME
+    if scene.scale is not None:
+        content["metres_per_unit"] = scene.scale.metres_per_unit
+        if scene.scale.standard_error is not None:
+            content["metres_per_unit_standard_error"] = scene.scale.standard_error
+    return content | {"frames": entries}

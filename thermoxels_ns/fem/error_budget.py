@@ -1,0 +1,116 @@
+"""What error a user allows, and how much of it a solution makes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermoxels_ns.checks import check_positive
+from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
+
+Flows = Mapping[tuple[str, str], float]
+"""Mean heat flow into the body of each effect and patch or region, [W]."""
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Errors that a user allows; what is None does not matter."""
+
+    temperature_k: float | None = 0.05
+    """Largest error of the temperature at any node of the mesh, [K]. The default is half of what building physics asks
+    of a temperature (ISO 10211: 0.1 K)."""
+    heat_flow: float | None = None
+    """Largest error of the mean heat flow through any patch or from any region, as a share of all heat that flows
+    through the body; 0.01 is what building physics asks for (ISO 10211)."""
+
+    def __post_init__(self) -> None:
+        if self.temperature_k is None and self.heat_flow is None:
+            remedy = "Give a tolerance in kelvin, or one for heat flows such as 0.01."
+            raise HeatError(explain("tolerance", expected="temperature_k or heat_flow", got="neither", remedy=remedy))
+        for name, remedy in (("temperature_k", "Give it in kelvin."), ("heat_flow", "Give a share, such as 0.01.")):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, check_positive(name, value, remedy, HeatError))
+
+    def excess(self, error: ErrorSize) -> float:
+        """Error over what is allowed, whichever is worse; at most 1 is good."""
+        shares = [0.0]
+        if self.temperature_k is not None:
+            shares.append(error.temperature_k / self.temperature_k)
+        if self.heat_flow is not None:
+            shares.append(error.heat_flow / self.heat_flow)
+        return max(shares)
+
+    def describe(self) -> str:
+        """Say it in words."""
+        parts = [] if self.temperature_k is None else [f"{self.temperature_k:g} K"]
+        parts += [] if self.heat_flow is None else [f"{100.0 * self.heat_flow:g} % of the heat flow"]
+        return " and ".join(parts)
+
+
+@dataclass(frozen=True)
+class ErrorSize:
+    """Errors of a solution."""
+
+    temperature_k: float
+    """Largest error of the temperature at the nodes of the given mesh, [K]."""
+    heat_flow: float
+    """Largest error of a mean heat flow, as a share of all heat that flows through the body."""
+
+    def __add__(self, other: ErrorSize) -> ErrorSize:
+        """Both together, at worst."""
+        return ErrorSize(self.temperature_k + other.temperature_k, self.heat_flow + other.heat_flow)
+
+    def scaled(self, factor: float) -> ErrorSize:
+        """Both times a factor."""
+        return ErrorSize(factor * self.temperature_k, factor * self.heat_flow)
+
+    def describe(self) -> str:
+        """Say it in words."""
+        return f"{self.temperature_k:.2g} K and {100.0 * self.heat_flow:.2g} % of the heat flow"
+
+
+NO_ERROR = ErrorSize(0.0, 0.0)
+
+
+def mean_flows_w(solution: SteadySolution | HeatSolution) -> dict[tuple[str, str], float]:
+    """Give the mean heat flow into the body of each effect and patch or region over all times, [W]."""
+    lengths = np.diff(solution.times_s) if isinstance(solution, HeatSolution) else np.ones(1)
+    return {
+        (heat.effect, name): float(lengths @ heat.group_heat_w[:, column] / lengths.sum())
+        for heat in solution.effects
+        for column, name in enumerate(heat.group_names)
+    }
+
+
+def share_of_flow(difference: Flows, flows: Flows) -> float:
+    """Largest difference between heat flows as a share of what flows through the body, half the sum of their sizes.
+
+    >>> share_of_flow({("a", ""): 1.0, ("b", ""): -2.0}, {("a", ""): 99.0, ("b", ""): -101.0})
+    0.02
+    """
+    through = 0.5 * sum(abs(flow) for flow in flows.values())
+    largest = max((abs(part) for part in difference.values()), default=0.0)
+    if largest == 0.0:
+        return 0.0
+    return largest / through if through > 0.0 else math.inf
+
+
+def difference_between(
+    coarse: SteadySolution | HeatSolution, fine: SteadySolution | HeatSolution, num_nodes: int
+) -> ErrorSize:
+    """Compare two solutions of one problem at the same times.
+
+    Args:
+        coarse: One of them.
+        fine: The other.
+        num_nodes: Number of nodes of the mesh that both have in common; they come first in both.
+    """
+    change_k = fine.temperature_c[..., :num_nodes] - coarse.temperature_c[..., :num_nodes]
+    before, after = mean_flows_w(coarse), mean_flows_w(fine)
+    change_w = {group: flow - before[group] for group, flow in after.items()}
+    return ErrorSize(float(np.max(np.abs(change_k))), share_of_flow(change_w, after))

@@ -1,0 +1,129 @@
+"""Finer meshes of the same body: every tetrahedron is cut into eight.
+
+The kernel is kept compiled by numba, which watches a kernel's own file: it calls none of another file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from thermoxels_ns.fem.edge_midpoints import FACET_EDGES, TET_EDGES, edge_numbers, midpoints
+from thermoxels_ns.fem.sparsity import mesh_edges
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+
+def refine_mesh(mesh: TetMesh) -> TetMesh:
+    """Halve all edges of a mesh.
+
+    A tetrahedron loses its four corners to children of its own shape. What remains is an octahedron, cut into four
+    along the one of its three diagonals that leaves the smallest largest angle between faces. Where a tetrahedron is
+    one of the six of a cube (Kuhn), so are its children, and no angle becomes obtuse. The body stays the same: new
+    nodes lie in the middles of edges, also on the boundary.
+
+    Args:
+        mesh: The mesh. Nodes keep their numbers; each edge's middle is numbered after them, in the order of
+            `mesh_edges`.
+
+    Returns:
+        A conforming mesh. Children inherit regions, tags, patches, normals and area factors, and stand in the order of
+        their parents; temperatures and colours of new nodes are means, and a new node counts as observed if both ends
+        of its edge are.
+    """
+    edges = mesh_edges(mesh.tets, len(mesh.points_m))
+    num_nodes, low, high = len(mesh.points_m), edges.smaller_nodes(), edges.other
+    points = np.concatenate([mesh.points_m, midpoints(edges, mesh.points_m)])
+    local = np.concatenate([mesh.tets, num_nodes + edge_numbers(edges, mesh.tets, TET_EDGES)], axis=1)
+    chosen = np.empty(len(mesh.tets), np.int64)
+    _choose_diagonals(points, local, _CHILDREN, chosen)
+    facets = np.concatenate([mesh.facets, num_nodes + edge_numbers(edges, mesh.facets, FACET_EDGES)], axis=1)
+    tags, colour = mesh.boundary, mesh.colour
+    return replace(
+        mesh,
+        points_m=points,
+        tets=np.take_along_axis(local[:, None], _CHILDREN[chosen], axis=2).reshape(-1, 4),
+        temperature_c=np.concatenate([mesh.temperature_c, midpoints(edges, mesh.temperature_c)]),
+        observed=np.concatenate([mesh.observed, mesh.observed[low] & mesh.observed[high]]),
+        facets=facets[:, _FACET_CHILDREN].reshape(-1, 3),
+        facet_tags=np.repeat(mesh.facet_tags, 4),
+        region=np.repeat(mesh.region, 8),
+        boundary=None
+        if tags is None
+        else replace(
+            tags,
+            normal=np.repeat(tags.normal, 4, axis=0),
+            area_factor=np.repeat(tags.area_factor, 4),
+            seen=np.repeat(tags.seen, 4),
+            patch=np.repeat(tags.patch, 4),
+        ),
+        colour=None if colour is None else np.concatenate([colour, midpoints(edges, colour).astype(np.float32)]),
+    )
+
+
+def refined_values(mesh: TetMesh, nodal: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Interpolate values of a mesh's nodes to those of the refined one."""
+    return np.concatenate([nodal, midpoints(mesh_edges(mesh.tets, len(mesh.points_m)), nodal)])
+
+
+def _children() -> npt.NDArray[np.int64]:
+    """Local nodes of the eight children for each of the three diagonals, shape (3, 8, 4).
+
+    Local nodes 0 to 3 are the corners and 4 to 9 the middles of `TET_EDGES`.
+    """
+    middle = {frozenset(map(int, ends)): 4 + number for number, ends in enumerate(TET_EDGES)}
+    corners = [[i if j == i else middle[frozenset((i, j))] for j in range(4)] for i in range(4)]
+    place = np.vstack([np.zeros(3), np.eye(3)])
+    place = np.concatenate([place, [place[list(ends)].mean(axis=0) for ends in TET_EDGES]])
+    table = []
+    for first in range(3):
+        # Middles 4 + i and 9 - i belong to opposite edges; the other two pairs are the ring around the diagonal.
+        (a, b), (c, d) = ((4 + i, 9 - i) for i in range(3) if i != first)
+        ring = [[4 + first, 9 - first, *pair] for pair in ((a, c), (c, b), (b, d), (d, a))]
+        upright = [t if np.linalg.det(place[t[1:]] - place[t[0]]) > 0.0 else [t[1], t[0], *t[2:]] for t in ring]
+        table.append(corners + upright)
+    return np.array(table)
+
+
+_CHILDREN = _children()
+_FACET_CHILDREN = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
+"""Local nodes of a triangle's children: 0 to 2 are the corners and 3 to 5 the middles of `FACET_EDGES`."""
+_TIE = 1e-9
+"""Cosines that differ by less are the same."""
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _choose_diagonals(points, local, children, chosen):
+    """Finds the diagonal whose four children have the largest smallest cosine of an angle between faces."""
+    normal = np.empty((4, 3))
+    side = np.empty((3, 3))
+    for t in range(len(local)):
+        best = -2.0
+        for option in range(3):
+            worst = 2.0
+            for child in range(4, 8):
+                o = local[t, children[option, child, 0]]
+                for i in range(3):
+                    for x in range(3):
+                        side[i, x] = points[local[t, children[option, child, i + 1]], x] - points[o, x]
+                for i in range(3):
+                    u, v = side[(i + 1) % 3], side[(i + 2) % 3]
+                    normal[i + 1, 0] = u[1] * v[2] - u[2] * v[1]
+                    normal[i + 1, 1] = u[2] * v[0] - u[0] * v[2]
+                    normal[i + 1, 2] = u[0] * v[1] - u[1] * v[0]
+                for x in range(3):
+                    normal[0, x] = -normal[1, x] - normal[2, x] - normal[3, x]
+                for i in range(4):
+                    length = np.sqrt(normal[i, 0] ** 2 + normal[i, 1] ** 2 + normal[i, 2] ** 2)
+                    for x in range(3):
+                        normal[i, x] /= length
+                    for j in range(i):
+                        # Inward normals: the angle between the faces is what they lack to a half turn.
+                        cosine = 0.0
+                        for x in range(3):
+                            cosine -= normal[i, x] * normal[j, x]
+                        worst = min(worst, cosine)
+            if worst > best + _TIE:
+                best, chosen[t] = worst, option

@@ -1,0 +1,292 @@
+"""Which effects of a problem matter: those that cannot change the answer by more than a tolerance are left out.
+
+Without an effect, the temperatures differ by w with M w' + (K + R) w + radiation's own damping = f, where f is the heat
+that the effect would bring, and w = 0 at the start. K has no entry above 0 off its diagonal (no obtuse angles), masses
+and exchange are lumped: so whatever z >= 0 fulfils M z' + (K + R) z >= |f| at every node is a bound, |w| <= z (discrete
+maximum principle; it holds for backward Euler at any step length). Two such z are tried, F being the largest |f|:
+
+- z rises at the rate max F / M towards the ceiling max F / r, r being the exchange that is kept at the node (in a
+  steady state there is the ceiling alone: the flux over the coefficient, q / h);
+- from one implicit step over the whole duration t, (M / t + K) v = F: z = v + t max (F - K v) / M, which is 2 max v if
+  v is exact. It knows how far heat spreads into the body in that time (the Fourier number).
+
+Exchange brings at most its coefficient times the largest difference between its surroundings and the range that
+temperatures can reach, which follows from the start, all surroundings, and the bound of all fluxes and sources.
+Where angles are obtuse, which the principle does not allow for, the range is widened and bounds are doubled.
+"""
+
+from __future__ import annotations
+
+import time as clock
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.elements import capacities
+from thermoxels_ns.fem.linear_solver import ConjugateGradients
+from thermoxels_ns.fem.linear_space import LinearSpace
+from thermoxels_ns.fem.nodal_heat import Span, nodal_heats
+from thermoxels_ns.fem.pieces import Pieces
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.units import ZERO_CELSIUS_K
+
+Vector = npt.NDArray[np.float64]
+
+_WORTH_A_STEP = 1e4
+"""Largest bound, in tolerances, that the implicit step may bring below the tolerance."""
+_STEP_TOLERANCE = 1e-3
+"""Relative tolerance of the implicit step; the bound holds for any v."""
+_OBTUSE = 1e-9
+"""Share of the diagonal above which an entry off it counts as above 0."""
+_OBTUSE_FACTOR, _OBTUSE_WIDENING = 2.0, 0.1
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """An effect that is not built."""
+
+    effect: str
+    """What it is and where it would act."""
+    bound_k: float
+    """Largest difference that it could make to any temperature at any time, [K]."""
+    bound_w: float
+    """Largest heat flow that it could bring, [W]. Averaged since the start, no other effect's changes by more."""
+    reason: str
+    """Which bound it is."""
+
+
+@dataclass(frozen=True)
+class Kept:
+    """An effect that is built."""
+
+    effect: str
+    """What it is and where it acts."""
+    bound_k: float | None
+    """Largest difference that it could make if nothing else were left out, [K]; None if no bound is known."""
+    reason: str
+    """Why it is kept."""
+
+
+@dataclass(frozen=True)
+class Screening:
+    """What a problem needs."""
+
+    problem: HeatProblem
+    """The problem without what is left out."""
+    kept: tuple[Kept, ...]
+    """Effects that are built, in the order of the problem."""
+    left_out: tuple[LeftOut, ...]
+    """Effects that are not, in the order of the problem."""
+    tolerance_k: float
+    """Their bounds add up to no more than this, [K]."""
+    note: str
+    """What the bounds hold for."""
+    seconds: float
+    """Time it took, [s]."""
+
+    @property
+    def bound_k(self) -> float:
+        """Largest difference that all that is left out could make together, [K]."""
+        return sum(entry.bound_k for entry in self.left_out)
+
+
+@dataclass(frozen=True)
+class _Bound:
+    value_k: float
+    reason: str
+
+
+def screen(problem: HeatProblem, time: TimeSteps | AdaptiveSteps | None, tolerance_k: float) -> Screening:
+    """Leave out what cannot matter.
+
+    Args:
+        problem: The problem as the scene has it.
+        time: How long it is followed; None: its steady state.
+        tolerance_k: Largest difference to any temperature that all that is left out may make together, [K]; 0 leaves
+            out only what does nothing at all, and without any effect nothing is computed.
+
+    Returns:
+        The problem without what does not matter, and why.
+
+    Raises:
+        HeatError: The tolerance is negative, or an effect does not fit the mesh.
+    """
+    if not tolerance_k >= 0.0:
+        remedy = "Give a tolerance in kelvin, or 0 to keep everything."
+        raise HeatError(explain("tolerance_k", expected="a number of at least 0", got=tolerance_k, remedy=remedy))
+    begin = clock.perf_counter()
+    if not problem.effects:
+        return Screening(problem, (), (), tolerance_k, "No effect acts.", clock.perf_counter() - begin)
+    screener = _Screener(problem, time, tolerance_k)
+    left = screener.left_out()
+    names = [heat.effect for heat in screener.heats]
+    kept_effects = tuple(effect for number, effect in enumerate(problem.effects) if number not in left)
+    return Screening(
+        problem=replace(problem, effects=kept_effects) if left else problem,
+        kept=tuple(screener.why_kept(number) for number in range(len(names)) if number not in left),
+        left_out=tuple(
+            LeftOut(names[n], left[n].value_k, float(screener.largest_w[n].sum()), left[n].reason) for n in sorted(left)
+        ),
+        tolerance_k=tolerance_k,
+        note=screener.note(),
+        seconds=clock.perf_counter() - begin,
+    )
+
+
+class _Screener:
+    """Bounds of the effects of one problem."""
+
+    def __init__(self, problem: HeatProblem, time: TimeSteps | AdaptiveSteps | None, tolerance_k: float) -> None:
+        self._problem, self._tolerance = problem, tolerance_k
+        self._duration_s = np.inf if time is None else float(time.times_s[-1])
+        self._space = LinearSpace(Selection(problem.mesh, problem.up))
+        self.heats = nodal_heats(problem, time, self._space)
+        mesh = problem.mesh
+        self._mass: Vector = np.ones(0)
+        if time is not None:
+            self._mass = capacities(mesh.points_m, mesh.tets, problem.heat_capacity_j_m3k)[0]
+        self._free = ~np.logical_or.reduce([heat.fixed for heat in self.heats])
+        self._stiffness: sparse.csr_matrix | None = None
+        self._obtuse = False
+        self._steps: dict[int, _Bound] = {}
+        self.largest_w = self._largest()
+        alone = [self._alone(number) for number in range(len(self.heats))]
+        if min(bound.value_k for bound in alone) <= _WORTH_A_STEP * tolerance_k:
+            self._assemble()
+            if self._obtuse:
+                self.largest_w = self._largest()
+                alone = [self._alone(number) for number in range(len(self.heats))]
+        self._alone_bounds = alone
+
+    def left_out(self) -> dict[int, _Bound]:
+        """Choose what is left out: the least first, as long as all bounds together keep within the tolerance."""
+        left: dict[int, _Bound] = {}
+        if self._stiffness is None:
+            return left
+        for number in sorted(range(len(self.heats)), key=lambda n: self._alone_bounds[n].value_k):
+            tried = {n: self._bound(n, {*left, number}) for n in (*left, number)}
+            total = sum(bound.value_k for bound in tried.values())
+            if total <= self._tolerance and self._still_held({*left, number}):
+                left = tried
+        return left
+
+    def why_kept(self, number: int) -> Kept:
+        """Say what an effect that is kept could do."""
+        bound = self._alone_bounds[number]
+        if number in self._steps and self._steps[number].value_k < bound.value_k:
+            bound = self._steps[number]
+        name = self.heats[number].effect
+        if self.heats[number].fixed.any():
+            return Kept(name, None, "it fixes temperatures")
+        if not np.isfinite(bound.value_k):
+            return Kept(name, None, "nothing that is kept bounds what it could do")
+        if bound.value_k <= self._tolerance:
+            return Kept(name, bound.value_k, "with what is left out already, or as the only exchange, it matters")
+        return Kept(name, bound.value_k, "its bound is above the tolerance")
+
+    def note(self) -> str:
+        """Say what the bounds hold for."""
+        if self._stiffness is None:
+            return "Every effect can do more than the tolerance."
+        if self._obtuse:
+            return (
+                "The mesh has obtuse angles: bounds are those of the heat equation, doubled to allow for the error of "
+                "the mesh."
+            )
+        return "Bounds hold for the equations on this mesh (discrete maximum principle)."
+
+    def _largest(self) -> list[Vector]:
+        """Largest heat of each effect at each node."""
+        span = self._range()
+        return [heat.largest_w(span) for heat in self.heats]
+
+    def _range(self) -> Span:
+        """What temperatures can be."""
+        start = self._problem.start_c
+        spans = [span for heat in self.heats for span in heat.surroundings_c]
+        low = min([float(span.low.min()) for span in spans], default=np.inf)
+        high = max([float(span.high.max()) for span in spans], default=-np.inf)
+        if np.isfinite(self._duration_s):
+            low, high = min(low, float(start.min())), max(high, float(start.max()))
+        held = sum((heat.held_w_k for heat in self.heats), np.zeros(self._space.num_nodes))
+        cooling = sum((heat.cooling_w for heat in self.heats), np.zeros(self._space.num_nodes))
+        heating = sum((heat.heating_w for heat in self.heats), np.zeros(self._space.num_nodes))
+        low -= self._even_rise(cooling, held).value_k
+        high += self._even_rise(heating, held).value_k
+        widening = _OBTUSE_WIDENING * (high - low) if self._obtuse and np.isfinite(high - low) else 0.0
+        return Span(np.array(max(low - widening, -ZERO_CELSIUS_K)), np.array(high + widening))
+
+    def _alone(self, number: int) -> _Bound:
+        """Bound of an effect if all others are kept, without the implicit step."""
+        if self.heats[number].fixed.any():
+            return _Bound(np.inf, "")
+        return self._even_rise(self.largest_w[number], self._held({number}))
+
+    def _bound(self, number: int, left: set[int]) -> _Bound:
+        """Bound of an effect if it and others are left out."""
+        if self.heats[number].fixed.any():
+            return _Bound(np.inf, "")
+        bound = self._even_rise(self.largest_w[number], self._held(left))
+        worth = self._tolerance < bound.value_k <= _WORTH_A_STEP * self._tolerance
+        if np.isfinite(self._duration_s) and worth:
+            if number not in self._steps:
+                self._steps[number] = self._implicit_step(self.largest_w[number])
+            bound = min(bound, self._steps[number], key=lambda entry: entry.value_k)
+        return bound
+
+    def _held(self, left: set[int]) -> Vector:
+        """Convection that is kept at each node, [W / K]."""
+        kept = (heat.held_w_k for number, heat in enumerate(self.heats) if number not in left)
+        return sum(kept, np.zeros(self._space.num_nodes))
+
+    def _even_rise(self, heat_w: Vector, held_w_k: Vector) -> _Bound:
+        """The bound that rises at an even rate towards a ceiling."""
+        acting = (heat_w > 0.0) & self._free
+        if not acting.any():
+            return _Bound(0.0, "it brings no heat")
+        heat, held = heat_w[acting], held_w_k[acting]
+        with np.errstate(divide="ignore"):
+            ceiling_k = float(np.max(heat / held)) * self._factor
+        if not np.isfinite(self._duration_s):
+            return _Bound(ceiling_k, "the exchange that is kept carries its heat away")
+        rise_k = float(np.max(heat / self._mass[acting])) * self._duration_s * self._factor
+        if not np.isfinite(ceiling_k):
+            return _Bound(rise_k, "its heat warms no node by more in that time")
+        value_k = -ceiling_k * float(np.expm1(-rise_k / ceiling_k))
+        return _Bound(value_k, "the exchange that is kept carries its heat away")
+
+    def _implicit_step(self, heat_w: Vector) -> _Bound:
+        """The bound from one implicit step over the whole duration."""
+        assert self._stiffness is not None
+        matrix = sparse.csr_matrix(self._stiffness + sparse.diags(self._mass / self._duration_s, format="csr"))
+        solver = ConjugateGradients(matrix, relative_tolerance=_STEP_TOLERANCE)
+        v = np.maximum(solver.solve(np.where(self._free, heat_w, 0.0)).x, 0.0)
+        if not np.all(np.isfinite(v)):
+            return _Bound(np.inf, "")
+        rest = ((heat_w - self._stiffness @ v) / self._mass)[self._free]
+        value_k = float(v.max()) + self._duration_s * float(np.max(rest, initial=0.0))
+        return _Bound(self._factor * value_k, "its heat spreads into the depth in that time")
+
+    @property
+    def _factor(self) -> float:
+        return _OBTUSE_FACTOR if self._obtuse else 1.0
+
+    def _assemble(self) -> None:
+        self._stiffness = self._space.stiffness(self._problem.conductivity_w_mk)
+        entries = self._stiffness.tocoo()
+        off = entries.row != entries.col
+        diagonal = self._stiffness.diagonal()
+        self._obtuse = bool(np.any(entries.data[off] > _OBTUSE * diagonal[entries.row[off]]))
+
+    def _still_held(self, left: set[int]) -> bool:
+        """Whether every piece of a body whose steady state is asked for still exchanges heat with something."""
+        if np.isfinite(self._duration_s):
+            return True
+        assert self._stiffness is not None
+        kept = [heat.holds for number, heat in enumerate(self.heats) if number not in left]
+        holding = np.logical_or.reduce([np.zeros(self._space.num_nodes, dtype=bool), *kept])
+        return bool(Pieces(self._stiffness).touched(np.flatnonzero(holding)).all())

@@ -1,0 +1,98 @@
+"""Heat flow through parts of the surface that no effect knows of, such as the surface of each material."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.checks import check_shape
+from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.fixed_nodes import FixedNodes
+from thermoxels_ns.fem.forms import FixedForm, FluxForm, Form, RadiationForm, RobinForm
+from thermoxels_ns.fem.linear_space import LinearSpace
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.solution import EffectHeat, heat_by_effect
+from thermoxels_ns.fem.system import HeatSystem, effect_labels
+from thermoxels_ns.fem.terms import FixedTerm, FluxTerm, RadiationTerm, RobinTerm
+
+Vector = npt.NDArray[np.float64]
+
+
+def heat_by_part(
+    problem: HeatProblem,
+    temperature_c: Vector,
+    time_s: float,
+    part: npt.NDArray[np.int64],
+    part_names: Sequence[str],
+) -> tuple[EffectHeat, ...]:
+    """Evaluate the heat flow of each effect through parts of the surface at one moment.
+
+    Fixed temperatures are counted as if their nodes stored nothing at that moment, which holds for constant ones.
+    Boundary exchange is evaluated at the nodes, as the solvers do by default.
+
+    Args:
+        problem: Body and effects.
+        temperature_c: Nodal temperatures at that moment, shape (n,), [degrees Celsius].
+        time_s: The moment, [s].
+        part: Index into `part_names` of each boundary triangle, shape (f,).
+        part_names: Names of the parts.
+
+    Returns:
+        Heat into the body, one row, for each effect that acts on the surface; sources are left out.
+
+    Raises:
+        HeatError: `part` does not have one entry per boundary triangle.
+    """
+    remedy = "Give every boundary triangle of the mesh a part."
+    part = check_shape("part", np.asarray(part), (len(problem.mesh.facets),), remedy, HeatError)
+    selection = Selection(problem.mesh, problem.up)
+    parted = copy.copy(selection)
+    parted.facet_patch, parted.patch_names = part, tuple(part_names)
+    space = LinearSpace(parted)
+    reference_c = 0.5 * (float(temperature_c.min()) + float(temperature_c.max()))
+    relative_k = temperature_c - reference_c
+    labels = effect_labels(problem)
+    forms: list[Form] = []
+    fixed: list[FixedForm] = []
+    for label, effect in zip(labels, problem.effects):
+        for term in effect.terms(selection):
+            if isinstance(term, (RobinTerm, FluxTerm, RadiationTerm, FixedTerm)) and len(term.facets):
+                term = replace(term, effect=label)
+                if isinstance(term, RobinTerm):
+                    forms.append(RobinForm(term, space, reference_c))
+                elif isinstance(term, FluxTerm):
+                    forms.append(FluxForm(term, space))
+                elif isinstance(term, RadiationTerm):
+                    forms.append(RadiationForm(term, space, reference_c))
+                else:
+                    fixed.append(FixedForm(term, space, reference_c))
+    groups = [(form.effect, group) for form in forms for group in form.groups]
+    flows = [form.group_heat_w(relative_k, time_s) for form in forms]
+    if fixed:
+        held, system = FixedNodes(fixed, space.num_nodes), HeatSystem(problem)
+        groups += held.groups
+        kept_w = -system.net_heat_at_fixed(temperature_c - system.reference_c, time_s)
+        flows.append(held.shares @ kept_w)
+    named = [label for label in labels if any(owner == label for owner, _ in groups)]
+    return heat_by_effect(named, groups, np.concatenate([np.zeros(0), *flows])[None])
+
+
+def heat_through_parts(effects: Sequence[EffectHeat], part_names: Sequence[str]) -> Vector:
+    """Add up the effects' heat through each part, shape (s, p), [W].
+
+    >>> heat = EffectHeat("sun", np.array([3.0]), ("roof", "wall"), np.array([[2.0, 1.0]]))
+    >>> heat_through_parts([heat, heat], ["wall", "floor", "roof"]).tolist()
+    [[2.0, 0.0, 4.0]]
+    """
+    rows = len(effects[0].heat_w) if effects else 1
+    total = np.zeros((rows, len(part_names)))
+    for effect in effects:
+        for column, name in enumerate(effect.group_names):
+            if name in part_names:
+                total[:, list(part_names).index(name)] += effect.group_heat_w[:, column]
+    return total

@@ -1,0 +1,305 @@
+"""From a tolerance to a solution that meets it, at least cost."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from thermoxels_ns.checks import check_positive
+from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.edge_surplus import EdgeSurplus, Surplus
+from thermoxels_ns.fem.error_budget import (
+    NO_ERROR,
+    ErrorSize,
+    Tolerance,
+    difference_between,
+    mean_flows_w,
+    share_of_flow,
+)
+from thermoxels_ns.fem.error_estimate import HALF_THE_SIZE, error_ratio, recovered_error, richardson
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
+from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
+from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.fem.stepping import solve_heat
+
+DEFAULT_MEMORY_BYTES = 4 * 2**30
+"""Most memory that a solution may need, [bytes]."""
+
+_BYTES_PER_TET = {1: 250, 2: 3000}
+"""Memory of a solution by order, measured on lattices and doubled, because meshes without right angles have twice as
+many entries in their matrices."""
+_LINEAR_TOLERANCE = 1e-8
+"""Of the linear solver for a steady state: its error is far below any estimate here."""
+_AIM = 0.8
+"""What to aim at as a share of the tolerance, because predictions err."""
+_FIRST_OVER_SECOND = 8.0
+"""Tolerances of the two runs that tell what time steps do."""
+_TIME_SHARE = 0.4
+"""Share of the tolerance that time steps may use after they have been found too long."""
+_RATIO_RANGE = (1.0 / 64.0, 0.7)
+
+
+@dataclass(frozen=True)
+class Level:
+    """A solution on the way."""
+
+    order: int
+    """1 for linear tetrahedra, 2 for quadratic ones."""
+    refinements: int
+    """How often the size of the given mesh was halved."""
+    step_tolerance_k: float | None
+    """Tolerance of the time steps, [K]; None for a steady state."""
+    num_nodes: int
+    """Number of unknowns."""
+    error: ErrorSize
+    """Estimated errors."""
+    seconds: float
+    """Time for it and for the estimate, [s]."""
+
+    def describe(self) -> str:
+        """Say it in a line."""
+        mesh = "given mesh" if self.refinements == 0 else f"mesh size halved {self.refinements}x"
+        steps = "" if self.step_tolerance_k is None else f", steps to {self.step_tolerance_k:.2g} K"
+        return (
+            f"P{self.order}, {mesh}{steps}, {self.num_nodes} unknowns: estimated error {self.error.describe()}, "
+            f"{self.seconds:.2f} s"
+        )
+
+
+@dataclass(frozen=True)
+class ToleratedSolution:
+    """A solution with what is known of its error."""
+
+    solution: SteadySolution | HeatSolution
+    """Temperatures and heat flows. Nodes of the given mesh come first."""
+    problem: HeatProblem
+    """What was solved last: the given problem, or the same on a finer mesh."""
+    settings: Level
+    """Order, refinements and steps that were chosen, and the estimated errors."""
+    met: bool
+    """Whether the estimated errors are within the tolerance."""
+    status: str
+    """The outcome as a sentence, with the estimate and the seconds."""
+    seconds: float
+    """Time for all, [s]."""
+    levels: tuple[Level, ...]
+    """All solutions on the way, the last one is `settings`."""
+
+
+def solve_to_tolerance(
+    problem: HeatProblem,
+    tolerance: Tolerance,
+    *,
+    duration_s: float | None = None,
+    outputs: int = 10,
+    time_s: float = 0.0,
+    memory_bytes: float = DEFAULT_MEMORY_BYTES,
+    allow_unmet: bool = False,
+    log: Callable[[str], None] = print,
+) -> ToleratedSolution:
+    """Solve a problem with the cheapest choice of order, mesh size and time steps whose estimated error is allowed.
+
+    A steady state starts with linear tetrahedra on the given mesh. If its estimated error is too large, the mesh size
+    is halved if that is predicted to be enough, else quadratic tetrahedra are used, on the given mesh first and then on
+    finer ones. In time tetrahedra stay linear, since the mass of quadratic ones cannot be lumped; two tolerances of the
+    steps on the given mesh tell the error of the steps, and the mesh is then made as fine as the rest of the tolerance
+    asks for. The body is the one that the mesh describes: what the mesh lacks of a round body's area is not estimated.
+
+    Args:
+        problem: Body, materials, initial temperatures and effects.
+        tolerance: Allowed errors.
+        duration_s: Time to follow the body for, [s]; None: its steady state.
+        outputs: Number of equal intervals at whose ends temperatures are kept and compared.
+        time_s: Time at which effects that change are taken in a steady state, [s].
+        memory_bytes: Most memory that a solution may need, [bytes].
+        allow_unmet: Return the last solution that fits into memory, with `met` False and the reason in `status`,
+            instead of raising.
+        log: Takes a line per solution and one on the outcome; print by default.
+
+    Raises:
+        HeatError: The tolerance cannot be met within the memory, or a solution fails.
+    """
+    check_positive("memory_bytes", memory_bytes, "Give the memory in bytes, such as 4e9.", HeatError)
+    run = _Run(problem, tolerance, float(memory_bytes), log)
+    if duration_s is None:
+        failure = _steady(run, time_s)
+    else:
+        failure = _in_time(run, AdaptiveSteps(duration_s, tolerance_k=_needs_kelvin(tolerance), outputs=outputs))
+    return run.close(failure, allow_unmet)
+
+
+class _Run:
+    """What has been solved so far."""
+
+    def __init__(
+        self, problem: HeatProblem, tolerance: Tolerance, memory_bytes: float, log: Callable[[str], None]
+    ) -> None:
+        self.given, self.problem, self.tolerance = problem, problem, tolerance
+        self.levels: list[Level] = []
+        self.solution: SteadySolution | HeatSolution | None = None
+        self._memory_bytes, self._log = memory_bytes, log
+        self._begin_s = self._mark_s = time.perf_counter()
+
+    @property
+    def excess(self) -> float:
+        """Error of the last solution over what is allowed."""
+        return self.tolerance.excess(self.levels[-1].error)
+
+    def add(
+        self,
+        problem: HeatProblem,
+        solution: SteadySolution | HeatSolution,
+        error: ErrorSize,
+        *,
+        refinements: int,
+        step_tolerance_k: float | None = None,
+    ) -> None:
+        """Keep a solution."""
+        now_s = time.perf_counter()
+        edges = len(solution.edge_temperature_c) if isinstance(solution, SteadySolution) else 0
+        num_nodes = solution.temperature_c.shape[-1] + edges
+        seconds, self._mark_s = now_s - self._mark_s, now_s
+        self.levels.append(Level(2 if edges else 1, refinements, step_tolerance_k, num_nodes, error, seconds))
+        self.problem, self.solution = problem, solution
+        self._log(self.levels[-1].describe())
+
+    def lacks_memory(self, order: int, refinements: int, times: int = 1) -> str:
+        """Say that a solution on the given mesh with its size halved so often does not fit, or nothing."""
+        num_tets = len(self.given.mesh.tets) * 8.0**refinements
+        num_nodes = len(self.given.mesh.points_m) * 8.0**refinements
+        needed = _BYTES_PER_TET[order] * num_tets + 8.0 * times * num_nodes
+        if needed <= self._memory_bytes:
+            return ""
+        mesh = "the given mesh" if refinements == 0 else f"the mesh size halved {refinements}x"
+        return (
+            f"P{order} on {mesh} needs about {needed / 2**30:.2g} GiB, more than the {self._memory_bytes / 2**30:.2g} "
+            "GiB allowed"
+        )
+
+    def close(self, failure: str, allow_unmet: bool) -> ToleratedSolution:
+        """Say how it ended."""
+        if self.solution is None:
+            remedy = "Allow more memory, or use a coarser mesh."
+            raise HeatError(explain("memory_bytes", expected="room for a first estimate", got=failure, remedy=remedy))
+        last, seconds = self.levels[-1], time.perf_counter() - self._begin_s
+        allowed = self.tolerance.describe()
+        status = f"{'Not within' if failure else 'Within'} {allowed}: {last.describe()}, {seconds:.2f} s in all."
+        if failure:
+            status += f" {failure}. Allow more memory or a larger error."
+        self._log(status)
+        if failure and not allow_unmet:
+            raise HeatError(status)
+        return ToleratedSolution(self.solution, self.problem, last, not failure, status, seconds, tuple(self.levels))
+
+
+def _steady(run: _Run, time_s: float) -> str:
+    """Climb to a steady state that is good enough; returns why that was not possible, or nothing."""
+
+    def solve(problem: HeatProblem, order: int) -> SteadySolution:
+        return solve_steady(problem, time_s=time_s, order=order, relative_tolerance=_LINEAR_TOLERANCE)
+
+    given, num_nodes = run.given, len(run.given.mesh.points_m)
+    # The estimate needs what quadratic tetrahedra need.
+    failure = run.lacks_memory(2, 0)
+    if failure:
+        return failure
+    linear = solve(given, 1)
+    run.add(given, linear, _size(EdgeSurplus(given).of_steady(linear, time_s), linear), refinements=0)
+    if 1.0 < run.excess <= _AIM / HALF_THE_SIZE and not run.lacks_memory(1, 1):
+        finer = _refined(given, refined_values(given.mesh, linear.temperature_c))
+        solution = solve(finer, 1)
+        run.add(finer, solution, _richardson(linear, solution, num_nodes, HALF_THE_SIZE), refinements=1)
+    earlier, before, refinements = given, linear, 0
+    while run.excess > 1.0:
+        failure = run.lacks_memory(2, refinements)
+        if failure:
+            return failure
+        if refinements == 0:
+            problem = replace(given, initial_temperature_c=linear.temperature_c)
+        else:
+            # The nodes of quadratic tetrahedra are those of the finer mesh.
+            problem = _refined(earlier, np.concatenate([before.temperature_c, before.edge_temperature_c]))
+        solution = solve(problem, 2)
+        ratio = error_ratio(recovered_error(earlier, before), recovered_error(problem, solution))
+        run.add(problem, solution, _richardson(before, solution, num_nodes, ratio), refinements=refinements)
+        earlier, before, refinements = problem, solution, refinements + 1
+    return ""
+
+
+def _in_time(run: _Run, steps: AdaptiveSteps) -> str:
+    """Follow the body through time well enough; returns why that was not possible, or nothing."""
+    given, times = run.given, steps.outputs + 1
+    failure = run.lacks_memory(2, 0, 3 * times)
+    if failure:
+        return failure
+
+    def solve(problem: HeatProblem, tolerance_k: float) -> HeatSolution:
+        return solve_heat(problem, replace(steps, tolerance_k=tolerance_k))
+
+    tolerance_k = steps.tolerance_k
+    rough = solve(given, _FIRST_OVER_SECOND * tolerance_k)
+    solution = solve(given, tolerance_k)
+    in_time = _of_steps(rough, solution, given)
+    in_space = _size(EdgeSurplus(given).in_time(solution), solution)
+    run.add(given, solution, in_time + in_space, refinements=0, step_tolerance_k=tolerance_k)
+    while run.excess > 1.0 and run.tolerance.excess(in_time) > 0.5:
+        # The step follows the cube root of its own error, and the error of all steps the square of the step.
+        tolerance_k *= min((_TIME_SHARE / run.tolerance.excess(in_time)) ** 1.5, 0.25)
+        rough, solution = solution, solve(given, tolerance_k)
+        in_time = _of_steps(rough, solution, given)
+        run.add(given, solution, in_time + in_space, refinements=0, step_tolerance_k=tolerance_k)
+    problem, base, refinements = given, solution, 0
+    while run.excess > 1.0:
+        left = _AIM * (1.0 - run.tolerance.excess(in_time))
+        halvings = max(int(np.ceil(np.log(run.tolerance.excess(in_space) / left) / -np.log(HALF_THE_SIZE))), 1)
+        failure = run.lacks_memory(1, refinements + halvings, times)
+        if failure:
+            return failure
+        for _ in range(halvings):
+            problem = _refined(problem, refined_values(problem.mesh, problem.start_c))
+        refinements += halvings
+        solution = solve(problem, tolerance_k)
+        in_space = _richardson(base, solution, len(given.mesh.points_m), HALF_THE_SIZE**refinements)
+        run.add(problem, solution, in_time + in_space, refinements=refinements, step_tolerance_k=tolerance_k)
+    return ""
+
+
+def _refined(problem: HeatProblem, start_c: np.ndarray) -> HeatProblem:
+    """Pose the same problem on a finer mesh, with temperatures to start from."""
+    return replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=start_c)
+
+
+def _size(surplus: Surplus, solution: SteadySolution | HeatSolution) -> ErrorSize:
+    """Size of what an estimate adds."""
+    rows = surplus.group_heat_w
+    # Mean heat flows of intervals, from those at their ends.
+    mean_w = rows[0] if len(rows) == 1 else np.mean(0.5 * (rows[1:] + rows[:-1]), axis=0)
+    change_w = {group: float(heat) for group, heat in zip(surplus.groups, mean_w)}
+    largest_k = float(np.max(np.abs(surplus.temperature_k)))
+    return ErrorSize(largest_k, share_of_flow(change_w, mean_flows_w(solution)))
+
+
+def _richardson(
+    coarse: SteadySolution | HeatSolution, fine: SteadySolution | HeatSolution, num_nodes: int, ratio: float
+) -> ErrorSize:
+    return difference_between(coarse, fine, num_nodes).scaled(richardson(1.0, ratio))
+
+
+def _of_steps(rough: HeatSolution, solution: HeatSolution, problem: HeatProblem) -> ErrorSize:
+    """Error of the steps of the better of two runs: of second order in their mean length."""
+    difference = difference_between(rough, solution, len(problem.mesh.points_m))
+    if difference == NO_ERROR:
+        return NO_ERROR
+    ratio = float(np.clip((rough.steps / solution.steps) ** 2, *_RATIO_RANGE))
+    return difference.scaled(richardson(1.0, ratio))
+
+
+def _needs_kelvin(tolerance: Tolerance) -> float:
+    if tolerance.temperature_k is None:
+        remedy = "Give temperature_k too: steps in time are chosen by it."
+        raise HeatError(explain("tolerance", expected="one in kelvin", got="heat_flow only", remedy=remedy))
+    return tolerance.temperature_k

@@ -1,0 +1,127 @@
+"""What a wall between two airs is worth in a steady state: coupling, U-value and surface temperature factor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.answers import Spot, describe_spot
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.solution import SteadySolution
+from thermoxels_ns.fem.surface_heat import heat_by_part, heat_through_parts
+
+_LEAST_DIFFERENCE_K = 1e-6
+
+
+@dataclass(frozen=True)
+class WallPart:
+    """A part of the inner surface."""
+
+    name: str
+    """Name of the patch or region."""
+    area_m2: float
+    """Its true area, [m2]."""
+    heat_w: float
+    """Heat flow into it from the inside, [W]."""
+    u_value_w_m2k: float
+    """Heat flow per area and difference of the airs, [W / (m2 K)]."""
+
+
+@dataclass(frozen=True)
+class WallAnswer:
+    """A body as a wall between an inside and an outside."""
+
+    inside_c: float
+    """Temperature of the air inside, [degrees Celsius]."""
+    outside_c: float
+    """Temperature of the air outside, [degrees Celsius]."""
+    area_m2: float
+    """True area of the inner surface, [m2]."""
+    heat_w: float
+    """Heat flow into the inner surface, [W]."""
+    coupling_w_k: float
+    """Thermal coupling coefficient, heat flow per difference of the airs (ISO 10211: L_3D), [W / K]."""
+    u_value_w_m2k: float
+    """The same per area of the inner surface, [W / (m2 K)]. For a plane wall this is its U-value (ISO 6946); at corners
+    and thermal bridges it is a mean that depends on which surface is measured."""
+    temperature_factor: float
+    """f_Rsi = (T_si,min - T_e) / (T_i - T_e) at the coldest spot of the inner surface (ISO 13788): 1 is as warm as the
+    air inside; mould is a risk below about 0.7 in dwellings."""
+    coldest: Spot
+    """The coldest spot of the inner surface."""
+    patches: tuple[WallPart, ...]
+    """The inner surface by patch."""
+    regions: tuple[WallPart, ...]
+    """The inner surface by region of the body behind it."""
+
+
+def wall_answer(
+    problem: HeatProblem,
+    solution: SteadySolution,
+    inside: Sequence[str],
+    inside_c: float,
+    outside_c: float,
+    *,
+    facet_region: npt.NDArray[np.int64],
+) -> WallAnswer:
+    """Work out what a body between two airs lets through.
+
+    Args:
+        problem: What was solved.
+        solution: Its steady state.
+        inside: Names or patterns of the patches that face the inside.
+        inside_c: Temperature of the air inside, [degrees Celsius].
+        outside_c: Temperature of the air outside, [degrees Celsius].
+        facet_region: Region of the tetrahedron behind each boundary triangle, shape (f,).
+
+    Raises:
+        HeatError: Both airs are equally warm, or no surface faces the inside.
+    """
+    difference_k = inside_c - outside_c
+    if not abs(difference_k) >= _LEAST_DIFFERENCE_K:
+        remedy = "A U-value needs two different temperatures."
+        got = f"{inside_c:g} and {outside_c:g} C"
+        raise HeatError(explain("airs of a wall", expected="two temperatures", got=got, remedy=remedy))
+    selection, mesh = Selection(problem.mesh, problem.up), problem.mesh
+    matching = [any(fnmatchcase(name, pattern) for pattern in inside) for name in selection.patch_names]
+    inner = np.array(matching)[selection.facet_patch]
+    if not inner.any():
+        expected = f"some of the patches {', '.join(selection.patch_names)}"
+        remedy = "Name patches that have some surface."
+        raise HeatError(explain("inside of a wall", expected=expected, got=", ".join(inside), remedy=remedy))
+
+    def parts(numbers: npt.NDArray[np.int64], names: tuple[str, ...]) -> tuple[WallPart, ...]:
+        number = np.where(inner, numbers, len(names))
+        listed = (*names, "\0rest")
+        flows = heat_by_part(problem, solution.temperature_c, 0.0, number, listed)
+        heat = heat_through_parts(flows, listed)[0]
+        area = np.bincount(number, selection.facet_area_m2, len(listed))
+        return tuple(
+            WallPart(names[n], float(area[n]), float(heat[n]), float(heat[n] / area[n] / difference_k))
+            for n in np.unique(number[inner]).tolist()
+        )
+
+    patches = parts(selection.facet_patch, selection.patch_names)
+    area, heat = sum(part.area_m2 for part in patches), sum(part.heat_w for part in patches)
+    nodes = np.unique(mesh.facets[inner])
+    # The worst spot: the coldest if it is colder outside, else the hottest.
+    worst = int(nodes[np.argmin(np.sign(difference_k) * solution.temperature_c[nodes])])
+    spot = describe_spot(selection, worst, float(solution.temperature_c[worst]), 0.0)
+    return WallAnswer(
+        inside_c=inside_c,
+        outside_c=outside_c,
+        area_m2=area,
+        heat_w=heat,
+        coupling_w_k=heat / difference_k,
+        u_value_w_m2k=heat / area / difference_k,
+        temperature_factor=(spot.temperature_c - outside_c) / difference_k,
+        coldest=spot,
+        patches=patches,
+        regions=parts(facet_region, mesh.region_names),
+    )

@@ -1,0 +1,49 @@
+"""The command ``thermoxels heat``: put a heat scene around an exported mesh and answer what people ask of it.
+
+Only light imports at the top, so that ``thermoxels --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+
+@dataclass
+class Heat:
+    """Let heat flow through an exported mesh: heat losses, U-values, cold spots, temperatures over time, a report.
+
+    Writes report.html (open it first), answers.json, series.csv, temperatures for ParaView (heat.pvd through time,
+    heat.vtu of a steady state) and pictures."""
+
+    mesh: tyro.conf.Positional[Path]
+    """The mesh.vtu of an export with a known scale; mesh-boundary.vtp lies beside it."""
+    scene: str
+    """Heat scene: the path of a yaml file, or the name of one of configs/scene-NAME.yaml, such as winter-night."""
+    output_dir: Path = Path("heat")
+    """Folder for the results; made if it does not exist. Those of an earlier run in it are replaced."""
+    probes: tuple[tuple[float, float, float], ...] = ()
+    """Points whose temperature is followed, x y z in the coordinates of the mesh, one after the other, [m]."""
+    leave_out_below_k: float = 0.01
+    """Effects that together can change no temperature by more than this are left out, [K]; the report lists each with
+    its bound. A fifth of the default tolerance of the time steps. 0 builds everything that the scene names."""
+    up: tuple[float, float, float] | None = None
+    """Direction that points up in the coordinates of the mesh, if the scene does not say. Default: that of the
+    export's summary.json beside the mesh, or else z."""
+    pictures: bool = True
+    """Draw pictures of the surface."""
+
+    def main(self) -> None:
+        """Run it.
+
+        Raises:
+            ThermoxelsError: The mesh, the scene or an option cannot be used, or the solver fails.
+        """
+        from rich.console import Console
+
+        from thermoxels_ns.heat_run import run_heat
+
+        console = Console(highlight=False)
+        run_heat(self, lambda line: console.print(line, markup=False, soft_wrap=True))

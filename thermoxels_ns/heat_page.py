@@ -1,0 +1,326 @@
+"""What the report of a heat computation says, in which order and words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from thermoxels_ns.fem.answers import Spot
+from thermoxels_ns.fem.effects import Effect, FixedTemperature, InternalHeat
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.solution import HeatSolution
+from thermoxels_ns.fem.system import effect_labels
+from thermoxels_ns.heat_pictures import in_words, plot_over_time
+from thermoxels_ns.heat_report import HeatReport, Section, Table
+
+if TYPE_CHECKING:
+    from thermoxels_ns.heat_run import HeatRun
+
+_CAPTIONS = {1: ("Surface temperature.",), 3: ("At the start.", "At the end, in the same colours.", "The change.")}
+_INTO_BODY = "Heat flows are positive into the body; what is lost is negative."
+
+
+def heat_page(run: HeatRun, pictures: Sequence[bytes], command: str, files: Sequence[str]) -> HeatReport:
+    """Put a run into words.
+
+    Args:
+        run: What was computed.
+        pictures: PNG files of the surface, one or three.
+        command: The command that made it.
+        files: Names of the files beside the page.
+    """
+    sections = [_answers(run), *_wall(run), *_probes(run), _balance(run)]
+    if isinstance(run.solution, HeatSolution):
+        plot = plot_over_time(run.solution, run.mean_c, run.probes_c, _probe_names(run))
+        words = ("Heat flows are means over each interval between two kept times.",)
+        sections.append(Section("Over time", words=words, svg=plot))
+    if pictures:
+        captioned = tuple(zip(pictures, _CAPTIONS[len(pictures)], strict=True))
+        sections.append(Section("The surface", pictures=captioned))
+    sections += [_asked(run), _built(run), _made(run, command, files)]
+    return HeatReport(
+        title=run.scene.description or "Heat flow",
+        summary=_summary(run),
+        figures=_figures(run),
+        sections=tuple(sections),
+    )
+
+
+def _summary(run: HeatRun) -> str:
+    mesh = run.problem.mesh
+    what = f"A body of {len(mesh.tets):,} tetrahedra"
+    if run.scene.time is None:
+        return f"{what} in its steady state. {run.solution.status}"
+    return f"{what}, followed for {in_words(float(run.scene.time.times_s[-1]))}. {run.solution.status}"
+
+
+def _figures(run: HeatRun) -> tuple[tuple[str, str], ...]:
+    """The figures that matter most."""
+    answers, cards = run.answers, []
+    steady = run.scene.steady
+    lost = -sum(effect.heat_w for effect in answers.effects if effect.heat_w < 0.0)
+    won = sum(effect.heat_w for effect in answers.effects if effect.heat_w > 0.0)
+    cards.append((f"{_figure(lost)} W", "heat loss" if steady else "mean heat loss"))
+    if not steady:
+        cards.append((f"{_figure(won)} W", "mean heat gain"))
+    if run.wall is not None:
+        cards.append((f"{run.wall.u_value_w_m2k:.3f} W/(m\N{SUPERSCRIPT TWO} K)", "mean U-value of the inner surface"))
+        cards.append((f"{run.wall.temperature_factor:.3f}", "surface temperature factor f_Rsi"))
+    cards.append((f"{answers.coldest.temperature_c:.2f} \N{DEGREE SIGN}C", f"coldest spot {_place(answers.coldest)}"))
+    cards.append((f"{answers.hottest.temperature_c:.2f} \N{DEGREE SIGN}C", f"hottest spot {_place(answers.hottest)}"))
+    return tuple(cards)
+
+
+def _answers(run: HeatRun) -> Section:
+    answers, steady = run.answers, run.scene.steady
+    flow = "W" if steady else "mean W"
+    last = () if steady else ("last interval W",)
+    effects = Table(
+        ("What acts", "area m\N{SUPERSCRIPT TWO}", flow, "W/m\N{SUPERSCRIPT TWO}", *last),
+        tuple(
+            (
+                effect.effect,
+                _optional(effect.area_m2),
+                _figure(effect.heat_w),
+                _optional(effect.heat_w_m2),
+                *(() if steady else (_figure(effect.last_heat_w),)),
+            )
+            for effect in answers.effects
+        ),
+        note=_INTO_BODY,
+    )
+    patches = Table(
+        (
+            *("Patch", "area m\N{SUPERSCRIPT TWO}", flow, "W/m\N{SUPERSCRIPT TWO}", *last),
+            *("mean \N{DEGREE SIGN}C", "coldest \N{DEGREE SIGN}C", "hottest \N{DEGREE SIGN}C"),
+        ),
+        tuple(
+            (
+                *(patch.patch, _figure(patch.area_m2), _figure(patch.heat_w), _figure(patch.heat_w_m2)),
+                *(() if steady else (_figure(patch.last_heat_w),)),
+                *(f"{patch.mean_c:.2f}", _warm_and_where(patch.coldest), _warm_and_where(patch.hottest)),
+            )
+            for patch in answers.patches
+        ),
+        note="Areas are those of the true surface. Temperatures are those at the end." * (not steady)
+        or "Areas are those of the true surface.",
+    )
+    regions = Table(
+        (
+            *("Region", "material", "volume m\N{SUPERSCRIPT THREE}", "surface m\N{SUPERSCRIPT TWO}", "W"),
+            *("W/m\N{SUPERSCRIPT TWO}", "mean \N{DEGREE SIGN}C", "from \N{DEGREE SIGN}C", "to \N{DEGREE SIGN}C"),
+        ),
+        tuple(
+            (
+                *(region.region, region.material, _figure(region.volume_m3), _figure(region.area_m2)),
+                *(_figure(region.heat_w), _figure(region.heat_w_m2)),
+                *(f"{region.mean_c:.2f}", f"{region.min_c:.2f}", f"{region.max_c:.2f}"),
+            )
+            for region in answers.regions
+        ),
+        figures_from=2,
+        note="Heat flow through the region's own part of the surface" + ("." if steady else ", at the end."),
+    )
+    return Section("Answers", tables=(effects, patches, regions))
+
+
+def _wall(run: HeatRun) -> list[Section]:
+    if run.wall is None:
+        return []
+    wall = run.wall
+    words = (
+        f"Between {wall.inside_c:g} \N{DEGREE SIGN}C inside and {wall.outside_c:g} \N{DEGREE SIGN}C outside, "
+        f"{_figure(wall.heat_w)} W flow into the inner surface of {_figure(wall.area_m2)} m\N{SUPERSCRIPT TWO}: a "
+        f"thermal coupling of {_figure(wall.coupling_w_k)} W/K. The inner surface is worst at "
+        f"{wall.coldest.temperature_c:.2f} \N{DEGREE SIGN}C {_place(wall.coldest)}, which is a temperature factor of "
+        f"{wall.temperature_factor:.3f} (1: as warm as the air inside).",
+    )
+    columns = ("Inner surface", "area m\N{SUPERSCRIPT TWO}", "W", "U-value W/(m\N{SUPERSCRIPT TWO} K)")
+    rows = [(p.name, _figure(p.area_m2), _figure(p.heat_w), f"{p.u_value_w_m2k:.4f}") for p in wall.patches]
+    if len(wall.regions) > 1:
+        rows += [
+            (f"region {p.name}", _figure(p.area_m2), _figure(p.heat_w), f"{p.u_value_w_m2k:.4f}") for p in wall.regions
+        ]
+    note = "Heat flow per area of the inner surface and difference of the airs."
+    return [Section("As a wall", words=words, tables=(Table(columns, tuple(rows), note=note),))]
+
+
+def _probes(run: HeatRun) -> list[Section]:
+    if not len(run.probes.points_m):
+        return []
+    names, values = _probe_names(run), run.probes_c
+    if len(values) == 1:
+        rows = tuple((name, f"{value:.3f}") for name, value in zip(names, values[0]))
+        return [Section("Probes", tables=(Table(("Point", "\N{DEGREE SIGN}C"), rows),))]
+    rows = tuple(
+        (name, *(f"{value:.3f}" for value in (column[0], column[-1], column.min(), column.max())))
+        for name, column in zip(names, values.T)
+    )
+    columns = ("Point", "start \N{DEGREE SIGN}C", "end \N{DEGREE SIGN}C", "lowest", "highest")
+    return [Section("Probes", tables=(Table(columns, rows, note="All times stand in series.csv."),))]
+
+
+def _balance(run: HeatRun) -> Section:
+    balance = run.answers.balance
+    scale, unit = (1.0, "W") if balance.unit == "W" else (3.6e6, "kWh")
+    rows = (
+        ("into the body", f"{_figure(balance.into_body / scale)} {unit}"),
+        ("out of the body", f"{_figure(balance.out_of_body / scale)} {unit}"),
+        ("stored in it", f"{_figure(balance.stored / scale)} {unit}"),
+        ("stored - in + out: accounted for by nothing", f"{balance.residual / scale:.1e} {unit}"),
+        ("the same as a share", f"{balance.relative_residual:.1e}"),
+    )
+    return Section("Energy balance", tables=(Table(("", ""), rows),))
+
+
+def _asked(run: HeatRun) -> Section:
+    mesh, scene, time = run.problem.mesh, run.scene, run.scene.time
+    start = "the photographs" if scene.initial_c is None else f"{scene.initial_c:g} \N{DEGREE SIGN}C everywhere"
+    if isinstance(time, TimeSteps):
+        how = f"{time.steps} steps of {time.step_seconds:g} s"
+    elif isinstance(time, AdaptiveSteps):
+        how = f"{in_words(time.duration_s)} in steps that keep within {time.tolerance_k:g} K"
+    else:
+        how = "the steady state"
+    general = Table(
+        ("", ""),
+        (
+            ("mesh", f"{run.options.mesh.name}: {len(mesh.tets):,} tetrahedra, {len(mesh.points_m):,} nodes"),
+            ("time", how),
+            *((("start", start),) if time is not None else ()),
+            ("up", ", ".join(f"{part:g}" for part in run.problem.up)),
+            ("no heat crosses", ", ".join(scene.adiabatic) or "no patch"),
+        ),
+        figures_from=2,
+    )
+    rows = []
+    made_of = run.problem.material
+    for number in np.unique(mesh.region):
+        name = mesh.region_names[number]
+        what = made_of if isinstance(made_of, Material) else made_of[name]
+        figures = (what.conductivity_w_mk, what.density_kg_m3, what.specific_heat_j_kgk)
+        rows.append((name, what.name, *(f"{figure:g}" for figure in figures)))
+    columns = ("Region", "material", "W/(m K)", "kg/m\N{SUPERSCRIPT THREE}", "J/(kg K)")
+    materials = Table(columns, tuple(rows), figures_from=2)
+    selection = Selection(mesh, run.problem.up)
+    effects = Table(
+        ("What the scene names", "with"),
+        tuple(
+            (label, "; ".join(_values(effect, selection)))
+            for label, effect in zip(effect_labels(run.problem), run.problem.effects)
+        ),
+        figures_from=2,
+        note="A range is that over the surface at the start.",
+    )
+    return Section("What was asked", tables=(general, materials, effects))
+
+
+def _built(run: HeatRun) -> Section:
+    screening, words = run.screening, []
+    if not run.problem.effects:
+        words.append("The scene names nothing that acts on the body: its surface is insulated.")
+    elif screening.left_out:
+        words.append(
+            f"Left out, together they could change temperatures by {screening.bound_k:.2g} K at most; the tolerance is "
+            f"{screening.tolerance_k:g} K. {screening.note}"
+        )
+        cost = f"To find out took {screening.seconds:.2f} s"
+        saved = run.seconds_saved
+        words.append(f"{cost}." if saved is None else f"{cost} and saved about {saved:.2f} s (measured on one step).")
+    else:
+        words.append(f"Nothing could be left out at a tolerance of {screening.tolerance_k:g} K. {screening.note}")
+    left = Table(
+        ("Left out", "because", "at most K", "at most W"),
+        tuple((e.effect, e.reason, f"{e.bound_k:.2g}", f"{e.bound_w:.3g}") for e in screening.left_out),
+        figures_from=2,
+        note="No temperature and no mean heat flow of what is built would differ by more.",
+    )
+    kept = Table(
+        ("Built", "because", "up to K"),
+        tuple((e.effect, e.reason, "" if e.bound_k is None else f"{e.bound_k:.2g}") for e in screening.kept),
+        figures_from=2,
+    )
+    bill = run.solution.assembled
+    assembled = Table(
+        ("Assembled", "times", "s"),
+        tuple((kind, str(count), f"{bill.seconds.get(kind, 0.0):.3f}") for kind, count in bill.counts.items()),
+        note=_absent(run.problem, run.screening.problem, dict(bill.counts)),
+    )
+    return Section("What was built and left out", words=tuple(words), tables=(left, kept, assembled))
+
+
+def _absent(named: HeatProblem, built: HeatProblem, counts: dict[str, int]) -> str:
+    """Say what costs nothing because it is not there."""
+    absent = [kind for kind in ("radiation", "robin", "flux", "source", "fixed", "mass") if kind not in counts]
+    return f"Not there, and at no cost: {', '.join(absent)}." if absent else ""
+
+
+def _made(run: HeatRun, command: str, files: Sequence[str]) -> Section:
+    solution = run.solution
+    words = [f"{int(np.sum(solution.iterations)):,} iterations of the linear solver"]
+    if isinstance(solution, HeatSolution):
+        words.insert(0, f"{solution.steps} steps in time")
+        if np.isfinite(solution.time_error_k):
+            words.append(f"errors of the steps estimated to add up to {solution.time_error_k:.2g} K")
+    newton = int(np.sum(solution.newton_iterations))
+    words.append(f"{newton} Newton steps" if newton else "no Newton steps")
+    seconds = Table(("Part", "s"), tuple((name, f"{value:.2f}") for name, value in run.seconds.items()))
+    lines = (command, "", *files)
+    return Section("How it was made", words=(f"{', '.join(words)}.".capitalize(),), tables=(seconds,), lines=lines)
+
+
+def _values(effect: Effect, selection: Selection) -> list[str]:
+    """The quantities of an effect with their units."""
+    shown = []
+    for field in fields(effect):  # type: ignore[arg-type]
+        if field.name not in effect.bounds:
+            continue
+        value, unit = getattr(effect, field.name), effect.bounds[field.name].unit
+        name = field.name.rsplit("_w_m", 1)[0].removesuffix("_c").removesuffix("_m2k").replace("_", " ")
+        unit = {"1": "", "degrees Celsius": " \N{DEGREE SIGN}C"}.get(unit, f" {unit}")
+        if not isinstance(value, Varying):
+            shown.append(f"{name} {value:g}{unit}")
+        elif isinstance(effect, FixedTemperature):
+            shown.append(f"{name} varies")
+        else:
+            source = isinstance(effect, InternalHeat)
+            where = selection.tets(effect.where) if source else selection.facets(effect.where)
+            places = selection.tet_places(where) if source else selection.facet_places(where)
+            values = effect.bounded(field.name).at(places, 0.0)
+            changes = ", changes with time" if value.in_time else ""
+            span = f"{values.min():.3g} to {values.max():.3g}" if len(values) else "nowhere"
+            shown.append(f"{name} {span}{unit}{changes}")
+    return shown
+
+
+def _probe_names(run: HeatRun) -> list[str]:
+    return [f"({', '.join(f'{part:.4g}' for part in point)}) m" for point in run.probes.points_m]
+
+
+def _place(spot: Spot) -> str:
+    where = f"at ({', '.join(f'{part:.3g}' for part in spot.point_m)}) m"
+    return where if spot.patches else f"{where}, inside"
+
+
+def _warm_and_where(spot: Spot) -> str:
+    return f"{spot.temperature_c:.2f} {_place(spot)}"
+
+
+def _optional(value: float | None) -> str:
+    return "" if value is None else _figure(value)
+
+
+def _figure(value: float) -> str:
+    """Four digits, without powers of ten where figures are of everyday size."""
+    if value == 0.0:
+        return "0"
+    if 1e-3 <= abs(value) < 1e6:
+        digits = max(0, 3 - int(np.floor(np.log10(abs(value)))))
+        return f"{value:,.{digits}f}"
+    return f"{value:.3e}"

@@ -1,0 +1,132 @@
+"""Pictures of a heat computation: the surface at its start and end, and temperatures and heat flows over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.fem.solution import HeatSolution
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+Vector = npt.NDArray[np.float64]
+
+SURFACE_PICTURES = ("surface-start.png", "surface-end.png", "surface-change.png")
+"""Names of the pictures of the surface through time; of a steady state there is the second only."""
+
+_LEAST_CHANGE_K = 1e-3
+"""Half the span of the smallest scale of temperature changes, [K]."""
+_MOST_LINES = 8
+"""Curves in one plot; more cannot be told apart."""
+
+
+def draw_surface(folder: Path, mesh: TetMesh, states_c: Vector, times_s: Vector, look: Mapping[str, Any]) -> list[str]:
+    """Draw the surface: of a steady state once, through time at the start, at the end, and the change.
+
+    Args:
+        folder: Where to.
+        mesh: The body.
+        states_c: Nodal temperatures, shape (s, n), [degrees Celsius].
+        times_s: Their times, shape (s,), [s].
+        look: Arguments `up` and `view_direction` of `picture_of_mesh`.
+
+    Returns:
+        Names of the files.
+    """
+    from thermoxels_ns.mesh.pictures import picture_of_mesh
+
+    start, end, change = SURFACE_PICTURES
+    if len(times_s) == 1:
+        picture_of_mesh(folder / end, mesh, states_c[0], title="Surface temperature, steady", **look)
+        return [end]
+    shown = np.unique(mesh.facets)
+    ends = states_c[[0, -1]][:, shown]
+    difference = states_c[-1] - states_c[0]
+    most = max(float(np.abs(difference[shown]).max()), _LEAST_CHANGE_K)
+    same: Any = {"clim": (float(ends.min()), float(ends.max()))}
+    diverging: Any = {"clim": (-most, most), "colour_map": "coolwarm", "bar_title": "change [K]"}
+    first, last = in_words(float(times_s[0])), in_words(float(times_s[-1]))
+    picture_of_mesh(folder / start, mesh, states_c[0], title=f"Surface temperature at {first}", **same, **look)
+    picture_of_mesh(folder / end, mesh, states_c[-1], title=f"Surface temperature at {last}", **same, **look)
+    title = f"Change from {first} to {last}"
+    picture_of_mesh(folder / change, mesh, difference, title=title, **diverging, **look)
+    return list(SURFACE_PICTURES)
+
+
+def plot_over_time(solution: HeatSolution, mean_c: Vector, probes_c: Vector, probe_names: Sequence[str]) -> str:
+    """Plot temperatures and heat flows over time.
+
+    Args:
+        solution: Temperatures and heat flows.
+        mean_c: Mean temperature of the volume at each time, shape (s + 1,), [degrees Celsius].
+        probes_c: Temperatures at the probes, shape (s + 1, p), [degrees Celsius].
+        probe_names: Their names.
+
+    Returns:
+        An svg element, the same for the same figures.
+    """
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    unit, seconds = time_unit(float(solution.times_s[-1]))
+    time = solution.times_s / seconds
+    with rc_context({"svg.hashsalt": "heat", "font.size": 10, "axes.spines.top": False, "axes.spines.right": False}):
+        figure = Figure(figsize=(10.5, 7.0), layout="constrained")
+        FigureCanvasSVG(figure)
+        above, below = figure.subplots(2, 1, sharex=True)
+        states = solution.temperature_c
+        above.fill_between(time, states.min(axis=1), states.max(axis=1), color="#e9dcd6", label="coldest to hottest")
+        above.plot(time, mean_c, color="#1d2430", linewidth=2, label="mean of the volume")
+        for column, name in list(enumerate(probe_names))[:_MOST_LINES]:
+            above.plot(time, probes_c[:, column], linewidth=1.4, label=name)
+        above.set_ylabel("temperature [\N{DEGREE SIGN}C]")
+        below.axhline(0.0, color="#9aa3ae", linewidth=0.8)
+        # An effect's heat is a mean over each interval.
+        for heat in strongest(solution)[:_MOST_LINES]:
+            below.stairs(heat.heat_w, time, baseline=None, linewidth=1.4, label=heat.effect)
+        below.stairs(solution.heat_w, time, baseline=None, color="#1d2430", linewidth=2, label="all together: stored")
+        below.set_ylabel("heat flow into the body [W]")
+        below.set_xlabel(f"time [{unit}]")
+        below.set_xlim(time[0], time[-1])
+        for axis in (above, below):
+            axis.grid(color="#e1e5ea", linewidth=0.6)
+            axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8.5)
+        text = StringIO()
+        figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+    svg = text.getvalue()
+    return svg[svg.index("<svg") :].rstrip()
+
+
+def strongest(solution: HeatSolution) -> list[Any]:
+    """Effects with some heat, the strongest first."""
+    sizes = {id(heat): float(np.abs(heat.heat_w).max(initial=0.0)) for heat in solution.effects}
+    acting = [heat for heat in solution.effects if sizes[id(heat)] > 0.0]
+    return sorted(acting, key=lambda heat: -sizes[id(heat)])
+
+
+def time_unit(duration_s: float) -> tuple[str, float]:
+    """Choose a unit that suits a duration, and its length in seconds.
+
+    >>> time_unit(86400.0)
+    ('h', 3600.0)
+    """
+    if duration_s > 10 * 86400.0:
+        return "days", 86400.0
+    if duration_s > 2 * 3600.0:
+        return "h", 3600.0
+    return ("min", 60.0) if duration_s > 300.0 else ("s", 1.0)
+
+
+def in_words(seconds: float) -> str:
+    """Write a duration in the unit that suits it.
+
+    >>> in_words(5400.0)
+    '90 min'
+    """
+    unit, length = time_unit(seconds)
+    return f"{seconds / length:.4g} {unit}"

@@ -1,0 +1,142 @@
+"""Read a mesh back from the files that an export wrote: the body (.vtu) and its tagged boundary (.vtp)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.checks import check_finite, check_shape
+from thermoxels_ns.errors import MeshError, explain
+from thermoxels_ns.mesh.boundary_file import boundary_path
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, Boundary, TetMesh
+
+_REMEDY = "Export the mesh again with ns-export thermoxels-mesh."
+_REGION = "region:"
+_TETRAHEDRON = 10  # VTK's number for the kind of cell
+
+
+def read_mesh(path: Path | str) -> TetMesh:
+    """Read ``NAME.vtu`` and ``NAME-boundary.vtp``.
+
+    All comes back as it was written, bit for bit, but colours, which files hold as bytes.
+
+    Args:
+        path: The .vtu file; the .vtp file lies beside it.
+
+    Raises:
+        MeshError: A file is missing, cannot be read, lacks an array, or the two do not belong together.
+    """
+    path = Path(path)
+    if path.suffix != ".vtu":
+        raise _wrong("mesh file", "a name that ends in .vtu", path.name, "Pass the mesh.vtu of an export.")
+    body, surface = _read(path), _read(boundary_path(path))
+    points = np.array(body.points, dtype=np.float64)
+    tets = _tets(body, path.name)
+    names = _region_names(body, path.name)
+    region = _cell_numbers(body, "region", path.name, len(names))
+    colour = body.point_data.get("colour")
+    facets, tags = _boundary(surface, points, boundary_path(path).name)
+    on_box = _array(surface.cell_data, "on_box", boundary_path(path).name) != 0
+    return TetMesh(
+        points_m=check_finite("mesh points", points, _REMEDY, MeshError),
+        tets=tets,
+        temperature_c=_array(body.point_data, "temperature_c", path.name).astype(np.float64),
+        observed=_array(body.point_data, "observed", path.name) != 0,
+        facets=facets,
+        facet_tags=np.where(on_box, FACET_BOX, FACET_SURFACE).astype(np.int64),
+        region=region,
+        region_names=names,
+        boundary=tags,
+        colour=None if colour is None else (np.asarray(colour) / 255.0).astype(np.float32),
+    )
+
+
+def _read(path: Path) -> Any:
+    """Read a VTK file; a damaged one is an error, not an empty mesh."""
+    import pyvista as pv
+    from vtkmodules.vtkCommonCore import vtkLogger
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader
+
+    if not path.is_file():
+        raise _wrong(path.name, f"a file at {path}", "none", _REMEDY)
+    reader: Any = vtkXMLPolyDataReader() if path.suffix == ".vtp" else vtkXMLUnstructuredGridReader()
+    reader.SetFileName(str(path))
+    data, complaints = None, []
+    before = vtkLogger.GetCurrentVerbosityCutoff()
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+    try:
+        with pv.VtkErrorCatcher(raise_errors=False, send_to_logging=False) as catcher:
+            if reader.CanReadFile(str(path)):
+                reader.Update()
+                data = pv.wrap(reader.GetOutput())
+        complaints = catcher.events
+    finally:
+        vtkLogger.SetStderrVerbosity(before)
+    if data is None or complaints or reader.GetErrorCode() or not data.n_cells:
+        raise _wrong(path.name, f"a VTK file ({path.suffix})", "a damaged or empty one", _REMEDY)
+    return data
+
+
+def _tets(body: Any, name: str) -> npt.NDArray[np.int64]:
+    others = np.count_nonzero(body.celltypes != _TETRAHEDRON)
+    if others:
+        raise _wrong(name, "tetrahedra only", f"{others} cells of other kinds", _REMEDY)
+    return np.array(body.cell_connectivity, dtype=np.int64).reshape(-1, 4)
+
+
+def _region_names(body: Any, name: str) -> tuple[str, ...]:
+    """Names by their numbers, which the file holds one by one."""
+    arrays = body.GetFieldData()
+    numbers = {}
+    for place in range(arrays.GetNumberOfArrays()):
+        array = arrays.GetAbstractArray(place)
+        if array.GetName().startswith(_REGION):
+            numbers[int(array.GetVariantValue(0).ToInt())] = array.GetName().removeprefix(_REGION)
+    if sorted(numbers) != list(range(len(numbers))) or not numbers:
+        raise _wrong(name, f"field arrays {_REGION}NAME numbered from 0", sorted(numbers) or "none", _REMEDY)
+    return tuple(numbers[number] for number in range(len(numbers)))
+
+
+def _boundary(
+    surface: Any, points: npt.NDArray[np.float64], name: str
+) -> tuple[npt.NDArray[np.int64], Boundary | None]:
+    node = _array(surface.point_data, "node", name).astype(np.int64)
+    if node.min() < 0 or node.max() >= len(points) or not np.array_equal(points[node], surface.points):
+        raise _wrong(name, "the boundary of the mesh beside it", "that of another one", _REMEDY)
+    if not surface.is_all_triangles:
+        raise _wrong(name, "triangles only", "other polygons", _REMEDY)
+    facets = node[np.asarray(surface.regular_faces, dtype=np.int64)]
+    if "seen" not in surface.cell_data:
+        return facets, None
+    array = surface.GetFieldData().GetAbstractArray("patch_names")
+    if array is None:
+        raise _wrong(name, "the field array patch_names", "none", _REMEDY)
+    names = tuple(str(array.GetValue(number)) for number in range(array.GetNumberOfValues()))
+    normal = np.array(_array(surface.cell_data, "normal", name), dtype=np.float64)
+    return facets, Boundary(
+        normal=check_shape("normal", normal, (len(facets), 3), _REMEDY, MeshError),
+        area_factor=np.array(_array(surface.cell_data, "area_factor", name), dtype=np.float64),
+        seen=_array(surface.cell_data, "seen", name) != 0,
+        patch=_cell_numbers(surface, "patch", name, len(names)),
+        patch_names=names,
+    )
+
+
+def _cell_numbers(data: Any, array: str, name: str, count: int) -> npt.NDArray[np.int64]:
+    numbers = _array(data.cell_data, array, name).astype(np.int64)
+    if numbers.min() < 0 or numbers.max() >= count:
+        raise _wrong(f"{name}: {array}", f"0 to {count - 1}", f"{numbers.min()} to {numbers.max()}", _REMEDY)
+    return numbers
+
+
+def _array(data: Any, array: str, name: str) -> npt.NDArray:
+    if array not in data:
+        raise _wrong(name, f"an array {array}", f"{', '.join(sorted(data.keys())) or 'none'}", _REMEDY)
+    return check_finite(f"{name}: {array}", np.array(data[array]), _REMEDY, MeshError)
+
+
+def _wrong(name: str, expected: str, got: object, remedy: str) -> MeshError:
+    return MeshError(explain(name, expected=expected, got=got, remedy=remedy))
