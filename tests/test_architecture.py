@@ -46,6 +46,7 @@ ROOMS = (
     Room(GROUND, GROUND, frozenset({"nerfstudio", "open3d"}) | DRAWING | HEAT),
     Room(frozenset({"presets"}), GROUND, RADIANCE | DRAWING | HEAT),
     Room(frozenset({"data"}), GROUND | {"data"}, DRAWING | HEAT),
+    Room(frozenset({"capture"}), GROUND | {"data", "capture"}, DRAWING | HEAT),
     Room(frozenset({"field"}), GROUND | {"field"}, DRAWING | HEAT),
     Room(frozenset({"render"}), GROUND | {"render"}, DRAWING | HEAT),
     Room(MODEL, GROUND | {"field", "render"} | MODEL, DRAWING | HEAT),

@@ -12,6 +12,7 @@ from typing import Annotated, Literal, Union
 
 import tyro
 
+from thermoxels_ns.capture_command import Capture
 from thermoxels_ns.cost import Cost
 from thermoxels_ns.demo import Demo, SceneName
 from thermoxels_ns.errors import ThermoxelsError
@@ -83,6 +84,7 @@ class Synthetic:
 
 Commands = tyro.conf.FlagConversionOff[
     Union[  # noqa: UP007 - read by tyro
+        Annotated[Capture, tyro.conf.subcommand(name="capture")],
         Annotated[Demo, tyro.conf.subcommand(name="demo")],
         Annotated[Synthetic, tyro.conf.subcommand(name="synthetic")],
         Annotated[Cost, tyro.conf.subcommand(name="cost")],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING
 
@@ -22,16 +22,22 @@ from thermoxels_ns.heat_report import HeatReport, Section, Table
 if TYPE_CHECKING:
     from thermoxels_ns.heat_run import HeatRun
 
-_CAPTIONS = {1: ("Surface temperature.",), 3: ("At the start.", "At the end, in the same colours.", "The change.")}
+_CAPTIONS = {
+    "surface-start.png": "The surface at the start.",
+    "surface-end.png": "The surface at the end. Colours span the surface that photographs show.",
+    "surface-change.png": "What changed.",
+    "cut.png": "Cut through the middle at the end. Colours span the whole body.",
+}
+_LARGE_K = 100.0
 _INTO_BODY = "Heat flows are positive into the body; what is lost is negative."
 
 
-def heat_page(run: HeatRun, pictures: Sequence[bytes], command: str, files: Sequence[str]) -> HeatReport:
+def heat_page(run: HeatRun, pictures: Mapping[str, bytes], command: str, files: Sequence[str]) -> HeatReport:
     """Put a run into words.
 
     Args:
         run: What was computed.
-        pictures: PNG files of the surface, one or three.
+        pictures: PNG files by their names.
         command: The command that made it.
         files: Names of the files beside the page.
     """
@@ -41,8 +47,8 @@ def heat_page(run: HeatRun, pictures: Sequence[bytes], command: str, files: Sequ
         words = ("Heat flows are means over each interval between two kept times.",)
         sections.append(Section("Over time", words=words, svg=plot))
     if pictures:
-        captioned = tuple(zip(pictures, _CAPTIONS[len(pictures)], strict=True))
-        sections.append(Section("The surface", pictures=captioned))
+        captioned = tuple((png, _CAPTIONS[name]) for name, png in pictures.items())
+        sections.append(Section("Pictures", pictures=captioned))
     sections += [_asked(run), _built(run), _made(run, command, files)]
     return HeatReport(
         title=run.scene.description or "Heat flow",
@@ -243,7 +249,7 @@ def _built(run: HeatRun) -> Section:
     )
     kept = Table(
         ("Built", "because", "up to K"),
-        tuple((e.effect, e.reason, "" if e.bound_k is None else f"{e.bound_k:.2g}") for e in screening.kept),
+        tuple((e.effect, e.reason, _up_to(e.bound_k)) for e in screening.kept),
         figures_from=2,
     )
     bill = run.solution.assembled
@@ -271,15 +277,16 @@ def _made(run: HeatRun, command: str, files: Sequence[str]) -> Section:
     newton = int(np.sum(solution.newton_iterations))
     words.append(f"{newton} Newton steps" if newton else "no Newton steps")
     seconds = Table(("Part", "s"), tuple((name, f"{value:.2f}") for name, value in run.seconds.items()))
-    lines = (command, "", *files)
-    return Section("How it was made", words=(f"{', '.join(words)}.".capitalize(),), tables=(seconds,), lines=lines)
+    said = ", ".join(words)
+    lines = (command, *files)
+    return Section("How it was made", words=(f"{said[0].upper()}{said[1:]}.",), tables=(seconds,), lines=lines)
 
 
 def _values(effect: Effect, selection: Selection) -> list[str]:
     """The quantities of an effect with their units."""
     shown = []
     for field in fields(effect):  # type: ignore[arg-type]
-        if field.name not in effect.bounds:
+        if field.name not in effect.bounds or getattr(effect, field.name) == field.default:
             continue
         value, unit = getattr(effect, field.name), effect.bounds[field.name].unit
         name = field.name.rsplit("_w_m", 1)[0].removesuffix("_c").removesuffix("_m2k").replace("_", " ")
@@ -294,7 +301,8 @@ def _values(effect: Effect, selection: Selection) -> list[str]:
             places = selection.tet_places(where) if source else selection.facet_places(where)
             values = effect.bounded(field.name).at(places, 0.0)
             changes = ", changes with time" if value.in_time else ""
-            span = f"{values.min():.3g} to {values.max():.3g}" if len(values) else "nowhere"
+            ends = dict.fromkeys(f"{end:.3g}" for end in (values.min(), values.max())) if len(values) else ("nowhere",)
+            span = " to ".join(ends)
             shown.append(f"{name} {span}{unit}{changes}")
     return shown
 
@@ -310,6 +318,13 @@ def _place(spot: Spot) -> str:
 
 def _warm_and_where(spot: Spot) -> str:
     return f"{spot.temperature_c:.2f} {_place(spot)}"
+
+
+def _up_to(bound_k: float | None) -> str:
+    """A bound of what is kept; how far a large one is above the tolerance says nothing."""
+    if bound_k is None or bound_k > _LARGE_K:
+        return f"> {_LARGE_K:g}" if bound_k is not None else ""
+    return f"{bound_k:.2g}"
 
 
 def _optional(value: float | None) -> str:

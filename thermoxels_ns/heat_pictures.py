@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,8 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Vector = npt.NDArray[np.float64]
 
-SURFACE_PICTURES = ("surface-start.png", "surface-end.png", "surface-change.png")
-"""Names of the pictures of the surface through time; of a steady state there is the second only."""
+PICTURES = ("surface-start.png", "surface-end.png", "surface-change.png", "cut.png")
+"""Names of the pictures; of a steady state there are the second and the last only."""
 
 _LEAST_CHANGE_K = 1e-3
 """Half the span of the smallest scale of temperature changes, [K]."""
@@ -24,37 +25,83 @@ _MOST_LINES = 8
 """Curves in one plot; more cannot be told apart."""
 
 
-def draw_surface(folder: Path, mesh: TetMesh, states_c: Vector, times_s: Vector, look: Mapping[str, Any]) -> list[str]:
-    """Draw the surface: of a steady state once, through time at the start, at the end, and the change.
+def draw_surface(
+    folder: Path, mesh: TetMesh, states_c: Vector, times_s: Vector, up: tuple[float, float, float]
+) -> list[str]:
+    """Draw the surface at the start, at the end, and the change (of a steady state once), and a cut through the body.
+
+    Colours of the surface span what photographs show of it: inside a heated building it is far warmer.
 
     Args:
         folder: Where to.
         mesh: The body.
         states_c: Nodal temperatures, shape (s, n), [degrees Celsius].
         times_s: Their times, shape (s,), [s].
-        look: Arguments `up` and `view_direction` of `picture_of_mesh`.
+        up: Direction that points up.
 
     Returns:
         Names of the files.
     """
     from thermoxels_ns.mesh.pictures import picture_of_mesh
 
-    start, end, change = SURFACE_PICTURES
-    if len(times_s) == 1:
-        picture_of_mesh(folder / end, mesh, states_c[0], title="Surface temperature, steady", **look)
-        return [end]
-    shown = np.unique(mesh.facets)
+    start, end, change, cut = PICTURES
+    seen = np.ones(len(mesh.facets), dtype=bool) if mesh.boundary is None else mesh.boundary.seen
+    shown = np.unique(mesh.facets[seen] if seen.any() else mesh.facets)
+    steady = len(times_s) == 1
     ends = states_c[[0, -1]][:, shown]
+    same: Any = {"clim": (float(ends.min()), float(ends.max())), "up": up}
+    first, last = in_words(float(times_s[0])), in_words(float(times_s[-1]))
+    when = ", steady" if steady else f" at {last}"
+    picture_of_mesh(folder / end, mesh, states_c[-1], title=f"Surface temperature{when}", **same)
+    half, view = cut_open(mesh, up)
+    title = f"Cut through the middle{when}"
+    picture_of_mesh(folder / cut, half, states_c[-1], title=title, up=up, view_direction=view)
+    if steady:
+        return [end, cut]
     difference = states_c[-1] - states_c[0]
     most = max(float(np.abs(difference[shown]).max()), _LEAST_CHANGE_K)
-    same: Any = {"clim": (float(ends.min()), float(ends.max()))}
-    diverging: Any = {"clim": (-most, most), "colour_map": "coolwarm", "bar_title": "change [K]"}
-    first, last = in_words(float(times_s[0])), in_words(float(times_s[-1]))
-    picture_of_mesh(folder / start, mesh, states_c[0], title=f"Surface temperature at {first}", **same, **look)
-    picture_of_mesh(folder / end, mesh, states_c[-1], title=f"Surface temperature at {last}", **same, **look)
-    title = f"Change from {first} to {last}"
-    picture_of_mesh(folder / change, mesh, difference, title=title, **diverging, **look)
-    return list(SURFACE_PICTURES)
+    diverging: Any = {"clim": (-most, most), "colour_map": "coolwarm", "bar_title": "change [K]", "up": up}
+    picture_of_mesh(folder / start, mesh, states_c[0], title=f"Surface temperature at {first}", **same)
+    picture_of_mesh(folder / change, mesh, difference, title=f"Change from {first} to {last}", **diverging)
+    return list(PICTURES)
+
+
+def cut_open(mesh: TetMesh, up: tuple[float, float, float]) -> tuple[TetMesh, tuple[float, float, float]]:
+    """Take away the half of a body in front of an upright plane through its middle.
+
+    Args:
+        mesh: The body.
+        up: Direction that points up.
+
+    Returns:
+        half: The mesh with the other half of its tetrahedra, and all nodes.
+        view: Direction to look in.
+    """
+    from thermoxels_ns.mesh.voxel_tets import boundary_facets
+
+    upwards = np.array(up) / np.linalg.norm(up)
+    # Across the longer of the two sides, so that the cut is the larger one.
+    sides = [axis - (axis @ upwards) * upwards for axis in np.eye(3)]
+    sides = sorted(
+        (side for side in sides if np.linalg.norm(side) > 0.5), key=lambda side: np.ptp(mesh.points_m @ side)
+    )
+    towards = sides[0] / np.linalg.norm(sides[0])
+    across = mesh.points_m @ towards
+    # A little off the middle, which on a lattice may lie between two layers that are neither in nor out.
+    middle = 0.5 * (across.min() + across.max()) + 1e-6 * np.ptp(across)
+    kept = across[mesh.tets].mean(axis=1) <= middle
+    tets = mesh.tets[kept] if kept.any() else mesh.tets
+    facets = boundary_facets(tets)
+    half = replace(
+        mesh,
+        tets=tets,
+        facets=facets,
+        facet_tags=np.zeros(len(facets), np.int64),
+        region=mesh.region[kept] if kept.any() else mesh.region,
+        boundary=None,
+    )
+    x, y, z = (-(towards + 0.25 * np.cross(upwards, towards) + 0.3 * upwards)).tolist()
+    return half, (x, y, z)
 
 
 def plot_over_time(solution: HeatSolution, mean_c: Vector, probes_c: Vector, probe_names: Sequence[str]) -> str:

@@ -29,7 +29,7 @@ from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.wall_answers import WallAnswer, wall_answer
 from thermoxels_ns.heat_command import Heat
-from thermoxels_ns.heat_pictures import SURFACE_PICTURES, draw_surface
+from thermoxels_ns.heat_pictures import PICTURES, draw_surface
 from thermoxels_ns.mesh.facet_owners import facet_owners
 from thermoxels_ns.mesh.files import summary_text, write_summary, write_vtu
 from thermoxels_ns.mesh.read_mesh import read_mesh
@@ -186,7 +186,7 @@ def summary_of(run: HeatRun) -> dict[str, Any]:
 def _prepared(output_dir: Path) -> Path:
     """Make the folder, and find out what is in the way before anything is computed."""
     folder = writable_folder(output_dir)
-    names = (ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY, *SURFACE_PICTURES)
+    names = (ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY, *PICTURES)
     series = folder / Path(THROUGH_TIME).stem
     blocked = [name for name in names if (folder / name).is_dir()]
     blocked += [series.name] if series.exists() and not series.is_dir() else []
@@ -212,7 +212,7 @@ def _write(folder: Path, run: HeatRun, say: Say) -> None:
     times, states = times_and_states(run.solution)
     mesh, pictures = run.problem.mesh, list[str]()
     remove_file(folder / ANSWERS)
-    for name in (PAGE, STEADY, *SURFACE_PICTURES):
+    for name in (PAGE, STEADY, *PICTURES):
         remove_file(folder / name)
     if isinstance(run.solution, SteadySolution):
         remove_heat_series(folder / THROUGH_TIME)
@@ -221,8 +221,8 @@ def _write(folder: Path, run: HeatRun, say: Say) -> None:
         write_heat_series(folder / THROUGH_TIME, mesh, run.solution)
     _write_series(folder / SERIES, run)
     if run.options.pictures:
-        pictures = draw_surface(folder, mesh, states, times, {"up": run.problem.up})
-    shown = [(folder / name).read_bytes() for name in pictures]
+        pictures = draw_surface(folder, mesh, states, times, run.problem.up)
+    shown = {name: (folder / name).read_bytes() for name in pictures}
     fields = STEADY if isinstance(run.solution, SteadySolution) else THROUGH_TIME
     files = [PAGE, ANSWERS, SERIES, fields, *pictures]
     page = build_report(heat_page(run, shown, command_line(run.options), files))

@@ -73,17 +73,23 @@ class CaptureFrames:
     dropped: dict[str, str] = field(default_factory=dict)
     """Why, by the frame's name."""
 
-    def save(self, folder: Path) -> None:
-        """Write the list of frames into a folder; their images lie there already."""
+    def save(self, folder: Path, root: Path) -> None:
+        """Write the list of frames into the folder that holds their images; both folders may be moved later."""
         content = asdict(self)
         for row in content["frames"]:
-            row |= {"photograph": str(row["photograph"]), "thermal": str(row["thermal"])}
+            for name in ("photograph", "thermal"):
+                inside = row[name].is_relative_to(folder.resolve())
+                row[name] = [inside, row[name].relative_to(folder.resolve() if inside else root.resolve()).as_posix()]
         write_json(folder / _LIST, content)
 
     @classmethod
-    def load(cls, folder: Path) -> CaptureFrames:
-        """Read the list of frames from a folder."""
+    def load(cls, folder: Path, root: Path) -> CaptureFrames:
+        """Read the list of frames from a folder, for a capture in `root`."""
         content = read_json(folder / _LIST)
+        for row in content["frames"]:
+            for name in ("photograph", "thermal"):
+                inside, relative = row[name]
+                row[name] = (folder if inside else root) / relative
         return cls(
             tuple(_frame_of(row) for row in content["frames"]),
             (content["thermal_size"][0], content["thermal_size"][1]),
@@ -150,13 +156,11 @@ def read_frames(
     kept = [frame for frame in frames if frame.name not in dropped]
     dead, kept = _without_stuck_pixels(kept, (height, width), thermal_mask)
     result = CaptureFrames(tuple(kept), (width, height), dead, dropped)
-    result.save(folder)
+    result.save(folder, root)
     return result
 
 
-def _read(
-    pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions
-) -> tuple[CaptureFrame, tuple[int, int]]:
+def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -> tuple[CaptureFrame, tuple[int, int]]:
     thermogram = read_thermogram(pair.thermal, radiometry)
     photograph, thermal_focal = pair.photograph, None
     if pair.in_one_file:
@@ -234,7 +238,6 @@ def _without_stuck_pixels(
 
 def _frame_of(row: dict[str, Any]) -> CaptureFrame:
     row = dict(row)
-    row |= {"photograph": Path(row["photograph"]), "thermal": Path(row["thermal"])}
     if row["gps"] is not None:
         row["gps"] = GpsFix(**row["gps"])
     if row["gimbal_deg"] is not None:

@@ -37,9 +37,9 @@ def find_up(
     """Find up from the cameras' own levels, else from how cameras are usually held.
 
     A camera pitched by p and rolled by r against gravity has up at (-sin r cos p, cos r cos p, -sin p) in its axes
-    x right, y up, z back: pitch 0 is level, -90 looks straight down. Without such angles two things are assumed: people
-    hold the sides of a picture level, so up is normal to the cameras' x axes where these turn enough; else up is the mean
-    of the cameras' y axes.
+    x right, y up, z back: pitch 0 is level, -90 looks straight down. Without such angles it is assumed that people hold
+    the sides of a picture level: up is normal to the cameras' x axes where these turn enough; else it is the mean of the
+    cameras' y axes.
 
     Args:
         camera_to_world: Poses, shape (n, 4, 4), axes x right, y up, z back.
@@ -61,7 +61,7 @@ def find_up(
     values, vectors = np.linalg.eigh(level.T @ level / len(level))
     turned = math.degrees(math.asin(math.sqrt(min(1.0, float(values[1])))))
     if len(level) >= 3 and turned > _TURNED_DEG:
-        normal = vectors[:, 0] * np.sign(vectors[:, 0] @ mean)
+        normal = vectors[:, 0] if vectors[:, 0] @ mean > 0 else -vectors[:, 0]
         if normal @ mean > math.cos(math.radians(45.0)):
             off = np.degrees(np.arcsin(np.clip(np.abs(level @ normal), 0.0, 1.0)))
             return Up(normal, "Assumed: the photographs' sides were held level.", float(np.median(off)))

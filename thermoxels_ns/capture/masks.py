@@ -129,6 +129,6 @@ def mask_files(folder: Path) -> dict[str, Path]:
 
 
 def _spread(stack: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """How much a pixel changes: from the second lowest to the second highest value, so that one odd frame is nothing."""
+    """How much a pixel changes: from its second lowest to its second highest value, past one odd frame."""
     ordered = np.sort(stack, axis=0)
     return ordered[-2] - ordered[1]

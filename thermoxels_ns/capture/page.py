@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
@@ -40,7 +40,6 @@ class CapturePage:
     """Everything the page says."""
 
     title: str
-    input_name: str
     pairs: Sequence[Pair]
     dropped: Mapping[str, str]
     """Why, by the frame or file."""
@@ -65,7 +64,6 @@ class CapturePage:
     overlay_share: float | None
     """Share of the photographs that is masked as drawn over; None: nothing is."""
     seconds: Sequence[tuple[str, float]]
-    notes: Sequence[str] = field(default_factory=tuple)
 
 
 def write_page(page: CapturePage, path: Path) -> None:
@@ -110,8 +108,7 @@ def _summary(page: CapturePage) -> str:
     ]
     if len(error):
         rows.insert(2, ("Median reprojection error", f"{np.median(error):.2f} pixels"))
-    notes = "".join(f"<p class=note>{escape(note)}</p>" for note in page.notes)
-    return _rows(rows) + notes
+    return _rows(rows)
 
 
 def _scale_text(page: CapturePage) -> str:
@@ -133,15 +130,17 @@ def _overlays(page: CapturePage) -> str:
     )
     cells = "".join(
         f"<h3>{escape(one.name)}</h3><div class=three>"
-        f'{_figure(one.start_url, "start value")}{_figure(one.found_url, "as written")}'
-        f'{_figure(one.thermal_url, "thermal image")}</div>'
+        f"{_figure(one.start_url, 'start value')}{_figure(one.found_url, 'as written')}"
+        f"{_figure(one.thermal_url, 'thermal image')}</div>"
         for one in page.overlays
     )
     return f"<p>{escape(words)}</p>{cells}"
 
 
 def _figure(url: str, words: str) -> str:
-    return f'<figure><img src="{url}" alt="{escape(words, quote=True)}"><figcaption>{escape(words)}</figcaption></figure>'
+    return (
+        f'<figure><img src="{url}" alt="{escape(words, quote=True)}"><figcaption>{escape(words)}</figcaption></figure>'
+    )
 
 
 def _dropped(dropped: Mapping[str, str]) -> str:
@@ -290,7 +289,6 @@ th, td { text-align: left; padding: .35rem .75rem .35rem 0; border-bottom: 1px s
   overflow-wrap: anywhere; }
 th { font-size: .85rem; font-weight: 600; color: var(--soft); }
 .num { text-align: right; font-variant-numeric: tabular-nums; }
-.note { color: var(--accent); }
 .three { display: grid; grid-template-columns: repeat(3, 1fr); gap: .6rem; align-items: start; }
 figure { margin: 0; }
 figcaption { font-size: .8rem; color: var(--soft); }

@@ -132,9 +132,7 @@ def read_pair_list(file: Path, folder: Path) -> PairSearch:
                 explain(where, expected=f"a file {missing[0]}", got="none", remedy="Correct the name in the list.")
             )
         pairs.append((photograph, thermal))
-    twice = [
-        path.name for side in zip(*pairs) for path, count in Counter(side).items() if count > 1
-    ]
+    twice = [path.name for side in zip(*pairs) for path, count in Counter(side).items() if count > 1]
     if twice or not pairs:
         raise SceneError(
             explain(
@@ -290,9 +288,7 @@ def _names(photographs: Sequence[Path], folder: Path) -> list[str]:
     stems = [slug(_without_role(path.stem)) for path in photographs]
     counted = Counter(stems)
     longer = [
-        stem
-        if counted[stem] == 1
-        else slug("-".join((*path.relative_to(folder).parts[:-1], _without_role(path.stem))))
+        stem if counted[stem] == 1 else slug("-".join((*path.relative_to(folder).parts[:-1], _without_role(path.stem))))
         for stem, path in zip(stems, photographs)
     ]
     seen: Counter[str] = Counter()

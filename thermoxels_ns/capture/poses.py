@@ -260,9 +260,7 @@ def _mapping_options(options: PoseOptions) -> Any:
     return mapping
 
 
-def _map(
-    database: Path, folder: Path, options: PoseOptions, count: int, say: Callable[[str], None]
-) -> list[Any]:
+def _map(database: Path, folder: Path, options: PoseOptions, count: int, say: Callable[[str], None]) -> list[Any]:
     import pycolmap
 
     found = [2]  # the first pair comes without a call

@@ -86,14 +86,15 @@ class RigClimber:
         own = slopes[:, self._free] * self._scale
         total, frames = own.sum(axis=0), len(own)
         centred = own - own.mean(axis=0)
-        scatter = centred.T @ centred * (frames / max(frames - 1, 1))
-        curvature = np.empty((len(z), len(z)))
+        scatter: FloatArray = centred.T @ centred * (frames / max(frames - 1, 1))
+        curvature: FloatArray = np.empty((len(z), len(z)))
         for number, step in enumerate(self._step):
             moved = z.copy()
             moved[number] += step
             ahead = self._score.with_slopes(self._full(moved))[1].sum(axis=0)[self._free] * self._scale
             curvature[number] = (total - ahead) / step
-        values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
+        symmetric: FloatArray = 0.5 * (curvature + curvature.T)
+        values, vectors = np.linalg.eigh(symmetric)
         values = np.maximum(np.abs(values), 1e-6 * max(float(np.abs(values).max()), 1e-12))
         ratio = np.einsum("ij,ik,kj->j", vectors, scatter, vectors) / values
         weight = 1.0 / max(float(np.median(ratio)), 1e-9)

@@ -65,7 +65,7 @@ class PreparedFrames:
         edges, thermal = [], []
         for frame in self.frames:
             small = cv2.resize(frame.contrast, size, interpolation=cv2.INTER_AREA)
-            thermal.append(ThermalEdges(edge_field(small, blur_px)))
+            thermal.append(ThermalEdges(edge_field(small.astype(np.float32), blur_px)))
             edges.append(self._edge_points(frame, level, change, blur_px))
         return RigScore(edges, thermal, level)
 
@@ -75,7 +75,7 @@ class PreparedFrames:
         scale = min(level.camera.fl_x / self.visible.resized(width, height).fl_x, 1.0)
         size = max(round(width * scale), 8), max(round(height * scale), 8)
         small = cv2.resize(frame.grey, size, interpolation=cv2.INTER_AREA)
-        field = edge_field(small, blur_px)
+        field = edge_field(small.astype(np.float32), blur_px)
         rows, columns = np.nonzero(np.abs(field) > _WEAKEST_EDGE)
         rays = self.visible.resized(*size).rays(np.column_stack([columns + 0.5, rows + 0.5]))
         seen = level.project(change, rays * self.median_depth)

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -38,38 +37,32 @@ class ThermalEdges:
     def __init__(self, field: npt.NDArray[np.complex64]) -> None:
         """Take edge values, shape (height, width). Towards the border points count less and less."""
         height, width = field.shape
-        self.size = width, height
         taper = np.minimum.outer(_ramp(height), _ramp(width)).astype(np.float32)
-        strength = (field.real**2 + field.imag**2) * taper
-        self._values = np.dstack([field.real * taper, field.imag * taper, taper, strength]).astype(np.float32)
-        slopes = [
-            cv2.filter2D(self._values, cv2.CV_32F, kernel, borderType=cv2.BORDER_CONSTANT)
-            for kernel in (np.array([[-0.5, 0.0, 0.5]]), np.array([[-0.5], [0.0], [0.5]]))
-        ]
-        self._slopes = slopes
         self.field = field
         self.weight = taper
+        strength = np.abs(field) ** 2 * taper
+        values = np.dstack([field.real * taper, field.imag * taper, taper, strength]).astype(np.float32)
+        values = np.pad(values, ((2, 2), (2, 2), (0, 0)))  # zeros around, so that everything outside reads 0
+        self._planes = np.zeros((height + 4, width + 4, 12), np.float32)
+        self._planes[..., :4] = values
+        self._planes[:, 1:-1, 4:8] = 0.5 * (values[:, 2:] - values[:, :-2])
+        self._planes[1:-1, :, 8:] = 0.5 * (values[2:] - values[:-2])
 
-    def sample(self, pixels: FloatArray, slopes: bool = True) -> tuple[npt.NDArray, list[npt.NDArray]]:
-        """Values (n, 4) at pixel positions (n, 2) and their derivatives along x and y (each (n, 4)).
+    def sample(self, pixels: FloatArray) -> tuple[npt.NDArray[np.float32], ...]:
+        """Values (n, 4) at pixel positions (n, 2) and their derivatives along x and along y, each (n, 4).
 
         The four are: real and imaginary part of the edge value, weight, strength. All are 0 outside the image.
         """
-        place = np.nan_to_num(pixels, nan=-10.0, posinf=-10.0, neginf=-10.0).astype(np.float32) - np.float32(0.5)
-        place = np.clip(place, -10.0, 30_000.0)
-        columns = 1024
-        rows = -(-len(place) // columns)
-        padded = np.full((rows * columns, 2), -10.0, np.float32)
-        padded[: len(place)] = place
-        grid = padded.reshape(rows, columns, 2)
-
-        def look(image: npt.NDArray) -> npt.NDArray:
-            out = cv2.remap(
-                image, grid[..., 0], grid[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0
-            )
-            return out.reshape(-1, 4)[: len(place)]
-
-        return look(self._values), [look(slope) for slope in self._slopes] if slopes else []
+        rows, columns, _ = self._planes.shape
+        place = np.nan_to_num(pixels, nan=-9.0, posinf=-9.0, neginf=-9.0) + 1.5  # from the padded corner's centre
+        x, y = np.clip(place[:, 0], 0.0, columns - 1.001), np.clip(place[:, 1], 0.0, rows - 1.001)
+        left, top = x.astype(np.int64), y.astype(np.int64)
+        u, v = (x - left).astype(np.float32)[:, None], (y - top).astype(np.float32)[:, None]
+        flat, first = self._planes.reshape(rows * columns, 12), top * columns + left
+        above = flat[first] * (1 - u) + flat[first + 1] * u
+        below = flat[first + columns] * (1 - u) + flat[first + columns + 1] * u
+        out = above * (1 - v) + below * v
+        return out[:, :4], out[:, 4:8], out[:, 8:]
 
 
 class RigScore:
@@ -94,7 +87,7 @@ class RigScore:
         score, (_, own, other) = _score(total), np.maximum(total, _TINY)
         scale = 1.0 / np.sqrt(own * other)
         rows = []
-        for one, (_, along) in zip(self.edges, sampled):
+        for one, (_, *along) in zip(self.edges, sampled):
             a, b = scale * one.value.real, scale * one.value.imag
             c, d = (-0.5 * score / own) * np.abs(one.value) ** 2, -0.5 * score / other
             slope = np.column_stack([a * v[:, 0] + b * v[:, 1] + c * v[:, 2] + d * v[:, 3] for v in along])
@@ -106,7 +99,7 @@ class RigScore:
         count = len(self.edges)
         rows = []
         for number, one in enumerate(self.edges):
-            values, _ = self.thermal[(number + shift) % count].sample(self.rig.project(change, one.points), False)
+            values, _, _ = self.thermal[(number + shift) % count].sample(self.rig.project(change, one.points))
             rows.append(_weighted_sums(one.value, values))
         return np.array(rows)
 

@@ -49,8 +49,8 @@ class RoughSearch:
         """
         camera = score.rig.camera
         self._rig = score.rig
-        rows, columns = (fft.next_fast_len(int(_PADDING * length)) for length in (camera.height, camera.width))
-        self._shape = (rows, columns)
+        rows, columns = (_padded_length(length) for length in (camera.height, camera.width))
+        self._shape: tuple[int, int] = (rows, columns)
         content = [float(np.sum(np.abs(edges.field) ** 2 * edges.weight)) for edges in score.thermal]
         chosen = np.sort(np.argsort(-np.array(content), kind="stable")[:_MOST_FRAMES])
         self._edges = [score.edges[number] for number in chosen]
@@ -108,13 +108,13 @@ class RoughSearch:
         other = own.copy()
         for edges, field, (_, weight, strength) in zip(self._edges, fields, self._thermal):
             value, power, count = self._splat(edges, change)
-            product += np.conj(fft.fft2(value)) * field
-            own += np.conj(fft.rfft2(power)) * weight
-            other += np.conj(fft.rfft2(count)) * strength
-        overlap = fft.irfft2(own, s=self._shape)
+            product += np.conj(np.asarray(fft.fft2(value))) * field
+            own += np.conj(np.asarray(fft.rfft2(power))) * weight
+            other += np.conj(np.asarray(fft.rfft2(count))) * strength
+        overlap, strengths = np.asarray(fft.irfft2(own, s=self._shape)), np.asarray(fft.irfft2(other, s=self._shape))
         enough = overlap > _SMALLEST_OVERLAP * max(float(overlap.max()), 1e-12)
-        norm = np.where(enough, np.maximum(overlap * fft.irfft2(other, s=self._shape), 1e-12), np.inf)
-        return fft.ifft2(product).real / np.sqrt(norm)
+        norm = np.where(enough, np.maximum(overlap * strengths, 1e-12), np.inf)
+        return np.asarray(fft.ifft2(product)).real / np.sqrt(norm)
 
     def _splat(self, edges: EdgePoints, change: FloatArray) -> tuple[npt.NDArray, npt.NDArray, npt.NDArray]:
         """Edge values, their power and their number in each pixel of the padded image.
@@ -145,6 +145,11 @@ class RoughSearch:
             shifted[:2] = -(row - down) / focal[1], (column - across) / focal[0]
             found.append(RoughRig(shifted, float(window[row, column])))
         return found
+
+
+def _padded_length(length: int) -> int:
+    """A length that Fourier transforms are fast at, with room for shifts."""
+    return int(fft.next_fast_len(int(_PADDING * length)) or 0)
 
 
 def _steps(reach: float, step: float) -> FloatArray:

@@ -102,7 +102,6 @@ class _Run:
     dropped: dict[str, str] = field(default_factory=dict)
 
     def all(self) -> CaptureResult:
-        settings = self.settings
         pairs = self.find_pairs()
         read = self.read_temperatures(pairs)
         found = self.find_poses(read)
@@ -112,10 +111,8 @@ class _Run:
         rig, start = self.find_rig(model, frames, read)
         drift = self.find_drift(model, frames, rig)
         scene = Scene(frames, model, rig, drift, scale, up, self.masks(frames, model))
-        # The stage's folder holds nothing: its result lies in the output folder.
-        written = [self.output / JSON_NAME, self.output / "images", self.output / "thermal"]
-        there = all(path.exists() for path in written)
-        self.cache.run("scene", {"there": there or None}, lambda _: self._write_scene(scene))
+        written = [self.output / name for name in (JSON_NAME, "images", "thermal")]
+        self.cache.run("scene", {}, lambda _: self._write_scene(scene), written)
         findings = Findings(
             source=self.source,
             pairs=pairs,
@@ -128,10 +125,7 @@ class _Run:
             seconds=self.cache.seconds,
         )
         page = self.output / PAGE_NAME
-        self.cache.run(
-            "page", {"there": page.is_file() or None}, lambda _: report_page(findings, page)
-        )
-        del settings
+        self.cache.run("page", {}, lambda _: report_page(findings, page), [page])
         return CaptureResult(
             self.output / JSON_NAME, page, len(pairs), len(frames), self.dropped, rig, drift, scale, missing
         )
@@ -195,20 +189,25 @@ class _Run:
         depends = {"options": options, "skip_bad": settings.skip_bad, "mask": _fingerprints([settings.thermal_mask])}
 
         def work(folder: Path) -> None:
-            read = read_frames(
-                pairs, self.source, folder, options, settings.skip_bad, settings.thermal_mask, self.say
+            read = read_frames(pairs, self.source, folder, options, settings.skip_bad, settings.thermal_mask, self.say)
+            self.say(
+                f"temperatures: {len(read.frames)} thermal images of {read.thermal_size[0]} x "
+                f"{read.thermal_size[1]} pixels"
             )
-            self.say(f"temperatures: {len(read.frames)} thermal images of {read.thermal_size[0]} x "
-                     f"{read.thermal_size[1]} pixels")
 
-        read = CaptureFrames.load(self.cache.run("temperatures", depends, work))
+        read = CaptureFrames.load(self.cache.run("temperatures", depends, work), self.source)
         self.dropped |= read.dropped
         return read
 
     def find_poses(self, read: CaptureFrames) -> SfmModel:
         settings = self.settings
         options = PoseOptions(
-            settings.image_size, settings.max_features, settings.matching, settings.lens, settings.seed, settings.threads
+            settings.image_size,
+            settings.max_features,
+            settings.matching,
+            settings.lens,
+            settings.seed,
+            settings.threads,
         )
         given = [] if settings.poses is None else _files_of(settings.poses)
         masks = [] if settings.masks is None else list(mask_files(settings.masks).values())
@@ -242,9 +241,7 @@ class _Run:
         self.dropped |= read_json(folder / "dropped.json")
         return results.load_model(folder)
 
-    def find_scale(
-        self, found: SfmModel, read: CaptureFrames
-    ) -> tuple[SfmModel, MetricScale | None, str, Up]:
+    def find_scale(self, found: SfmModel, read: CaptureFrames) -> tuple[SfmModel, MetricScale | None, str, Up]:
         settings = self.settings
         depends = {
             "known": [settings.known_distance, settings.known_distance_error_m],

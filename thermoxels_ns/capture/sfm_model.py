@@ -11,6 +11,7 @@ import numpy.typing as npt
 from thermoxels_ns.capture.contract import OPENGL_FROM_OPENCV, CameraModel, FloatArray
 from thermoxels_ns.errors import SceneError, explain
 
+
 @dataclass(frozen=True)
 class SfmModel:
     """Poses of the photographs and the points that they share, in one arbitrary unit of length.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -23,7 +23,7 @@ class SparseDepth:
         """Take points (n, 3) in OpenCV camera axes; those not ahead of the camera are left out."""
         ahead = points[points[:, 2] > 0.0]
         self._inverse = 1.0 / ahead[:, 2]
-        self._tree = cKDTree(ahead[:, :2] * self._inverse[:, None]) if len(ahead) else None
+        self._tree = KDTree(ahead[:, :2] * self._inverse[:, None]) if len(ahead) else None
 
     def at(self, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Depth along the camera's axis for rays (n, 3) of depth 1.

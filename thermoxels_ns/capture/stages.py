@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from thermoxels_ns import __version__
 from thermoxels_ns.checks import replace_when_done, writable_folder
 from thermoxels_ns.errors import OutputError, ThermoxelsError, explain
 
@@ -39,7 +40,13 @@ class StageCache:
     """Stages in order and the time each took, also where it was taken from the cache, [s]."""
     _previous: str = ""
 
-    def run(self, name: StageName, depends_on: Mapping[str, Any], work: Callable[[Path], None]) -> Path:
+    def run(
+        self,
+        name: StageName,
+        depends_on: Mapping[str, Any],
+        work: Callable[[Path], None],
+        writes: Sequence[Path] = (),
+    ) -> Path:
         """Run a stage, or take its earlier result.
 
         Args:
@@ -47,22 +54,24 @@ class StageCache:
             depends_on: Everything but the earlier stages that its result depends on; json must be able to hold it.
             work: Writes the result into the folder that it is given; that may hold what an interrupted run with the
                 same key left.
+            writes: Files that the stage writes elsewhere; where one is gone, the stage runs again.
 
         Returns:
             The folder with the result.
         """
-        content = json.dumps([name, self._previous, depends_on], sort_keys=True, default=str)
+        content = json.dumps([__version__, name, self._previous, depends_on], sort_keys=True, default=str)
         key = hashlib.sha256(content.encode()).hexdigest()
         self._previous = key
         folder = self.folder / CACHE_FOLDER / name
         forced = self.from_stage is not None and STAGES.index(name) >= STAGES.index(self.from_stage)
         title = f"{STAGES.index(name) + 1}/{len(STAGES)} {name}"
-        done = _read_done(folder) if not forced and _read_key(folder) == key else None
+        stale = forced or _read_key(folder) != key
+        done = None if stale or not all(path.exists() for path in writes) else _read_done(folder)
         if done is not None:
             self.say(f"{title}: as before")
             self.seconds.append((name, done))
             return folder
-        if forced or _read_key(folder) != key:
+        if stale:
             shutil.rmtree(folder, ignore_errors=True)
         writable_folder(folder)
         (folder / _DONE_FILE).unlink(missing_ok=True)

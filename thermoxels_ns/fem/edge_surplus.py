@@ -160,8 +160,8 @@ class EdgeSurplus:
                 matrix = sparse.csr_matrix(matrix + quadratic.radiation_slope(begin_k, time_s))
                 nodes = nodes + linear.radiation_slope(begin_k[: linear.num_nodes], time_s)
             free = linear.fixed.free
-            nodes = sparse.csr_matrix(nodes if len(free) == linear.num_nodes else nodes[free][:, free])
-            self._kept = step_s, matrix, LinearSolver(nodes, relative_tolerance=_NODE_TOLERANCE)
+            block = sparse.csr_matrix(sparse.csr_matrix(nodes)[free][:, free])
+            self._kept = step_s, matrix, LinearSolver(block, relative_tolerance=_NODE_TOLERANCE)
         return self._kept[1:]
 
 

@@ -53,8 +53,8 @@ class QuadraticSpace(LinearSpace):
     def to_mesh_nodes(self, heat_w: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Move half of an edge's heat to each of its ends, shape (v,); the transpose of `from_mesh_nodes`."""
         corners, edges = heat_w[: self._num_corners], 0.5 * heat_w[self._num_corners :]
-        total = corners + sums_by_number(self._edges.smaller_nodes(), edges, self._num_corners)
-        return total + sums_by_number(self._edges.other, edges, self._num_corners)
+        total = corners + np.bincount(self._edges.smaller_nodes(), edges, self._num_corners)
+        return total + np.bincount(self._edges.other, edges, self._num_corners)
 
     def tet_nodes(self) -> npt.NDArray[np.int64]:
         """Corners of each tetrahedron, then the middles of its edges, shape (t, 10)."""

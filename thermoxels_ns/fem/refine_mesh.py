@@ -59,7 +59,7 @@ def refine_mesh(mesh: TetMesh) -> TetMesh:
             seen=np.repeat(tags.seen, 4),
             patch=np.repeat(tags.patch, 4),
         ),
-        colour=None if colour is None else np.concatenate([colour, midpoints(edges, colour).astype(np.float32)]),
+        colour=None if colour is None else np.concatenate([colour, 0.5 * (colour[low] + colour[high])]),
     )
 
 

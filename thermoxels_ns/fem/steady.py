@@ -112,7 +112,7 @@ def _check_held(system: HeatSystem, time_s: float) -> None:
         return
     sizes = np.bincount(system.pieces.number, minlength=system.pieces.count)
     piece = int(loose[np.argmax(sizes[loose])])
-    points = system.points_m[system.pieces.number == piece]
+    points = system.space.points_m[system.pieces.number == piece]
     low, high = (", ".join(f"{part:.4g}" for part in corner) for corner in (points.min(axis=0), points.max(axis=0)))
     raise HeatError(
         explain(

@@ -90,11 +90,6 @@ class HeatSystem:
         return self._space
 
     @property
-    def points_m(self) -> npt.NDArray[np.float64]:
-        """Positions of the nodes, shape (n, 3), [m]."""
-        return self._space.points_m
-
-    @property
     def start_k(self) -> Vector:
         """Temperatures at the start, relative to the reference, shape (n,), [K]."""
         return self._space.from_mesh_nodes(self.problem.start_c - self.reference_c)

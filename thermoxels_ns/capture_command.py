@@ -1,0 +1,70 @@
+"""The command ``thermoxels capture``: from the folder of a memory card to a scene that can be trained.
+
+Only light imports at the top, so that ``thermoxels --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from thermoxels_ns.capture.settings import CaptureSettings
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from thermoxels_ns.capture.run import CaptureResult
+
+_LISTED = 10
+
+
+@dataclass
+class Capture(CaptureSettings):
+    """Turn camera files into a scene: pair photographs with thermal images, read temperatures, find poses, scale, the
+    rig between the two cameras and drift, and write a scene for thermal-data and a page to judge it by."""
+
+    source: tyro.conf.Positional[Path] = field(kw_only=True)
+    """Folder of camera files; it is only read."""
+    output: Path = field(kw_only=True)
+    """Folder for the scene and capture.html; made if it does not exist. An earlier capture in it goes on where it
+    stopped."""
+
+    def main(self) -> None:
+        """Run the capture.
+
+        Raises:
+            ThermoxelsError: A file cannot be read, there are no pairs or no poses, or an option is out of range.
+        """
+        from rich.console import Console
+
+        from thermoxels_ns.capture.run import run_capture
+
+        console = Console(highlight=False)
+        result = run_capture(
+            self.source, self.output, self, lambda line: console.print(line, markup=False, soft_wrap=True)
+        )
+        _print_result(result, self.output, console)
+
+
+def _print_result(result: CaptureResult, folder: Path, console: Console) -> None:
+    """Say what was made, what was left out and what to do next."""
+
+    def say(line: str, style: str | None = None) -> None:
+        console.print(line, style=style, markup=False, soft_wrap=True)
+
+    say(f"{result.frames} frames of {result.pairs} pairs are in the scene.")
+    if result.dropped:
+        say(f"Left out: {len(result.dropped)}", "bold yellow")
+        for name, why in list(result.dropped.items())[:_LISTED]:
+            say(f"  {name}: {why}")
+        if len(result.dropped) > _LISTED:
+            say(f"  and {len(result.dropped) - _LISTED} more, listed in {result.page}")
+    if not result.rig.determined:
+        say(f"The rig was not determined. {result.rig.explanation}", "bold yellow")
+    if result.scale is None:
+        say(f"The scale is unknown: {result.scale_missing}. Give a length when you export.", "bold yellow")
+    say(f"What was found, with pictures to judge it by: {result.page}")
+    say(f"Train with: ns-train thermoxels thermal-data --data {folder}")
