@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import permutations
-
 import numpy as np
 
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
@@ -36,8 +34,7 @@ def shell_mesh(
     for axes in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         for signs in np.ndindex(*((1, 1, 1) if eighth else (2, 2, 2))):
             mirrored = quarter[:, axes] * (1.0 - 2.0 * np.array(signs))
-            even = (sum(signs) + (tuple(axes) not in _EVEN)) % 2 == 0
-            blocks.append((tets if even else tets[:, [1, 0, 2, 3]]) + len(points) * len(quarter))
+            blocks.append((tets if sum(signs) % 2 == 0 else tets[:, [1, 0, 2, 3]]) + len(points) * len(quarter))
             points.append(mirrored)
     every = np.concatenate(points)
     _, first, number = np.unique(np.round(every / outer_m, 9) + 0.0, axis=0, return_index=True, return_inverse=True)
@@ -63,5 +60,3 @@ def shell_mesh(
         ),
     )
 
-
-_EVEN = {p for p in permutations(range(3)) if np.linalg.det(np.eye(3)[list(p)]) > 0.0}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.fem.solution import HeatSolution
-from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 
 Vector = npt.NDArray[np.float64]
 
@@ -45,7 +44,9 @@ def draw_surface(
     from thermoxels_ns.mesh.pictures import picture_of_mesh
 
     start, end, change, cut = PICTURES
-    seen = np.ones(len(mesh.facets), dtype=bool) if mesh.boundary is None else mesh.boundary.seen
+    seen = mesh.facet_tags != FACET_BOX
+    if mesh.boundary is not None:
+        seen = seen & mesh.boundary.seen
     shown = np.unique(mesh.facets[seen] if seen.any() else mesh.facets)
     steady = len(times_s) == 1
     ends = states_c[[0, -1]][:, shown]
@@ -53,9 +54,9 @@ def draw_surface(
     first, last = in_words(float(times_s[0])), in_words(float(times_s[-1]))
     when = ", steady" if steady else f" at {last}"
     picture_of_mesh(folder / end, mesh, states_c[-1], title=f"Surface temperature{when}", **same)
-    half, view = cut_open(mesh, up)
+    half, values, view = cut_open(mesh, states_c[-1], up)
     title = f"Cut through the middle{when}"
-    picture_of_mesh(folder / cut, half, states_c[-1], title=title, up=up, view_direction=view)
+    picture_of_mesh(folder / cut, half, values, title=title, up=up, view_direction=view.tolist())
     if steady:
         return [end, cut]
     difference = states_c[-1] - states_c[0]
@@ -66,42 +67,48 @@ def draw_surface(
     return list(PICTURES)
 
 
-def cut_open(mesh: TetMesh, up: tuple[float, float, float]) -> tuple[TetMesh, tuple[float, float, float]]:
+def cut_open(mesh: TetMesh, nodal_c: Vector, up: tuple[float, float, float]) -> tuple[TetMesh, Vector, Vector]:
     """Take away the half of a body in front of an upright plane through its middle.
 
     Args:
         mesh: The body.
+        nodal_c: Nodal values, shape (n,).
         up: Direction that points up.
 
     Returns:
-        half: The mesh with the other half of its tetrahedra, and all nodes.
-        view: Direction to look in.
+        half: What is left, as a mesh to draw: its nodes and boundary triangles are real, its tetrahedra only a number.
+        values: Values at its nodes.
+        view: Direction to look in, shape (3,).
     """
-    from thermoxels_ns.mesh.voxel_tets import boundary_facets
+    import pyvista as pv
+    from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
 
     upwards = np.array(up) / np.linalg.norm(up)
-    # Across the longer of the two sides, so that the cut is the larger one.
+    # Across the shorter of the two sides, so that the cut is the larger one.
     sides = [axis - (axis @ upwards) * upwards for axis in np.eye(3)]
-    sides = sorted(
-        (side for side in sides if np.linalg.norm(side) > 0.5), key=lambda side: np.ptp(mesh.points_m @ side)
-    )
-    towards = sides[0] / np.linalg.norm(sides[0])
+    sides = [side / np.linalg.norm(side) for side in sides if np.linalg.norm(side) > 0.5]
+    towards = min(sides, key=lambda side: float(np.ptp(mesh.points_m @ side)))
     across = mesh.points_m @ towards
-    # A little off the middle, which on a lattice may lie between two layers that are neither in nor out.
-    middle = 0.5 * (across.min() + across.max()) + 1e-6 * np.ptp(across)
-    kept = across[mesh.tets].mean(axis=1) <= middle
-    tets = mesh.tets[kept] if kept.any() else mesh.tets
-    facets = boundary_facets(tets)
-    half = replace(
-        mesh,
-        tets=tets,
+    origin = towards * 0.5 * float(across.min() + across.max())
+    grid = pv.UnstructuredGrid({pv.CellType.TETRA: mesh.tets}, mesh.points_m)
+    grid.point_data["value"] = nodal_c
+    outside = vtkDataSetSurfaceFilter()
+    outside.SetInputData(grid.clip(normal=tuple(towards), origin=tuple(origin)))
+    outside.Update()
+    surface: Any = pv.wrap(outside.GetOutput()).triangulate()
+    points = np.array(surface.points, dtype=np.float64)
+    facets = np.array(surface.regular_faces, dtype=np.int64)
+    half = TetMesh(
+        points_m=points,
+        tets=np.zeros_like(mesh.tets),
+        temperature_c=np.array(surface.point_data["value"], dtype=np.float64),
+        observed=np.ones(len(points), dtype=bool),
         facets=facets,
         facet_tags=np.zeros(len(facets), np.int64),
-        region=mesh.region[kept] if kept.any() else mesh.region,
-        boundary=None,
+        region=mesh.region,
+        region_names=mesh.region_names,
     )
-    x, y, z = (-(towards + 0.25 * np.cross(upwards, towards) + 0.3 * upwards)).tolist()
-    return half, (x, y, z)
+    return half, half.temperature_c, -(towards + 0.25 * np.cross(upwards, towards) + 0.3 * upwards)
 
 
 def plot_over_time(solution: HeatSolution, mean_c: Vector, probes_c: Vector, probe_names: Sequence[str]) -> str:

@@ -98,6 +98,9 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
         nonlocal start
         seconds[name], start = clock.perf_counter() - start, clock.perf_counter()
 
+    if not options.leave_out_below_k >= 0.0:
+        got, remedy = options.leave_out_below_k, "Pass 0 to build everything."
+        raise HeatError(explain("leave-out-below-k", expected="a number of at least 0", got=got, remedy=remedy))
     scene = load_heat_scene(options.scene)
     export = _export_summary(options.mesh)
     mesh = read_mesh(options.mesh)

@@ -62,7 +62,7 @@ def image_pairs(count: int, matching: Matching) -> npt.NDArray[np.int64]:
     near = np.stack([first, first + step], axis=1)
     anchors = np.unique(np.linspace(0, count - 1, min(_ANCHORS, count)).round().astype(np.int64))
     far = anchors[_all_pairs(len(anchors))]
-    return np.unique(np.concatenate([near[near[:, 1] < count], far]), axis=0)
+    return np.unique(np.concatenate([near[near[:, 1] < count], far]).astype(np.int64), axis=0)
 
 
 def _all_pairs(count: int) -> npt.NDArray[np.int64]:

@@ -38,8 +38,8 @@ def find_up(
 
     A camera pitched by p and rolled by r against gravity has up at (-sin r cos p, cos r cos p, -sin p) in its axes
     x right, y up, z back: pitch 0 is level, -90 looks straight down. Without such angles it is assumed that people hold
-    the sides of a picture level: up is normal to the cameras' x axes where these turn enough; else it is the mean of the
-    cameras' y axes.
+    the sides of a picture level: up is normal to the cameras' x axes where these turn enough, else the mean of their
+    y axes.
 
     Args:
         camera_to_world: Poses, shape (n, 4, 4), axes x right, y up, z back.

@@ -310,7 +310,7 @@ class _Run:
                 why = "Switched off." if self.settings.drift == "off" else "There are no scene points to compare at."
                 drift = DriftEstimate(np.zeros(len(frames)), (), np.nan, np.nan, False, why)
             else:
-                drift = estimate_drift(rig_frames(model, frames), model.camera, rig)
+                drift = estimate_drift(rig_frames(model, frames), rig.thermal_camera, rig.visible_to_thermal)
             results.save_drift(folder, drift)
             self.say(f"drift: {drift.explanation}")
 

@@ -35,5 +35,6 @@ class SparseDepth:
         if self._tree is None:
             return np.full(len(rays), np.inf), np.full(len(rays), np.inf)
         count = min(_NEIGHBOURS, len(self._inverse))
-        distance, index = self._tree.query(rays[:, :2], k=np.arange(1, count + 1))
+        distance, index = self._tree.query(rays[:, :2], k=count)
+        distance, index = np.reshape(distance, (len(rays), count)), np.reshape(index, (len(rays), count))
         return 1.0 / np.quantile(self._inverse[index], _NEAR_QUANTILE, axis=1), distance[:, 0]

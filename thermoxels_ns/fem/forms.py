@@ -144,16 +144,16 @@ class SourceForm:
     def __init__(self, term: SourceTerm, space: LinearSpace) -> None:
         self.effect = term.effect
         self._term, self._space = term, space
-        self._places = space.selection.tet_places(term.tets)
-        self._volumes = space.tet_volumes_m3(term.tets)
+        self._places, self._volumes = space.source_points(term.tets)
         mesh = space.selection.mesh
-        used, self._group = np.unique(mesh.region[term.tets], return_inverse=True)
+        used, group = np.unique(mesh.region[term.tets], return_inverse=True)
+        self._group = np.repeat(group, len(self._places) // len(term.tets))
         self.groups = tuple(mesh.region_names[number] for number in used)
         self.load_in_time = term.source_w_m3.in_time
 
     def load(self, time_s: float) -> Vector:
         """Entries integral(s phi_i), [W]."""
-        return self._space.tet_load(self._term.tets, self._heat_w(time_s))
+        return self._space.source_load(self._term.tets, self._heat_w(time_s))
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat set free in each region, [W]."""

@@ -100,6 +100,14 @@ class LinearSpace:
         nodes = self.selection.mesh.tets[tets]
         return sums_by_number(nodes.ravel(), np.repeat(0.25 * heat_w, 4), self.num_nodes)
 
+    def source_points(self, tets: npt.NDArray[np.int64]) -> tuple[Places, npt.NDArray[np.float64]]:
+        """Places where sources in tetrahedra are asked, those of one after the other, and the volume of each, [m3]."""
+        return self.selection.tet_places(tets), self.tet_volumes_m3(tets)
+
+    def source_load(self, tets: npt.NDArray[np.int64], point_w: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Spread heat at the points of `source_points` over the nodes, shape (n,), [W]."""
+        return self.tet_load(tets, point_w)
+
     def tet_volumes_m3(self, tets: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
         """Volumes of tetrahedra, shape (k,), [m3]."""
         corner = self.selection.mesh.points_m[self.selection.mesh.tets[tets]]

@@ -9,11 +9,15 @@ from scipy import sparse
 from thermoxels_ns.fem.edge_midpoints import FACET_EDGES, TET_EDGES, edge_numbers, midpoints
 from thermoxels_ns.fem.linear_space import SIX_POINTS, FacetRule, LinearSpace, sums_by_number
 from thermoxels_ns.fem.quadratic_elements import edge_shapes, mass_matrix, stiffness_matrix
+from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.sparsity import mesh_edges
 
 _QUADRATIC_SIX_POINTS = FacetRule(edge_shapes(SIX_POINTS.shapes), SIX_POINTS.weights)
 """The same points as in P1; of products of quadratic functions they are exact too."""
+_FOUR_POINTS = (5.0 - np.sqrt(5.0)) / 20.0 + np.eye(4) / np.sqrt(5.0)
+"""Points of a tetrahedron whose mean integrates polynomials of degree 2 exactly (Hammer and Stroud 1956): what a source
+is integrated with, so that the error of the temperature falls with the cube of the mesh size."""
 
 
 class QuadraticSpace(LinearSpace):
@@ -77,6 +81,18 @@ class QuadraticSpace(LinearSpace):
         """Nodes of boundary triangles, corners first, shape (k, 6)."""
         corners = self.selection.mesh.facets[facets]
         return np.concatenate([corners, self._num_corners + edge_numbers(self._edges, corners, FACET_EDGES)], axis=1)
+
+    def source_points(self, tets: npt.NDArray[np.int64]) -> tuple[Places, npt.NDArray[np.float64]]:
+        """Places where sources in tetrahedra are asked, those of one after the other, and the volume of each, [m3]."""
+        corners = self.selection.mesh.points_m[self.selection.mesh.tets[tets]]
+        points = np.einsum("qa,tai->tqi", _FOUR_POINTS, corners).reshape(-1, 3)
+        volumes = np.repeat(self.tet_volumes_m3(tets) / len(_FOUR_POINTS), len(_FOUR_POINTS))
+        return Places(points, np.zeros_like(points), self.selection.up), volumes
+
+    def source_load(self, tets: npt.NDArray[np.int64], point_w: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Spread heat at the points of `source_points` over the nodes, shape (n,), [W]."""
+        shares = point_w.reshape(-1, len(_FOUR_POINTS)) @ edge_shapes(_FOUR_POINTS)
+        return sums_by_number(self.tet_nodes()[tets].ravel(), shares.ravel(), self.num_nodes)
 
     def tet_load(self, tets: npt.NDArray[np.int64], heat_w: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Spread heat that is even in each tetrahedron over the nodes: -1/20 to a corner, 1/5 to an edge; [W]."""

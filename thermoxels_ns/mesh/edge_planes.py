@@ -10,6 +10,7 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial import KDTree
 
 from thermoxels_ns.mesh.quality import facet_area_vectors
+from thermoxels_ns.mesh.stuffing import StuffedSolid
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -162,7 +163,7 @@ def _planes_beside(surface: Surface, nodes: IntArray, tree: KDTree, centroids: F
         Those of the nodes with surface in different directions beside them, and their planes.
     """
     distance, found = tree.query(surface.points[nodes], k=_NEAREST, distance_upper_bound=_REACH)
-    several = np.flatnonzero(np.isfinite(distance[:, 2 * _LEAST_FACETS - 1]))
+    several = np.flatnonzero(np.count_nonzero(np.isfinite(distance), axis=1) >= 2 * _LEAST_FACETS)
     nodes, distance, found = nodes[several], distance[several], found[several]
     usable = np.isfinite(distance)
     found = np.where(usable, found, 0)

@@ -92,6 +92,7 @@ def write_vtk(writer: Any, path: Path, data: Any) -> None:
     with replace_when_done(path) as temporary:
         writer.SetFileName(str(temporary))
         writer.SetInputData(data)
+        writer.SetCompressionLevel(1)  # a quarter of the time of the default, for files 5 % larger
         if not writer.Write() or writer.GetErrorCode() or not temporary.is_file():
             raise OutputError(
                 explain(

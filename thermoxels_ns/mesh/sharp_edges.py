@@ -43,9 +43,10 @@ def sharpen(solid: StuffedSolid, shape: tuple[int, ...]) -> StuffedSolid:
 
     Planes come from the flat parts of the surface within three voxels, never from the chamfer: the triangles there
     are sorted by their normals into at most three planes. Where it is not clear that there are two or three of them,
-    as on smooth or noisy surfaces and walls of less than 3 voxels, nothing moves. Nodes move one after another, those with the shortest way
-    first, each only if all tetrahedra around it keep their dihedral angles between 13 and 160 degrees and their
-    volumes above 0. Nodes on the border of the lattice stay, and so do those that would come near to another surface.
+    as on smooth or noisy surfaces and walls of less than 3 voxels, nothing moves. Nodes move one after another, those
+    with the shortest way first, each only if all tetrahedra around it end up with dihedral angles between 13 and 160
+    degrees and volumes above 0. Nodes on the border of the lattice stay, and so do those with another surface in
+    front of them.
 
     Measured at 48 voxels across: the area of boxes at any angle is within 0.5 % instead of 3.2 %, that of a cylinder
     within 0.1 % instead of 1.4 %, and true edges are 0.04 to 0.11 voxels from the mesh on average instead of 0.38.
