@@ -81,17 +81,21 @@ def read_results(eval_json: Path, summary_json: Path) -> DemoResults:
         ("Surface precision", f"{truth.number('precision'):.3f}"),
         ("Surface recall", f"{truth.number('recall'):.3f}"),
         (
-            "Distance of the surface to the true one, mean",
-            f"{truth.number('mean_distance_voxels'):.2f} voxels, {1e3 * truth.number('mean_distance_m'):.1f} mm",
+            "Distance between the mesh's and the true surface, mean of both ways (Chamfer)",
+            f"{truth.number('chamfer_voxels'):.2f} voxels, {1e3 * truth.number('chamfer_m'):.1f} mm",
         ),
         (
-            "Temperature error of measured mesh nodes near the true surface, mean",
-            f"{truth.number('temperature_mae_c'):.2f} °C ({truth.number('temperature_nodes'):.0f} nodes)",
+            "Temperature error of the mesh on the seen surface, mean",
+            f"{truth.number('temperature_seen_mae_c'):.2f} °C "
+            f"({100.0 * truth.number('share_of_seen_reached'):.0f} % of the surface)",
         ),
-        ("Volume of the mesh", f"{truth.number('volume_m3'):.4g} m³ (true: {truth.number('true_volume_m3'):.4g} m³)"),
         (
-            "Surface of the mesh, a staircase of voxels",
-            f"{truth.number('area_m2'):.4g} m² (true: {truth.number('true_area_m2'):.4g} m²)",
+            "Volume of the mesh",
+            f"{truth.number('mesh_volume_m3'):.4g} m³ (true: {truth.number('true_volume_m3'):.4g} m³)",
+        ),
+        (
+            "Surface of the mesh",
+            f"{truth.number('mesh_area_m2'):.4g} m² (true: {truth.number('true_area_m2'):.4g} m²)",
         ),
         ("Tetrahedra", f"{mesh.number('tets'):,.0f}"),
         ("Nodes", f"{mesh.number('nodes'):,.0f}"),

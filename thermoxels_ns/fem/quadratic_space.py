@@ -23,7 +23,8 @@ is integrated with, so that the error of the temperature falls with the cube of 
 class QuadraticSpace(LinearSpace):
     """The unknowns of `LinearSpace` and one more per edge: temperatures are quadratic in each tetrahedron.
 
-    It is for steady states. Lumping its mass would give the corners negative masses, and with the consistent mass
+    Boundary values are asked once per triangle, as in P1: where they vary within one, the error falls with the square of
+    the mesh size only. It is for steady states. Lumping its mass would give the corners negative masses, and with the consistent mass
     temperatures leave their range in steps below about h^2 / diffusivity, so that it is not offered in time.
     """
 

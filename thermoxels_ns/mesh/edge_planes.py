@@ -162,7 +162,7 @@ def _planes_beside(surface: Surface, nodes: IntArray, tree: KDTree, centroids: F
     Returns:
         Those of the nodes with surface in different directions beside them, and their planes.
     """
-    distance, found = tree.query(surface.points[nodes], k=_NEAREST, distance_upper_bound=_REACH)
+    distance, found = map(np.asarray, tree.query(surface.points[nodes], k=_NEAREST, distance_upper_bound=_REACH))
     several = np.flatnonzero(np.count_nonzero(np.isfinite(distance), axis=1) >= 2 * _LEAST_FACETS)
     nodes, distance, found = nodes[several], distance[several], found[several]
     usable = np.isfinite(distance)
