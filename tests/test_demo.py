@@ -36,10 +36,6 @@ SUMMARY = {
         "precision": 0.95,
         "recall": 0.85,
         "voxel_size_m": 0.017,
-        "mean_distance_voxels": 0.5,
-        "mean_distance_m": 0.0085,
-        "temperature_mae_c": 1.25,
-        "temperature_nodes": 1234,
         "mesh_volume_m3": 0.08,
         "chamfer_voxels": 0.5,
         "chamfer_m": 0.03,
@@ -201,12 +197,14 @@ def test_figures_come_from_what_the_commands_wrote(tmp_path):
     ]
     others = dict(results.others)
     assert others["Voxel size"] == "17.0 mm"
-    assert others["Distance of the surface to the true one, mean"] == "0.50 voxels, 8.5 mm"
+    distance = others["Distance between the mesh's and the true surface, mean of both ways (Chamfer)"]
+    assert distance == "0.50 voxels, 30.0 mm"
+    assert others["Temperature error of the mesh on the seen surface, mean"] == "0.20 °C (97 % of the surface)"
     assert others["Volume of the mesh"] == "0.08 m³ (true: 0.09 m³)"
 
 
 def test_a_figure_that_does_not_exist_misses_its_target(tmp_path):
-    truth = SUMMARY["truth"] | {"fscore": None, "mean_distance_m": None}
+    truth = SUMMARY["truth"] | {"fscore": None, "chamfer_m": None}
     results = read_results(*write_results(tmp_path, IMAGES, SUMMARY | {"truth": truth}))
     assert [t.met for t in results.targets] == [True, True, False, True]
     assert results.targets[2].measured_text == "not measured"
