@@ -19,6 +19,7 @@ from thermoxels_ns.errors import HeatError, MeshError, OutputError, explain
 from thermoxels_ns.fem.answers import Answers, Solution, heat_answers, plain_values, times_and_states
 from thermoxels_ns.fem.files import STEP_PATTERN, remove_heat_series, write_heat_series
 from thermoxels_ns.fem.heat_scene import HeatScene
+from thermoxels_ns.fem.lumped_body import LumpedBody, lumped_body
 from thermoxels_ns.fem.probes import Probes, place_probes
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.savings import seconds_saved
@@ -55,6 +56,8 @@ class HeatRun:
     """The problem with all that the scene names."""
     screening: Screening
     """What of it was built."""
+    lumped: LumpedBody | None
+    """Whether the body could have one temperature; None if that was not asked, as in a steady state."""
     solution: Solution
     """Temperatures and heat flows."""
     answers: Answers
@@ -122,16 +125,22 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
         say("Nothing acts on the body: its surface is insulated.")
 
     solution: Solution
+    lumped: LumpedBody | None = None
     if scene.time is None:
         solution = solve_steady(screening.problem)
     else:
-        solution = solve_heat(screening.problem, scene.time)
+        allowed_k = options.leave_out_below_k - screening.bound_k
+        lumped = lumped_body(screening.problem, scene.time, allowed_k) if allowed_k > 0.0 else None
+        if lumped is not None and lumped.solution is not None:
+            solution = lumped.solution
+        else:
+            solution = solve_heat(screening.problem, scene.time)
     lap("solve")
     say(f"Heat: {solution.status} ({seconds['solve']:.1f} s)")
     say(f"Energy balance closed to {solution.energy_residual:.1e}.")
 
     saved = None
-    if screening.left_out and scene.time is not None and isinstance(solution, HeatSolution):
+    if screening.left_out and scene.time is not None and isinstance(solution, HeatSolution) and solution.steps:
         saved = seconds_saved(problem, screening.problem, scene.time, solution.steps)
         say(f"Leaving out saved about {saved:.1f} s and cost {screening.seconds:.1f} s.")
         lap("measure what was saved")
@@ -144,6 +153,7 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
         scene=scene,
         problem=problem,
         screening=screening,
+        lumped=lumped,
         solution=solution,
         answers=answers,
         wall=_wall(scene, screening.problem, solution, facet_region),
@@ -176,6 +186,7 @@ def summary_of(run: HeatRun) -> dict[str, Any]:
         "left_out": plain_values(screening.left_out),
         "left_out_bound_k": screening.bound_k,
         "left_out_note": screening.note,
+        "lumped_model": _lumped_summary(run.lumped),
         "assembled": dict(run.solution.assembled.counts),
         "newton_iterations": int(np.sum(run.solution.newton_iterations)),
         "linear_iterations": int(np.sum(run.solution.iterations)),
@@ -184,6 +195,13 @@ def summary_of(run: HeatRun) -> dict[str, Any]:
         "seconds": dict(run.seconds),
         "seconds_saved": run.seconds_saved,
     }
+
+
+def _lumped_summary(lumped: LumpedBody | None) -> dict[str, Any] | None:
+    if lumped is None:
+        return None
+    used = lumped.solution is not None
+    return {"used": used, "biot": lumped.biot, "bound_k": lumped.bound_k, "reason": lumped.reason}
 
 
 def _prepared(output_dir: Path) -> Path:

@@ -154,6 +154,7 @@ def measure(name: str, voxels: int, mode: str, repeats: int) -> dict:
     for share in (parts + 0.25) / 5.0:
         points = np.einsum("c,tcd->td", share, mesh.points_m[mesh.tets])
         inside += float(volumes[body.signed_distance(points) <= 0.0].sum()) / len(parts)
+    inside = min(inside, quality.volume_m3, body.volume)
     return {
         "body": name,
         "voxels": voxels,

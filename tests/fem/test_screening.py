@@ -9,7 +9,6 @@ import pytest
 
 from tests.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.errors import HeatError
-from thermoxels_ns.fem import nodal_heat
 from thermoxels_ns.fem.effects import (
     AbsorbedSolar,
     Convection,
@@ -104,3 +103,157 @@ def test_screening_never_changes_an_answer_by_more_than_its_bound(seed) -> None:
         most_w = sum(entry.bound_w for entry in screening.left_out)
         assert difference_k <= screening.bound_k * (1 + 1e-9) + 1e-9, screening.left_out
         assert change_w <= most_w * (1 + 1e-9) + 1e-9 and gone_w <= most_w * (1 + 1e-9) + 1e-9
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_bounds_hold_in_steady_states(seed) -> None:
+    rng = np.random.default_rng(300 + seed)
+    mesh = body(seed)
+    everywhere = Convection(("*",), float(rng.uniform(2.0, 25.0)), float(rng.uniform(-10.0, 30.0)))
+    surface = [
+        effect for effect in (random_effect(rng, mesh) for _ in range(4)) if not isinstance(effect, InternalHeat)
+    ]
+    problem = HeatProblem(mesh, CONCRETE, effects=(everywhere, *surface))
+    for tolerance_k in (0.1, 300.0):
+        screening = screen(problem, None, tolerance_k)
+        assert everywhere in screening.problem.effects, "the only exchange of some nodes"
+        assert screening.bound_k <= tolerance_k
+        difference_k, _, _ = differences(problem, screening.problem, None)
+        assert difference_k <= screening.bound_k * (1 + 1e-6) + 1e-9, screening.left_out
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bounds_hold_with_adaptive_steps_and_obtuse_angles(seed) -> None:
+    """Up to what the steps themselves are allowed to be wrong by, in either computation."""
+    rng = np.random.default_rng(500 + seed)
+    mesh = body(seed, shaken=0.25)
+    problem = HeatProblem(mesh, CONCRETE, effects=tuple(random_effect(rng, mesh) for _ in range(3)))
+    time = AdaptiveSteps(3000.0, 0.01, outputs=2)
+    screening = screen(problem, time, 5.0)
+    assert "obtuse" in screening.note
+    difference_k, _, _ = differences(problem, screening.problem, time)
+    assert difference_k <= screening.bound_k + 2 * 0.01, screening.left_out
+
+
+def slab(temperature_c: float = 20.0) -> TetMesh:
+    return box_mesh(planes(0.0, 0.2, step=0.02), [0.0, 0.1], [0.0, 0.1], temperature_c=temperature_c)
+
+
+def test_a_steady_bound_is_flux_over_coefficient() -> None:
+    """Sun of 60 W/m2 on a wall with 25 W/(m2 K): 2.4 K at most; it makes 2.4 K less what flows through the wall."""
+    effects = (Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, 0.0), AbsorbedSolar(("x1",), 0.6, 100.0))
+    problem = HeatProblem(slab(), CONCRETE, effects=effects)
+    screening = screen(problem, None, 2.41)
+    assert [entry.effect for entry in screening.left_out] == ["absorbed solar on x1"]
+    assert screening.left_out[0].bound_k == pytest.approx(2.4, rel=1e-12)
+    assert screening.left_out[0].bound_w == pytest.approx(0.6, rel=1e-12)
+    assert "carries its heat away" in screening.left_out[0].reason
+    difference_k, _, _ = differences(problem, screening.problem, None)
+    assert 1.9 < difference_k <= 2.4
+    kept = screen(problem, None, 2.39)
+    assert kept.left_out == () and kept.problem is problem
+    assert kept.kept[2].bound_k == pytest.approx(2.4) and "above the tolerance" in kept.kept[2].reason
+
+
+def test_a_flux_for_a_short_time_knows_the_depth() -> None:
+    """An insulated wall, 10 W/m2 for 10 minutes: the surface rises 2 q sqrt(t / (pi k rho c)) = 0.152 K."""
+    problem = HeatProblem(slab(), CONCRETE, effects=(HeatFlux(("x0",), 10.0),))
+    exact = 2.0 * 10.0 * np.sqrt(600.0 / (np.pi * 1.7 * 2200.0 * 880.0))
+    screening = screen(problem, TimeSteps(10, 60.0), 0.31)
+    assert exact == pytest.approx(0.1524, abs=1e-4)
+    # 2 max v, and the v of one implicit step is sqrt(pi) / 2 of the exact rise at the surface.
+    assert exact < screening.left_out[0].bound_k < 2.0 * 1.02 * exact
+    assert "depth" in screening.left_out[0].reason
+
+
+def test_a_source_in_an_insulated_body_is_exact() -> None:
+    problem = HeatProblem(slab(), CONCRETE, effects=(InternalHeat(("*",), -50.0),))
+    screening = screen(problem, TimeSteps(4, 3600.0), 1.0)
+    assert screening.left_out[0].bound_k == pytest.approx(50.0 * 14400.0 / (2200.0 * 880.0), rel=1e-9)
+    assert differences(problem, screening.problem, TimeSteps(4, 3600.0))[0] == pytest.approx(
+        screening.bound_k, rel=1e-9
+    )
+
+
+def test_a_jump_between_kept_times_is_not_missed_by_equal_steps() -> None:
+    """Equal steps ask at their ends; that is where the bound looks, also at an irradiance of one step only."""
+    flash = Varying(lambda places, time_s: 1000.0 if 170.0 < time_s < 190.0 else 0.0)
+    problem = HeatProblem(slab(), CONCRETE, effects=(AbsorbedSolar(("x0",), 1.0, flash),))
+    time = TimeSteps(5, 60.0)
+    screening = screen(problem, time, EVERYTHING)
+    assert 0.0 < differences(problem, screening.problem, time)[0] <= screening.bound_k
+
+
+def test_together_they_keep_within_the_tolerance() -> None:
+    """Four of 0.4 times the tolerance each: two may go."""
+    sources = tuple(HeatFlux((side,), 1.0) for side in ("x0", "x1", "y0", "y1"))
+    air = Convection(("*",), 10.0, 20.0)
+    mesh = box_mesh(*(planes(0.0, 0.2, step=0.05) for _ in range(3)))
+    problem = HeatProblem(mesh, CONCRETE, effects=(air, *sources))
+    alone = screen(problem, None, EVERYTHING).left_out[0].bound_k
+    assert alone == pytest.approx(0.1)
+    screening = screen(problem, None, 0.25)
+    assert len(screening.left_out) == 2 and screening.bound_k == pytest.approx(0.2)
+    assert len(screening.problem.effects) == 3
+
+
+def test_the_only_exchange_of_a_steady_body_stays() -> None:
+    """Air as warm as the body brings no heat, but without it there is no steady state."""
+    problem = HeatProblem(slab(20.0), CONCRETE, effects=(Convection(("x0",), 5.0, 20.0),))
+    assert screen(problem, None, 1.0).left_out == ()
+    assert len(screen(problem, TimeSteps(3, 60.0), 1.0).left_out) == 1
+    two = replace(problem, effects=(*problem.effects, Convection(("x1",), 5.0, 20.0)))
+    assert len(screen(two, None, 1.0).left_out) == 1
+
+
+def test_what_fixes_temperatures_stays() -> None:
+    problem = HeatProblem(slab(), CONCRETE, effects=(FixedTemperature(("x0",), 20.0), HeatFlux(("x0",), 1e6)))
+    screening = screen(problem, TimeSteps(3, 60.0), 1.0)
+    assert [(entry.effect, entry.bound_k) for entry in screening.kept] == [("fixed temperature on x0", None)]
+    # A flux onto a fixed surface changes no temperature, and all of its heat.
+    assert screening.left_out[0].bound_k == 0.0 and screening.left_out[0].bound_w == pytest.approx(1e4)
+
+
+def test_screening_costs_nothing_where_nothing_acts(monkeypatch) -> None:
+    monkeypatch.setattr("thermoxels_ns.fem.screening._Screener", None)
+    problem = HeatProblem(slab(), CONCRETE)
+    screening = screen(problem, TimeSteps(3, 60.0), 0.1)
+    assert screening.problem is problem and screening.kept == screening.left_out == ()
+
+
+def test_an_absent_effect_assembles_nothing() -> None:
+    """Counted by kind: what is not there, or was left out, has no entry."""
+    every: dict[str, Effect] = {
+        "robin": Convection(("x1",), 25.0, 0.0),
+        "flux": HeatFlux(("y0",), 50.0),
+        "radiation": Radiation(("y1",), 0.9, -20.0),
+        "source": InternalHeat(("*",), 500.0),
+        "fixed": FixedTemperature(("x0",), 30.0),
+    }
+    time = TimeSteps(2, 600.0)
+    for absent in (None, *every):
+        effects = tuple(effect for kind, effect in every.items() if kind != absent)
+        counts = solve_heat(HeatProblem(slab(), CONCRETE, effects=effects), time).assembled.counts
+        assert set(counts) == {"stiffness", "mass", *every} - {absent}
+    assert set(solve_heat(HeatProblem(slab(), CONCRETE), time).assembled.counts) == {"stiffness", "mass"}
+    feeble = HeatProblem(slab(), CONCRETE, effects=(every["robin"], Radiation(("y1",), 1e-7, -20.0)))
+    screened = screen(feeble, time, 0.01).problem
+    assert set(solve_heat(screened, time).assembled.counts) == {"stiffness", "mass", "robin"}
+
+
+def test_a_scene_whose_radiation_does_not_matter_never_enters_newton(monkeypatch) -> None:
+    def refuse(*_, **__):
+        raise AssertionError("entered")
+
+    monkeypatch.setattr("thermoxels_ns.fem.stage.newton", refuse)
+    effects = (Convection(("x1",), 25.0, 0.0), Radiation(("y1",), 1e-7, -20.0))
+    problem, time = HeatProblem(slab(), CONCRETE, effects=effects), TimeSteps(2, 600.0)
+    solve_heat(screen(problem, time, 0.01).problem, time)
+    with pytest.raises(AssertionError, match="entered"):
+        solve_heat(screen(problem, time, 0.0).problem, time)
+
+
+@pytest.mark.parametrize("tolerance_k", [-1.0, float("nan")])
+def test_a_tolerance_is_not_negative(tolerance_k) -> None:
+    with pytest.raises(HeatError, match=r"tolerance_k: expected a number of at least 0"):
+        screen(HeatProblem(slab(), CONCRETE), None, tolerance_k)

@@ -16,9 +16,9 @@ FloatImage = npt.NDArray[np.float32]
 
 _GRADIENT_SIGMA_PX = 1.2
 _NOISE_FACTOR = 3.0
-_SMALLEST_SHARE = 1e-5
-"""Of the strongest edge: below this an image without noise counts as flat."""
-_CONTRAST_SIGMA_PX = 6.0
+_STRONG_PERCENTILE, _SMALLEST_SHARE = 98.0, 3e-3
+"""Below this share of the strong edges' |z| an image without noise counts as flat."""
+_CONTRAST_SIGMA_PX, _CONTRAST_SIGMA_SHARE = 6.0, 0.02
 _FEWEST_FOR_PATTERN = 8
 _PATTERN_CORRELATION = 0.25
 
@@ -44,7 +44,8 @@ def edge_field(image: FloatImage, blur_px: float) -> npt.NDArray[np.complex64]:
     gy = cv2.Scharr(smooth, cv2.CV_32F, 0, 1, borderType=cv2.BORDER_REPLICATE) / np.float32(32.0)
     real, imaginary = gx * gx - gy * gy, 2.0 * gx * gy
     strength = gx * gx + gy * gy
-    floor = max(_NOISE_FACTOR * float(np.median(strength)), _SMALLEST_SHARE * float(strength.max()), 1e-30)
+    middle, strong = np.percentile(strength, [50.0, _STRONG_PERCENTILE])
+    floor = max(_NOISE_FACTOR * float(middle), _SMALLEST_SHARE * float(strong), 1e-30)
     weight = 1.0 / (strength + floor)
     if bad.any():
         reach = 2 * int(np.ceil(3.0 * _GRADIENT_SIGMA_PX)) + 1
@@ -89,8 +90,9 @@ def local_contrast(image: FloatImage) -> FloatImage:
     filled = np.where(bad, np.float32(0.0), image).astype(np.float32)
     mean = filled.sum() / max(float(known.sum()), 1.0)
     filled = np.where(bad, np.float32(0.0), filled - mean)
-    weight = cv2.GaussianBlur(known, (0, 0), _CONTRAST_SIGMA_PX)
-    around = cv2.GaussianBlur(filled, (0, 0), _CONTRAST_SIGMA_PX) / np.maximum(weight, 1e-6)
+    reach = max(_CONTRAST_SIGMA_PX, _CONTRAST_SIGMA_SHARE * image.shape[1])
+    weight = cv2.GaussianBlur(known, (0, 0), reach)
+    around = cv2.GaussianBlur(filled, (0, 0), reach) / np.maximum(weight, 1e-6)
     return np.where(bad, np.float32(np.nan), filled - around).astype(np.float32)
 
 

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.capture.colmap_log import only_errors
 from thermoxels_ns.capture.contract import CameraModel
 
 Matching = Literal["auto", "exhaustive", "sequential"]
@@ -93,30 +94,31 @@ def fill_database(
     """
     import pycolmap
 
-    _add_camera(database, camera, options.lens, known_focal)
-    reader = pycolmap.ImageReaderOptions(camera_model=options.lens, existing_camera_id=1)
-    if masks is not None:
-        reader.mask_path = str(masks)
-    extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=options.threads)
-    extraction.sift.max_num_features = options.max_features
-    todo = _without_features(database, names)
-    for start in range(0, len(todo), _CHUNK):
-        pycolmap.extract_features(
-            database, images, todo[start : start + _CHUNK], reader_options=reader, extraction_options=extraction
-        )
-        say(f"features: {len(names) - len(todo) + min(start + _CHUNK, len(todo))} of {len(names)} photographs")
-    matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=options.threads)
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = options.seed
-    pairs = image_pairs(len(names), options.matching)
-    listed = database.with_name("pairs.txt")
-    for start in range(0, len(pairs), _PAIR_CHUNK):
-        some = pairs[start : start + _PAIR_CHUNK]
-        listed.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in some), encoding="utf-8")
-        pairing: Any = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = str(listed)
-        pycolmap.match_image_pairs(database, matching, pairing, verification)
-        say(f"matches: {start + len(some)} of {len(pairs)} pairs of photographs")
+    with only_errors():
+        _add_images(database, names, camera, options.lens, known_focal)
+        reader = pycolmap.ImageReaderOptions(camera_model=options.lens, existing_camera_id=1)
+        if masks is not None:
+            reader.mask_path = str(masks)
+        extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=options.threads)
+        extraction.sift.max_num_features = options.max_features
+        todo = _without_features(database, names)
+        for start in range(0, len(todo), _CHUNK):
+            pycolmap.extract_features(
+                database, images, todo[start : start + _CHUNK], reader_options=reader, extraction_options=extraction
+            )
+            say(f"features: {len(names) - len(todo) + min(start + _CHUNK, len(todo))} of {len(names)} photographs")
+        matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=options.threads)
+        verification = pycolmap.TwoViewGeometryOptions()
+        verification.ransac.random_seed = options.seed
+        pairs = image_pairs(len(names), options.matching)
+        listed = database.with_name("pairs.txt")
+        for start in range(0, len(pairs), _PAIR_CHUNK):
+            some = pairs[start : start + _PAIR_CHUNK]
+            listed.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in some), encoding="utf-8")
+            pairing: Any = pycolmap.ImportedPairingOptions()
+            pairing.match_list_path = str(listed)
+            pycolmap.match_image_pairs(database, matching, pairing, verification)
+            say(f"matches: {start + len(some)} of {len(pairs)} pairs of photographs")
 
 
 def lens_parameters(camera: CameraModel, lens: LensModel) -> list[float]:
@@ -128,20 +130,34 @@ def lens_parameters(camera: CameraModel, lens: LensModel) -> list[float]:
     return [camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.k1, camera.k2, camera.p1, camera.p2]
 
 
-def _add_camera(database: Path, camera: CameraModel, lens: LensModel, known_focal: bool) -> None:
+def _add_images(
+    database: Path, names: Sequence[str], camera: CameraModel, lens: LensModel, known_focal: bool
+) -> None:
+    """Number the photographs in their order; else the threads that look for features would number them by chance."""
     import pycolmap
 
     with pycolmap.Database.open(database) as opened:
-        if opened.num_cameras() == 0:
-            opened.write_camera(
-                pycolmap.Camera(
-                    model=lens,
-                    width=camera.width,
-                    height=camera.height,
-                    params=lens_parameters(camera, lens),
-                    has_prior_focal_length=known_focal,
-                )
-            )
+        if opened.num_images() == len(names):
+            return
+        opened.clear_all_tables()
+        colmap_camera = pycolmap.Camera(
+            camera_id=1,
+            model=lens,
+            width=camera.width,
+            height=camera.height,
+            params=lens_parameters(camera, lens),
+            has_prior_focal_length=known_focal,
+        )
+        opened.write_camera(colmap_camera, use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=1)
+        rig.add_ref_sensor(colmap_camera.sensor_id)
+        opened.write_rig(rig, use_rig_id=True)
+        for number, name in enumerate(names, start=1):
+            image = pycolmap.Image(name=name, camera_id=1, image_id=number)
+            opened.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame(frame_id=number, rig_id=1)
+            frame.add_data_id(image.data_id)
+            opened.write_frame(frame, use_frame_id=True)
 
 
 def _without_features(database: Path, names: Sequence[str]) -> list[str]:

@@ -15,7 +15,6 @@ from thermoxels_ns.capture.poses import Poses
 from thermoxels_ns.capture.sfm_model import SfmModel
 from thermoxels_ns.capture.stages import read_json
 from thermoxels_ns.data.folder_walls import path_inside
-from thermoxels_ns.data.pose_file_cameras import read_intrinsics, read_pose
 from thermoxels_ns.errors import SceneError, explain
 
 
@@ -69,6 +68,8 @@ def in_order(model: SfmModel, key: Callable[[str], Any]) -> SfmModel:
 
 
 def _read_transforms(path: Path, photographs: Mapping[str, str]) -> SfmModel:
+    from thermoxels_ns.data.pose_file_cameras import read_intrinsics, read_pose  # loads torch
+
     content: Any = read_json(path)
     entries = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from thermoxels_ns.capture.colmap_log import only_errors
 from thermoxels_ns.capture.colmap_model import model_of_colmap
 from thermoxels_ns.capture.contract import CameraModel
 from thermoxels_ns.capture.feature_matching import FeatureOptions, LensModel, Matching, fill_database, lens_parameters
@@ -170,7 +171,7 @@ def add_points(
     mapping.ba_refine_focal_length = mapping.ba_refine_extra_params = False
     mapping.constant_cameras = {1}
     mapping.fix_existing_frames = True
-    with _quiet(pycolmap):
+    with only_errors():
         found = pycolmap.triangulate_points(
             posed, database, folder / "images", folder, clear_points=True, options=mapping, refine_intrinsics=False
         )
@@ -254,8 +255,9 @@ def _mapping_options(options: PoseOptions) -> Any:
     mapping.random_seed = options.seed
     mapping.mapper.random_seed = options.seed
     mapping.triangulation.random_seed = options.seed
-    mapping.num_threads = options.threads
-    mapping.mapper.num_threads = options.threads
+    # Sums over threads come in any order, and their last bits decide which point is kept: one thread, same result.
+    mapping.num_threads = 1
+    mapping.mapper.num_threads = 1
     mapping.min_model_size = MIN_FRAMES
     return mapping
 
@@ -273,25 +275,11 @@ def _map(database: Path, folder: Path, options: PoseOptions, count: int, say: Ca
     pycolmap.set_random_seed(options.seed)
     mapping = _mapping_options(options)
     models: dict[int, Any] = {}
-    with _quiet(pycolmap):
+    with only_errors():
         models = pycolmap.incremental_mapping(
             database, folder / "images", folder, mapping, next_image_callback=next_image
         )
     return list(models.values())
-
-
-class _quiet:
-    """COLMAP's own log, of which only errors are shown while it runs."""
-
-    def __init__(self, pycolmap: Any) -> None:
-        self._logging = pycolmap.logging
-
-    def __enter__(self) -> None:
-        self._before = self._logging.minloglevel
-        self._logging.minloglevel = 2
-
-    def __exit__(self, *_: object) -> None:
-        self._logging.minloglevel = self._before
 
 
 def _too_few(got: int, what: str) -> SceneError:

@@ -16,7 +16,8 @@ from thermoxels_ns.capture.contract import CameraModel, RigEstimate, RigFrame, R
 from thermoxels_ns.capture.rig_fit import RigClimber
 from thermoxels_ns.capture.rig_levels import PreparedFrames, prepare_frames
 from thermoxels_ns.capture.rig_parameters import PARAMETERS, RigModel, prior_sigmas
-from thermoxels_ns.capture.rig_start import RoughSearch
+from thermoxels_ns.capture.rig_score import RigScore
+from thermoxels_ns.capture.rig_start import RoughRig, RoughSearch
 from thermoxels_ns.errors import SceneError, explain
 
 FloatArray = npt.NDArray[np.float64]
@@ -94,10 +95,9 @@ class _RigSearch:
                 f"({chance:.3f}): the thermal images are too flat or show other things"
             )
             return self._kept(rig, sigmas, before, reason)
-        climber = RigClimber(coarse, sigmas, depth)
-        tops = [climber.climb(one.change) for one in rough if one.score >= _WORTH_A_CLIMB * rough[0].score]
-        change = max(tops, key=lambda top: top.log_posterior).change
-        score = coarse
+        change = self._best_top(coarse, rough, sigmas)
+        score = coarse.around(change)
+        climber = RigClimber(score, sigmas, depth)
         for number, size in enumerate(sizes[1:]):
             self.progress(f"Comparing edges, {size[0]} x {size[1]} pixels", 0.3 + 0.6 * number / len(sizes))
             score = self.prepared.score(rig, change, size, _BLUR_PX)
@@ -118,6 +118,15 @@ class _RigSearch:
             f"scene points fall within {error_px:.2f} thermal pixels (standard error). Start: {self.start.source}."
         )
         return RigEstimate(camera, transform, PARAMETERS, covariance, True, explanation, before, after, error_px)
+
+    def _best_top(self, coarse: RigScore, rough: Sequence[RoughRig], sigmas: FloatArray) -> FloatArray:
+        """Climb from every rough place worth it; the ten changes of the top that agrees best."""
+        tops = []
+        for one in rough:
+            if one.score >= _WORTH_A_CLIMB * rough[0].score:
+                climber = RigClimber(coarse.around(one.change), sigmas, self.prepared.median_depth)
+                tops.append(climber.climb(one.change))
+        return max(tops, key=lambda top: top.score).change
 
     def _doubt(
         self, change: FloatArray, sigmas: FloatArray, before: float, after: float, error_px: float

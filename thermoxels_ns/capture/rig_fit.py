@@ -56,7 +56,7 @@ class RigClimber:
 
         def negative(y: FloatArray) -> tuple[float, FloatArray]:
             point = z + root @ y
-            value, slopes = self._score.with_slopes(self._full(point))
+            value, slopes = self._score.slopes(self._full(point))
             slope = weight * slopes.sum(axis=0)[self._free] * self._scale - point
             return -(weight * value - 0.5 * float(point @ point)), -(root.T @ slope)
 
@@ -82,7 +82,7 @@ class RigClimber:
 
     def _information(self, z: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         """Weight, curvature made positive and scatter of the frames' slopes, in standard deviations of the start."""
-        _, slopes = self._score.with_slopes(self._full(z))
+        _, slopes = self._score.slopes(self._full(z))
         own = slopes[:, self._free] * self._scale
         total, frames = own.sum(axis=0), len(own)
         centred = own - own.mean(axis=0)
@@ -91,7 +91,7 @@ class RigClimber:
         for number, step in enumerate(self._step):
             moved = z.copy()
             moved[number] += step
-            ahead = self._score.with_slopes(self._full(moved))[1].sum(axis=0)[self._free] * self._scale
+            ahead = self._score.slopes(self._full(moved))[1].sum(axis=0)[self._free] * self._scale
             curvature[number] = (total - ahead) / step
         symmetric: FloatArray = 0.5 * (curvature + curvature.T)
         values, vectors = np.linalg.eigh(symmetric)

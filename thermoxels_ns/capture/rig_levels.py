@@ -60,14 +60,14 @@ class PreparedFrames:
         return [(round(width / 2**k), round(height / 2**k)) for k in range(halvings, -1, -1)]
 
     def score(self, rig: RigModel, change: npt.NDArray, size: tuple[int, int], blur_px: float) -> RigScore:
-        """Make the score at one size; `change` only says which part of a photograph can be in the thermal image."""
+        """Make the score at one size; `change` says about where in the thermal image the points lie."""
         level = rig.at_size(*size)
         edges, thermal = [], []
         for frame in self.frames:
             small = cv2.resize(frame.contrast, size, interpolation=cv2.INTER_AREA)
             thermal.append(ThermalEdges(edge_field(small.astype(np.float32), blur_px)))
             edges.append(self._edge_points(frame, level, change, blur_px))
-        return RigScore(edges, thermal, level)
+        return RigScore(edges, thermal, level, change)
 
     def _edge_points(self, frame: PreparedFrame, level: RigModel, change: npt.NDArray, blur_px: float) -> EdgePoints:
         """The strongest edges of a photograph, at about the thermal image's pixel size."""

@@ -28,6 +28,7 @@ from thermoxels_ns.errors import HeatError, explain
 from thermoxels_ns.fem.elements import capacities
 from thermoxels_ns.fem.linear_solver import ConjugateGradients
 from thermoxels_ns.fem.linear_space import LinearSpace
+from thermoxels_ns.fem.maximum_principle import holds_maximum_principle
 from thermoxels_ns.fem.nodal_heat import Span, nodal_heats
 from thermoxels_ns.fem.pieces import Pieces
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
@@ -40,8 +41,6 @@ _WORTH_A_STEP = 1e4
 """Largest bound, in tolerances, that the implicit step may bring below the tolerance."""
 _STEP_TOLERANCE = 1e-3
 """Relative tolerance of the implicit step; the bound holds for any v."""
-_OBTUSE = 1e-9
-"""Share of the diagonal above which an entry off it counts as above 0."""
 _OBTUSE_FACTOR, _OBTUSE_WIDENING = 2.0, 0.1
 
 
@@ -277,10 +276,7 @@ class _Screener:
 
     def _assemble(self) -> None:
         self._stiffness = self._space.stiffness(self._problem.conductivity_w_mk)
-        entries = self._stiffness.tocoo()
-        off = entries.row != entries.col
-        diagonal = self._stiffness.diagonal()
-        self._obtuse = bool(np.any(entries.data[off] > _OBTUSE * diagonal[entries.row[off]]))
+        self._obtuse = not holds_maximum_principle(self._stiffness)
 
     def _still_held(self, left: set[int]) -> bool:
         """Whether every piece of a body whose steady state is asked for still exchanges heat with something."""

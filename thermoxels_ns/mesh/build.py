@@ -16,6 +16,7 @@ from thermoxels_ns.mesh.components import node_parts, renumbered
 from thermoxels_ns.mesh.node_values import interpolate_corners
 from thermoxels_ns.mesh.patch_rules import PatchRules
 from thermoxels_ns.mesh.patches import apply_regions
+from thermoxels_ns.mesh.sharp_edges import sharpen
 from thermoxels_ns.mesh.solid import SolidCells, SolidSelection, select_solid
 from thermoxels_ns.mesh.stuffing import stuff
 from thermoxels_ns.mesh.temperature import MIN_OBSERVED_WEIGHT, extend_harmonically, tet_conductances
@@ -167,7 +168,7 @@ def _voxel_shape(cells: npt.NDArray[np.bool_]) -> _Shape:
 
 
 def _stuffed_shape(level: npt.NDArray[np.floating], coarsest_cell: int) -> _Shape:
-    stuffed = stuff(level, coarsest_cell)
+    stuffed = sharpen(stuff(level, coarsest_cell), level.shape)
     tags = np.where(stuffed.on_box, FACET_BOX, FACET_SURFACE).astype(np.int64)
     return _Shape(stuffed.points, stuffed.tets, stuffed.facets, tags)
 

@@ -1,0 +1,49 @@
+"""A model of structure from motion whose truth is known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from thermoxels_ns.capture.contract import CameraModel
+from thermoxels_ns.capture.sfm_model import SfmModel
+from thermoxels_ns.data.pinhole import look_at
+
+CAMERA = CameraModel(640, 480, 500.0, 500.0, 320.0, 240.0, k1=0.02)
+
+
+def ring_model(count: int = 8, points: int = 300, seed: int = 0, unit_m: float = 1.0) -> SfmModel:
+    """Cameras on a half circle of 4 m that look at points on a wall and a floor; one unit is `unit_m` metres."""
+    rng = np.random.default_rng(seed)
+    on_wall = np.stack([rng.uniform(-2, 2, points), np.full(points, 1.0), rng.uniform(0, 2, points)], axis=1)
+    angles = np.linspace(-0.6, 0.6, count)
+    poses = np.array([look_at((4 * np.sin(a), 1 - 4 * np.cos(a), 1.5), (0, 1, 1)) for a in angles])
+    poses[:, :3, 3] /= unit_m
+    model = SfmModel(
+        frames=tuple(f"f{n}" for n in range(count)),
+        camera=CAMERA,
+        camera_to_world=poses,
+        points=on_wall / unit_m,
+        colours=rng.integers(0, 255, (points, 3)).astype(np.uint8),
+        point_error_px=np.zeros(points),
+        sighting_frame=np.zeros(0, dtype=np.int64),
+        sighting_point=np.zeros(0, dtype=np.int64),
+        sighting_pixel=np.zeros((0, 2)),
+    )
+    frames, seen, pixels = [], [], []
+    for index in range(count):
+        at = CAMERA.project(model.in_camera(index, model.points))
+        inside = np.flatnonzero(CAMERA.contains(at))
+        frames.append(np.full(len(inside), index))
+        seen.append(inside)
+        pixels.append(at[inside])
+    return SfmModel(
+        model.frames,
+        model.camera,
+        model.camera_to_world,
+        model.points,
+        model.colours,
+        model.point_error_px,
+        np.concatenate(frames),
+        np.concatenate(seen),
+        np.concatenate(pixels),
+    )

@@ -1,0 +1,86 @@
+"""Up from levels, and from how cameras are held."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from thermoxels_ns.capture.gravity import find_up, level_rotation
+from thermoxels_ns.data.pinhole import look_at
+
+SHAKEN = Rotation.from_euler("xyz", [40, -70, 25], degrees=True).as_matrix()
+"""World in which nothing is level; its up is the third column."""
+
+
+def held(azimuths_deg, pitches_deg, rolls_deg):
+    """Poses of cameras that are turned, pitched and rolled against gravity, in the shaken world."""
+    poses = []
+    for azimuth, pitch, roll in zip(azimuths_deg, pitches_deg, rolls_deg):
+        a, p = np.radians([azimuth, pitch])
+        ahead = [np.cos(a) * np.cos(p), np.sin(a) * np.cos(p), np.sin(p)]
+        pose = look_at((0.0, 0.0, 0.0), ahead)
+        # A roll to the right, seen from behind, turns the camera clockwise about its view direction.
+        pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("z", -roll, degrees=True).as_matrix()
+        pose[:3, :3] = SHAKEN @ pose[:3, :3]
+        poses.append(pose)
+    return np.array(poses)
+
+
+def off_deg(up):
+    return np.degrees(np.arccos(np.clip(up.direction @ SHAKEN[:, 2], -1, 1)))
+
+
+def test_up_of_pitch_and_roll_is_exact():
+    azimuths, pitches, rolls = [0, 50, 170, 300], [-30, -80, 10, 0], [0, 5, -12, 90]
+    up = find_up(held(azimuths, pitches, rolls), list(zip(pitches, rolls)), [1] * 4)
+    assert off_deg(up) < 1e-5
+    assert up.spread_deg == pytest.approx(0, abs=1e-5)
+    assert "pitch and roll that 4 photographs state" in up.source
+
+
+def test_cameras_pitched_down_all_around_still_give_up():
+    """The mean of their y axes would do here; pitched to one side it would be off by the pitch."""
+    count = 12
+    azimuths = np.linspace(0, 90, count)
+    up = find_up(held(azimuths, [-35] * count, [0] * count), [None] * count, [1] * count)
+    assert off_deg(up) < 1e-5
+    assert "held level" in up.source
+
+
+def test_single_rolled_cameras_do_not_tilt_up_much():
+    rng = np.random.default_rng(1)
+    count = 30
+    rolls = rng.normal(0, 2, count)
+    up = find_up(held(rng.uniform(0, 180, count), rng.uniform(-20, 20, count), rolls), [None] * count, [1] * count)
+    assert off_deg(up) < 1.5
+
+
+def test_cameras_that_look_one_way_give_the_mean_of_their_y_axes():
+    up = find_up(held([0, 2, 4], [0, 0, 0], [0, 0, 0]), [None] * 3, [1] * 3)
+    assert "mean" in up.source
+    assert off_deg(up) < 0.1
+
+
+@pytest.mark.parametrize(("orientation", "roll"), [(6, -90), (8, 90), (3, 180)])
+def test_upright_pictures_of_a_turned_camera(orientation, roll):
+    """EXIF says how to turn the stored pixels; the camera was turned the other way."""
+    up = find_up(held([0, 40, 80], [0] * 3, [roll] * 3), [None] * 3, [orientation] * 3)
+    assert off_deg(up) < 1e-4
+
+
+def test_levelling_turns_up_to_z_and_ahead_to_y():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        up, ahead = rng.normal(size=(2, 3))
+        rotation = level_rotation(up, ahead)
+        assert rotation @ rotation.T == pytest.approx(np.eye(3))
+        assert np.linalg.det(rotation) == pytest.approx(1)
+        assert rotation @ up / np.linalg.norm(up) == pytest.approx([0, 0, 1])
+        assert (rotation @ ahead)[0] == pytest.approx(0)
+        assert (rotation @ ahead)[1] > 0
+
+
+def test_levelling_when_the_cameras_look_straight_down():
+    rotation = level_rotation([0, 0, 1], [0, 0, -1])
+    assert rotation @ [0, 0, 1] == pytest.approx([0, 0, 1])

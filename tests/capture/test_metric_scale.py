@@ -1,0 +1,148 @@
+"""Metres per unit from GPS, a measured length and markers, each against a known scale, with its error."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.capture.posed_model import CAMERA, ring_model
+from thermoxels_ns.capture.metric_scale import (
+    MeasuredDistance,
+    local_metres,
+    scale_from_distance,
+    scale_from_gps,
+    scale_from_markers,
+)
+from thermoxels_ns.capture.photograph import GpsFix
+from thermoxels_ns.errors import ThermoxelsError
+
+UNIT_M = 0.37
+
+
+def fixes_at(metres):
+    """GPS fixes around 48 degrees north of points east, north and up, by the lengths of a degree on the ellipsoid."""
+    north, east = 111_200.6, 74_627.7  # metres per degree at 48 degrees north (WGS 84)
+    return [GpsFix(48 + n / north, 11 + e / east, 500 + u) for e, n, u in metres]
+
+
+def path(count=40, size_m=30.0, seed=0):
+    return np.random.default_rng(seed).uniform(-size_m, size_m, (count, 3)) * (1, 1, 0.2)
+
+
+def test_lengths_of_degrees_are_those_of_the_ellipsoid():
+    local = local_metres([GpsFix(48.0, 11.0, 1.0), GpsFix(48.001, 11.001, None), GpsFix(48.0, 11.0, 3.0)])
+    assert local[1, :2] - local[0, :2] == pytest.approx([74.63, 111.20], abs=0.02)
+    assert local[:, 2] == pytest.approx([-1, 0, 1])
+
+
+def test_the_date_line_does_not_tear_a_path_apart():
+    local = local_metres([GpsFix(0.0, 179.9999, 0.0), GpsFix(0.0, -179.9999, 0.0)])
+    assert abs(local[1, 0] - local[0, 0]) == pytest.approx(22.26, abs=0.01)
+
+
+def test_gps_without_noise_gives_the_scale():
+    metres = path()
+    scale, why = scale_from_gps(metres[:, [1, 2, 0]] / UNIT_M, fixes_at(metres))
+    assert scale is not None, why
+    assert scale.metres_per_unit == pytest.approx(UNIT_M, rel=2e-4)
+
+
+def test_gps_error_is_the_scatter_over_many_captures():
+    found, claimed = [], []
+    for seed in range(60):
+        metres = path(seed=seed)
+        noisy = metres + np.random.default_rng(1000 + seed).normal(0, 2.0, metres.shape)
+        scale, why = scale_from_gps(metres / UNIT_M, fixes_at(noisy))
+        assert scale is not None and scale.standard_error is not None, why
+        found.append(scale.metres_per_unit)
+        claimed.append(scale.standard_error)
+    assert np.mean(claimed) == pytest.approx(np.std(found), rel=0.35)
+
+
+def test_one_wild_fix_hardly_moves_the_scale():
+    metres = path()
+    wild = metres.copy()
+    wild[3] += 500.0
+    scale, why = scale_from_gps(metres / UNIT_M, fixes_at(wild))
+    assert scale is not None, why
+    assert scale.metres_per_unit == pytest.approx(UNIT_M, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("fixes", "words"),
+    [
+        ([None] * 5, "no photograph has a GPS position"),
+        ([GpsFix(48, 11, 0)] * 2 + [None] * 3, "4 are needed"),
+        (fixes_at(np.random.default_rng(0).normal(0, 5, (5, 3))), "scatter too much"),
+    ],
+)
+def test_gps_that_says_nothing_is_not_used(fixes, words):
+    scale, why = scale_from_gps(0.01 * np.random.default_rng(1).normal(size=(5, 3)), fixes)
+    assert scale is None
+    assert words in why
+
+
+def test_a_measured_length_on_a_wall_gives_the_scale():
+    model = ring_model(unit_m=UNIT_M)
+    ends = np.array([[-0.8, 1.0, 0.6], [0.9, 1.0, 1.4]])
+    pixels = CAMERA.project(model.in_camera(3, ends / UNIT_M))
+    measured = MeasuredDistance(
+        "IMG_3.jpg", tuple(pixels[0]), tuple(pixels[1]), float(np.linalg.norm(ends[1] - ends[0])), 0.01
+    )
+    scale = scale_from_distance(model, measured, {"f3": "day/IMG_3.jpg"})
+    assert scale.metres_per_unit == pytest.approx(UNIT_M, rel=1e-3)
+    assert scale.standard_error == pytest.approx(UNIT_M * 0.01 / measured.distance_m, rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("measured", "words"),
+    [
+        (MeasuredDistance("f1", (10, 10), (20, 20), -1.0), "above 0"),
+        (MeasuredDistance("nobody.jpg", (10, 10), (20, 20), 1.0), "nobody.jpg"),
+        (MeasuredDistance("f1", (-5, 10), (20, 20), 1.0), "inside 640 x 480"),
+        (MeasuredDistance("f1", (320, 470), (320, 200), 1.0), "scene points around"),
+    ],
+)
+def test_a_wrong_length_is_refused(measured, words):
+    with pytest.raises(ThermoxelsError, match=words):
+        scale_from_distance(ring_model(), measured, {})
+
+
+@pytest.fixture
+def marker_photographs(tmp_path):
+    """Photographs of a wall with an ArUco marker of 0.4 m."""
+    model = ring_model(count=4, unit_m=UNIT_M)
+    marker = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 240)
+    texture = cv2.copyMakeBorder(marker, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
+    files = {}
+    for index, name in enumerate(model.frames):
+        pixel = np.stack(np.meshgrid(np.arange(640) + 0.5, np.arange(480) + 0.5), -1).reshape(-1, 2)
+        pose = model.camera_to_world[index]
+        rays = CAMERA.rays(pixel) * (1, -1, -1) @ pose[:3, :3].T
+        centre = pose[:3, 3] * UNIT_M
+        hit = centre + rays * ((1.0 - centre[1]) / rays[:, 1])[:, None]
+        x = ((hit[:, 0] + 0.3) / 0.6 * 360 - 0.5).astype(np.float32).reshape(480, 640)
+        y = ((1.3 - hit[:, 2]) / 0.6 * 360 - 0.5).astype(np.float32).reshape(480, 640)
+        seen = cv2.remap(texture, x, y, cv2.INTER_AREA, borderMode=cv2.BORDER_CONSTANT, borderValue=(128,))
+        files[name] = tmp_path / f"{name}.png"
+        Image.fromarray(seen).save(files[name])
+    return model, files
+
+
+def test_a_marker_gives_the_scale(marker_photographs):
+    model, files = marker_photographs
+    scale, why = scale_from_markers(model, files, 0.4, 0.001)
+    assert scale is not None and scale.standard_error is not None, why
+    assert scale.metres_per_unit == pytest.approx(UNIT_M, rel=0.01)
+    assert abs(scale.metres_per_unit - UNIT_M) < 4 * scale.standard_error
+    assert "1 ArUco marker of 0.4 m (7)" in scale.source
+
+
+def test_photographs_without_a_marker_say_so(marker_photographs, tmp_path):
+    model, files = marker_photographs
+    Image.new("L", (640, 480), 128).save(tmp_path / "grey.png")
+    scale, why = scale_from_markers(model, dict.fromkeys(files, tmp_path / "grey.png"), 0.4)
+    assert scale is None
+    assert "no photograph shows" in why

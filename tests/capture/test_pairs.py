@@ -1,0 +1,201 @@
+"""Which thermal image belongs to which photograph: by file, by names, by time; nothing is paired by chance."""
+
+from __future__ import annotations
+
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.capture.camera_card import counts, jpeg_bytes, photograph
+from tests.data.flir_file import FlirFile
+from thermoxels_ns.capture.camera_files import CameraFile, CameraFolder, scan_folder
+from thermoxels_ns.capture.pairs import PairOptions, PairSearch, find_pairs, read_pair_list
+from thermoxels_ns.errors import SceneError
+
+ROOT = Path("/card")
+NOON = datetime(2024, 5, 1, 12)
+
+
+def of(*files: tuple[str, str] | tuple[str, str, float], options: PairOptions | None = None) -> PairSearch:
+    """Pair files given as name, role and (optional) seconds after noon."""
+    listed = tuple(
+        CameraFile(ROOT / f[0], f[1], None if len(f) == 2 else NOON + timedelta(seconds=f[2]))  # type: ignore[arg-type]
+        for f in files
+    )
+    return find_pairs(CameraFolder(ROOT, listed), options)
+
+
+def names(search: PairSearch) -> list[tuple[str, str]]:
+    return [(pair.photograph.name, pair.thermal.name) for pair in search.pairs]
+
+
+@pytest.mark.parametrize(
+    ("photo", "thermal"),
+    [
+        ("10-58-15-636-visible.jpg", "10-58-15-636-radiometric.tiff"),
+        ("visible/a7.jpg", "thermal/a7.npy"),
+        ("RGB_0004.png", "IR_0004.tif"),
+        ("20180528_120000_V.jpg", "20180528_120000_R.tiff"),
+        ("Halle (2) rgb.JPG", "Halle (2) thermal.csv"),
+    ],
+)
+def test_equal_names_belong_together(photo, thermal):
+    search = of((photo, "photograph"), (thermal, "thermal"), ("other.jpg", "photograph"))
+    assert names(search) == [(Path(photo).name, Path(thermal).name)]
+    assert list(search.unpaired) == [ROOT / "other.jpg"]
+
+
+def test_numbers_sort_as_numbers_and_names_are_plain():
+    files = [(f"shot {n}{kind}", role) for n in (10, 2) for kind, role in ((".jpg", "photograph"), (".npy", "thermal"))]
+    assert [pair.name for pair in of(*files).pairs] == ["shot_2", "shot_10"]
+
+
+def test_the_same_name_in_two_folders_is_told_apart_by_the_folder():
+    search = of(
+        *(("day1/visible/a.jpg", "photograph"), ("day1/thermal/a.tif", "thermal")),
+        *(("day2/visible/a.jpg", "photograph"), ("day2/thermal/a.tif", "thermal")),
+    )
+    assert [(p.photograph.parts[2], p.thermal.parts[2]) for p in search.pairs] == [("day1", "day1"), ("day2", "day2")]
+    assert len({pair.name for pair in search.pairs}) == 2
+
+
+def test_two_thermal_images_of_one_name_are_ambiguous_and_both_named():
+    search = of(("a.jpg", "photograph"), ("a.npy", "thermal"), ("a.csv", "thermal"))
+    assert search.pairs == ()
+    assert set(search.unpaired) == {ROOT / "a.jpg", ROOT / "a.npy", ROOT / "a.csv"}
+    assert all("ambiguous" in why for why in search.unpaired.values())
+
+
+def test_a_picture_for_the_eye_gives_way_to_the_temperatures_and_is_named():
+    search = of(("a-visible.jpg", "photograph"), ("a-thermal.jpg", "thermal picture"), ("a-radiometric.tif", "thermal"))
+    assert names(search) == [("a-visible.jpg", "a-radiometric.tif")]
+    assert "a-radiometric.tif" in search.unpaired[ROOT / "a-thermal.jpg"]
+
+
+def test_dji_names_pair_though_their_times_differ_by_a_second():
+    search = of(
+        ("DJI_20220723151219_0001_T.JPG", "thermal"),
+        *(("DJI_20220723151220_0001_V.JPG", "photograph"), ("DJI_20220723151220_0001_Z.JPG", "photograph")),
+        *(("DJI_20220723160000_0001_V.JPG", "photograph"), ("DJI_0002_T.JPG", "thermal")),
+        *(("DJI_0002_W.JPG", "photograph"), ("DJI_0002_Z.JPG", "photograph")),
+    )
+    assert sorted(names(search)) == [
+        ("DJI_0002_W.JPG", "DJI_0002_T.JPG"),
+        ("DJI_20220723151220_0001_V.JPG", "DJI_20220723151219_0001_T.JPG"),
+    ]
+    assert "DJI_0002_W.JPG is the partner" in search.unpaired[ROOT / "DJI_0002_Z.JPG"]
+    assert ROOT / "DJI_20220723160000_0001_V.JPG" in search.unpaired
+
+
+def test_times_pair_what_names_do_not():
+    search = of(
+        *(("IMG_1.jpg", "photograph", 0.0), ("IMG_2.jpg", "photograph", 10.0), ("IMG_3.jpg", "photograph", 60.0)),
+        *(("FLIR7.jpg", "thermal", 0.4), ("FLIR8.jpg", "thermal", 10.9)),
+    )
+    assert names(search) == [("IMG_1.jpg", "FLIR7.jpg"), ("IMG_2.jpg", "FLIR8.jpg")]
+    assert "49.1 s away" in search.unpaired[ROOT / "IMG_3.jpg"]
+
+
+def test_a_clock_that_is_ahead_is_set_back():
+    files = (("a.jpg", "photograph", 0.0), ("b.npy", "thermal", 3600.2))
+    assert of(*files).pairs == ()
+    assert names(of(*files, options=PairOptions(clock_offset_s=3600.0))) == [("a.jpg", "b.npy")]
+
+
+def test_two_candidates_about_as_near_in_time_are_not_guessed_between():
+    search = of(("x.jpg", "photograph", 1.0), ("p.npy", "thermal", 0.5), ("q.npy", "thermal", 1.6))
+    assert search.pairs == ()
+    assert "about as near" in search.unpaired[ROOT / "x.jpg"]
+
+
+def test_every_file_is_in_a_pair_or_explained():
+    rng = np.random.default_rng(0)
+    files = [(f"p{n}.jpg", "photograph", float(rng.uniform(0, 100))) for n in range(30)]
+    files += [(f"t{n}q.npy", "thermal", float(rng.uniform(0, 100))) for n in range(25)]
+    search = of(*files)
+    paired = [path for pair in search.pairs for path in (pair.photograph, pair.thermal)]
+    assert len(search.pairs) > 3
+    assert len(paired) == len(set(paired))
+    assert set(paired) | set(search.unpaired) == {ROOT / f[0] for f in files}
+    assert not set(paired) & set(search.unpaired)
+
+
+@pytest.fixture
+def card(tmp_path):
+    folder = tmp_path / "card"
+    photograph(folder / "1-visible.jpg")
+    counts(folder / "1-radiometric.tiff")
+    flir = FlirFile(np.full((6, 8), 14000, dtype=np.uint16), photograph=jpeg_bytes(np.zeros((24, 32, 3), np.uint8)))
+    (folder / "FLIR2.jpg").write_bytes(flir.jpeg())
+    (folder / "log.txt").write_text("not ours")
+    return folder
+
+
+def test_a_card_is_read_by_content(card):
+    (card / "3-visible.jpg").write_bytes(b"")
+    (card / "4-visible.jpg").write_bytes(b"no picture at all")
+    (card / ".trash").mkdir()
+    photograph(card / ".trash" / "9-visible.jpg")
+    found = scan_folder(card)
+    assert {f.path.name: f.role for f in found.files} == {
+        "1-visible.jpg": "photograph",
+        "1-radiometric.tiff": "thermal",
+        "FLIR2.jpg": "both",
+    }
+    assert {path.name for path in found.unreadable} == {"3-visible.jpg", "4-visible.jpg"}
+    assert all(path.name in why for path, why in found.unreadable.items())
+    assert found.others == 1
+    search = find_pairs(found)
+    assert [pair.in_one_file for pair in search.pairs] == [False, True]
+
+
+def test_a_plain_jpeg_that_is_named_thermal_is_no_photograph(tmp_path):
+    photograph(tmp_path / "thermal" / "a.jpg")
+    photograph(tmp_path / "visible" / "a.jpg")
+    photograph(tmp_path / "thermal rgb" / "visible" / "b.jpg")
+    roles = {f.path.relative_to(tmp_path).as_posix(): f.role for f in scan_folder(tmp_path).files}
+    assert roles == {
+        "thermal/a.jpg": "thermal picture",
+        "visible/a.jpg": "photograph",
+        "thermal rgb/visible/b.jpg": "photograph",
+    }
+
+
+def test_links_that_lead_out_of_the_folder_are_passed_over(card, tmp_path):
+    outside = photograph(tmp_path / "elsewhere" / "7-visible.jpg")
+    (card / "7-visible.jpg").symlink_to(outside)
+    assert "7-visible.jpg" not in {file.path.name for file in scan_folder(card).files}
+
+
+def test_a_list_of_pairs_goes_before_names(card, tmp_path):
+    listed = tmp_path / "pairs.csv"
+    listed.write_text("photograph,thermal\n1-visible.jpg,1-radiometric.tiff\n")
+    search = read_pair_list(listed, card)
+    assert names(search) == [("1-visible.jpg", "1-radiometric.tiff")]
+
+
+@pytest.mark.parametrize("name", ["../secret.jpg", "/etc/passwd", "C:\\x.jpg", "a/../../secret.jpg"])
+def test_a_list_that_points_outside_the_capture_is_refused(card, tmp_path, name):
+    photograph(tmp_path / "secret.jpg")
+    listed = tmp_path / "pairs.csv"
+    listed.write_text(f"{name},1-radiometric.tiff\n")
+    with pytest.raises(SceneError, match=r"line 1: expected a file inside"):
+        read_pair_list(listed, card)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("1-visible.jpg\n", "two names per line"),
+        ("1-visible.jpg,missing.tiff\n", "missing.tiff"),
+        ("1-visible.jpg,1-radiometric.tiff\n1-visible.jpg,FLIR2.jpg\n", "1-visible.jpg twice"),
+        ("", "no pair"),
+    ],
+)
+def test_a_wrong_list_of_pairs_says_where(card, tmp_path, text, words):
+    listed = tmp_path / "pairs.csv"
+    listed.write_text(text)
+    with pytest.raises(SceneError, match=words):
+        read_pair_list(listed, card)

@@ -1,0 +1,193 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.heat_meshes import box_mesh, planes
+from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.edge_surplus import EdgeSurplus
+from thermoxels_ns.fem.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
+from thermoxels_ns.fem.error_estimate import RecoveredError, error_ratio, recovered_error, richardson
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.refine_mesh import refine_mesh
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.fem.stepping import solve_heat
+
+STEEL = Material("steel", 50.0, 7800.0, 450.0)
+WOOL = Material("wool", 0.04, 30.0, 1000.0)
+
+
+def exact(p: np.ndarray) -> np.ndarray:
+    return np.cos(np.pi * p[:, 0]) * np.sin(np.pi * p[:, 1]) * np.exp(p[:, 2])
+
+
+ENERGY = (np.exp(2.0) - 1.0) / 8.0 * (2.0 * np.pi**2 + 1.0)
+"""integral |grad u|^2 over the unit cube for the function above."""
+
+
+def smooth(parts: int) -> HeatProblem:
+    axis = np.linspace(0, 1, parts + 1)
+    given = Varying(lambda places, t: exact(places.points_m), in_time=False)
+    source = Varying(lambda places, t: (2 * np.pi**2 - 1) * exact(places.points_m), in_time=False)
+    effects = (FixedTemperature(("*",), given), InternalHeat(("*",), source))
+    return HeatProblem(box_mesh(axis, axis, axis), Material("any", 1.0, 1.0, 1.0), effects=effects)
+
+
+def corner(parts: int, cold: tuple[str, ...] = ("other",)) -> HeatProblem:
+    """Two materials around a notch, warm air above and cold air in it: the temperature is singular at the notch."""
+    mesh = box_mesh(
+        np.linspace(0, 1, parts + 1),
+        np.linspace(0, 1, parts + 1),
+        [0, 1 / parts],
+        regions={"steel": lambda p: p[..., 0] > -1, "wool": lambda p: p[..., 0] > 0.75},
+        keep=lambda p: (p[..., 0] > 0.5) | (p[..., 1] > 0.5),
+    )
+    effects = (Convection(("y1",), 500.0, 20.0), Convection(cold, 500.0, 0.0))
+    return HeatProblem(mesh, {"steel": STEEL, "wool": replace(STEEL, conductivity_w_mk=5.0)}, effects=effects)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_flux_that_is_even_in_each_layer_has_no_error(order) -> None:
+    """The gradient jumps by 1250 between layers; means are taken in each material apart."""
+    regions = {"steel": lambda p: p[..., 0] < 0.2, "wool": lambda p: p[..., 0] > 0.2}
+    mesh = box_mesh(planes(0.0, 0.2, 0.3, step=0.05), [0, 0.1], [0, 0.1], regions=regions)
+    effects = (Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, -10.0))
+    problem = HeatProblem(mesh, {"steel": STEEL, "wool": WOOL}, effects=effects)
+    error = recovered_error(problem, solve_steady(problem, order=order))
+    through = 0.01 * 30.0 / (1 / 8 + 0.2 / 50 + 0.1 / 0.04 + 1 / 25)
+    assert len(error.tet_w_k) == len(mesh.tets)
+    assert 0.0 <= error.total_w_k < 1e-12 * through * 30.0
+    one = replace(mesh, region=np.zeros_like(mesh.region), region_names=("steel",))
+    mixed = recovered_error(HeatProblem(one, STEEL, effects=effects), solve_steady(problem, order=order))
+    assert mixed.total_w_k > 1.0
+
+
+@pytest.mark.parametrize(("order", "parts"), [(1, (4, 8, 16)), (2, (4, 8))])
+def test_the_recovered_error_is_close_to_the_true_one(order, parts) -> None:
+    """P1: within a fifth. The error of P2 in the squared flux is that of the energy a(e, e)."""
+    totals = []
+    for number in parts:
+        problem = smooth(number)
+        totals.append(recovered_error(problem, solve_steady(problem, order=order)).total_w_k)
+    # L2 norms of the gradient's error, measured in tests/convergence with 64 points per tetrahedron.
+    true = {1: (1.6120, 0.82468, 0.41478), 2: (0.25428, 0.065222)}[order]
+    effectivity = np.sqrt(totals) / np.array(true)
+    assert np.all((effectivity > 0.85) & (effectivity < 1.2)), effectivity
+
+
+def test_the_recovered_error_is_that_of_the_heat_flow() -> None:
+    """Between two airs, flow times their difference exceeds the exact one by the error: here within a factor of 2."""
+    exact_w = solve_steady(replace_mesh(corner(16), 1), order=2).effects[0].heat_w[0]
+    for parts in (8, 16):
+        problem = corner(parts)
+        depth = (1 / parts) / (1 / 16)
+        solution = solve_steady(problem, lumped_boundary=False)
+        surplus_w = solution.effects[0].heat_w[0] - depth * exact_w
+        estimate_w = recovered_error(problem, solution).total_w_k / 20.0
+        assert surplus_w > 0.0
+        assert 0.5 < estimate_w / surplus_w < 2.0, (parts, estimate_w, surplus_w)
+
+
+def test_the_worst_tetrahedra_are_at_the_notch() -> None:
+    problem = corner(16)
+    error = recovered_error(problem, solve_steady(problem))
+    centre = problem.mesh.points_m[problem.mesh.tets].mean(axis=1)
+    from_notch = np.abs(centre[:, :2] - 0.5).max(axis=1)
+    assert error.tet_w_k[from_notch < 1 / 16].mean() > 10.0 * error.tet_w_k.mean()
+
+
+def test_richardson() -> None:
+    """T_h = 1 + 0.4 h^2: from h = 1 and h = 1/2 the error of the second is 0.1."""
+    assert richardson(1.4 - 1.1, 0.25) == pytest.approx(0.1)
+    assert richardson(1.1 - 1.4, 0.25) == pytest.approx(0.1)
+    assert richardson(0.0, 0.5) == 0.0
+    for ratio in (0.0, 1.0, -0.1, np.nan):
+        with pytest.raises(HeatError, match="ratio: expected a number above 0 and below 1"):
+            richardson(1.0, ratio)
+
+
+def test_error_ratio_is_kept_in_bounds() -> None:
+    first, second = RecoveredError(np.array([1.0, 3.0])), RecoveredError(np.array([0.5, 0.5]))
+    assert error_ratio(first, second) == 0.25
+    assert error_ratio(second, first) == 0.7
+    nothing = RecoveredError(np.zeros(2))
+    assert error_ratio(first, nothing) == error_ratio(nothing, first) == 1.0 / 64.0
+
+
+def test_a_solution_of_another_mesh_is_refused() -> None:
+    problem = smooth(2)
+    with pytest.raises(HeatError, match="solution: expected 125 temperatures, got 27"):
+        recovered_error(smooth(4), solve_steady(problem))
+    quadratic = solve_steady(problem, order=2)
+    with pytest.raises(HeatError, match="solution: expected 125 temperatures, got 124"):
+        recovered_error(problem, replace(quadratic, edge_temperature_c=quadratic.edge_temperature_c[1:]))
+
+
+def replace_mesh(problem: HeatProblem, times: int) -> HeatProblem:
+    for _ in range(times):
+        problem = replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=None)
+    return problem
+
+
+RADIATING = HeatProblem(
+    box_mesh(np.linspace(0, 1, 5), np.linspace(0, 1, 5), np.linspace(0, 1, 5), temperature_c=400.0),
+    Material("ceramic", 2.0, 2000.0, 900.0),
+    effects=(
+        FixedTemperature(("x0",), Varying(lambda p, t: 600.0 * p.points_m[:, 1], in_time=False)),
+        Radiation(("x1", "y1"), 0.9, 20.0),
+        HeatFlux(("z0",), 500.0),
+    ),
+)
+
+
+@pytest.mark.parametrize("problem", [smooth(4), smooth(8), corner(8), corner(16), RADIATING])
+def test_the_surplus_of_edges_is_most_of_what_quadratic_tetrahedra_add(problem) -> None:
+    linear, quadratic = solve_steady(problem), solve_steady(problem, order=2)
+    surplus = EdgeSurplus(problem).of_steady(linear)
+    added_k = quadratic.temperature_c - linear.temperature_c
+    share = np.linalg.norm(surplus.temperature_k[0]) / np.linalg.norm(added_k)
+    assert 0.8 < share < 1.1, share
+    alike = surplus.temperature_k[0] @ added_k / (np.linalg.norm(surplus.temperature_k[0]) * np.linalg.norm(added_k))
+    assert alike > 0.85, alike
+    before, after = ({(e.effect, n): e.group_heat_w[0, i] for e in s.effects for i, n in enumerate(e.group_names)}
+                     for s in (linear, quadratic))  # fmt: skip
+    added_w = np.array([after[group] - before[group] for group in surplus.groups])
+    largest = np.abs(added_w).max()
+    np.testing.assert_allclose(surplus.group_heat_w[0], added_w, atol=0.15 * largest)
+
+
+def test_the_surplus_where_two_airs_meet() -> None:
+    """The temperature all but jumps at an edge."""
+    problem = corner(8, ("x1", "other"))
+    linear, quadratic = solve_steady(problem), solve_steady(problem, order=2)
+    surplus_k = EdgeSurplus(problem).of_steady(linear).temperature_k[0]
+    share = np.abs(surplus_k).max() / np.abs(quadratic.temperature_c - linear.temperature_c).max()
+    assert 0.9 < share < 1.1, share
+
+
+def test_the_surplus_follows_the_error_through_time() -> None:
+    """A block that one hot side warms, against a mesh of half the size twice; heat that flowed in too."""
+    axis = np.linspace(0, 0.1, 7)
+    swing = Varying(lambda places, t: 100.0 * np.sin(np.pi * t / 40.0))
+    effects = (FixedTemperature(("x1",), swing), Convection(("y0",), 400.0, 0.0))
+    mesh = box_mesh(axis, axis, [0, 0.1 / 6], temperature_c=0.0)
+    problem = HeatProblem(mesh, Material("steel", 35.0, 7200.0, 440.5), effects=effects)
+    steps = AdaptiveSteps(32.0, 0.05)
+    rough, fine = solve_heat(problem, steps), solve_heat(replace_mesh(problem, 2), steps)
+    surplus = EdgeSurplus(problem).in_time(rough)
+    true_k = fine.temperature_c[:, : len(mesh.points_m)] - rough.temperature_c
+    assert np.all(surplus.temperature_k[0] == 0.0)
+    share = np.abs(surplus.temperature_k).max() / np.abs(true_k).max()
+    assert 0.7 < share < 1.4, share
+    last = surplus.temperature_k[-1] @ true_k[-1]
+    assert last > 0.8 * np.linalg.norm(surplus.temperature_k[-1]) * np.linalg.norm(true_k[-1])
+    true_w = [fine.effects[k].heat_w.mean() - rough.effects[k].heat_w.mean() for k in (0, 1)]
+    added_w = {label: surplus.group_heat_w[1:, i].mean() for i, (label, _) in enumerate(surplus.groups)}
+    estimated_w = [added_w[heat.effect] for heat in rough.effects]
+    assert np.sign(estimated_w).tolist() == np.sign(true_w).tolist()
+    assert 0.7 < estimated_w[1] / true_w[1] < 1.4, (estimated_w, true_w)
+    assert 1.0 < estimated_w[0] / true_w[0] < 4.0, (estimated_w, true_w)

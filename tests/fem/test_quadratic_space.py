@@ -1,0 +1,166 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.heat_meshes import box_mesh, planes
+from tests.shell_mesh import shell_mesh
+from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
+from thermoxels_ns.fem.linear_space import LinearSpace
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.quadratic_elements import mass_table
+from thermoxels_ns.fem.quadratic_space import QuadraticSpace
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.fem.system import HeatSystem
+
+STEEL = Material("steel", 50.0, 7800.0, 450.0)
+HESSIAN = np.array([[2.0, 0.5, -1.0], [0.5, -3.0, 0.25], [-1.0, 0.25, 1.5]])
+SLOPE = np.array([1.0, -2.0, 0.5])
+
+
+def quadratic(points: np.ndarray) -> np.ndarray:
+    return 3.0 + points @ SLOPE + 0.5 * np.einsum("ki,ij,kj->k", points, HESSIAN, points)
+
+
+def crooked_box():
+    """A box of two regions whose inner nodes are off the lattice, so that no angle is right."""
+    mesh = box_mesh(
+        planes(0, 0.5, 1, step=0.25),
+        np.linspace(0, 1, 4),
+        np.linspace(0, 1, 4),
+        regions={"left": lambda p: p[..., 0] < 0.5, "right": lambda p: p[..., 0] > 0.5},
+    )
+    inside = np.all((mesh.points_m > 1e-9) & (mesh.points_m < 1 - 1e-9), axis=1) & (mesh.points_m[:, 0] != 0.5)
+    mesh.points_m[inside] += np.random.default_rng(1).uniform(-0.05, 0.05, (inside.sum(), 3))
+    return mesh
+
+
+def test_the_energy_of_a_quadratic_is_exact() -> None:
+    """integral |grad q|^2 over the unit cube, grad q = b + A x: b.b + b.A1 + sum over A A^T of the moments of x."""
+    space = QuadraticSpace(Selection(crooked_box()))
+    moments = np.full((3, 3), 0.25) + np.eye(3) / 12.0
+    exact = SLOPE @ SLOPE + SLOPE @ HESSIAN @ np.ones(3) + np.trace(HESSIAN @ HESSIAN.T @ moments)
+    values = quadratic(space.points_m)
+    stiffness = space.stiffness(1.0)
+    assert values @ (stiffness @ values) == pytest.approx(exact, rel=1e-12)
+    assert abs(stiffness - stiffness.T).max() == 0.0
+    assert np.abs(stiffness @ np.ones(space.num_nodes)).max() < 1e-13 * abs(stiffness).max()
+    doubled = space.stiffness(np.full(len(space.selection.mesh.tets), 2.0))
+    assert abs(doubled - 2.0 * stiffness).max() == 0.0
+
+
+def test_p1_is_part_of_p2() -> None:
+    """Restricted to functions that are linear in each tetrahedron, the matrices are those of P1."""
+    mesh = shell_mesh(0.5, 0.6, 3, 2)
+    linear, space = LinearSpace(Selection(mesh), lumped=False), QuadraticSpace(Selection(mesh))
+    conductivity = np.random.default_rng(2).uniform(1.0, 5.0, len(mesh.tets))
+    u, v = np.random.default_rng(3).normal(size=(2, len(mesh.points_m)))
+    fine_u, fine_v = space.from_mesh_nodes(u), space.from_mesh_nodes(v)
+    for of_linear, of_quadratic in (
+        (linear.stiffness(conductivity), space.stiffness(conductivity)),
+        (linear.mass(conductivity)[0], space.mass(conductivity)[0]),
+    ):
+        assert of_linear is not None and of_quadratic is not None
+        assert fine_u @ (of_quadratic @ fine_v) == pytest.approx(u @ (of_linear @ v), rel=1e-11)
+    heat = np.random.default_rng(4).normal(size=space.num_nodes)
+    assert fine_u @ heat == pytest.approx(u @ space.to_mesh_nodes(heat), rel=1e-12)
+    every = np.arange(len(mesh.tets))
+    load = space.tet_load(every, conductivity)
+    np.testing.assert_allclose(space.to_mesh_nodes(load), linear.tet_load(every, conductivity), atol=1e-12)
+
+
+def test_mass() -> None:
+    """Row sums of one tetrahedron: -1/20 of its capacity at a corner, 1/5 at an edge; a total of rho c V."""
+    np.testing.assert_allclose(mass_table().sum(axis=1), np.repeat([-0.05, 0.2], [4, 6]), atol=1e-15)
+    space = QuadraticSpace(Selection(crooked_box()))
+    matrix, row_sums = space.mass(3.0)
+    assert matrix is not None
+    assert row_sums.sum() == pytest.approx(3.0, rel=1e-12) and row_sums.min() < 0.0
+    x = space.points_m[:, 0]
+    assert (x**2) @ (matrix @ x**2) == pytest.approx(3.0 / 5.0, rel=1e-12)
+
+
+def test_a_quadratic_temperature_is_exact() -> None:
+    """div(k grad q) + s = 0 with the flux of q through one side, convection, and q itself on the others."""
+    mesh, k = crooked_box(), 50.0
+    space = QuadraticSpace(Selection(mesh))
+
+    def gradient(points):
+        return SLOPE + points @ HESSIAN
+
+    side = Varying(lambda places, t: k * gradient(places.points_m)[:, 2], in_time=False)
+    given = Varying(lambda places, t: quadratic(places.points_m), in_time=False)
+    effects = (
+        FixedTemperature(("x?", "y?", "z0"), given),
+        HeatFlux(("z1",), side),
+        InternalHeat(("*",), -k * np.trace(HESSIAN)),
+    )
+    solution = solve_steady(HeatProblem(mesh, {"left": STEEL, "right": STEEL}, effects=effects), order=2)
+    exact = quadratic(space.points_m)
+    found = np.concatenate([solution.temperature_c, solution.edge_temperature_c])
+    # The flux is taken at the centroids of the triangles: exact in the mean only. The rest is not touched by it.
+    assert np.abs(found - exact).max() < 0.02 * np.ptp(exact)
+    fixed = (FixedTemperature(("*",), given), InternalHeat(("*",), -k * np.trace(HESSIAN)))
+    solution = solve_steady(HeatProblem(mesh, {"left": STEEL, "right": STEEL}, effects=fixed), order=2)
+    found = np.concatenate([solution.temperature_c, solution.edge_temperature_c])
+    np.testing.assert_allclose(found, exact, atol=1e-9)
+    assert solution.energy_residual < 1e-12
+
+
+def test_a_heated_slab_between_airs_is_exact() -> None:
+    """Heat s leaves through both sides: T = T_air + s L / (2 h) + s (L x - x^2) / (2 k), quadratic."""
+    length, source, h, k = 0.2, 1e4, 10.0, 50.0
+    mesh = box_mesh(np.linspace(0, length, 4), [0, 0.1], [0, 0.1])
+    effects = (InternalHeat(("*",), source), Convection(("x0", "x1"), h, 5.0))
+    solution = solve_steady(HeatProblem(mesh, STEEL, effects=effects), order=2)
+    space = QuadraticSpace(Selection(mesh))
+    x = space.points_m[:, 0]
+    exact = 5.0 + source * length / (2 * h) + source * (length * x - x**2) / (2 * k)
+    found = np.concatenate([solution.temperature_c, solution.edge_temperature_c])
+    np.testing.assert_allclose(found, exact, atol=1e-8)
+    assert solution.effects[1].heat_w[0] == pytest.approx(-source * length * 0.01, rel=1e-10)
+
+
+def test_radiation_is_integrated() -> None:
+    """NAFEMS T2: a rod at 1000 K that radiates at its other end, 927.0076 K there."""
+    mesh = box_mesh(np.linspace(0, 0.1, 3), [0, 0.01], [0, 0.01])
+    effects = (FixedTemperature(("x0",), 726.85), Radiation(("x1",), 0.98, 26.85, 5.67e-8))
+    solution = solve_steady(HeatProblem(mesh, Material("rod", 55.6, 7850.0, 460.0), effects=effects), order=2)
+    end_k = solution.temperature_c[mesh.points_m[:, 0] == 0.1] + 273.15
+    np.testing.assert_allclose(end_k, 927.0076, atol=1e-4)
+
+
+def test_normals_of_edges_point_out() -> None:
+    """What is asked at fixed nodes is told the normal there, also in the middle of an edge."""
+    mesh = box_mesh([0, 1], [0, 1], [0, 1])
+    space = QuadraticSpace(Selection(mesh))
+    places = space.node_places(np.arange(space.num_nodes))
+    inside = np.all((places.points_m > 0) & (places.points_m < 1), axis=1)
+    assert np.all(places.normals[inside] == 0.0) and inside.sum() == 1
+    outward = np.einsum("ki,ki->k", places.normals, places.points_m - 0.5)
+    assert np.all(outward[~inside] > 0.2)
+    np.testing.assert_allclose(np.linalg.norm(places.normals[~inside], axis=1), 1.0)
+
+
+@pytest.mark.parametrize("options", [{"lumped": True}, {"lumped": False, "lumped_boundary": True}])
+def test_lumping_is_refused(options) -> None:
+    problem = HeatProblem(box_mesh([0, 1], [0, 1], [0, 1]), STEEL)
+    with pytest.raises(HeatError, match="order 2: expected integrals that are not lumped, got lumped.*negative masses"):
+        HeatSystem(problem, order=2, **options)
+
+
+def test_other_orders_are_refused() -> None:
+    problem = HeatProblem(box_mesh([0, 1], [0, 1], [0, 1]), STEEL, effects=(FixedTemperature(("*",), 0.0),))
+    with pytest.raises(HeatError, match="order: expected 1 or 2, got 3"):
+        solve_steady(problem, order=3)
+
+
+def test_a_loose_piece_is_named_in_quadratic_meshes_too() -> None:
+    mesh = box_mesh(np.linspace(0, 0.5, 6), [0, 0.1], [0, 0.1], keep=lambda p: abs(p[..., 0] - 0.25) > 0.06)
+    problem = HeatProblem(mesh, STEEL, effects=(Convection(("x0",), 5.0, 10.0),))
+    with pytest.raises(HeatError, match=r"none on 1 of 2 pieces.*\(0\.3, 0, 0\) to \(0\.5,"):
+        solve_steady(problem, order=2)

@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.heat_meshes import box_mesh
+from tests.shell_mesh import shell_mesh
+from thermoxels_ns.fem.edge_midpoints import TET_EDGES, edge_numbers
+from thermoxels_ns.fem.elements import edge_couplings
+from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
+from thermoxels_ns.fem.sparsity import mesh_edges
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.mesh.voxel_tets import boundary_facets
+
+
+def volumes(mesh: TetMesh) -> np.ndarray:
+    corner = mesh.points_m[mesh.tets]
+    return np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6.0
+
+
+def areas(mesh: TetMesh) -> np.ndarray:
+    corner = mesh.points_m[mesh.facets]
+    return 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+
+
+def turned(facets: np.ndarray) -> set[tuple[int, ...]]:
+    """Triangles from their smallest node on, which keeps their sense of rotation."""
+    return {tuple(np.roll(facet, -int(np.argmin(facet)))) for facet in facets}
+
+
+def notched() -> TetMesh:
+    mesh = box_mesh(
+        [0, 1, 2, 4],
+        [0, 1, 2],
+        [0, 1.5, 2],
+        temperature_c=lambda p: 3 * p[:, 0] - p[:, 2],
+        regions={"low": lambda p: p[..., 0] < 2, "high": lambda p: p[..., 0] > 2},
+        keep=lambda p: (p[..., 0] < 2) | (p[..., 1] < 1),
+    )
+    tags = mesh.boundary
+    assert tags is not None
+    return replace(
+        mesh,
+        boundary=replace(tags, area_factor=np.linspace(0.5, 1.0, len(mesh.facets)), seen=tags.patch % 2 == 0),
+        colour=np.linspace(0, 1, 3 * len(mesh.points_m), dtype=np.float32).reshape(-1, 3),
+        observed=mesh.points_m[:, 0] < 1.5,
+    )
+
+
+@pytest.mark.parametrize("make", [notched, lambda: shell_mesh(0.5, 0.6, 2, 1)], ids=["notched", "shell"])
+def test_the_body_and_its_boundary_stay_the_same(make) -> None:
+    mesh = make()
+    fine = refine_mesh(mesh)
+    assert len(fine.tets) == 8 * len(mesh.tets) and len(fine.facets) == 4 * len(mesh.facets)
+    parts = volumes(fine).reshape(-1, 8)
+    assert parts.min() > 0.0
+    # Each child is an eighth of its parent, and stands where its parent stood.
+    np.testing.assert_allclose(parts, np.repeat(volumes(mesh)[:, None] / 8.0, 8, axis=1), rtol=1e-9)
+    # Conforming: what faces no other tetrahedron is exactly the children of the boundary, with their orientation.
+    assert turned(boundary_facets(fine.tets)) == turned(fine.facets)
+    np.testing.assert_allclose(areas(fine).reshape(-1, 4), np.repeat(areas(mesh)[:, None] / 4.0, 4, axis=1))
+    assert len(np.unique(fine.tets)) == len(fine.points_m)
+
+
+def test_children_inherit() -> None:
+    mesh = notched()
+    fine = refine_mesh(mesh)
+    tags, finer = mesh.boundary, fine.boundary
+    assert tags is not None and finer is not None and mesh.colour is not None and fine.colour is not None
+    np.testing.assert_array_equal(fine.region, np.repeat(mesh.region, 8))
+    np.testing.assert_array_equal(finer.patch, np.repeat(tags.patch, 4))
+    np.testing.assert_array_equal(finer.area_factor, np.repeat(tags.area_factor, 4))
+    np.testing.assert_array_equal(finer.seen, np.repeat(tags.seen, 4))
+    np.testing.assert_array_equal(finer.normal, np.repeat(tags.normal, 4, axis=0))
+    np.testing.assert_array_equal(fine.facet_tags, np.repeat(mesh.facet_tags, 4))
+    assert finer.patch_names == tags.patch_names and fine.region_names == mesh.region_names
+    old = len(mesh.points_m)
+    np.testing.assert_array_equal(fine.points_m[:old], mesh.points_m)
+    np.testing.assert_array_equal(fine.observed[:old], mesh.observed)
+    # Linear data stay linear; a node between a seen and an unseen one was not seen.
+    np.testing.assert_allclose(fine.temperature_c, 3 * fine.points_m[:, 0] - fine.points_m[:, 2], atol=1e-12)
+    np.testing.assert_array_equal(fine.observed, fine.points_m[:, 0] <= 1.0)
+    assert fine.colour.dtype == np.float32 and 0.0 <= fine.colour.min() and fine.colour.max() <= 1.0
+    np.testing.assert_array_equal(refined_values(mesh, mesh.temperature_c), fine.temperature_c)
+    untagged = refine_mesh(replace(mesh, boundary=None, colour=None))
+    assert untagged.boundary is None and untagged.colour is None
+    np.testing.assert_array_equal(untagged.tets, fine.tets)
+
+
+def test_no_angle_of_a_lattice_becomes_obtuse() -> None:
+    """Entries of the stiffness matrix off its diagonal stay below 0: the maximum principle survives."""
+    mesh = box_mesh([0, 1, 2], [0, 1], [0, 1])
+    for _ in range(3):
+        mesh = refine_mesh(mesh)
+        edges = mesh_edges(mesh.tets, len(mesh.points_m))
+        coupling = edge_couplings(mesh.points_m, mesh.tets, 1.0, edges)
+        assert coupling.max() <= 0.0
+        corner = mesh.points_m[mesh.tets]
+        lengths = np.linalg.norm(corner[:, TET_EDGES[:, 0]] - corner[:, TET_EDGES[:, 1]], axis=2)
+        # All children are of the one shape of the parents.
+        shapes = np.sort(lengths, axis=1) / lengths.min(axis=1)[:, None]
+        np.testing.assert_allclose(shapes, np.tile(np.sqrt([1, 1, 1, 2, 2, 3]), (len(shapes), 1)))
+
+
+def test_shapes_do_not_degenerate() -> None:
+    """Where tetrahedra are irregular, three more refinements leave the worst shape as it is after the first."""
+    mesh, worst = shell_mesh(0.5, 0.6, 2, 1, eighth=True), []
+    for _ in range(4):
+        mesh = refine_mesh(mesh)
+        corner = mesh.points_m[mesh.tets]
+        longest = np.linalg.norm(corner[:, TET_EDGES[:, 0]] - corner[:, TET_EDGES[:, 1]], axis=2).max(axis=1)
+        worst.append(float((volumes(mesh) / longest**3).min()))
+    assert worst[-1] == pytest.approx(worst[0], rel=0.3), worst
+
+
+def test_edges_that_are_not_there() -> None:
+    edges = mesh_edges(np.array([[0, 1, 2, 3], [1, 2, 4, 3]]), 6)
+    found = edge_numbers(edges, np.array([[0, 4], [4, 1], [5, 0], [0, 6], [-1, 0]]), np.array([(0, 1)]))
+    np.testing.assert_array_equal(found[:, 0], [-1, 5, -1, -1, -1])

@@ -1,0 +1,234 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.heat_meshes import box_mesh, graded
+from tests.shell_mesh import shell_mesh
+from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.effects import Convection, FixedTemperature, Radiation
+from thermoxels_ns.fem.error_budget import ErrorSize, Tolerance, difference_between, mean_flows_w
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.refine_mesh import refine_mesh
+from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.tolerance import ToleratedSolution, solve_to_tolerance
+
+CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
+WITHIN = 3.0
+"""Factor that an estimate may be off by."""
+
+
+def finer(problem: HeatProblem, times: int = 1) -> HeatProblem:
+    for _ in range(times):
+        problem = replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=None)
+    return problem
+
+
+def true_error(found: ToleratedSolution, given: HeatProblem, exact: SteadySolution | HeatSolution) -> ErrorSize:
+    return difference_between(found.solution, exact, len(given.mesh.points_m))
+
+
+def silent(line: str) -> None:
+    assert line
+
+
+def iso_10211_case_3(finest: float) -> HeatProblem:
+    """The corner with a balcony slab of tests/verification, on a coarse mesh."""
+    step = {"finest": finest, "growth": 1.5, "coarsest": 0.4}
+    x, y, z = (
+        graded(*knots, **step)
+        for knots in ((-0.1, 0, 0.05, 0.2, 1.2), (-0.7, -0.1, 0, 0.05, 0.2, 1.2), (0, 1.0, 1.15, 1.2, 2.15))
+    )
+
+    def depth(p):
+        return np.minimum(p[..., 0], p[..., 1])
+
+    def slab(p):
+        return (p[..., 0] > 0.05) & (p[..., 2] > 1.0) & (p[..., 2] < 1.15)
+
+    regions = {
+        "inner wall": lambda p: depth(p) > 0.05,
+        "insulation": lambda p: (depth(p) > 0) & (depth(p) < 0.05),
+        "outer wall": lambda p: depth(p) < 0,
+        "floor": lambda p: (depth(p) > 0.2) & (p[..., 2] > 1.15),
+        "slab": slab,
+    }
+
+    def solid(p):
+        wall = (depth(p) > -0.1) & (depth(p) < 0.2)
+        return wall | slab(p) | ((depth(p) > 0.2) & (p[..., 2] > 1.15) & (p[..., 2] < 1.2))
+
+    def cut(c):
+        return (c[:, :2] > 1.2 - 1e-9).any(axis=1) | (c[:, 2] < 1e-9) | (c[:, 2] > 2.15 - 1e-9)
+
+    def room(c):
+        return ~cut(c) & (depth(c) > 0.2 - 1e-9)
+
+    patches = {
+        "cut": lambda c, n: cut(c),
+        "outside": lambda c, n: ~cut(c) & ~room(c),
+        "lower room": lambda c, n: room(c) & (c[:, 2] < 1.0 + 1e-9),
+        "upper room": lambda c, n: room(c) & (c[:, 2] > 1.15),
+    }
+    conductivity = {"inner wall": 0.7, "insulation": 0.04, "outer wall": 1.0, "floor": 1.0, "slab": 2.5}
+    effects = (
+        Convection(("lower room",), 5.0, 20.0),
+        Convection(("upper room",), 5.0, 15.0),
+        Convection(("outside",), 20.0, 0.0),
+    )
+    mesh = box_mesh(x, y, z, regions=regions, patches=patches, keep=solid)
+    return HeatProblem(mesh, {n: Material(n, k, 1000.0, 1000.0) for n, k in conductivity.items()}, effects=effects)
+
+
+def shell() -> HeatProblem:
+    mesh = shell_mesh(0.5, 0.6, 4, 1, eighth=True)
+    effects = (Convection(("inside",), 7.69, 20.0), Convection(("outside",), 25.0, -10.0))
+    return HeatProblem(mesh, CONCRETE, effects=effects)
+
+
+def nafems_t3(parts: int = 10) -> HeatProblem:
+    mesh = box_mesh(np.linspace(0, 0.1, parts + 1), [0, 0.01], [0, 0.01], temperature_c=0.0)
+    swing = Varying(lambda places, time_s: 100.0 * np.sin(np.pi * time_s / 40.0))
+    effects = (FixedTemperature(("x0",), 0.0), FixedTemperature(("x1",), swing))
+    return HeatProblem(mesh, Material("steel", 35.0, 7200.0, 440.5), effects=effects)
+
+
+@pytest.fixture(scope="module")
+def iso() -> tuple[HeatProblem, SteadySolution]:
+    """The problem and its solution with quadratic tetrahedra of half the size."""
+    problem = iso_10211_case_3(0.05)
+    return problem, solve_steady(finer(problem), order=2, relative_tolerance=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "order", "refinements"),
+    [(Tolerance(1.0), 1, 0), (Tolerance(0.25), 1, 1), (Tolerance(0.15), 2, 0), (Tolerance(None, 0.005), 2, 0)],
+)
+def test_iso_10211_case_3(iso, tolerance, order, refinements) -> None:
+    problem, exact = iso
+    found = solve_to_tolerance(problem, tolerance, log=silent)
+    settings, true = found.settings, true_error(found, problem, exact)
+    assert (settings.order, settings.refinements) == (order, refinements), found.levels
+    assert found.met and tolerance.excess(settings.error) <= 1.0
+    assert tolerance.excess(true) <= 1.0, (true, settings.error)
+    for level in found.levels:
+        assert np.isfinite(level.error.temperature_k) and level.seconds > 0.0
+    assert 1 / WITHIN < settings.error.temperature_k / true.temperature_k < WITHIN, (settings.error, true)
+    assert 1 / WITHIN < settings.error.heat_flow / true.heat_flow < WITHIN, (settings.error, true)
+
+
+@pytest.mark.parametrize("tolerance_k", [0.4, 0.15, 0.05])
+def test_spherical_shell(tolerance_k) -> None:
+    """The body is the one between the facets: the exact answer is that of much finer tetrahedra in it."""
+    problem = shell()
+    exact = solve_steady(finer(problem, 2), order=2)
+    found = solve_to_tolerance(problem, Tolerance(tolerance_k), log=silent)
+    true, estimate = true_error(found, problem, exact), found.settings.error
+    assert true.temperature_k <= tolerance_k and found.met
+    assert 1 / WITHIN < estimate.temperature_k / true.temperature_k < WITHIN, (found.settings, true)
+    assert 1 / WITHIN < estimate.heat_flow / true.heat_flow < WITHIN, (found.settings, true)
+
+
+@pytest.mark.parametrize(("tolerance_k", "refinements"), [(2.0, 0), (0.5, 1), (0.2, 2)])
+def test_nafems_t3(tolerance_k, refinements) -> None:
+    problem = nafems_t3()
+    exact = solve_heat(nafems_t3(160), AdaptiveSteps(32.0, 0.01))
+    found = solve_to_tolerance(problem, Tolerance(tolerance_k), duration_s=32.0, log=silent)
+    assert found.met and found.settings.refinements == refinements and found.settings.order == 1
+    assert isinstance(found.solution, HeatSolution) and found.settings.step_tolerance_k is not None
+    x, fine_x = problem.mesh.points_m[:, 0], np.sort(nafems_t3(160).mesh.points_m[:, 0])
+    fine_order = np.argsort(nafems_t3(160).mesh.points_m[:, 0])
+    on_line = np.array([np.interp(x, fine_x, row[fine_order]) for row in exact.temperature_c])
+    true_k = float(np.abs(found.solution.temperature_c[:, : len(x)] - on_line).max())
+    assert true_k <= tolerance_k
+    assert 1 / WITHIN < found.settings.error.temperature_k / true_k < WITHIN, (found.settings, true_k)
+
+
+def test_long_steps_are_shortened() -> None:
+    """On a fine mesh the steps are what errs: their error is found and brought within the tolerance."""
+    mesh = box_mesh(np.linspace(0, 0.1, 61), [0, 0.01], [0, 0.01], temperature_c=20.0)
+    effects = (Convection(("x1",), 50.0, 0.0),)
+    problem = HeatProblem(mesh, CONCRETE, effects=effects)
+    found = solve_to_tolerance(problem, Tolerance(0.01), duration_s=3600.0, outputs=2, log=silent)
+    exact = solve_heat(problem, AdaptiveSteps(3600.0, 1e-4, outputs=2))
+    assert isinstance(found.solution, HeatSolution)
+    assert np.abs(found.solution.temperature_c - exact.temperature_c).max() < 0.01
+    assert found.settings.refinements == 0
+
+
+def test_radiation_is_solved_to_tolerance() -> None:
+    axis = np.linspace(0, 0.2, 4)
+    mesh = box_mesh(axis, axis, axis, temperature_c=300.0)
+    effects = (FixedTemperature(("x0",), 600.0), Radiation(("x1", "y?"), 0.9, 20.0))
+    problem = HeatProblem(mesh, Material("ceramic", 2.0, 2000.0, 900.0), effects=effects)
+    exact = solve_steady(finer(problem, 2), order=2)
+    found = solve_to_tolerance(problem, Tolerance(None, 0.02), log=silent)
+    assert true_error(found, problem, exact).heat_flow <= 0.02
+
+
+def test_lines_say_what_was_done() -> None:
+    lines: list[str] = []
+    found = solve_to_tolerance(shell(), Tolerance(0.1, 0.01), log=lines.append)
+    assert len(lines) == len(found.levels) + 1
+    assert lines[0].startswith("P1, given mesh, 50 unknowns: estimated error ") and lines[0].endswith(" s")
+    assert lines[-1] == found.status
+    assert found.status.startswith("Within 0.1 K and 1 % of the heat flow: P2, given mesh,")
+    assert f"{found.seconds:.2f} s in all." in found.status
+
+
+def test_printing_is_the_default(capsys) -> None:
+    solve_to_tolerance(shell(), Tolerance(1.0))
+    assert "Within 1 K: P1, given mesh" in capsys.readouterr().out
+
+
+def test_too_little_memory_is_a_status() -> None:
+    problem = shell()
+    room = 3001.0 * len(problem.mesh.tets)
+    with pytest.raises(HeatError, match=r"Not within 1e-05 K: P2, given mesh.*size halved 1x needs about .* GiB"):
+        solve_to_tolerance(problem, Tolerance(1e-5), memory_bytes=room, log=silent)
+    found = solve_to_tolerance(problem, Tolerance(1e-5), memory_bytes=room, allow_unmet=True, log=silent)
+    assert not found.met and found.settings.order == 2 and found.status.endswith("a larger error.")
+    assert np.isfinite(found.solution.temperature_c).all()
+    with pytest.raises(HeatError, match="memory_bytes: expected room for a first estimate, got P2 on the given mesh"):
+        solve_to_tolerance(problem, Tolerance(1.0), memory_bytes=1e4, log=silent)
+    transient = solve_to_tolerance(
+        nafems_t3(), Tolerance(0.01), duration_s=32.0, memory_bytes=1e6, allow_unmet=True, log=silent
+    )
+    assert not transient.met and "P1 on the mesh size halved" in transient.status
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Tolerance(None, None), "tolerance: expected temperature_k or heat_flow, got neither"),
+        (lambda: Tolerance(0.0), "temperature_k: expected a finite number above 0"),
+        (lambda: Tolerance(1.0, -0.1), "heat_flow: expected a finite number above 0"),
+        (
+            lambda: solve_to_tolerance(nafems_t3(), Tolerance(None, 0.1), duration_s=32.0),
+            "tolerance: expected one in kelvin, got heat_flow only",
+        ),
+        (lambda: solve_to_tolerance(shell(), Tolerance(1.0), memory_bytes=-1.0), "memory_bytes: expected a finite"),
+    ],
+)
+def test_bad_input(make, message) -> None:
+    with pytest.raises(HeatError, match=message):
+        make()
+
+
+def test_differences_and_flows() -> None:
+    problem = shell()
+    solution = solve_steady(problem)
+    flows = mean_flows_w(solution)
+    assert [name for _, name in flows] == ["inside", "outside"]
+    assert sum(flows.values()) == pytest.approx(0.0, abs=1e-9 * max(flows.values()))
+    warmer = replace(solution, temperature_c=solution.temperature_c + np.arange(len(solution.temperature_c)))
+    assert difference_between(solution, warmer, 3) == ErrorSize(2.0, 0.0)
+    assert Tolerance(4.0, 0.1).excess(ErrorSize(2.0, 0.2)) == 2.0
+    assert Tolerance(4.0).excess(ErrorSize(2.0, 0.2)) == 0.5
+    assert ErrorSize(1.0, 0.1) + ErrorSize(2.0, 0.2).scaled(0.5) == ErrorSize(2.0, 0.2)
