@@ -59,4 +59,3 @@ def shell_mesh(
             normal, np.ones(len(facets)), np.ones(len(facets), bool), patch, ("inside", "outside", "cut")
         ),
     )
-

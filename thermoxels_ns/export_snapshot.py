@@ -132,7 +132,7 @@ def export_snapshot(
     voxel_size = snapshot.lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(to_mesh[:3, :3]))))
     check_mesh(mesh)
     unit = "input unit" if scale is None else "m"
-    report = quality_report(mesh, options.boundary, length_unit=unit)
+    report = quality_report(mesh, options.boundary, built.observed_range_c, length_unit=unit)
     _tell(built, report.volume_m3, unit, None if scale is None else voxel_size, say)
 
     preset, solution, truth = checked.preset, None, None

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 import pytest
+from PIL import Image, ImageOps
 from scipy.spatial.transform import Rotation
 
 from thermoxels_ns.capture.gravity import find_up, level_rotation
@@ -62,11 +65,28 @@ def test_cameras_that_look_one_way_give_the_mean_of_their_y_axes():
     assert off_deg(up) < 0.1
 
 
-@pytest.mark.parametrize(("orientation", "roll"), [(6, -90), (8, 90), (3, 180)])
+@pytest.mark.parametrize(("orientation", "roll"), [(6, 90), (8, -90), (3, 180)])
 def test_upright_pictures_of_a_turned_camera(orientation, roll):
     """EXIF says how to turn the stored pixels; the camera was turned the other way."""
     up = find_up(held([0, 40, 80], [0] * 3, [roll] * 3), [None] * 3, [orientation] * 3)
     assert off_deg(up) < 1e-4
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_the_upper_edge_is_where_the_picture_has_it_after_turning(orientation):
+    """Pillow turns a stored picture upright; the edge that is then on top is the one that up points to."""
+    identity = np.eye(4)[None]
+    x, y, _ = find_up(identity, [None], [orientation]).direction.round()
+    stored = np.zeros((4, 4), dtype=np.uint8)
+    rows = {1: slice(0, 1), -1: slice(3, 4), 0: slice(None)}[int(y)]
+    columns = {1: slice(3, 4), -1: slice(0, 1), 0: slice(None)}[int(x)]
+    stored[rows, columns] = 255
+    picture = Image.fromarray(stored)
+    picture.getexif()[274] = orientation
+    stream = io.BytesIO()
+    picture.save(stream, "PNG", exif=picture.getexif())
+    upright = np.asarray(ImageOps.exif_transpose(Image.open(stream)))
+    assert (upright[0] == 255).all() and (upright[1:] == 0).all()
 
 
 def test_levelling_turns_up_to_z_and_ahead_to_y():

@@ -7,9 +7,9 @@ import pytest
 
 from tests.heat_meshes import box_mesh, planes
 from thermoxels_ns.errors import HeatError
-from thermoxels_ns.fem.edge_surplus import EdgeSurplus
-from thermoxels_ns.fem.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
-from thermoxels_ns.fem.error_estimate import RecoveredError, error_ratio, recovered_error, richardson
+from thermoxels_ns.fem.edge_surplus import edge_surplus
+from thermoxels_ns.fem.effects import Convection, FixedTemperature, InternalHeat
+from thermoxels_ns.fem.error_estimate import RecoveredError, error_ratios, recovered_error, richardson
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
 from thermoxels_ns.fem.quantities import Varying
@@ -68,7 +68,7 @@ def test_a_flux_that_is_even_in_each_layer_has_no_error(order) -> None:
 
 @pytest.mark.parametrize(("order", "parts"), [(1, (4, 8, 16)), (2, (4, 8))])
 def test_the_recovered_error_is_close_to_the_true_one(order, parts) -> None:
-    """P1: within a fifth. The error of P2 in the squared flux is that of the energy a(e, e)."""
+    """All of it with P1; with P2 means around nodes find two thirds."""
     totals = []
     for number in parts:
         problem = smooth(number)
@@ -76,7 +76,8 @@ def test_the_recovered_error_is_close_to_the_true_one(order, parts) -> None:
     # L2 norms of the gradient's error, measured in tests/convergence with 64 points per tetrahedron.
     true = {1: (1.6120, 0.82468, 0.41478), 2: (0.25428, 0.065222)}[order]
     effectivity = np.sqrt(totals) / np.array(true)
-    assert np.all((effectivity > 0.85) & (effectivity < 1.2)), effectivity
+    low, high = {1: (0.95, 1.05), 2: (0.6, 0.75)}[order]
+    assert np.all((effectivity > low) & (effectivity < high)), effectivity
 
 
 def test_the_recovered_error_is_that_of_the_heat_flow() -> None:
@@ -110,12 +111,16 @@ def test_richardson() -> None:
             richardson(1.0, ratio)
 
 
-def test_error_ratio_is_kept_in_bounds() -> None:
+def test_error_ratios() -> None:
     first, second = RecoveredError(np.array([1.0, 3.0])), RecoveredError(np.array([0.5, 0.5]))
-    assert error_ratio(first, second) == 0.25
-    assert error_ratio(second, first) == 0.7
+    ratios = error_ratios(first, second, same_order=True)
+    assert (ratios.temperature, ratios.heat_flow) == (0.25, 0.25)
+    ratios = error_ratios(first, second, same_order=False)
+    assert (ratios.temperature, ratios.heat_flow) == (0.5, 0.25)
+    assert error_ratios(second, first, same_order=True).heat_flow == 0.7
     nothing = RecoveredError(np.zeros(2))
-    assert error_ratio(first, nothing) == error_ratio(nothing, first) == 1.0 / 64.0
+    for pair in ((first, nothing), (nothing, first)):
+        assert error_ratios(*pair, same_order=True).temperature == 1e-3
 
 
 def test_a_solution_of_another_mesh_is_refused() -> None:
@@ -133,42 +138,6 @@ def replace_mesh(problem: HeatProblem, times: int) -> HeatProblem:
     return problem
 
 
-RADIATING = HeatProblem(
-    box_mesh(np.linspace(0, 1, 5), np.linspace(0, 1, 5), np.linspace(0, 1, 5), temperature_c=400.0),
-    Material("ceramic", 2.0, 2000.0, 900.0),
-    effects=(
-        FixedTemperature(("x0",), Varying(lambda p, t: 600.0 * p.points_m[:, 1], in_time=False)),
-        Radiation(("x1", "y1"), 0.9, 20.0),
-        HeatFlux(("z0",), 500.0),
-    ),
-)
-
-
-@pytest.mark.parametrize("problem", [smooth(4), smooth(8), corner(8), corner(16), RADIATING])
-def test_the_surplus_of_edges_is_most_of_what_quadratic_tetrahedra_add(problem) -> None:
-    linear, quadratic = solve_steady(problem), solve_steady(problem, order=2)
-    surplus = EdgeSurplus(problem).of_steady(linear)
-    added_k = quadratic.temperature_c - linear.temperature_c
-    share = np.linalg.norm(surplus.temperature_k[0]) / np.linalg.norm(added_k)
-    assert 0.8 < share < 1.1, share
-    alike = surplus.temperature_k[0] @ added_k / (np.linalg.norm(surplus.temperature_k[0]) * np.linalg.norm(added_k))
-    assert alike > 0.85, alike
-    before, after = ({(e.effect, n): e.group_heat_w[0, i] for e in s.effects for i, n in enumerate(e.group_names)}
-                     for s in (linear, quadratic))  # fmt: skip
-    added_w = np.array([after[group] - before[group] for group in surplus.groups])
-    largest = np.abs(added_w).max()
-    np.testing.assert_allclose(surplus.group_heat_w[0], added_w, atol=0.15 * largest)
-
-
-def test_the_surplus_where_two_airs_meet() -> None:
-    """The temperature all but jumps at an edge."""
-    problem = corner(8, ("x1", "other"))
-    linear, quadratic = solve_steady(problem), solve_steady(problem, order=2)
-    surplus_k = EdgeSurplus(problem).of_steady(linear).temperature_k[0]
-    share = np.abs(surplus_k).max() / np.abs(quadratic.temperature_c - linear.temperature_c).max()
-    assert 0.9 < share < 1.1, share
-
-
 def test_the_surplus_follows_the_error_through_time() -> None:
     """A block that one hot side warms, against a mesh of half the size twice; heat that flowed in too."""
     axis = np.linspace(0, 0.1, 7)
@@ -178,7 +147,7 @@ def test_the_surplus_follows_the_error_through_time() -> None:
     problem = HeatProblem(mesh, Material("steel", 35.0, 7200.0, 440.5), effects=effects)
     steps = AdaptiveSteps(32.0, 0.05)
     rough, fine = solve_heat(problem, steps), solve_heat(replace_mesh(problem, 2), steps)
-    surplus = EdgeSurplus(problem).in_time(rough)
+    surplus = edge_surplus(problem, rough)
     true_k = fine.temperature_c[:, : len(mesh.points_m)] - rough.temperature_c
     assert np.all(surplus.temperature_k[0] == 0.0)
     share = np.abs(surplus.temperature_k).max() / np.abs(true_k).max()

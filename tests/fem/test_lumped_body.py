@@ -90,3 +90,15 @@ def test_an_insulated_body_at_one_temperature_stays() -> None:
     lumped = lumped_body(HeatProblem(cube(), COPPER), TimeSteps(2, 1e5), 1e-6)
     assert lumped.solution is not None and lumped.biot == 0.0
     np.testing.assert_allclose(lumped.solution.temperature_c, 80.0, atol=1e-9)
+
+
+def test_the_bound_is_that_of_its_proof() -> None:
+    """In a slab heated at one end psi is q L / (3 k) there: one part for the start and two for all times."""
+    mesh = box_mesh(planes(0.0, 0.1, step=0.002), [0.0, 0.01], [0.0, 0.01], temperature_c=20.0)
+    psi = 1000.0 * 0.1 / (3.0 * 380.0)
+    heated = lumped_body(HeatProblem(mesh, COPPER, effects=(HeatFlux(("x0",), 1000.0),)), TimeSteps(2, 100.0), 1.0)
+    assert heated.bound_k == pytest.approx(3.0 * psi, rel=0.01)
+    # Air takes it back to 0 in the end: as much again in change, which counts three times.
+    air = Convection(("x0",), 10.0, 120.0)
+    warmed = lumped_body(HeatProblem(mesh, COPPER, effects=(air,)), TimeSteps(2, 1e6), 1.0)
+    assert warmed.bound_k == pytest.approx(6.0 * psi, rel=0.01)

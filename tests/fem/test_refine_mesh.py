@@ -82,7 +82,7 @@ def test_children_inherit() -> None:
     # Linear data stay linear; a node between a seen and an unseen one was not seen.
     np.testing.assert_allclose(fine.temperature_c, 3 * fine.points_m[:, 0] - fine.points_m[:, 2], atol=1e-12)
     np.testing.assert_array_equal(fine.observed, fine.points_m[:, 0] <= 1.0)
-    assert fine.colour.dtype == np.float32 and 0.0 <= fine.colour.min() and fine.colour.max() <= 1.0
+    assert fine.colour.dtype == np.float32 and fine.colour.min() >= 0.0 and fine.colour.max() <= 1.0
     np.testing.assert_array_equal(refined_values(mesh, mesh.temperature_c), fine.temperature_c)
     untagged = refine_mesh(replace(mesh, boundary=None, colour=None))
     assert untagged.boundary is None and untagged.colour is None

@@ -20,6 +20,7 @@ from thermoxels_ns.fem.effects import (
     Radiation,
 )
 from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.nodal_heat import nodal_heats
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.screening import screen
@@ -257,3 +258,15 @@ def test_a_scene_whose_radiation_does_not_matter_never_enters_newton(monkeypatch
 def test_a_tolerance_is_not_negative(tolerance_k) -> None:
     with pytest.raises(HeatError, match=r"tolerance_k: expected a number of at least 0"):
         screen(HeatProblem(slab(), CONCRETE), None, tolerance_k)
+
+
+def test_quantities_that_change_between_samples_are_bounded() -> None:
+    """Adaptive steps ask at any time: peaks lie between the times at which the bound asks."""
+    time = AdaptiveSteps(1000.0)
+    step = 1000.0 / 240.0
+    wave = Varying(lambda places, time_s: 100.0 + 50.0 * np.cos(2.0 * np.pi * (time_s / step - 0.5) / 8.0))
+    problem = HeatProblem(slab(), CONCRETE, effects=(HeatFlux(("x0",), wave),))
+    heat = nodal_heats(problem, time)[0]
+    assert 0.01 * 150.0 < heat.heating_w.sum() < 0.01 * 150.0 * 1.25
+    only_there = nodal_heats(problem, TimeSteps(240, step))[0]
+    assert only_there.heating_w.sum() == pytest.approx(0.01 * (100.0 + 50.0 * np.cos(np.pi / 8.0)), rel=1e-9)

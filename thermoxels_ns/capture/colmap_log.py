@@ -1,4 +1,4 @@
-"""COLMAP's own log: hundreds of lines that mean nothing to a user, of which only errors are shown."""
+"""COLMAP's own log: hundreds of lines that mean nothing to a user, which would hide ours."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-_ERRORS_ONLY = 2
+_FATAL_ONLY = 3
 
 
 @contextmanager
-def only_errors() -> Iterator[None]:
-    """Show only COLMAP's errors in the block."""
+def quiet_colmap() -> Iterator[None]:
+    """Silence COLMAP in the block; what matters comes back as results or exceptions."""
     import pycolmap
 
     log: Any = pycolmap.logging
     before = log.minloglevel
-    log.minloglevel = _ERRORS_ONLY
+    log.minloglevel = _FATAL_ONLY
     try:
         yield
     finally:

@@ -16,9 +16,9 @@ from thermoxels_ns.capture.sparse_depth import SparseDepth
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
-_POINTS_PER_FRAME = 400
+_POINTS_PER_FRAME = 1000
 _BLUR_PX = 1.0
-_SMOOTH_SHARE = 0.7
+_SMOOTH_SHARE = 0.4
 _DEPTH_TOLERANCE = 0.03
 _BORDER_PX = 2.0
 

@@ -23,7 +23,7 @@ _FEWEST_FOR_PATTERN = 8
 _PATTERN_CORRELATION = 0.25
 
 
-def edge_field(image: FloatImage, blur_px: float) -> npt.NDArray[np.complex64]:
+def edge_field(image: FloatImage, blur_px: float, pixels_per_pixel: float = 1.0) -> npt.NDArray[np.complex64]:
     """Edges of an image as complex numbers of magnitude 0 to 1 and twice the edge's angle.
 
     Strong edges all count as 1 and noise as little: z / (|z| + c) with c a multiple of the median of |z|, the
@@ -32,6 +32,7 @@ def edge_field(image: FloatImage, blur_px: float) -> npt.NDArray[np.complex64]:
     Args:
         image: Shape (height, width).
         blur_px: Standard deviation of the blur that follows, which is how far apart two edges may lie to be found.
+        pixels_per_pixel: How many pixels of this image are one of those that lengths are given in.
 
     Returns:
         Shape (height, width).
@@ -39,7 +40,8 @@ def edge_field(image: FloatImage, blur_px: float) -> npt.NDArray[np.complex64]:
     bad = ~np.isfinite(image)
     filled = np.where(bad, np.float32(np.nanmedian(image) if not bad.all() else 0.0), image).astype(np.float32)
     filled -= filled.mean()
-    smooth = cv2.GaussianBlur(filled, (0, 0), _GRADIENT_SIGMA_PX, borderType=cv2.BORDER_REPLICATE)
+    sigma = _GRADIENT_SIGMA_PX * pixels_per_pixel
+    smooth = cv2.GaussianBlur(filled, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
     gx = cv2.Scharr(smooth, cv2.CV_32F, 1, 0, borderType=cv2.BORDER_REPLICATE) / np.float32(32.0)
     gy = cv2.Scharr(smooth, cv2.CV_32F, 0, 1, borderType=cv2.BORDER_REPLICATE) / np.float32(32.0)
     real, imaginary = gx * gx - gy * gy, 2.0 * gx * gy
@@ -48,9 +50,9 @@ def edge_field(image: FloatImage, blur_px: float) -> npt.NDArray[np.complex64]:
     floor = max(_NOISE_FACTOR * float(middle), _SMALLEST_SHARE * float(strong), 1e-30)
     weight = 1.0 / (strength + floor)
     if bad.any():
-        reach = 2 * int(np.ceil(3.0 * _GRADIENT_SIGMA_PX)) + 1
+        reach = 2 * int(np.ceil(3.0 * sigma)) + 1
         weight[cv2.dilate(bad.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0] = 0.0
-    parts = [cv2.GaussianBlur(part * weight, (0, 0), blur_px) for part in (real, imaginary)]
+    parts = [cv2.GaussianBlur(part * weight, (0, 0), blur_px * pixels_per_pixel) for part in (real, imaginary)]
     return (parts[0] + 1j * parts[1]).astype(np.complex64)
 
 
@@ -70,15 +72,15 @@ def without_fixed_pattern(images: Sequence[FloatImage], neighbours: int = 20) ->
     contrast = [local_contrast(image) for image in images]
     if len(contrast) < _FEWEST_FOR_PATTERN:
         return contrast, 0.0
-    stack = np.stack(contrast)
-    agreement = _correlation(np.nanmedian(stack[::2], axis=0), np.nanmedian(stack[1::2], axis=0))
+    stack = np.nan_to_num(np.stack(contrast), nan=0.0)
+    agreement = _correlation(np.median(stack[::2], axis=0), np.median(stack[1::2], axis=0))
     if not agreement > _PATTERN_CORRELATION:
         return contrast, agreement
     cleaned, window = [], min(neighbours, len(stack))
     step = max(window // 4, 1)
     for first in range(0, len(stack), step):  # one median serves a few neighbouring frames
         start = min(max(first + step // 2 - window // 2, 0), len(stack) - window)
-        pattern = np.nanmedian(stack[start : start + window], axis=0)
+        pattern = np.median(stack[start : start + window], axis=0)
         cleaned += [image - pattern for image in stack[first : first + step]]
     return cleaned, agreement
 
@@ -97,8 +99,6 @@ def local_contrast(image: FloatImage) -> FloatImage:
 
 
 def _correlation(first: FloatImage, second: FloatImage) -> float:
-    good = np.isfinite(first) & np.isfinite(second)
-    a, b = first[good].astype(np.float64), second[good].astype(np.float64)
-    a, b = a - a.mean(), b - b.mean()
+    a, b = (image.ravel().astype(np.float64) - float(image.mean(dtype=np.float64)) for image in (first, second))
     scale = np.sqrt(float(a @ a) * float(b @ b))
     return float(a @ b) / scale if scale > 0.0 else 0.0

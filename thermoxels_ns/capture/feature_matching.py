@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.colmap_log import only_errors
+from thermoxels_ns.capture.colmap_log import quiet_colmap
 from thermoxels_ns.capture.contract import CameraModel
 
 Matching = Literal["auto", "exhaustive", "sequential"]
@@ -94,7 +94,7 @@ def fill_database(
     """
     import pycolmap
 
-    with only_errors():
+    with quiet_colmap():
         _add_images(database, names, camera, options.lens, known_focal)
         reader = pycolmap.ImageReaderOptions(camera_model=options.lens, existing_camera_id=1)
         if masks is not None:
@@ -130,9 +130,7 @@ def lens_parameters(camera: CameraModel, lens: LensModel) -> list[float]:
     return [camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.k1, camera.k2, camera.p1, camera.p2]
 
 
-def _add_images(
-    database: Path, names: Sequence[str], camera: CameraModel, lens: LensModel, known_focal: bool
-) -> None:
+def _add_images(database: Path, names: Sequence[str], camera: CameraModel, lens: LensModel, known_focal: bool) -> None:
     """Number the photographs in their order; else the threads that look for features would number them by chance."""
     import pycolmap
 

@@ -13,8 +13,10 @@ from thermoxels_ns.capture.contract import FloatArray
 
 _UP_OF_ORIENTATION = {1: (0, 1), 2: (0, 1), 3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
 """Where the upper edge of the upright picture lies in the stored one (x right, y up), by EXIF's orientation."""
-_TURNED_DEG = 15.0
-"""Cameras whose level axes spread by less than this show a plane too weakly to find its normal, [degrees]."""
+_ROLLED_DEG = 2.0
+"""How far from level people hold the sides of a picture, standard deviation, [degrees]."""
+_BELIEVED_DEG = 5.0
+"""Standard error up to which the common normal of the cameras' level axes is believed, [degrees]."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +61,8 @@ def find_up(
     mean = _robust_mean(held)
     level = np.einsum("nij,nj->ni", rotations[:, :, :2], np.stack([flat[:, 1], -flat[:, 0]], axis=1))
     values, vectors = np.linalg.eigh(level.T @ level / len(level))
-    turned = math.degrees(math.asin(math.sqrt(min(1.0, float(values[1])))))
-    if len(level) >= 3 and turned > _TURNED_DEG:
+    turned = math.sqrt(max(float(values[1]), 0.0))  # sine of how far the axes spread, root mean square
+    if len(level) >= 3 and _BELIEVED_DEG * math.sqrt(len(level)) * turned > _ROLLED_DEG:
         normal = vectors[:, 0] if vectors[:, 0] @ mean > 0 else -vectors[:, 0]
         if normal @ mean > math.cos(math.radians(45.0)):
             off = np.degrees(np.arcsin(np.clip(np.abs(level @ normal), 0.0, 1.0)))

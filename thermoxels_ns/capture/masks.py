@@ -14,13 +14,13 @@ from PIL import Image
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.errors import SceneError, explain
 
-MIN_FRAMES = 6
+MIN_FRAMES = 8
 """Fewer photographs cannot tell what is drawn over them from what they all happen to show."""
 _SIDE = 800
 """Longest side at which overlays are looked for, [pixels]."""
-_STILL = 4.0
+_STILL = 10.0
 """Grey levels (of 255) that what is drawn changes by, from JPEG's compression alone."""
-_ALIVE = 12.0
+_ALIVE = 30.0
 """Grey levels that the surroundings change by at least."""
 _EDGE = 25.0
 """Grey levels by which what is drawn stands out from its surroundings in the mean picture."""
@@ -81,7 +81,7 @@ def find_overlay(photographs: Sequence[Path]) -> npt.NDArray[np.bool_] | None:
         stack.append(np.asarray(picture.resize(small, Image.Resampling.BOX), dtype=np.float32))
     if len({grey.shape for grey in stack}) != 1:
         return None
-    spread = _spread(np.stack(stack))
+    spread = np.ptp(np.stack(stack), axis=0)
     mean = np.mean(stack, axis=0)
     width = int(_AROUND_SHARE * max(mean.shape)) | 1
     around = cv2.blur(spread, (width, width))
@@ -126,9 +126,3 @@ def mask_files(folder: Path) -> dict[str, Path]:
     return {
         path.stem.lower(): path for path in sorted(folder.iterdir()) if path.suffix.lower() in (".png", ".jpg", ".jpeg")
     }
-
-
-def _spread(stack: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """How much a pixel changes: from its second lowest to its second highest value, past one odd frame."""
-    ordered = np.sort(stack, axis=0)
-    return ordered[-2] - ordered[1]

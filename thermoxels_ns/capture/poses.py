@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from thermoxels_ns.capture.colmap_log import only_errors
+from thermoxels_ns.capture.colmap_log import quiet_colmap
 from thermoxels_ns.capture.colmap_model import model_of_colmap
 from thermoxels_ns.capture.contract import CameraModel
 from thermoxels_ns.capture.feature_matching import FeatureOptions, LensModel, Matching, fill_database, lens_parameters
@@ -171,7 +171,7 @@ def add_points(
     mapping.ba_refine_focal_length = mapping.ba_refine_extra_params = False
     mapping.constant_cameras = {1}
     mapping.fix_existing_frames = True
-    with only_errors():
+    with quiet_colmap():
         found = pycolmap.triangulate_points(
             posed, database, folder / "images", folder, clear_points=True, options=mapping, refine_intrinsics=False
         )
@@ -275,7 +275,7 @@ def _map(database: Path, folder: Path, options: PoseOptions, count: int, say: Ca
     pycolmap.set_random_seed(options.seed)
     mapping = _mapping_options(options)
     models: dict[int, Any] = {}
-    with only_errors():
+    with quiet_colmap():
         models = pycolmap.incremental_mapping(
             database, folder / "images", folder, mapping, next_image_callback=next_image
         )

@@ -22,7 +22,7 @@ from thermoxels_ns.errors import SceneError, explain
 
 FloatArray = npt.NDArray[np.float64]
 
-_FEWEST_FRAMES = 3
+_FEWEST_FRAMES, _FEWEST_POINTS = 3, 12
 _MOST_FRAMES = 40
 _BLUR_PX = 1.5
 _ABOVE_CHANCE = 1.5
@@ -42,7 +42,8 @@ def estimate_rig(
     """Find the thermal camera's intrinsics and the fixed transform from the visible to the thermal camera.
 
     Args:
-        frames: Pairs with poses and scene points, in the order they were taken; of more than 40 an even choice.
+        frames: Pairs with poses and scene points, in the order they were taken. Those with fewer than 12 points are
+            left out; of more than 40 an even choice is used.
         visible: Intrinsics of the photographs.
         start: First guess and how far it can be off.
         progress: Told what is being done and which share of the work is behind (0 to 1).
@@ -51,18 +52,19 @@ def estimate_rig(
         The rig; the start with `determined` False and the reason where the images cannot tell.
 
     Raises:
-        SceneError: No frames, or images that do not have the size of their camera.
+        SceneError: No frame has scene points, or an image cannot be read or does not have the size of its camera.
     """
-    if not frames:
+    usable = [frame for frame in frames if np.count_nonzero(frame.points_visible()[:, 2] > 0.0) >= _FEWEST_POINTS]
+    if not usable:
         raise SceneError(
             explain(
                 "rig",
-                expected="frames with a pose and a thermal partner",
-                got="none",
-                remedy="Check that structure from motion registered the photographs.",
+                expected=f"frames with a pose, a thermal partner and at least {_FEWEST_POINTS} scene points",
+                got=f"{len(frames)} frames, none of them with that many",
+                remedy="Check that structure from motion registered the photographs and that poses are in OpenGL axes.",
             )
         )
-    chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _MOST_FRAMES)).astype(int))]
+    chosen = [usable[i] for i in np.unique(np.linspace(0, len(usable) - 1, min(len(usable), _MOST_FRAMES)).astype(int))]
     progress("Reading the frames", 0.0)
     prepared = prepare_frames(chosen, visible, start.thermal_camera)
     return _RigSearch(prepared, start, progress).run()
@@ -88,7 +90,7 @@ class _RigSearch:
         self.progress("Comparing edges, all directions", 0.1)
         search = RoughSearch(coarse, sigmas, depth)
         rough, chance = search.best(), search.best_by_chance()
-        if not rough or rough[0].score < _ABOVE_CHANCE * chance:
+        if not rough or not rough[0].score > _ABOVE_CHANCE * chance:
             best = rough[0].score if rough else 0.0
             reason = (
                 f"the thermal edges agree with those of the photographs no better ({best:.3f}) than chance "

@@ -98,5 +98,5 @@ class RigClimber:
         values = np.maximum(np.abs(values), 1e-6 * max(float(np.abs(values).max()), 1e-12))
         ratio = np.einsum("ij,ik,kj->j", vectors, scatter, vectors) / values
         weight = 1.0 / max(float(np.median(ratio)), 1e-9)
-        information: FloatArray = (vectors * values) @ vectors.T
+        information = np.asarray((vectors * values) @ vectors.T, dtype=np.float64)
         return weight, information, scatter

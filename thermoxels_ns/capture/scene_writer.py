@@ -148,6 +148,7 @@ def _good_points(model: SfmModel) -> tuple[FloatArray, npt.NDArray[np.uint8]]:
 
 def _content(scene: Scene, entries: list[dict[str, Any]]) -> dict[str, Any]:
     rig, drift = scene.rig, scene.drift
+    disagreement = {"before": drift.before_k, "after": drift.after_k}
     content: dict[str, Any] = {
         **camera_entries(scene.model.camera),
         "thermal_camera": camera_entries(rig.thermal_camera),
@@ -164,6 +165,7 @@ def _content(scene: Scene, entries: list[dict[str, Any]]) -> dict[str, Any]:
             "corrected": drift.used,
             "offsets_k": drift.offsets_k.tolist(),
             "radial_k": list(drift.radial),
+            **{f"disagreement_{name}_k": k for name, k in disagreement.items() if np.isfinite(k)},
             "explanation": drift.explanation,
         },
     }

@@ -12,8 +12,8 @@ from thermoxels_ns.checks import check_positive
 from thermoxels_ns.errors import HeatError, explain
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 
-Flows = Mapping[tuple[str, str], float]
-"""Mean heat flow into the body of each effect and patch or region, [W]."""
+Flows = Mapping[str, float]
+"""Mean heat flow into the body of each effect, [W]."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class Tolerance:
     """Largest error of the temperature at any node of the mesh, [K]. The default is half of what building physics asks
     of a temperature (ISO 10211: 0.1 K)."""
     heat_flow: float | None = None
-    """Largest error of the mean heat flow through any patch or from any region, as a share of all heat that flows
-    through the body; 0.01 is what building physics asks for (ISO 10211)."""
+    """Largest error of the mean heat flow that any effect brings, as a share of all heat that flows through the body;
+    0.01 is what building physics asks for (ISO 10211)."""
 
     def __post_init__(self) -> None:
         if self.temperature_k is None and self.heat_flow is None:
@@ -59,38 +59,30 @@ class ErrorSize:
     temperature_k: float
     """Largest error of the temperature at the nodes of the given mesh, [K]."""
     heat_flow: float
-    """Largest error of a mean heat flow, as a share of all heat that flows through the body."""
+    """Largest error of the mean heat flow of an effect, as a share of all heat that flows through the body."""
 
     def __add__(self, other: ErrorSize) -> ErrorSize:
         """Both together, at worst."""
         return ErrorSize(self.temperature_k + other.temperature_k, self.heat_flow + other.heat_flow)
-
-    def scaled(self, factor: float) -> ErrorSize:
-        """Both times a factor."""
-        return ErrorSize(factor * self.temperature_k, factor * self.heat_flow)
 
     def describe(self) -> str:
         """Say it in words."""
         return f"{self.temperature_k:.2g} K and {100.0 * self.heat_flow:.2g} % of the heat flow"
 
 
-NO_ERROR = ErrorSize(0.0, 0.0)
+def mean_flows_w(solution: SteadySolution | HeatSolution) -> dict[str, float]:
+    """Give the mean heat flow into the body of each effect over all times, [W].
 
-
-def mean_flows_w(solution: SteadySolution | HeatSolution) -> dict[tuple[str, str], float]:
-    """Give the mean heat flow into the body of each effect and patch or region over all times, [W]."""
+    Not of each patch: how much of the heat of a fixed node between two patches belongs to either is a convention.
+    """
     lengths = np.diff(solution.times_s) if isinstance(solution, HeatSolution) else np.ones(1)
-    return {
-        (heat.effect, name): float(lengths @ heat.group_heat_w[:, column] / lengths.sum())
-        for heat in solution.effects
-        for column, name in enumerate(heat.group_names)
-    }
+    return {heat.effect: float(lengths @ heat.heat_w / lengths.sum()) for heat in solution.effects}
 
 
 def share_of_flow(difference: Flows, flows: Flows) -> float:
     """Largest difference between heat flows as a share of what flows through the body, half the sum of their sizes.
 
-    >>> share_of_flow({("a", ""): 1.0, ("b", ""): -2.0}, {("a", ""): 99.0, ("b", ""): -101.0})
+    >>> share_of_flow({"a": 1.0, "b": -2.0}, {"a": 99.0, "b": -101.0})
     0.02
     """
     through = 0.5 * sum(abs(flow) for flow in flows.values())

@@ -70,10 +70,6 @@ class LinearSpace:
         """Give unknowns the values that the mesh's nodes have, shape (n, ...)."""
         return nodal
 
-    def to_mesh_nodes(self, heat_w: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """Move heat to the mesh's nodes; the transpose of `from_mesh_nodes`."""
-        return heat_w
-
     def stiffness(self, conductivity_w_mk: float | npt.NDArray[np.float64]) -> sparse.csr_matrix:
         """K, entries integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]."""
         mesh = self.selection.mesh

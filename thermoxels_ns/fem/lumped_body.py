@@ -40,7 +40,7 @@ MOST_BIOT = 0.1
 _OBTUSE_FACTOR = 2.0
 _SLACK = 1e-4
 """How much storage is added to K, per duration, so that it can be inverted; what that changes is bounded too."""
-_SOLVER_TOLERANCE = 1e-6
+_SOLVER_TOLERANCE = 1e-10
 _ODE_TOLERANCE = 1e-9
 _HOT_K = 300.0
 

@@ -23,9 +23,10 @@ is integrated with, so that the error of the temperature falls with the cube of 
 class QuadraticSpace(LinearSpace):
     """The unknowns of `LinearSpace` and one more per edge: temperatures are quadratic in each tetrahedron.
 
-    Boundary values are asked once per triangle, as in P1: where they vary within one, the error falls with the square of
-    the mesh size only. It is for steady states. Lumping its mass would give the corners negative masses, and with the consistent mass
-    temperatures leave their range in steps below about h^2 / diffusivity, so that it is not offered in time.
+    Boundary values are asked once per triangle, as in P1: where they vary within one, the error falls with the square
+    of the mesh size only. The space is for steady states. Lumping its mass would give the corners negative masses, and
+    with the consistent mass temperatures leave their range in steps below about h^2 / diffusivity, so that it is not
+    offered in time.
     """
 
     def __init__(self, selection: Selection) -> None:
@@ -55,11 +56,14 @@ class QuadraticSpace(LinearSpace):
         """Interpolate what is linear between the mesh's nodes, shape (n, ...)."""
         return np.concatenate([nodal, midpoints(self._edges, nodal)])
 
-    def to_mesh_nodes(self, heat_w: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """Move half of an edge's heat to each of its ends, shape (v,); the transpose of `from_mesh_nodes`."""
-        corners, edges = heat_w[: self._num_corners], 0.5 * heat_w[self._num_corners :]
-        total = corners + np.bincount(self._edges.smaller_nodes(), edges, self._num_corners)
-        return total + np.bincount(self._edges.other, edges, self._num_corners)
+    def prolongation(self) -> sparse.csr_matrix:
+        """Give `from_mesh_nodes` as a matrix, shape (n, v)."""
+        corners, edges = self._num_corners, len(self._edges.other)
+        ends = np.stack([self._edges.smaller_nodes(), self._edges.other], axis=1)
+        columns = np.concatenate([np.arange(corners), ends.ravel()])
+        starts = np.concatenate([np.arange(corners), corners + 2 * np.arange(edges + 1)])
+        weights = np.repeat([1.0, 0.5], [corners, 2 * edges])
+        return sparse.csr_matrix((weights, columns, starts), shape=(corners + edges, corners))
 
     def tet_nodes(self) -> npt.NDArray[np.int64]:
         """Corners of each tetrahedron, then the middles of its edges, shape (t, 10)."""

@@ -12,8 +12,8 @@ from scipy import sparse
 from thermoxels_ns.fem.forms import COLDEST_SLOPE_K
 from thermoxels_ns.fem.linear_solver import LinearSolution
 from thermoxels_ns.fem.newton import Residual, newton
-from thermoxels_ns.fem.solver_choice import LinearSolver
 from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.fem.two_level import SystemSolver
 from thermoxels_ns.units import ZERO_CELSIUS_K
 
 Vector = npt.NDArray[np.float64]
@@ -75,7 +75,7 @@ class Stage:
         """Row sums of M / step + R, shape (n,), [W / K]."""
         self.floating: npt.NDArray[np.bool_] = ~system.pieces.touched(system.fixed.nodes)
         """Pieces without fixed nodes, shape (p,)."""
-        self._solver: LinearSolver | None = None
+        self._solver: SystemSolver | None = None
 
     def solve(
         self,
@@ -101,7 +101,7 @@ class Stage:
             end_k = balance.base_k + self.everywhere(found.u)
             return StageSolution(end_k, found.linear_iterations, found.iterations, found.converged, found.status)
         if self._solver is None:
-            self._solver = LinearSolver(self.matrix, relative_tolerance=self._relative_tolerance)
+            self._solver = self.system.linear_solver(self.matrix, self._relative_tolerance)
         change, linear = self.correction(self._solver, self.held_w_k, first)
         return StageSolution(
             balance.base_k + self.everywhere(change), linear.iterations, 0, linear.converged, linear.status
@@ -118,10 +118,10 @@ class Stage:
         matrix = self.matrix
         if self.system.nonlinear:
             matrix = sparse.csr_matrix(matrix + self.free_block(self.system.radiation_slope(relative_k, time_s)))
-        solver = LinearSolver(matrix, relative_tolerance=_ESTIMATE_TOLERANCE)
+        solver = self.system.linear_solver(matrix, _ESTIMATE_TOLERANCE)
         return self.everywhere(solver.solve(self.at_free(heat_w)).x)
 
-    def correction(self, solver: LinearSolver, held_w_k: Vector, residual: Residual) -> tuple[Vector, LinearSolution]:
+    def correction(self, solver: SystemSolver, held_w_k: Vector, residual: Residual) -> tuple[Vector, LinearSolution]:
         """Solve for a change of the free nodes, its mean over floating pieces by their balance.
 
         Args:
@@ -217,7 +217,7 @@ class _Balance:
         slope = system.radiation_slope(self._now(u), self._time_s)
         held_w_k = stage.held_w_k + slope @ np.ones(system.num_nodes)
         matrix = sparse.csr_matrix(stage.matrix + stage.free_block(slope))
-        return stage.correction(LinearSolver(matrix, relative_tolerance=_NEWTON_TOLERANCE), held_w_k, residual)
+        return stage.correction(system.linear_solver(matrix, _NEWTON_TOLERANCE), held_w_k, residual)
 
     def is_short(self, u: Vector, direction: Vector, share: float) -> bool:
         """Whether no absolute temperature changes by more than a share of it."""

@@ -17,8 +17,10 @@ from thermoxels_ns.fem.pieces import Pieces
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quadratic_space import QuadraticSpace
 from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.solver_choice import LinearSolver
 from thermoxels_ns.fem.sparsity import product_and_bound
 from thermoxels_ns.fem.terms import FluxTerm, RadiationTerm, RobinTerm, SourceTerm, Term
+from thermoxels_ns.fem.two_level import SystemSolver, TwoLevelConjugateGradients
 
 Vector = npt.NDArray[np.float64]
 
@@ -78,6 +80,7 @@ class HeatSystem:
         self._kept_exchange: sparse.csr_matrix | None = None
         self._kept_load: Vector | None = None
         self._fixed_rows: sparse.csr_matrix | None = None
+        self._prolongation: sparse.csr_matrix | None = None
 
     @property
     def num_nodes(self) -> int:
@@ -121,6 +124,16 @@ class HeatSystem:
         mass, nodal = self._masses()
         per_second = sparse.diags(nodal / step_s, format="csr") if mass is None else mass / step_s
         return sparse.csr_matrix(matrix + per_second)
+
+    def linear_solver(self, matrix: sparse.csr_matrix, relative_tolerance: float) -> SystemSolver:
+        """Make the solver for a matrix between the free nodes that suits the tetrahedra."""
+        if not isinstance(self._space, QuadraticSpace):
+            return LinearSolver(matrix, relative_tolerance=relative_tolerance)
+        if self._prolongation is None:
+            free, num_mesh_nodes = self.fixed.free, len(self.problem.mesh.points_m)
+            rows = sparse.csr_matrix(self._space.prolongation()[free])
+            self._prolongation = sparse.csr_matrix(rows[:, free[free < num_mesh_nodes]])
+        return TwoLevelConjugateGradients(matrix, self._prolongation, relative_tolerance=relative_tolerance)
 
     def held_w_k(self, time_s: float, step_s: float) -> Vector:
         """Row sums of M / step + R, shape (n,), [W / K]: of the matrix too, because those of K are 0, but exact."""

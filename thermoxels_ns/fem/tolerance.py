@@ -10,16 +10,15 @@ import numpy as np
 
 from thermoxels_ns.checks import check_positive
 from thermoxels_ns.errors import HeatError, explain
-from thermoxels_ns.fem.edge_surplus import EdgeSurplus, Surplus
+from thermoxels_ns.fem.edge_surplus import Surplus, edge_surplus
 from thermoxels_ns.fem.error_budget import (
-    NO_ERROR,
     ErrorSize,
     Tolerance,
     difference_between,
     mean_flows_w,
     share_of_flow,
 )
-from thermoxels_ns.fem.error_estimate import HALF_THE_SIZE, error_ratio, recovered_error, richardson
+from thermoxels_ns.fem.error_estimate import HALF_THE_SIZE, ErrorRatios, error_ratios, recovered_error, richardson
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
 from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
@@ -34,13 +33,13 @@ _BYTES_PER_TET = {1: 250, 2: 3000}
 many entries in their matrices."""
 _LINEAR_TOLERANCE = 1e-8
 """Of the linear solver for a steady state: its error is far below any estimate here."""
-_AIM = 0.8
-"""What to aim at as a share of the tolerance, because predictions err."""
 _FIRST_OVER_SECOND = 8.0
 """Tolerances of the two runs that tell what time steps do."""
 _TIME_SHARE = 0.4
 """Share of the tolerance that time steps may use after they have been found too long."""
-_RATIO_RANGE = (1.0 / 64.0, 0.7)
+_HALVING_GAINS = 4.0
+"""What half the mesh size may divide an error by. A mesh that turns out too coarse costs a tenth of the next."""
+_LARGEST_RATIO = 0.7
 
 
 @dataclass(frozen=True)
@@ -103,11 +102,12 @@ def solve_to_tolerance(
 ) -> ToleratedSolution:
     """Solve a problem with the cheapest choice of order, mesh size and time steps whose estimated error is allowed.
 
-    A steady state starts with linear tetrahedra on the given mesh. If its estimated error is too large, the mesh size
-    is halved if that is predicted to be enough, else quadratic tetrahedra are used, on the given mesh first and then on
-    finer ones. In time tetrahedra stay linear, since the mass of quadratic ones cannot be lumped; two tolerances of the
-    steps on the given mesh tell the error of the steps, and the mesh is then made as fine as the rest of the tolerance
-    asks for. The body is the one that the mesh describes: what the mesh lacks of a round body's area is not estimated.
+    A steady state is solved with linear and with quadratic tetrahedra on the given mesh; how the errors of their fluxes
+    compare tells the error of the better one. If it is too large the mesh size is halved, again and again: quadratic
+    tetrahedra cost less than linear ones of half the size and err less. In time tetrahedra stay linear, since the mass
+    of quadratic ones cannot be lumped. Two tolerances of the steps on the given mesh tell the error of the steps, the
+    surplus of quadratic tetrahedra that of the mesh, and the mesh is made as fine as the rest of the tolerance asks
+    for. The body is the one that the mesh describes: what flat facets lack of a round body's area is not estimated.
 
     Args:
         problem: Body, materials, initial temperatures and effects.
@@ -203,18 +203,9 @@ def _steady(run: _Run, time_s: float) -> str:
         return solve_steady(problem, time_s=time_s, order=order, relative_tolerance=_LINEAR_TOLERANCE)
 
     given, num_nodes = run.given, len(run.given.mesh.points_m)
-    # The estimate needs what quadratic tetrahedra need.
-    failure = run.lacks_memory(2, 0)
-    if failure:
-        return failure
     linear = solve(given, 1)
-    run.add(given, linear, _size(EdgeSurplus(given).of_steady(linear, time_s), linear), refinements=0)
-    if 1.0 < run.excess <= _AIM / HALF_THE_SIZE and not run.lacks_memory(1, 1):
-        finer = _refined(given, refined_values(given.mesh, linear.temperature_c))
-        solution = solve(finer, 1)
-        run.add(finer, solution, _richardson(linear, solution, num_nodes, HALF_THE_SIZE), refinements=1)
     earlier, before, refinements = given, linear, 0
-    while run.excess > 1.0:
+    while refinements == 0 or run.excess > 1.0:
         failure = run.lacks_memory(2, refinements)
         if failure:
             return failure
@@ -224,8 +215,9 @@ def _steady(run: _Run, time_s: float) -> str:
             # The nodes of quadratic tetrahedra are those of the finer mesh.
             problem = _refined(earlier, np.concatenate([before.temperature_c, before.edge_temperature_c]))
         solution = solve(problem, 2)
-        ratio = error_ratio(recovered_error(earlier, before), recovered_error(problem, solution))
-        run.add(problem, solution, _richardson(before, solution, num_nodes, ratio), refinements=refinements)
+        both = recovered_error(earlier, before), recovered_error(problem, solution)
+        ratios = error_ratios(*both, same_order=refinements > 0)
+        run.add(problem, solution, _richardson(before, solution, num_nodes, ratios), refinements=refinements)
         earlier, before, refinements = problem, solution, refinements + 1
     return ""
 
@@ -244,7 +236,7 @@ def _in_time(run: _Run, steps: AdaptiveSteps) -> str:
     rough = solve(given, _FIRST_OVER_SECOND * tolerance_k)
     solution = solve(given, tolerance_k)
     in_time = _of_steps(rough, solution, given)
-    in_space = _size(EdgeSurplus(given).in_time(solution), solution)
+    in_space = _size(edge_surplus(given, solution), solution)
     run.add(given, solution, in_time + in_space, refinements=0, step_tolerance_k=tolerance_k)
     while run.excess > 1.0 and run.tolerance.excess(in_time) > 0.5:
         # The step follows the cube root of its own error, and the error of all steps the square of the step.
@@ -254,8 +246,8 @@ def _in_time(run: _Run, steps: AdaptiveSteps) -> str:
         run.add(given, solution, in_time + in_space, refinements=0, step_tolerance_k=tolerance_k)
     problem, base, refinements = given, solution, 0
     while run.excess > 1.0:
-        left = _AIM * (1.0 - run.tolerance.excess(in_time))
-        halvings = max(int(np.ceil(np.log(run.tolerance.excess(in_space) / left) / -np.log(HALF_THE_SIZE))), 1)
+        left = 1.0 - run.tolerance.excess(in_time)
+        halvings = max(int(np.ceil(np.log(run.tolerance.excess(in_space) / left) / np.log(_HALVING_GAINS))), 1)
         failure = run.lacks_memory(1, refinements + halvings, times)
         if failure:
             return failure
@@ -263,7 +255,7 @@ def _in_time(run: _Run, steps: AdaptiveSteps) -> str:
             problem = _refined(problem, refined_values(problem.mesh, problem.start_c))
         refinements += halvings
         solution = solve(problem, tolerance_k)
-        in_space = _richardson(base, solution, len(given.mesh.points_m), HALF_THE_SIZE**refinements)
+        in_space = _richardson(base, solution, len(given.mesh.points_m), _same(HALF_THE_SIZE**refinements))
         run.add(problem, solution, in_time + in_space, refinements=refinements, step_tolerance_k=tolerance_k)
     return ""
 
@@ -273,29 +265,35 @@ def _refined(problem: HeatProblem, start_c: np.ndarray) -> HeatProblem:
     return replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=start_c)
 
 
-def _size(surplus: Surplus, solution: SteadySolution | HeatSolution) -> ErrorSize:
+def _size(surplus: Surplus, solution: HeatSolution) -> ErrorSize:
     """Size of what an estimate adds."""
     rows = surplus.group_heat_w
     # Mean heat flows of intervals, from those at their ends.
-    mean_w = rows[0] if len(rows) == 1 else np.mean(0.5 * (rows[1:] + rows[:-1]), axis=0)
-    change_w = {group: float(heat) for group, heat in zip(surplus.groups, mean_w)}
+    mean_w = np.mean(0.5 * (rows[1:] + rows[:-1]), axis=0)
+    change_w = dict.fromkeys((effect for effect, _ in surplus.groups), 0.0)
+    for (effect, _), heat_w in zip(surplus.groups, mean_w):
+        change_w[effect] += float(heat_w)
     largest_k = float(np.max(np.abs(surplus.temperature_k)))
     return ErrorSize(largest_k, share_of_flow(change_w, mean_flows_w(solution)))
 
 
+def _same(ratio: float) -> ErrorRatios:
+    return ErrorRatios(ratio, ratio)
+
+
 def _richardson(
-    coarse: SteadySolution | HeatSolution, fine: SteadySolution | HeatSolution, num_nodes: int, ratio: float
+    coarse: SteadySolution | HeatSolution, fine: SteadySolution | HeatSolution, num_nodes: int, ratios: ErrorRatios
 ) -> ErrorSize:
-    return difference_between(coarse, fine, num_nodes).scaled(richardson(1.0, ratio))
+    difference = difference_between(coarse, fine, num_nodes)
+    return ErrorSize(
+        richardson(difference.temperature_k, ratios.temperature), richardson(difference.heat_flow, ratios.heat_flow)
+    )
 
 
 def _of_steps(rough: HeatSolution, solution: HeatSolution, problem: HeatProblem) -> ErrorSize:
     """Error of the steps of the better of two runs: of second order in their mean length."""
-    difference = difference_between(rough, solution, len(problem.mesh.points_m))
-    if difference == NO_ERROR:
-        return NO_ERROR
-    ratio = float(np.clip((rough.steps / solution.steps) ** 2, *_RATIO_RANGE))
-    return difference.scaled(richardson(1.0, ratio))
+    ratio = min((rough.steps / solution.steps) ** 2, _LARGEST_RATIO)
+    return _richardson(rough, solution, len(problem.mesh.points_m), _same(ratio))
 
 
 def _needs_kelvin(tolerance: Tolerance) -> float:

@@ -52,6 +52,16 @@ class MeshOptions:
                     remedy=f"Leave it out to use {MIN_OBSERVED_WEIGHT}.",
                 )
             )
+        coarsest = self.coarsest_cell
+        if not (isinstance(coarsest, int) and coarsest > 0 and coarsest & (coarsest - 1) == 0):
+            raise MeshError(
+                explain(
+                    "coarsest_cell",
+                    expected="1, 2, 4, 8 or another power of two, [voxels]",
+                    got=repr(coarsest),
+                    remedy="Pass --coarsest-cell 4.",
+                )
+            )
         if self.boundary not in ("conforming", "voxel"):
             raise MeshError(
                 explain("boundary", expected="conforming or voxel", got=self.boundary, remedy="Pass one of them.")
@@ -70,6 +80,8 @@ class BuiltMesh:
     """Parts left out because no thermal ray saw any of their nodes."""
     unobserved_voxels: int
     """Voxels of these parts; they count in `solid.component_sizes`, but are not in `solid.cells`."""
+    observed_range_c: tuple[float, float]
+    """Lowest and highest temperature of the measured corners, [degrees Celsius]; no node lies outside."""
 
 
 @dataclass(frozen=True)
@@ -115,11 +127,11 @@ def build_mesh(
 
     if options.boundary == "voxel":
         shape = _voxel_shape(solid.cells)
-        temperature_c, weight = _measured(snapshot, shape.points)
+        temperature_c, weight = _measured(snapshot, shape.points, least)
         edges, conductance = lattice_edges(solid.cells)
     else:
         shape = _stuffed_shape(solid.level, options.coarsest_cell)
-        temperature_c, weight = _measured(snapshot, shape.points)
+        temperature_c, weight = _measured(snapshot, shape.points, least)
         shape, stays = _with_a_measurement(shape, weight >= least)
         temperature_c, weight = temperature_c[stays], weight[stays]
         edges, conductance = tet_conductances(shape.points, shape.tets)
@@ -156,7 +168,9 @@ def build_mesh(
         options.up,
         options.rules,
     )
-    return BuiltMesh(replace(mesh, boundary=boundary), solid, num_parts, num_voxels)
+    measured_c = snapshot.temperature_c[snapshot.observed_weight >= least]
+    observed_range_c = float(measured_c.min()), float(measured_c.max())
+    return BuiltMesh(replace(mesh, boundary=boundary), solid, num_parts, num_voxels, observed_range_c)
 
 
 def _voxel_shape(cells: npt.NDArray[np.bool_]) -> _Shape:
@@ -174,10 +188,13 @@ def _stuffed_shape(level: npt.NDArray[np.floating], coarsest_cell: int) -> _Shap
 
 
 def _measured(
-    snapshot: GridSnapshot, points: npt.NDArray[np.float64]
+    snapshot: GridSnapshot, points: npt.NDArray[np.float64], least: float
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Temperature at points given by fractional corner indices, and the ray weight behind it, each shape (n,)."""
-    return interpolate_corners(points, snapshot.temperature_c, snapshot.observed_weight)
+    """Temperature at points given by fractional corner indices from measured corners alone, and the ray weight of these
+    that reaches the point, each shape (n,).
+    """
+    weight = np.where(snapshot.observed_weight >= least, snapshot.observed_weight, 0.0)
+    return interpolate_corners(points, snapshot.temperature_c, weight)
 
 
 def _colour(snapshot: GridSnapshot, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float32] | None:

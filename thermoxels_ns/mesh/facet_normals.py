@@ -80,7 +80,13 @@ def facet_normals_from_level(
     surface = np.flatnonzero(~outside)
     gradient = _gradient_at_faces(level, below[surface], above[surface], axis[surface])
     normals[surface] = -gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
-    normals[surface] = _average_with_neighbours(normals[surface], 0.5 * (below[surface] + above[surface]))
+    own = np.zeros((len(surface), 3))
+    own[np.arange(len(surface)), axis[surface]] = np.where(across_below[surface] > 0.0, 1.0, -1.0)
+    averaged = _average_with_neighbours(normals[surface], 0.5 * (below[surface] + above[surface]))
+    # Where surfaces of different directions are nearer than a voxel to each other, the average may point inwards.
+    inwards = np.einsum("ij,ij->i", averaged, own) <= 0.0
+    averaged[inwards] = own[inwards]
+    normals[surface] = averaged
     return normals[face_of_facet]
 
 

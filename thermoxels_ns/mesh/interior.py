@@ -51,7 +51,10 @@ def interior(cells: BoolArray, lattice: Lattice, views: Views | None, seal: int)
     enclosed, rooms = _enclosed(cells, sealed, lattice, views, seal)
     if views is None or len(views.focal) == 0:
         return Interior(enclosed, np.zeros_like(cells), rooms)
-    return Interior(enclosed, _hidden(sealed, lattice, views) & ~cells & ~enclosed, rooms)
+    hidden = _hidden(sealed, lattice, views) & ~cells & ~enclosed
+    # What the filled space now encloses is as much inside as the rest.
+    cavity, _ = _cavities(cells | enclosed | hidden, _camera_voxels(cells, lattice, views))
+    return Interior(enclosed, hidden | cavity, rooms)
 
 
 def _enclosed(
@@ -133,5 +136,5 @@ def _hulls(cells: BoolArray) -> BoolArray:
     labels = connected(cells)
     hull = np.zeros_like(cells)
     for number, box in enumerate(ndimage.find_objects(labels), start=1):
-        hull[box] |= convex_hull(labels[box] == number)
+        hull[box] |= convex_hull(labels[box] == number, of_centres=True)
     return hull

@@ -65,8 +65,10 @@ def fill_enclosed(cells: BoolArray) -> BoolArray:
     return (labels != labels[0, 0, 0])[1:-1, 1:-1, 1:-1]
 
 
-def convex_hull(cells: BoolArray) -> BoolArray:
-    """Find the voxels whose centres lie in the convex hull of the solid voxels (cubes, not just their centres).
+def convex_hull(cells: BoolArray, of_centres: bool = False) -> BoolArray:
+    """Find the voxels whose centres lie in the convex hull of the solid voxels: of the cubes, or of their centres.
+
+    The hull of cubes lies half a voxel beyond the centres, so it takes in voxels beside a curved surface.
 
     The hull meets every column of voxels in one interval, so it costs one comparison per column and plane.
     """
@@ -81,6 +83,8 @@ def convex_hull(cells: BoolArray) -> BoolArray:
         [np.column_stack((columns + step, ends)) for step in steps for ends in (first, last)]
     ).astype(np.float64)
     planes = ConvexHull(corners).equations
+    if of_centres:  # the cubes' hull is that of the centres plus half a cube to all sides
+        planes[:, 3] += 0.5 * np.abs(planes[:, :3]).sum(axis=1) - 1e-9
 
     nx, ny, nz = cells.shape
     x, y = np.arange(nx)[:, None] + 0.5, np.arange(ny)[None, :] + 0.5

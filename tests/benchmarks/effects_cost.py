@@ -1,0 +1,157 @@
+"""What each effect costs: time and what was assembled, for a scene with all effects and with each one removed.
+
+Run it on an otherwise idle machine:
+
+    OMP_NUM_THREADS=1 python tests/benchmarks/effects_cost.py
+
+A room of concrete with the scene of configs/scene-all-effects.yaml takes equal steps, so that all rows take the same
+number of them. Times are medians; all problems take turns in one process, and compiled kernels are loaded before the
+first. The last table compares conduction alone, without any effect, with a straightforward use of the assembly and of
+the linear solver that has no effects between: the same matrices, the same steps, the same tolerance.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import tyro
+from scipy import sparse
+
+from thermoxels_ns.fem.assembly import assemble
+from thermoxels_ns.fem.linear_solver import ConjugateGradients
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+from thermoxels_ns.fem.scene_file import load_heat_scene
+from thermoxels_ns.fem.screening import screen
+from thermoxels_ns.fem.solution import HeatSolution
+from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.system import effect_labels
+from thermoxels_ns.mesh.patches import default_patches
+from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
+from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
+
+TOLERANCE = 1e-12
+Z_UP = (0.0, 0.0, 1.0)
+KINDS = ("stiffness", "mass", "robin", "flux", "radiation", "source", "fixed")
+
+
+@dataclass
+class EffectsCost:
+    """Print the tables."""
+
+    voxels: int = 28
+    """Voxels along a side of the room; its walls are an eighth as thick."""
+    steps: int = 24
+    """Time steps."""
+    step_seconds: float = 600.0
+    """Length of a step, [s]."""
+    repeats: int = 5
+    """Runs per median."""
+
+    def main(self) -> None:
+        """Measure and print."""
+        mesh, steps = room(self.voxels), TimeSteps(self.steps, self.step_seconds)
+        scene = load_heat_scene("all-effects")
+        whole = scene.problem(mesh)
+        problems = {"all effects": whole}
+        for number, label in enumerate(effect_labels(whole)):
+            rest = whole.effects[:number] + whole.effects[number + 1 :]
+            problems[f"without {label}"] = replace(whole, effects=rest)
+        calm = tuple(effect for effect in whole.effects if effect.kind != "radiation")
+        problems["without any radiation"] = replace(whole, effects=calm)
+        problems["conduction only"] = replace(whole, effects=())
+        print(f"{len(mesh.tets):,} tetrahedra, {self.steps} steps of {self.step_seconds:g} s, {self.repeats} runs\n")
+        seconds, solutions = take_turns(
+            {name: lambda p=problem: solve_heat(p, steps) for name, problem in problems.items()}, self.repeats
+        )
+        print(f"| | s | of all | Newton steps | {' | '.join(KINDS)} |\n|{'---|' * (4 + len(KINDS))}")
+        for name, solution in solutions.items():
+            counts = solution.assembled.counts
+            shown = " | ".join(str(counts.get(kind, "")) for kind in KINDS)
+            median = statistics.median(seconds[name])
+            share = median / statistics.median(seconds["all effects"])
+            print(f"| {name} | {median:.2f} | {share:.2f} | {solution.newton_iterations.sum()} | {shown} |")
+        self.screening(whole, steps)
+        self.conduction_only(problems["conduction only"], steps)
+
+    def screening(self, whole: HeatProblem, steps: TimeSteps) -> None:
+        """What screening costs, beside the computation that it may shorten."""
+        taken, _ = take_turns({"screen": lambda: screen(whole, steps, 0.01)}, self.repeats)
+        print(f"\nScreening all effects at 0.01 K: {statistics.median(taken['screen']):.3f} s")
+
+    def conduction_only(self, problem: HeatProblem, steps: TimeSteps) -> None:
+        """Conduction alone, through the effects layer and without it."""
+        sides: dict[str, Callable[[], np.ndarray]] = {
+            "through effects": lambda: solve_heat(problem, steps, relative_tolerance=TOLERANCE).temperature_c,
+            "directly": lambda: directly(problem, steps),
+        }
+        seconds, states = take_turns(sides, self.repeats)
+        ratios = [ours / plain for ours, plain in zip(seconds["through effects"], seconds["directly"])]
+        difference = np.abs(states["through effects"] - states["directly"]).max()
+        print("\n| conduction only | s |\n|---|---|")
+        for name, taken in seconds.items():
+            print(f"| {name} | {statistics.median(taken):.3f} |")
+        print(
+            f"\nRatio, median of {self.repeats}: {statistics.median(ratios):.3f} ({min(ratios):.3f} to "
+            f"{max(ratios):.3f}); largest difference {difference:.1e} K"
+        )
+
+
+def directly(problem: HeatProblem, steps: TimeSteps) -> np.ndarray:
+    """Backward Euler with the assembled matrices and nothing in between."""
+    assert isinstance(problem.material, Material)
+    matrices = assemble(problem.mesh, problem.material)
+    system = sparse.csr_matrix(matrices.stiffness_w_k + matrices.mass_j_k / steps.step_seconds)
+    solver = ConjugateGradients(system, relative_tolerance=TOLERANCE)
+    states = np.empty((steps.steps + 1, len(problem.start_c)))
+    states[0] = problem.start_c
+    for number in range(steps.steps):
+        states[number + 1] = states[number] + solver.solve(-(matrices.stiffness_w_k @ states[number])).x
+    return states
+
+
+def take_turns(sides: dict[str, Callable], repeats: int) -> tuple[dict[str, list[float]], dict]:
+    """Run all sides in turns after one run that does not count; times and last results."""
+    seconds: dict[str, list[float]] = {name: [] for name in sides}
+    results: dict[str, np.ndarray | HeatSolution] = {}
+    for run in range(repeats + 1):
+        for name, side in sides.items():
+            begin = time.process_time()
+            results[name] = side()
+            if run:
+                seconds[name].append(time.process_time() - begin)
+    return seconds, results
+
+
+def room(voxels: int) -> TetMesh:
+    """A closed room of 4 m whose side at x = 0 is cut by the box around the scene."""
+    thick = max(voxels // 8, 1)
+    cells = np.ones((voxels,) * 3, dtype=bool)
+    cells[thick:-thick, thick:-thick, thick:-thick] = False
+    corners, tets = kuhn_tets(cells)
+    facets = boundary_facets(tets)
+    corner = corners[facets]
+    normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).astype(float)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    middle = corner.mean(axis=1)
+    outside = np.any((middle + 0.5 * normals < 0) | (middle + 0.5 * normals > voxels), axis=1)
+    patch, names = default_patches(normals, Z_UP, outside, middle[:, 0] < 1e-6)
+    points = corners * (4.0 / voxels)
+    return TetMesh(
+        points_m=points,
+        tets=tets,
+        temperature_c=15.0 + 2.0 * points[:, 2] + np.sin(3.0 * points[:, 0]),
+        observed=np.ones(len(points), bool),
+        facets=facets,
+        facet_tags=np.zeros(len(facets), np.int64),
+        region=np.zeros(len(tets), np.int64),
+        boundary=Boundary(normals, np.ones(len(facets)), outside, patch, names),
+    )
+
+
+if __name__ == "__main__":
+    tyro.cli(EffectsCost).main()

@@ -1,0 +1,138 @@
+"""Reading pairs: degrees, photographs out of thermal files, and files that cannot be read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.capture.camera_card import counts, jpeg_bytes, photograph
+from tests.data.flir_file import FlirFile
+from thermoxels_ns.capture.frames import CaptureFrames, read_frames
+from thermoxels_ns.capture.pairs import Pair
+from thermoxels_ns.data.radiometry import RadiometryOptions
+from thermoxels_ns.errors import ThermalFileError, ThermoxelsError
+
+RADIOMETRY = RadiometryOptions()
+
+
+def pair(folder: Path, name: str, temperature_c: np.ndarray | None = None, **exif) -> Pair:
+    return Pair(
+        name,
+        photograph(folder / f"{name}-visible.jpg", **exif),
+        counts(folder / f"{name}-radiometric.tiff", temperature_c),
+        "equal names",
+    )
+
+
+def read(pairs, tmp_path, skip_bad=False, mask=None):
+    work = tmp_path / "work"
+    work.mkdir(exist_ok=True)
+    return read_frames(pairs, tmp_path / "card", work, RADIOMETRY, skip_bad, mask)
+
+
+def test_degrees_and_what_the_files_say(tmp_path):
+    temperature_c = np.linspace(10, 30, 192).reshape(12, 16)
+    one = pair(tmp_path / "card", "a", temperature_c, taken_at="2024:01:02 03:04:05", focal=(4.0, 100.0))
+    frames = read([one], tmp_path)
+    (frame,) = frames.frames
+    assert np.load(frame.thermal) == pytest.approx(temperature_c, abs=0.013)
+    assert (frame.taken_at, frame.focal_px, frame.camera) == ("2024-01-02T03:04:05", 40.0, "Workswell WIRIS Pro")
+    assert (frame.photograph_source, frame.thermal_source) == ("a-visible.jpg", "a-radiometric.tiff")
+    assert frames.thermal_size == (16, 12)
+
+
+def test_the_list_survives_a_move_of_both_folders(tmp_path):
+    flir = FlirFile(np.full((12, 16), 14000, dtype=np.uint16), photograph=jpeg_bytes(np.zeros((24, 32, 3), np.uint8)))
+    card = tmp_path / "card"
+    first = pair(card, "a", gps=(48.0, 11.0, 500.0))
+    (card / "F.jpg").write_bytes(flir.jpeg())
+    frames = read([first, Pair("F", card / "F.jpg", card / "F.jpg", "both in one file")], tmp_path)
+    (tmp_path / "work").rename(tmp_path / "work2")
+    card.rename(tmp_path / "card2")
+    loaded = CaptureFrames.load(tmp_path / "work2", tmp_path / "card2")
+    assert [frame.name for frame in loaded.frames] == ["a", "F"]
+    assert loaded.frames[0].gps == frames.frames[0].gps
+    for frame in loaded.frames:
+        assert frame.photograph.is_file() and frame.thermal.is_file()
+
+
+def test_a_photograph_inside_a_flir_file_is_taken_out(tmp_path):
+    pixels = np.full((24, 32, 3), (200, 30, 30), dtype=np.uint8)
+    card = tmp_path / "card"
+    card.mkdir()
+    flir = FlirFile(np.full((12, 16), 14000, np.uint16), photograph=jpeg_bytes(pixels), alignment=(1.2, 3, -4))
+    (card / "F.jpg").write_bytes(flir.jpeg())
+    (frame,) = read([Pair("F", card / "F.jpg", card / "F.jpg", "")], tmp_path).frames
+    assert np.asarray(Image.open(frame.photograph)).mean(axis=(0, 1)) == pytest.approx((200, 30, 30), abs=3)
+    assert frame.picture_in_picture is not None and frame.picture_in_picture.real_to_thermal == pytest.approx(1.2)
+    assert not frame.photograph.is_relative_to(card)
+
+
+def bad_files(card: Path) -> dict[str, Pair]:
+    """One pair for each way in which a file can be damaged."""
+    pairs = {name: pair(card, name) for name in ("cut", "zero", "eight", "palette", "text", "wide", "photo")}
+    content = pairs["cut"].thermal.read_bytes()
+    pairs["cut"].thermal.write_bytes(content[: len(content) // 2])
+    pairs["zero"].thermal.write_bytes(b"")
+    Image.new("L", (16, 12), 90).save(pairs["eight"].thermal, format="TIFF")
+    pairs["palette"].thermal.write_bytes(jpeg_bytes(np.zeros((12, 16, 3), np.uint8)))
+    pairs["text"].thermal.write_bytes(b"hello, this is no picture")
+    Image.new("I;16", (30000, 1)).save(pairs["wide"].thermal, format="TIFF")
+    rng = np.random.default_rng(0)
+    whole = photograph(pairs["photo"].photograph, rng.integers(0, 255, (64, 64, 3), dtype=np.uint8)).read_bytes()
+    pairs["photo"].photograph.write_bytes(whole[: len(whole) // 2])
+    return pairs
+
+
+def test_every_damaged_file_is_an_error_that_names_it(tmp_path):
+    pairs = bad_files(tmp_path / "card")
+    for name, one in pairs.items():
+        with pytest.raises(ThermoxelsError, match=name):
+            read([one], tmp_path)
+
+
+def test_the_rest_goes_on_without_damaged_files(tmp_path):
+    pairs = bad_files(tmp_path / "card")
+    good = pair(tmp_path / "card", "good")
+    frames = read([*pairs.values(), good], tmp_path, skip_bad=True)
+    assert [frame.name for frame in frames.frames] == ["good"]
+    assert set(frames.dropped) == set(pairs)
+    assert all(name in why for name, why in frames.dropped.items())
+
+
+def test_nothing_but_damaged_files_is_an_error_even_when_they_may_be_skipped(tmp_path):
+    with pytest.raises(ThermoxelsError, match="at least one pair"):
+        read(list(bad_files(tmp_path / "card").values()), tmp_path, skip_bad=True)
+
+
+def test_a_palette_picture_is_refused_as_such(tmp_path):
+    with pytest.raises(ThermalFileError, match="palette"):
+        read([bad_files(tmp_path / "card")["palette"]], tmp_path)
+
+
+def test_a_frame_of_another_thermal_camera_is_dropped_by_name(tmp_path):
+    card = tmp_path / "card"
+    pairs = [pair(card, "a"), pair(card, "b"), pair(card, "odd", np.full((6, 8), 20.0))]
+    frames = read(pairs, tmp_path)
+    assert [frame.name for frame in frames.frames] == ["a", "b"]
+    assert "8 x 6 pixels, most have 16 x 12" in frames.dropped["odd"]
+
+
+def test_stuck_pixels_and_the_users_mask_become_nan(tmp_path):
+    rng = np.random.default_rng(0)
+    pairs = []
+    for number in range(6):
+        temperature_c = rng.uniform(10, 30, (12, 16))
+        temperature_c[5, 7] = 99.0
+        pairs.append(pair(tmp_path / "card", f"p{number}", temperature_c))
+    mask = np.full((12, 16), 255, dtype=np.uint8)
+    mask[:, 15] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    frames = read(pairs, tmp_path, mask=tmp_path / "mask.png")
+    assert frames.dead_pixels == 1
+    for frame in frames.frames:
+        missing = np.isnan(np.load(frame.thermal))
+        assert missing[5, 7] and missing[:, 15].all() and missing.sum() == 13 == frame.masked

@@ -1,0 +1,137 @@
+"""Poses that exist already: recognised by file names, kept as they are, and never a way out of their folder."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.capture.posed_model import CAMERA, ring_model
+from thermoxels_ns.capture.colmap_model import camera_of_colmap, model_of_colmap, read_colmap
+from thermoxels_ns.capture.given_poses import in_order, read_given_poses
+from thermoxels_ns.errors import SceneError
+
+MODEL = ring_model(5, points=60)
+SOURCES = {name: f"visible/{name}-visible.jpg" for name in MODEL.frames}
+
+
+def transforms(tmp_path, names=None, **more):
+    content = {
+        **{key: getattr(CAMERA, key) for key in ("fl_x", "fl_y", "cx", "cy", "k1")},
+        **{"w": CAMERA.width, "h": CAMERA.height, "camera_model": "OPENCV", **more},
+        "frames": [
+            {"file_path": (names or SOURCES)[name], "transform_matrix": pose.tolist()}
+            for name, pose in zip(MODEL.frames, MODEL.camera_to_world)
+        ],
+    }
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+@pytest.mark.parametrize("form", ["{0}-visible.jpg", "images/{0}-visible.png", "visible\\{0}-visible.jpg", "{0}.jpg"])
+def test_photographs_are_recognised_by_name(tmp_path, form):
+    path = transforms(tmp_path, {name: form.format(name) for name in MODEL.frames})
+    found = read_given_poses(path, {**SOURCES, "other": "visible/other-visible.jpg"})
+    assert found.model.frames == MODEL.frames
+    assert np.array_equal(found.model.camera_to_world, MODEL.camera_to_world)
+    assert found.model.camera == CAMERA
+    assert list(found.dropped) == ["other"]
+
+
+@pytest.mark.parametrize("name", ["../../etc/f0-visible.jpg", "/data/f0-visible.jpg", "C:\\f0-visible.jpg"])
+def test_a_name_that_leads_out_is_refused(tmp_path, name):
+    with pytest.raises(SceneError, match="a file inside"):
+        read_given_poses(transforms(tmp_path, {**SOURCES, "f0": name}), SOURCES)
+
+
+def test_what_is_no_pose_is_refused(tmp_path):
+    path = transforms(tmp_path)
+    content = json.loads(path.read_text())
+    content["frames"][2]["transform_matrix"][0][0] = 7.0
+    path.write_text(json.dumps(content))
+    with pytest.raises(SceneError, match="frame 2: transform_matrix"):
+        read_given_poses(path, SOURCES)
+    with pytest.raises(SceneError, match="no known one"):
+        read_given_poses(transforms(tmp_path), {"x": "x.jpg"})
+    with pytest.raises(SceneError, match="nothing at"):
+        read_given_poses(tmp_path / "nowhere", SOURCES)
+    with pytest.raises(SceneError, match="a COLMAP model"):
+        read_given_poses(tmp_path, SOURCES)
+
+
+def test_distortion_that_the_camera_cannot_hold_is_refused(tmp_path):
+    with pytest.raises(SceneError, match="k3 0"):
+        read_given_poses(transforms(tmp_path, k3=0.1), SOURCES)
+
+
+def colmap_model(folder, lens="SIMPLE_RADIAL"):
+    """The same cameras and points in COLMAP's text form."""
+    params = {"SIMPLE_RADIAL": "500 320 240 0.02", "FOV": "500 500 320 240 0.1"}[lens]
+    (folder / "cameras.txt").write_text(f"1 {lens} 640 480 {params}\n")
+    flip = np.diag([1.0, -1.0, -1.0])
+    images, tracks = [], {n: [] for n in range(len(MODEL.points))}
+    for number, name in enumerate(MODEL.frames):
+        pose = MODEL.camera_to_world[number]
+        rotation = (pose[:3, :3] @ flip).T
+        shift = -rotation @ pose[:3, 3]
+        from scipy.spatial.transform import Rotation
+
+        x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+        seen, pixels = MODEL.seen_by(number)
+        images.append(f"{number + 1} {w} {x} {y} {z} {shift[0]} {shift[1]} {shift[2]} 1 {name}-visible.jpg")
+        images.append(" ".join(f"{u} {v} {point + 1}" for point, (u, v) in zip(seen, pixels)))
+        for index, point in enumerate(seen):
+            tracks[point].append(f"{number + 1} {index}")
+    (folder / "images.txt").write_text("\n".join(images) + "\n")
+    rows = [
+        f"{n + 1} {p[0]} {p[1]} {p[2]} {' '.join(map(str, MODEL.colours[n]))} 0.5 {' '.join(tracks[n])}"
+        for n, p in enumerate(MODEL.points)
+        if tracks[n]
+    ]
+    (folder / "points3D.txt").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+def test_a_colmap_model_comes_in_with_its_points(tmp_path):
+    found = read_given_poses(colmap_model(tmp_path), SOURCES).model
+    assert found.camera_to_world == pytest.approx(MODEL.camera_to_world, abs=1e-9)
+    assert found.camera == CAMERA
+    assert len(found.points) == len(np.unique(MODEL.sighting_point))
+    assert found.sighting_error_px().max() < 1e-6
+    assert len(found.sighting_frame) == len(MODEL.sighting_frame)
+    assert found.point_error_px == pytest.approx(0.5)
+
+
+def test_a_model_of_reduced_photographs_is_scaled_to_the_originals(tmp_path):
+    reconstruction = read_colmap(colmap_model(tmp_path))
+    large = model_of_colmap(reconstruction, {f"{n}-visible.jpg": n for n in MODEL.frames}, (1280, 960))
+    assert (large.camera.fl_x, large.camera.cx, large.camera.k1) == (1000.0, 640.0, 0.02)
+    assert large.sighting_error_px().max() < 1e-6
+    assert large.point_error_px == pytest.approx(1.0)
+
+
+def test_a_lens_that_ours_cannot_be_is_refused(tmp_path):
+    reconstruction = read_colmap(colmap_model(tmp_path, "FOV"))
+    with pytest.raises(SceneError, match="got FOV"):
+        camera_of_colmap(reconstruction.cameras[1])
+
+
+def test_sorting_frames_keeps_sightings_with_their_frames():
+    turned = in_order(MODEL, lambda name: -int(name[1:]))
+    assert turned.frames == MODEL.frames[::-1]
+    assert turned.sighting_error_px().max() == pytest.approx(MODEL.sighting_error_px().max())
+    for index, name in enumerate(turned.frames):
+        before = MODEL.seen_by(MODEL.frames.index(name))
+        assert np.array_equal(turned.seen_by(index)[0], before[0])
+
+
+def test_leaving_frames_out_and_moving_the_world_keep_reprojection():
+    some = MODEL.without(["f1", "f3"])
+    assert some.frames == ("f0", "f2", "f4")
+    assert some.sighting_error_px().max() < 1e-9
+    rotation = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    moved = some.moved(rotation, np.array([1.0, 2.0, 3.0]))
+    assert moved.sighting_error_px().max() < 1e-9
+    assert moved.points[0] == pytest.approx(rotation @ (some.points[0] - [1.0, 2.0, 3.0]))

@@ -1,0 +1,211 @@
+"""A whole capture, from camera files to a scene that trains, and again with what is kept from the first time."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from tests.capture.camera_card import photograph
+from tests.capture.textured_room import RIG, THERMAL, VISIBLE, alignment, poses, write_card
+from thermoxels_ns import cli
+from thermoxels_ns.capture.run import run_capture
+from thermoxels_ns.capture.settings import CaptureSettings
+from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
+from thermoxels_ns.errors import OutputError, SceneError, ThermoxelsError
+
+COUNT = 6
+DRIFT_K = 0.6
+ANGLE_DEG = float(2 * np.degrees(np.arctan(THERMAL.width / 2 / THERMAL.fl_x)))
+
+
+def settings(**more) -> CaptureSettings:
+    return CaptureSettings(max_features=500, thermal_field_of_view_deg=ANGLE_DEG, **more)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """A card with a stray pair, a lone photograph and a file that cannot be read; and the result."""
+    folder = tmp_path_factory.mktemp("capture")
+    card = folder / "card"
+    write_card(card, COUNT, DRIFT_K, stray=True)
+    photograph(card / "lonely.jpg")
+    (card / "shot9-visible.jpg").write_bytes(b"")
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    said = []
+    result = run_capture(card, folder / "scene", settings(skip_bad=True), said.append)
+    outside = {p: p.stat().st_mtime_ns for p in folder.rglob("*") if not p.is_relative_to(folder / "scene")}
+    assert outside == {**before, folder: outside.get(folder, 0)} or outside == before
+    return card, folder / "scene", result, said
+
+
+def content(scene):
+    return json.loads((scene / "transforms.json").read_text())
+
+
+def test_what_is_left_out_is_named_with_its_reason(capture):
+    dropped = capture[2].dropped
+    assert set(dropped) == {f"shot{COUNT}", "lonely.jpg", "shot9-visible.jpg"}
+    assert "zero bytes" in dropped["shot9-visible.jpg"]
+    assert (capture[2].pairs, capture[2].frames) == (COUNT + 1, COUNT)
+
+
+def test_the_scene_has_the_cameras_of_the_truth(capture):
+    entries = sorted(content(capture[1])["frames"], key=lambda entry: entry["source"])
+    found = np.array([entry["transform_matrix"] for entry in entries])
+    scale, off_m, off_deg = alignment(found, poses(COUNT))
+    assert off_m < 0.01 and off_deg < 0.3
+    thermal = np.array([entry["thermal_transform_matrix"] for entry in entries])
+    apart = np.linalg.norm(thermal[:, :3, 3] - found[:, :3, 3], axis=1) * scale
+    assert apart.std() < 1e-6
+    assert apart[0] == pytest.approx(np.linalg.norm(RIG[:3, 3]), abs=0.04)
+
+
+def test_the_rig_that_was_found_projects_as_the_true_one(capture):
+    rig = capture[2].rig
+    assert rig.determined, rig.explanation
+    scale = alignment(
+        np.array([e["transform_matrix"] for e in sorted(content(capture[1])["frames"], key=lambda e: e["source"])]),
+        poses(COUNT),
+    )[0]
+    grid = np.stack(np.meshgrid(np.linspace(60, 420, 7), np.linspace(60, 300, 5)), -1).reshape(-1, 2)
+    points_m = VISIBLE.rays(grid) * 2.5
+    true = THERMAL.project(points_m @ RIG[:3, :3].T + RIG[:3, 3])
+    found = rig.visible_to_thermal
+    seen = rig.thermal_camera.project(points_m / scale @ found[:3, :3].T + found[:3, 3])
+    assert np.median(np.linalg.norm(seen - true, axis=1)) < 1.5
+
+
+def test_drift_is_found(capture):
+    drift = capture[2].drift
+    assert drift.used, drift.explanation
+    assert drift.offsets_k == pytest.approx([DRIFT_K * (-1) ** n for n in range(COUNT)], abs=0.1)
+    assert drift.after_k < 0.5 * drift.before_k
+    assert content(capture[1])["drift"]["disagreement_after_k"] == pytest.approx(drift.after_k)
+
+
+def test_z_is_up(capture):
+    meta = content(capture[1])
+    assert meta["up"] == pytest.approx([0, 0, 1], abs=1e-9)
+    entries = sorted(meta["frames"], key=lambda entry: entry["source"])
+    found = np.array([entry["transform_matrix"] for entry in entries])[:, :3, :3]
+    # Up in each camera's axes, by the scene and by the truth.
+    assert np.degrees(np.arccos(np.einsum("ni,ni->n", found[:, 2], poses(COUNT)[:, 2, :3]))).max() < 2.0
+
+
+def test_the_dataparser_reads_the_scene(capture):
+    outputs = ThermalDataParserConfig(data=capture[1]).setup().get_dataparser_outputs("train")
+    assert len(outputs.image_filenames) == COUNT - 1
+    limits = outputs.metadata["temperature_range"]
+    assert 13 < limits.min_c < limits.max_c < 25
+
+
+def test_the_page_shows_everything_and_fetches_nothing(capture):
+    page = capture[2].page.read_text()
+    for words in ("shot9-visible.jpg", "lonely.jpg", f"shot{COUNT}", "too few matches", "480 x 360", "160 x 128"):
+        assert words in page, words
+    assert page.count("<img") == 3 * COUNT
+    assert page.count("<svg") == 3  # reprojection, temperatures, drift
+    assert not re.search(r"""(src|href)=["'](?!data:)""", page)
+    assert "<script" not in page and "http" not in page.replace("http-equiv", "")
+    assert "nan" not in re.sub(r'data:image/jpeg;base64,[^"]+', "", page)
+
+
+def test_a_second_run_takes_everything_from_the_first(capture):
+    card, scene, first, _ = capture
+    before = (scene / "transforms.json").stat().st_mtime_ns
+    said = []
+    again = run_capture(card, scene, settings(skip_bad=True), said.append)
+    assert [line for line in said if "as before" not in line] == []
+    assert (scene / "transforms.json").stat().st_mtime_ns == before
+    assert again.dropped == first.dropped
+    assert np.array_equal(again.rig.visible_to_thermal, first.rig.visible_to_thermal)
+    assert np.array_equal(again.drift.offsets_k, first.drift.offsets_k)
+
+
+def test_another_scale_runs_only_what_depends_on_it_and_so_does_from_stage(capture, tmp_path):
+    card, earlier, _, _ = capture
+    scene = tmp_path / "scene"
+    shutil.copytree(earlier, scene)
+    said = []
+    more = {"skip_bad": True, "drift": "off", "rig": earlier / "transforms.json"}
+    more["known_distance"] = ("shot2-visible.jpg", 100.0, 100.0, 380.0, 120.0, 2.0)
+    result = run_capture(card, scene, settings(**more), said.append)
+    assert [line.split(":")[0] for line in said if "as before" in line] == [
+        "1/8 pairs",
+        "2/8 temperatures",
+        "3/8 poses",
+    ]
+    assert result.scale is not None
+    assert content(scene)["metres_per_unit"] == result.scale.metres_per_unit
+    assert not result.drift.used
+    said.clear()
+    run_capture(card, scene, settings(from_stage="scene", **more), said.append)
+    assert [line.split(" ")[1] for line in said if re.match(r"\d/8", line) and "as before" not in line] == [
+        "scene",
+        "page",
+    ]
+
+
+def test_a_bad_file_stops_the_capture_and_is_named(capture, tmp_path):
+    with pytest.raises(SceneError, match=r"shot9-visible\.jpg.*--skip-bad True"):
+        run_capture(capture[0], tmp_path / "scene", settings())
+
+
+def test_given_poses_and_a_given_rig_are_kept(capture, tmp_path):
+    card, scene, _, _ = capture
+    meta = content(scene)
+    # The poses of the first capture, under the names that the photographs have on the card.
+    given = {**meta, "frames": [{**entry, "file_path": entry["source"]} for entry in meta["frames"]]}
+    file = tmp_path / "transforms.json"
+    file.write_text(json.dumps(given))
+    result = run_capture(card, tmp_path / "scene", settings(skip_bad=True, poses=file, rig=scene / "transforms.json"))
+    new = content(tmp_path / "scene")
+    before = {entry["source"]: entry["transform_matrix"] for entry in meta["frames"]}
+    assert {entry["source"]: entry["transform_matrix"] for entry in new["frames"]} == before
+    assert new["rig"] == meta["rig"] and new["thermal_camera"] == meta["thermal_camera"]
+    assert f"shot{COUNT}" in result.dropped and "no pose" in result.dropped[f"shot{COUNT}"]
+    assert result.drift.used
+
+
+@pytest.mark.parametrize("output", ["card", "full"])
+def test_folders_that_are_not_ours_are_not_written_to(capture, tmp_path, output):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.txt").write_text("mine")
+    folder = capture[0] if output == "card" else tmp_path / "full"
+    before = sorted(folder.iterdir())
+    with pytest.raises((OutputError, SceneError), match="output"):
+        run_capture(capture[0], folder, settings())
+    assert sorted(folder.iterdir()) == before
+
+
+def test_a_folder_without_pairs_says_what_was_found(tmp_path):
+    photograph(tmp_path / "card" / "a.jpg")
+    with pytest.raises(ThermoxelsError, match=r"none; a\.jpg: no partner"):
+        run_capture(tmp_path / "card", tmp_path / "scene", settings())
+    with pytest.raises(ThermoxelsError, match="nothing at"):
+        run_capture(tmp_path / "nowhere", tmp_path / "scene", settings())
+
+
+def test_the_command(capture, tmp_path, capsys):
+    assert cli.main(["capture", str(tmp_path / "nowhere"), "--output", str(tmp_path / "scene")]) == 1
+    assert "nothing at" in capsys.readouterr().err
+    card, scene, _, _ = capture
+    words = ["--skip-bad", "True", "--max-features", "500", "--thermal-field-of-view-deg", str(ANGLE_DEG)]
+    assert cli.main(["capture", str(card), "--output", str(scene), *words]) == 0
+    out = capsys.readouterr().out
+    assert f"{COUNT} frames of {COUNT + 1} pairs" in out
+    assert "shot9-visible.jpg" in out and f"--data {scene}" in " ".join(out.split())
+
+
+def test_the_help_names_every_option(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["capture", "--help"])
+    assert stop.value.code == 0
+    words = capsys.readouterr().out
+    for option in ("--from-stage", "--skip-bad", "--known-distance", "--marker-side-m", "--poses", "--rig", "--masks"):
+        assert option in words
+    assert "Longest side to which photographs are reduced" in re.sub(r"[\s│]+", " ", words)

@@ -1,0 +1,60 @@
+"""Published benchmarks with quadratic tetrahedra."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.building_corner import COLDEST_C, LISTED_W, building_corner
+from tests.heat_meshes import box_mesh, planes
+from tests.shell_mesh import shell_mesh
+from thermoxels_ns.fem.effects import Convection, FixedTemperature
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.steady import solve_steady
+
+
+def test_iso_10211_case_3() -> None:
+    """Cells of 50 mm are enough: flows within 1 %, in fact within 0.2 %, and the coldest spots within 0.1 K."""
+    problem = building_corner(lambda *knots: planes(*knots, step=0.05))
+    solution = solve_steady(problem, order=2, relative_tolerance=1e-9)
+    flows = [heat.heat_w[0] for heat in solution.effects]
+    assert flows == pytest.approx(LISTED_W, rel=0.002)
+    # What scikit-fem finds with the same mesh and elements.
+    assert flows == pytest.approx([46.133, 13.912, -60.045], abs=6e-4)
+    mesh = problem.mesh
+    tags = mesh.boundary
+    assert tags is not None
+    for patch, listed in COLDEST_C.items():
+        nodes = np.unique(mesh.facets[tags.patch == tags.patch_names.index(patch)])
+        assert solution.temperature_c[nodes].min() == pytest.approx(listed, abs=0.02), patch
+    assert solution.energy_residual < 1e-9
+
+
+def test_nafems_t4() -> None:
+    """A plate with convection: 18.25376 C at (0.6, 0.2), near a singular corner; within 1 % on a mesh of 10."""
+    errors = []
+    for n in (10, 20):
+        mesh = box_mesh(np.linspace(0, 0.6, 6 * n // 10 + 1), np.linspace(0, 1, n + 1), [0, 1 / n], temperature_c=50.0)
+        effects = (FixedTemperature(("y0",), 100.0), Convection(("x1", "y1"), 750.0, 0.0))
+        problem = HeatProblem(mesh, Material("plate", 52.0, 7850.0, 460.0), effects=effects)
+        solution = solve_steady(problem, order=2)
+        node = np.linalg.norm(mesh.points_m - [0.6, 0.2, 0.0], axis=1).argmin()
+        errors.append(float(solution.temperature_c[node]) - 18.25376)
+    assert abs(errors[0]) < 0.01 * 18.25376 and abs(errors[1]) < 0.3 * abs(errors[0]), errors
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_closed_spherical_shell(order) -> None:
+    """455.6634 W. With flat facets the error is that of the area, of second order whatever the tetrahedra."""
+    errors = []
+    for parts in (4, 8):
+        mesh = shell_mesh(0.5, 0.6, parts, parts // 4)
+        effects = (Convection(("inside",), 7.69, 20.0), Convection(("outside",), 25.0, -10.0))
+        solution = solve_steady(
+            HeatProblem(mesh, Material("concrete", 1.7, 2200.0, 880.0), effects=effects), order=order
+        )
+        assert solution.energy_residual < 1e-9
+        errors.append(float(solution.effects[0].heat_w[0]) / 455.6634 - 1.0)
+    assert abs(errors[1]) < 3e-3, errors
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.15), f"observed order of {errors}"
