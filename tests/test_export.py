@@ -427,6 +427,45 @@ def test_view_from_where_the_cameras_stood() -> None:
     assert viewpoint_of_cameras(np.stack([pose, turned]), np.eye(4)).view_direction is None
 
 
+def test_up_of_cameras_that_look_down_is_that_of_their_level_pictures() -> None:
+    """A drone that looks 60 degrees down from half of the sky: the mean of the pictures' up would lean to one side."""
+    poses = []
+    for heading in np.radians([-40, -20, 0, 20, 40]):
+        right = np.array([np.cos(heading), np.sin(heading), 0.0])
+        ahead = np.array([-np.sin(heading), np.cos(heading), 0.0])
+        back = -(0.5 * ahead - np.sqrt(0.75) * np.array([0.0, 0.0, 1.0]))
+        poses.append(np.column_stack([right, np.cross(back, right), back, np.zeros(3)]))
+    view = viewpoint_of_cameras(np.stack(poses), np.eye(4))
+    assert view.up == pytest.approx((0.0, 0.0, 1.0), abs=1e-9) and "horizontal axes" in view.up_source
+    one_way = viewpoint_of_cameras(np.stack(poses[2:3]), np.eye(4))
+    assert one_way.up == pytest.approx((0.0, np.sqrt(0.75), 0.5)) and "tilt" in one_way.up_source
+
+
+def test_up_can_be_given(ball, tmp_path) -> None:
+    options = ExportOptions(metres_per_unit=1.0, steps=1, pictures=False, up=(0.0, 0.0, -2.0))
+    summary = export_snapshot(ball, np.eye(4), options, tmp_path, scene_file={"up": [0.0, 1.0, 0.0]})
+    assert summary["up"] == (0.0, 0.0, -1.0) and "--up" in summary["up_source"] and "up" not in summary["scale"]
+    with pytest.raises(MeshError, match="up: expected a direction"):
+        export_snapshot(ball, np.eye(4), ExportOptions(up=(0.0, 0.0, 0.0)), tmp_path)
+
+
+@pytest.mark.parametrize("option", [{"wall_thickness": 0.3}, {"patches": "rules"}])
+def test_lengths_in_metres_need_a_scale(ball, tmp_path, option) -> None:
+    (tmp_path / "rules.yaml").write_text("patches: []\n")
+    if "patches" in option:
+        option = {"patches": tmp_path / "rules.yaml"}
+    with pytest.raises(MeshError, match=f"scale: .* --{next(iter(option)).replace('_', '-')}"):
+        export_snapshot(ball, np.eye(4), ExportOptions(**option), tmp_path / "out")
+
+
+@pytest.mark.parametrize("cell", [0, 3, -8])
+def test_coarsest_cell_is_a_power_of_two_in_both_modes(ball, tmp_path, cell) -> None:
+    for boundary in ("conforming", "voxel"):
+        with pytest.raises(MeshError, match="coarsest_cell"):
+            export_snapshot(ball, np.eye(4), ExportOptions(coarsest_cell=cell, boundary=boundary), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("missing", ["--load-config", "--output-dir"])
 def test_command_line_needs_input_and_output(missing, capsys) -> None:
     line = {"--load-config": "c", "--output-dir": "o"}

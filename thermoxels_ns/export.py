@@ -193,13 +193,19 @@ def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.Ar
     if np.linalg.norm(up) < 0.1:  # cameras held every way round
         return Viewpoint()
     up /= np.linalg.norm(up)
+    source = "The mean of what was up in the photographs; cameras that all look down or up tilt it."
+    # People hold pictures level: up is at right angles to the pictures' horizontal axes, if these span a plane.
+    spread, directions = np.linalg.eigh(np.einsum("ni,nj->ij", axes[:, :, 0], axes[:, :, 0]) / len(axes))
+    level = directions[:, 0] * np.sign(directions[:, 0] @ up)
+    if spread[1] > 0.05 and spread[0] < 0.2 * spread[1] and level @ up > 0.3:
+        up, source = level, "At right angles to the horizontal axes of the photographs."
     forward = -axes[:, :, 2].mean(axis=0)
     level = forward - (forward @ up) * up
     direction = None
     if np.linalg.norm(level) > 0.3:
         level /= np.linalg.norm(level)
         direction = tuple(float(v) for v in level + 0.35 * np.cross(up, level) - 0.35 * up)
-    return Viewpoint(tuple(float(v) for v in up), direction)  # type: ignore[arg-type]
+    return Viewpoint(tuple(float(v) for v in up), source, direction)  # type: ignore[arg-type]
 
 
 def input_from_world(transform: npt.ArrayLike, scale: float) -> npt.NDArray[np.float64]:

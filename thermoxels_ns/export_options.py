@@ -5,12 +5,19 @@ Imports at the top are light: nerfstudio's exporter reads the options for ``--he
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 from thermoxels_ns.errors import MeshError, explain
-from thermoxels_ns.scene_scale import SceneScale, choose_scale, scale_from_known_distance, scale_from_option
+from thermoxels_ns.scene_scale import (
+    SceneScale,
+    choose_scale,
+    scale_from_known_distance,
+    scale_from_option,
+    up_from_scene_file,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -23,6 +30,7 @@ if TYPE_CHECKING:
     from thermoxels_ns.mesh.solid import SolidSelection
 
 Settings = TypeVar("Settings", "Material", "TimeSteps")
+Vector = tuple[float, float, float]
 FormatName = Literal["vtu", "xdmf", "msh", "inp", "stl", "ply", "glb"]
 
 
@@ -65,6 +73,9 @@ class ExportOptions:
     metres_per_unit: float | None = None
     """Length of one unit of the input poses, [m]; 1 if the poses are in metres. Needed for heat, unless the scene's
     json has metres_per_unit: without a scale the mesh is written in units of the input, without heat."""
+    up: tuple[float, float, float] | None = None
+    """Direction that points up, in the coordinates of the input poses; it decides which patches face up, down or
+    sideways. Left out: that of the scene's json, else from the cameras, whose pictures people hold level."""
     known_distance: tuple[float, float, float, float, float, float, float] | None = None
     """In place of metres per unit: two points in the coordinates of the input poses and the distance between them,
     x y z x y z metres."""
@@ -93,6 +104,8 @@ class Viewpoint:
 
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Direction that points up."""
+    up_source: str = "Up is assumed to be z."
+    """How it was found."""
     view_direction: tuple[float, float, float] | None = None
     """Direction from the camera to the mesh; None: obliquely from above."""
 
@@ -118,6 +131,7 @@ def check_options(options: ExportOptions) -> CheckedOptions:
         ThermoxelsError: An option is out of range, or a file cannot be read.
     """
     from thermoxels_ns.fem.presets import load_heat_preset
+    from thermoxels_ns.mesh.build import MeshOptions
     from thermoxels_ns.mesh.patch_rules import PatchRules, load_patch_rules
     from thermoxels_ns.mesh.solid import SolidSelection
 
@@ -137,6 +151,7 @@ def check_options(options: ExportOptions) -> CheckedOptions:
                 remedy="Pass --formats vtu glb, for example.",
             )
         )
+    MeshOptions(options.boundary, options.coarsest_cell)  # refuses what is out of range
     selection = SolidSelection(**{field.name: getattr(options, field.name) for field in fields(SolidSelection)})
     preset = load_heat_preset(options.heat_preset)
     material = _with_options(preset.material, options)
@@ -160,6 +175,8 @@ def scale_of(
     """
     scale = choose_scale(options.metres_per_unit, checked.distance, scene_file)
     needs = [f"--formats {name}" for name in ("inp",) if name in options.formats]
+    needs += ["--wall-thickness"] if options.wall_thickness is not None else []
+    needs += ["--patches"] if options.patches is not None else []
     if scale is None and needs:
         raise MeshError(
             explain(
@@ -170,6 +187,26 @@ def scale_of(
             )
         )
     return scale
+
+
+def up_of(options: ExportOptions, scene_file: Mapping[str, Any] | None, viewpoint: Viewpoint) -> tuple[Vector, str]:
+    """Up, a unit vector, and where it comes from: the user, else the scene's json, else the cameras.
+
+    Raises:
+        ThermoxelsError: What the user or the json says is no direction.
+    """
+    if options.up is not None:
+        length = math.sqrt(sum(value * value for value in options.up))
+        if not (math.isfinite(length) and length > 0.0):
+            raise MeshError(
+                explain("up", expected="a direction", got=options.up, remedy="Pass --up 0 0 1, for example.")
+            )
+        x, y, z = (value / length for value in options.up)
+        return (x, y, z), "Given with --up."
+    in_file = up_from_scene_file(scene_file or {})
+    if in_file is not None:
+        return in_file, "From the scene's json."
+    return viewpoint.up, viewpoint.up_source
 
 
 def _with_options(preset: Settings, options: ExportOptions) -> Settings:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.checks import remove_file, remove_stale_temporaries, writable_folder
 from thermoxels_ns.errors import OutputError, ThermoxelsError, explain
-from thermoxels_ns.export_options import ExportOptions, Viewpoint, check_options, scale_of
+from thermoxels_ns.export_options import ExportOptions, Viewpoint, check_options, scale_of, up_of
 
 if TYPE_CHECKING:
     from thermoxels_ns.mesh.build import BuiltMesh
@@ -114,12 +114,11 @@ def export_snapshot(
     from thermoxels_ns.mesh.quality import check_mesh
     from thermoxels_ns.mesh.quality_picture import picture_of_quality
     from thermoxels_ns.mesh.quality_report import quality_report
-    from thermoxels_ns.scene_scale import up_from_scene_file
 
     checked = check_options(options)
     scale = scale_of(options, checked, scene_file)
     metres = 1.0 if scale is None else scale.metres_per_unit
-    up = up_from_scene_file(scene_file or {}) or viewpoint.up
+    up, up_source = up_of(options, scene_file, viewpoint)
     folder = prepare_folder(output_dir, heat=scale is not None)
     to_mesh = np.diag([metres, metres, metres, 1.0]) @ world_to_input
     built = build_mesh(
@@ -133,6 +132,7 @@ def export_snapshot(
     check_mesh(mesh)
     unit = "input unit" if scale is None else "m"
     report = quality_report(mesh, options.boundary, built.observed_range_c, length_unit=unit)
+    say(f"Up: {', '.join(f'{value:.3g}' for value in up)}. {up_source}")
     _tell(built, report.volume_m3, unit, None if scale is None else voxel_size, say)
 
     preset, solution, truth = checked.preset, None, None
@@ -156,8 +156,9 @@ def export_snapshot(
         "options": {field.name: getattr(options, field.name) for field in fields(options)},
         "versions": versions(),
         "length_unit": unit,
-        "scale": None if scale is None else scale.as_mapping(),
+        "scale": None if scale is None else _without_up(scale.as_mapping()),
         "up": up,
+        "up_source": up_source,
         "mesh": mesh_summary(built, report, checked.selection, scale, voxel_size),
         "heat": skipped if solution is None else heat_summary(preset, solution),
         **({} if truth is None else {"truth": truth}),
@@ -191,6 +192,11 @@ def export_snapshot(
     write_summary(folder / _SUMMARY, summary)
     say(f"Written to {folder}: {', '.join(name for name in summary['files'] if '/' not in name)}")
     return summary
+
+
+def _without_up(scale: Mapping[str, Any]) -> dict[str, Any]:
+    """What a scale says of length; up is decided and reported apart from it."""
+    return {name: value for name, value in scale.items() if not name.startswith("up")}
 
 
 def _mesh_files(suffixes: Iterable[str]) -> list[str]:

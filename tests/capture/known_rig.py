@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.contract import OPENGL_FROM_OPENCV, CameraModel, RigFrame, radius_squared
+from thermoxels_ns.capture.contract import (
+    OPENGL_FROM_OPENCV,
+    CameraModel,
+    RigEstimate,
+    RigFrame,
+    RigStart,
+    radius_squared,
+)
 from thermoxels_ns.data.pinhole import PinholeCamera
 from thermoxels_ns.data.raycast import render_view
 from thermoxels_ns.data.synthetic import make_scene
@@ -25,6 +33,39 @@ class KnownCapture:
     visible_to_thermal: FloatArray
     offsets_k: FloatArray
     radial: tuple[float, float]
+
+    def measured_start(self, focal_error: float = 1.04) -> RigStart:
+        """What a user knows: a focal length some percent off, and the lenses' distance by a ruler, to 2 cm."""
+        transform = np.eye(4)
+        transform[:3, 3] = np.round(self.visible_to_thermal[:3, 3] / 0.02) * 0.02
+        focal = self.thermal.fl_x * focal_error
+        camera = replace(self.thermal, fl_x=focal, fl_y=focal)
+        return RigStart(camera, transform, centre_sigma=0.003, k1_sigma=0.02, translation_sigma=0.015)
+
+    def turn_error_deg(self, found: RigEstimate) -> float:
+        """Angle between the rotation found and the true one [degrees]."""
+        turn = found.visible_to_thermal[:3, :3] @ self.visible_to_thermal[:3, :3].T
+        return float(np.degrees(np.arccos(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0))))
+
+    def focal_error(self, found: RigEstimate) -> float:
+        """Error of the focal length as a share of it."""
+        return abs(found.thermal_camera.fl_x / self.thermal.fl_x - 1.0)
+
+    def projection_error_px(self, found: RigEstimate) -> float:
+        """Median distance of where scene points fall from where they should [thermal pixels]."""
+        return projection_difference_px(
+            self.frames, (self.thermal, self.visible_to_thermal), (found.thermal_camera, found.visible_to_thermal)
+        )
+
+
+def projection_difference_px(
+    frames: list[RigFrame], first: tuple[CameraModel, FloatArray], second: tuple[CameraModel, FloatArray]
+) -> float:
+    """Median distance between where two rigs (camera, visible to thermal) put the frames' points [pixels]."""
+    points = np.concatenate([frame.points_visible() for frame in frames])
+    pixels = [camera.project(points @ rig[:3, :3].T + rig[:3, 3]) for camera, rig in (first, second)]
+    inside = first[0].contains(pixels[0])
+    return float(np.median(np.linalg.norm(pixels[0] - pixels[1], axis=1)[inside]))
 
 
 def turned(x_deg: float, y_deg: float, z_deg: float) -> FloatArray:
@@ -89,3 +130,45 @@ def known_capture(
             RigFrame(f"view {number}", photographs[number], temperatures[number], pose, points[ids], ids.astype(np.int64))
         )
     return KnownCapture(frames, visible, thermal, rig, offsets, radial)
+
+
+def painted_sky(
+    views: int = 5,
+    photograph_width: int = 480,
+    thermal_width: int = 120,
+    turn_deg: tuple[float, float, float] = (0.8, -1.6, 0.5),
+    zoom: float = 1.07,
+    seed: int = 0,
+) -> KnownCapture:
+    """Two cameras in one place look at random blobs: no parallax, no outlines, so only the comparison of edges errs."""
+    draw = np.random.default_rng(seed)
+    focal = 0.86 * photograph_width
+    visible = CameraModel(
+        photograph_width, photograph_width * 3 // 4, focal, focal, photograph_width / 2, photograph_width * 3 / 8
+    )
+    focal = 0.86 * thermal_width * zoom
+    thermal = CameraModel(thermal_width, thermal_width * 4 // 5, focal, focal, thermal_width / 2, thermal_width * 0.4)
+    rig = np.eye(4)
+    rig[:3, :3] = turned(*turn_deg)
+    frames = []
+    for number in range(views):
+        paint = cv2.GaussianBlur(draw.standard_normal((1000, 1300)).astype(np.float32), (0, 0), 14.0)
+        paint = cv2.GaussianBlur((paint > 0.0).astype(np.float32), (0, 0), 1.0)
+        photograph = _seen(paint, visible, np.eye(3), 2)
+        temperature_c = 20.0 + 3.0 * _seen(paint, thermal, rig[:3, :3], 4)
+        pixels = draw.uniform(0.0, 1.0, (600, 2)) * (visible.width, visible.height)
+        points = 10.0 * visible.rays(pixels) * (1.0, -1.0, -1.0)
+        ids = np.arange(len(points)) + number * len(points)
+        frames.append(RigFrame(f"sky {number}", photograph, temperature_c.astype(np.float32), np.eye(4), points, ids))
+    return KnownCapture(frames, visible, thermal, rig, np.zeros(views), (0.0, 0.0))
+
+
+def _seen(paint: npt.NDArray[np.float32], camera: CameraModel, turn: FloatArray, samples: int) -> npt.NDArray:
+    """Image of a painting far away; every pixel is the mean of samples^2 rays."""
+    across = (np.arange(camera.width * samples) + 0.5) / samples
+    down = (np.arange(camera.height * samples) + 0.5) / samples
+    rays = camera.rays(np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)) @ turn
+    place = (800.0 * rays[:, :2] / rays[:, 2:] + (650.0, 500.0) - 0.5).astype(np.float32)
+    place = place.reshape(len(down), len(across), 2)
+    values = cv2.remap(paint, place[..., 0].copy(), place[..., 1].copy(), cv2.INTER_LINEAR)
+    return values.reshape(camera.height, samples, camera.width, samples).mean(axis=(1, 3))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import fields
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -12,8 +14,10 @@ import pytest
 from tests.capture.camera_card import photograph
 from tests.capture.textured_room import RIG, THERMAL, VISIBLE, alignment, poses, write_card
 from thermoxels_ns import cli
+from thermoxels_ns.capture.feature_matching import LensModel, Matching
 from thermoxels_ns.capture.run import run_capture
 from thermoxels_ns.capture.settings import CaptureSettings
+from thermoxels_ns.data.thermal_cameras import COUNT_SCALES
 from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
 from thermoxels_ns.errors import OutputError, SceneError, ThermoxelsError
 
@@ -209,3 +213,11 @@ def test_the_help_names_every_option(capsys):
     for option in ("--from-stage", "--skip-bad", "--known-distance", "--marker-side-m", "--poses", "--rig", "--masks"):
         assert option in words
     assert "Longest side to which photographs are reduced" in re.sub(r"[\s│]+", " ", words)
+
+
+def test_the_choices_on_the_command_line_are_those_there_are():
+    choices = {each.name: get_args(get_type_hints(CaptureSettings)[each.name]) for each in fields(CaptureSettings)}
+    cameras = next(get_args(each) for each in choices["camera"] if get_args(each))
+    assert cameras == tuple(COUNT_SCALES)
+    assert choices["matching"] == get_args(Matching)
+    assert choices["lens"] == get_args(LensModel)

@@ -61,13 +61,13 @@ def iso() -> tuple[HeatProblem, SteadySolution]:
 
 @pytest.mark.parametrize(
     ("tolerance", "refinements"),
-    [(Tolerance(1.0), 0), (Tolerance(0.2), 0), (Tolerance(0.05), 1), (Tolerance(None, 0.005), 0)],
+    [(Tolerance(1.0), 0), (Tolerance(0.2), 0), (Tolerance(None, 0.005), 0)],
 )
-def test_iso_10211_case_3(iso, tolerance, refinements) -> None:
+def test_iso_10211_case_3(iso, tolerance) -> None:
     problem, exact = iso
     found = solve_to_tolerance(problem, tolerance, log=silent)
     settings, true = found.settings, true_error(found, problem, exact)
-    assert (settings.order, settings.refinements) == (2, refinements), found.levels
+    assert (settings.order, settings.refinements) == (2, 0), found.levels
     assert found.met and tolerance.excess(settings.error) <= 1.0
     assert tolerance.excess(true) <= 1.0, (true, settings.error)
     for level in found.levels:
@@ -76,12 +76,13 @@ def test_iso_10211_case_3(iso, tolerance, refinements) -> None:
     assert 1 / WITHIN < settings.error.heat_flow / true.heat_flow < WITHIN, (settings.error, true)
 
 
-@pytest.mark.parametrize("tolerance_k", [0.4, 0.15, 0.05])
-def test_spherical_shell(tolerance_k) -> None:
+@pytest.mark.parametrize(("tolerance_k", "refinements"), [(0.2, 0), (0.02, 1)])
+def test_spherical_shell(tolerance_k, refinements) -> None:
     """The body is the one between the facets: the exact answer is that of much finer tetrahedra in it."""
     problem = shell()
-    exact = solve_steady(finer(problem, 2), order=2)
+    exact = solve_steady(finer(problem, 3), order=2)
     found = solve_to_tolerance(problem, Tolerance(tolerance_k), log=silent)
+    assert (found.settings.order, found.settings.refinements) == (2, refinements), found.levels
     true, estimate = true_error(found, problem, exact), found.settings.error
     assert true.temperature_k <= tolerance_k and found.met
     assert 1 / WITHIN < estimate.temperature_k / true.temperature_k < WITHIN, (found.settings, true)
@@ -129,7 +130,7 @@ def test_lines_say_what_was_done() -> None:
     lines: list[str] = []
     found = solve_to_tolerance(shell(), Tolerance(0.1, 0.01), log=lines.append)
     assert len(lines) == len(found.levels) + 1
-    assert lines[0].startswith("P1, given mesh, 122 unknowns: estimated error ") and lines[0].endswith(" s")
+    assert lines[0].startswith("P2, given mesh, 651 unknowns: estimated error ") and lines[0].endswith(" s")
     assert lines[-1] == found.status
     assert found.status.startswith("Within 0.1 K and 1 % of the heat flow: P2, given mesh,")
     assert f"{found.seconds:.2f} s in all." in found.status
@@ -137,7 +138,7 @@ def test_lines_say_what_was_done() -> None:
 
 def test_printing_is_the_default(capsys) -> None:
     solve_to_tolerance(shell(), Tolerance(1.0))
-    assert "Within 1 K: P1, given mesh" in capsys.readouterr().out
+    assert "Within 1 K: P2, given mesh" in capsys.readouterr().out
 
 
 def test_too_little_memory_is_a_status() -> None:

@@ -67,7 +67,7 @@ class TwoLevelConjugateGradients:
         self._restriction = sparse.csr_matrix(prolongation.T)
         self._norm = float(np.max(np.asarray(abs(matrix).sum(axis=1)), initial=0.0))
         coarse = sparse.csr_matrix(self._restriction @ (matrix @ prolongation))
-        self._coarse = LinearSolver(coarse, relative_tolerance=_COARSE_TOLERANCE) if coarse.shape[0] else None
+        self._coarse = LinearSolver(coarse, relative_tolerance=_COARSE_TOLERANCE) if len(coarse.indptr) > 1 else None
         self._relative_tolerance = relative_tolerance
         self._max_iterations = max_iterations
 

@@ -1,0 +1,233 @@
+"""The rig of two cameras is found from their images alone, and the search says where it cannot be."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.capture.known_rig import KnownCapture, known_capture, painted_sky, projection_difference_px
+from thermoxels_ns.capture.contract import CameraModel, RigFrame, RigStart
+from thermoxels_ns.capture.drift import estimate_drift
+from thermoxels_ns.capture.rig import estimate_rig
+from thermoxels_ns.capture.rig_levels import prepare_frames
+from thermoxels_ns.capture.rig_parameters import RigModel, prior_sigmas
+from thermoxels_ns.errors import SceneError
+
+
+@pytest.fixture(scope="module")
+def house() -> KnownCapture:
+    return known_capture()
+
+
+@pytest.fixture(scope="module")
+def sky() -> KnownCapture:
+    return painted_sky()
+
+
+def sky_start(sky: KnownCapture) -> RigStart:
+    camera = replace(sky.thermal, fl_x=sky.thermal.fl_x * 0.95, fl_y=sky.thermal.fl_y * 0.95)
+    return RigStart(camera, centre_sigma=0.0, k1_sigma=0.0, translation_sigma=1e-6)
+
+
+def with_temperatures(capture: KnownCapture, images: list[np.ndarray]) -> list[RigFrame]:
+    return [replace(f, temperature_c=image.astype(np.float32)) for f, image in zip(capture.frames, images)]
+
+
+def test_comparing_edges_alone_is_exact_to_a_twentieth_of_a_pixel(sky: KnownCapture) -> None:
+    found = estimate_rig(sky.frames, sky.visible, sky_start(sky))
+    assert found.determined, found.explanation
+    assert sky.turn_error_deg(found) < 0.05
+    assert sky.focal_error(found) < 2e-3
+    assert sky.projection_error_px(found) < 0.05
+
+
+def test_dark_for_warm_is_the_same_as_light_for_warm(sky: KnownCapture) -> None:
+    warm = estimate_rig(sky.frames, sky.visible, sky_start(sky))
+    cold = estimate_rig(
+        with_temperatures(sky, [40.0 - np.asarray(f.temperature_c) for f in sky.frames]), sky.visible, sky_start(sky)
+    )
+    assert np.allclose(warm.visible_to_thermal, cold.visible_to_thermal, atol=1e-5)
+    assert cold.thermal_camera.fl_x == pytest.approx(warm.thermal_camera.fl_x, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("scene", "photograph_width", "thermal_width", "baseline_m"),
+    [
+        ("house-corner", 640, 160, (0.15, 0.03, 0.02)),  # 4 times the resolution
+        ("house-corner", 1600, 80, (0.19, -0.02, 0.01)),  # 20 times
+        ("courtyard", 640, 160, (0.05, 0.02, 0.0)),
+    ],
+)
+def test_rig_and_drift_of_a_noisy_drifting_vignetting_camera(
+    scene: str, photograph_width: int, thermal_width: int, baseline_m: tuple[float, float, float]
+) -> None:
+    views = 6 if photograph_width > 1000 else 8
+    capture = known_capture(scene, views, photograph_width, thermal_width, baseline_m)
+    found = estimate_rig(capture.frames, capture.visible, capture.measured_start())
+    assert found.determined, found.explanation
+    assert capture.turn_error_deg(found) < 0.2
+    assert capture.focal_error(found) < 0.01
+    assert capture.projection_error_px(found) < 0.4
+    assert found.score_after > found.score_before
+    drift = estimate_drift(capture.frames, found.thermal_camera, found.visible_to_thermal)
+    assert drift.used, drift.explanation
+    assert np.abs(drift.offsets_k - capture.offsets_k).max() < 0.1
+    assert drift.after_k < 0.5 * drift.before_k
+
+
+def test_without_a_ruler_points_fall_in_place_and_the_error_says_what_is_unsure(house: KnownCapture) -> None:
+    angle = 2 * np.degrees(np.arctan(0.5 * house.thermal.width / (0.94 * house.thermal.fl_x)))
+    start = RigStart(CameraModel.from_field_of_view(house.thermal.width, house.thermal.height, angle))
+    found = estimate_rig(house.frames, house.visible, start)
+    assert found.determined, found.explanation
+    assert house.projection_error_px(found) < 0.6
+    # Turn, shift and principal point stand for each other: each alone is unsure, and its standard error says so.
+    errors = found.standard_errors
+    missed_m = np.abs(found.visible_to_thermal[:3, 3] - house.visible_to_thermal[:3, 3])
+    assert np.all(missed_m < 4.0 * np.array([errors["tx"], errors["ty"], errors["tz"]]))
+    assert abs(np.log(found.thermal_camera.fl_x / house.thermal.fl_x)) < 4.0 * errors["log_focal"]
+    assert 0.0 < found.projection_sigma_px < 1.0
+
+
+@pytest.mark.parametrize("kind", ["noise", "constant", "other frames", "two frames", "black photographs"])
+def test_what_the_images_cannot_tell_stays_as_it_was(house: KnownCapture, kind: str) -> None:
+    draw = np.random.default_rng(1)
+    shape = (house.thermal.height, house.thermal.width)
+    if kind == "noise":
+        frames = with_temperatures(house, [20.0 + 0.05 * draw.standard_normal(shape) for _ in house.frames])
+    elif kind == "constant":
+        frames = with_temperatures(house, [np.full(shape, 20.0) for _ in house.frames])
+    elif kind == "other frames":
+        frames = with_temperatures(house, [np.asarray(f.temperature_c) for f in (*house.frames[3:], *house.frames[:3])])
+    elif kind == "two frames":
+        frames = house.frames[:2]
+    else:
+        frames = [replace(f, photograph=np.zeros_like(f.photograph)) for f in house.frames]
+    start = RigStart(house.thermal, source="the test")
+    found = estimate_rig(frames, house.visible, start)
+    assert not found.determined
+    assert found.thermal_camera == start.thermal_camera
+    assert np.array_equal(found.visible_to_thermal, start.visible_to_thermal)
+    assert "the start value is kept (the test)" in found.explanation
+
+
+def test_rows_and_columns_of_the_sensor_do_not_pull_the_rig(sky: KnownCapture) -> None:
+    many = painted_sky(views=8)
+    rows = 2.0 * np.random.default_rng(2).standard_normal((1, many.thermal.width))
+    striped = with_temperatures(many, [np.asarray(f.temperature_c) + rows for f in many.frames])
+    found = estimate_rig(striped, many.visible, sky_start(many))
+    assert found.determined, found.explanation
+    assert many.projection_error_px(found) < 0.3
+
+
+def test_dead_columns_and_an_odd_number_of_colours_do_no_harm(sky: KnownCapture) -> None:
+    width = sky.thermal.width
+    images = [np.where(np.arange(width) < width // 8, np.nan, np.asarray(f.temperature_c)) for f in sky.frames]
+    frames = [
+        replace(f, photograph=np.dstack([255 * np.asarray(f.photograph)] * 3).astype(np.uint8))
+        for f in with_temperatures(sky, images)
+    ]
+    found = estimate_rig(frames, sky.visible, sky_start(sky))
+    assert found.determined, found.explanation
+    assert sky.projection_error_px(found) < 0.1
+
+
+def test_the_same_input_gives_the_same_bits_and_files_read_as_arrays(sky: KnownCapture, tmp_path: Path) -> None:
+    frames = []
+    for frame in sky.frames:
+        photograph, temperatures = tmp_path / f"{frame.name}.png", tmp_path / f"{frame.name}.npy"
+        cv2.imwrite(str(photograph), np.round(255 * np.asarray(frame.photograph)).astype(np.uint8))
+        np.save(temperatures, frame.temperature_c)
+        frames.append(replace(frame, photograph=photograph, temperature_c=temperatures))
+    first, second = (estimate_rig(frames, sky.visible, sky_start(sky)) for _ in range(2))
+    assert first.visible_to_thermal.tobytes() == second.visible_to_thermal.tobytes()
+    assert first.thermal_camera == second.thermal_camera
+    assert sky.projection_error_px(first) < 0.05
+
+
+def test_slopes_are_the_derivatives_of_what_is_climbed(house: KnownCapture) -> None:
+    prepared = prepare_frames(house.frames[:3], house.visible, house.thermal)
+    rig = RigModel(replace(house.thermal, k1=0.05), house.visible_to_thermal)
+    change = np.array([0.002, -0.003, 0.004, 0.02, -0.01, 0.03, 0.01, 0.4, -0.3, 0.02])
+    points = np.concatenate([frame.points_visible() for frame in house.frames[:2]])
+    slope = np.random.default_rng(0).standard_normal((len(points), 2))
+    exact = rig.pull_back(change, points, slope)
+    score = prepared.score(rig, change, (80, 64), 3.0)
+    total, by_frame = score.slopes(change)
+    climbed = by_frame.sum(axis=0)
+    for number, step in enumerate([1e-5] * 3 + [1e-4] * 3 + [1e-5] + [1e-3] * 2 + [1e-4]):
+        moved = [change.copy(), change.copy()]
+        moved[0][number] += step
+        moved[1][number] -= step
+        ahead, behind = (np.sum(slope * rig.project(one, points)) for one in moved)
+        assert exact[number] == pytest.approx((ahead - behind) / (2 * step), rel=1e-5, abs=1e-4)
+        ahead, behind = (score.slopes(change + 50 * (one - change))[0] for one in moved)
+        scale = prior_sigmas(RigStart(house.thermal), prepared.median_depth)[number]
+        assert climbed[number] * scale == pytest.approx((ahead - behind) / (100 * step) * scale, rel=0.05, abs=5e-3)
+    assert total == pytest.approx(score.value(change), rel=1e-6)
+
+
+def test_errors_name_the_frame_and_what_to_do(sky: KnownCapture, tmp_path: Path) -> None:
+    start = sky_start(sky)
+    bare = [replace(f, points_world=np.zeros((0, 3)), point_ids=np.zeros(0, dtype=np.int64)) for f in sky.frames]
+    with pytest.raises(SceneError, match="at least 12 scene points"):
+        estimate_rig(bare, sky.visible, start)
+    with pytest.raises(SceneError, match="sky 0: temperatures: expected the thermal camera's 96 rows"):
+        estimate_rig(with_temperatures(sky, [np.zeros((5, 5))] * 5), sky.visible, start)
+    with pytest.raises(SceneError, match="sky 0: photograph: expected the aspect"):
+        estimate_rig([replace(f, photograph=np.zeros((50, 50))) for f in sky.frames], sky.visible, start)
+    broken = tmp_path / "broken.jpg"
+    broken.write_bytes(b"no picture")
+    with pytest.raises(SceneError, match=r"sky 0: broken\.jpg: expected a readable photograph"):
+        estimate_rig([replace(f, photograph=broken) for f in sky.frames], sky.visible, start)
+
+
+def test_camera_rays_undo_project_and_the_thermal_pose_is_the_rig_s() -> None:
+    camera = CameraModel(640, 480, 500.0, 510.0, 322.0, 236.0, k1=-0.12, k2=0.03, p1=0.001, p2=-0.002)
+    pixels = np.random.default_rng(0).uniform((0, 0), (640, 480), (200, 2))
+    assert np.allclose(camera.project(3.0 * camera.rays(pixels)), pixels, atol=1e-6)
+    assert np.isnan(camera.project([[0.0, 0.0, -1.0]])).all()
+    with pytest.raises(SceneError, match="focal lengths above 0"):
+        replace(camera, fl_x=0.0)
+
+
+@pytest.mark.real_data
+def test_arco_agrees_with_its_given_rig_and_drift_halves(shared_data: Path) -> None:
+    import pycolmap
+
+    folder = shared_data / "arco"
+    given = json.loads((folder / "transforms.json").read_text())
+    model = pycolmap.Reconstruction(str(folder / "colmap"))
+    images = {Path(image.name).name: image for image in model.images.values()}
+    frames = []
+    for entry in given["frames"][::2]:
+        name = Path(entry["file_path"]).name
+        ids = np.unique([point.point3D_id for point in images[name].points2D if point.has_point3D()])
+        counts = cv2.imread(str(folder / entry["thermal_file_path"]), cv2.IMREAD_UNCHANGED).astype(np.float32)
+        temperature_c = cv2.resize(counts, (320, 256), interpolation=cv2.INTER_AREA) * 0.025 - 100.0
+        photograph = cv2.imread(str(folder / entry["file_path"]), cv2.IMREAD_REDUCED_GRAYSCALE_2)
+        world = np.array([model.points3D[number].xyz for number in ids])
+        pose = np.array(entry["transform_matrix"])
+        frames.append(RigFrame(name, photograph, temperature_c, pose, world, ids.astype(np.int64)))
+
+    def camera(entry: dict[str, float]) -> CameraModel:
+        keys = ("fl_x", "fl_y", "cx", "cy", "k1")
+        return CameraModel(int(entry["w"]), int(entry["h"]), **{key: entry[key] for key in keys})
+
+    thermal, rig = camera(given["thermal_camera"]), np.array(given["rig"])
+    start = RigStart(CameraModel.from_field_of_view(320, 256, 47.0))
+    found = estimate_rig(frames, camera(given), start)
+    assert found.determined, found.explanation
+    half = thermal.resized(320, 256)
+    # 3 pixels of the full image
+    apart = projection_difference_px(frames, (half, rig), (found.thermal_camera, found.visible_to_thermal))
+    assert apart < 1.5
+    assert 2.0 * found.thermal_camera.fl_x == pytest.approx(thermal.fl_x, rel=0.02)
+    drift = estimate_drift(frames, found.thermal_camera, found.visible_to_thermal)
+    assert drift.used
+    assert drift.after_k < 0.25 * drift.before_k, drift.explanation
