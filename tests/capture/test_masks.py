@@ -74,3 +74,11 @@ def test_a_mask_of_another_size_is_refused(tmp_path):
         read_mask(tmp_path / "m.png", 32, 24)
     with pytest.raises(SceneError, match="no folder at"):
         mask_files(tmp_path / "nowhere")
+
+
+def test_a_still_patch_that_looks_like_its_surroundings_is_left_alone(tmp_path):
+    paths = []
+    for number, pixels in enumerate(scenes(16)):
+        pixels[100:130, 100:150] = 127
+        paths.append(write(tmp_path, number, pixels))
+    assert find_overlay(paths) is None

@@ -230,7 +230,7 @@ def _without_stuck_pixels(
     changed = []
     for frame in frames:
         temperature_c = np.load(frame.thermal)
-        pass
+        temperature_c[bad] = np.nan
         np.save(frame.thermal, temperature_c)
         changed.append(replace(frame, masked=int(np.isnan(temperature_c).sum())))
     return dead, changed

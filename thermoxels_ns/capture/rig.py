@@ -24,7 +24,7 @@ FloatArray = npt.NDArray[np.float64]
 
 _FEWEST_FRAMES, _FEWEST_POINTS = 3, 12
 _MOST_FRAMES = 40
-_BLUR_PX = 1.5
+_COARSE_BLUR_PX, _FINE_BLUR_PX = 1.5, 1.0
 _ABOVE_CHANCE = 1.5
 _FARTHEST_SIGMAS = 5.0
 _WORTH_A_CLIMB = 0.8
@@ -82,7 +82,7 @@ class _RigSearch:
         rig = RigModel(self.start.thermal_camera, np.asarray(self.start.visible_to_thermal, dtype=np.float64))
         unchanged = np.zeros(len(PARAMETERS))
         sizes = self.prepared.sizes()
-        coarse = self.prepared.score(rig, unchanged, sizes[0], _BLUR_PX)
+        coarse = self.prepared.score(rig, unchanged, sizes[0], _COARSE_BLUR_PX)
         before = coarse.value(unchanged)
         if len(self.prepared.frames) < _FEWEST_FRAMES:
             reason = f"{len(self.prepared.frames)} frames are too few to tell; at least {_FEWEST_FRAMES} are needed"
@@ -102,7 +102,8 @@ class _RigSearch:
         climber = RigClimber(score, sigmas, depth)
         for number, size in enumerate(sizes[1:]):
             self.progress(f"Comparing edges, {size[0]} x {size[1]} pixels", 0.3 + 0.6 * number / len(sizes))
-            score = self.prepared.score(rig, change, size, _BLUR_PX)
+            blur_px = _FINE_BLUR_PX if size == sizes[-1] else _COARSE_BLUR_PX
+            score = self.prepared.score(rig, change, size, blur_px)
             climber = RigClimber(score, sigmas, depth)
             change = climber.climb(change).change
         covariance = climber.covariance(change)

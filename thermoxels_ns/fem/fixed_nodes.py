@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -41,12 +42,16 @@ class FixedNodes:
         total = np.asarray(area.sum(axis=0)).ravel()
         self.shares: sparse.csr_matrix = sparse.csr_matrix(area @ sparse.diags(1.0 / total))
         """Share of each node's heat that belongs to each group, by the area around the node, shape (g, d)."""
-        free = np.ones(num_nodes, dtype=bool)
-        free[self.nodes] = False
-        self.free: npt.NDArray[np.int64] = np.flatnonzero(free)
-        """Nodes that are not fixed, ascending."""
+        self._num_nodes = num_nodes
         self.in_time = any(form.in_time for form in forms)
         """Whether a temperature changes with time."""
+
+    @cached_property
+    def free(self) -> npt.NDArray[np.int64]:
+        """Nodes that are not fixed, ascending."""
+        free = np.ones(self._num_nodes, dtype=bool)
+        free[self.nodes] = False
+        return np.flatnonzero(free)
 
     def temperature_k(self, time_s: float) -> Vector:
         """Temperatures of `nodes`, relative to the reference, shape (d,), [K].

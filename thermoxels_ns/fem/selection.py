@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fnmatch import fnmatchcase
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -32,20 +33,34 @@ class Selection:
         self.mesh = mesh
         self.up = up
         self._check()
-        corner = mesh.points_m[mesh.facets]
-        cross = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        area = 0.5 * np.sqrt(np.einsum("fi,fi->f", cross, cross))
         tags = mesh.boundary
-        self.facet_area_m2: npt.NDArray[np.float64] = area if tags is None else area * tags.area_factor
-        """True area that each boundary triangle stands for, shape (f,), [m2]."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            own = np.nan_to_num(cross / (2.0 * area)[:, None], nan=0.0, posinf=0.0, neginf=0.0)
-        self.facet_normal: npt.NDArray[np.float64] = own if tags is None else tags.normal
-        """Outward unit normal of the true surface, shape (f, 3)."""
         self.patch_names: tuple[str, ...] = (WHOLE_BOUNDARY,) if tags is None else tags.patch_names
         """Names of the patches."""
-        self.facet_patch: npt.NDArray[np.int64] = np.zeros(len(area), np.int64) if tags is None else tags.patch
+        self.facet_patch: npt.NDArray[np.int64] = np.zeros(len(mesh.facets), np.int64) if tags is None else tags.patch
         """Index into `patch_names`, shape (f,)."""
+
+    @cached_property
+    def facet_area_m2(self) -> npt.NDArray[np.float64]:
+        """True area that each boundary triangle stands for, shape (f,), [m2]; computed when first asked for."""
+        cross = self._facet_cross_m2
+        area = 0.5 * np.sqrt(np.einsum("fi,fi->f", cross, cross))
+        tags = self.mesh.boundary
+        return area if tags is None else area * tags.area_factor
+
+    @cached_property
+    def facet_normal(self) -> npt.NDArray[np.float64]:
+        """Outward unit normal of the true surface, shape (f, 3); computed when first asked for."""
+        if self.mesh.boundary is not None:
+            return self.mesh.boundary.normal
+        cross = self._facet_cross_m2
+        with np.errstate(invalid="ignore", divide="ignore"):
+            own = cross / np.sqrt(np.einsum("fi,fi->f", cross, cross))[:, None]
+        return np.nan_to_num(own, nan=0.0, posinf=0.0, neginf=0.0)
+
+    @cached_property
+    def _facet_cross_m2(self) -> npt.NDArray[np.float64]:
+        corner = self.mesh.points_m[self.mesh.facets]
+        return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
 
     def facets(self, patterns: tuple[str, ...]) -> npt.NDArray[np.int64]:
         """Number the boundary triangles of the patches that match any pattern; patches may be without triangles.
