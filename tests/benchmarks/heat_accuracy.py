@@ -222,7 +222,13 @@ class HeatAccuracy:
                 line = "" if method == "driver" or problem == "NAFEMS T3" else "-"
                 marker, size = ("*", 13) if method == "driver" else ("o", 5)
                 panel.plot(*zip(*dots), marker + line, markersize=size, label=method)
-            panel.set(xscale="log", yscale="log", title=problem, xlabel="processor seconds", ylabel="largest error of a node [K]")
+            panel.set(
+                xscale="log",
+                yscale="log",
+                title=problem,
+                xlabel="processor seconds",
+                ylabel="largest error of a node [K]",
+            )
             panel.grid(True, which="both", alpha=0.25)
             panel.legend()
         self.picture.parent.mkdir(parents=True, exist_ok=True)

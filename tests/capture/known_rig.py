@@ -123,11 +123,15 @@ def known_capture(
     frames = []
     for number, pose in enumerate(poses):
         pixels, inside = plain.project(pose, points)
-        column, row = np.where(inside[:, None], np.minimum(pixels, (plain.width - 1, plain.height - 1)), 0).astype(int).T
+        column, row = (
+            np.where(inside[:, None], np.minimum(pixels, (plain.width - 1, plain.height - 1)), 0).astype(int).T
+        )
         distance = np.linalg.norm(points - pose[:3, 3], axis=1)
         ids = np.flatnonzero(inside & (np.abs(depths[number][row, column] - distance) < 0.01 * distance))
         frames.append(
-            RigFrame(f"view {number}", photographs[number], temperatures[number], pose, points[ids], ids.astype(np.int64))
+            RigFrame(
+                f"view {number}", photographs[number], temperatures[number], pose, points[ids], ids.astype(np.int64)
+            )
         )
     return KnownCapture(frames, visible, thermal, rig, offsets, radial)
 

@@ -149,6 +149,6 @@ def rig_from_boards(
 
 def _board_in_camera(pixels: FloatArray, camera: CameraModel, board: CheckerBoard) -> FloatArray:
     """The board's corners in the camera's OpenCV axes, shape (n, 3) [m]."""
-    plane = camera.rays(pixels)[:, :2]
+    plane = np.ascontiguousarray(camera.rays(pixels)[:, :2])
     _, turn, shift = cv2.solvePnP(board.corners, plane, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE)
     return board.corners @ cv2.Rodrigues(turn)[0].T + shift.ravel()

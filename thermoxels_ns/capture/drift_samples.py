@@ -81,7 +81,7 @@ def sample_shared_points(
         near = np.flatnonzero(camera.contains(pixels, _BORDER_PX) & (visible[:, 2] > 0.0))
         near = near[tracked[number][near] | _unhidden(visible[near], SparseDepth(frame.points_visible()))]
         reading, steepness = _read(read_temperatures(frame, camera), pixels[near])
-        known = np.isfinite(reading)
+        known = np.isfinite(reading) & np.isfinite(steepness)
         near, reading, steepness = near[known], reading[known], steepness[known]
         if len(near):
             smooth = steepness <= np.quantile(steepness, _SMOOTH_SHARE)

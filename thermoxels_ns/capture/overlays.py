@@ -16,6 +16,8 @@ from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.sparse_depth import SparseDepth
 
 _WIDTH = 640
+_DEPTH_STEP = 4
+"""Depth is looked up at every so many pixels of the reduced photograph, and linear between."""
 _COLOUR_SHARE = 0.55
 """How much of the thermal colours covers the photograph."""
 _PERCENTILES = (2.0, 98.0)
@@ -37,12 +39,12 @@ def thermal_in_photograph(
         Temperatures by pixel of the reduced photograph, [degrees C], NaN where the thermal image does not reach.
     """
     height = max(1, round(visible.height * width / visible.width))
-    small = visible.resized(width, height)
-    grid = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
-    rays = small.rays(grid)
-    depth, _ = SparseDepth(frame.points_visible()).at(rays)
+    rays = _grid_rays(visible, width, height)
+    coarse = (max(2, width // _DEPTH_STEP), max(2, height // _DEPTH_STEP))
+    depth, _ = SparseDepth(frame.points_visible()).at(_grid_rays(visible, *coarse))
+    inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=np.isfinite(depth)).reshape(coarse[::-1])
+    parallax = cv2.resize(inverse, (width, height), interpolation=cv2.INTER_LINEAR).ravel()
     rotation, shift = rig.visible_to_thermal[:3, :3], rig.visible_to_thermal[:3, 3]
-    parallax = np.divide(1.0, depth, out=np.zeros_like(depth), where=np.isfinite(depth))
     local = rays @ rotation.T + parallax[:, None] * shift  # a point times its inverse depth projects alike
     pixels = rig.thermal_camera.project(local).reshape(height, width, 2).astype(np.float32) - np.float32(0.5)
     return cv2.remap(
@@ -53,6 +55,12 @@ def thermal_in_photograph(
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=float("nan"),  # type: ignore[arg-type]
     )
+
+
+def _grid_rays(camera: CameraModel, width: int, height: int) -> npt.NDArray[np.float64]:
+    """Rays of depth 1 through the pixels of a reduced photograph, row by row, shape (width * height, 3)."""
+    grid = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
+    return camera.resized(width, height).rays(grid)
 
 
 def overlay(frame: RigFrame, temperature_c: npt.NDArray, visible: CameraModel, rig: RigEstimate) -> npt.NDArray:

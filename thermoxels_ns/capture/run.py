@@ -12,10 +12,11 @@ from thermoxels_ns.capture import results
 from thermoxels_ns.capture.camera_files import SUFFIXES, scan_folder
 from thermoxels_ns.capture.contract import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.drift import estimate_drift
+from thermoxels_ns.capture.frame_masks import find_masks, user_masks
 from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames
 from thermoxels_ns.capture.given_poses import in_order, read_given_poses
 from thermoxels_ns.capture.gravity import Up, find_up, level_rotation
-from thermoxels_ns.capture.masks import PhotographMasks, find_overlay, mask_files
+from thermoxels_ns.capture.masks import PhotographMasks, mask_files
 from thermoxels_ns.capture.metric_scale import (
     MeasuredDistance,
     MetricScale,
@@ -24,7 +25,6 @@ from thermoxels_ns.capture.metric_scale import (
     scale_from_markers,
 )
 from thermoxels_ns.capture.pairs import Pair, PairOptions, find_pairs, read_pair_list
-from thermoxels_ns.capture.photograph import read_photograph_facts
 from thermoxels_ns.capture.poses import PoseOptions, add_points, find_poses
 from thermoxels_ns.capture.report import Findings, report_page
 from thermoxels_ns.capture.rig import estimate_rig
@@ -32,13 +32,11 @@ from thermoxels_ns.capture.rig_inputs import kept_start, read_rig, rig_frames, r
 from thermoxels_ns.capture.scene_writer import JSON_NAME, Scene, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm_model import SfmModel
-from thermoxels_ns.capture.stages import StageCache, fingerprint, prepare_output, read_json, write_json
+from thermoxels_ns.capture.stages import CACHE_FOLDER, StageCache, fingerprint, prepare_output, read_json, write_json
 from thermoxels_ns.data.radiometry import RadiometryOptions
 from thermoxels_ns.errors import SceneError, explain
 
 PAGE_NAME = "capture.html"
-_OVERLAY_FRAMES = 40
-"""Photographs that overlays are looked for in."""
 _LEAST_POINTS = 50
 """Sightings of scene points below which thermal images and photographs cannot be compared."""
 _OVERLAY_FILE = "overlay.npy"
@@ -210,21 +208,24 @@ class _Run:
             settings.threads,
         )
         given = [] if settings.poses is None else _files_of(settings.poses)
-        masks = [] if settings.masks is None else list(mask_files(settings.masks).values())
+        user = [] if settings.masks is None else list(mask_files(settings.masks).values())
         depends = {
             "options": options,
             "poses": _fingerprints(given),
-            "masks": _fingerprints(masks),
+            "masks": _fingerprints(user),
             "overlays": settings.find_overlays,
         }
 
         def work(folder: Path) -> None:
             photographs = {frame.name: frame.photograph for frame in read.frames}
-            mask = self._find_masks(read, folder)
+            masks = find_masks(read.frames, settings.masks, settings.find_overlays)
+            if masks.overlay is not None:
+                np.save(folder / _OVERLAY_FILE, masks.overlay)
+                self.say(f"masks: {100 * (1 - masks.overlay.mean()):.1f} % of every photograph is drawn over")
             if settings.poses is None:
                 focal = [frame.focal_px for frame in read.frames if frame.focal_px]
                 poses = find_poses(
-                    photographs, folder, float(np.median(focal)) if focal else None, mask, options, self.say
+                    photographs, folder, float(np.median(focal)) if focal else None, masks, options, self.say
                 )
                 order = {name: number for number, name in enumerate(photographs)}
                 model = in_order(poses.model, lambda name: order[name])
@@ -232,7 +233,7 @@ class _Run:
                 poses = read_given_poses(settings.poses, {f.name: f.photograph_source for f in read.frames})
                 model = poses.model
                 if not len(model.points):
-                    model = add_points(model, photographs, folder, mask, options, self.say)
+                    model = add_points(model, photographs, folder, masks, options, self.say)
             results.save_model(folder, model)
             write_json(folder / "dropped.json", dict(poses.dropped))
             self.say(f"poses: {len(model.frames)} of {len(read.frames)} frames, {len(model.points)} points")
@@ -318,48 +319,11 @@ class _Run:
 
     def masks(self, frames: list[CaptureFrame], model: SfmModel) -> PhotographMasks:
         size = (model.camera.width, model.camera.height)
-        file = self.output / ".capture" / "poses" / _OVERLAY_FILE
+        file = self.output / CACHE_FOLDER / "poses" / _OVERLAY_FILE
         drawn = np.load(file) if file.is_file() else None
         if drawn is not None and drawn.shape != (size[1], size[0]):
             drawn = None
-        return PhotographMasks(size, drawn, self._user_masks(frames))
-
-    def _user_masks(self, frames: list[CaptureFrame] | tuple[CaptureFrame, ...]) -> dict[str, Path]:
-        if self.settings.masks is None:
-            return {}
-        files = mask_files(self.settings.masks)
-        found = {}
-        for frame in frames:
-            for name in (Path(frame.photograph_source).stem, frame.name):
-                if name.lower() in files:
-                    found[frame.name] = files[name.lower()]
-                    break
-        if not found:
-            raise SceneError(
-                explain(
-                    "masks",
-                    expected="masks named like photographs",
-                    got=f"{len(files)} pictures in {self.settings.masks}, none of them named so",
-                    remedy=f"Name them like {Path(frames[0].photograph_source).stem}.png.",
-                )
-            )
-        return found
-
-    def _find_masks(self, read: CaptureFrames, folder: Path) -> PhotographMasks:
-        sizes = {}
-        for frame in read.frames:
-            facts = read_photograph_facts(frame.photograph)
-            sizes[frame.name] = (facts.width, facts.height)
-        size = max(dict.fromkeys(sizes.values()), key=list(sizes.values()).count)
-        same = [frame for frame in read.frames if sizes[frame.name] == size]
-        drawn = None
-        if self.settings.find_overlays:
-            some = np.linspace(0, len(same) - 1, min(len(same), _OVERLAY_FRAMES)).round().astype(int)
-            drawn = find_overlay([same[i].photograph for i in np.unique(some)])
-        if drawn is not None:
-            np.save(folder / _OVERLAY_FILE, drawn)
-            self.say(f"masks: {100 * (1 - drawn.mean()):.1f} % of every photograph is drawn over by the camera")
-        return PhotographMasks(size, drawn, self._user_masks(same))
+        return PhotographMasks(size, drawn, user_masks(frames, self.settings.masks))
 
     def _metric_scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[MetricScale | None, str]:
         settings = self.settings

@@ -1,0 +1,144 @@
+"""Offsets and vignetting come back from readings of shared points, and only where there are any."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.capture.known_rig import known_capture
+from thermoxels_ns.capture.contract import DriftEstimate, radius_squared
+from thermoxels_ns.capture.drift import drift_of_samples, estimate_drift
+from thermoxels_ns.capture.drift_samples import DriftSamples
+from thermoxels_ns.errors import SceneError
+
+FRAMES = 12
+
+
+def readings(
+    offsets_k: np.ndarray,
+    radial: tuple[float, float] = (0.0, 0.0),
+    noise_k: float = 0.05,
+    wrong_share: float = 0.0,
+    groups: int = 1,
+    points: int = 600,
+    seed: int = 0,
+) -> DriftSamples:
+    """Readings of points, each seen by four frames of one group."""
+    draw = np.random.default_rng(seed)
+    frames = len(offsets_k)
+    per_group = frames // groups
+    group = np.arange(points) % groups
+    seen = np.sort(np.argsort(draw.random((points, per_group)), axis=1)[:, :4], axis=1) + group[:, None] * per_group
+    radius2 = draw.uniform(0.0, 1.0, seen.shape)
+    truth = draw.uniform(5.0, 25.0, (points, 1))
+    value = truth + offsets_k[seen] + radial[0] * radius2 + radial[1] * radius2**2
+    value = value + noise_k * draw.standard_normal(seen.shape)
+    value = value + np.where(draw.random(seen.shape) < wrong_share, -8.0, 0.0)
+    return DriftSamples(np.repeat(np.arange(points), 4), seen.ravel(), value.ravel(), radius2.ravel(), frames)
+
+
+@pytest.fixture
+def offsets_k() -> np.ndarray:
+    offsets = 2.0 * np.random.default_rng(4).standard_normal(FRAMES)
+    return offsets - offsets.mean()
+
+
+def test_without_noise_offsets_and_radial_term_are_exact(offsets_k: np.ndarray) -> None:
+    found = drift_of_samples(readings(offsets_k, (1.5, -0.4), noise_k=0.0))
+    assert np.allclose(found.offsets_k, offsets_k, atol=1e-9)
+    assert np.allclose(found.radial, (1.5, -0.4), atol=1e-8)
+    assert found.used
+    assert found.after_k < 1e-9 < 1.0 < found.before_k
+
+
+def test_a_tenth_of_wrong_readings_does_not_pull_the_offsets(offsets_k: np.ndarray) -> None:
+    found = drift_of_samples(readings(offsets_k, (1.5, -0.4), wrong_share=0.1))
+    assert found.used
+    assert np.abs(found.offsets_k - offsets_k).max() < 0.1
+    assert abs(found.offsets_k.mean()) < 1e-12
+
+
+def test_noise_alone_calls_for_no_correction() -> None:
+    found = drift_of_samples(readings(np.zeros(FRAMES)))
+    assert not found.used
+    assert not found.offsets_k.any()
+    assert found.radial == ()
+    assert found.before_k == found.after_k == pytest.approx(0.05 * np.sqrt(2.0) * 0.6745, rel=0.15)
+    assert "No correction" in found.explanation
+
+
+def test_no_radial_term_where_there_is_no_vignetting(offsets_k: np.ndarray) -> None:
+    found = drift_of_samples(readings(offsets_k))
+    assert found.used
+    assert found.radial == ()
+    assert "no radial term" in found.explanation
+
+
+def test_groups_that_share_no_points_get_mean_zero_each(offsets_k: np.ndarray) -> None:
+    found = drift_of_samples(readings(offsets_k, groups=2))
+    half = FRAMES // 2
+    for part in (slice(0, half), slice(half, None)):
+        assert abs(found.offsets_k[part].mean()) < 1e-6
+        assert np.allclose(found.offsets_k[part], offsets_k[part] - offsets_k[part].mean(), atol=0.05)
+    assert "2 groups of images share no points" in found.explanation
+
+
+def test_order_of_frames_and_unit_of_temperature_do_not_matter(offsets_k: np.ndarray) -> None:
+    samples = readings(offsets_k, (1.5, -0.4))
+    plain = drift_of_samples(samples)
+    kelvin = drift_of_samples(replace(samples, temperature_c=samples.temperature_c + 273.15))
+    assert np.allclose(kelvin.offsets_k, plain.offsets_k, atol=1e-6)
+    turned = drift_of_samples(replace(samples, frame=FRAMES - 1 - samples.frame))
+    assert np.allclose(turned.offsets_k, plain.offsets_k[::-1], atol=1e-6)
+
+
+def test_too_few_points_or_frames_are_said() -> None:
+    few = drift_of_samples(readings(np.ones(FRAMES), points=20))
+    assert not few.used
+    assert "only 20 scene points" in few.explanation
+    capture = known_capture("sphere", views=2, photograph_width=80, thermal_width=40)
+    one = estimate_drift(capture.frames[:1], capture.thermal, capture.visible_to_thermal)
+    assert not one.used
+    assert len(one.offsets_k) == 1
+    assert "nothing to compare" in one.explanation
+
+
+def test_images_are_corrected_by_what_was_put_into_them() -> None:
+    capture = known_capture(photograph_width=320, views=8)
+    found = estimate_drift(capture.frames, capture.thermal, capture.visible_to_thermal)
+    assert found.used
+    assert np.abs(found.offsets_k - capture.offsets_k).max() < 0.1
+    size = capture.thermal.width, capture.thermal.height
+    radius2 = radius_squared(np.array([[8.0, 8.0]]), *size)[0]
+    put_in = capture.radial[0] * radius2 + capture.radial[1] * radius2**2
+    found_there = found.radial_k(*size)[7:9, 7:9].mean()
+    assert found_there == pytest.approx(put_in, abs=0.35)
+    raw = np.asarray(capture.frames[3].temperature_c)
+    corrected = found.corrected(3, raw)
+    centre = slice(62, 66), slice(78, 82)
+    assert np.abs((raw - corrected)[centre] - capture.offsets_k[3]).max() < 0.1
+
+
+def test_pixels_without_a_temperature_are_left_out() -> None:
+    capture = known_capture(photograph_width=320, views=6)
+    hole = np.zeros((capture.thermal.height, capture.thermal.width), dtype=bool)
+    hole[40:70, 50:90] = True
+    frames = [replace(f, temperature_c=np.where(hole, np.nan, f.temperature_c)) for f in capture.frames]
+    found = estimate_drift(frames, capture.thermal, capture.visible_to_thermal)
+    assert np.isfinite(found.offsets_k).all()
+    assert np.abs(found.offsets_k - capture.offsets_k).max() < 0.15
+
+
+def test_an_image_of_another_size_is_refused_by_name() -> None:
+    capture = known_capture("sphere", views=2, photograph_width=80, thermal_width=40)
+    frames = [capture.frames[0], replace(capture.frames[1], temperature_c=np.zeros((7, 9)))]
+    with pytest.raises(SceneError, match="view 1: temperatures: expected the thermal camera's 32 rows"):
+        estimate_drift(frames, capture.thermal, capture.visible_to_thermal)
+
+
+def test_a_correction_of_nothing_changes_nothing() -> None:
+    nothing = DriftEstimate(np.zeros(1), (), 0.1, 0.1, False, "")
+    image = np.random.default_rng(0).normal(20.0, 5.0, (6, 8)).astype(np.float32)
+    assert np.array_equal(nothing.corrected(0, image), image)
