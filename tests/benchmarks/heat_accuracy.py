@@ -230,7 +230,7 @@ class HeatAccuracy:
                 ylabel="largest error of a node [K]",
             )
             panel.grid(True, which="both", alpha=0.25)
-            panel.legend()
+            panel.legend(loc="lower left")
         self.picture.parent.mkdir(parents=True, exist_ok=True)
         with replace_when_done(self.picture) as path:
             figure.savefig(path, dpi=110)

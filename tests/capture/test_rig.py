@@ -87,15 +87,8 @@ def test_what_the_images_cannot_tell_stays_as_it_was(house: KnownCapture, kind: 
     assert found.thermal_camera == start.thermal_camera
     assert np.array_equal(found.visible_to_thermal, start.visible_to_thermal)
     assert "the start value is kept (the test)" in found.explanation
-
-
-def test_rows_and_columns_of_the_sensor_do_not_pull_the_rig(sky: KnownCapture) -> None:
-    many = painted_sky(views=8)
-    rows = 2.0 * np.random.default_rng(2).standard_normal((1, many.thermal.width))
-    striped = with_temperatures(many, [np.asarray(f.temperature_c) + rows for f in many.frames])
-    found = estimate_rig(striped, many.visible, sky_start(many))
-    assert found.determined, found.explanation
-    assert many.projection_error_px(found) < 0.3
+    reason = {"two frames": "2 frames are too few", "other frames": "uncertain by"}.get(kind, "no better")
+    assert reason in found.explanation
 
 
 def test_dead_columns_and_an_odd_number_of_colours_do_no_harm(sky: KnownCapture) -> None:

@@ -48,7 +48,7 @@ def scene_names(count: int) -> list[str]:
     """Names of a scene's frames, without ending; every 8th evaluates, the ends of the capture train.
 
     >>> scene_names(5)[3:]
-    ['frame_train_00004', 'frame_eval_00005']
+    ['frame_eval_00004', 'frame_train_00005']
     """
     offset = min(EVAL_INTERVAL // 2, max(count - 2, 0)) if count > 1 else -1
     digits = max(5, len(str(count)))
