@@ -12,6 +12,7 @@ from scipy import fft
 from thermoxels_ns.capture.rig_score import EdgePoints, RigScore
 
 FloatArray = npt.NDArray[np.float64]
+_Spectra = tuple[npt.NDArray, ...]
 
 _REACH_SIGMAS = 2.5
 _STEP_PX = 2.5
@@ -54,11 +55,7 @@ class RoughSearch:
         content = [float(np.sum(np.abs(edges.field) ** 2 * edges.weight)) for edges in score.thermal]
         chosen = np.sort(np.argsort(-np.array(content), kind="stable")[:_MOST_FRAMES])
         self._edges = [score.edges[number] for number in chosen]
-        self._thermal = []
-        for edges in (score.thermal[number] for number in chosen):
-            field = fft.fft2((edges.field * edges.weight).astype(np.complex64), s=self._shape)
-            planes = edges.weight, (np.abs(edges.field) ** 2 * edges.weight).astype(np.float32)
-            self._thermal.append((field, *(fft.rfft2(plane, s=self._shape) for plane in planes)))
+        self._thermal = [score.thermal[number] for number in chosen]
         turn = np.hypot(sigmas[:2], sigmas[3:5][::-1] / median_depth)[::-1]  # about y moves along x
         self._reach_px = np.minimum(_REACH_SIGMAS * turn * camera.fl_x, 0.5 * np.array([columns, rows]) - 2.0)
         corner_px = 0.5 * float(np.hypot(camera.width, camera.height))
@@ -67,7 +64,7 @@ class RoughSearch:
 
     def best(self) -> list[RoughRig]:
         """Find the best few places that differ, best first."""
-        found = self._found([field for field, _, _ in self._thermal])
+        found = self._found([self._spectra(edges.field, edges.weight) for edges in self._thermal])
         found.sort(key=lambda rough: -rough.score)
         kept: list[RoughRig] = []
         for rough in found:
@@ -87,26 +84,35 @@ class RoughSearch:
         draw = np.random.default_rng(0)
         highest = 0.0
         for _ in range(_CHANCE_DRAWS):
-            phases = [np.exp(2j * np.pi * draw.random(self._shape)).astype(np.complex64) for _ in self._thermal]
-            found = self._found([field * phase for (field, _, _), phase in zip(self._thermal, phases)])
-            highest = max(highest, *(rough.score for rough in found))
+            spectra = []
+            for edges in self._thermal:
+                phases = np.exp(2j * np.pi * draw.random(edges.field.shape))
+                noise = np.asarray(fft.ifft2(np.asarray(fft.fft2(edges.field)) * phases))
+                spectra.append(self._spectra(noise, edges.weight))
+            highest = max(highest, *(rough.score for rough in self._found(spectra)))
         return highest
 
-    def _found(self, fields: Sequence[npt.NDArray[np.complex64]]) -> list[RoughRig]:
+    def _spectra(self, field: npt.NDArray, weight: npt.NDArray) -> _Spectra:
+        """Fourier transforms of a thermal image's edge values, weights and edge strengths."""
+        weighted = fft.fft2((field * weight).astype(np.complex64), s=self._shape)
+        planes = weight, (np.abs(field) ** 2 * weight).astype(np.float32)
+        return (np.asarray(weighted), *(np.asarray(fft.rfft2(plane, s=self._shape)) for plane in planes))
+
+    def _found(self, spectra: Sequence[_Spectra]) -> list[RoughRig]:
         found: list[RoughRig] = []
         for log_focal in self._focals:
             for roll in self._rolls:
                 change = np.zeros(10)
                 change[2], change[6] = roll, log_focal
-                found += self._best_shifts(self._surface(fields, change), change)
+                found += self._best_shifts(self._surface(spectra, change), change)
         return found
 
-    def _surface(self, fields: Sequence[npt.NDArray[np.complex64]], change: FloatArray) -> FloatArray:
+    def _surface(self, spectra: Sequence[_Spectra], change: FloatArray) -> FloatArray:
         """Score for every whole shift of the thermal image, shape (rows, columns), shift 0 at [0, 0]."""
         product: npt.NDArray = np.zeros(self._shape, np.complex64)
         own: npt.NDArray = np.zeros((self._shape[0], self._shape[1] // 2 + 1), np.complex64)
         other = own.copy()
-        for edges, field, (_, weight, strength) in zip(self._edges, fields, self._thermal):
+        for edges, (field, weight, strength) in zip(self._edges, spectra):
             value, power, count = self._splat(edges, change)
             product += np.conj(np.asarray(fft.fft2(value))) * field
             own += np.conj(np.asarray(fft.rfft2(power))) * weight

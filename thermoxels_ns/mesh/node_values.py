@@ -42,6 +42,7 @@ def interpolate_corners(
     trailing = (slice(None), *[None] * (values.ndim - 3))
     # Chosen as the origin of the sum so that equal values come out as they are.
     first: npt.NDArray[np.float64] | None = None
+    known = np.zeros(len(low), dtype=bool)
     for offset in CORNER_OFFSETS:
         at = ((low[:, 0] + offset[0]) * shape[1] + low[:, 1] + offset[1]) * shape[2] + low[:, 2] + offset[2]
         share = np.prod(np.where(offset == 1, fraction, 1.0 - fraction), axis=1) * flat_weights[at]
@@ -49,7 +50,6 @@ def interpolate_corners(
         here = flat_values[at].astype(np.float64)
         if first is None:
             first = np.zeros_like(here)
-            known = np.zeros(len(low), dtype=bool)
         fresh = ~known & (share > 0.0)
         first[fresh] = here[fresh]
         known |= fresh

@@ -91,7 +91,7 @@ def surface_distances(
         return None
     outwards = np.abs(truth.signed_distance(sample_facets(points, facets, 20_000)))
     surface = pv.PolyData.from_regular_faces(points, facets)
-    cell, closest = surface.find_closest_cell(seen, return_closest_point=True)
+    cell, closest = surface.find_closest_cell(seen, return_closest_point=True)  # type: ignore[misc]
     inwards = np.linalg.norm(closest - seen, axis=1)
     triangle = facets[np.asarray(cell)]
     share = _barycentric(points[triangle], np.asarray(closest))
