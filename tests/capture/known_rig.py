@@ -35,12 +35,15 @@ class KnownCapture:
     radial: tuple[float, float]
 
     def measured_start(self, focal_error: float = 1.04) -> RigStart:
-        """What a user knows: a focal length some percent off, and the lenses' distance by a ruler, to 2 cm."""
+        """What a user knows: a focal length some percent off, and the lenses' distance by a ruler, to 2 cm.
+
+        The principal point is held near the image's centre: it and the turn stand for each other.
+        """
         transform = np.eye(4)
         transform[:3, 3] = np.round(self.visible_to_thermal[:3, 3] / 0.02) * 0.02
         focal = self.thermal.fl_x * focal_error
         camera = replace(self.thermal, fl_x=focal, fl_y=focal)
-        return RigStart(camera, transform, centre_sigma=0.003, k1_sigma=0.02, translation_sigma=0.015)
+        return RigStart(camera, transform, centre_sigma=0.001, k1_sigma=0.02, translation_sigma=0.015)
 
     def turn_error_deg(self, found: RigEstimate) -> float:
         """Angle between the rotation found and the true one [degrees]."""

@@ -26,6 +26,7 @@ _FEWEST_FRAMES, _FEWEST_POINTS = 3, 12
 _MOST_FRAMES = 40
 _COARSE_BLUR_PX, _FINE_BLUR_PX = 1.5, 1.0
 _ABOVE_CHANCE = 1.5
+_SEARCHED_SIZES = 2
 _FARTHEST_SIGMAS = 5.0
 _WORTH_A_CLIMB = 0.8
 _SMALLEST_ERROR_PX, _LARGEST_ERROR_SHARE = 1.5, 0.005
@@ -87,21 +88,26 @@ class _RigSearch:
         if len(self.prepared.frames) < _FEWEST_FRAMES:
             reason = f"{len(self.prepared.frames)} frames are too few to tell; at least {_FEWEST_FRAMES} are needed"
             return self._kept(rig, sigmas, before, reason)
-        self.progress("Comparing edges, all directions", 0.1)
-        search = RoughSearch(coarse, sigmas, depth)
-        rough, chance = search.best(), search.best_by_chance()
-        if not rough or not rough[0].score > _ABOVE_CHANCE * chance:
-            best = rough[0].score if rough else 0.0
+        rough: list[RoughRig] = []
+        chance, level = 0.0, 0
+        for level, size in enumerate(sizes[:_SEARCHED_SIZES]):  # small things show in the second size only
+            self.progress(f"Comparing edges, all directions, {size[0]} x {size[1]} pixels", 0.1 * (1 + level))
+            coarse = self.prepared.score(rig, unchanged, size, _COARSE_BLUR_PX) if level else coarse
+            search = RoughSearch(coarse, sigmas, depth)
+            rough, chance = search.best(), search.best_by_chance()
+            if rough[0].score > _ABOVE_CHANCE * chance:
+                break
+        else:
             reason = (
-                f"the thermal edges agree with those of the photographs no better ({best:.3f}) than chance "
+                f"the thermal edges agree with those of the photographs no better ({rough[0].score:.3f}) than chance "
                 f"({chance:.3f}): the thermal images are too flat or show other things"
             )
             return self._kept(rig, sigmas, before, reason)
         change = self._best_top(coarse, rough, sigmas)
-        score = coarse.around(change)
-        climber = RigClimber(score, sigmas, depth)
-        for number, size in enumerate(sizes[1:]):
-            self.progress(f"Comparing edges, {size[0]} x {size[1]} pixels", 0.3 + 0.6 * number / len(sizes))
+        finer = sizes[level + 1 :] or sizes[-1:]
+        score, climber = coarse, RigClimber(coarse, sigmas, depth)
+        for number, size in enumerate(finer):
+            self.progress(f"Comparing edges, {size[0]} x {size[1]} pixels", 0.3 + 0.6 * number / len(finer))
             blur_px = _FINE_BLUR_PX if size == sizes[-1] else _COARSE_BLUR_PX
             score = self.prepared.score(rig, change, size, blur_px)
             climber = RigClimber(score, sigmas, depth)

@@ -1,0 +1,99 @@
+"""How far the heat loss of a reconstruction is off that of the exact body, by kind of mesh.
+
+    python tests/benchmarks/heat_loss.py outputs/hot-object/thermoxels/TIME/config.yml ...
+
+A body of concrete starts at 20 C in air of 0 C that takes heat from all of its surface with 25 W/(m2 K); the heat it
+has lost after `--hours` (ten equal steps) is compared with that of the exact body, a conforming mesh of the scene's
+signed distance on a lattice `--finer` times as fine. Reconstructions are meshed as an export does by default: voxels
+with the plain area of their faces, voxels with the area factor, and conforming. Scenes with a known truth only.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from thermoxels_ns.export import load_trained_scene
+from thermoxels_ns.fem.effects import Convection
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.mesh.build import MeshOptions, build_mesh
+from thermoxels_ns.mesh.quality import facet_areas, signed_volumes
+from thermoxels_ns.mesh.solid import SolidSelection
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.snapshot import GridSnapshot
+from thermoxels_ns.truth_comparison import load_known_truth
+
+CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
+
+
+def exact_mesh(scene, voxels: int) -> TetMesh:
+    """The scene's exact solid."""
+    lattice = Lattice.covering(*scene.scene_box, voxels)
+    centres = lattice.cell_centres().reshape(-1, 3)
+    depth = np.clip(-scene.signed_distance(centres) / lattice.voxel_size, -8.0, 8.0).reshape(lattice.cell_shape)
+    ones = np.ones(lattice.shape, np.float32)
+    snapshot = GridSnapshot(lattice, ones, 20.0 * ones, ones, np.exp(depth).astype(np.float32))
+    return build_mesh(snapshot, SolidSelection(density_threshold=1.0, close_gaps=0), np.eye(4)).mesh
+
+
+def heat_lost_j(mesh: TetMesh, hours: float) -> float:
+    """Heat that the body gives to the air."""
+    start = np.full(len(mesh.points_m), 20.0)
+    problem = HeatProblem(mesh, CONCRETE, start, effects=(Convection(("*",), 25.0, 0.0),))
+    solution = solve_heat(problem, TimeSteps(10, 360.0 * hours))
+    return float(solution.heat_content_j[0] - solution.heat_content_j[-1])
+
+
+def size(mesh: TetMesh) -> tuple[float, float]:
+    """True area and volume."""
+    assert mesh.boundary is not None
+    area = facet_areas(mesh.points_m, mesh.facets) * mesh.boundary.area_factor
+    return float(area.sum()), float(signed_volumes(mesh.points_m, mesh.tets).sum())
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("configs", type=Path, nargs="+")
+    parser.add_argument("--hours", type=float, default=1.0)
+    parser.add_argument("--finer", type=float, default=1.5)
+    arguments = parser.parse_args()
+    rows = []
+    for config in arguments.configs:
+        trained = load_trained_scene(config)
+        known = load_known_truth(trained.scene_folder)
+        if known is None:
+            raise SystemExit(f"{config}: the exact shape of this scene is not known")
+        exact = exact_mesh(known.scene, round(arguments.finer * max(trained.snapshot.lattice.cell_shape)))
+        truth = heat_lost_j(exact, arguments.hours)
+        area, volume = size(exact)
+        rows.append(
+            f"| {known.scene.name} | exact shape, meshed | {100 * (area / known.scene.area_m2 - 1):+.1f} % "
+            f"| {100 * (volume / known.scene.volume_m3 - 1):+.1f} % | {truth / 3.6e6:.4g} kWh |"
+        )
+        for mode in ("voxel", "conforming"):
+            built = build_mesh(trained.snapshot, SolidSelection(), trained.world_to_input, MeshOptions(mode)).mesh
+            assert built.boundary is not None
+            plain = replace(built, boundary=replace(built.boundary, area_factor=np.ones(len(built.facets))))
+            cases = {"conforming": built}
+            if mode == "voxel":
+                cases = {"voxel, plain area": plain, "voxel, area factor": built}
+            for name, mesh in cases.items():
+                area, volume = size(mesh)
+                lost = heat_lost_j(mesh, arguments.hours)
+                rows.append(
+                    f"| {known.scene.name} | {name} | {100 * (area / known.scene.area_m2 - 1):+.1f} % "
+                    f"| {100 * (volume / known.scene.volume_m3 - 1):+.1f} % | {100 * (lost / truth - 1):+.1f} % |"
+                )
+    print("\n| scene | mesh | area | volume | heat lost |\n|---|---|---:|---:|---:|")
+    print("\n".join(rows))
+
+
+if __name__ == "__main__":
+    main()
