@@ -119,11 +119,20 @@ def test_mesh_export_and_heat(trained: Trained, tmp_path):
     assert (tmp_path / "mesh.png").stat().st_size > 5000
 
 
-def test_mesh_without_a_scale_skips_heat_and_says_what_to_pass(trained: Trained, tmp_path):
-    result = run(
-        *("ns-export", "thermoxels-mesh", "--load-config", str(trained.config), "--output-dir", str(tmp_path)),
-        *("--density-percentile", "90", "--pictures", "False"),
-    )
+def test_mesh_takes_the_scale_of_the_scene_and_skips_heat_without_one(trained: Trained, tmp_path):
+    command = ("ns-export", "thermoxels-mesh", "--load-config", str(trained.config), "--output-dir", str(tmp_path))
+    command += ("--density-percentile", "90", "--pictures", "False", "--steps", "1")
+    scene = trained.scene / "transforms.json"
+    known = scene.read_text()
+    result = run(*command)
+    assert result.returncode == 0, result.stdout
+    assert (tmp_path / "heat.pvd").exists()
+    assert json.loads((tmp_path / "summary.json").read_text())["scale"]["metres_per_unit"] == 1.0
+    try:
+        scene.write_text(json.dumps({key: value for key, value in json.loads(known).items() if "metres" not in key}))
+        result = run(*command)
+    finally:
+        scene.write_text(known)
     assert result.returncode == 0, result.stdout
     assert "--metres-per-unit" in result.stdout and not (tmp_path / "heat.pvd").exists()
     assert (tmp_path / "mesh.vtu").exists()
