@@ -261,7 +261,7 @@ def plot(rows: Sequence[dict], path: Path) -> None:
                         textcoords="offset points",
                         fontsize=7,
                     )
-                if key == "area_error" and mode == "voxel":
+                if key == "area_error" and mode == "voxel" and np.isfinite(chosen[0]["area_error_of_triangles"]):
                     stairs = [abs(100 * row["area_error_of_triangles"]) for row in chosen]
                     panel.loglog(
                         seconds, stairs, color=colour, marker="s", ls=":", alpha=0.6, label="voxel, plain area"
@@ -273,7 +273,7 @@ def plot(rows: Sequence[dict], path: Path) -> None:
                 panel.set_title(name)
             else:
                 panel.set_xlabel("seconds")
-    axes[0][0].legend(fontsize=7, loc="lower left")
+    axes[0][0].legend(fontsize=7, loc="upper right")
     figure.tight_layout()
     figure.savefig(path, dpi=130)
 
