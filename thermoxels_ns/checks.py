@@ -122,6 +122,25 @@ def remove_stale_temporaries(folder: Path | str, names: Iterable[str]) -> None:
                 remove_file(path)
 
 
+def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Iterable[str] = ()) -> None:
+    """Refuse an output folder in which a folder has the name of a file to write, or a file that of a folder.
+
+    Raises:
+        OutputError: Something is in the way; the message lists it.
+    """
+    blocked = [name for name in files if (folder / name).is_dir()]
+    blocked += [name for name in folders if (folder / name).exists() and not (folder / name).is_dir()]
+    if blocked:
+        raise OutputError(
+            explain(
+                "output folder",
+                expected=f"no folder in the place of a file, and no file in the place of a folder, in {folder}",
+                got=", ".join(blocked),
+                remedy="Move it away, or choose another folder.",
+            )
+        )
+
+
 def _output_error(path: Path, expected: str, problem: OSError) -> OutputError:
     return OutputError(
         explain(

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import remove_file, remove_stale_temporaries, writable_folder
-from thermoxels_ns.errors import OutputError, ThermoxelsError, explain
+from thermoxels_ns.checks import refuse_what_is_in_the_way, remove_file, remove_stale_temporaries, writable_folder
+from thermoxels_ns.errors import ThermoxelsError
 from thermoxels_ns.export_options import ExportOptions, Viewpoint, check_options, scale_of, up_of
 
 if TYPE_CHECKING:
@@ -50,18 +50,7 @@ def prepare_folder(output_dir: Path | str, *, heat: bool) -> Path:
     folder = writable_folder(output_dir)
     names = (*_mesh_files(MESH_FORMATS), *_MESH_PICTURES, _HEAT, _HEAT_PICTURE, _QUALITY, _SUMMARY)
     series = folder / Path(_HEAT).stem
-    blocked = [name for name in names if (folder / name).is_dir()]
-    if heat and series.exists() and not series.is_dir():
-        blocked.append(series.name)
-    if blocked:
-        raise OutputError(
-            explain(
-                "output folder",
-                expected=f"no folder in the place of a file, and no file in the place of a folder, in {folder}",
-                got=", ".join(blocked),
-                remedy="Move it away, or choose another folder.",
-            )
-        )
+    refuse_what_is_in_the_way(folder, names, [series.name] if heat else [])
     remove_stale_temporaries(folder, names)
     remove_stale_temporaries(series, [STEP_PATTERN])
     return folder

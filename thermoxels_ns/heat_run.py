@@ -14,8 +14,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import remove_file, remove_stale_temporaries, replace_when_done, writable_folder
-from thermoxels_ns.errors import HeatError, MeshError, OutputError, explain
+from thermoxels_ns.checks import (
+    refuse_what_is_in_the_way,
+    remove_file,
+    remove_stale_temporaries,
+    replace_when_done,
+    writable_folder,
+)
+from thermoxels_ns.errors import HeatError, MeshError, explain
 from thermoxels_ns.fem.answers import Answers, Solution, heat_answers, plain_values, times_and_states
 from thermoxels_ns.fem.files import STEP_PATTERN, remove_heat_series, write_heat_series
 from thermoxels_ns.fem.heat_scene import HeatScene
@@ -209,17 +215,7 @@ def _prepared(output_dir: Path) -> Path:
     folder = writable_folder(output_dir)
     names = (ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY, *PICTURES)
     series = folder / Path(THROUGH_TIME).stem
-    blocked = [name for name in names if (folder / name).is_dir()]
-    blocked += [series.name] if series.exists() and not series.is_dir() else []
-    if blocked:
-        raise OutputError(
-            explain(
-                "output folder",
-                expected=f"no folder in the place of a file, and no file in the place of a folder, in {folder}",
-                got=", ".join(blocked),
-                remedy="Move it away, or choose another folder.",
-            )
-        )
+    refuse_what_is_in_the_way(folder, names, [series.name])
     remove_stale_temporaries(folder, names)
     remove_stale_temporaries(series, [STEP_PATTERN])
     return folder

@@ -9,6 +9,7 @@ from tests.looking_cameras import looking_at
 from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.mesh import interior as interior_module
 from thermoxels_ns.mesh.interior import interior
+from thermoxels_ns.mesh.morphology import fill_enclosed
 
 N = 24
 LATTICE = Lattice((0.0, 0.0, 0.0), 1.0, (N + 1, N + 1, N + 1))
@@ -151,3 +152,22 @@ def test_blocks_give_the_same_inside(monkeypatch):
         # Along the open side the hull ends in the middle of a block.
         expected[:, :, : 6 + shift[2]] = found[:, :, : 6 + shift[2]] = False
         assert np.array_equal(found, expected)
+
+
+def test_no_bubble_is_left_when_hidden_space_is_filled():
+    """Space that the cameras see into through slits is not hidden; once the rest is filled, nothing gets out of it."""
+    shell = cup()[0]
+    shell[11:13, 5:7, 12] = shell[5:7, 11:13, 12] = False
+    shell[12, 12, 10:14] = False
+    cameras = looking_at(MIDDLE, around(24, 14.0))
+    found = interior(shell, LATTICE, cameras, 0)
+    filled = shell | found.enclosed | found.hidden
+    assert found.hidden.any()
+    assert np.array_equal(fill_enclosed(filled), filled)
+
+
+def test_filling_does_not_bulge_a_round_body():
+    """The far side of a ball that no camera sees stays where its voxels are, half a cube within their hull."""
+    ball = np.linalg.norm(np.indices((N, N, N)).transpose(1, 2, 3, 0) + 0.5 - 12.0, axis=-1) < 8.0
+    found = interior(ball, LATTICE, looking_at(MIDDLE, [(70.0, 12.0, 12.0)]), 0)
+    assert found.hidden.sum() < 0.02 * ball.sum()

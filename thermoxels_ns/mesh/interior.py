@@ -48,19 +48,20 @@ def interior(cells: BoolArray, lattice: Lattice, views: Views | None, seal: int)
         The inside; none of it is in `cells`.
     """
     sealed = close_gaps(cells, seal)
-    enclosed, rooms = _enclosed(cells, sealed, lattice, views, seal)
+    enclosed, room = _enclosed(cells, sealed, lattice, views, seal)
+    rooms = int(face_connected(room).max()) if room.any() else 0
     if views is None or len(views.focal) == 0:
         return Interior(enclosed, np.zeros_like(cells), rooms)
     hidden = _hidden(sealed, lattice, views) & ~cells & ~enclosed
     # What the filled space now encloses is as much inside as the rest.
-    cavity, _ = _cavities(cells | enclosed | hidden, _camera_voxels(cells, lattice, views))
+    cavity, _ = _cavities(cells | enclosed | hidden, room | _camera_voxels(cells, lattice, views))
     return Interior(enclosed, hidden | cavity, rooms)
 
 
 def _enclosed(
     cells: BoolArray, sealed: BoolArray, lattice: Lattice, views: Views | None, seal: int
-) -> tuple[BoolArray, int]:
-    """Cavities without a camera, of the shell and of the sealed shell, and the number of those with one."""
+) -> tuple[BoolArray, BoolArray]:
+    """Cavities without a camera, of the shell and of the sealed shell, and those with one."""
     everywhere = np.ones((3, 3, 3), dtype=bool)
     cameras = _camera_voxels(cells, lattice, views)
     # Sealing takes the alcoves and corridors of a cavity, where cameras may stand as well.
@@ -75,7 +76,7 @@ def _enclosed(
             taken = wide | (sealed & ~cells)
             wide = np.asarray(ndimage.binary_dilation(wide, everywhere, iterations=2 * seal, mask=taken), dtype=bool)
         cavity = (cavity | wide) & ~room
-    return cavity, int(face_connected(room).max()) if room.any() else 0
+    return cavity, room
 
 
 def _camera_voxels(cells: BoolArray, lattice: Lattice, views: Views | None) -> BoolArray:
