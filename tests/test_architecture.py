@@ -18,7 +18,7 @@ PACKAGE = Path(thermoxels_ns.__file__).parent
 MOST_LINES = 450
 NAMES_THAT_SAY_NOTHING = {"utils", "util", "helpers", "helper", "common", "misc"}
 
-GROUND = frozenset({"errors", "checks", "units", "lattice", "snapshot", "streams", "schedule", "threads"})
+GROUND = frozenset({"errors", "checks", "units", "lattice", "snapshot", "streams", "schedule", "threads", "configs_folder"})
 # One nerfstudio model, in files of one idea each.
 MODEL = frozenset(
     {"losses", "optim", "optim_kernels", "metrics", "model", "model_config", "coarse_to_fine"}

@@ -610,6 +610,11 @@ def test_scale_from_a_known_distance(ball, tmp_path) -> None:
     assert (summary["length_unit"], summary["heat"]["computed"]) == ("m", True)
     extent = np.ptp(pyvista.read(tmp_path / "mesh.vtu").points, axis=0)
     assert extent == pytest.approx(np.full(3, 2.0), abs=0.25)  # a ball of radius 0.5 units
+    known = ExportOptions(known_distance=options.known_distance, known_distance_error=0.1, pictures=False, steps=1)
+    mesh = export_snapshot(ball, np.eye(4), known, tmp_path / "known")["mesh"]
+    assert mesh["volume_standard_error"] == pytest.approx(0.03 * mesh["volume"])
+    with pytest.raises(MeshError, match="known_distance_error: expected --known-distance beside it"):
+        check_options(ExportOptions(known_distance_error=0.1, metres_per_unit=1.0))
     both = ExportOptions(known_distance=options.known_distance, metres_per_unit=1.0)
     with pytest.raises(ThermoxelsError, match="scale: expected metres per unit or a known distance"):
         export_snapshot(ball, np.eye(4), both, tmp_path)

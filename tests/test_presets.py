@@ -171,13 +171,13 @@ def test_overrides_leave_the_base_alone() -> None:
 
 
 def test_an_unknown_preset_lists_the_known() -> None:
-    with pytest.raises(ThermoxelsError, match=r"preset: expected one of .*thermoxels-paper.*got cheese"):
+    with pytest.raises(ThermoxelsError, match=f"^preset: expected one of {', '.join(METHOD_FILES)}, got cheese"):
         read_preset("cheese")
 
 
 def test_a_preset_that_is_no_mapping_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "mine.yaml").write_text("- a\n- list\n")
-    monkeypatch.setattr(presets, "preset_folder", lambda: tmp_path)
+    monkeypatch.setattr(presets, "configs_folder", lambda: tmp_path)
     with pytest.raises(ThermoxelsError, match=r"^mine\.yaml: expected a mapping, got list"):
         read_preset("mine")
 
@@ -211,7 +211,7 @@ def test_an_unknown_heat_key_is_refused(name: str, where: tuple[str, ...], tmp_p
 
 
 def test_an_installed_package_brings_the_presets(tmp_path: Path) -> None:
-    """The wheel holds configs/ inside the package, where `preset_folder` looks first."""
+    """The wheel holds configs/ inside the package, where `configs_folder` looks first."""
     from hatchling.builders.wheel import WheelBuilder
 
     (wheel,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])

@@ -79,6 +79,9 @@ class ExportOptions:
     known_distance: tuple[float, float, float, float, float, float, float] | None = None
     """In place of metres per unit: two points in the coordinates of the input poses and the distance between them,
     x y z x y z metres."""
+    known_distance_error: float | None = None
+    """Standard error of that distance, with what the two points may be off, [m]; the summary then says how well areas
+    and volumes are known."""
     formats: tuple[FormatName, ...] = ("vtu", "glb")
     """Files to write the mesh to: vtu (ParaView), xdmf (FEniCSx), msh (Gmsh), inp (CalculiX, Abaqus), stl, ply
     (surface), glb (browsers, phones)."""
@@ -140,7 +143,16 @@ def check_options(options: ExportOptions) -> CheckedOptions:
     distance = None
     if options.known_distance is not None:
         first, second, length = options.known_distance[:3], options.known_distance[3:6], options.known_distance[6]
-        distance = scale_from_known_distance(first, second, length)
+        distance = scale_from_known_distance(first, second, length, options.known_distance_error)
+    elif options.known_distance_error is not None:
+        raise MeshError(
+            explain(
+                "known_distance_error",
+                expected="--known-distance beside it",
+                got="none",
+                remedy="Pass --known-distance x y z x y z metres, or leave the error out.",
+            )
+        )
     choose_scale(options.metres_per_unit, distance)
     if not options.formats or len(set(options.formats)) < len(options.formats):
         raise MeshError(

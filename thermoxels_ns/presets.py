@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 
+from thermoxels_ns.configs_folder import configs_folder
 from thermoxels_ns.errors import ThermoxelsError, explain
 
 Config = TypeVar("Config")
 
-
-def preset_folder() -> Path:
-    """The folder of the presets: inside an installed package, or beside it in a source checkout."""
-    package = Path(__file__).resolve().parent
-    installed = package / "configs"
-    return installed if installed.is_dir() else package.parent / "configs"
+_PATTERNS = ("plenoxels*.yaml", "thermoxels*.yaml")
+"""The presets among the files of the folder, which also holds materials and heat scenes."""
 
 
 def read_preset(name: str) -> dict[str, Any]:
@@ -27,9 +23,9 @@ def read_preset(name: str) -> dict[str, Any]:
     Raises:
         ThermoxelsError: There is no such preset, or it is not a mapping.
     """
-    path = preset_folder() / f"{name}.yaml"
+    path = configs_folder() / f"{name}.yaml"
     if not path.is_file():
-        known = ", ".join(sorted(p.stem for p in preset_folder().glob("*.yaml"))) or "none"
+        known = ", ".join(sorted(p.stem for pattern in _PATTERNS for p in configs_folder().glob(pattern))) or "none"
         raise ThermoxelsError(explain("preset", expected=f"one of {known}", got=name, remedy="Correct the name."))
     content = yaml.safe_load(path.read_text(encoding="utf-8"))
     if not isinstance(content, dict):

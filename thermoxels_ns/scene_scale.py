@@ -41,10 +41,6 @@ class SceneScale:
         """Standard error over scale; None where it is not known."""
         return None if self.standard_error is None else self.standard_error / self.metres_per_unit
 
-    def length_standard_error(self, length_m: float) -> float | None:
-        """What the scale's error makes of a length, [m]; None where it is not known."""
-        return self._share(1, length_m)
-
     def area_standard_error(self, area_m2: float) -> float | None:
         """What the scale's error makes of an area, twice its relative error, [m^2]; None where it is not known."""
         return self._share(2, area_m2)
@@ -88,20 +84,18 @@ def scale_from_known_distance(
     point_b: npt.ArrayLike,
     distance_m: float,
     standard_error_m: float | None = None,
-    point_standard_error: float | None = None,
 ) -> SceneScale:
     """Find the scale from two points of the scene whose distance was measured.
 
-    scale = D / d with the measured distance D and the distance d between the points. To first order its relative
-    standard error is sqrt((s_D / D)^2 + 2 (s_p / d)^2): only what the points err along the line between them counts,
-    each of them once. An error that is not given counts as 0 if the other one is.
+    scale = D / d with the measured distance D and the distance d between the points; its relative standard error is
+    that of D.
 
     Args:
         point_a: First point, three numbers, [input units].
         point_b: Second point, three numbers, [input units].
         distance_m: Their distance, above 0, [m].
-        standard_error_m: Standard error of the distance, at least 0, [m].
-        point_standard_error: Standard error of each coordinate of each point, at least 0, [input units].
+        standard_error_m: Standard error of the distance, at least 0, [m]: of measuring it, and of how far the points
+            may lie from the ends of what was measured. None: nobody knows.
 
     Raises:
         ThermoxelsError: A number is out of range, or the points coincide.
@@ -111,9 +105,10 @@ def scale_from_known_distance(
     """
     a, b = _point("point_a", point_a), _point("point_b", point_b)
     check_positive("distance_m", distance_m, "Pass the measured distance between the points in metres.")
-    for name, error in (("standard_error_m", standard_error_m), ("point_standard_error", point_standard_error)):
-        if error is not None:
-            _check_not_negative(name, error, "Pass a standard error, or leave it out.", ThermoxelsError)
+    if standard_error_m is not None:
+        _check_not_negative(
+            "standard_error_m", standard_error_m, "Pass it in metres, or leave it out.", ThermoxelsError
+        )
     apart = float(np.linalg.norm(b - a))
     if not apart > 1e-12 * max(float(np.abs(a).max()), float(np.abs(b).max())):
         raise ThermoxelsError(
@@ -124,11 +119,7 @@ def scale_from_known_distance(
                 remedy="Pass two points far from each other, in the coordinates of transforms.json.",
             )
         )
-    error = None
-    if standard_error_m is not None or point_standard_error is not None:
-        of_distance = (standard_error_m or 0.0) / distance_m
-        of_points = math.sqrt(2.0) * (point_standard_error or 0.0) / apart
-        error = math.hypot(of_distance, of_points) * distance_m / apart
+    error = None if standard_error_m is None else standard_error_m / apart
     source = f"From {distance_m:g} m measured between {_in_words(a)} and {_in_words(b)}, {apart:.6g} units apart."
     return SceneScale(float(distance_m) / apart, error, source)
 

@@ -3,8 +3,9 @@ from __future__ import annotations
 import pytest
 import yaml
 
+from thermoxels_ns.configs_folder import configs_folder
 from thermoxels_ns.errors import HeatError
-from thermoxels_ns.fem.presets import heat_preset_names, load_heat_preset, presets_folder
+from thermoxels_ns.fem.presets import heat_preset_names, load_heat_preset
 
 
 @pytest.mark.parametrize("name", heat_preset_names())
@@ -13,7 +14,7 @@ def test_every_preset_loads_and_goes_round(name: str, tmp_path) -> None:
     copy = tmp_path / "copy.yaml"
     copy.write_text(yaml.safe_dump(preset.as_mapping()))
     assert load_heat_preset(str(copy)) == preset
-    assert yaml.safe_load((presets_folder() / f"heat-{name}.yaml").read_text()) == preset.as_mapping()
+    assert yaml.safe_load((configs_folder() / f"heat-{name}.yaml").read_text()) == preset.as_mapping()
 
 
 def test_concrete_is_there() -> None:

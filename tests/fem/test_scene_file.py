@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from tests.scene_bodies import room
+from thermoxels_ns.configs_folder import configs_folder
 from thermoxels_ns.errors import HeatError
 from thermoxels_ns.fem.effects import (
     AbsorbedSolar,
@@ -20,7 +21,7 @@ from thermoxels_ns.fem.effects import (
 )
 from thermoxels_ns.fem.heat_scene import HeatScene
 from thermoxels_ns.fem.material_table import material
-from thermoxels_ns.fem.presets import load_heat_preset, presets_folder
+from thermoxels_ns.fem.presets import load_heat_preset
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.scene_file import heat_scene_names, load_heat_scene
@@ -47,7 +48,7 @@ def test_each_builds_a_problem_by_name_and_by_path(name: str) -> None:
     assert problem.effects and problem.material == material("concrete")
     assert found.description
     np.testing.assert_array_equal(problem.start_c, mesh.temperature_c)
-    again = load_heat_scene(str(presets_folder() / f"scene-{name}.yaml"))
+    again = load_heat_scene(str(configs_folder() / f"scene-{name}.yaml"))
     assert again == found
 
 
@@ -96,7 +97,7 @@ def test_all_effects() -> None:
         FixedTemperature,
     }
     # It shows every key but one, and that one in a comment.
-    written = yaml.safe_load((presets_folder() / "scene-all-effects.yaml").read_text(encoding="utf-8"))
+    written = yaml.safe_load((configs_folder() / "scene-all-effects.yaml").read_text(encoding="utf-8"))
     keys = {field.name for field in dataclasses.fields(HeatScene)} - {"initial_c"} | {"initial"}
     assert keys - set(written) == {"convection"}
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+from thermoxels_ns.configs_folder import configs_folder
 from thermoxels_ns.errors import HeatError, explain
 from thermoxels_ns.fem.materials import Material
-from thermoxels_ns.fem.presets import presets_folder
 from thermoxels_ns.fem.yaml_records import as_record, read_yaml
 
 
@@ -54,7 +54,7 @@ def load_material_table(path: Path | str | None = None) -> dict[str, MaterialRow
     Raises:
         HeatError: There is no such file, or a row has an unknown or missing key or a figure out of range.
     """
-    file = presets_folder() / "materials.yaml" if path is None else Path(path)
+    file = configs_folder() / "materials.yaml" if path is None else Path(path)
     return {name: as_record(f"{file.name}: {name}", row, MaterialRow) for name, row in read_yaml(file).items()}
 
 

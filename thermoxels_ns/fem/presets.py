@@ -12,11 +12,10 @@ from typing import Any
 
 import yaml
 
+from thermoxels_ns.configs_folder import configs_folder
 from thermoxels_ns.errors import HeatError, explain
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import TimeSteps
-
-_PACKAGE = Path(__file__).resolve().parents[1]
 
 
 @dataclass(frozen=True)
@@ -33,24 +32,9 @@ class HeatPreset:
         return asdict(self)
 
 
-def presets_folder() -> Path:
-    """Find the presets: inside an installed package, beside it in a source tree."""
-    for folder in (_PACKAGE / "configs", _PACKAGE.parent / "configs"):
-        if folder.is_dir():
-            return folder
-    raise HeatError(
-        explain(
-            "heat presets",
-            expected=f"a folder configs in or beside {_PACKAGE}",
-            got="none",
-            remedy="Install the package again, or pass the path of a yaml file.",
-        )
-    )
-
-
 def heat_preset_names() -> list[str]:
     """List the names that `load_heat_preset` knows."""
-    return sorted(path.stem.removeprefix("heat-") for path in presets_folder().glob("heat-*.yaml"))
+    return sorted(path.stem.removeprefix("heat-") for path in configs_folder().glob("heat-*.yaml"))
 
 
 def load_heat_preset(name: str) -> HeatPreset:
@@ -66,7 +50,7 @@ def load_heat_preset(name: str) -> HeatPreset:
     Raises:
         HeatError: If there is no such preset or file, or if a key is missing, unknown or out of range.
     """
-    path = Path(name) if Path(name).suffix in (".yaml", ".yml") else presets_folder() / f"heat-{name}.yaml"
+    path = Path(name) if Path(name).suffix in (".yaml", ".yml") else configs_folder() / f"heat-{name}.yaml"
     if not path.is_file():
         raise HeatError(
             explain(

@@ -11,11 +11,11 @@ import dataclasses
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from thermoxels_ns.configs_folder import configs_folder
 from thermoxels_ns.errors import HeatError
 from thermoxels_ns.fem.heat_scene import HeatScene
 from thermoxels_ns.fem.material_table import material
 from thermoxels_ns.fem.materials import Material
-from thermoxels_ns.fem.presets import presets_folder
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
 from thermoxels_ns.fem.yaml_records import as_mapping, as_record, as_value, check_keys, read_yaml, shown, wrong
 
@@ -43,7 +43,7 @@ class _Uniform:
 
 def heat_scene_names() -> list[str]:
     """List the names that `load_heat_scene` knows."""
-    return sorted(path.stem.removeprefix("scene-") for path in presets_folder().glob("scene-*.yaml"))
+    return sorted(path.stem.removeprefix("scene-") for path in configs_folder().glob("scene-*.yaml"))
 
 
 def load_heat_scene(name: Path | str) -> HeatScene:
@@ -62,7 +62,7 @@ def load_heat_scene(name: Path | str) -> HeatScene:
     """
     path = Path(name)
     if path.suffix not in (".yaml", ".yml"):
-        path = presets_folder() / f"scene-{name}.yaml"
+        path = configs_folder() / f"scene-{name}.yaml"
         if not path.is_file():
             expected = f"one of {', '.join(heat_scene_names())}, or the path of a yaml file"
             raise wrong("heat scene", expected, repr(str(name)), "Correct the name.")

@@ -1,0 +1,28 @@
+"""Where the yaml files of the package lie."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from thermoxels_ns.errors import ThermoxelsError, explain
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def configs_folder() -> Path:
+    """Find the folder of the yaml files: inside an installed package, or beside it in a source tree.
+
+    Raises:
+        ThermoxelsError: There is neither.
+    """
+    for folder in (_PACKAGE / "configs", _PACKAGE.parent / "configs"):
+        if folder.is_dir():
+            return folder
+    raise ThermoxelsError(
+        explain(
+            "configuration files",
+            expected=f"a folder configs in or beside {_PACKAGE}",
+            got="none",
+            remedy="Install the package again.",
+        )
+    )
