@@ -177,6 +177,14 @@ def test_records_that_cannot_be_are_refused(tmp_path, change, said):
         read_thermogram(write(tmp_path, FlirFile(smooth_counts(), **change)))
 
 
+def test_a_camera_without_air_temperature_is_read_where_none_is_needed(tmp_path):
+    settings = {"e": 1.0, "d": 0.0, "r": 0.0, "a": 0.0, "w": 0.0, "p": 1.0}
+    got = read_thermogram(write(tmp_path, FlirFile(smooth_counts(), settings=settings)))
+    assert got.metadata.conditions.air_c is None and got.metadata.conditions.reflected_c is None
+    with pytest.raises(ThermalFileError, match="air_c: expected a temperature, because a distance of 2 m needs one"):
+        read_thermogram(write(tmp_path, FlirFile(smooth_counts(), settings={**settings, "d": 2.0})))
+
+
 @pytest.mark.parametrize("lost", [0x01, 0x20])
 def test_a_file_without_counts_or_calibration_is_refused(tmp_path, lost):
     content = FlirFile(smooth_counts()).jpeg()

@@ -20,6 +20,18 @@ def test_every_row_is_a_material_with_a_source() -> None:
     assert all(100 < row.specific_heat_j_kgk < 2000 for row in table.values())
 
 
+def test_conductivity_fits_the_kind_of_material() -> None:
+    """Light materials are little more than still air (0.026 W/(m K)), metals conduct by electrons, all else lies between."""
+    metals = {"aluminium", "copper", "steel", "stainless-steel", "lead", "zinc"}
+    for name, row in load_material_table().items():
+        if name in metals:
+            assert row.conductivity_w_mk > 10.0, name
+        elif row.density_kg_m3 <= 250.0:
+            assert 0.02 <= row.conductivity_w_mk <= 0.08, name
+        else:
+            assert 0.05 < row.conductivity_w_mk < 4.0, name
+
+
 def test_concrete_means_the_same_everywhere() -> None:
     assert material("concrete") == load_heat_preset("concrete").material
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import datetime, timezone
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.screening import screen
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.sun import moving_sun
 from thermoxels_ns.fem.system import effect_labels
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -270,3 +272,31 @@ def test_quantities_that_change_between_samples_are_bounded() -> None:
     assert 0.01 * 150.0 < heat.heating_w.sum() < 0.01 * 150.0 * 1.25
     only_there = nodal_heats(problem, TimeSteps(240, step))[0]
     assert only_there.heating_w.sum() == pytest.approx(0.01 * (100.0 + 50.0 * np.cos(np.pi / 8.0)), rel=1e-9)
+
+
+def test_the_sun_is_not_left_out_because_every_look_at_it_is_at_midnight() -> None:
+    mesh = replace(body(3), temperature_c=np.full(len(body(3).points_m), 5.0))
+    start = datetime(2026, 10, 1, tzinfo=timezone.utc)
+    sun = AbsorbedSolar(SIDES, 0.7, moving_sun(start, 50.0, 0.0, (0.0, 1.0, 0.0)))
+    problem = HeatProblem(mesh, CONCRETE, effects=(Convection(SIDES, 10.0, 5.0), sun))
+    days = 240 * 86400.0
+    for time in (AdaptiveSteps(days), TimeSteps(5760, 3600.0)):
+        screening = screen(problem, time, 0.01)
+        kept = {entry.effect.split(" on ")[0]: entry.bound_k for entry in screening.kept}
+        assert kept["absorbed solar"] is None  # no bound is claimed
+    # A night is looked at often enough to know that it is dark.
+    night = screen(problem, AdaptiveSteps(3 * 3600.0), 0.01)
+    assert "absorbed solar" in [left.effect.split(" on ")[0] for left in night.left_out]
+
+
+@pytest.mark.parametrize("tolerance_k", [0.0, 0.01])
+@pytest.mark.parametrize("time", [None, TimeSteps(3, 60.0)])
+def test_an_effect_on_a_patch_without_triangles_does_nothing(tolerance_k: float, time: TimeSteps | None) -> None:
+    mesh = body(3)
+    assert mesh.boundary is not None
+    nowhere = Convection(("interior-side",), 5.0, 20.0)
+    patches = (*mesh.boundary.patch_names, "interior-side")
+    mesh = replace(mesh, boundary=replace(mesh.boundary, patch_names=patches))
+    problem = HeatProblem(mesh, CONCRETE, effects=(Convection(SIDES, 10.0, 5.0), nowhere))
+    screening = screen(problem, time, tolerance_k)
+    assert [(left.effect, left.bound_k) for left in screening.left_out] == [("convection on interior-side", 0.0)]

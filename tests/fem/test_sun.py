@@ -172,3 +172,19 @@ def test_a_sun_that_stands_still() -> None:
 def test_what_is_refused(call, message: str) -> None:
     with pytest.raises(HeatError, match=message):
         call()
+
+
+def test_light_of_a_clear_sky_by_its_formulas() -> None:
+    """At 30 degrees, by hand: air mass 1.9939, 0.7^(AM^0.678) = 0.56571."""
+    light = meinel_clear_sky(30.0)
+    transmitted = 0.7 ** (1.0 / (0.5 + 0.50572 * 36.07995**-1.6364)) ** 0.678
+    assert transmitted == pytest.approx(0.5657, abs=2e-4)
+    assert light.direct_w_m2 == pytest.approx(1353.0 * transmitted)
+    assert light.diffuse_w_m2 == pytest.approx(1353.0 * 0.5 * (0.271 - 0.294 * transmitted))
+    assert light.diffuse_w_m2 == pytest.approx(70.8, abs=0.1)
+
+
+def test_a_time_without_a_date_is_refused() -> None:
+    sun = moving_sun(datetime(2026, 1, 1, tzinfo=UTC), 50.0, 0.0, NORTH)
+    with pytest.raises(HeatError, match=r"time of the sun: expected a date of the years 1 to 9999, got 1e\+12 s"):
+        sun.function(Places(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), Z_UP), 1e12)

@@ -176,12 +176,12 @@ def read_camera_info(content: bytes) -> CameraInfo:
             air=AirConstants(*record.numbers(0x70, "5f")),
             conditions=Conditions(
                 emissivity=emissivity,
-                reflected_c=kelvin_to_celsius(reflected),
+                reflected_c=_celsius(reflected),
                 distance_m=distance,
                 relative_humidity=humidity / 100.0 if humidity > 2.0 else humidity,  # some write percent
-                air_c=kelvin_to_celsius(air),
+                air_c=_celsius(air),
                 window_transmission=window_transmission or 1.0,  # a camera without the setting writes 0
-                window_c=kelvin_to_celsius(window),
+                window_c=_celsius(window),
             ),
             raw_range=(int(low), int(high)) if low < high else (0, 0xFFFF),
             field_of_view_deg=field_of_view if field_of_view > 0 else None,
@@ -192,6 +192,11 @@ def read_camera_info(content: bytes) -> CameraInfo:
         )
     except ThermoxelsError as problem:
         raise DamagedRecordError(f"a camera info record with a wrong value: {problem}") from problem
+
+
+def _celsius(kelvin: float) -> float | None:
+    """A temperature, or None where the camera has not set it and writes 0 K."""
+    return float(kelvin_to_celsius(kelvin)) if kelvin != 0.0 else None
 
 
 def _with_maker(model: str | None) -> str | None:

@@ -80,7 +80,7 @@ def lumped_body(problem: HeatProblem, time: TimeSteps | AdaptiveSteps, tolerance
     biot = _biot(problem, space, np.zeros(space.num_nodes, np.int64), held)
     if biot > MOST_BIOT:
         return LumpedBody(biot, None, f"The Biot number is {biot:.3g}, above {MOST_BIOT:g}.", None)
-    body = _Body(HeatSystem(problem), float(time.times_s[-1]))
+    body = _Body(HeatSystem(problem), time.duration_s)
     lumped_k, heat_j = body.follow(time.times_s)
     biot = _biot(problem, space, body.system.pieces.number.astype(np.int64), body.conductance_w_k(lumped_k))
     bound = body.bound_k(lumped_k[0], lumped_k[-1])

@@ -1,7 +1,8 @@
 """How much heat each effect of a problem can bring to each node, before anything is solved.
 
 Exchange counts at the nodes, as in the solvers' default. Quantities that change with time are asked for at given times;
-between them they may go beyond by as much as they change from one of them to the next.
+between them they may go beyond by as much as they change from one of them to the next. Where these times are too far
+apart to say how a quantity changes, such as every noon of a year for the sun, it may be all that it is allowed to be.
 """
 
 from __future__ import annotations
@@ -141,6 +142,8 @@ class NodalHeat:
 
     def _over_time(self, quantity: Bounded, places: Places) -> Span:
         """Lowest and highest value at each place."""
+        if self._between and self._times[1] - self._times[0] > quantity.resolution_s:
+            return Span(np.full(len(places), quantity.bounds.low), np.full(len(places), quantity.bounds.high))
         first = quantity.at(places, float(self._times[0]))
         low, high, jump, last = first.copy(), first.copy(), np.zeros_like(first), first
         for time_s in self._times[1:] if quantity.in_time else ():
@@ -182,11 +185,13 @@ def sample_times(time: TimeSteps | AdaptiveSteps | None) -> tuple[Vector, bool]:
         return np.zeros(1), False
     if isinstance(time, TimeSteps) and time.steps < MOST_TIMES:
         return time.times_s, False
-    return np.linspace(0.0, float(time.times_s[-1]), MOST_TIMES), True
+    return np.linspace(0.0, time.duration_s, MOST_TIMES), True
 
 
 def _product(first: Span, second: Span) -> Span:
-    corners = [a * b for a in (first.low, first.high) for b in (second.low, second.high)]
+    with np.errstate(invalid="ignore"):
+        corners = [a * b for a in (first.low, first.high) for b in (second.low, second.high)]
+    corners = [np.where(np.isnan(corner), 0.0, corner) for corner in corners]  # nothing of an unknown amount is nothing
     return Span(np.minimum.reduce(corners), np.maximum.reduce(corners))
 
 

@@ -57,6 +57,16 @@ class TimeSteps:
             )
 
     @property
+    def duration_s(self) -> float:
+        """Time that the body is followed for, [s]."""
+        return self.steps * self.step_seconds
+
+    @property
+    def num_times(self) -> int:
+        """Number of times at which temperatures are kept."""
+        return self.steps + 1
+
+    @property
     def times_s(self) -> npt.NDArray[np.float64]:
         """Start, then the end of every step, shape (steps + 1,), [s]."""
         return np.arange(self.steps + 1, dtype=np.float64) * self.step_seconds
@@ -85,6 +95,11 @@ class AdaptiveSteps:
         if not whole or self.outputs < 1:
             expected, remedy = "a whole number of at least 1", "Give the number of intervals, such as 10."
             raise HeatError(explain("outputs", expected=expected, got=repr(self.outputs), remedy=remedy))
+
+    @property
+    def num_times(self) -> int:
+        """Number of times at which temperatures are kept."""
+        return self.outputs + 1
 
     @property
     def times_s(self) -> npt.NDArray[np.float64]:

@@ -42,6 +42,9 @@ class Varying:
     all."""
     in_time: bool = True
     """Whether the numbers change with time. False: they are asked for once, at the time 0."""
+    resolution_s: float = math.inf
+    """Numbers this far apart in time say how they change in between, above 0, [s]; steps that are chosen by their error
+    are no longer. Infinite: nobody knows."""
 
 
 Quantity: TypeAlias = float | Varying
@@ -115,6 +118,11 @@ class Bounded:
     def in_time(self) -> bool:
         """Whether it changes with time."""
         return isinstance(self.quantity, Varying) and self.quantity.in_time
+
+    @property
+    def resolution_s(self) -> float:
+        """How far apart in time numbers may be that say how it changes in between, [s]."""
+        return self.quantity.resolution_s if isinstance(self.quantity, Varying) and self.in_time else math.inf
 
     def at(self, places: Places, time_s: float) -> npt.NDArray[np.float64]:
         """Compute the quantity at places, shape (k,).

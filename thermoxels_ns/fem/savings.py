@@ -27,7 +27,7 @@ def seconds_saved(problem: HeatProblem, without: HeatProblem, time: TimeSteps | 
     Returns:
         The difference, [s]; at least 0.
     """
-    step_s = float(time.times_s[-1]) / max(steps, 1)
+    step_s = time.duration_s / max(steps, 1)
     more = [ours - theirs for ours, theirs in zip(_seconds(problem, time, step_s), _seconds(without, time, step_s))]
     return max(more[0] + steps * more[1], 0.0)
 

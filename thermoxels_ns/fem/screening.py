@@ -141,7 +141,7 @@ class _Screener:
 
     def __init__(self, problem: HeatProblem, time: TimeSteps | AdaptiveSteps | None, tolerance_k: float) -> None:
         self._problem, self._tolerance = problem, tolerance_k
-        self._duration_s = np.inf if time is None else float(time.times_s[-1])
+        self._duration_s = np.inf if time is None else time.duration_s
         self._space = LinearSpace(Selection(problem.mesh, problem.up))
         self.heats = nodal_heats(problem, time, self._space)
         mesh = problem.mesh
@@ -207,8 +207,8 @@ class _Screener:
         """What temperatures can be."""
         start = self._problem.start_c
         spans = [span for heat in self.heats for span in heat.surroundings_c]
-        low = min([float(span.low.min()) for span in spans], default=np.inf)
-        high = max([float(span.high.max()) for span in spans], default=-np.inf)
+        low = min([float(span.low.min()) for span in spans if span.low.size], default=np.inf)
+        high = max([float(span.high.max()) for span in spans if span.high.size], default=-np.inf)
         if np.isfinite(self._duration_s):
             low, high = min(low, float(start.min())), max(high, float(start.max()))
         held = sum((heat.held_w_k for heat in self.heats), np.zeros(self._space.num_nodes))

@@ -20,6 +20,8 @@ SOLAR_CONSTANT_W_M2 = 1353.0
 """Sunlight above the air at the mean distance of the sun, [W / m2]: the value that Meinel's fit was made with. (Today's
 is 1361.)"""
 
+_RESOLUTION_S = 3600.0
+"""The sun moves by 15 degrees in this time."""
 _EPOCH = datetime(2000, 1, 1, 12, tzinfo=timezone.utc)
 _LATITUDE = Bounds("latitude_deg", "degrees", -90.0, 90.0)
 _LONGITUDE = Bounds("longitude_deg", "degrees", -180.0, 180.0)
@@ -250,12 +252,27 @@ def moving_sun(
     reflectance = float(_REFLECTANCE.check(ground_reflectance))
 
     def irradiance(places: Places, time_s: float) -> npt.NDArray[np.float64]:
-        position = sun_position(start + timedelta(seconds=time_s), latitude_deg, longitude_deg)
+        position = sun_position(_later(start, time_s), latitude_deg, longitude_deg)
         light = sunlight or meinel_clear_sky(position.elevation_deg, position.distance_au)
         towards = towards_sun(position, places.up, north)
         return facet_irradiance(places.normals, places.up, towards, light, reflectance)
 
-    return Varying(irradiance)
+    return Varying(irradiance, resolution_s=_RESOLUTION_S)
+
+
+def _later(start: datetime, time_s: float) -> datetime:
+    """The moment some seconds later."""
+    try:
+        return start + timedelta(seconds=time_s)
+    except OverflowError as problem:
+        raise HeatError(
+            explain(
+                "time of the sun",
+                expected="a date of the years 1 to 9999",
+                got=f"{time_s:.3g} s after {start.isoformat()}",
+                remedy="Follow the body for a shorter time.",
+            )
+        ) from problem
 
 
 def _days(moment: datetime) -> float:
