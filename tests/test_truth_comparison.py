@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermoxels_ns.data.synthetic import make_scene, write_scene
+from thermoxels_ns.data.synthetic import make_scene, visible_surface_points, write_scene
 from thermoxels_ns.errors import MeshError, SceneError
 from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh
-from thermoxels_ns.mesh.solid import SolidSelection
-from thermoxels_ns.snapshot import GridSnapshot
+from thermoxels_ns.mesh.solid import SolidSelection, select_solid
+from thermoxels_ns.snapshot import GridSnapshot, Views
 from thermoxels_ns.truth_comparison import KnownTruth, compare_with_truth, load_known_truth
 
 IDENTITY = np.eye(4)
@@ -107,6 +107,39 @@ def test_shifted_voxels_lose_score(sphere):
     assert result["fscore"] < 0.6
     # The surface moved by d along x: the distance is d |cos|, on average d / 2.
     assert result["mean_distance_voxels"] == pytest.approx(2.0, abs=0.2)
+
+
+def test_what_no_camera_sees_is_left_out_of_the_second_score(hot_object):
+    # Nobody sees the table's underside: a block below it costs the score of all, not that of what is seen.
+    cells, lattice = exact_cells(hot_object, 80)
+    plain = compare(cells, lattice, IDENTITY, hot_object)
+    below = cells.copy()
+    z = lattice.cell_centres()[0, 0, :, 2]
+    below[20:60, 20:48, (z > -0.125) & (z < -0.07)] = True
+    guessed = compare(below, lattice, IDENTITY, hot_object)
+    assert guessed["precision"] < plain["precision"] - 0.05
+    assert guessed["precision_seen"] == pytest.approx(plain["precision_seen"], abs=0.01)
+    assert plain["fscore_seen"] > 0.97 and 0.5 < plain["share_seen"] < 0.9
+    # A plate above the table is seen.
+    above = cells.copy()
+    above[20:28, 20:28, -3] = True
+    wrong = compare(above, lattice, IDENTITY, hot_object)
+    assert wrong["precision_seen"] < wrong["precision"] < plain["precision"]
+
+
+def test_cameras_are_found_in_a_mirrored_turned_and_scaled_world(hot_object):
+    cells, lattice = exact_cells(hot_object, 24)
+    plain = compare(cells, lattice, IDENTITY, hot_object)
+    # The same voxels, turned by 90 degrees around z and counted downwards: a turned mirror image.
+    world_to_truth = np.array(
+        [[0.0, -0.5, 0.0, 0.3], [0.5, 0.0, 0.0, -0.1], [0.0, 0.0, -0.5, 0.2], [0.0, 0.0, 0.0, 1.0]]
+    )
+    turned = np.ascontiguousarray(cells[::-1, :, ::-1].transpose(1, 0, 2))
+    nx, ny, nz = lattice.shape
+    ends = np.array([lattice.hi[0], lattice.lo[1], lattice.hi[2]])
+    lo = (np.linalg.inv(world_to_truth) @ np.append(ends, 1.0))[:3]
+    other = Lattice(tuple(lo), lattice.voxel_size / 0.5, (ny, nx, nz))
+    assert compare(turned, other, world_to_truth, hot_object) == pytest.approx(plain, abs=2e-3)
 
 
 def test_a_rotated_and_scaled_world_gives_the_same_figures(hot_object):
@@ -240,3 +273,39 @@ def test_distances_and_sizes_are_in_units_of_the_truth_whatever_the_scale_of_the
     scaled = compare(cells, lattice, IDENTITY, truth, scaled_mesh, 3.0)
     for name in ("chamfer_m", "hausdorff_m", "mesh_volume_m3", "mesh_area_m2", "temperature_seen_mae_c"):
         assert scaled[name] == pytest.approx(plain[name], rel=1e-6)
+
+
+def shell_that_cameras_see(truth: KnownTruth, resolution: int) -> GridSnapshot:
+    """What a perfect training would leave: dense voxels just below the surface that three cameras see."""
+    lattice = Lattice.covering(*truth.scene.scene_box, resolution)
+    points, normals = truth.scene.surface_points(12 * resolution**2, 1)
+    seen = visible_surface_points(truth.scene, truth.training_poses, truth.camera, points, normals, 3)
+    below = lattice.world_to_index(points[seen] - 0.5 * lattice.voxel_size * normals[seen])
+    density = np.zeros(lattice.cell_shape, dtype=np.float32)
+    density[tuple(np.clip(np.floor(below).astype(int), 0, np.array(lattice.cell_shape) - 1).T)] = 1.0
+    corners = np.zeros(lattice.shape, dtype=np.float32)
+    camera, count = truth.camera, len(truth.training_poses)
+    views = Views(
+        truth.training_poses[:, :3],
+        np.tile([camera.fl_x, camera.fl_y], (count, 1)),
+        np.tile([camera.cx, camera.cy], (count, 1)),
+        np.tile([camera.width, camera.height], (count, 1)),
+    )
+    return GridSnapshot(lattice, corners, corners, corners, voxel_density=density, views=views)
+
+
+@pytest.mark.parametrize(
+    ("name", "resolution", "least_fscore"), [("pipes", 128, 0.99), ("hot-object", 64, 0.97), ("house-corner", 64, 0.97)]
+)
+def test_the_solid_of_a_perfectly_trained_scene_is_the_scene(name, resolution, least_fscore):
+    """Filling adds the inside of every body, and nothing between pipes and the wall that they stand before."""
+    scene = make_scene(name)
+    truth = KnownTruth(scene, scene.poses(24, 0)[0], scene.camera(160, 120))
+    snapshot = shell_that_cameras_see(truth, resolution)
+    shell = select_solid(snapshot, SolidSelection(density_threshold=0.5, interior="hollow")).cells
+    cells = select_solid(snapshot, SolidSelection(density_threshold=0.5)).cells
+    result = compare(cells, snapshot.lattice, IDENTITY, truth)
+    assert result["fscore"] > least_fscore and result["fscore_seen"] > least_fscore
+    # The wall is 7 voxels thick, the table 5: half a voxel to either side.
+    assert result["volume_m3"] == pytest.approx(result["true_volume_m3"], rel=0.13)
+    assert np.count_nonzero(cells) > 3 * np.count_nonzero(shell)

@@ -16,17 +16,18 @@ from thermoxels_ns.data.scene_truth import SyntheticScene
 from thermoxels_ns.data.synthetic import load_truth, visible_surface_points
 from thermoxels_ns.errors import MeshError, SceneError, explain
 from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.mesh.accuracy import surface_fscore
+from thermoxels_ns.mesh.accuracy import MIN_VIEWS, surface_fscore
 from thermoxels_ns.mesh.build import check_similarity
+from thermoxels_ns.mesh.morphology import fill_enclosed
 from thermoxels_ns.mesh.quality import facet_areas, signed_volumes
-from thermoxels_ns.mesh.solid import fill_enclosed
 from thermoxels_ns.mesh.surface_distance import surface_distances
 from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.snapshot import Views
+
+__all__ = ["MIN_VIEWS", "TOLERANCE_VOXELS", "KnownTruth", "compare_with_truth", "load_known_truth", "points_seen"]
 
 TOLERANCE_VOXELS = 1.5
 """Surfaces closer than this agree, [voxels]."""
-MIN_VIEWS = 3
-"""A true surface point counts for recall if at least this many training cameras see it."""
 
 _SURFACE_POINTS = 20_000
 _TRAINING_PREFIX = "frame_train_"
@@ -100,7 +101,8 @@ def compare_with_truth(
     Precision is the share of the reconstructed boundary within `TOLERANCE_VOXELS` of the true surface; recall the
     share of the true surface that at least `MIN_VIEWS` training cameras see and that lies within the tolerance of
     the reconstructed boundary; the F-score is their harmonic mean. Enclosed cavities are filled first, and the
-    boundary is not counted for precision where the scene box cuts it.
+    boundary is not counted for precision where the scene box cuts it. Beside them stand the same figures for the part
+    of the boundary that at least `MIN_VIEWS` training cameras see: no photograph shows the rest, which is a guess.
 
     Args:
         cells: Solid voxels, shape `lattice.cell_shape`.
@@ -114,6 +116,7 @@ def compare_with_truth(
     Returns:
         A mapping that json can write, or None if the truth is not known: ``scene``, ``voxel_size_m``,
         ``tolerance_voxels``, ``true_points_seen``; ``precision``, ``recall``, ``fscore``, 0 to 1;
+        ``share_seen`` (of the boundary), ``precision_seen``, ``recall_seen``, ``fscore_seen``, 0 to 1;
         ``mean_distance_voxels`` and ``mean_distance_m`` of the reconstructed boundary to the true surface (None
         without a boundary); ``volume_m3``, ``filled_volume_m3`` (with cavities) and ``area_m2`` of the voxels (a
         staircase: its area exceeds that of the slope it follows) beside ``true_volume_m3`` and ``true_area_m2``.
@@ -139,7 +142,8 @@ def compare_with_truth(
     voxel_m = lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(transform[:3, :3]))))
     tolerance_m = TOLERANCE_VOXELS * voxel_m
     seen = points_seen(known)
-    score = surface_fscore(cells, lattice, known.scene, seen, tolerance_m, transform)
+    score = surface_fscore(cells, lattice, known.scene, seen, tolerance_m, transform, _training_views(known, transform))
+    assert score.seen is not None
     solid = np.asarray(cells, dtype=bool)
     result: dict[str, Any] = {
         "scene": known.scene.name,
@@ -149,6 +153,10 @@ def compare_with_truth(
         "precision": score.precision,
         "recall": score.recall,
         "fscore": score.fscore,
+        "share_seen": score.seen.share,
+        "precision_seen": score.seen.precision,
+        "recall_seen": score.seen.recall,
+        "fscore_seen": score.seen.fscore,
         "mean_distance_voxels": None if score.mean_distance is None else score.mean_distance / voxel_m,
         "mean_distance_m": score.mean_distance,
         "volume_m3": int(np.count_nonzero(solid)) * voxel_m**3,
@@ -177,6 +185,20 @@ def points_seen(known: KnownTruth) -> npt.NDArray[np.float64]:
             )
         )
     return points[seen]
+
+
+def _training_views(known: KnownTruth, world_to_truth: npt.NDArray[np.float64]) -> Views:
+    """The training cameras in the coordinates of the lattice."""
+    scale = float(np.cbrt(abs(np.linalg.det(world_to_truth[:3, :3]))))
+    poses, camera, count = known.training_poses, known.camera, len(known.training_poses)
+    axes = world_to_truth[:3, :3].T / scale  # the inverse of its rotation (and mirror)
+    centres = (poses[:, :3, 3] - world_to_truth[:3, 3]) @ axes.T / scale
+    return Views(
+        camera_to_world=np.concatenate([axes @ poses[:, :3, :3], centres[:, :, None]], axis=2),
+        focal=np.tile([camera.fl_x, camera.fl_y], (count, 1)),
+        centre=np.tile([camera.cx, camera.cy], (count, 1)),
+        size=np.tile([camera.width, camera.height], (count, 1)),
+    )
 
 
 def _num_faces(cells: npt.NDArray[np.bool_]) -> int:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.looking_cameras import looking_at
 from thermoxels_ns.errors import MeshError
 from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.mesh.accuracy import boundary_samples, surface_fscore
+from thermoxels_ns.mesh.accuracy import SeenScore, boundary_samples, surface_fscore
+from thermoxels_ns.snapshot import Views
 
 
 class Sphere:
@@ -135,3 +137,61 @@ def test_bad_input_is_refused():
         surface_fscore(voxels(SPHERE), LATTICE, SPHERE, SEEN[:0], TOLERANCE)
     with pytest.raises(MeshError, match="tolerance"):
         surface_fscore(voxels(SPHERE), LATTICE, SPHERE, SEEN, 0.0)
+
+
+def from_above() -> Views:
+    eyes = [(1.2 * np.cos(turn), 1.2 * np.sin(turn), 6.0) for turn in np.arange(5) * 2 * np.pi / 5]
+    return looking_at((0.0, 0.0, 0.0), eyes, focal=200.0)
+
+
+def test_a_wrong_guess_behind_the_body_costs_only_the_score_of_all():
+    cells = voxels(SPHERE)
+    shadow = cells.copy()
+    shadow[8:16, 8:16, 1:12] = True  # below the ball, where no camera above can look
+    upper = SEEN[SEEN[:, 2] > 0.15]
+    right = surface_fscore(cells, LATTICE, SPHERE, upper, TOLERANCE, views=from_above())
+    guessed = surface_fscore(shadow, LATTICE, SPHERE, upper, TOLERANCE, views=from_above())
+    assert right.precision == 1.0 and guessed.precision < 0.85
+    assert right.seen is not None and guessed.seen is not None
+    assert right.seen.precision == guessed.seen.precision == 1.0
+    assert guessed.seen.fscore == right.seen.fscore == 1.0
+    assert guessed.seen.share < right.seen.share < 0.75
+
+
+def test_an_error_that_cameras_see_weighs_more_among_what_they_see():
+    cells = voxels(SPHERE)
+    cells[10:14, 10:14, 22] = True  # a plate before the cameras
+    score = surface_fscore(cells, LATTICE, SPHERE, SEEN[SEEN[:, 2] > 0.15], TOLERANCE, views=from_above())
+    assert score.seen is not None
+    assert score.seen.precision < score.precision < 1.0
+    plate, hidden = 16, 4 * 4  # its upper faces; its lower ones and a part of the ball are behind it
+    assert 1.0 - score.seen.precision > plate / (np.count_nonzero(cells.any(axis=2)) * 2 + plate + hidden)
+
+
+def test_only_faces_before_which_cameras_see_space_are_seen():
+    plate = np.zeros(LATTICE.cell_shape, dtype=bool)
+    plate[8:16, 8:16, 12] = True
+    score = surface_fscore(plate, LATTICE, SPHERE, SEEN, TOLERANCE, views=from_above())
+    assert score.seen is not None
+    assert score.seen.share == (64 + 32) / (64 + 64 + 32)  # top and rim, not the underside
+
+
+def test_a_true_surface_reached_only_by_hidden_boundary_is_not_recalled():
+    # A roof over the whole ball: cameras see the roof, and none of the ball below it.
+    cells = voxels(SPHERE)
+    cells[:, :, 21:23] = True
+    score = surface_fscore(cells, LATTICE, SPHERE, SEEN[SEEN[:, 2] > 0.15], TOLERANCE, views=from_above())
+    assert score.recall == 1.0
+    assert score.seen is not None
+    assert (score.seen.precision, score.seen.recall, score.seen.fscore) == (0.0, 0.0, 0.0)
+    assert score.seen.share > 0.0
+
+
+def test_without_cameras_nothing_is_said_about_what_they_see():
+    assert surface_fscore(voxels(SPHERE), LATTICE, SPHERE, SEEN, TOLERANCE).seen is None
+    few = looking_at((0.0, 0.0, 0.0), [(0.0, 0.0, 6.0), (0.1, 0.0, 6.0)])  # fewer than three
+    score = surface_fscore(voxels(SPHERE), LATTICE, SPHERE, SEEN, TOLERANCE, views=few)
+    assert score.fscore == 1.0
+    assert score.seen == SeenScore(share=0.0, precision=0.0, recall=0.0, fscore=0.0)
+    for cells in (np.zeros(LATTICE.cell_shape, bool), np.ones(LATTICE.cell_shape, bool)):
+        assert surface_fscore(cells, LATTICE, SPHERE, SEEN, TOLERANCE, views=few).seen == score.seen

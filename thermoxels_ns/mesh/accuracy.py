@@ -13,7 +13,14 @@ from thermoxels_ns.checks import check_finite, check_positive, check_shape
 from thermoxels_ns.errors import MeshError, explain
 from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.mesh.build import apply_transform, check_similarity
-from thermoxels_ns.mesh.solid import fill_enclosed
+from thermoxels_ns.mesh.free_space import look
+from thermoxels_ns.mesh.morphology import fill_enclosed
+from thermoxels_ns.snapshot import Views
+
+MIN_VIEWS = 3
+"""A point of a surface is seen if at least this many training cameras see it."""
+
+_PER_SIDE = 2
 
 
 class TrueShape(Protocol):
@@ -29,6 +36,23 @@ class TrueShape(Protocol):
 
 
 @dataclass(frozen=True)
+class SeenScore:
+    """Agreement of the part of a reconstructed surface that cameras see with the true one.
+
+    Against the whole surface's score it tells what photographs could have shown from what was guessed behind it.
+    """
+
+    share: float
+    """Share of the reconstructed boundary that at least `MIN_VIEWS` cameras see, 0 to 1."""
+    precision: float
+    """Share of that part within the tolerance of the true surface, 0 to 1; 0 if there is none."""
+    recall: float
+    """Share of the true surface that cameras see within the tolerance of that part, 0 to 1."""
+    fscore: float
+    """Harmonic mean of precision and recall; 0 if both are."""
+
+
+@dataclass(frozen=True)
 class SurfaceScore:
     """Agreement of a reconstructed surface with the true one."""
 
@@ -40,6 +64,8 @@ class SurfaceScore:
     """Harmonic mean of precision and recall; 0 if both are."""
     mean_distance: float | None
     """Mean distance of the reconstructed boundary to the true surface, [truth units]; None without a boundary."""
+    seen: SeenScore | None = None
+    """The same for the part of the boundary that cameras see; None if the cameras are not given."""
 
 
 def surface_fscore(
@@ -49,12 +75,15 @@ def surface_fscore(
     true_points_seen: npt.NDArray[np.float64],
     tolerance: float,
     world_to_truth: npt.NDArray[np.float64] | None = None,
+    views: Views | None = None,
 ) -> SurfaceScore:
     """Compare the boundary of the solid voxels with the true surface.
 
     Enclosed cavities are filled first: no camera sees what is inside. The boundary is sampled at four points per voxel
     face. Faces on the border of the lattice, where the box cuts the scene, do not count for precision. Distances for
     recall go to the nearest sample, at most 0.36 voxels beyond the face itself.
+
+    A voxel face is seen if `MIN_VIEWS` cameras have a free line, past the solid voxels, to the empty voxel before it.
 
     Args:
         cells: Solid voxels, shape `lattice.cell_shape`.
@@ -65,6 +94,8 @@ def surface_fscore(
         tolerance: Distance that counts as agreement, above 0, [truth units]; 1.5 voxels by custom.
         world_to_truth: Similarity, shape (4, 4), from the lattice's world to truth coordinates (homogeneous column
             vectors); the identity if left out.
+        views: The training cameras, in the coordinates of the lattice. With them the part of the boundary that they
+            see is scored too, which takes a few passes over the lattice per camera.
 
     Returns:
         Precision, recall, F-score and mean distance.
@@ -82,27 +113,53 @@ def surface_fscore(
     check_positive("tolerance", tolerance, "Pass 1.5 voxels in truth units.", MeshError)
     transform = check_similarity("world_to_truth", np.eye(4) if world_to_truth is None else world_to_truth)
 
-    samples, on_border = boundary_samples(fill_enclosed(cells))
+    solid = fill_enclosed(cells)
+    faces = _boundary_faces(solid)
+    samples, on_border = _samples(faces, per_side=_PER_SIDE)
+    of_seen = None if views is None else SeenScore(share=0.0, precision=0.0, recall=0.0, fscore=0.0)
     if len(samples) == 0:
-        return SurfaceScore(precision=0.0, recall=0.0, fscore=0.0, mean_distance=None)
+        return SurfaceScore(precision=0.0, recall=0.0, fscore=0.0, mean_distance=None, seen=of_seen)
     samples = apply_transform(transform, lattice.index_to_world(samples))
     recall = float(np.mean(KDTree(samples).query(seen)[0] <= tolerance))
     inner = samples[~on_border]
     if len(inner) == 0:
-        return SurfaceScore(precision=0.0, recall=recall, fscore=0.0, mean_distance=None)
+        return SurfaceScore(precision=0.0, recall=recall, fscore=0.0, mean_distance=None, seen=of_seen)
     distance = np.abs(truth.signed_distance(inner))
     precision = float(np.mean(distance <= tolerance))
-    total = precision + recall
+    if views is not None and len(views.focal):
+        free = look(solid, lattice, views).free >= MIN_VIEWS
+        shown = np.concatenate([free[tuple(f.empty[~f.on_border].T)] for f in faces]).repeat(_PER_SIDE**2)
+        of_seen = _seen_score(inner[shown], distance[shown] <= tolerance, float(shown.mean()), seen, tolerance)
     return SurfaceScore(
         precision=precision,
         recall=recall,
-        fscore=2.0 * precision * recall / total if total > 0.0 else 0.0,
+        fscore=_harmonic_mean(precision, recall),
         mean_distance=float(distance.mean()),
+        seen=of_seen,
     )
 
 
+def _seen_score(
+    samples: npt.NDArray[np.float64],
+    agrees: npt.NDArray[np.bool_],
+    share: float,
+    true_points: npt.NDArray[np.float64],
+    tolerance: float,
+) -> SeenScore:
+    if len(samples) == 0:
+        return SeenScore(share=0.0, precision=0.0, recall=0.0, fscore=0.0)
+    precision = float(agrees.mean())
+    recall = float(np.mean(KDTree(samples).query(true_points)[0] <= tolerance))
+    return SeenScore(share, precision, recall, _harmonic_mean(precision, recall))
+
+
+def _harmonic_mean(precision: float, recall: float) -> float:
+    total = precision + recall
+    return 2.0 * precision * recall / total if total > 0.0 else 0.0
+
+
 def boundary_samples(
-    cells: npt.NDArray[np.bool_], per_side: int = 2
+    cells: npt.NDArray[np.bool_], per_side: int = _PER_SIDE
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
     """Sample the voxel faces between solid and empty on a regular grid of `per_side`^2 points each.
 
@@ -114,18 +171,43 @@ def boundary_samples(
         points: Fractional corner indices, shape (n, 3).
         on_border: True where the face lies on the border of the lattice, shape (n,).
     """
-    cells = np.asarray(cells, dtype=bool)
-    steps = (np.arange(per_side) + 0.5) / per_side
-    points, borders = [np.zeros((0, 3))], [np.zeros(0, dtype=bool)]
+    return _samples(_boundary_faces(np.asarray(cells, dtype=bool)), per_side)
+
+
+@dataclass(frozen=True)
+class _Faces:
+    """Voxel faces across one axis, between solid and empty."""
+
+    axis: int
+    corner: npt.NDArray[np.int64]
+    """Corner index of each face's first corner, shape (n, 3)."""
+    empty: npt.NDArray[np.int64]
+    """The empty voxel beside each face, shape (n, 3); outside the lattice for some faces on its border."""
+    on_border: npt.NDArray[np.bool_]
+    """Faces on the border of the lattice, shape (n,)."""
+
+
+def _boundary_faces(cells: npt.NDArray[np.bool_]) -> tuple[_Faces, ...]:
+    faces = []
     for axis in range(3):
         width = [(0, 0)] * 3
         width[axis] = (1, 1)
-        padded = np.pad(cells, width).astype(np.int8)
-        face = np.argwhere(np.diff(padded, axis=axis) != 0)
-        u, v = (a for a in range(3) if a != axis)
+        rise = np.diff(np.pad(cells, width).astype(np.int8), axis=axis)
+        corner = np.argwhere(rise != 0)
+        empty = corner.copy()
+        empty[:, axis] -= rise[tuple(corner.T)] > 0
+        on_border = (corner[:, axis] == 0) | (corner[:, axis] == cells.shape[axis])
+        faces.append(_Faces(axis, corner, empty, on_border))
+    return tuple(faces)
+
+
+def _samples(faces: tuple[_Faces, ...], per_side: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+    steps = (np.arange(per_side) + 0.5) / per_side
+    points, borders = [], []
+    for face in faces:
+        u, v = (a for a in range(3) if a != face.axis)
         offsets = np.zeros((per_side, per_side, 3))
         offsets[..., u], offsets[..., v] = steps[:, None], steps[None, :]
-        points.append((face[:, None, :] + offsets.reshape(1, -1, 3)).reshape(-1, 3))
-        on_border = (face[:, axis] == 0) | (face[:, axis] == cells.shape[axis])
-        borders.append(np.repeat(on_border, per_side**2))
+        points.append((face.corner[:, None, :] + offsets.reshape(1, -1, 3)).reshape(-1, 3))
+        borders.append(np.repeat(face.on_border, per_side**2))
     return np.concatenate(points), np.concatenate(borders)
