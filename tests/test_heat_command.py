@@ -12,14 +12,22 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-from tests.scene_bodies import room, wall
+from tests.scene_bodies import room, tagged_body, wall
 from thermoxels_ns import cli
 from thermoxels_ns.errors import HeatError, OutputError, ThermoxelsError
+from thermoxels_ns.fem.probes import place_probes
+from thermoxels_ns.fem.problem import AdaptiveSteps
+from thermoxels_ns.fem.refine_mesh import refine_mesh
+from thermoxels_ns.fem.scene_file import load_heat_scene
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.heat_command import Heat
 from thermoxels_ns.heat_pictures import PICTURES, cut_open, plot_over_time
 from thermoxels_ns.heat_report import HeatReport, Section, Table, build_report
 from thermoxels_ns.heat_run import compute_heat, run_heat
+from thermoxels_ns.heat_solving import LEFT_OUT_SHARE
 from thermoxels_ns.mesh.formats import write_mesh
+from thermoxels_ns.mesh.read_mesh import read_mesh
 
 TRANSIENT = """
 description: A <cold> & windy hour
@@ -178,7 +186,7 @@ def test_bad_input_is_one_sentence_and_exit_status_1(folder, tmp_path, capsys) -
     words = ["heat", str(folder / "room" / "mesh.vtu"), "--output-dir", str(tmp_path / "out")]
     for more, message in (
         (["--scene", "summer-nite"], "heat scene: expected one of"),
-        (["--scene", "original", "--leave-out-below-k", "-1"], "leave-out-below-k: expected a number of at least 0"),
+        (["--scene", "original", "--leave-out-below-k", "-1"], "leave-out-below-k: expected a finite number"),
     ):
         assert cli.main([*words, *more]) == 1
         shown = capsys.readouterr().err.splitlines()
@@ -188,12 +196,178 @@ def test_bad_input_is_one_sentence_and_exit_status_1(folder, tmp_path, capsys) -
         run_heat(Heat(folder / "wall" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path / "out"))
 
 
+ROOM_TOLERANCE_K = 0.5
+
+
+@pytest.fixture(scope="module")
+def tolerated(folder) -> Path:
+    """The room's steady state to a tolerance that linear tetrahedra on its mesh are far from."""
+    words = ["heat", str(folder / "room" / "mesh.vtu"), "--scene", str(folder / "steady.yaml"), "--pictures", "False"]
+    words += ["--tolerance", str(ROOM_TOLERANCE_K), "--probes", "0.5", "2", "2"]
+    assert cli.main([*words, "--output-dir", str(folder / "tolerated")]) == 0
+    return folder / "tolerated"
+
+
+def test_a_tolerance_is_met_on_a_finer_mesh_and_everything_is_that_of_it(folder, tolerated) -> None:
+    found = answers(tolerated)
+    accuracy, levels = found["accuracy"], found["accuracy"]["levels"]
+    assert accuracy["met"] is True and accuracy["estimated_k"] <= accuracy["tolerance_k"] == ROOM_TOLERANCE_K
+    assert accuracy["order"] == 2 and accuracy["refinements"] >= 1 and len(levels) > 2
+    assert [level["order"] for level in levels[:2]] == [1, 2] and all(level["seconds"] > 0.0 for level in levels)
+    fine = read_mesh(folder / "room" / "mesh.vtu")
+    scene = load_heat_scene(str(folder / "steady.yaml"))
+    for _ in range(accuracy["refinements"] + 1):
+        fine = refine_mesh(fine)
+    exact = solve_steady(scene.problem(fine), order=2, relative_tolerance=1e-8)
+    written = pv.read(tolerated / "heat.vtu")
+    assert written.n_points == found["solved"]["unknowns"] == len(fine.points_m) > found["solved"]["nodes"]
+    given = len(read_mesh(folder / "room" / "mesh.vtu").points_m)
+    error = np.abs(np.asarray(written.point_data["temperature_c"]) - exact.temperature_c)[:given].max()
+    assert error <= ROOM_TOLERANCE_K and 1 / 3 < accuracy["estimated_k"] / error < 3
+    probe = place_probes(fine, [(0.5, 2.0, 2.0)]).at(exact.temperature_c)
+    assert found["probes"][0]["temperature_c"][0] == pytest.approx(float(probe[0]), abs=ROOM_TOLERANCE_K)
+    assert found["coldest"]["temperature_c"] == pytest.approx(float(written.point_data["temperature_c"].min()))
+
+
+def test_flows_of_quadratic_tetrahedra_agree_everywhere(tolerated) -> None:
+    """By effect, by patch, by region and as a wall."""
+    found = answers(tolerated)
+    into = {entry["effect"]: entry["heat_w"] for entry in found["effects"]}
+    assert found["wall"]["heat_w"] == pytest.approx(into["convection on interior-*"], rel=1e-9)
+    assert sum(entry["heat_w"] for entry in found["patches"]) == pytest.approx(0.0, abs=1e-6 * found["wall"]["heat_w"])
+    assert found["regions"][0]["heat_w"] == pytest.approx(0.0, abs=1e-6 * found["wall"]["heat_w"])
+    page = (tolerated / "report.html").read_text()
+    assert "estimated error of temperatures, within the tolerance" in page and "<h2>Accuracy</h2>" in page
+    assert "quadratic tetrahedra, mesh size halved" in page and "--tolerance 0.5" in page
+
+
+def test_a_tolerance_in_time_keeps_the_scenes_times(folder, tmp_path) -> None:
+    (tmp_path / "hour.yaml").write_text(
+        TRANSIENT.replace("{duration_s: 3600.0, tolerance_k: 0.05, outputs: 3}", "{steps: 3, step_seconds: 1200.0}")
+    )
+    options = Heat(folder / "wall" / "mesh.vtu", str(tmp_path / "hour.yaml"), tmp_path, tolerance=0.2, pictures=False)
+    (tmp_path / "hour.yaml").write_text((tmp_path / "hour.yaml").read_text().split("radiation:")[0])
+    lines: list[str] = []
+    run = run_heat(options, lines.append)
+    found = answers(tmp_path)
+    assert found["times_s"] == [0.0, 1200.0, 2400.0, 3600.0]
+    assert run.accuracy is not None and run.accuracy.met and found["accuracy"]["step_tolerance_k"] > 0.0
+    fine = refine_mesh(refine_mesh(refine_mesh(run.problem.mesh)))
+    finest = replace(run.problem, mesh=fine, initial_temperature_c=np.full(len(fine.points_m), 15.0))
+    exact = solve_heat(finest, AdaptiveSteps(3600.0, 0.02, outputs=3))
+    given = len(run.problem.mesh.points_m)
+    assert np.abs(run.solution.temperature_c[:, :given] - exact.temperature_c[:, :given]).max() <= 0.2
+    assert any(line.endswith(" at most.") and "needs about" in line for line in lines)
+    assert any(line.startswith("Within 0.2 K") for line in lines)
+    assert "in steps chosen by the tolerance" in (tmp_path / "report.html").read_text()
+
+
+def test_what_is_left_out_counts_against_the_tolerance(folder, tmp_path) -> None:
+    scene, mesh = str(folder / "hour.yaml"), folder / "room" / "mesh.vtu"
+    run = compute_heat(Heat(mesh, scene, tmp_path, tolerance=2.0))
+    assert run.accuracy is not None and run.screening.tolerance_k == pytest.approx(LEFT_OUT_SHARE * 2.0)
+    bound = run.screening.bound_k
+    assert bound > 0.0 and run.accuracy.left_out_k == bound
+    assert run.accuracy.estimated_k == run.accuracy.levels[-1]["error"]["temperature_k"] + bound <= 2.0
+    by_flow = compute_heat(
+        Heat(folder / "wall" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path, flow_tolerance=0.01)
+    )
+    assert by_flow.screening.tolerance_k == 0.0 and by_flow.accuracy is not None and by_flow.accuracy.met
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"tolerance": -1.0}, "tolerance: expected a finite number above 0"),
+        ({"flow_tolerance": 0.0}, "flow-tolerance: expected a finite number above 0"),
+        ({"flow_tolerance": 0.1}, "flow-tolerance: expected --tolerance beside it"),
+        ({"tolerance": 0.1, "leave_out_below_k": 0.1}, "leave-out-below-k: expected less than the tolerance of 0.1 K"),
+        ({"memory_gb": 0.0}, "memory-gb: expected a finite number above 0"),
+        ({"memory_gb": 1e-5}, "memory of the heat problem: expected at most .*Pass a larger --memory-gb"),
+        ({"tolerance": 1e-6, "memory_gb": 0.002}, "Not within 1e-06 K|memory_bytes: expected room"),
+    ],
+)
+def test_accuracy_options_that_cannot_be_used(folder, tmp_path, more, message) -> None:
+    with pytest.raises(HeatError, match=message):
+        compute_heat(Heat(folder / "room" / "mesh.vtu", str(folder / "hour.yaml"), tmp_path, **more))
+
+
+def test_a_tolerance_that_does_not_fit_is_said_and_written_if_allowed(folder, tmp_path) -> None:
+    options = Heat(folder / "room" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path, tolerance=1e-4, pictures=False)
+    small = replace(options, memory_gb=0.003)
+    with pytest.raises(HeatError, match=r"Not within 0.0001 K: P2, given mesh.*needs about .* MiB, more than"):
+        run_heat(small)
+    assert list(tmp_path.iterdir()) == []
+    run_heat(replace(small, allow_unmet=True))
+    assert answers(tmp_path)["accuracy"]["met"] is False
+    page = (tmp_path / "report.html").read_text()
+    assert "NOT within the tolerance" in page and "Not met: a tolerance of 0.0001 K." in page
+    assert "--allow-unmet True" in page
+
+
+def test_a_body_without_rooms_is_warned_about(folder, tmp_path, capsys) -> None:
+    cells, outside = np.ones((3, 3, 3), dtype=bool), np.ones((5, 5, 5), dtype=bool)
+    outside[:, :, 0] = False
+    write_mesh(tmp_path / "mesh.vtu", tagged_body(cells, 1.0, outside))
+    words = ["heat", str(tmp_path / "mesh.vtu"), "--scene", "winter-night", "--pictures", "False"]
+    assert cli.main([*words, "--output-dir", str(tmp_path / "out")]) == 0
+    assert "Warning: The scene names air inside, but the body has no rooms" in capsys.readouterr().out
+    assert "--interior hollow" in answers(tmp_path / "out")["warnings"][0]
+    assert "<h2>Look at this first</h2>" in (tmp_path / "out" / "report.html").read_text()
+    assert compute_heat(Heat(folder / "room" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path)).warnings == ()
+
+
+def test_no_u_value_where_more_than_two_airs_acts(folder, tmp_path) -> None:
+    """40 W/m3 inside a wall of 0.2 m would make it 0.8 W/(m2 K) better than it is."""
+    scene = STEADY + "internal_heat: [{regions: ['*'], source_w_m3: 40.0}]\n"
+    (tmp_path / "warm.yaml").write_text(scene)
+    options = Heat(folder / "wall" / "mesh.vtu", str(tmp_path / "warm.yaml"), tmp_path / "out", pictures=False)
+    assert run_heat(options).wall is None
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "There is no U-value, because its heat would count in it: internal heat" in page
+    assert answers(tmp_path / "out")["wall"] is None and "internal heat" in answers(tmp_path / "out")["no_wall"]
+
+
+def test_no_u_value_of_a_body_without_an_inside(folder, tmp_path) -> None:
+    mesh = wall()
+    assert mesh.boundary is not None
+    boundary = replace(mesh.boundary, patch=np.zeros_like(mesh.boundary.patch), patch_names=("outer", "interior"))
+    write_mesh(tmp_path / "mesh.vtu", replace(mesh, boundary=boundary))
+    (tmp_path / "steady.yaml").write_text(STEADY.replace("air_c: 20.0,", "air_c: 20.0, patches: [interior],"))
+    run = compute_heat(Heat(tmp_path / "mesh.vtu", str(tmp_path / "steady.yaml"), tmp_path))
+    assert run.wall is None and "no surface of the body faces the air inside" in run.no_wall
+
+
+@pytest.mark.parametrize(
+    ("summary", "message"),
+    [
+        ("[1, 2]", "summary.json: expected the summary of an export, got \\[1, 2\\]"),
+        ('{"up": [0, 1]}', "summary.json: up: expected three numbers, got \\[0, 1\\]"),
+        ('{"up": [0, null, 1]}', "summary.json: up: expected three numbers"),
+        ('{"length_unit": "unit"}', "scale of the mesh: expected an export in metres"),
+    ],
+)
+def test_a_damaged_summary_is_refused(folder, tmp_path, summary: str, message: str) -> None:
+    write_mesh(tmp_path / "mesh.vtu", wall())
+    (tmp_path / "summary.json").write_text(summary)
+    with pytest.raises(ThermoxelsError, match=message):
+        compute_heat(Heat(tmp_path / "mesh.vtu", str(folder / "steady.yaml"), tmp_path))
+
+
+def test_a_mesh_without_a_summary_is_said_to_be_taken_in_metres(folder, tmp_path, capsys) -> None:
+    lines: list[str] = []
+    compute_heat(Heat(folder / "wall" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path), lines.append)
+    assert any("summary.json is missing; the mesh is taken to be in metres" in line for line in lines)
+
+
 def test_help_says_what_it_writes(capsys) -> None:
     with pytest.raises(SystemExit) as stop:
         cli.main(["heat", "--help"])
     assert stop.value.code == 0
     words = capsys.readouterr().out
-    assert all(word in words for word in ("--scene", "--probes", "--leave-out-below-k", "report.html", "[K]"))
+    assert all(
+        word in words for word in ("--scene", "--probes", "--tolerance", "--leave-out-below-k", "report.html", "[K]")
+    )
 
 
 def test_a_cut_body_is_half_of_it() -> None:

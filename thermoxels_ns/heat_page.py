@@ -11,11 +11,13 @@ import numpy as np
 from thermoxels_ns.fem.answers import Spot
 from thermoxels_ns.fem.effects import Effect, FixedTemperature, InternalHeat
 from thermoxels_ns.fem.materials import Material
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.system import effect_labels
+from thermoxels_ns.heat_accuracy_page import accuracy_card, accuracy_sections, how_time_was_followed
+from thermoxels_ns.heat_figures import figure as _figure
 from thermoxels_ns.heat_pictures import in_words, plot_over_time
 from thermoxels_ns.heat_report import HeatReport, Section, Table
 
@@ -41,7 +43,14 @@ def heat_page(run: HeatRun, pictures: Mapping[str, bytes], command: str, files: 
         command: The command that made it.
         files: Names of the files beside the page.
     """
-    sections = [_answers(run), *_wall(run), *_probes(run), _balance(run)]
+    sections = [
+        *_doubts(run),
+        _answers(run),
+        *_wall(run),
+        *_probes(run),
+        _balance(run),
+        *accuracy_sections(run.accuracy),
+    ]
     if isinstance(run.solution, HeatSolution):
         plot = plot_over_time(run.solution, run.mean_c, run.probes_c, _probe_names(run))
         words = ("Heat flows are means over each interval between two kept times.",)
@@ -59,8 +68,9 @@ def heat_page(run: HeatRun, pictures: Mapping[str, bytes], command: str, files: 
 
 
 def _summary(run: HeatRun) -> str:
-    mesh = run.problem.mesh
-    what = f"A body of {len(mesh.tets):,} tetrahedra"
+    mesh = run.solved.mesh
+    kind = "quadratic tetrahedra" if run.nodes.quadratic else "tetrahedra"
+    what = f"A body of {len(mesh.tets):,} {kind}"
     if run.scene.time is None:
         return f"{what} in its steady state. {run.solution.status}"
     return f"{what}, followed for {in_words(float(run.scene.time.times_s[-1]))}. {run.solution.status}"
@@ -80,7 +90,12 @@ def _figures(run: HeatRun) -> tuple[tuple[str, str], ...]:
         cards.append((f"{run.wall.temperature_factor:.3f}", "surface temperature factor f_Rsi"))
     cards.append((f"{answers.coldest.temperature_c:.2f} \N{DEGREE SIGN}C", f"coldest spot {_place(answers.coldest)}"))
     cards.append((f"{answers.hottest.temperature_c:.2f} \N{DEGREE SIGN}C", f"hottest spot {_place(answers.hottest)}"))
+    cards += accuracy_card(run.accuracy)
     return tuple(cards)
+
+
+def _doubts(run: HeatRun) -> list[Section]:
+    return [Section("Look at this first", words=run.warnings)] if run.warnings else []
 
 
 def _answers(run: HeatRun) -> Section:
@@ -138,14 +153,15 @@ def _answers(run: HeatRun) -> Section:
 
 def _wall(run: HeatRun) -> list[Section]:
     if run.wall is None:
-        return []
+        return [Section("As a wall", words=(run.no_wall,))] if run.no_wall else []
     wall = run.wall
     words = (
         f"Between {wall.inside_c:g} \N{DEGREE SIGN}C inside and {wall.outside_c:g} \N{DEGREE SIGN}C outside, "
         f"{_figure(wall.heat_w)} W flow into the inner surface of {_figure(wall.area_m2)} m\N{SUPERSCRIPT TWO}: a "
         f"thermal coupling of {_figure(wall.coupling_w_k)} W/K. The inner surface is worst at "
         f"{wall.coldest.temperature_c:.2f} \N{DEGREE SIGN}C {_place(wall.coldest)}, which is a temperature factor of "
-        f"{wall.temperature_factor:.3f} (1: as warm as the air inside).",
+        f"{wall.temperature_factor:.3f} (1: as warm as the air inside). For the risk of mould ISO 13788 asks for "
+        "it with a resistance of the inner surface of 0.25 m\N{SUPERSCRIPT TWO} K/W, coefficient_w_m2k: 4.",
     )
     columns = ("Inner surface", "area m\N{SUPERSCRIPT TWO}", "W", "U-value W/(m\N{SUPERSCRIPT TWO} K)")
     rows = [(p.name, _figure(p.area_m2), _figure(p.heat_w), f"{p.u_value_w_m2k:.4f}") for p in wall.patches]
@@ -188,12 +204,7 @@ def _balance(run: HeatRun) -> Section:
 def _asked(run: HeatRun) -> Section:
     mesh, scene, time = run.problem.mesh, run.scene, run.scene.time
     start = "the photographs" if scene.initial_c is None else f"{scene.initial_c:g} \N{DEGREE SIGN}C everywhere"
-    if isinstance(time, TimeSteps):
-        how = f"{time.steps} steps of {time.step_seconds:g} s"
-    elif isinstance(time, AdaptiveSteps):
-        how = f"{in_words(time.duration_s)} in steps that keep within {time.tolerance_k:g} K"
-    else:
-        how = "the steady state"
+    how = how_time_was_followed(time, run.accuracy)
     general = Table(
         ("", ""),
         (
@@ -332,13 +343,3 @@ def _up_to(bound_k: float | None) -> str:
 
 def _optional(value: float | None) -> str:
     return "" if value is None else _figure(value)
-
-
-def _figure(value: float) -> str:
-    """Four digits, without powers of ten where figures are of everyday size."""
-    if value == 0.0:
-        return "0"
-    if 1e-3 <= abs(value) < 1e6:
-        digits = max(0, 3 - int(np.floor(np.log10(abs(value)))))
-        return f"{value:,.{digits}f}"
-    return f"{value:.3e}"

@@ -49,22 +49,34 @@ def draw_surface(
         seen = seen & mesh.boundary.seen
     shown = np.unique(mesh.facets[seen] if seen.any() else mesh.facets)
     steady = len(times_s) == 1
-    ends = states_c[[0, -1]][:, shown]
-    same: Any = {"clim": (float(ends.min()), float(ends.max())), "up": up}
+    (low, high), beyond = _colour_ends(states_c[[0, -1]][:, shown])
+    same: Any = {"clim": (low, high), "up": up}
+    few = "; colours: middle 99 %" if beyond else ""
     first, last = in_words(float(times_s[0])), in_words(float(times_s[-1]))
     when = ", steady" if steady else f" at {last}"
-    picture_of_mesh(folder / end, mesh, states_c[-1], title=f"Surface temperature{when}", **same)
+    picture_of_mesh(folder / end, mesh, states_c[-1], title=f"Surface temperature{when}{few}", **same)
     half, values, view = cut_open(mesh, states_c[-1], up)
     title = f"Cut through the middle{when}"
     picture_of_mesh(folder / cut, half, values, title=title, up=up, view_direction=view.tolist())
     if steady:
         return [end, cut]
     difference = states_c[-1] - states_c[0]
-    most = max(float(np.abs(difference[shown]).max()), _LEAST_CHANGE_K)
+    (low, high), beyond = _colour_ends(difference[shown])
+    most = max(abs(low), abs(high), _LEAST_CHANGE_K)
     diverging: Any = {"clim": (-most, most), "colour_map": "coolwarm", "bar_title": "change [K]", "up": up}
-    picture_of_mesh(folder / start, mesh, states_c[0], title=f"Surface temperature at {first}", **same)
-    picture_of_mesh(folder / change, mesh, difference, title=f"Change from {first} to {last}", **diverging)
+    picture_of_mesh(folder / start, mesh, states_c[0], title=f"Surface temperature at {first}{few}", **same)
+    few = "; colours: middle 99 %" if beyond else ""
+    picture_of_mesh(folder / change, mesh, difference, title=f"Change from {first} to {last}{few}", **diverging)
     return list(PICTURES)
+
+
+def _colour_ends(values: Vector) -> tuple[tuple[float, float], bool]:
+    """Ends of a scale, and whether values lie beyond: where a few stretch it to more than twice the middle 99 %."""
+    low, high = (float(end) for end in np.quantile(values, (0.005, 0.995)))
+    least, most = float(values.min()), float(values.max())
+    if most - least > 2.0 * (high - low) > 0.0:
+        return (low, high), True
+    return (least, most), False
 
 
 def cut_open(mesh: TetMesh, nodal_c: Vector, up: tuple[float, float, float]) -> tuple[TetMesh, Vector, Vector]:

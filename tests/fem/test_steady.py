@@ -4,16 +4,17 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from tests.heat_meshes import box_mesh, planes
+from tests.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.errors import HeatError
 from thermoxels_ns.fem import newton as newton_module
-from thermoxels_ns.fem import solver_choice
+from thermoxels_ns.fem import solver_choice, steady
 from thermoxels_ns.fem.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.solver_choice import PATIENCE, LinearSolver
 from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.fem.system import HeatSystem
 
 STEEL = Material("steel", 50.0, 7800.0, 450.0)
 SIGMA = 5.67e-8
@@ -198,3 +199,17 @@ def test_multigrid_draws_the_same_numbers_and_leaves_the_generator_alone() -> No
     assert first.converged and first.iterations == second.iterations
     few = MultigridConjugateGradients(matrix, max_iterations=2).solve(b)
     assert not few.converged and "stopped after 2 iterations" in few.status
+
+
+def test_the_residual_is_round_off_also_where_nothing_flows_or_flows_cancel() -> None:
+    mesh = box_mesh(*(planes(0.0, 0.4, step=0.1) for _ in range(3)))
+    still = HeatProblem(mesh, STEEL, effects=(Convection(SIDES[:1], 8.0, 20.0), Convection(SIDES[1:], 25.0, 20.0)))
+    assert solve_steady(still).energy_residual < 1e-9
+    # Heat comes in through one half of a patch and leaves through the other.
+    air = Varying(lambda places, _: np.where(places.points_m[:, 1] > 0.2, 30.0, -10.0), in_time=False)
+    through = solve_steady(HeatProblem(mesh, STEEL, effects=(Convection(SIDES[:1], 8.0, air),)))
+    assert abs(through.effects[0].heat_w[0]) < 1e-6 and through.energy_residual < 1e-9
+    # Heat that does come in and stays is not called round-off.
+    system = HeatSystem(still)
+    warm = np.full(len(mesh.points_m), 21.0 - system.reference_c)
+    assert steady._residual(system, warm, 0.0, steady.heat_of_groups_w(system, warm, 0.0)) == pytest.approx(1.0)

@@ -1,14 +1,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import datetime, timezone
 
 import numpy as np
 import pytest
 
+from tests.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.errors import HeatError
 from thermoxels_ns.fem.assembly import assemble
-from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+from thermoxels_ns.fem.effects import AbsorbedSolar, Convection
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.sun import moving_sun
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 PAPER = TimeSteps(10, 60.0)
@@ -109,5 +113,27 @@ def test_states_that_do_not_fit_into_memory_are_refused(random_body, concrete, m
     nodes = len(random_body.points_m)
     monkeypatch.setattr("thermoxels_ns.fem.stepping.MAX_STATE_BYTES", 11 * nodes * 8)
     assert solve_heat(HeatProblem(random_body, concrete), PAPER).converged
-    with pytest.raises(HeatError, match=rf"12 times x {nodes} nodes x 8 bytes = {12 * nodes * 8} .*--steps up to 10,"):
+    with pytest.raises(
+        HeatError, match=rf"12 times x {nodes} nodes x 8 bytes = {12 * nodes * 8} .*Take at most 10 steps,"
+    ):
         solve_heat(HeatProblem(random_body, concrete), TimeSteps(11, 60.0))
+
+
+@pytest.mark.parametrize("outputs", [1, 10])
+def test_a_body_at_rest_in_the_dark_still_sees_the_sun_rise(concrete, outputs: int) -> None:
+    """Nothing flows at midnight; a step as long as an interval would end at midnight again."""
+    mesh = box_mesh(*(planes(0.0, 0.2, step=0.1) for _ in range(3)))
+    mesh = replace(mesh, temperature_c=np.full(len(mesh.points_m), 5.0))
+    sun = AbsorbedSolar(SIDES, 0.7, moving_sun(datetime(2026, 1, 10, tzinfo=timezone.utc), 47.0, 0.0, (0.0, 1.0, 0.0)))
+    problem = HeatProblem(mesh, concrete, effects=(Convection(SIDES, 10.0, 5.0), sun))
+    days = solve_heat(problem, AdaptiveSteps(4 * 86400.0, outputs=outputs))
+    assert days.steps >= 96  # one an hour at least
+    fine = solve_heat(problem, TimeSteps(4 * 24 * 12, 300.0))
+    mean_w = {heat.effect.split(" on ")[0]: float(heat.heat_w.mean()) for heat in days.effects}
+    fine_w = {heat.effect.split(" on ")[0]: float(heat.heat_w.mean()) for heat in fine.effects}
+    assert (
+        mean_w["absorbed solar"] == pytest.approx(fine_w["absorbed solar"], rel=0.02) and mean_w["absorbed solar"] > 1.0
+    )
+    coarse = solve_heat(problem, TimeSteps(4, 86400.0))
+    assert "Steps of 86400 s are longer than the 3600 s by which effects" in coarse.status
+    assert "longer than" not in fine.status

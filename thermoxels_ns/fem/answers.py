@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,13 +15,12 @@ from thermoxels_ns.fem.effects import Effect, InternalHeat
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
-from thermoxels_ns.fem.solution import EffectHeat, HeatSolution, SteadySolution
+from thermoxels_ns.fem.solution import EffectHeat, SteadySolution
+from thermoxels_ns.fem.solution_nodes import Solution, SolutionNodes, solution_nodes
 from thermoxels_ns.fem.surface_heat import heat_by_part, heat_through_parts
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Vector = npt.NDArray[np.float64]
-Solution: TypeAlias = HeatSolution | SteadySolution
-"""What either solver returns."""
 
 
 @dataclass(frozen=True)
@@ -165,8 +164,11 @@ def heat_answers(
     *,
     facet_region: npt.NDArray[np.int64] | None = None,
     end_s: float | None = None,
+    nodes: SolutionNodes | None = None,
 ) -> Answers:
     """Work out the answers from a solution.
+
+    Temperatures are those of all its unknowns, heat flows those that its own tetrahedra, linear or quadratic, bring.
 
     Args:
         problem: What was solved.
@@ -174,13 +176,17 @@ def heat_answers(
         facet_region: Region of the tetrahedron behind each boundary triangle, shape (f,); needed only if the body has
             several regions.
         end_s: Time at which effects that change are taken for the flows of regions, [s]; None: the last one.
+        nodes: What `solution_nodes` gives, if it is there already.
 
     Raises:
         HeatError: The body has several regions and `facet_region` is missing or does not fit.
     """
-    mesh, selection = problem.mesh, Selection(problem.mesh, problem.up)
-    times, states = times_and_states(solution)
+    nodes = solution_nodes(problem, solution) if nodes is None else nodes
+    times, states, selection = nodes.times_s, nodes.states_c, Selection(nodes.mesh, problem.up)
     end_s = float(times[-1]) if end_s is None else end_s
+    facet_region = _checked_regions(problem.mesh, facet_region)
+    names = problem.mesh.region_names
+    by_region = heat_by_part(problem, end_state_c(solution), end_s, facet_region, names)
     lengths = np.diff(times) if len(times) > 1 else np.ones(1)
     spots = _Spots(selection, times, states)
     surface = [heat for effect, heat in zip(problem.effects, solution.effects) if not isinstance(effect, InternalHeat)]
@@ -189,18 +195,20 @@ def heat_answers(
         times_s=tuple(times.tolist()),
         patches=_patches(selection, surface, lengths, states[-1], spots),
         effects=_effects(selection, problem.effects, solution.effects, lengths),
-        regions=_regions(problem, selection, states[-1], end_s, _checked_regions(mesh, facet_region)),
+        regions=_regions(
+            problem, selection, states[-1], heat_through_parts(by_region, names)[0], nodes.of_facets(facet_region)
+        ),
         balance=_balance(solution, lengths),
         coldest=spots.extreme(np.argmin),
         hottest=spots.extreme(np.argmax),
     )
 
 
-def times_and_states(solution: Solution) -> tuple[Vector, Vector]:
-    """Times, shape (s,), and nodal temperatures, shape (s, n), of either kind of solution; a steady one has one."""
+def end_state_c(solution: Solution) -> Vector:
+    """Give the last temperatures of all unknowns of a solution, those of edges last, [degrees Celsius]."""
     if isinstance(solution, SteadySolution):
-        return np.zeros(1), solution.temperature_c[None]
-    return solution.times_s, solution.temperature_c
+        return np.concatenate([solution.temperature_c, solution.edge_temperature_c])
+    return solution.temperature_c[-1]
 
 
 class _Spots:
@@ -282,10 +290,9 @@ def _effects(
 
 
 def _regions(
-    problem: HeatProblem, selection: Selection, last_c: Vector, end_s: float, facet_region: npt.NDArray[np.int64]
+    problem: HeatProblem, selection: Selection, last_c: Vector, heat: Vector, facet_region: npt.NDArray[np.int64]
 ) -> tuple[RegionAnswer, ...]:
-    mesh, names = problem.mesh, problem.mesh.region_names
-    heat = heat_through_parts(heat_by_part(problem, last_c, end_s, facet_region, names), names)[0]
+    mesh, names = selection.mesh, selection.mesh.region_names
     area = np.bincount(facet_region, selection.facet_area_m2, len(names))
     corner = mesh.points_m[mesh.tets]
     sides = corner[:, 1:] - corner[:, :1]

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
+from thermoxels_ns.fem.range_keeper import RangeKeeper, allowed_range, is_in_range
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, Scheme
 from thermoxels_ns.fem.stepper import Step, Stepper
 from thermoxels_ns.fem.system import HeatSystem
@@ -22,10 +23,8 @@ _SAFETY = 0.9
 _SHRINK, _GROW = 0.2, 5.0
 _KEEP_BELOW = 1.25
 """A step that could be longer by less than this stays as it is, and so do its matrices."""
-_SHORTEST = 1e-18
-"""Shortest step as a share of the duration; bodies with next to no heat capacity need short ones after a jump."""
-_RANGE_ROUND_OFF = 1e-9
-"""How far out of its range a temperature may be, as a share of the range."""
+_SHORTEST = 1e-30
+"""Shortest step as a share of the duration; bodies with next to no heat capacity begin with such short ones."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +37,10 @@ class Taken:
     """Its length, [s]."""
     ends_interval: bool
     """Whether temperatures are kept at its end."""
+    limited: bool = False
+    """Whether couplings with the wrong sign were left out to keep temperatures in range."""
+    in_range: bool = True
+    """Whether all temperatures are in the range of the start and of the surroundings."""
     failure: str = ""
     """Why the computation ends here; then the step does not count."""
 
@@ -45,7 +48,7 @@ class Taken:
 def equal_steps(
     system: HeatSystem, scheme: Scheme, start_k: Vector, time: TimeSteps, tolerance: float
 ) -> Iterator[Taken]:
-    """Take equal steps.
+    """Take equal steps; those of backward Euler keep temperatures in range, those of other schemes are watched.
 
     Args:
         system: The equations.
@@ -57,14 +60,21 @@ def equal_steps(
     Yields:
         Every step; the last one may be a failure.
     """
+    keeper = RangeKeeper(system, relative_tolerance=tolerance) if scheme is BACKWARD_EULER else None
     stepper, relative_k = Stepper(system, scheme, relative_tolerance=tolerance), start_k
     for number, begin_s in enumerate(time.times_s[:-1]):
-        step = stepper.step(relative_k, float(begin_s), time.step_seconds)
+        limited = False
+        if keeper is not None:
+            step, limited, in_range = keeper.step(relative_k, float(begin_s), time.step_seconds)
+        else:
+            step = stepper.step(relative_k, float(begin_s), time.step_seconds)
+            times = tuple(float(begin_s) + node * time.step_seconds for node in (0.0, *scheme.nodes))
+            in_range = step.converged and is_in_range(step, *allowed_range(system, relative_k, times))
         failure = ""
         if not step.converged:
-            remedy = "Use shorter steps (--step-seconds) or check the mesh's quality."
+            remedy = "Use shorter steps or check the mesh's quality."
             failure = f"Step {number + 1} of {time.steps} failed. {step.status} {remedy}"
-        yield Taken(step, time.step_seconds, True, failure)
+        yield Taken(step, time.step_seconds, True, limited, in_range, failure)
         relative_k = step.relative_k
 
 
@@ -78,16 +88,19 @@ class _Attempt:
     """Power of the step length that its error estimate grows with."""
     made_safe: int = 0
     """1 if it was taken with backward Euler."""
-    out_of_range: int = 0
-    """1 if a temperature left its range."""
+    limited: bool = False
+    """Whether couplings were left out."""
+    in_range: bool = True
+    """Whether all temperatures are in range."""
 
 
 class AdaptiveMarch:
     """Steps as long as a tolerance allows, by the estimate of an embedded scheme.
 
     A step whose result leaves the range that temperatures may have, that of its start and of all surroundings, is
-    taken with backward Euler instead, which never leaves it on meshes without obtuse angles; the difference between
-    both is then the estimate. So nothing overshoots, and second order returns as soon as it is safe.
+    taken with backward Euler and a `RangeKeeper` instead, which never leave it; the difference between both is then the
+    estimate. So nothing overshoots, and second order returns as soon as it is safe. No step is longer than effects can
+    be followed by, so that none steps over a day of sunshine.
     """
 
     def __init__(
@@ -106,14 +119,13 @@ class AdaptiveMarch:
         """Name of the scheme."""
         self._system, self._time, self._start_k = system, time, start_k
         self._scheme = Stepper(system, scheme, relative_tolerance=relative_tolerance)
-        self._safe = Stepper(system, BACKWARD_EULER, relative_tolerance=relative_tolerance)
+        self._safe = RangeKeeper(system, relative_tolerance=relative_tolerance)
         self._allowed_k = STEP_SHARE * time.tolerance_k
+        self._longest_s = system.problem.resolution_s
         self.repeated = 0
         """Steps that had to be repeated with a shorter length."""
         self.made_safe = 0
         """Steps taken with backward Euler."""
-        self.out_of_range = 0
-        """Steps whose result is out of range whatever the scheme, which obtuse angles or consistent masses do."""
 
     def steps(self) -> Iterator[Taken]:
         """Take steps to the end.
@@ -125,24 +137,23 @@ class AdaptiveMarch:
         for end_s in self._time.times_s[1:]:
             while now_s < end_s:
                 left_s = float(end_s) - now_s
-                step_s = _fitted(wished_s, left_s)
+                step_s = _fitted(min(wished_s, self._longest_s), left_s)
                 attempt = self._try(relative_k, now_s, step_s)
                 factor = self._factor(attempt)
                 if not attempt.step.converged or attempt.step.error_k > self._allowed_k:
                     self.repeated += 1
                     wished_s = step_s * min(factor, _SAFETY)
                     if wished_s < _SHORTEST * self._time.duration_s or now_s + 0.25 * wished_s == now_s:
-                        yield Taken(attempt.step, step_s, False, self._failure(attempt.step, now_s))
+                        yield Taken(attempt.step, step_s, False, failure=self._failure(attempt.step, now_s))
                         return
                     continue
                 self.made_safe += attempt.made_safe
-                self.out_of_range += attempt.out_of_range
                 now_s = float(end_s) if step_s == left_s else now_s + step_s
                 relative_k = attempt.step.relative_k
                 next_s = step_s * (factor if factor > _KEEP_BELOW else min(factor, 1.0))
                 # A step cut short by an interval's end says nothing against the length wished for.
                 wished_s = max(next_s, wished_s) if step_s < wished_s and factor >= 1.0 else next_s
-                yield Taken(attempt.step, step_s, now_s == end_s)
+                yield Taken(attempt.step, step_s, now_s == end_s, attempt.limited, attempt.in_range)
 
     def _first_length(self) -> float:
         system, time = self._system, self._time
@@ -158,22 +169,20 @@ class AdaptiveMarch:
         plain = _Attempt(step, self._scheme.scheme.order + 1)
         if not step.converged or step.error_k > self._allowed_k or self._in_range(step, start_k, now_s, step_s):
             return plain
-        safe = self._safe.step(start_k, now_s, step_s)
-        if not safe.converged or not self._in_range(safe, start_k, now_s, step_s):
-            return replace(plain, out_of_range=1)
+        safe, limited, in_range = self._safe.step(start_k, now_s, step_s)
+        if not in_range:
+            return replace(plain, in_range=False)
         safe = replace(
             safe,
             error_k=float(np.max(np.abs(safe.relative_k - step.relative_k))),
             iterations=safe.iterations + step.iterations,
             newton_iterations=safe.newton_iterations + step.newton_iterations,
         )
-        return _Attempt(safe, BACKWARD_EULER.order + 1, made_safe=1)
+        return _Attempt(safe, BACKWARD_EULER.order + 1, made_safe=1, limited=limited)
 
     def _in_range(self, step: Step, start_k: Vector, now_s: float, step_s: float) -> bool:
         times = (now_s, *(now_s + node * step_s for node in self._scheme.scheme.nodes))
-        low, high = self._system.allowed_range_k(start_k, times)
-        slack = _RANGE_ROUND_OFF * (high - low) if np.isfinite(high - low) else _RANGE_ROUND_OFF
-        return low - slack <= float(step.relative_k.min()) and float(step.relative_k.max()) <= high + slack
+        return is_in_range(step, *allowed_range(self._system, start_k, times))
 
     def _factor(self, attempt: _Attempt) -> float:
         """How much longer the next step may be."""

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.fem.linear_solver import LinearSolution
+from thermoxels_ns.fem.piece_balance import is_within
 
 Vector = npt.NDArray[np.float64]
 
@@ -49,8 +50,7 @@ class Residual:
     @property
     def is_round_off(self) -> bool:
         """Whether it is nothing but round-off, at every node and piece."""
-        nodes = np.all(np.abs(self.heat_w) <= self.round_off_w)
-        return bool(nodes and np.all(np.abs(self.piece_heat_w) <= self.piece_round_off_w))
+        return is_within(self.piece_heat_w, self.piece_round_off_w) and is_within(self.heat_w, self.round_off_w)
 
     def is_small(self, heat_w: float, before: Residual) -> bool:
         """Whether it is within a tolerance or round-off at the nodes, and each piece is balanced.
@@ -78,6 +78,10 @@ class Equations(Protocol):
         """Whether no absolute temperature changes by more than a share of it from u to u + direction."""
         ...
 
+    def is_lost(self, u: Vector, direction: Vector) -> bool:
+        """Whether no unknown is changed by more than round-off from u to u + direction."""
+        ...
+
     def rise(self, u: Vector, direction: Vector) -> Callable[[float], float]:
         """Give the slope of the energy along a direction, an increasing function of the length."""
         ...
@@ -94,7 +98,7 @@ class NewtonSolution:
     linear_iterations: int
     """Iterations of the linear solver in all of them."""
     converged: bool
-    """Whether the residual is within the tolerance, or as small as round-off."""
+    """Whether the residual is within the tolerance or as small as round-off, or the next step would be."""
     status: str
     """The outcome as a sentence."""
 
@@ -123,10 +127,13 @@ def newton(equations: Equations, num_unknowns: int, *, relative_tolerance: float
             return NewtonSolution(
                 u, count, spent, False, f"Newton's method stopped in step {count + 1}: {linear.status}"
             )
-        settled = equations.is_short(u, direction, _SETTLED)
+        settled, lost = equations.is_short(u, direction, _SETTLED), equations.is_lost(u, direction)
         u = u + _length(equations, u, direction) * direction
         before, residual = residual, equations.residual(u)
         count += 1
+        if settled and lost:
+            # What is left of the residual is round-off that its bound does not know of, such as that of what was given.
+            break
     return NewtonSolution(u, count, spent, True, f"Newton's method converged in {count} steps.")
 
 

@@ -1,4 +1,4 @@
-"""Temperatures at points inside a body, interpolated as the solver does: linear in each tetrahedron."""
+"""Temperatures at points inside a body, interpolated as the solver does: linear or quadratic in each tetrahedron."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ import numpy.typing as npt
 
 from thermoxels_ns.checks import check_finite, check_shape
 from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.edge_midpoints import TET_EDGES, edge_numbers
+from thermoxels_ns.fem.quadratic_elements import edge_shapes
+from thermoxels_ns.fem.sparsity import mesh_edges
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _OUTSIDE = 1e-9
@@ -29,6 +32,18 @@ class Probes:
     def at(self, nodal: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Interpolate nodal values, shape (..., n), to the points, shape (..., p)."""
         return np.einsum("...pa,pa->...p", nodal[..., self.nodes], self.weights)
+
+    def at_quadratic(self, mesh: TetMesh, values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Interpolate in quadratic tetrahedra, shape (..., p).
+
+        Args:
+            mesh: The mesh in which the probes were placed.
+            values: Of its nodes and then of the middles of its edges, in the order of `mesh_edges`, shape (..., n).
+        """
+        edges = mesh_edges(mesh.tets, len(mesh.points_m))
+        middles = len(mesh.points_m) + edge_numbers(edges, self.nodes, TET_EDGES)
+        shapes = edge_shapes(self.weights)
+        return np.einsum("...pa,pa->...p", values[..., np.concatenate([self.nodes, middles], axis=1)], shapes)
 
 
 def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> Probes:

@@ -41,10 +41,11 @@ class TimeSteps:
                     "steps",
                     expected="a whole number of at least 1",
                     got=repr(self.steps),
-                    remedy="Pass --steps 10, for example.",
+                    remedy="Give 10, for example: steps in a scene, --steps in an export.",
                 )
             )
-        seconds = check_positive("step_seconds", self.step_seconds, "Pass --step-seconds 60, for example.", HeatError)
+        remedy = "Give 60, for example: step_seconds in a scene, --step-seconds in an export."
+        seconds = check_positive("step_seconds", self.step_seconds, remedy, HeatError)
         object.__setattr__(self, "step_seconds", seconds)
         if self.steps * (seconds / sys.float_info.max) > 1.0:
             raise HeatError(
@@ -52,7 +53,7 @@ class TimeSteps:
                     "steps and step_seconds",
                     expected=f"a last time that is a number, at most {sys.float_info.max:.3g} s",
                     got=f"{self.steps} steps of {seconds:g} s",
-                    remedy="Pass a shorter --step-seconds.",
+                    remedy="Give a shorter one.",
                 )
             )
 
@@ -157,6 +158,11 @@ class HeatProblem:
         self._check_temperatures()
         self._check_materials()
         self._check_effects()
+
+    @property
+    def resolution_s(self) -> float:
+        """How far apart in time one may look at the effects and know how they change in between, [s]."""
+        return min((e.bounded(name).resolution_s for e in self.effects for name in e.bounds), default=math.inf)
 
     @property
     def start_c(self) -> npt.NDArray[np.float64]:

@@ -45,11 +45,15 @@ class LinearSolver:
         """What preconditions the last solution, for reports."""
         return "diagonal" if self._multigrid is None else "multigrid"
 
-    def solve(self, right_hand_side: Vector) -> LinearSolution:
-        """Solve A x = b."""
-        start: Vector | None = None
+    def solve(self, right_hand_side: Vector, start: Vector | None = None) -> LinearSolution:
+        """Solve A x = b.
+
+        Args:
+            right_hand_side: b, shape (n,).
+            start: Where to start from, shape (n,); None: from 0. It changes the number of iterations only.
+        """
         if self._multigrid is None and not self._slow:
-            plain = self._plain.solve(right_hand_side)
+            plain = self._plain.solve(right_hand_side, start)
             self._slow = plain.iterations > PATIENCE_WHEN_REPEATED
             # A breakdown after few iterations is not slowness, and no preconditioner mends it.
             if plain.converged or plain.iterations < PATIENCE:

@@ -12,6 +12,9 @@ from scipy import sparse
 from thermoxels_ns.fem.forms import COLDEST_SLOPE_K
 from thermoxels_ns.fem.linear_solver import LinearSolution
 from thermoxels_ns.fem.newton import Residual, newton
+from thermoxels_ns.fem.piece_balance import is_within, weighted_sums, without_sums
+from thermoxels_ns.fem.solver_choice import LinearSolver
+from thermoxels_ns.fem.starting_guess import StartingGuess
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.fem.two_level import SystemSolver
 from thermoxels_ns.units import ZERO_CELSIUS_K
@@ -22,7 +25,10 @@ _ESTIMATE_TOLERANCE = 1e-3
 """Relative tolerance of the linear solver for error estimates."""
 _NEWTON_TOLERANCE = 1e-6
 """Relative tolerance of the linear solver in a step of Newton's method: the next step corrects the rest."""
-ROUND_OFF = 8.0 * np.finfo(np.float64).eps
+_UNEXPLAINED = 1e-11
+"""Largest share of the stored heat that may be unaccounted for where nodes are fixed."""
+_EPS = float(np.finfo(np.float64).eps)
+ROUND_OFF = 8.0 * _EPS
 """Round-off of a sum as a share of the sum of sizes."""
 
 
@@ -32,6 +38,8 @@ class StageSolution:
 
     relative_k: Vector
     """Relative to the system's reference, shape (n,), [K]."""
+    change_k: Vector
+    """T - T_0 as it was solved for, shape (n,), [K]: the difference of the temperatures has lost its last digits."""
     iterations: int
     """Iterations of the linear solver."""
     newton_iterations: int
@@ -76,6 +84,7 @@ class Stage:
         self.floating: npt.NDArray[np.bool_] = ~system.pieces.touched(system.fixed.nodes)
         """Pieces without fixed nodes, shape (p,)."""
         self._solver: SystemSolver | None = None
+        self._guess = StartingGuess()
 
     def solve(
         self,
@@ -95,58 +104,70 @@ class Stage:
         balance = _Balance(self, start_k, time_s, given_w, given_to_pieces_w)
         first = balance.residual()
         if first.is_round_off:
-            return StageSolution(balance.base_k, 0, 0, True, "The temperature is level: nothing flows.")
+            status = "The temperature is level: nothing flows."
+            return StageSolution(balance.base_k, balance.base_k - start_k, 0, 0, True, status)
         if self.system.nonlinear:
             found = newton(balance, len(first.heat_w), relative_tolerance=self._relative_tolerance)
-            end_k = balance.base_k + self.everywhere(found.u)
-            return StageSolution(end_k, found.linear_iterations, found.iterations, found.converged, found.status)
+            return balance.solution(found.u, found.linear_iterations, found.iterations, found.converged, found.status)
         if self._solver is None:
             self._solver = self.system.linear_solver(self.matrix, self._relative_tolerance)
-        change, linear = self.correction(self._solver, self.held_w_k, first)
-        return StageSolution(
-            balance.base_k + self.everywhere(change), linear.iterations, 0, linear.converged, linear.status
-        )
+        change, linear = self.correction(self._solver, self.held_w_k, first, self._guess)
+        iterations = linear.iterations
+        if self._free is not None and linear.converged and np.isfinite(self.step_s):
+            rest = balance.residual(change)
+            stored_w = self.at_free(self.system.mass_product(self.everywhere(change))) / self.step_s
+            # In a long step, what is nothing beside the heat that flows may be much beside what is stored.
+            if abs(np.sum(rest.heat_w)) > _UNEXPLAINED * np.sum(np.abs(stored_w)) and not rest.is_round_off:
+                more, again = self.correction(self._solver, self.held_w_k, rest)
+                iterations += again.iterations
+                change = change + more if again.converged else change
+        return balance.solution(change, iterations, 0, linear.converged, linear.status)
 
-    def damped(self, heat_w: Vector, relative_k: Vector, time_s: float) -> Vector:
+    def damped(self, heat_w: Vector, piece_heat_w: Vector, relative_k: Vector, time_s: float) -> Vector:
         """Solve (M / step + K + R + slope of radiation) e = heat roughly, for error estimates; shape (n,), [K].
 
         Args:
             heat_w: Shape (n,), [W].
+            piece_heat_w: Its sum over each piece without the round-off of conduction, shape (p,), [W].
             relative_k: Temperatures at which the slope of radiation is taken, shape (n,), [K].
             time_s: Time at which it is taken.
         """
-        matrix = self.matrix
+        matrix, held_w_k = self.matrix, self.held_w_k
         if self.system.nonlinear:
-            matrix = sparse.csr_matrix(matrix + self.free_block(self.system.radiation_slope(relative_k, time_s)))
+            slope = self.system.radiation_slope(relative_k, time_s)
+            matrix = sparse.csr_matrix(matrix + self.free_block(slope))
+            held_w_k = held_w_k + slope @ np.ones(self.system.num_nodes)
         solver = self.system.linear_solver(matrix, _ESTIMATE_TOLERANCE)
-        return self.everywhere(solver.solve(self.at_free(heat_w)).x)
+        heat_w = self.at_free(heat_w)
+        nothing = np.zeros_like(heat_w)
+        balance = Residual(heat_w, np.where(self.floating, piece_heat_w, 0.0), nothing, np.zeros_like(piece_heat_w))
+        return self.everywhere(self.correction(solver, held_w_k, balance)[0])
 
-    def correction(self, solver: SystemSolver, held_w_k: Vector, residual: Residual) -> tuple[Vector, LinearSolution]:
+    def correction(
+        self, solver: SystemSolver, held_w_k: Vector, residual: Residual, guess: StartingGuess | None = None
+    ) -> tuple[Vector, LinearSolution]:
         """Solve for a change of the free nodes, its mean over floating pieces by their balance.
 
         Args:
             solver: Of the matrix.
             held_w_k: The matrix's row sums, exactly, shape (n,).
             residual: What is to be balanced.
+            guess: Earlier solutions with this matrix, to which this one is added; None: start from nothing.
         """
         if not self.floating.any():
-            linear = solver.solve(residual.heat_w)
+            linear = _solved(solver, residual.heat_w, guess)
             return linear.x, linear
         pieces, full_w = self.system.pieces, self.everywhere(residual.heat_w)
         held = np.where(self.floating, pieces.sums(held_w_k), 1.0)
-        # In multiples of the row sums, this shifts the solution by a constant in each piece. The second time takes out
-        # the round-off of the first.
-        rest_w = full_w
-        for _ in range(2):
-            surplus = np.where(self.floating, pieces.sums(rest_w) / held, 0.0)
-            rest_w = rest_w - pieces.at_nodes(surplus) * held_w_k
-        rest_w, round_off_w = self.at_free(rest_w), residual.round_off_w + ROUND_OFF * np.abs(residual.heat_w)
-        if np.all(np.abs(rest_w) <= round_off_w):
+        # In multiples of the row sums, this shifts the solution by a constant in each piece.
+        rest_w = self.at_free(without_sums(pieces, self.floating, full_w, held_w_k, held))
+        if is_within(rest_w, residual.round_off_w, ROUND_OFF, residual.heat_w):
             linear = LinearSolution(np.zeros_like(rest_w), 0, 0.0, True, "Each piece changes as a whole.")
         else:
-            linear = solver.solve(rest_w)
+            linear = _solved(solver, rest_w, guess)
         full_k = self.everywhere(linear.x)
-        shift = np.where(self.floating, (residual.piece_heat_w - pieces.sums(held_w_k * full_k)) / held, 0.0)
+        stored_w = weighted_sums(pieces, held_w_k, full_k)
+        shift = np.where(self.floating, (residual.piece_heat_w - stored_w) / held, 0.0)
         return self.at_free(full_k + pieces.at_nodes(shift)), linear
 
     def at_free(self, nodal: Vector) -> Vector:
@@ -166,6 +187,16 @@ class Stage:
         return full
 
 
+def _solved(solver: SystemSolver, heat_w: Vector, guess: StartingGuess | None) -> LinearSolution:
+    """Solve from a guess and learn from the solution."""
+    if guess is None or not isinstance(solver, LinearSolver):
+        return solver.solve(heat_w)
+    solution = solver.solve(heat_w, guess.for_right_hand_side(heat_w))
+    if solution.converged:
+        guess.keep(heat_w, solution.x, solution.iterations)
+    return solution
+
+
 class _Balance:
     """The heat balance of a stage as a function of the change of the free nodes."""
 
@@ -175,7 +206,7 @@ class _Balance:
         system = stage.system
         self._stage, self._time_s = stage, time_s
         self._given_w, self._given_to_pieces_w = given_w, given_to_pieces_w
-        self.base_k = start_k
+        self.base_k, self._start_k = start_k, start_k
         if len(system.fixed.nodes):
             self.base_k = start_k.copy()
             self.base_k[system.fixed.nodes] = system.fixed.temperature_k(time_s)
@@ -183,18 +214,32 @@ class _Balance:
                 moved_w = system.mass_product(self.base_k - start_k) / stage.step_s
                 self._given_w = -moved_w if given_w is None else given_w - moved_w
 
+    def solution(
+        self, u: Vector, iterations: int, newton_iterations: int, converged: bool, status: str
+    ) -> StageSolution:
+        """Temperatures after a change of the free nodes, with how it was found."""
+        change_k = self._stage.everywhere(u)
+        end_k = self.base_k + change_k
+        fixed = self._stage.system.fixed.nodes
+        if len(fixed):
+            change_k[fixed] = self.base_k[fixed] - self._start_k[fixed]
+        return StageSolution(end_k, change_k, iterations, newton_iterations, converged, status)
+
     def residual(self, u: Vector | None = None) -> Residual:
         """Heat that is not balanced at a change of the temperature; None: at no change."""
         stage, system, pieces = self._stage, self._stage.system, self._stage.system.pieces
         now_k = self.base_k if u is None else self.base_k + stage.everywhere(u)
-        heat_w, bound_w = system.exchanged_heat(now_k, self._time_s)
-        piece_w, piece_bound_w = pieces.sums(heat_w), pieces.sums(bound_w)
+        conducted_w, bound_w = system.conducted_heat(now_k)
+        heat_w = np.negative(conducted_w, out=conducted_w)
+        piece_w, piece_bound_w = np.zeros(pieces.count), np.zeros(pieces.count)
+        if system.exchanges:
+            exchanged_w, exchanged_bound_w = system.exchanged_heat(now_k, self._time_s)
+            heat_w += exchanged_w
+            bound_w += exchanged_bound_w
+            piece_w, piece_bound_w = pieces.sums(exchanged_w), pieces.sums(exchanged_bound_w)
         if self._given_to_pieces_w is not None:
             piece_w += self._given_to_pieces_w
             piece_bound_w += np.abs(self._given_to_pieces_w)
-        conducted_w, conducted_bound_w = system.conducted_heat(now_k)
-        heat_w -= conducted_w
-        bound_w += conducted_bound_w
         if self._given_w is not None:
             heat_w += self._given_w
             bound_w += np.abs(self._given_w)
@@ -207,7 +252,7 @@ class _Balance:
         return Residual(
             stage.at_free(heat_w),
             np.where(stage.floating, piece_w, 0.0),
-            ROUND_OFF * stage.at_free(bound_w),
+            stage.at_free(np.multiply(bound_w, ROUND_OFF, out=bound_w)),
             ROUND_OFF * piece_bound_w,
         )
 
@@ -223,6 +268,11 @@ class _Balance:
         """Whether no absolute temperature changes by more than a share of it."""
         kelvin = self._stage.at_free(self._now(u)) + self._stage.system.reference_c + ZERO_CELSIUS_K
         return bool(np.all(np.abs(direction) <= share * np.maximum(np.abs(kelvin), COLDEST_SLOPE_K)))
+
+    def is_lost(self, u: Vector, direction: Vector) -> bool:
+        """Whether a direction changes no temperature by more than round-off."""
+        size = np.abs(self._stage.at_free(self.base_k)) + np.abs(u)
+        return bool(np.all(np.abs(direction) <= _EPS * size))
 
     def rise(self, u: Vector, direction: Vector) -> Callable[[float], float]:
         """Slope of the energy along a direction: minus the power of the residual."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -35,6 +35,10 @@ class Step:
     """Whether all stages were solved."""
     status: str
     """The outcome as a sentence."""
+
+    def with_iterations(self, iterations: int, newton_iterations: int) -> Step:
+        """Copy it with other numbers of iterations, those of repetitions included."""
+        return replace(self, iterations=iterations, newton_iterations=newton_iterations)
 
 
 class Stepper:
@@ -87,16 +91,18 @@ class Stepper:
                 unknown = np.full(len(system.groups), np.nan)
                 return Step(solution.relative_k, unknown, iterations, newton_iterations, np.nan, False, status)
             if estimate or number + 1 < len(scheme.nodes):
-                stored_w = system.mass_product(solution.relative_k - start_k) / (implicit * step_s)
+                stored_w = system.mass_product(solution.change_k) / (implicit * step_s)
                 inner_w.append(stored_w if given_w is None else stored_w - given_w)
                 pieces_w.append(system.pieces.sums(system.exchanged_heat(solution.relative_k, now_s)[0]))
         heat_w = self._heat(start_k, states, time_s, step_s)
-        error_k = self._error(start_k, inner_w, time_s, step_s) if estimate and scheme.estimate else np.nan
+        error_k = self._error(start_k, inner_w, pieces_w, time_s, step_s) if estimate and scheme.estimate else np.nan
         return Step(states[-1], heat_w, iterations, newton_iterations, error_k, True, status)
 
     def _heat(self, start_k: Vector, states: list[Vector], time_s: float, step_s: float) -> Vector:
         """Mean heat flow of each group: the stages' flows, and what the balance of the fixed nodes leaves."""
         system, scheme = self._system, self.scheme
+        if not system.groups:
+            return np.zeros(0)
         flows, fixed = np.zeros(len(system.groups) - len(system.fixed.groups)), system.fixed
         kept_w = system.mass_product(states[-1] - start_k)[fixed.nodes] / step_s if len(fixed.nodes) else np.zeros(0)
         for weight, node, state in zip(scheme.ends, scheme.nodes, states):
@@ -105,16 +111,25 @@ class Stepper:
                 kept_w -= weight * system.net_heat_at_fixed(state, time_s + node * step_s)
         return np.concatenate([flows, fixed.shares @ kept_w])
 
-    def _error(self, start_k: Vector, inner_w: list[Vector], time_s: float, step_s: float) -> float:
-        """Largest error by the scheme of the next order, damped as the stages are."""
+    def _error(
+        self, start_k: Vector, inner_w: list[Vector], pieces_w: list[Vector], time_s: float, step_s: float
+    ) -> float:
+        """Largest error by the scheme of the next order, damped as the stages are.
+
+        As in the stages, sums over pieces come from what the pieces exchange: in those of the nodes' flows, the
+        round-off of conduction is as large as a small error where a step is long for the mesh.
+        """
         system, scheme = self._system, self.scheme
         assert scheme.estimate is not None
-        more = np.array(scheme.estimate) - np.array([0.0, *scheme.ends])
-        difference_w = _weighted(list(more), [system.net_heat(start_k, time_s)[0], *inner_w])
-        assert difference_w is not None
         implicit = scheme.weights[-1][-1]
+        more = [float(part) / implicit for part in np.array(scheme.estimate) - np.array([0.0, *scheme.ends])]
+        exchanged_w = system.exchanged_heat(start_k, time_s)[0]
+        difference_w = _weighted(more, [exchanged_w - system.conducted_heat(start_k)[0], *inner_w])
+        pieces_difference_w = _weighted(more, [system.pieces.sums(exchanged_w), *pieces_w])
+        assert difference_w is not None and pieces_difference_w is not None
         end_s = time_s + scheme.nodes[-1] * step_s
-        error = self._stage(end_s, implicit * step_s).damped(difference_w / implicit, start_k, end_s)
+        stage = self._stage(end_s, implicit * step_s)
+        error = stage.damped(difference_w, pieces_difference_w, start_k, end_s)
         return float(np.max(np.abs(error)))
 
     def _stage(self, time_s: float, step_s: float) -> Stage:

@@ -35,7 +35,8 @@ def solve_heat(
     """Follow the temperatures of a body through time.
 
     With the defaults no temperature leaves the range of the start and of the surroundings, unless a flux or source
-    drives it out, on meshes without obtuse angles and at any step length.
+    drives it out, at any step length and on any mesh: where obtuse angles would let one leave, see `RangeKeeper`. If
+    other choices let one leave, the status says so.
 
     Args:
         problem: Body, materials, initial temperatures and effects; without effects the boundary is insulated.
@@ -55,7 +56,7 @@ def solve_heat(
         HeatError: If the temperatures of all times do not fit into memory, an effect does not fit the mesh, a step's
             solver does not converge, or the temperature falls below absolute zero.
     """
-    states = _room_for_states(len(time.times_s), len(problem.mesh.points_m))
+    states = _room_for_states(time.num_times, len(problem.mesh.points_m))
     system = HeatSystem(problem, lumped=lumped, lumped_boundary=lumped_boundary)
     states[0] = problem.start_c - system.reference_c
     if len(system.fixed.nodes):
@@ -76,7 +77,7 @@ def solve_heat(
         account.add(taken)
     if failure and not allow_unconverged:
         raise HeatError(failure)
-    return account.close(failure or account.success(march), not failure, adaptive=march is not None)
+    return account.close(failure or account.success(march) + _skips(problem, time), not failure, adaptive=bool(march))
 
 
 class _Account:
@@ -89,6 +90,7 @@ class _Account:
         self._exchanged_j = np.zeros(len(times_s) - 1)
         self._iterations = np.zeros((len(times_s) - 1, 2), dtype=np.int64)
         self._error_k = 0.0
+        self._limited = self._out_of_range = 0
 
     def add(self, taken: Taken) -> None:
         """Count a step."""
@@ -99,6 +101,8 @@ class _Account:
         self._most_iterations = max(self._most_iterations, step.iterations)
         self._error_k += step.error_k
         self._steps += 1
+        self._limited += taken.limited
+        self._out_of_range += not taken.in_range
         if taken.ends_interval:
             self._done += 1
             self._states[self._done] = step.relative_k
@@ -106,16 +110,19 @@ class _Account:
     def success(self, march: AdaptiveMarch | None) -> str:
         """Say that all went well, and how."""
         sentence = f"All {self._steps} steps converged, in {self._most_iterations} iterations at most."
-        if march is None:
-            return sentence
-        if march.repeated:
+        if march is not None and march.repeated:
             sentence += f" {march.repeated} more were repeated with a shorter length."
-        if march.made_safe:
+        if march is not None and march.made_safe:
             sentence += f" {march.made_safe} were taken with backward Euler because {march.name} would have overshot."
-        if march.out_of_range:
+        if self._limited:
             sentence += (
-                f" In {march.out_of_range} a temperature left its range, which happens on meshes with obtuse angles "
-                "and with consistent masses."
+                f" In {self._limited}, obtuse angles would have let a temperature leave its range; couplings with the "
+                "wrong sign were left out there."
+            )
+        if self._out_of_range:
+            sentence += (
+                f" In {self._out_of_range} a temperature left its range, which schemes other than backward Euler, "
+                "consistent masses and integrated boundary exchange may do."
             )
         return sentence
 
@@ -154,6 +161,16 @@ class _Account:
         )
 
 
+def _skips(problem: HeatProblem, time: TimeSteps | AdaptiveSteps) -> str:
+    """Say that equal steps are too long to see how an effect changes, or nothing."""
+    if isinstance(time, AdaptiveSteps) or time.step_seconds <= problem.resolution_s:
+        return ""
+    return (
+        f" Steps of {time.step_seconds:g} s are longer than the {problem.resolution_s:g} s by which effects that "
+        "change with time can be followed; what happens in between is missed."
+    )
+
+
 def _check_estimate(scheme: Scheme | None) -> None:
     if scheme is not None and scheme.estimate is None:
         remedy = "Use SDIRK2, or equal steps."
@@ -176,8 +193,7 @@ def _room_for_states(num_times: int, num_nodes: int) -> Vector:
             "steps",
             expected=f"temperatures of all times that fit into memory, at most {MAX_STATE_BYTES} bytes",
             got=f"{got} that: {num_times} times x {num_nodes} nodes x 8 bytes = {needed} bytes",
-            remedy=f"Pass fewer and longer steps (--steps up to {max(MAX_STATE_BYTES // (8 * num_nodes) - 1, 1)}, "
-            "--step-seconds), or a coarser mesh.",
+            remedy=f"Take at most {max(MAX_STATE_BYTES // (8 * num_nodes) - 1, 1)} steps, or a coarser mesh.",
         )
     )
 

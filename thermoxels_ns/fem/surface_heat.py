@@ -15,6 +15,7 @@ from thermoxels_ns.fem.fixed_nodes import FixedNodes
 from thermoxels_ns.fem.forms import FixedForm, FluxForm, Form, RadiationForm, RobinForm
 from thermoxels_ns.fem.linear_space import LinearSpace
 from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.quadratic_space import QuadraticSpace
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import EffectHeat, heat_by_effect
 from thermoxels_ns.fem.system import HeatSystem, effect_labels
@@ -33,11 +34,13 @@ def heat_by_part(
     """Evaluate the heat flow of each effect through parts of the surface at one moment.
 
     Fixed temperatures are counted as if their nodes stored nothing at that moment, which holds for constant ones.
-    Boundary exchange is evaluated at the nodes, as the solvers do by default.
+    Boundary exchange is evaluated as the solvers do by default: at the nodes of linear tetrahedra, and integrated over
+    each triangle if they are quadratic.
 
     Args:
         problem: Body and effects.
-        temperature_c: Nodal temperatures at that moment, shape (n,), [degrees Celsius].
+        temperature_c: Temperatures at that moment, shape (n,), [degrees Celsius]: of the mesh's nodes, or of them and
+            then the middles of its edges, in the order of `mesh_edges`, if tetrahedra are quadratic.
         time_s: The moment, [s].
         part: Index into `part_names` of each boundary triangle, shape (f,).
         part_names: Names of the parts.
@@ -46,14 +49,17 @@ def heat_by_part(
         Heat into the body, one row, for each effect that acts on the surface; sources are left out.
 
     Raises:
-        HeatError: `part` does not have one entry per boundary triangle.
+        HeatError: `part` does not have one entry per boundary triangle, or the temperatures are not those of this mesh.
     """
     remedy = "Give every boundary triangle of the mesh a part."
     part = check_shape("part", np.asarray(part), (len(problem.mesh.facets),), remedy, HeatError)
     selection = Selection(problem.mesh, problem.up)
     parted = copy.copy(selection)
     parted.facet_patch, parted.patch_names = part, tuple(part_names)
-    space = LinearSpace(parted)
+    order = 1 if len(temperature_c) == len(problem.mesh.points_m) else 2
+    space = LinearSpace(parted) if order == 1 else QuadraticSpace(parted)
+    remedy = "Give the temperatures of the problem that was solved."
+    check_shape("temperature_c", temperature_c, (space.num_nodes,), remedy, HeatError)
     reference_c = 0.5 * (float(temperature_c.min()) + float(temperature_c.max()))
     relative_k = temperature_c - reference_c
     labels = effect_labels(problem)
@@ -74,7 +80,7 @@ def heat_by_part(
     groups = [(form.effect, group) for form in forms for group in form.groups]
     flows = [form.group_heat_w(relative_k, time_s) for form in forms]
     if fixed:
-        held, system = FixedNodes(fixed, space.num_nodes), HeatSystem(problem)
+        held, system = FixedNodes(fixed, space.num_nodes), HeatSystem(problem, lumped=order == 1, order=order)
         groups += held.groups
         kept_w = -system.net_heat_at_fixed(temperature_c - system.reference_c, time_s)
         flows.append(held.shares @ kept_w)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from thermoxels_ns.errors import HeatError, explain
 from thermoxels_ns.fem.account import Assembled
 from thermoxels_ns.fem.fixed_nodes import FixedNodes
 from thermoxels_ns.fem.forms import FixedForm, FluxForm, Form, RadiationForm, RobinForm, SourceForm
-from thermoxels_ns.fem.linear_space import LinearSpace
+from thermoxels_ns.fem.linear_space import CORNERS, LinearSpace
 from thermoxels_ns.fem.pieces import Pieces
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quadratic_space import QuadraticSpace
@@ -71,6 +72,8 @@ class HeatSystem:
         self.nonlinear: bool = bool(self._radiation)
         """Whether there is radiation."""
         self._forms: tuple[Form, ...] = (*self._robin, *self._loads, *self._radiation)
+        self.exchanges: bool = bool(self._forms)
+        """Whether heat flows into the body other than through fixed nodes."""
         self.groups: tuple[tuple[str, str], ...] = (
             *((form.effect, group) for form in self._forms for group in form.groups),
             *self.fixed.groups,
@@ -91,6 +94,22 @@ class HeatSystem:
     def space(self) -> LinearSpace:
         """The nodes, and how what happens becomes numbers on them."""
         return self._space
+
+    @property
+    def stiffness(self) -> sparse.csr_matrix:
+        """K, shape (n, n), [W / K]."""
+        return self._stiffness
+
+    @property
+    def lumped(self) -> bool:
+        """Whether masses and boundary exchange are both on the diagonal."""
+        return self._space.lumped and self._space.rule is CORNERS
+
+    def with_stiffness(self, stiffness: sparse.csr_matrix) -> HeatSystem:
+        """Copy the system with another K between the same nodes; all else is shared."""
+        other = copy(self)
+        other._stiffness, other._fixed_rows = stiffness, None
+        return other
 
     @property
     def start_k(self) -> Vector:

@@ -10,11 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.errors import HeatError, explain
-from thermoxels_ns.fem.answers import Spot, describe_spot
+from thermoxels_ns.fem.answers import Spot, describe_spot, end_state_c
+from thermoxels_ns.fem.effects import Convection
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import SteadySolution
+from thermoxels_ns.fem.solution_nodes import SolutionNodes, solution_nodes
 from thermoxels_ns.fem.surface_heat import heat_by_part, heat_through_parts
+from thermoxels_ns.fem.system import effect_labels
 
 _LEAST_DIFFERENCE_K = 1e-6
 
@@ -51,14 +54,30 @@ class WallAnswer:
     """The same per area of the inner surface, [W / (m2 K)]. For a plane wall this is its U-value (ISO 6946); at corners
     and thermal bridges it is a mean that depends on which surface is measured."""
     temperature_factor: float
-    """f_Rsi = (T_si,min - T_e) / (T_i - T_e) at the coldest spot of the inner surface (ISO 13788): 1 is as warm as the
-    air inside; mould is a risk below about 0.7 in dwellings."""
+    """f_Rsi = (T_si,min - T_e) / (T_i - T_e) at the coldest spot of the inner surface: 1 is as warm as the air inside.
+    It depends on the resistance of the inner surface; for the risk of mould ISO 13788 asks for 0.25 m2 K/W, a
+    coefficient of 4 W/(m2 K), where ISO 6946 takes 0.10 to 0.17 for the loss of heat."""
     coldest: Spot
     """The coldest spot of the inner surface."""
     patches: tuple[WallPart, ...]
     """The inner surface by patch."""
     regions: tuple[WallPart, ...]
     """The inner surface by region of the body behind it."""
+
+
+def not_only_airs(problem: HeatProblem, inside_c: float, outside_c: float) -> str:
+    """Name an effect that is not exchange with one of two airs, so that a U-value would count its heat; "" if none."""
+    for label, effect in zip(effect_labels(problem), problem.effects):
+        if not (isinstance(effect, Convection) and effect.air_c in (inside_c, outside_c)):
+            return label
+    return ""
+
+
+def faces_inside(problem: HeatProblem, inside: Sequence[str]) -> npt.NDArray[np.bool_]:
+    """Mark the boundary triangles of patches whose names match one of some names or patterns, shape (f,)."""
+    selection = Selection(problem.mesh, problem.up)
+    matching = [any(fnmatchcase(name, pattern) for pattern in inside) for name in selection.patch_names]
+    return np.array(matching, dtype=bool)[selection.facet_patch]
 
 
 def wall_answer(
@@ -69,8 +88,12 @@ def wall_answer(
     outside_c: float,
     *,
     facet_region: npt.NDArray[np.int64],
+    nodes: SolutionNodes | None = None,
 ) -> WallAnswer:
     """Work out what a body between two airs lets through.
+
+    What it says is that of a wall only if nothing but the two airs acts: sunlight or a cold sky count as heat through
+    it. `not_only_airs` tells.
 
     Args:
         problem: What was solved.
@@ -79,6 +102,7 @@ def wall_answer(
         inside_c: Temperature of the air inside, [degrees Celsius].
         outside_c: Temperature of the air outside, [degrees Celsius].
         facet_region: Region of the tetrahedron behind each boundary triangle, shape (f,).
+        nodes: What `solution_nodes` gives, if it is there already.
 
     Raises:
         HeatError: Both airs are equally warm, or no surface faces the inside.
@@ -89,8 +113,8 @@ def wall_answer(
         got = f"{inside_c:g} and {outside_c:g} C"
         raise HeatError(explain("airs of a wall", expected="two temperatures", got=got, remedy=remedy))
     selection, mesh = Selection(problem.mesh, problem.up), problem.mesh
-    matching = [any(fnmatchcase(name, pattern) for pattern in inside) for name in selection.patch_names]
-    inner = np.array(matching)[selection.facet_patch]
+    every_c = end_state_c(solution)
+    inner = faces_inside(problem, inside)
     if not inner.any():
         expected = f"some of the patches {', '.join(selection.patch_names)}"
         remedy = "Name patches that have some surface."
@@ -99,7 +123,7 @@ def wall_answer(
     def parts(numbers: npt.NDArray[np.int64], names: tuple[str, ...]) -> tuple[WallPart, ...]:
         number = np.where(inner, numbers, len(names))
         listed = (*names, "\0rest")
-        flows = heat_by_part(problem, solution.temperature_c, 0.0, number, listed)
+        flows = heat_by_part(problem, every_c, 0.0, number, listed)
         heat = heat_through_parts(flows, listed)[0]
         area = np.bincount(number, selection.facet_area_m2, len(listed))
         return tuple(
@@ -109,10 +133,11 @@ def wall_answer(
 
     patches = parts(selection.facet_patch, selection.patch_names)
     area, heat = sum(part.area_m2 for part in patches), sum(part.heat_w for part in patches)
-    nodes = np.unique(mesh.facets[inner])
+    shown = solution_nodes(problem, solution) if nodes is None else nodes
+    inner_nodes = np.unique(shown.mesh.facets[shown.of_facets(inner)])
     # The worst spot: the coldest if it is colder outside, else the hottest.
-    worst = int(nodes[np.argmin(np.sign(difference_k) * solution.temperature_c[nodes])])
-    spot = describe_spot(selection, worst, float(solution.temperature_c[worst]), 0.0)
+    worst = int(inner_nodes[np.argmin(np.sign(difference_k) * every_c[inner_nodes])])
+    spot = describe_spot(Selection(shown.mesh, problem.up), worst, float(every_c[worst]), 0.0)
     return WallAnswer(
         inside_c=inside_c,
         outside_c=outside_c,

@@ -1,0 +1,83 @@
+"""Steps with radiation that are very short, change next to nothing, or begin where nothing is left to change."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.heat_meshes import box_mesh
+from thermoxels_ns.fem.effects import Convection, HeatFlux, Radiation
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+
+def two_plates(step: float = 0.01) -> TetMesh:
+    """Two plates that do not touch, at 20 and 60 C."""
+    x = np.array([0.0, 0.01, 0.02, 0.03])
+    return box_mesh(
+        x,
+        x,
+        [0.0, step],
+        keep=lambda p: np.abs(p[..., 0] - 0.015) > 0.005,
+        temperature_c=lambda p: np.where(p[:, 0] > 0.015, 60.0, 20.0),
+    )
+
+
+@pytest.mark.parametrize("patches", [("x1",), ("*",)])
+def test_newton_ends_in_stages_whose_change_is_tiny(concrete, patches) -> None:
+    """Short steps change far less than the temperatures are: what one stage stores must reach the next one in full."""
+    problem = HeatProblem(two_plates(), concrete, effects=(Radiation(patches, 0.9, 306.6),))
+    fine = solve_heat(problem, AdaptiveSteps(264.0, 1e-3, outputs=4))
+    coarse = solve_heat(problem, AdaptiveSteps(264.0, 1e-2, outputs=4))
+    assert fine.converged and fine.energy_residual_of_spread < 1e-12
+    assert np.abs(fine.temperature_c - coarse.temperature_c).max() < 1e-2
+
+
+@pytest.mark.parametrize("scheme", [BACKWARD_EULER, CRANK_NICOLSON, SDIRK2])
+@pytest.mark.parametrize("step_s", [1e-9, 1e-6, 1e-3])
+def test_newton_takes_few_steps_however_short_the_time_step(concrete, scheme, step_s) -> None:
+    problem = HeatProblem(two_plates(), concrete, effects=(Radiation(("x1",), 0.9, 306.6),))
+    solution = solve_heat(problem, TimeSteps(3, step_s), scheme=scheme)
+    assert solution.newton_iterations.max() <= 3 * len(scheme.nodes)
+    # As long as nothing has changed to speak of, the heat is that of the first moment.
+    around, plate = 306.6 + 273.15, 60.0 + 273.15
+    heat = 0.9 * 5.670374419e-8 * (around**4 - plate**4) * 0.03 * 0.01
+    np.testing.assert_allclose(solution.effects[0].heat_w, heat, rtol=1e-4)
+
+
+def test_newton_ends_near_a_steady_state_and_after_it(concrete) -> None:
+    """Restarts from what is all but steady: the residual begins at round-off and has nowhere to go."""
+    effects = (Radiation(("x1",), 0.9, 306.6), Convection(("x0",), 8.0, 10.0))
+    mesh = box_mesh(*[np.arange(4) * 0.05] * 3, temperature_c=100.0)
+    problem = HeatProblem(mesh, concrete, effects=effects)
+    steady = solve_steady(problem).temperature_c
+    for away in (0.0, 1e-12, 1e-9, 1e-6):
+        near = replace(problem, initial_temperature_c=steady + away * np.sin(np.arange(len(steady))))
+        for time in (AdaptiveSteps(1e5, 1e-4, outputs=3), TimeSteps(3, 1e-6), TimeSteps(3, 1e7)):
+            solution = solve_heat(near, time)
+            assert np.abs(solution.temperature_c[-1] - steady).max() < max(10.0 * away, 1e-8)
+
+
+def test_the_error_estimate_does_not_see_round_off_in_long_steps() -> None:
+    """Next to no heat capacity: steps that are long for conduction and short for what a weak flux warms."""
+    empty = Material("nearly nothing", 1.7, 1e-9, 1e-6)
+    axis = np.arange(4) * 0.0085
+    mesh = box_mesh(axis, axis, axis[:3], temperature_c=lambda p: -200.0 + 27.0 * np.sin(700.0 * p[:, 0]))
+    problem = HeatProblem(mesh, empty, effects=(Radiation(("x0",), 1e-6, -200.0), HeatFlux(("y1",), 21.0)))
+    solution = solve_heat(problem, AdaptiveSteps(4.2e-6, 0.0167, outputs=1))
+    assert solution.converged and solution.steps < 600
+
+
+def test_the_first_step_is_as_short_as_a_body_without_capacity_needs() -> None:
+    empty = Material("nearly nothing", 1.7, 1e-9, 1e-6)
+    mesh = box_mesh(*[np.arange(4) * 0.05] * 3, temperature_c=lambda p: 10.0 * np.sin(30.0 * p[:, 0]))
+    problem = HeatProblem(mesh, empty, effects=(Radiation(("x0",), 0.9, -50.0),))
+    solution = solve_heat(problem, AdaptiveSteps(100.0, 0.1, outputs=2))
+    assert solution.converged
+    np.testing.assert_allclose(solution.temperature_c[-1], -50.0, atol=0.1)

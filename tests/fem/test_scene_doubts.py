@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.scene_bodies import Z_UP, room, tagged_body, wall
+from thermoxels_ns.fem.heat_scene import HeatScene
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.scene_doubts import scene_doubts
+from thermoxels_ns.fem.scene_fields import InsideAir, OutsideAir
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+CONCRETE = {"*": Material("concrete", 1.7, 2200.0, 880.0)}
+AIRS = {"inside_air": InsideAir(20.0, "iso-6946-combined"), "outside_air": OutsideAir(0.0, "iso-6946-combined")}
+
+
+def filled() -> TetMesh:
+    """A solid block that stands on the ground: only its underside was not seen."""
+    outside = np.ones((5, 5, 5), dtype=bool)
+    outside[:, :, 0] = False
+    return tagged_body(np.ones((3, 3, 3), dtype=bool), 1.0, outside)
+
+
+def photographed_from_within() -> TetMesh:
+    """A room whose inner surface is what was seen."""
+    cells = np.ones((4, 4, 4), dtype=bool)
+    cells[1:3, 1:3, 1:3] = False
+    inside = np.zeros((6, 6, 6), dtype=bool)
+    inside[2:4, 2:4, 2:4] = True
+    return tagged_body(cells, 1.0, inside)
+
+
+def test_rooms_and_walls_are_trusted() -> None:
+    scene = HeatScene(CONCRETE, **AIRS)
+    assert scene_doubts(scene, room(), Z_UP) == () and scene_doubts(scene, wall(), Z_UP) == ()
+
+
+def test_a_filled_body_has_no_rooms() -> None:
+    (doubt,) = scene_doubts(HeatScene(CONCRETE, **AIRS), filled(), Z_UP)
+    assert "of the 9 m2 that no photograph saw" in doubt and "--interior hollow" in doubt and "--patches" in doubt
+
+
+def test_without_air_inside_a_filled_body_is_fine() -> None:
+    assert scene_doubts(HeatScene(CONCRETE, outside_air=AIRS["outside_air"]), filled(), Z_UP) == ()
+
+
+def test_a_room_seen_from_within_is_inside_out() -> None:
+    scene = HeatScene(CONCRETE, **AIRS)
+    (doubt,) = scene_doubts(scene, photographed_from_within(), Z_UP)
+    assert "faces inwards" in doubt and 'patches: ["exterior-*"] to the inside air' in doubt
+    turned = {name: replace(air, patches=(where,)) for (name, air), where in zip(AIRS.items(), ("ext*", "int*"))}
+    assert scene_doubts(HeatScene(CONCRETE, **turned), photographed_from_within(), Z_UP) == ()
+
+
+@pytest.mark.parametrize("up", [(1.0, 0.0, 0.0), (0.0, -3.0, 0.0)])
+def test_up_decides_what_an_underside_is(up) -> None:
+    """What faces down as the mesh was made is a wall if another direction is up."""
+    assert scene_doubts(HeatScene(CONCRETE, **AIRS), filled(), up) == ()

@@ -1,0 +1,161 @@
+"""Hard cases of the heat solver on conforming meshes, whose angles are obtuse here and there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.heat_meshes import Nodal
+from tests.stuffed_shapes import SHAPES, box_distance, centres, stiffness, tet_mesh, turn
+from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.effects import Convection, Effect, FixedTemperature, Radiation
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.schemes import CRANK_NICOLSON, SDIRK2
+from thermoxels_ns.fem.solution import HeatSolution
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.mesh.stuffing import stuff
+from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
+
+CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
+H = 0.05
+STEP_S = H**2 / CONCRETE.diffusivity_m2_s
+
+
+def stuffed(level: np.ndarray, temperature_c: Nodal = 20.0, regions: bool = False) -> TetMesh:
+    mesh = tet_mesh(stuff(level), H)
+    corner = mesh.points_m[mesh.facets]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    middle = mesh.points_m.mean(axis=0)
+    patch = (corner.mean(axis=1)[:, 0] > middle[0]).astype(np.int64)
+    boundary = Boundary(normal, np.ones(len(patch)), np.ones(len(patch), bool), patch, ("x0", "x1"))
+    nodal = temperature_c(mesh.points_m) if callable(temperature_c) else np.full(len(mesh.points_m), temperature_c)
+    mesh = replace(mesh, temperature_c=nodal, boundary=boundary)
+    if regions:
+        odd = np.floor(mesh.points_m[mesh.tets].mean(axis=1) / H).sum(axis=1) % 2
+        mesh = replace(mesh, region=odd.astype(np.int64), region_names=("even", "odd"))
+    return mesh
+
+
+def body(shape: str = "slab at 30 degrees", temperature_c: Nodal = 20.0, regions: bool = False) -> TetMesh:
+    return stuffed(SHAPES[shape].level(8), temperature_c, regions)
+
+
+def spots(points: np.ndarray) -> np.ndarray:
+    return np.random.default_rng(1).choice([-30.0, 20.0, 90.0], len(points))
+
+
+def solved(problem: HeatProblem, time: TimeSteps | AdaptiveSteps, low: float, high: float, **options) -> HeatSolution:
+    """Converged, finite, balanced, and in range to round-off."""
+    solution = solve_heat(problem, time, **options)
+    assert solution.converged and np.isfinite(solution.temperature_c).all()
+    assert solution.energy_residual < 1e-9 and solution.energy_residual_of_spread < 1e-9, solution.status
+    slack = 1e-8 * (high - low)
+    assert solution.temperature_c.min() >= low - slack and solution.temperature_c.max() <= high + slack
+    return solution
+
+
+def test_these_meshes_do_have_obtuse_angles() -> None:
+    """Or the tests below would show nothing: couplings with the wrong sign, up to a tenth of the diagonal."""
+    for shape in ("sphere", "slab at 30 degrees"):
+        mesh = body(shape)
+        matrix = stiffness(mesh.points_m, mesh.tets).tocoo()
+        off = matrix.row != matrix.col
+        assert (matrix.data[off] / matrix.diagonal()[matrix.row[off]]).max() > 0.02
+
+
+@pytest.mark.parametrize("shape", ["sphere", "slab at 30 degrees"])
+@pytest.mark.parametrize("fourier", [1e-3, 1e-1, 1.0, 1e3, 1e6])
+@pytest.mark.parametrize("strength", [0.0, 1e-9, 1e6])
+def test_range_and_balance_at_any_step_and_any_cooling(shape, fourier, strength) -> None:
+    effects: tuple[Effect, ...] = () if strength == 0.0 else (Convection(("*",), strength, -40.0),)
+    if strength == 1e6:
+        effects = (*effects, Radiation(("*",), 0.9, 100.0))
+    low, high = (-30.0, 90.0) if strength == 0.0 else (-40.0, 100.0)
+    solved(HeatProblem(body(shape, spots), CONCRETE, effects=effects), TimeSteps(3, fourier * STEP_S), low, high)
+
+
+@pytest.mark.parametrize("contrast", [1e-6, 1e6])
+def test_two_materials_in_turns(contrast) -> None:
+    materials = {"even": CONCRETE, "odd": replace(CONCRETE, conductivity_w_mk=1.7 * contrast)}
+    effects = (Convection(("*",), 10.0, -10.0), Radiation(("*",), 0.9, 30.0))
+    problem = HeatProblem(body(temperature_c=20.0, regions=True), materials, effects=effects)
+    for fourier in (1e-3, 1.0, 1e6):
+        solved(problem, TimeSteps(2, fourier * STEP_S), -10.0, 30.0)
+
+
+@pytest.mark.parametrize(
+    ("start_c", "sky_c"), [(726.85, -270.15), (-270.15, 726.85), (-273.15, -270.15), (-273.15, 20.0)]
+)
+def test_radiation_between_1000_k_and_3_k(start_c, sky_c) -> None:
+    problem = HeatProblem(body("sphere", start_c), CONCRETE, effects=(Radiation(("*",), 1.0, sky_c),))
+    for fourier in (1e-3, 10.0, 1e6):
+        solved(problem, TimeSteps(2, fourier * STEP_S), min(start_c, sky_c), max(start_c, sky_c))
+    np.testing.assert_allclose(solve_steady(problem).temperature_c, sky_c, atol=1e-4)
+
+
+def test_adaptive_steps_through_a_shock() -> None:
+    effects = (Convection(("*",), 1e4, -50.0), Radiation(("*",), 0.9, -80.0))
+    problem = HeatProblem(body(temperature_c=200.0), CONCRETE, effects=effects)
+    solved(problem, AdaptiveSteps(1800.0, 0.5, outputs=2), -80.0, 200.0)
+
+
+def test_no_heat_capacity_to_speak_of() -> None:
+    empty = Material("nearly nothing", 1.7, 1e-9, 1e-6)
+    effects = (Convection(("x0",), 10.0, -10.0), Radiation(("x1",), 0.9, 30.0))
+    problem = HeatProblem(body(), empty, effects=effects)
+    end = solve_heat(problem, TimeSteps(1, 1.0)).temperature_c[-1]
+    np.testing.assert_allclose(end, solve_steady(problem).temperature_c, atol=1e-6)
+
+
+def test_a_wall_of_one_element() -> None:
+    """0.75 voxels thick and slanted: most nodes are on the surface."""
+    points = centres(10, 10, 6)
+    level = np.clip(-box_distance(points @ turn(17.0), np.array([4.0, 4.0, 0.75])), -1.0, 1.0)
+    problem = HeatProblem(stuffed(level, spots), CONCRETE, effects=(Convection(("*",), 8.0, -5.0),))
+    for fourier in (1e-3, 1.0, 1e6):
+        solved(problem, TimeSteps(3, fourier * STEP_S), -30.0, 90.0)
+
+
+def test_a_disconnected_piece() -> None:
+    """Two balls, one held: fine in time, and a clear error when steady."""
+    points = centres(14, 7, 7)
+    distance = np.minimum(
+        np.linalg.norm(points - [-3.5, 0.1, 0.2], axis=-1), np.linalg.norm(points - [3.6, 0.1, 0.2], axis=-1)
+    )
+    mesh = stuffed(np.clip(2.3 - distance, -1.0, 1.0), spots)
+    problem = HeatProblem(mesh, CONCRETE, effects=(FixedTemperature(("x0",), 50.0),))
+    solved(problem, TimeSteps(2, 1e9), -30.0, 90.0)
+    with pytest.raises(HeatError, match="none on 1 of 2 pieces"):
+        solve_steady(problem)
+
+
+@pytest.mark.parametrize("temperature_c", [-273.15, -273.1499])
+def test_near_absolute_zero(temperature_c) -> None:
+    problem = HeatProblem(body("sphere", temperature_c), CONCRETE, effects=(Radiation(("*",), 1.0, -273.15),))
+    solution = solve_heat(problem, TimeSteps(3, STEP_S))
+    assert solution.temperature_c.min() >= -273.15 and solution.temperature_c.max() <= temperature_c + 1e-12
+
+
+def jump() -> HeatProblem:
+    """A body at 20 C that is held at 100 C on one side from now on, followed by steps too short for the mesh."""
+    return HeatProblem(body("sphere"), CONCRETE, effects=(FixedTemperature(("x1",), 100.0),))
+
+
+def test_what_is_left_out_is_said_and_only_where_needed() -> None:
+    short = solved(jump(), TimeSteps(2, 1e-2 * STEP_S), 20.0, 100.0)
+    assert "couplings with the wrong sign were left out" in short.status
+    # Long steps are smooth: nothing to mend, and nothing that changes the answer.
+    long = solved(jump(), TimeSteps(4, 20.0 * STEP_S), 20.0, 100.0)
+    assert "left" not in long.status
+
+
+@pytest.mark.parametrize("options", [{"scheme": CRANK_NICOLSON}, {"scheme": SDIRK2}, {"lumped": False}])
+def test_fixed_steps_say_when_a_temperature_leaves_its_range(options) -> None:
+    solution = solve_heat(jump(), TimeSteps(2, 1e-2 * STEP_S), **options)
+    assert solution.temperature_c.min() < 20.0 - 1e-3
+    assert "In 2 a temperature left its range" in solution.status or "In 1 a temperature" in solution.status

@@ -1,0 +1,119 @@
+"""Steps of backward Euler whose temperatures stay in range on any mesh.
+
+Where faces meet at an obtuse angle, the stiffness matrix couples two nodes with the wrong sign: heat flows from the
+colder to the warmer one. With smooth temperatures that is right, because flows along other edges outweigh it; beside a
+jump that the mesh cannot resolve, a temperature may leave the range that it came from and that surrounds it.
+
+A step after which one has left is taken again without the wrong-signed couplings of the nodes that left, and again if
+others leave then. Without all of them the matrix is an M-matrix, of which no temperature leaves its range (Ciarlet and
+Raviart, Computer Methods in Applied Mechanics and Engineering 2, 1973), so it ends. A coupling is a heat flow between
+two nodes: to leave it out keeps the matrix symmetric, its rows sum to 0 and heat is conserved. Where temperatures stay
+in range, that is wherever the mesh resolves them, nothing is left out and the order of the error is what it was.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from thermoxels_ns.fem.schemes import BACKWARD_EULER
+from thermoxels_ns.fem.stepper import Step, Stepper
+from thermoxels_ns.fem.system import HeatSystem
+
+Vector = npt.NDArray[np.float64]
+
+RANGE_ROUND_OFF = 1e-9
+"""How far out of its range a temperature may be, as a share of the range."""
+_ATTEMPTS = 8
+"""Repetitions after which all wrong-signed couplings are left out."""
+
+
+class RangeKeeper:
+    """Backward Euler with a watch on the range."""
+
+    def __init__(self, system: HeatSystem, *, relative_tolerance: float) -> None:
+        """Prepare; what only some meshes need is made when it is needed.
+
+        Args:
+            system: The equations.
+            relative_tolerance: Of the linear solver.
+        """
+        self._system, self._relative_tolerance = system, relative_tolerance
+        self._plain = Stepper(system, BACKWARD_EULER, relative_tolerance=relative_tolerance)
+        self._wrong: tuple[npt.NDArray[np.int32], npt.NDArray[np.int32], Vector] | None = None
+
+    def step(self, start_k: Vector, time_s: float, step_s: float) -> tuple[Step, bool, bool]:
+        """Take one step.
+
+        Args:
+            start_k: Temperatures at the start, relative to the system's reference, shape (n,), [K].
+            time_s: Time at the start.
+            step_s: Length, [s].
+
+        Returns:
+            step: Its outcome; iterations of all repetitions count.
+            limited: Whether couplings were left out.
+            in_range: Whether all temperatures are in range. They are not if the step failed, and may not be with
+                consistent masses or boundary exchange.
+        """
+        step = self._plain.step(start_k, time_s, step_s)
+        if not step.converged:
+            return step, False, False
+        low, high = allowed_range(self._system, start_k, (time_s, time_s + step_s))
+        if is_in_range(step, low, high):
+            return step, False, True
+        if not self._system.lumped:
+            return step, False, False
+        first, second, size = self._wrong_couplings()
+        chosen = np.zeros(len(size), dtype=bool)
+        iterations, newton_iterations = step.iterations, step.newton_iterations
+        for attempt in range(_ATTEMPTS + 1):
+            outside = (step.relative_k < low) | (step.relative_k > high)
+            more = (outside[first] | outside[second]) & ~chosen
+            if attempt == _ATTEMPTS:
+                more = ~chosen
+            if not more.any():
+                break
+            chosen |= more
+            limited = self._system.with_stiffness(self._without(first[chosen], second[chosen], size[chosen]))
+            stepper = Stepper(limited, BACKWARD_EULER, relative_tolerance=self._relative_tolerance)
+            step = stepper.step(start_k, time_s, step_s)
+            iterations, newton_iterations = iterations + step.iterations, newton_iterations + step.newton_iterations
+            if not step.converged or is_in_range(step, low, high):
+                break
+        step = step.with_iterations(iterations, newton_iterations)
+        return step, bool(chosen.any()), step.converged and is_in_range(step, low, high)
+
+    def _wrong_couplings(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32], Vector]:
+        """Pairs of nodes with an entry above 0, and the entries, [W / K]."""
+        if self._wrong is None:
+            upper = sparse.triu(self._system.stiffness, k=1, format="coo")
+            wrong = upper.data > 0.0
+            self._wrong = (upper.row[wrong], upper.col[wrong], upper.data[wrong])
+        return self._wrong
+
+    def _without(self, first: npt.NDArray[np.int32], second: npt.NDArray[np.int32], size: Vector) -> sparse.csr_matrix:
+        """K without some couplings, whose heat flows are taken from the diagonal too."""
+        rows, columns = np.concatenate([first, second, first, second]), np.concatenate([second, first, first, second])
+        entries = np.concatenate([-size, -size, size, size])
+        change = sparse.csr_matrix((entries, (rows, columns)), shape=self._system.stiffness.shape)
+        return sparse.csr_matrix(self._system.stiffness + change)
+
+
+def allowed_range(system: HeatSystem, start_k: Vector, times_s: tuple[float, ...]) -> tuple[float, float]:
+    """Range that temperatures may have after a step from a start, with some slack for round-off, [K].
+
+    Args:
+        system: The equations.
+        start_k: Temperatures at the start, relative to the system's reference, shape (n,), [K].
+        times_s: Times at which the surroundings count, [s].
+    """
+    low, high = system.allowed_range_k(start_k, times_s)
+    slack = RANGE_ROUND_OFF * (high - low) if np.isfinite(high - low) else RANGE_ROUND_OFF
+    return low - slack, high + slack
+
+
+def is_in_range(step: Step, low: float, high: float) -> bool:
+    """Whether all temperatures after a step are from `low` to `high`."""
+    return low <= float(step.relative_k.min()) and float(step.relative_k.max()) <= high

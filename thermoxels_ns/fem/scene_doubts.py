@@ -1,0 +1,84 @@
+"""What looks wrong about a heat scene around a body although it is possible."""
+
+from __future__ import annotations
+
+from fnmatch import fnmatchcase
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.fem.heat_scene import HeatScene
+from thermoxels_ns.fem.scene_fields import INSIDE, OUTSIDE
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.sky import Vector
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+_COS_45 = float(np.sqrt(0.5))
+_LEAST_OF_A_ROOM = 0.1
+"""Share of its surface that a room has on walls and floor at least: of a cube they are five sixths."""
+_INWARDS = -0.2
+"""Mean cosine between the normals of a surface and the directions away from its middle: 0.8 to 1 for a body seen from
+around it, 0 for a plane, -0.8 to -1 for a room seen from within."""
+
+
+def scene_doubts(scene: HeatScene, mesh: TetMesh, up: Vector) -> tuple[str, ...]:
+    """Find what a scene's default patches mean on a mesh for which they were not meant.
+
+    Which surfaces are inside is known from what no camera saw. That is wrong for a body that was filled, of which only
+    the underside remains unseen, and for a room that was photographed from within, whose inner surface is what was
+    seen. A scene that names patches of its own is trusted.
+
+    Args:
+        scene: The scene.
+        mesh: The body.
+        up: Direction that points up.
+
+    Returns:
+        What is doubtful and what to do about it, one or two sentences each.
+    """
+    selection = Selection(mesh, up)
+    inside, outside = _chosen(selection, INSIDE), _chosen(selection, OUTSIDE)
+    inside_air = scene.inside_air is not None and scene.inside_air.patches == INSIDE
+    outside_air = scene.outside_air is not None and scene.outside_air.patches == OUTSIDE
+    doubts = []
+    if (inside_air or outside_air) and _outwards(selection, outside) < _INWARDS:
+        doubts.append(
+            "The surface that photographs see faces inwards, as that of a room photographed from within. The scene's "
+            "outside air (and sun and sky) acts on surfaces that were seen, its inside air on those that were not. If "
+            "the seen surface is that of the room, give inside_air and outside_air their patches in the scene: "
+            'patches: ["exterior-*"] to the inside air, patches: ["interior-*"] to the outside air.'
+        )
+    elif inside_air and not _has_rooms(selection, inside):
+        area = float(selection.facet_area_m2[inside].sum())
+        doubts.append(
+            f"The scene names air inside, but the body has no rooms: of the {area:.4g} m2 that no photograph saw, next "
+            "to nothing is walls or floor of a room. The air acts on what is left, such as the underside, and U-values "
+            "and heat losses are those of that. Export again with --interior hollow, which keeps the inside empty, or "
+            "name the inner surface with --patches."
+        )
+    return tuple(doubts)
+
+
+def _chosen(selection: Selection, patterns: tuple[str, ...]) -> npt.NDArray[np.bool_]:
+    """Mark the boundary triangles of patches that match, shape (f,)."""
+    matching = [any(fnmatchcase(name, pattern) for pattern in patterns) for name in selection.patch_names]
+    return np.array(matching, dtype=bool)[selection.facet_patch]
+
+
+def _has_rooms(selection: Selection, inside: npt.NDArray[np.bool_]) -> bool:
+    """Whether enough of a surface faces up or sideways to be that of rooms."""
+    area = selection.facet_area_m2[inside]
+    level = selection.facet_normal[inside] @ np.array(selection.up) / np.linalg.norm(selection.up)
+    return float(area[level > -_COS_45].sum()) > _LEAST_OF_A_ROOM * float(area.sum())
+
+
+def _outwards(selection: Selection, chosen: npt.NDArray[np.bool_]) -> float:
+    """Mean cosine between normals and the directions away from the middle; 0 of nothing."""
+    area = selection.facet_area_m2[chosen]
+    if not float(area.sum()) > 0.0:
+        return 0.0
+    centroid = selection.mesh.points_m[selection.mesh.facets[chosen]].mean(axis=1)
+    away = centroid - area @ centroid / area.sum()
+    length = np.linalg.norm(away, axis=1)
+    cosine = np.einsum("fi,fi->f", away, selection.facet_normal[chosen]) / np.maximum(length, np.finfo(float).tiny)
+    return float(area @ cosine / area.sum())

@@ -1,0 +1,165 @@
+"""What ``thermoxels heat`` writes: answers.json, series.csv, report.html, temperatures for ParaView and pictures."""
+
+from __future__ import annotations
+
+import csv
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from thermoxels_ns.checks import (
+    refuse_what_is_in_the_way,
+    remove_file,
+    remove_stale_temporaries,
+    replace_when_done,
+    writable_folder,
+)
+from thermoxels_ns.fem.answers import plain_values
+from thermoxels_ns.fem.files import STEP_PATTERN, remove_heat_series, write_heat_series
+from thermoxels_ns.fem.lumped_body import LumpedBody
+from thermoxels_ns.fem.solution import SteadySolution
+from thermoxels_ns.heat_command import Heat
+from thermoxels_ns.heat_page import heat_page
+from thermoxels_ns.heat_pictures import PICTURES, draw_surface
+from thermoxels_ns.heat_report import build_report
+from thermoxels_ns.heat_solving import steps_taken, time_error_k
+from thermoxels_ns.mesh.files import summary_text, write_summary, write_vtu
+
+if TYPE_CHECKING:
+    from thermoxels_ns.heat_run import HeatRun
+
+ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY = "answers.json", "series.csv", "report.html", "heat.pvd", "heat.vtu"
+"""Files of a run; pictures come on top."""
+
+
+def summary_of(run: HeatRun) -> dict[str, Any]:
+    """Everything that answers.json says."""
+    screening = run.screening
+    return {
+        "mesh": run.options.mesh,
+        "scene": run.options.scene,
+        "description": run.scene.description,
+        "steady": run.scene.steady,
+        "warnings": list(run.warnings),
+        "leave_out_below_k": screening.tolerance_k,
+        "accuracy": None if run.accuracy is None else plain_values(run.accuracy),
+        "solved": {
+            "tets": len(run.solved.mesh.tets),
+            "nodes": len(run.solved.mesh.points_m),
+            "unknowns": run.nodes.states_c.shape[1],
+        },
+        **run.answers.as_mapping(),
+        "wall": None if run.wall is None else plain_values(run.wall),
+        "no_wall": run.no_wall,
+        "probes": [
+            {"point_m": point, "temperature_c": run.probes_c[:, number]}
+            for number, point in enumerate(run.probes.points_m)
+        ],
+        "built": plain_values(screening.kept),
+        "left_out": plain_values(screening.left_out),
+        "left_out_bound_k": screening.bound_k,
+        "left_out_note": screening.note,
+        "lumped_model": _lumped_summary(run.lumped),
+        "assembled": dict(run.solution.assembled.counts),
+        "newton_iterations": int(np.sum(run.solution.newton_iterations)),
+        "linear_iterations": int(np.sum(run.solution.iterations)),
+        "steps": steps_taken(run.solution),
+        "time_error_k": time_error_k(run.solution),
+        "seconds": dict(run.seconds),
+        "seconds_saved": run.seconds_saved,
+    }
+
+
+def _lumped_summary(lumped: LumpedBody | None) -> dict[str, Any] | None:
+    if lumped is None:
+        return None
+    used = lumped.solution is not None
+    return {"used": used, "biot": lumped.biot, "bound_k": lumped.bound_k, "reason": lumped.reason}
+
+
+def prepared_folder(output_dir: Path) -> Path:
+    """Make the folder, and find out what is in the way before anything is computed.
+
+    Raises:
+        OutputError: It cannot be written to, or something has the name of what is to be written.
+    """
+    folder = writable_folder(output_dir)
+    names = (ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY, *PICTURES)
+    series = folder / Path(THROUGH_TIME).stem
+    refuse_what_is_in_the_way(folder, names, [series.name])
+    remove_stale_temporaries(folder, names)
+    remove_stale_temporaries(series, [STEP_PATTERN])
+    return folder
+
+
+def write_heat_files(folder: Path, run: HeatRun, say: Callable[[str], None]) -> None:
+    """Write everything; answers.json comes last, so that files beside one belong together.
+
+    Args:
+        folder: From `prepared_folder`.
+        run: What was computed.
+        say: Called with one line of progress at a time.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    summary_text(summary_of(run))  # raises if json cannot hold it
+    shown, pictures = run.nodes, list[str]()
+    remove_file(folder / ANSWERS)
+    for name in (PAGE, STEADY, *PICTURES):
+        remove_file(folder / name)
+    if isinstance(run.solution, SteadySolution):
+        remove_heat_series(folder / THROUGH_TIME)
+        write_vtu(folder / STEADY, shown.mesh, temperature_c=shown.states_c[-1])
+    else:
+        write_heat_series(folder / THROUGH_TIME, shown.mesh, run.solution)
+    _write_series(folder / SERIES, run)
+    if run.options.pictures:
+        pictures = draw_surface(folder, shown.mesh, shown.states_c, shown.times_s, run.problem.up)
+    drawn = {name: (folder / name).read_bytes() for name in pictures}
+    fields = STEADY if isinstance(run.solution, SteadySolution) else THROUGH_TIME
+    files = [PAGE, ANSWERS, SERIES, fields, *pictures]
+    page = build_report(heat_page(run, drawn, command_line(run.options), files))
+    with replace_when_done(folder / PAGE) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    write_summary(folder / ANSWERS, summary_of(run))
+    say(f"Written to {folder}: {', '.join(files)}")
+
+
+def command_line(options: Heat) -> str:
+    """Write the command as it is typed."""
+    words = ["thermoxels", "heat", str(options.mesh), "--scene", options.scene, "--output-dir", str(options.output_dir)]
+    if options.probes:
+        words += ["--probes", *(f"{part:g}" for point in options.probes for part in point)]
+    for name, value in (
+        ("--tolerance", options.tolerance),
+        ("--flow-tolerance", options.flow_tolerance),
+        ("--leave-out-below-k", options.leave_out_below_k),
+    ):
+        words += [] if value is None else [name, f"{value:g}"]
+    words += ["--memory-gb", f"{options.memory_gb:g}"] if options.memory_gb != Heat.memory_gb else []
+    words += ["--allow-unmet", "True"] if options.allow_unmet else []
+    if options.up is not None:
+        words += ["--up", *(f"{part:g}" for part in options.up)]
+    return shlex.join(words)
+
+
+def _write_series(path: Path, run: HeatRun) -> None:
+    """Temperatures at each time, and mean heat flows during the interval that ends there."""
+    times, states = run.nodes.times_s, run.nodes.states_c
+    effects = run.solution.effects
+    head = ["time_s", "min_c", "mean_c", "max_c"]
+    head += [f"probe {number + 1} [C]" for number in range(run.probes_c.shape[1])]
+    head += [f"{heat.effect} [W]" for heat in effects]
+    heat_w = np.stack([heat.heat_w for heat in effects], axis=1) if effects else np.zeros((max(len(times) - 1, 1), 0))
+    with replace_when_done(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(head)
+        for number, time_s in enumerate(times):
+            temperatures = [states[number].min(), run.mean_c[number], states[number].max(), *run.probes_c[number]]
+            interval = number if len(times) == 1 else number - 1
+            flows = ["" for _ in effects] if interval < 0 else [repr(float(flow)) for flow in heat_w[interval]]
+            writer.writerow([repr(float(time_s)), *(repr(float(value)) for value in temperatures), *flows])

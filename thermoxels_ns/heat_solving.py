@@ -1,0 +1,241 @@
+"""How ``thermoxels heat`` solves a scene: with the scene's own steps on the mesh as it is, or to a tolerance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from thermoxels_ns.checks import check_positive
+from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.answers import plain_values
+from thermoxels_ns.fem.error_budget import Tolerance
+from thermoxels_ns.fem.heat_scene import HeatScene
+from thermoxels_ns.fem.lumped_body import LumpedBody, lumped_body
+from thermoxels_ns.fem.memory import check_memory, describe_bytes, needed_bytes
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.screening import Screening, screen
+from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
+from thermoxels_ns.fem.solution_nodes import Solution
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.tolerance import ToleratedSolution, solve_to_tolerance
+from thermoxels_ns.heat_command import Heat
+
+Say = Callable[[str], None]
+Lap = Callable[[str], None]
+
+LEFT_OUT_SHARE = 0.2
+"""Share of the tolerance that effects which are left out may use together; the solver gets what they do not use."""
+LEAVE_OUT_BELOW_K = 0.01
+"""The same without a tolerance, [K]: a fifth of the default tolerance of the time steps."""
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """What is known of the error, and how the tolerance was met."""
+
+    tolerance_k: float | None
+    """Error of any temperature that was allowed, [K]; None: any."""
+    flow_tolerance: float | None
+    """Error of the mean heat flow of any effect that was allowed, as a share of all heat; None: any."""
+    met: bool
+    """Whether the estimates are within it."""
+    estimated_k: float
+    """Estimated largest error of a temperature, what is left out included, [K]."""
+    estimated_flow: float | None
+    """Estimated largest error of a heat flow as a share of all heat; None for the lumped model, which gives none."""
+    left_out_k: float
+    """What of `estimated_k` is the bound of the effects that are left out, [K]."""
+    order: int
+    """1 for linear tetrahedra, 2 for quadratic ones; 0 for the lumped model."""
+    refinements: int
+    """How often the size of the given mesh was halved."""
+    step_tolerance_k: float | None
+    """Tolerance of the time steps, [K]; None without steps."""
+    seconds: float | None
+    """Time for all solutions and estimates, [s]; None for the lumped model."""
+    status: str
+    """The outcome as a sentence."""
+    levels: tuple[dict[str, Any], ...]
+    """All solutions on the way with their estimates and seconds, the one that counts last."""
+
+
+@dataclass(frozen=True)
+class SolvedScene:
+    """A solution and what it is one of."""
+
+    problem: HeatProblem
+    """What was solved last: without what is left out, and perhaps on a finer mesh than the given one."""
+    solution: Solution
+    """Temperatures and heat flows."""
+    screening: Screening
+    """What was built."""
+    lumped: LumpedBody | None
+    """Whether the body could have one temperature; None if that was not asked, as in a steady state."""
+    accuracy: Accuracy | None
+    """What is known of the error; None if no tolerance was given."""
+
+
+def leave_out_below_k(options: Heat) -> float:
+    """Tell what effects that are left out may change together, [K].
+
+    Raises:
+        HeatError: It is negative, or all of the tolerance.
+    """
+    given, tolerance_k = options.leave_out_below_k, options.tolerance
+    if given is None:
+        if options.flow_tolerance is not None:
+            return 0.0
+        return LEAVE_OUT_BELOW_K if tolerance_k is None else LEFT_OUT_SHARE * tolerance_k
+    if not 0.0 <= given < np.inf:
+        expected, remedy = "a finite number of at least 0", "Pass 0 to build everything."
+        raise HeatError(explain("leave-out-below-k", expected=expected, got=given, remedy=remedy))
+    if tolerance_k is not None and given >= tolerance_k:
+        expected, remedy = f"less than the tolerance of {tolerance_k:g} K", "Leave it out for a fifth of the tolerance."
+        raise HeatError(explain("leave-out-below-k", expected=expected, got=f"{given:g} K", remedy=remedy))
+    return given
+
+
+def check_accuracy_options(options: Heat, scene: HeatScene) -> None:
+    """Refuse options that make no sense together, before anything is read or computed.
+
+    Raises:
+        HeatError: One is out of range or needs another.
+    """
+    check_positive("memory-gb", options.memory_gb, "Give it in GiB, such as 4.", HeatError)
+    if options.tolerance is not None:
+        check_positive("tolerance", options.tolerance, "Give it in kelvin, such as 0.05.", HeatError)
+    if options.flow_tolerance is not None:
+        check_positive("flow-tolerance", options.flow_tolerance, "Give a share, such as 0.01 for 1 %.", HeatError)
+    if scene.time is not None and options.flow_tolerance is not None and options.tolerance is None:
+        remedy = "Pass --tolerance too: steps in time are chosen by it."
+        raise HeatError(
+            explain(
+                "flow-tolerance",
+                expected="--tolerance beside it if the scene has a duration",
+                got="none",
+                remedy=remedy,
+            )
+        )
+    leave_out_below_k(options)
+
+
+def solve_scene(options: Heat, scene: HeatScene, problem: HeatProblem, say: Say, lap: Lap) -> SolvedScene:
+    """Leave out what does not matter, and solve the rest.
+
+    Args:
+        options: What was asked.
+        scene: The scene.
+        problem: The scene around the mesh.
+        say: Called with one line of progress at a time.
+        lap: Called with the name of each part when it is done.
+
+    Raises:
+        HeatError: The problem needs more memory than allowed, its solver fails, or the tolerance cannot be met.
+    """
+    screening = screen(problem, scene.time, leave_out_below_k(options))
+    lap("screen")
+    _say_what_is_built(screening, say)
+    lumped: LumpedBody | None = None
+    asked = options.tolerance is not None or options.flow_tolerance is not None
+    if scene.time is not None and options.flow_tolerance is None:
+        most_k = leave_out_below_k(options) if options.tolerance is None else options.tolerance
+        allowed_k = most_k - screening.bound_k
+        lumped = lumped_body(screening.problem, scene.time, allowed_k) if allowed_k > 0.0 else None
+    if lumped is not None and lumped.solution is not None:
+        accuracy = _of_lumped(options, screening, lumped) if asked else None
+        return SolvedScene(screening.problem, lumped.solution, screening, lumped, accuracy)
+    if asked:
+        return _to_tolerance(options, scene, screening, lumped, say)
+    mesh, times = problem.mesh, 1 if scene.time is None else scene.time.num_times
+    needed = needed_bytes(len(mesh.tets), len(mesh.points_m), times=times)
+    say(f"Memory: about {describe_bytes(needed)} at most.")
+    check_memory(needed, options.memory_gb * 2**30, "Pass a larger --memory-gb, or export a coarser mesh.")
+    if scene.time is None:
+        return SolvedScene(screening.problem, solve_steady(screening.problem), screening, None, None)
+    return SolvedScene(screening.problem, solve_heat(screening.problem, scene.time), screening, lumped, None)
+
+
+def _to_tolerance(
+    options: Heat, scene: HeatScene, screening: Screening, lumped: LumpedBody | None, say: Say
+) -> SolvedScene:
+    """Give the solver what is left of the tolerance."""
+    left_k = None if options.tolerance is None else options.tolerance - screening.bound_k
+    found = solve_to_tolerance(
+        screening.problem,
+        Tolerance(left_k, options.flow_tolerance),
+        duration_s=None if scene.time is None else scene.time.duration_s,
+        outputs=1 if scene.time is None else scene.time.num_times - 1,
+        memory_bytes=options.memory_gb * 2**30,
+        allow_unmet=options.allow_unmet,
+        log=say,
+    )
+    return SolvedScene(found.problem, found.solution, screening, lumped, _of_levels(options, screening, found))
+
+
+def _of_levels(options: Heat, screening: Screening, found: ToleratedSolution) -> Accuracy:
+    last = found.settings
+    return Accuracy(
+        tolerance_k=options.tolerance,
+        flow_tolerance=options.flow_tolerance,
+        met=found.met,
+        estimated_k=last.error.temperature_k + screening.bound_k,
+        estimated_flow=last.error.heat_flow,
+        left_out_k=screening.bound_k,
+        order=last.order,
+        refinements=last.refinements,
+        step_tolerance_k=last.step_tolerance_k,
+        seconds=found.seconds,
+        status=found.status,
+        levels=tuple(plain_values(level) for level in found.levels),
+    )
+
+
+def _of_lumped(options: Heat, screening: Screening, lumped: LumpedBody) -> Accuracy:
+    assert lumped.bound_k is not None, "there is a solution"
+    return Accuracy(
+        tolerance_k=options.tolerance,
+        flow_tolerance=None,
+        met=True,
+        estimated_k=lumped.bound_k + screening.bound_k,
+        estimated_flow=None,
+        left_out_k=screening.bound_k,
+        order=0,
+        refinements=0,
+        step_tolerance_k=None,
+        seconds=None,
+        status=f"Within {options.tolerance:g} K without steps or conduction. {lumped.reason}",
+        levels=(),
+    )
+
+
+def problem_as_solved(problem: HeatProblem, solved: SolvedScene) -> HeatProblem:
+    """Give the problem with all effects, also those that were left out, on the mesh that was solved."""
+    if solved.problem.mesh is problem.mesh:
+        return problem
+    return replace(solved.problem, effects=problem.effects)
+
+
+def time_error_k(solution: Solution) -> float | None:
+    """Give the estimated error of the steps as their controller adds it up, [K]; None if there is none."""
+    if isinstance(solution, SteadySolution) or not np.isfinite(solution.time_error_k):
+        return None
+    return solution.time_error_k
+
+
+def steps_taken(solution: Solution) -> int:
+    """Count the time steps; 0 in a steady state and for the lumped model."""
+    return solution.steps if isinstance(solution, HeatSolution) else 0
+
+
+def _say_what_is_built(screening: Screening, say: Say) -> None:
+    for entry in screening.left_out:
+        say(f"Left out: {entry.effect}, at most {entry.bound_k:.2g} K and {entry.bound_w:.3g} W: {entry.reason}.")
+    for entry in screening.kept:
+        bound = "" if entry.bound_k is None else f" (up to {entry.bound_k:.2g} K)"
+        say(f"Built: {entry.effect}{bound}")
+    if not screening.kept and not screening.left_out:
+        say("Nothing acts on the body: its surface is insulated.")
