@@ -365,7 +365,7 @@ def test_truth_that_cannot_be_used_does_not_cost_the_export(ball, tmp_path) -> N
 
 def test_too_many_steps_are_refused_before_anything_is_written(ball, tmp_path) -> None:
     options = ExportOptions(metres_per_unit=1.0, steps=3_000_000)
-    with pytest.raises(HeatError, match=r"steps: .* 8 bytes = \d+ bytes\. Pass fewer and longer steps"):
+    with pytest.raises(HeatError, match=r"steps: .* 8 bytes = \d+ bytes\. Take at most \d+ steps"):
         export_snapshot(ball, np.eye(4), options, tmp_path)
     assert not list(tmp_path.iterdir())
 

@@ -211,6 +211,10 @@ def _tell(built: BuiltMesh, volume: float, unit: str, voxel_size: float | None, 
             f"Left out because no thermal ray saw them: {built.unobserved_parts} parts of the mesh, "
             f"{built.unobserved_voxels} voxels in all."
         )
+    for rule in built.idle_rules:
+        say(
+            f"Rule without effect: {rule}. Nothing in the mesh meets its conditions, or later rules take all that does."
+        )
 
 
 def _compared(

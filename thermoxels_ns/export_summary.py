@@ -90,6 +90,7 @@ def mesh_summary(
         "voxels_without_thermal_rays_left_out": built.unobserved_voxels,
         "share_of_nodes_observed": float(np.mean(mesh.observed)),
         "share_of_area_not_fully_observed": _share_of_area_unobserved(mesh),
+        "rules_without_effect": built.idle_rules,
         "patches": patch_areas(mesh),
         "regions": region_volumes(mesh),
         "temperature_c": {

@@ -10,6 +10,7 @@ import pytest
 
 from thermoxels_ns.errors import HeatError, MeshError
 from thermoxels_ns.mesh.abaqus_file import HeatStep, write_inp
+from thermoxels_ns.mesh.quality import facet_areas
 
 STEP = HeatStep(1.7, 2200.0, 880.0, steps=10, step_seconds=60.0)
 # Nodes of the faces S1 to S4 of a linear tetrahedron, as the manuals of Abaqus and CalculiX list them.
@@ -127,3 +128,13 @@ def test_names_that_become_one_are_refused(tmp_path, tagged_mesh, names):
 def test_a_step_that_means_nothing_is_refused(change, message):
     with pytest.raises(HeatError, match=message):
         dataclasses.replace(STEP, **change)
+
+
+def test_surfaces_say_how_large_they_truly_are(written, tagged_mesh):
+    areas = facet_areas(tagged_mesh.points_m, tagged_mesh.facets)
+    for number, name in enumerate(("UP", "DOWN", "INSIDE", "FA_ADE_1")):
+        patch = tagged_mesh.boundary.patch == number
+        true = areas[patch] @ tagged_mesh.boundary.area_factor[patch]
+        said = [line for line in written if line.startswith("**") and f"PATCH-{name}" in line]
+        numbers_said = [float(word) for line in said for word in line.split() if word.replace(".", "").isdigit()]
+        assert numbers_said == pytest.approx([true, areas[patch].sum(), true / areas[patch].sum()], rel=1e-8)

@@ -9,6 +9,7 @@ import pytest
 
 from thermoxels_ns.errors import MeshError
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh, check_similarity
+from thermoxels_ns.mesh.patch_rules import PatchRules, Rule
 from thermoxels_ns.mesh.quality import check_mesh, facet_areas
 from thermoxels_ns.mesh.solid import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX
@@ -144,6 +145,31 @@ def test_part_no_thermal_ray_saw_is_left_out(snapshot_of):
     assert (built.unobserved_parts, built.unobserved_voxels, len(built.mesh.tets)) == (0, 0, 6 * 15)
 
 
+def test_part_of_a_conforming_mesh_no_thermal_ray_saw_is_counted(snapshot_of):
+    """Two cubes that touch by a corner: one part as voxels, two as a smooth surface. Rays saw only the first."""
+    cells = np.zeros((10, 10, 10), bool)
+    cells[1:4, 1:4, 1:4] = cells[4:7, 4:7, 4:7] = True
+    weight = np.zeros((11, 11, 11))
+    weight[:3, :3, :3] = 1.0
+    field = replace(snapshot_of(np.ones(weight.shape), 20.0, weight), voxel_density=cells.astype(np.float32))
+    every = SolidSelection(close_gaps=0, density_threshold=0.5, interior="hollow")
+    built = build_mesh(field, every, np.eye(4))
+    assert (built.unobserved_parts, built.unobserved_voxels) == (1, 27)
+    assert built.solid.cells.sum() == 27 and built.solid.cells[1:4, 1:4, 1:4].all()
+    assert np.array_equal(built.solid.level > 0, built.solid.cells)
+    assert built.mesh.points_m.max() < 4.3 * 0.5
+    assert check_mesh(built.mesh).volume_m3 == pytest.approx(27 * 0.5**3, rel=0.2)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_rules_without_effect_are_named(snapshot_of, mode):
+    far = ((50.0, 50.0, 50.0), (51.0, 51.0, 51.0))
+    rules = PatchRules((Rule("top", facing="up"), Rule("typo", box=far)), (Rule("pipe", box=far),))
+    built = build_mesh(carved(snapshot_of), DENSE, np.eye(4), MeshOptions(mode, rules=rules))
+    assert built.idle_rules == ("patch typo (entry 2)", "region pipe (entry 1)")
+    assert build_mesh(carved(snapshot_of), DENSE, np.eye(4), MeshOptions(mode)).idle_rules == ()
+
+
 def test_solid_that_touches_the_border_is_tagged(snapshot_of):
     mesh = build_mesh(carved(snapshot_of), DENSE, similarity(1.0, rotation(4)), VOXEL).mesh
     quality = check_mesh(mesh)
@@ -190,7 +216,7 @@ def test_conforming_mesh_follows_the_level_set(snapshot_of, mirror):
     mesh = build_mesh(ball(snapshot_of), selection, similarity(3.0, linear, (5.0, -7.0, 1.0))).mesh
     quality = check_mesh(mesh)
     radius = 5.3 * 0.5 * 3.0
-    assert quality.area_m2 == pytest.approx(4 * np.pi * radius**2, rel=0.02)
+    assert quality.area_m2 == pytest.approx(4 * np.pi * radius**2, rel=0.03)
     assert quality.volume_m3 == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.03)
     assert quality.min_dihedral_deg > 10.7 and quality.max_dihedral_deg < 164.8
 
@@ -216,7 +242,7 @@ def test_boundary_is_tagged_with_normal_and_true_area(snapshot_of, mode):
     outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
     assert np.einsum("ij,ij->i", outwards, boundary.normal).min() > 0.9
     true_area = (facet_areas(mesh.points_m, mesh.facets) * boundary.area_factor).sum()
-    radius = np.cbrt(3 / (4 * np.pi) * check_mesh(mesh).volume_m3)
+    radius = 5.3 + np.log(2.0) / 3.0  # where density is one half, [voxels]; a voxel is 0.5 * 2 wide
     assert true_area == pytest.approx(4 * np.pi * radius**2, rel=0.03)
 
 

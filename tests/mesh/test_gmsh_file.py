@@ -60,3 +60,24 @@ def test_a_name_that_gmsh_would_cut_is_refused(tmp_path, tagged_mesh):
     with pytest.raises(MeshError, match=r"at most 127 bytes.*got 128 bytes"):
         write_msh(tmp_path / "house.msh", dataclasses.replace(tagged_mesh, region_names=names))
     assert not list(tmp_path.iterdir())
+
+
+def test_triangles_carry_true_areas_and_normals(tmp_path, tagged_mesh):
+    """Tag of the element, number of its nodes, then the values at each of them."""
+    write_msh(tmp_path / "house.msh", tagged_mesh)
+    data, count = (tmp_path / "house.msh").read_bytes(), len(tagged_mesh.facets)
+    views = {"area_factor": tagged_mesh.boundary.area_factor[:, None], "normal": tagged_mesh.boundary.normal}
+    for name, values in views.items():
+        width = values.shape[1]
+        head = f'$ElementNodeData\n1\n"{name}"\n1\n0.0\n3\n0\n{width}\n{count}\n'.encode()
+        row = np.dtype([("tag", "<i4"), ("nodes", "<i4"), ("value", "<f8", (3, width))])
+        table = np.frombuffer(data, row, count, data.index(head) + len(head))
+        assert np.array_equal(table["tag"], len(tagged_mesh.tets) + 1 + np.arange(count))
+        assert np.all(table["nodes"] == 3)
+        assert np.array_equal(table["value"], np.repeat(values[:, None], 3, axis=1))
+
+
+def test_a_mesh_that_follows_the_surface_has_no_factors(tmp_path, tagged_mesh):
+    plain = dataclasses.replace(tagged_mesh.boundary, area_factor=np.ones(len(tagged_mesh.facets)))
+    write_msh(tmp_path / "house.msh", dataclasses.replace(tagged_mesh, boundary=plain))
+    assert b"ElementNodeData" not in (tmp_path / "house.msh").read_bytes()

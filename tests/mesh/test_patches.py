@@ -9,7 +9,14 @@ import pytest
 
 from thermoxels_ns.errors import MeshError
 from thermoxels_ns.mesh.patch_rules import DEFAULT_PATCHES, PatchRules, Rule, load_patch_rules
-from thermoxels_ns.mesh.patches import apply_patches, apply_regions, default_patches, facing
+from thermoxels_ns.mesh.patches import (
+    apply_patches,
+    apply_regions,
+    default_patches,
+    facing,
+    idle_patch_rules,
+    idle_region_rules,
+)
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "configs" / "patches-example.yaml"
 UP = (0.0, 0.0, 1.0)
@@ -319,3 +326,30 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 def test_colours_are_whole_numbers_or_shares(tmp_path: Path, rgb: str, colour: tuple) -> None:
     (rule,) = rules_of(tmp_path, f"patches: [{{name: a, nearest_colour: {{rgb: {rgb}}}}}]").patches
     assert rule.colour == pytest.approx(colour)
+
+
+def test_rules_that_nothing_follows_are_named() -> None:
+    far = ((50.0, 50.0, 50.0), (51.0, 51.0, 51.0))
+    everywhere = ((-9.0, -9.0, -9.0), (99.0, 99.0, 99.0))
+    rules = PatchRules(
+        patches=(
+            Rule("wall", box=everywhere),
+            Rule("typo", box=far),
+            Rule("wall", box=far),
+            Rule("roof", facing="up"),
+            Rule("window", box=everywhere),
+        ),
+        regions=(Rule("brick", box=everywhere), Rule("pipe", box=far)),
+    )
+    facets = {
+        "centroids_m": np.zeros((3, 3)),
+        "normals": np.eye(3),
+        "up": UP,
+        "seen": np.ones(3, dtype=bool),
+        "on_box": np.zeros(3, dtype=bool),
+    }
+    idle = idle_patch_rules(rules, **facets)
+    assert idle == ("patch wall (entry 1)", "patch typo (entry 2)", "patch wall (entry 3)", "patch roof (entry 4)")
+    assert idle_patch_rules(PatchRules(rules.patches[:4]), **facets) == ("patch typo (entry 2)", "patch wall (entry 3)")
+    assert idle_region_rules(rules, np.zeros((2, 3))) == ("region pipe (entry 2)",)
+    assert idle_region_rules(PatchRules(), np.zeros((2, 3))) == ()

@@ -7,7 +7,7 @@ import pytest
 
 from thermoxels_ns.errors import MeshError
 from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.mesh.facet_normals import facet_normals_from_level
+from thermoxels_ns.mesh.facet_normals import true_surface
 from thermoxels_ns.mesh.quality import facet_normals
 from thermoxels_ns.mesh.visibility import _EmptySpace, seen_facets
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets, voxel_facets
@@ -59,7 +59,7 @@ def test_a_sphere_is_seen_up_to_its_horizon() -> None:
     cells, camera = distance < 0.0, MIDDLE + np.array([12.0, 3.0, -2.0])
     points = kuhn_tets(cells)[0]
     facets = voxel_facets(cells)
-    normals = facet_normals_from_level(np.clip(-distance, -1, 1), points, facets)
+    normals, _ = true_surface(np.clip(-distance, -1, 1), points, facets)
     centroids = LATTICE.index_to_world(points[facets].mean(axis=1))
     seen = seen_facets(cells, views(camera), LATTICE, centroids, normals)
 
@@ -269,3 +269,13 @@ def test_what_does_not_fit_is_refused() -> None:
     centroids[3, 1] = np.nan
     with pytest.raises(MeshError, match="centroids_world: expected finite numbers only, got 1 of"):
         seen_facets(cells, camera, LATTICE, centroids, normals)
+
+
+def test_a_cavity_is_closed_unless_a_camera_is_in_it() -> None:
+    space = _EmptySpace(room())
+    middle, outside = np.full((1, 3), 16.0), np.full((1, 3), 2.0)
+    far, within = np.full((1, 3), 90.0), np.array([[10.3, 12.1, 14.2]])
+    assert space.enclosed_at(middle, far).all()
+    assert not space.enclosed_at(middle, within).any()
+    assert not space.enclosed_at(outside, far).any()
+    assert not _EmptySpace(room() & ~block((25, 28), (16, 17), (16, 17))).enclosed_at(middle, far).any()

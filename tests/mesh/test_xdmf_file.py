@@ -63,7 +63,7 @@ def test_the_data_file_holds_no_times_of_day(tmp_path, box_mesh):
     write_xdmf(tmp_path / "box.xdmf", box_mesh)
     with h5py.File(heavy_data_path(tmp_path / "box.xdmf")) as file:
         times = {name: h5py.h5g.get_objinfo(file.id, name.encode()).mtime for name in file}
-    assert len(times) == 8
+    assert len(times) == 10
     assert not any(times.values()), times
 
 
@@ -82,3 +82,10 @@ def test_an_index_never_points_at_data_of_another_mesh(tmp_path, box_mesh, tagge
     with pytest.raises(OutputError, match="no space"):
         write_xdmf(path, tagged_mesh)
     assert [file.name for file in tmp_path.iterdir()] == ["mesh.h5"]
+
+
+def test_the_boundary_carries_true_areas_and_normals(tmp_path, tagged_mesh):
+    write_xdmf(tmp_path / "house.xdmf", tagged_mesh)
+    boundary = read_grids(tmp_path / "house.xdmf")[FACET_GRID]
+    assert np.array_equal(boundary.cell_data["area_factor"], tagged_mesh.boundary.area_factor)
+    assert np.array_equal(boundary.cell_data["normal"], tagged_mesh.boundary.normal)

@@ -16,6 +16,7 @@ from thermoxels_ns.checks import check_positive, replace_when_done, writable_fol
 from thermoxels_ns.errors import HeatError, MeshError, explain
 from thermoxels_ns.mesh.facet_owners import facet_owners
 from thermoxels_ns.mesh.file_content import FileContent, check_suffix, file_content
+from thermoxels_ns.mesh.quality import facet_area_vectors
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.units import ZERO_CELSIUS_K
 
@@ -75,6 +76,9 @@ def write_inp(
       transfer and CalculiX takes for C3D4.
     - ``REGION-<name>``: elements of a region; ``MATERIAL-<name>``: its material, the same for all regions.
     - ``PATCH-<name>``: nodes of a boundary patch, and under the same name its element faces as a surface.
+      Before it, a comment says how large the true surface is and how large its triangles are together. In voxel
+      meshes the latter is larger: multiply the film coefficient and the emissivity of a load on the surface (``*FILM``,
+      ``*RADIATE``, a flux of ``*DFLUX``) by the ratio.
     - ``OBSERVED``: the nodes whose temperature was measured, if there are any.
     - Initial temperatures, and a heat transfer step without boundary conditions that prints temperatures (``NT``).
 
@@ -166,7 +170,11 @@ def _nodes_and_elements(content: FileContent, observed: npt.NDArray[np.bool_], r
 def _surfaces(
     content: FileContent, patches: Sequence[str], owner: npt.NDArray[np.int64], face: npt.NDArray[np.int64]
 ) -> Iterator[str]:
+    areas = np.linalg.norm(facet_area_vectors(content.points_m, content.facets), axis=1)
     for name, members in _parts(content.patch, patches):
+        mesh_m2, true_m2 = float(areas[members].sum()), float(areas[members] @ content.area_factor[members])
+        yield f"** PATCH-{name}: true area {true_m2:.9g} m2, area of its triangles {mesh_m2:.9g} m2\n"
+        yield f"** Multiply film coefficients, emissivities and fluxes on PATCH-{name} by {true_m2 / mesh_m2:.9g}\n"
         yield f"*NSET, NSET=PATCH-{name}\n"
         yield from _number_lines(np.unique(content.facets[members]) + 1)
         yield f"*SURFACE, NAME=PATCH-{name}, TYPE=ELEMENT\n"

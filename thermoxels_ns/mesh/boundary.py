@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.mesh.facet_normals import area_factors, facet_normals_from_level
+from thermoxels_ns.mesh.facet_normals import true_surface
 from thermoxels_ns.mesh.patch_rules import PatchRules
 from thermoxels_ns.mesh.patches import apply_patches
 from thermoxels_ns.mesh.quality import facet_normals
@@ -54,9 +54,8 @@ def tag_boundary(
     linear = world_to_metres[:3, :3] / np.cbrt(abs(np.linalg.det(world_to_metres[:3, :3])))
     on_box = mesh.facet_tags == FACET_BOX
     if mode == "voxel":
-        in_world = facet_normals_from_level(solid.level, points_index, mesh.facets)
+        in_world, factor = true_surface(solid.level, points_index, mesh.facets)
         normal = in_world @ linear.T
-        factor = area_factors(mesh.points_m, mesh.facets, normal)
     else:
         normal = facet_normals(mesh.points_m, mesh.facets)
         in_world = normal @ linear

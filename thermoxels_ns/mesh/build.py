@@ -15,7 +15,7 @@ from thermoxels_ns.mesh.boundary import BoundaryMode, tag_boundary
 from thermoxels_ns.mesh.components import node_parts, renumbered
 from thermoxels_ns.mesh.node_values import interpolate_corners
 from thermoxels_ns.mesh.patch_rules import PatchRules
-from thermoxels_ns.mesh.patches import apply_regions
+from thermoxels_ns.mesh.patches import apply_regions, idle_patch_rules, idle_region_rules
 from thermoxels_ns.mesh.sharp_edges import sharpen
 from thermoxels_ns.mesh.solid import SolidCells, SolidSelection, select_solid
 from thermoxels_ns.mesh.stuffing import stuff
@@ -82,6 +82,8 @@ class BuiltMesh:
     """Voxels of these parts; they count in `solid.component_sizes`, but are not in `solid.cells`."""
     observed_range_c: tuple[float, float]
     """Lowest and highest temperature of the measured corners, [degrees Celsius]; no node lies outside."""
+    idle_rules: tuple[str, ...] = ()
+    """The user's rules for patches and regions that nothing in the mesh follows, such as "patch roof (entry 2)"."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,7 @@ def build_mesh(
     transform = check_similarity("world_to_metres", world_to_metres)
     least = max(options.min_observed_weight, float(np.finfo(np.float32).tiny))
     scale = float(np.cbrt(abs(np.linalg.det(transform[:3, :3]))))
-    solid = select_solid(snapshot, selection, scale)
+    solid = select_solid(snapshot, selection, scale, makes_up_volume=options.boundary == "conforming")
     solid, num_parts, num_voxels = _without_unobserved_parts(solid, snapshot.observed_weight >= least)
 
     if options.boundary == "voxel":
@@ -132,8 +134,11 @@ def build_mesh(
     else:
         shape = _stuffed_shape(solid.level, options.coarsest_cell)
         temperature_c, weight = _measured(snapshot, shape.points, least)
-        shape, stays = _with_a_measurement(shape, weight >= least)
-        temperature_c, weight = temperature_c[stays], weight[stays]
+        stays, dropped = _with_a_measurement(shape, weight >= least)
+        if dropped:
+            solid, dropped_voxels = _without_voxels_of(solid, shape.points[~stays])
+            num_parts, num_voxels = num_parts + dropped, num_voxels + dropped_voxels
+            shape, temperature_c, weight = _kept(shape, stays), temperature_c[stays], weight[stays]
         edges, conductance = tet_conductances(shape.points, shape.tets)
     observed = weight >= least
     temperature_c = extend_harmonically(edges, temperature_c, observed, edge_weights=conductance)
@@ -143,9 +148,9 @@ def build_mesh(
         tets, facets = tets[:, [0, 2, 1, 3]], facets[:, ::-1]
     points_m = apply_transform(transform, snapshot.lattice.index_to_world(shape.points))
     colour = _colour(snapshot, shape.points)
-    region, region_names = apply_regions(
-        options.rules, points_m[tets].mean(axis=1), None if colour is None else colour[tets].mean(axis=1)
-    )
+    of_tets = points_m[tets].mean(axis=1), None if colour is None else colour[tets].mean(axis=1)
+    region, region_names = apply_regions(options.rules, *of_tets)
+    idle = idle_region_rules(options.rules, *of_tets) if options.rules.regions else ()
     mesh = TetMesh(
         points_m=points_m,
         tets=np.ascontiguousarray(tets),
@@ -168,9 +173,20 @@ def build_mesh(
         options.up,
         options.rules,
     )
+    if options.rules.patches:
+        of_facets = idle_patch_rules(
+            options.rules,
+            centroids_m=points_m[mesh.facets].mean(axis=1),
+            normals=boundary.normal,
+            up=options.up,
+            seen=boundary.seen,
+            on_box=mesh.facet_tags == FACET_BOX,
+            colours=None if colour is None else colour[mesh.facets].mean(axis=1),
+        )
+        idle = (*of_facets, *idle)
     measured_c = snapshot.temperature_c[snapshot.observed_weight >= least]
     observed_range_c = float(measured_c.min()), float(measured_c.max())
-    return BuiltMesh(replace(mesh, boundary=boundary), solid, num_parts, num_voxels, observed_range_c)
+    return BuiltMesh(replace(mesh, boundary=boundary), solid, num_parts, num_voxels, observed_range_c, idle)
 
 
 def _voxel_shape(cells: npt.NDArray[np.bool_]) -> _Shape:
@@ -205,25 +221,49 @@ def _colour(snapshot: GridSnapshot, points: npt.NDArray[np.float64]) -> npt.NDAr
     return np.where(weight[:, None] > 0.0, colour, 0.5).astype(np.float32)
 
 
-def _with_a_measurement(shape: _Shape, observed: npt.NDArray[np.bool_]) -> tuple[_Shape, npt.NDArray[np.bool_]]:
-    """Leave out parts of a mesh without an observed node, unless that is all of them; also: which nodes stay.
+def _with_a_measurement(shape: _Shape, observed: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.bool_], int]:
+    """Nodes of the parts of a mesh that have an observed node, or all if none has, and how many parts are left out.
 
     Voxels that touch by a corner only are one part as voxels, but may be two once their surface is smooth.
     """
     part = node_parts(shape.tets, len(shape.points))
     seen = np.bincount(part[observed], minlength=int(part.max()) + 1) > 0
-    stays = seen[part]
-    if stays.all() or not seen.any():
-        return shape, np.ones(len(stays), dtype=bool)
+    if not seen.any():
+        seen[:] = True
+    return seen[part], int(np.count_nonzero(~seen))
+
+
+def _kept(shape: _Shape, stays: npt.NDArray[np.bool_]) -> _Shape:
+    """The parts of a mesh whose nodes stay."""
     number = renumbered(stays)
     facet_stays = stays[shape.facets[:, 0]]
-    kept = _Shape(
+    return _Shape(
         shape.points[stays],
         number[shape.tets[stays[shape.tets[:, 0]]]],
         number[shape.facets[facet_stays]],
         shape.facet_tags[facet_stays],
     )
-    return kept, stays
+
+
+def _without_voxels_of(solid: SolidCells, points: npt.NDArray[np.float64]) -> tuple[SolidCells, int]:
+    """Leave out the voxels that parts of a mesh with these nodes were made from; also their number.
+
+    Centres of solid voxels near the surface are nodes, and voxels that share a face are in one part.
+    """
+    part = np.zeros(solid.cells.shape, dtype=np.int32)
+    count = int(ndimage.label(solid.cells, output=part))  # type: ignore[arg-type]
+    voxel = np.floor(points).astype(np.int64)
+    centres = voxel[np.all(points == voxel + 0.5, axis=1)]
+    goes = np.zeros(count + 1, dtype=bool)
+    goes[part[tuple(centres.T)]] = True
+    goes[0] = False
+    return _without(solid, goes[part])
+
+
+def _without(solid: SolidCells, goes: npt.NDArray[np.bool_]) -> tuple[SolidCells, int]:
+    """Leave out some solid voxels; also their number."""
+    level = np.where(goes, -np.abs(solid.level), solid.level)
+    return replace(solid, cells=solid.cells & ~goes, level=level), int(np.count_nonzero(goes))
 
 
 def _without_unobserved_parts(
@@ -240,9 +280,8 @@ def _without_unobserved_parts(
     seen = np.bincount(part[solid.cells & touched], minlength=count + 1) > 0
     if seen[1:].all() or not seen.any():
         return solid, 0, 0
-    goes = solid.cells & ~seen[part]
-    kept = replace(solid, cells=solid.cells & ~goes, level=np.where(goes, -np.abs(solid.level), solid.level))
-    return kept, int(np.count_nonzero(~seen[1:])), int(np.count_nonzero(goes))
+    kept, num_voxels = _without(solid, solid.cells & ~seen[part])
+    return kept, int(np.count_nonzero(~seen[1:])), num_voxels
 
 
 def check_similarity(name: str, matrix: npt.ArrayLike) -> npt.NDArray[np.float64]:

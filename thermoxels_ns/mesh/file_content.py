@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.checks import check_finite, check_shape
 from thermoxels_ns.errors import MeshError, OutputError, explain
+from thermoxels_ns.mesh.quality import facet_area_vectors
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 UNTAGGED_PATCH = "boundary"
@@ -39,6 +40,10 @@ class FileContent:
     """Index into `patch_names`, shape (f,)."""
     patch_names: tuple[str, ...]
     """Names of the patches, all different; some may have no triangle."""
+    normal: npt.NDArray[np.float64]
+    """Outward unit normal of the true surface at each boundary triangle, shape (f, 3)."""
+    area_factor: npt.NDArray[np.float64]
+    """True area that each boundary triangle stands for, over its own, shape (f,)."""
 
 
 def file_content(mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None = None) -> FileContent:
@@ -75,7 +80,17 @@ def file_content(mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None =
     _check_indices("region", region, len(mesh.region_names))
     if mesh.boundary is None:
         patch, patch_names = np.zeros(len(facets), dtype=np.int64), (UNTAGGED_PATCH,)
+        vectors = facet_area_vectors(points, facets)
+        length = np.linalg.norm(vectors, axis=1, keepdims=True)
+        normal, factor = vectors / np.where(length > 0.0, length, 1.0), np.ones(len(facets))
     else:
+        remedy = "Give every boundary triangle a finite value."
+        normal = np.asarray(mesh.boundary.normal, dtype=np.float64)
+        factor = np.asarray(mesh.boundary.area_factor, dtype=np.float64)
+        check_shape("boundary.normal", normal, (len(facets), 3), remedy, MeshError)
+        check_shape("boundary.area_factor", factor, (len(facets),), remedy, MeshError)
+        check_finite("boundary.normal", normal, remedy, MeshError)
+        check_finite("boundary.area_factor", factor, remedy, MeshError)
         patch, patch_names = np.asarray(mesh.boundary.patch), mesh.boundary.patch_names
         check_shape("boundary.patch", patch, (len(facets),), _REMEDY, MeshError)
         _check_names("boundary.patch_names", patch_names)
@@ -89,6 +104,8 @@ def file_content(mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None =
         facets=facets,
         patch=patch,
         patch_names=tuple(patch_names),
+        normal=normal,
+        area_factor=factor,
     )
 
 

@@ -17,6 +17,11 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 TEMPERATURE_VIEW = "temperature_c"
 """Name of the view of nodal temperatures, [degrees Celsius]."""
 
+FACTOR_VIEW = "area_factor"
+"""Name of the view of true area over the triangle's own, for voxel meshes."""
+NORMAL_VIEW = "normal"
+"""Name of the view of the true surface's outward normals, for voxel meshes."""
+
 _LONGEST_NAME = 127
 _TRIANGLE, _TETRAHEDRON = 2, 4
 _SIZE, _INT, _DOUBLE = np.dtype("<u8"), np.dtype("<i4"), np.dtype("<f8")
@@ -26,9 +31,11 @@ def write_msh(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
     """Write a mesh as a Gmsh file, MSH 4.1, binary, with one physical group per region and per patch.
 
     Regions are physical volumes and patches are physical surfaces, both numbered from 1 in the order of their names;
-    one that is empty is left out. Nodal temperatures are a view, "temperature_c". Tetrahedron k of the mesh has the
-    tag k + 1, and the boundary triangles follow. Nodes are numbered anew: Gmsh wants them sorted by the patch or
-    region they lie on, and meshio takes a node's place in the file for its number.
+    one that is empty is left out. Nodal temperatures are a view, "temperature_c". A mesh whose triangles stand for
+    another area than their own, as in voxel meshes, has two more: "area_factor" and "normal" of the true surface at
+    each triangle, the same at its three nodes; multiply a flux through a triangle by the first. meshio passes them by.
+    Tetrahedron k of the mesh has the tag k + 1, and the boundary triangles follow. Nodes are numbered anew: Gmsh wants
+    them sorted by the patch or region they lie on, and meshio takes a node's place in the file for its number.
 
     Layout: "MSH file format", Gmsh reference manual, version 4.1 of the format.
 
@@ -72,6 +79,9 @@ def write_msh(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
             file.writelines(parts)
             file.write(f"\n$End{section}\n".encode())
         file.writelines(_node_data(content.temperature_c[order]))
+        if np.any(content.area_factor != 1.0):
+            for name, values in ((FACTOR_VIEW, content.area_factor[:, None]), (NORMAL_VIEW, content.normal)):
+                file.writelines(_triangle_view(name, len(content.tets) + 1, values))
 
 
 def _ints(*values: int) -> bytes:
@@ -159,12 +169,32 @@ def _elements(content: FileContent, tag: npt.NDArray[np.int64]) -> Iterator[byte
             yield table.tobytes()
 
 
+def _header(section: str, name: str, components: int, count: int) -> bytes:
+    """Start of a view: name, time 0, then step 0, number of components, number of nodes or elements."""
+    return f'${section}\n1\n"{name}"\n1\n0.0\n3\n0\n{components}\n{count}\n'.encode()
+
+
 def _node_data(temperature_c: npt.NDArray[np.float64]) -> Iterator[bytes]:
-    """One view of temperatures in the order of the tags: name, time 0, then step 0, one component, number of nodes."""
+    """One view of temperatures in the order of the tags."""
     count = len(temperature_c)
-    yield f'$NodeData\n1\n"{TEMPERATURE_VIEW}"\n1\n0.0\n3\n0\n1\n{count}\n'.encode()
+    yield _header("NodeData", TEMPERATURE_VIEW, 1, count)
     table = np.empty(count, dtype=[("tag", _INT), ("value", _DOUBLE)])
     table["tag"] = np.arange(1, count + 1)
     table["value"] = temperature_c
     yield table.tobytes()
     yield b"\n$EndNodeData\n"
+
+
+def _triangle_view(name: str, first_tag: int, values: npt.NDArray[np.float64]) -> Iterator[bytes]:
+    """One view of values per triangle, as values at its three nodes.
+
+    ElementData would be shorter, but meshio then wants a value for every element, in the order of the file.
+    """
+    count, components = values.shape
+    yield _header("ElementNodeData", name, components, count)
+    table = np.empty(count, dtype=[("tag", _INT), ("nodes", _INT), ("value", _DOUBLE, (3, components))])
+    table["tag"] = np.arange(first_tag, first_tag + count)
+    table["nodes"] = 3
+    table["value"] = values[:, None, :]
+    yield table.tobytes()
+    yield b"\n$EndElementNodeData\n"

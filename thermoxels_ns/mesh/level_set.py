@@ -8,6 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from thermoxels_ns.mesh.surface_ramp import surface_ramp
+from thermoxels_ns.mesh.volume_keeping import keep_volume
+
 BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float32]
 
@@ -17,6 +20,8 @@ DEEP_RATIOS = (2.0, 100.0)
 """... but that density is kept within these multiples of the threshold."""
 LEAST_LEVEL = 0.02
 """No voxel is nearer to 0 than this before smoothing: a surface never passes through a voxel's centre."""
+LEAST_SMOOTH_LEVEL = 0.005
+"""The same where density is a smooth ramp."""
 LEAST_SHARE = 0.25
 """Smoothing leaves at least this share of a voxel's level, with its sign."""
 MARGIN = 4
@@ -25,15 +30,25 @@ LEAST_SHARE_THIN = 0.5
 """The same in walls and gaps one voxel thick; they keep their thickness."""
 
 
-def level_of(density: npt.NDArray[np.floating], threshold: float, dense: BoolArray, cells: BoolArray) -> FloatArray:
+def level_of(
+    density: npt.NDArray[np.floating],
+    threshold: float,
+    dense: BoolArray,
+    cells: BoolArray,
+    *,
+    makes_up_volume: bool = True,
+) -> FloatArray:
     """Give every voxel a level: above 0 in solid voxels, below 0 in empty ones, 0 on the surface between them.
 
-    Before smoothing it is s = log(density / threshold) / log(deep / threshold), at most 1, where it is above 0, and
-    exp(s) - 1 below; deep is the density of the densest part of the body. So it is 0 at the threshold and -1 where
-    there is no density, and where density grows exponentially from voxel to voxel its trilinear zero is where density
-    is the threshold. Trained density jumps by orders of magnitude between neighbours, mostly from exactly 0; the
-    logarithm keeps what it says about the place of the surface, and the weights 1 2 1 along each axis,
-    over three voxels, take the noise out.
+    Where density falls smoothly across the surface (`surface_ramp`), the level is a function of density that is linear
+    in the distance there; area and volume of a body are then of second order in the voxel size.
+
+    Trained density jumps by orders of magnitude between neighbours, mostly from exactly 0. There the level is
+    s = log(density / threshold) / log(deep / threshold), at most 1, where that is above 0, and exp(s) - 1 below; deep
+    is the density of the densest part of the body. So it is 0 at the threshold and -1 where there is no density: the
+    logarithm keeps what density says about the place of the surface. The weights 1 2 1 along each axis, over three
+    voxels, take the noise out, and the level shifts where thin or small bodies would lose volume by that
+    (`keep_volume`).
 
     Args:
         density: At voxel centres, at least 0, [1 / world unit].
@@ -41,6 +56,8 @@ def level_of(density: npt.NDArray[np.floating], threshold: float, dense: BoolArr
         dense: Voxels that the threshold chose.
         cells: Solid voxels. Those that are not dense were made solid on purpose and lie deep inside; dense ones that
             are not solid were removed on purpose and lie far outside.
+        makes_up_volume: Whether the level shifts in thin and small bodies so that its trilinear zero holds their
+            volume. Not for voxels, which hold it as they are.
 
     Returns:
         The level, shape of `cells`, in [-1, 1], never 0; -1 far outside.
@@ -48,7 +65,7 @@ def level_of(density: npt.NDArray[np.floating], threshold: float, dense: BoolArr
     level = np.full(cells.shape, -1.0, dtype=np.float32)
     near = _around(cells)
     level[near] = _level_nearby(
-        density[near], threshold, _deep_ratio(density[dense], threshold), dense[near], cells[near]
+        density[near], threshold, _deep_ratio(density[dense], threshold), dense[near], cells[near], makes_up_volume
     )
     return level
 
@@ -64,9 +81,33 @@ def _around(cells: BoolArray) -> tuple[slice, ...]:
 
 
 def _level_nearby(
-    density: npt.NDArray[np.floating], threshold: float, deep_ratio: float, dense: BoolArray, cells: BoolArray
+    density: npt.NDArray[np.floating],
+    threshold: float,
+    deep_ratio: float,
+    dense: BoolArray,
+    cells: BoolArray,
+    makes_up_volume: bool,
 ) -> FloatArray:
     """The level in a part of the lattice; `deep_ratio` is that of the whole."""
+    ramp = surface_ramp(density, threshold, deep_ratio, dense, cells) if threshold > 0.0 else None
+    if ramp is None:
+        return _smoothed(density, threshold, deep_ratio, dense, cells, makes_up_volume)
+    level = ramp.level
+    if ramp.belief.min() < 1.0:
+        smoothed = _smoothed(density, threshold, deep_ratio, dense, cells, makes_up_volume)
+        level = smoothed + ramp.belief * (level - smoothed)
+    return _signed(level, np.float32(LEAST_SMOOTH_LEVEL), cells)
+
+
+def _smoothed(
+    density: npt.NDArray[np.floating],
+    threshold: float,
+    deep_ratio: float,
+    dense: BoolArray,
+    cells: BoolArray,
+    makes_up_volume: bool,
+) -> FloatArray:
+    """The level where density jumps."""
     level = np.full(cells.shape, -1.0, dtype=np.float32)
     positive = density > 0.0
     # A threshold of 0 asks for any density at all; what has some is then deep inside.
@@ -83,7 +124,8 @@ def _level_nearby(
         ndimage.convolve1d(smooth, [0.25, 0.5, 0.25], axis=axis, mode="nearest", output=smooth)
     least = np.abs(level)
     least *= np.where(_thin(cells) | _thin(~cells), np.float32(LEAST_SHARE_THIN), np.float32(LEAST_SHARE))
-    return np.clip(_signed(smooth, least, cells), np.float32(-1.0), np.float32(1.0))
+    smooth = np.clip(_signed(smooth, least, cells), np.float32(-1.0), np.float32(1.0))
+    return keep_volume(smooth, level, least, cells) if makes_up_volume else smooth
 
 
 def _deep_ratio(dense: npt.NDArray[np.floating], threshold: float) -> float:

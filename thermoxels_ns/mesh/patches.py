@@ -101,18 +101,56 @@ def apply_patches(
         MeshError: A rule asks for colours and there are none, `up` is no direction, or shapes do not fit.
     """
     patch, names = default_patches(normals, up, seen, on_box)
+    owner = _patch_rule_of_each(rules, centroids_m, normals, up, seen, on_box, colours)
+    return _renamed(rules.patches, owner, patch, names)
+
+
+def idle_patch_rules(
+    rules: PatchRules,
+    *,
+    centroids_m: npt.NDArray[np.float64],
+    normals: npt.NDArray[np.float64],
+    up: npt.ArrayLike,
+    seen: npt.NDArray[np.bool_],
+    on_box: npt.NDArray[np.bool_],
+    colours: npt.NDArray | None = None,
+) -> tuple[str, ...]:
+    """Rules for patches that no triangle follows: none meets their conditions, or later rules take all that do.
+
+    Args:
+        rules: The user's rules; the other arguments are those of `apply_patches`.
+
+    Returns:
+        What to call each of these rules, in their order, such as "patch roof (entry 2)".
+
+    Raises:
+        MeshError: As `apply_patches`.
+    """
+    owner = _patch_rule_of_each(rules, centroids_m, normals, up, seen, on_box, colours)
+    return _idle(rules.patches, "patch", owner)
+
+
+def _patch_rule_of_each(
+    rules: PatchRules,
+    centroids_m: npt.NDArray[np.float64],
+    normals: npt.NDArray[np.float64],
+    up: npt.ArrayLike,
+    seen: npt.NDArray[np.bool_],
+    on_box: npt.NDArray[np.bool_],
+    colours: npt.NDArray | None,
+) -> npt.NDArray[np.int64]:
     direction = facing(normals, up)
     parts = {
         "exterior": ~on_box & seen,
         "interior": ~on_box & ~seen,
         "cut": on_box,
-        "all": np.ones(len(patch), dtype=bool),
+        "all": np.ones(len(direction), dtype=bool),
     }
     allowed = [
         parts[rule.only] & (True if rule.facing == "any" else direction == FACINGS.index(rule.facing))
         for rule in rules.patches
     ]
-    return _apply(rules.patches, "patch", allowed, patch, names, centroids_m, colours)
+    return _rule_of_each(rules.patches, "patch", allowed, len(direction), centroids_m, colours)
 
 
 def apply_regions(
@@ -131,23 +169,55 @@ def apply_regions(
     Raises:
         MeshError: A rule asks for colours and there are none, or shapes do not fit.
     """
-    start = np.zeros(len(tet_centroids), dtype=np.int64)
-    allowed = [np.ones(len(start), dtype=bool)] * len(rules.regions)
-    return _apply(rules.regions, "region", allowed, start, (DEFAULT_REGION,), tet_centroids, tet_colours)
+    owner = _region_rule_of_each(rules, tet_centroids, tet_colours)
+    return _renamed(rules.regions, owner, np.zeros(len(tet_centroids), dtype=np.int64), (DEFAULT_REGION,))
 
 
-def _apply(
+def idle_region_rules(
+    rules: PatchRules, tet_centroids: npt.NDArray[np.float64], tet_colours: npt.NDArray | None = None
+) -> tuple[str, ...]:
+    """Rules for regions that no tetrahedron follows, as `idle_patch_rules` names them."""
+    return _idle(rules.regions, "region", _region_rule_of_each(rules, tet_centroids, tet_colours))
+
+
+def _region_rule_of_each(
+    rules: PatchRules, tet_centroids: npt.NDArray[np.float64], tet_colours: npt.NDArray | None
+) -> npt.NDArray[np.int64]:
+    allowed = [np.ones(len(tet_centroids), dtype=bool)] * len(rules.regions)
+    return _rule_of_each(rules.regions, "region", allowed, len(tet_centroids), tet_centroids, tet_colours)
+
+
+def _idle(rules: Sequence[Rule], kind: str, owner: npt.NDArray[np.int64]) -> tuple[str, ...]:
+    followed = np.bincount(owner[owner >= 0], minlength=len(rules)) > 0
+    return tuple(f"{kind} {rule.name} (entry {n})" for n, rule in enumerate(rules, start=1) if not followed[n - 1])
+
+
+def _renamed(
+    rules: Sequence[Rule], owner: npt.NDArray[np.int64], start: npt.NDArray[np.int64], names: tuple[str, ...]
+) -> tuple[npt.NDArray[np.int64], tuple[str, ...]]:
+    """Overwrite `start` where a rule owns the element, and append the rules' names."""
+    all_names = tuple(dict.fromkeys((*names, *(rule.name for rule in rules))))
+    number = np.array([all_names.index(rule.name) for rule in rules], dtype=np.int64)
+    index = start.copy()
+    owned = owner >= 0
+    index[owned] = number[owner[owned]]
+    return index, all_names
+
+
+def _rule_of_each(
     rules: Sequence[Rule],
     kind: str,
     allowed: Sequence[npt.NDArray[np.bool_]],
-    start: npt.NDArray[np.int64],
-    names: tuple[str, ...],
+    count: int,
     centroids: npt.NDArray[np.float64],
     colours: npt.NDArray | None,
-) -> tuple[npt.NDArray[np.int64], tuple[str, ...]]:
-    """Overwrite `start` rule by rule; `allowed` says for each rule where `only` and `facing` hold."""
+) -> npt.NDArray[np.int64]:
+    """Number of the rule that each of `count` elements follows, -1 for none, shape (count,).
+
+    `allowed` says for each rule where `only` and `facing` hold.
+    """
     remedy = f"Pass one centroid and one colour per element that gets a {kind}."
-    check_shape("centroids", centroids, (len(start), 3), remedy, MeshError)
+    check_shape("centroids", centroids, (count, 3), remedy, MeshError)
     check_finite("centroids", centroids, remedy, MeshError)
     matches = [mask & _in_space(rule, centroids) for rule, mask in zip(rules, allowed)]
 
@@ -162,9 +232,9 @@ def _apply(
                     remedy="Use box or plane, or a model that was trained on colour photographs.",
                 )
             )
-        check_shape("colours", colours, (len(start), 3), remedy, MeshError)
-        closest = np.full(len(start), np.inf)
-        winner = np.full(len(start), -1)
+        check_shape("colours", colours, (count, 3), remedy, MeshError)
+        closest = np.full(count, np.inf)
+        winner = np.full(count, -1)
         for number in coloured:
             rule = rules[number]
             distance = np.linalg.norm(colours - rule.colour, axis=1)
@@ -173,12 +243,10 @@ def _apply(
         for number in coloured:
             matches[number] = winner == number
 
-    index = start.copy()
-    for rule, match in zip(rules, matches):
-        if rule.name not in names:
-            names = (*names, rule.name)
-        index[match] = names.index(rule.name)
-    return index, names
+    owner = np.full(count, -1, dtype=np.int64)
+    for number, match in enumerate(matches):
+        owner[match] = number
+    return owner
 
 
 def _in_space(rule: Rule, centroids: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:

@@ -165,7 +165,11 @@ class SolidCells:
 
 
 def select_solid(
-    snapshot: GridSnapshot, selection: SolidSelection, metres_per_world_unit: float | None = None
+    snapshot: GridSnapshot,
+    selection: SolidSelection,
+    metres_per_world_unit: float | None = None,
+    *,
+    makes_up_volume: bool = True,
 ) -> SolidCells:
     """Choose the solid voxels of a trained field.
 
@@ -176,6 +180,7 @@ def select_solid(
         snapshot: The trained field on its corner lattice.
         selection: Threshold and what to do with gaps, floaters and interiors.
         metres_per_world_unit: Length of one unit of the lattice's world, [m]; only a wall thickness needs it.
+        makes_up_volume: As in `level_of`.
 
     Returns:
         The solid voxels, the level whose zero is their surface, and what each step did.
@@ -220,7 +225,7 @@ def select_solid(
         cells = step("interior", *_filled(cells, snapshot, selection))
     return SolidCells(
         cells=cells,
-        level=level_of(density, chosen.density, chosen.cells, cells),
+        level=level_of(density, chosen.density, chosen.cells, cells, makes_up_volume=makes_up_volume),
         threshold=chosen.density,
         explanation=chosen.explanation,
         steps=tuple(steps),

@@ -1,9 +1,14 @@
-"""Which boundary triangles some training camera has a free line of sight to."""
+"""Which boundary triangles some training camera has a free line of sight to.
+
+Kernels are kept compiled by numba, which watches a kernel's own file: none may call one of another file.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
+from scipy import ndimage
 
 from thermoxels_ns.checks import check_finite, check_shape
 from thermoxels_ns.errors import MeshError
@@ -61,14 +66,18 @@ def seen_facets(
     start[inside] = (middle + START_ABOVE_SURFACE[1] * normal)[inside]
 
     centres = lattice.world_to_index(views.camera_to_world[:, :, 3])
-    seen = np.zeros(len(middle), dtype=bool)
-    hidden = np.flatnonzero(~space.solid_at(start))
-    for camera in _spread(centres):
-        towards = centres[camera] - middle[hidden]
-        facing = hidden[np.einsum("ij,ij->i", normal[hidden], towards) > 0.0]
-        inside = facing[_in_image(views, camera, middle[facing] - centres[camera])]
-        seen[inside[space.free_lines(start[inside], centres[camera])]] = True
-        hidden = hidden[~seen[hidden]]
+    order = _spread(centres)
+    seen = _seen_by_any(
+        space.block,
+        space.lowest,
+        middle,
+        normal,
+        start,
+        ~space.solid_at(start) & ~space.enclosed_at(start, centres),
+        np.ascontiguousarray(centres[order]),
+        np.ascontiguousarray(views.camera_to_world[order, :, :3], dtype=np.float64),
+        np.concatenate([views.focal, views.centre, views.size], axis=1, dtype=np.float64)[order],
+    )
     return seen[group]
 
 
@@ -106,17 +115,6 @@ def _spread(centres: npt.NDArray[np.float64]) -> list[int]:
     return order
 
 
-def _in_image(views: Views, camera: int, offsets: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-    """Whether points, given relative to a camera's centre in any unit, lie in its image, shape (points,)."""
-    x, y, z = (offsets @ views.camera_to_world[camera, :, :3]).T
-    front = z < 0.0
-    depth = np.where(front, -z, 1.0)
-    column = views.centre[camera, 0] + views.focal[camera, 0] * x / depth
-    row = views.centre[camera, 1] - views.focal[camera, 1] * y / depth
-    width, height = views.size[camera]
-    return front & (column >= 0.0) & (column <= width) & (row >= 0.0) & (row <= height)
-
-
 class _EmptySpace:
     """Solid voxels, arranged so that a line crosses empty space in large steps."""
 
@@ -148,54 +146,129 @@ class _EmptySpace:
         solid[inside] = self.cells[tuple(index[inside].T)]
         return solid
 
+    def enclosed_at(self, points: npt.NDArray[np.float64], cameras: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+        """Whether points lie in empty space that solid voxels cut off from the outside and from all cameras.
+
+        No line of sight leaves such a cavity, so it needs not be followed. Voxels that touch by a corner count as one
+        space, because a line may pass there.
+        """
+        label = np.zeros(self.cells.shape, dtype=np.int32)
+        ndimage.label(~self.cells, structure=np.ones((3, 3, 3), dtype=bool), output=label)  # type: ignore[arg-type]
+        borders = [np.take(label, (0, -1), axis).ravel() for axis in range(3)]
+        # Lines end at CLEAR_OF_CAMERA from a camera's centre, in one of the voxels around it.
+        reach = int(np.ceil(CLEAR_OF_CAMERA)) + 2
+        for camera in np.floor(cameras - self.lowest).astype(np.int64):
+            low, high = np.maximum(camera - reach, 0), np.minimum(camera + reach + 1, self.size)
+            if np.all(low < high):
+                borders.append(label[tuple(slice(a, b) for a, b in zip(low, high))].ravel())
+        is_open = np.zeros(int(label.max()) + 1, dtype=bool)
+        for border in borders:
+            is_open[border] = True
+        index = np.floor(points - self.lowest).astype(np.int64)
+        inside = np.all((index >= 0) & (index < self.size), axis=1)
+        enclosed = np.zeros(len(points), dtype=bool)
+        enclosed[inside] = ~is_open[label[tuple(index[inside].T)]]
+        return enclosed
+
     def free_lines(self, start: npt.NDArray[np.float64], end: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
         """Whether the lines from points to a camera's centre, all in corner indices, are free, shape (points,).
 
         The line is followed from block to block, through every voxel that it crosses by more than 0.0001 voxels.
         """
-        # One row per axis: numpy is much faster along rows than along columns of three.
-        origin = np.ascontiguousarray((start - self.lowest).T)
-        direction = (end - self.lowest)[:, None] - origin
-        distance = np.sqrt(_sum_of_rows(direction**2))
-        direction /= np.maximum(distance, _NUDGE)
-        # An axis along which the line does not move is never the one that it leaves a block by.
-        inverse = 1.0 / np.where(np.abs(direction) < 1e-12, 1e-12, direction)
-        ahead = (inverse > 0.0).astype(np.int64)
-        size = self.size[:, None]
-        travelled = np.maximum(_largest_of_rows(((1 - ahead) * size - origin) * inverse), 0.0) + _NUDGE
-        last = np.minimum(_smallest_of_rows((ahead * size - origin) * inverse), distance - CLEAR_OF_CAMERA)
-
-        free = np.ones(len(start), dtype=bool)
-        line = np.arange(len(start))
-        going = travelled < last
-        while going.any():
-            if not going.all():
-                keep = np.flatnonzero(going)
-                line, travelled, last = line[keep], travelled[keep], last[keep]
-                origin, direction, inverse, ahead = (a.take(keep, 1) for a in (origin, direction, inverse, ahead))
-            voxel = (origin + travelled * direction).astype(np.int64)
-            np.clip(voxel, 0, size - 1, out=voxel)
-            block = self.block.take((voxel[0] * self.size[1] + voxel[1]) * self.size[2] + voxel[2])
-            blocked = block < 0
-            free[line[blocked]] = False
-            power = np.maximum(block, 0).astype(np.int64)
-            leave = _smallest_of_rows(((((voxel >> power) + ahead) << power) - origin) * inverse)
-            # At least a nudge, so that rounding on a block's border does not hold the line up.
-            travelled = np.maximum(leave, travelled) + _NUDGE
-            going = (travelled < last) & ~blocked
-        return free
+        return _free_lines(self.block, np.ascontiguousarray(start - self.lowest), end - self.lowest)
 
 
-def _sum_of_rows(rows: npt.NDArray) -> npt.NDArray:
-    return rows[0] + rows[1] + rows[2]
+@njit(nogil=True, cache=True, error_model="numpy")
+def _is_free(block, origin, x1, y1, z1):
+    """Whether the line from a point to (x1, y1, z1) crosses no solid voxel; block is -1 in solid voxels."""
+    x0, y0, z0 = origin[0], origin[1], origin[2]
+    dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
+    distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+    scale = max(distance, _NUDGE)
+    dx, dy, dz = dx / scale, dy / scale, dz / scale
+    # An axis along which the line does not move is never the one that it leaves a block by.
+    ix = 1.0 / (dx if abs(dx) >= 1e-12 else 1e-12)
+    iy = 1.0 / (dy if abs(dy) >= 1e-12 else 1e-12)
+    iz = 1.0 / (dz if abs(dz) >= 1e-12 else 1e-12)
+    ax, ay, az = int(ix > 0.0), int(iy > 0.0), int(iz > 0.0)
+    nx, ny, nz = block.shape
+    enter = max(((1 - ax) * nx - x0) * ix, ((1 - ay) * ny - y0) * iy, ((1 - az) * nz - z0) * iz)
+    last = min((ax * nx - x0) * ix, (ay * ny - y0) * iy, (az * nz - z0) * iz, distance - CLEAR_OF_CAMERA)
+    travelled = max(enter, 0.0) + _NUDGE
+    while travelled < last:
+        i = min(max(int(x0 + travelled * dx), 0), nx - 1)
+        j = min(max(int(y0 + travelled * dy), 0), ny - 1)
+        k = min(max(int(z0 + travelled * dz), 0), nz - 1)
+        power = block[i, j, k]
+        if power < 0:
+            return False
+        leave = min(
+            ((((i >> power) + ax) << power) - x0) * ix,
+            ((((j >> power) + ay) << power) - y0) * iy,
+            ((((k >> power) + az) << power) - z0) * iz,
+        )
+        # At least a nudge, so that rounding on a block's border does not hold the line up.
+        travelled = max(leave, travelled) + _NUDGE
+    return True
 
 
-def _largest_of_rows(rows: npt.NDArray) -> npt.NDArray:
-    return np.maximum(np.maximum(rows[0], rows[1]), rows[2])
+@njit(nogil=True, cache=True, error_model="numpy")
+def _free_lines(block, start, end):
+    """`_is_free` for many points and one end."""
+    free = np.empty(len(start), np.bool_)
+    for p in range(len(start)):
+        free[p] = _is_free(block, start[p], end[0], end[1], end[2])
+    return free
 
 
-def _smallest_of_rows(rows: npt.NDArray) -> npt.NDArray:
-    return np.minimum(np.minimum(rows[0], rows[1]), rows[2])
+@njit(nogil=True, cache=True, error_model="numpy")
+def _seen_by_any(block, lowest, middle, normal, start, open_start, centres, rotations, lenses):
+    """Whether some camera that each point faces has it in its image, with a free line from the point's start.
+
+    Lenses are focal length, principal point and size, x and y each, shape (cameras, 6), [pixels].
+    """
+    seen = np.zeros(len(middle), np.bool_)
+    origin = np.empty(3)
+    likely = 0
+    for p in range(len(middle)):
+        if not open_start[p]:
+            continue
+        for axis in range(3):
+            origin[axis] = start[p, axis] - lowest[axis]
+        for turn in range(len(centres)):
+            # The camera that saw the point before often sees this one.
+            camera = likely if turn == 0 else turn - 1 if turn <= likely else turn
+            tx, ty, tz = (
+                centres[camera, 0] - middle[p, 0],
+                centres[camera, 1] - middle[p, 1],
+                centres[camera, 2] - middle[p, 2],
+            )
+            if normal[p, 0] * tx + normal[p, 1] * ty + normal[p, 2] * tz <= 0.0:
+                continue
+            depth = 0.0
+            right, up = 0.0, 0.0
+            for axis in range(3):
+                offset = middle[p, axis] - centres[camera, axis]
+                right += offset * rotations[camera, axis, 0]
+                up += offset * rotations[camera, axis, 1]
+                depth -= offset * rotations[camera, axis, 2]
+            if depth <= 0.0:
+                continue
+            column = lenses[camera, 2] + lenses[camera, 0] * right / depth
+            row = lenses[camera, 3] - lenses[camera, 1] * up / depth
+            if not (0.0 <= column <= lenses[camera, 4] and 0.0 <= row <= lenses[camera, 5]):
+                continue
+            if _is_free(
+                block,
+                origin,
+                centres[camera, 0] - lowest[0],
+                centres[camera, 1] - lowest[1],
+                centres[camera, 2] - lowest[2],
+            ):
+                seen[p] = True
+                likely = camera
+                break
+    return seen
 
 
 def _any_of_pairs(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:

@@ -50,12 +50,12 @@ def kuhn_tets(cells: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.int64], npt.
     >>> corners.shape, tets.shape
     ((8, 3), (6, 4))
     """
-    cells = _as_cells(cells)
+    cells, first = _cropped(_as_cells(cells))
     number = _node_numbers(cells)
     strides = np.array([number.shape[1] * number.shape[2], number.shape[2], 1], dtype=np.int64)
     corners = (np.argwhere(cells) @ strides)[:, None] + CORNER_OFFSETS @ strides
     tets = number.ravel()[corners][:, KUHN_PATTERN].reshape(-1, 4)
-    return np.argwhere(number >= 0).astype(np.int64), tets
+    return np.argwhere(number >= 0) + first, tets
 
 
 def lattice_edges(cells: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
@@ -70,7 +70,7 @@ def lattice_edges(cells: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.int64], 
         edges: Node pairs, shape (e, 2), each edge once.
         num_voxels: Solid voxels around each edge, 1 to 4, shape (e,).
     """
-    cells = _as_cells(cells)
+    cells, _ = _cropped(_as_cells(cells))
     number = _node_numbers(cells)
     flat_number = number.ravel()
     strides = (number.shape[1] * number.shape[2], number.shape[2], 1)
@@ -101,7 +101,7 @@ def voxel_facets(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
     >>> voxel_facets(np.ones((1, 1, 1), dtype=bool)).shape
     (12, 3)
     """
-    cells = _as_cells(cells)
+    cells, _ = _cropped(_as_cells(cells))
     number = _node_numbers(cells)
     facets = []
     for axis in range(3):
@@ -160,10 +160,13 @@ def boundary_tags(
     Returns:
         `FACET_BOX` where all three nodes lie on one side of the lattice, else `FACET_SURFACE`; shape (f,).
     """
-    index = corner_indices[facets]
-    low = np.all(index == 0, axis=1)
-    high = np.all(index == np.array(lattice_shape) - 1, axis=1)
-    return np.where(np.logical_or(low, high).any(axis=1), FACET_BOX, FACET_SURFACE).astype(np.int64)
+    # One bit per side of the lattice; a triangle lies on the sides that its nodes have in common.
+    sides = np.zeros(len(corner_indices), dtype=np.uint8)
+    for axis, count in enumerate(lattice_shape):
+        sides |= (corner_indices[:, axis] == 0).astype(np.uint8) << (2 * axis)
+        sides |= (corner_indices[:, axis] == count - 1).astype(np.uint8) << (2 * axis + 1)
+    common = sides[facets[:, 0]] & sides[facets[:, 1]] & sides[facets[:, 2]]
+    return np.where(common > 0, FACET_BOX, FACET_SURFACE).astype(np.int64)
 
 
 def _as_cells(cells: npt.NDArray) -> npt.NDArray[np.bool_]:
@@ -178,6 +181,17 @@ def _as_cells(cells: npt.NDArray) -> npt.NDArray[np.bool_]:
             )
         )
     return cells
+
+
+def _cropped(cells: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
+    """The box of voxels that holds all solid ones, and the index of its first: empty space around it costs one look."""
+    spans = []
+    for axis in range(3):
+        used = np.flatnonzero(cells.any(axis=tuple({0, 1, 2} - {axis})))
+        spans.append((int(used[0]), int(used[-1]) + 1))
+        # What is left to look at gets smaller.
+        cells = cells[(slice(None),) * axis + (slice(*spans[-1]),)]
+    return np.ascontiguousarray(cells), np.array([low for low, _ in spans], dtype=np.int64)
 
 
 def _node_numbers(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:

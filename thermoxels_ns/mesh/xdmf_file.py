@@ -35,7 +35,8 @@ def write_xdmf(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np
     """Write a mesh as ``NAME.xdmf`` and ``NAME.h5``.
 
     The grid "mesh" holds the tetrahedra with `region` per cell and `temperature_c`, `temperature_k`, `observed` and,
-    if the mesh has them, `colour` per node; the grid "facets" holds the boundary triangles with `patch` per triangle.
+    if the mesh has them, `colour` per node; the grid "facets" holds the boundary triangles with `patch`, `area_factor`
+    (true area over the triangle's own, other than 1 in voxel meshes) and `normal` (of the true surface) per triangle.
     Region and patch are numbers from 0; the file says their names in ``Information`` elements of their grids. In
     FEniCSx::
 
@@ -66,6 +67,8 @@ def write_xdmf(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np
         "region": content.region.astype(np.int32),
         "facets": content.facets.astype(np.int64),
         "patch": content.patch.astype(np.int32),
+        "area_factor": content.area_factor,
+        "normal": content.normal,
         "temperature_c": content.temperature_c,
         "temperature_k": celsius_to_kelvin(content.temperature_c),
         "observed": mesh.observed.astype(np.uint8),
@@ -127,6 +130,8 @@ def _index(content: FileContent, arrays: dict[str, npt.NDArray], data_file: str)
     # FEniCSx takes the first attribute of a grid for its tags.
     add_values(body, "region", "Cell")
     add_values(boundary, "patch", "Cell")
+    add_values(boundary, "area_factor", "Cell")
+    add_values(boundary, "normal", "Cell", "Vector")
     for grid in (body, boundary):
         for name in ("temperature_c", "temperature_k", "observed"):
             add_values(grid, name, "Node")

@@ -1,0 +1,81 @@
+"""From a field to a mesh: area and volume of known bodies, and how their errors fall with the voxel size."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, centres
+from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.mesh.build import build_mesh
+from thermoxels_ns.mesh.quality import check_mesh
+from thermoxels_ns.mesh.solid import SolidSelection
+from thermoxels_ns.snapshot import GridSnapshot
+
+BODIES = ("sphere", "torus", "cylinder", "slab at 30 degrees", "slab at 45 degrees")
+OFFSETS = ((0.11, -0.27, 0.38), (0.5, 0.0, -0.25), (-0.42, 0.33, 0.06))
+"""Where the body's middle is, from the middle of the lattice, [voxels]."""
+DEPTHS = {"exponential": (np.exp, 1.0), "blurred step": (lambda depth: 100.0 / (1.0 + np.exp(-2.0 * depth)), 50.0)}
+"""Density as a function of the depth in voxels, and at the surface."""
+
+
+@cache
+def errors(name: str, cells: int, offset: tuple[float, float, float], kind: str = "exponential") -> tuple[float, ...]:
+    """Relative errors of area and volume, and smallest and largest dihedral angle, [degrees]."""
+    shape, size, voxels = SHAPES[name], 2.0 / cells, cells + 8
+    function, threshold = DEPTHS[kind]
+
+    def density(points: np.ndarray) -> np.ndarray:
+        depth = -shape.distance((points - offset) * size) / size
+        return function(np.clip(depth, -8.0, 8.0)).astype(np.float32)
+
+    at_corners = density(centres(*(voxels + 1,) * 3))
+    seen = np.ones(at_corners.shape, np.float32)
+    lattice = Lattice((-0.5 * voxels * size,) * 3, size, at_corners.shape)  # type: ignore[arg-type]
+    field = GridSnapshot(lattice, at_corners, 20.0 * seen, seen, density(centres(*(voxels,) * 3)))
+    built = build_mesh(field, SolidSelection(density_threshold=threshold, close_gaps=0), np.eye(4))
+    quality = check_mesh(built.mesh)
+    angles = quality.min_dihedral_deg, quality.max_dihedral_deg
+    return quality.area_m2 / shape.area - 1.0, quality.volume_m3 / shape.volume - 1.0, *angles
+
+
+@pytest.mark.parametrize("offset", OFFSETS)
+@pytest.mark.parametrize("name", BODIES)
+def test_area_and_volume_within_one_percent_at_48_voxels(name, offset):
+    area, volume, low, high = errors(name, 48, offset)
+    assert abs(area) < 0.01 and abs(volume) < 0.01, f"{name}: area {area:+.2%}, volume {volume:+.2%}"
+    assert low >= ANGLE_BOUNDS_DEG[0] and high <= ANGLE_BOUNDS_DEG[1]
+
+
+@pytest.mark.parametrize("name", ["torus", "slab at 30 degrees"])
+def test_so_they_are_where_density_is_a_blurred_step(name):
+    area, volume, *_ = errors(name, 48, OFFSETS[0], "blurred step")
+    assert abs(area) < 0.01 and abs(volume) < 0.01, f"{name}: area {area:+.2%}, volume {volume:+.2%}"
+
+
+def order(cells: tuple[int, ...], error: np.ndarray) -> float:
+    """Slope of the straight line through the errors, both logarithmic."""
+    return -float(np.polyfit(np.log(cells), np.log(error), 1)[0])
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_volume_is_of_second_order(name):
+    cells = (24, 48, 96)
+    error = np.abs([errors(name, n, OFFSETS[0])[1] for n in cells])
+    assert order(cells, error) > 1.75, f"{name}, volume: observed order {order(cells, error):.2f}, errors {error}"
+
+
+@pytest.mark.parametrize(("name", "cells"), [("sphere", (24, 48, 96)), ("torus", (40, 60, 90))])
+def test_area_of_smooth_bodies_is_of_second_order(name, cells):
+    """Of the torus from 5 voxels of radius on; below, some of its surface is taken for an edge."""
+    error = np.abs([errors(name, n, OFFSETS[0])[0] for n in cells])
+    assert order(cells, error) > 1.75, f"{name}, area: observed order {order(cells, error):.2f}, errors {error}"
+
+
+@pytest.mark.parametrize("name", ["cylinder", "slab at 30 degrees", "slab at 45 degrees"])
+def test_area_of_bodies_with_edges_goes_on_falling(name):
+    """What is left at edges changes its sign with the body's place on the lattice; it is a share of a voxel wide."""
+    area = errors(name, 96, OFFSETS[0])[0]
+    assert abs(area) < 0.003, f"{name}: area {area:+.2%}"

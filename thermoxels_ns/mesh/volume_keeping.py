@@ -1,0 +1,166 @@
+"""Smoothing that keeps volume: thin and small bodies would shrink, narrow gaps would close.
+
+A level of -1 and 1 smoothed over three voxels has its zero where it should be on flat walls, but moves inwards at
+convex edges; of a bar one voxel thick a third would be left. What is missing around is made up by a shift of the level.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.mesh.surface_ramp import near_surface
+
+BoolArray = npt.NDArray[np.bool_]
+FloatArray = npt.NDArray[np.float32]
+IntArray = npt.NDArray[np.int64]
+
+UNNOTICED = 0.12
+"""Up to this share of the solid (for gaps: of the empty space) within a voxel may be lost. To that much, edges of large
+bodies and single bumps of noise are rounded off, which is what smoothing is for."""
+ROUNDS = 5
+"""How often what is missing is looked for and made up."""
+
+_RATE = 1.5
+"""Share of what is missing that each round makes up, if all of the surface moves alike."""
+_LEAST_SLOPE = 0.6
+"""Levels change by at least this much per voxel of shift, [1 / voxel]; else a speck that smoothing left nearly nothing
+of would never grow."""
+_CHUNK = 1 << 14
+"""Voxels at a time: what is worked on stays in the processor's cache."""
+
+_AROUND = np.indices((3, 3, 3)).reshape(3, 27).T - 1
+
+
+def _octant_weights() -> tuple[FloatArray, FloatArray]:
+    """Trilinear value and gradient in the middle of a voxel's octants from its own level and those of the voxels
+    around, shapes (8, 27) and (3, 8, 27).
+    """
+    side = np.indices((2, 2, 2)).reshape(3, 8).T * 2 - 1
+    towards = _AROUND[None] == side[:, None]
+    share = np.where(_AROUND[None] == 0, 0.75, np.where(towards, 0.25, 0.0))
+    change = np.where(_AROUND[None] == 0, -side[:, None], np.where(towards, side[:, None], 0.0))
+    slopes = [np.where(np.arange(3) == axis, change, share).prod(axis=2) for axis in range(3)]
+    return share.prod(axis=2).astype(np.float32), np.array(slopes, dtype=np.float32)
+
+
+_VALUES, _SLOPES = _octant_weights()
+_WINDOW = np.array([0.25, 0.5, 0.25], dtype=np.float32)[_AROUND + 1].prod(axis=1)
+
+
+def keep_volume(level: FloatArray, sharp: FloatArray, least: FloatArray, cells: BoolArray) -> FloatArray:
+    """Shift a smoothed level until around every voxel about as much is solid as the level before smoothing has it.
+
+    Of each voxel near the surface, the solid share is taken from the trilinear level, and from where the sharp level
+    changes its sign along the axes. Their differences, averaged with weights 1 4 6 4 1 along each axis and divided by
+    the surface around, say how far the surface should move. Differences below `UNNOTICED` of what is there are left
+    alone, so that this acts on bars, corners, specks and pits, not on the faces and long edges of a body of many
+    voxels.
+
+    Args:
+        level: The smoothed level, in [-1, 1].
+        sharp: The level before, same signs.
+        least: No level comes nearer to 0 than this.
+        cells: Solid voxels, where both levels are above 0.
+
+    Returns:
+        The level, with the same signs, in [-1, 1].
+    """
+    near = np.pad(near_surface(cells), 1)
+    index = np.flatnonzero(near)
+    if len(index) == 0:
+        return level
+    strides = np.array([near.shape[1] * near.shape[2], near.shape[2], 1])
+    steps = _AROUND @ strides
+    wanted, sides = _wanted(np.pad(sharp, 1, mode="edge").reshape(-1), index, strides)
+    solid, lowest = np.pad(cells, 1, mode="edge").reshape(-1)[index], np.pad(least, 1).reshape(-1)[index]
+    volume = _windowed(np.pad(cells, 1, mode="edge").astype(np.float32).reshape(-1), wanted, index, steps)
+    buffer = np.zeros(near.size, dtype=np.float32)
+    area = np.maximum(_windowed(buffer, 0.5 * sides, index, steps), np.finfo(np.float32).tiny)
+
+    padded = np.pad(level, 1, mode="edge")
+    levels = padded.reshape(-1)
+    found = _found(levels, index, steps)
+    changed = np.zeros(len(levels), dtype=bool)
+    for _ in range(ROUNDS):
+        missing = _windowed(buffer, wanted - found.share, index, steps)
+        noticed = np.abs(missing) - UNNOTICED * np.where(missing > 0.0, volume, 1.0 - volume)
+        moves = np.flatnonzero(noticed > 0.0)
+        if len(moves) == 0:
+            break
+        shift = _RATE * np.sign(missing[moves]) * noticed[moves] / area[moves]
+        moved = levels[index[moves]] + shift * np.maximum(found.slope[moves], np.float32(_LEAST_SLOPE))
+        low = lowest[moves]
+        moved = np.where(solid[moves], np.maximum(moved, low), np.minimum(moved, -low))
+        levels[index[moves]] = np.clip(moved, -1.0, 1.0)
+        changed[:] = False
+        for step in steps:
+            changed[index[moves] + step] = True
+        again = np.flatnonzero(changed[index])
+        update = _found(levels, index[again], steps)
+        found.share[again], found.slope[again] = update.share, update.slope
+    return np.ascontiguousarray(padded[1:-1, 1:-1, 1:-1])
+
+
+def _wanted(sharp: FloatArray, index: IntArray, strides: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Share of some voxels that is solid, and how many of their six neighbours are on the other side of the surface.
+
+    A voxel is as wide along an axis as the surface leaves of it, from its centre at most half a voxel to either side.
+    """
+    own = sharp[index]
+    share, sides = np.ones(len(index), dtype=np.float32), np.zeros(len(index), dtype=np.float32)
+    for stride in strides:
+        width = np.zeros(len(index), dtype=np.float32)
+        for step in (stride, -stride):
+            other = sharp[index + step]
+            across = (other > 0.0) != (own > 0.0)
+            # Both are never 0.
+            width += np.where(across, np.minimum(np.abs(own) / (np.abs(own) + np.abs(other)), 0.5), 0.5)
+            sides += across
+        share *= width
+    return np.where(own > 0.0, share, 1.0 - share), sides
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What the trilinear level makes of some voxels, arrays of shape (n,)."""
+
+    share: FloatArray
+    """Solid share, 0 to 1."""
+    slope: FloatArray
+    """Mean slope, [1 / voxel]."""
+
+
+def _found(levels: FloatArray, index: IntArray, steps: IntArray) -> _Found:
+    """The level is taken for linear in each octant of a voxel: of a cube of half a voxel, cut by a plane at distance d
+    from its middle, 1/2 + 2 d is inside, whatever way the plane faces (exactly so on average over directions).
+    """
+    share, slope = np.empty(len(index), dtype=np.float32), np.empty(len(index), dtype=np.float32)
+    for start in range(0, len(index), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        around = levels[index[part] + steps[:, None]]
+        slopes = np.sqrt(sum((weights @ around) ** 2 for weights in _SLOPES))
+        distance = (_VALUES @ around) / np.maximum(slopes, np.float32(1e-6))
+        share[part] = np.clip(0.5 + 2.0 * distance, 0.0, 1.0).mean(axis=0)
+        slope[part] = slopes.mean(axis=0)
+    return _Found(share, slope)
+
+
+def _windowed(values: FloatArray, at_index: FloatArray, index: IntArray, steps: IntArray) -> FloatArray:
+    """Mean around some voxels with weights 1 4 6 4 1 along each axis, shape (n,).
+
+    Args:
+        values: What there is at all other voxels; those at `index` are overwritten.
+        at_index: What there is at these, shape (n,).
+        index: Flat indices of voxels, shape (n,).
+        steps: Flat steps to the 27 voxels around, shape (27,).
+    """
+    for _ in range(2):
+        values[index] = at_index
+        at_index = np.empty(len(index), dtype=np.float32)
+        for start in range(0, len(index), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            at_index[part] = _WINDOW @ values[index[part] + steps[:, None]]
+    return at_index
