@@ -7,51 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.capture.board_pictures import BOARD, board_pairs, picture
 from tests.capture.known_rig import turned
-from thermoxels_ns.capture.board_rig import CheckerBoard, find_board, rig_from_boards
+from thermoxels_ns.capture.board_rig import find_board, rig_from_boards
 from thermoxels_ns.capture.contract import CameraModel, RigStart
 from thermoxels_ns.errors import SceneError
 
-BOARD = CheckerBoard(7, 5, 0.06)
 VISIBLE = CameraModel(640, 480, 600.0, 600.0, 322.0, 238.0, k1=-0.05)
 THERMAL = CameraModel(160, 128, 150.0, 150.0, 81.0, 63.0)
 RIG = np.eye(4)
 RIG[:3, :3], RIG[:3, 3] = turned(0.7, -1.5, 0.4), (0.09, -0.02, 0.01)
 
 
-def picture(camera: CameraModel, board_to_camera: np.ndarray, samples: int = 4) -> np.ndarray:
-    """The board seen by a camera: 1 on light squares, 0 on dark ones, 0.5 around, mean over samples^2 rays."""
-    across = (np.arange(camera.width * samples) + 0.5) / samples
-    down = (np.arange(camera.height * samples) + 0.5) / samples
-    rays = camera.rays(np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))
-    normal, origin = board_to_camera[:3, 2], board_to_camera[:3, 3]
-    distance = (normal @ origin) / (rays @ normal)
-    on_board = (distance[:, None] * rays - origin) @ board_to_camera[:3, :2] / BOARD.square_m
-    square = np.floor(on_board).astype(int)  # the first inner corner is at (0, 0)
-    inside = (on_board > -1).all(axis=1) & (on_board[:, 0] < BOARD.columns) & (on_board[:, 1] < BOARD.rows)
-    around = (on_board > -2).all(axis=1) & (on_board[:, 0] < BOARD.columns + 1) & (on_board[:, 1] < BOARD.rows + 1)
-    value = np.where(inside, (square.sum(axis=1) % 2).astype(float), np.where(around, 1.0, 0.5))
-    return value.reshape(camera.height, samples, camera.width, samples).mean(axis=(1, 3))
-
-
 @pytest.fixture(scope="module")
 def pairs() -> list[tuple[np.ndarray, np.ndarray]]:
-    draw = np.random.default_rng(0)
-    result = []
-    for x_deg, y_deg, z_deg, x, y, z in (
-        (5, 20, 3, 0.0, 0.0, 0.9),
-        (-20, -15, -5, 0.12, 0.05, 0.8),
-        (15, -25, 8, -0.12, -0.04, 0.85),
-        (-25, 10, -3, -0.08, 0.08, 1.0),
-        (10, 5, 0, 0.1, -0.08, 0.7),
-    ):
-        board = np.eye(4)
-        board[:3, :3] = turned(x_deg, y_deg, z_deg)
-        board[:3, 3] = np.array((x, y, z)) - board[:3, :2] @ (3 * BOARD.square_m, 2 * BOARD.square_m)
-        photograph = 255.0 * picture(VISIBLE, board, 2)
-        warm_is_dark = 25.0 - 4.0 * picture(THERMAL, RIG @ board)
-        result.append((photograph, warm_is_dark + 0.05 * draw.standard_normal(warm_is_dark.shape)))
-    return result
+    return board_pairs(VISIBLE, THERMAL, RIG)
 
 
 def start() -> RigStart:

@@ -11,6 +11,7 @@ from typing import get_args, get_type_hints
 import numpy as np
 import pytest
 
+from tests.capture.board_pictures import BOARD, board_pairs, write_board_folder
 from tests.capture.camera_card import photograph
 from tests.capture.textured_room import RIG, THERMAL, VISIBLE, alignment, poses, write_card
 from thermoxels_ns import cli
@@ -148,19 +149,39 @@ def test_another_scale_runs_only_what_depends_on_it_and_so_does_from_stage(captu
     more["known_distance"] = ("shot2-visible.jpg", 100.0, 100.0, 380.0, 120.0, 2.0)
     result = run_capture(card, scene, settings(**more), said.append)
     assert [line.split(":")[0] for line in said if "as before" in line] == [
-        "1/8 pairs",
-        "2/8 temperatures",
-        "3/8 poses",
+        "1/9 pairs",
+        "2/9 temperatures",
+        "3/9 poses",
     ]
     assert result.scale is not None
     assert content(scene)["metres_per_unit"] == result.scale.metres_per_unit
     assert not result.drift.used
     said.clear()
     run_capture(card, scene, settings(from_stage="scene", **more), said.append)
-    assert [line.split(" ")[1] for line in said if re.match(r"\d/8", line) and "as before" not in line] == [
+    assert [line.split(" ")[1] for line in said if re.match(r"\d/9", line) and "as before" not in line] == [
         "scene",
         "page",
     ]
+
+
+def test_a_board_gives_the_rig_and_a_scale_is_needed_for_it(capture, tmp_path):
+    card, earlier, _, _ = capture
+    scene = tmp_path / "scene"
+    shutil.copytree(earlier, scene)
+    pictures = write_board_folder(tmp_path / "board", board_pairs(VISIBLE, THERMAL, RIG))
+    more = {"skip_bad": True, "board_photos": pictures, "board": "7x5", "board_square_m": BOARD.square_m}
+    with pytest.raises(SceneError, match=r"known scale.*--known-distance"):
+        run_capture(card, scene, settings(**more), [].append)
+    more["known_distance"] = ("shot2-visible.jpg", 100.0, 100.0, 380.0, 120.0, 2.0)
+    result = run_capture(card, scene, settings(**more), [].append)
+    assert "checker board" in result.rig.explanation
+    assert result.scale is not None
+    shift_m = result.rig.visible_to_thermal[:3, 3] * result.scale.metres_per_unit
+    assert np.allclose(shift_m, RIG[:3, 3], atol=0.02)
+    assert result.rig.thermal_camera.fl_x == pytest.approx(THERMAL.fl_x, rel=0.02)
+    said = []
+    run_capture(card, scene, settings(**more), said.append)
+    assert "5/9 board: as before" in said
 
 
 def test_a_bad_file_stops_the_capture_and_is_named(capture, tmp_path):

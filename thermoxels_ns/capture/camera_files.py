@@ -42,11 +42,6 @@ class CameraFile:
     taken_at: datetime | None
     """As the camera's clock showed it, without a zone."""
 
-    @property
-    def stem_words(self) -> tuple[str, ...]:
-        """The name without its ending, in small letters, cut at what is neither letter nor digit."""
-        return words_of(self.path.stem)
-
 
 @dataclass(frozen=True)
 class CameraFolder:

@@ -163,8 +163,9 @@ class RigStart:
     """Standard deviation of the rotation about each axis [degrees]."""
     translation_sigma: float | None = None
     """Standard deviation of the shift along each axis [world units]. None: 3 % of the median depth of the points."""
-    centre_sigma: float = 0.012
-    """Standard deviation of the principal point, as a share of the image width."""
+    centre_sigma: float = 0.005
+    """Standard deviation of the principal point, as a share of the image width. A turn moves the image of a narrow lens
+    almost as the principal point does, so what is allowed here is what the rotation remains unsure by."""
     k1_sigma: float = 0.05
     """Standard deviation of the radial distortion; 0 keeps it as given."""
     source: str = "a guess: same place and direction as the visible camera"

@@ -20,6 +20,8 @@ _MOST_ERROR_PX = 4.0
 """Points that project farther than this from where they were seen are not used, [pixels of the photographs]."""
 _FROM_LENS, _FROM_FLIR, _FROM_ANGLE, _FROM_USER, _GUESSED = 0.03, 0.06, 0.1, 0.05, 0.25
 """Standard deviations of the thermal focal length by where it comes from, as shares of it."""
+BASELINE_SIGMA_M = 0.1
+"""Standard deviation of the thermal lens's place beside the other one, along each axis, where metres are known, [m]."""
 _BELIEVED_DEG = (3.0, 150.0)
 """Angles of view that are believed; some cameras state nonsense."""
 
@@ -50,6 +52,7 @@ def rig_start(
     visible: CameraModel,
     thermal_size: tuple[int, int],
     field_of_view_deg: float | None = None,
+    metres_per_unit: float | None = None,
 ) -> RigStart:
     """Guess the thermal camera from the user's angle of view, its lens, FLIR's alignment or its angle of view.
 
@@ -58,6 +61,7 @@ def rig_start(
         visible: The photographs' camera.
         thermal_size: Width and height of the thermal images.
         field_of_view_deg: Horizontal angle of view of the thermal lens that the user gives, [degrees].
+        metres_per_unit: Scale of the scene, where it is known: the lenses of a pair of cameras lie close together.
     """
     width, height = thermal_size
     transform = np.eye(4)
@@ -88,14 +92,25 @@ def rig_start(
         focal = visible.fl_x * width / visible.width
         camera = CameraModel(width, height, focal, focal, width / 2, height / 2)
         sigma, source = _GUESSED, "a guess: the photographs' angle of view"
-    return RigStart(thermal_camera=camera, visible_to_thermal=transform, focal_sigma=sigma, source=source)
+    return RigStart(
+        thermal_camera=camera,
+        visible_to_thermal=transform,
+        focal_sigma=sigma,
+        translation_sigma=None if metres_per_unit is None else BASELINE_SIGMA_M / metres_per_unit,
+        source=source,
+    )
 
 
-def read_rig(file: Path) -> RigEstimate:
+def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float | None = None) -> RigEstimate:
     """Read a rig that was found before: ``thermal_camera`` and ``rig`` of a transforms.json.
 
+    Args:
+        file: The json.
+        thermal_size: Width and height of this capture's thermal images.
+        metres_per_unit: Scale of this capture; where the json has one too, lengths are converted.
+
     Raises:
-        SceneError: One of them is missing or no camera, or no rotation and shift.
+        SceneError: One of them is missing or no camera, or no rotation and shift, or the camera has another size.
     """
     content: Any = read_json(file)
     remedy = "Pass the transforms.json of an earlier capture with the same camera."
@@ -120,13 +135,28 @@ def read_rig(file: Path) -> RigEstimate:
                 f"{file}: rig", expected="4 x 4 numbers, a rotation and a shift", got=transform.tolist(), remedy=remedy
             )
         )
+    if (camera.width, camera.height) != thermal_size:
+        raise SceneError(
+            explain(
+                f"{file.name}: thermal_camera",
+                expected=f"{thermal_size[0]} x {thermal_size[1]} pixels, as the images have",
+                got=f"{camera.width} x {camera.height}",
+                remedy="Pass the rig of the same camera and mode.",
+            )
+        )
+    theirs = content.get("metres_per_unit")
+    if metres_per_unit is not None and isinstance(theirs, (int, float)) and theirs > 0.0:
+        transform[:3, 3] *= theirs / metres_per_unit
+        lengths = "its lengths converted by the two scales"
+    else:
+        lengths = "its lengths taken for those of this scene, because not both have a scale"
     return RigEstimate(
         thermal_camera=camera,
         visible_to_thermal=transform,
         parameters=(),
         covariance=np.zeros((0, 0)),
         determined=True,
-        explanation=f"Given in {file.name}.",
+        explanation=f"Given in {file.name}, {lengths}.",
         score_before=math.nan,
         score_after=math.nan,
         projection_sigma_px=math.nan,

@@ -25,6 +25,10 @@ _STRONGEST_SHARE = 0.35
 _WEAKEST_EDGE = 0.05
 _FARTHEST_FROM_POINT = 0.06
 """Distance on the plane at depth 1 to the next scene point, beyond which an edge's depth is not known."""
+_SURE_DISTANCE = 0.01
+"""Distance on that plane up to which an edge's depth is that of the scene points around it."""
+_EDGE_REACH = 2.0
+"""Half the width of an edge, in standard deviations of its blur."""
 _MARGIN_SHARE = 0.15
 _FINER = 1.23
 _ASPECT_TOLERANCE = 0.02
@@ -91,12 +95,28 @@ class PreparedFrames:
         most = min(_MOST_POINTS, int(_STRONGEST_SHARE * field.size))
         if len(value) > most:
             keep = np.sort(np.argsort(-np.abs(value), kind="stable")[:most])
-            value, rays = value[keep], rays[keep]
+            value, rays, rows, columns = value[keep], rays[keep], rows[keep], columns[keep]
         depth, distance = frame.depth.at(rays)
         known = distance < _FARTHEST_FROM_POINT
         turn = level.transform[:3, :3]
         roll = np.exp(2j * np.arctan2(turn[1, 0], turn[0, 0])).astype(np.complex64)
-        return EdgePoints(rays[known] * depth[known, None], value[known] * roll)
+        trust = _even_trust(rows, columns, distance, field.shape, blur_px * scale / same)[known]
+        return EdgePoints(rays[known] * depth[known, None], value[known] * trust * roll)
+
+
+def _even_trust(
+    rows: npt.NDArray, columns: npt.NDArray, distance: npt.NDArray, shape: tuple[int, ...], blur_px: float
+) -> FloatImage:
+    """How much edges count by their distance to the next scene point, shape (n,).
+
+    The same across the width of an edge: where only one side of an outline has scene points, a weight that falls across
+    it would move the edge.
+    """
+    trust = np.zeros(shape, np.float32)
+    trust[rows, columns] = 1.0 / (1.0 + (distance / _SURE_DISTANCE) ** 4)
+    reach = 2 * int(np.ceil(_EDGE_REACH * (blur_px + 1.0))) + 1
+    widened = cv2.dilate(trust, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
+    return widened[rows, columns].astype(np.float32)
 
 
 def prepare_frames(frames: Sequence[RigFrame], visible: CameraModel, thermal: CameraModel) -> PreparedFrames:

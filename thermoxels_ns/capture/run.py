@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from thermoxels_ns.capture import results
+from thermoxels_ns.capture.board_photos import board_of, in_scene_units, rig_from_board_photos
+from thermoxels_ns.capture.board_rig import CheckerBoard
 from thermoxels_ns.capture.camera_files import SUFFIXES, scan_folder
 from thermoxels_ns.capture.contract import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.drift import estimate_drift
@@ -86,8 +88,11 @@ def run_capture(
                 remedy="Pass a new folder with --output; the camera's files stay as they are.",
             )
         )
+    board = board_of(settings)
+    if settings.board_photos is not None and not settings.board_photos.is_dir():
+        scan_folder(settings.board_photos)
     folder = prepare_output(output)
-    return _Run(source, folder, settings, StageCache(folder, settings.from_stage, say), say).all()
+    return _Run(source, folder, settings, StageCache(folder, settings.from_stage, say), say, board).all()
 
 
 @dataclass
@@ -97,6 +102,8 @@ class _Run:
     settings: CaptureSettings
     cache: StageCache
     say: Callable[[str], None]
+    board: CheckerBoard | None = None
+    """What the user's pictures of a checker board show."""
     dropped: dict[str, str] = field(default_factory=dict)
 
     def all(self) -> CaptureResult:
@@ -106,7 +113,8 @@ class _Run:
         model, scale, missing, up = self.find_scale(found, read)
         by_name = {frame.name: frame for frame in read.frames}
         frames = [by_name[name] for name in model.frames]
-        rig, start = self.find_rig(model, frames, read)
+        board = self.find_board_rig(model, read)
+        rig, start = self.find_rig(model, frames, read, scale, missing, board)
         drift = self.find_drift(model, frames, rig)
         scene = Scene(frames, model, rig, drift, scale, up, self.masks(frames, model))
         written = [self.output / name for name in (JSON_NAME, "images", "thermal")]
@@ -173,17 +181,7 @@ class _Run:
 
     def read_temperatures(self, pairs: tuple[Pair, ...]) -> CaptureFrames:
         settings = self.settings
-        options = RadiometryOptions(
-            camera=settings.camera,
-            celsius_per_count=settings.celsius_per_count,
-            celsius_offset=settings.celsius_offset,
-            dji_library=settings.dji_library,
-            emissivity=settings.emissivity,
-            reflected_c=settings.reflected_c,
-            distance_m=settings.distance_m,
-            relative_humidity=settings.relative_humidity,
-            air_c=settings.air_c,
-        )
+        options = self.radiometry()
         depends = {"options": options, "skip_bad": settings.skip_bad, "mask": _fingerprints([settings.thermal_mask])}
 
         def work(folder: Path) -> None:
@@ -196,6 +194,20 @@ class _Run:
         read = CaptureFrames.load(self.cache.run("temperatures", depends, work), self.source)
         self.dropped |= read.dropped
         return read
+
+    def radiometry(self) -> RadiometryOptions:
+        settings = self.settings
+        return RadiometryOptions(
+            camera=settings.camera,
+            celsius_per_count=settings.celsius_per_count,
+            celsius_offset=settings.celsius_offset,
+            dji_library=settings.dji_library,
+            emissivity=settings.emissivity,
+            reflected_c=settings.reflected_c,
+            distance_m=settings.distance_m,
+            relative_humidity=settings.relative_humidity,
+            air_c=settings.air_c,
+        )
 
     def find_poses(self, read: CaptureFrames) -> SfmModel:
         settings = self.settings
@@ -269,27 +281,46 @@ class _Run:
         folder = self.cache.run("scale", depends, work)
         return results.load_model(folder), *results.load_scale(folder)
 
+    def find_board_rig(self, model: SfmModel, read: CaptureFrames) -> RigEstimate | None:
+        """The rig in metres, where the user has pictures of a checker board; None: there are none."""
+        board, pictures, settings = self.board, self.settings.board_photos, self.settings
+        if board is None or pictures is None:
+            return None
+        depends = {
+            "board": board,
+            "files": fingerprint(_files_of(pictures), pictures),
+            "angle": settings.thermal_field_of_view_deg,
+        }
+
+        def work(folder: Path) -> None:
+            radiometry = self.radiometry()
+            rig = rig_from_board_photos(
+                pictures, board, model.camera, read.thermal_size, folder, settings, radiometry, self.say
+            )
+            results.save_rig(folder, rig)
+
+        return results.load_rig(self.cache.run("board", depends, work))
+
     def find_rig(
-        self, model: SfmModel, frames: list[CaptureFrame], read: CaptureFrames
+        self,
+        model: SfmModel,
+        frames: list[CaptureFrame],
+        read: CaptureFrames,
+        scale: MetricScale | None,
+        scale_missing: str,
+        board: RigEstimate | None,
     ) -> tuple[RigEstimate, RigEstimate]:
         settings = self.settings
         depends = {"angle": settings.thermal_field_of_view_deg, "rig": _fingerprints([settings.rig])}
 
         def work(folder: Path) -> None:
-            begin = rig_start(frames, model.camera, read.thermal_size, settings.thermal_field_of_view_deg)
+            metres = None if scale is None else scale.metres_per_unit
+            begin = rig_start(frames, model.camera, read.thermal_size, settings.thermal_field_of_view_deg, metres)
             results.save_rig(folder, kept_start(begin, "Where the search begins."), "start")
             if settings.rig is not None:
-                rig = read_rig(settings.rig)
-                size = (rig.thermal_camera.width, rig.thermal_camera.height)
-                if size != read.thermal_size:
-                    raise SceneError(
-                        explain(
-                            f"{settings.rig.name}: thermal_camera",
-                            expected=f"{read.thermal_size[0]} x {read.thermal_size[1]} pixels, as the images have",
-                            got=f"{size[0]} x {size[1]}",
-                            remedy="Pass the rig of the same camera and mode.",
-                        )
-                    )
+                rig = read_rig(settings.rig, read.thermal_size, metres)
+            elif board is not None:
+                rig = in_scene_units(board, scale, scale_missing)
             elif len(model.sighting_frame) < _LEAST_POINTS:
                 rig = kept_start(begin, "There are no scene points to compare the images at.")
             else:

@@ -71,7 +71,15 @@ class CaptureSettings:
     """Horizontal angle of view of the thermal lens, in degrees, where the search for it begins. Default: what the files
     say."""
     rig: Optional[Path] = None  # noqa: UP045 - read by tyro
-    """transforms.json of an earlier capture with the same camera: its thermal camera and rig are used as they are."""
+    """transforms.json of an earlier capture with the same camera: its thermal camera and rig are used as they are, and
+    lengths follow the two scales where both are known."""
+    board_photos: Optional[Path] = None  # noqa: UP045 - read by tyro
+    """Folder with pictures of a heated (or foil) checker board, taken by both cameras in at least three places: the rig
+    comes from them instead of from the scene. Needs --board, --board-square-m and a known scale."""
+    board: Optional[str] = None  # noqa: UP045 - read by tyro
+    """Inner corners of that board along both sides, such as 7x5 for 8 x 6 squares."""
+    board_square_m: Optional[float] = None  # noqa: UP045 - read by tyro
+    """Side of one of its squares, in metres."""
     drift: Literal["auto", "off"] = "auto"
     """Correct offsets between thermal images and vignetting, if points that the fit does not see agree better."""
     find_overlays: bool = True

@@ -15,7 +15,7 @@ from thermoxels_ns import __version__
 from thermoxels_ns.checks import replace_when_done, writable_folder
 from thermoxels_ns.errors import OutputError, ThermoxelsError, explain
 
-StageName = Literal["pairs", "temperatures", "poses", "scale", "rig", "drift", "scene", "page"]
+StageName = Literal["pairs", "temperatures", "poses", "scale", "board", "rig", "drift", "scene", "page"]
 """The stages in order."""
 STAGES: tuple[StageName, ...] = get_args(StageName)
 CACHE_FOLDER = ".capture"
