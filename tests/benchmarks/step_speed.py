@@ -6,7 +6,9 @@ Run it on an otherwise idle machine:
 
 A synthetic house with a thermal camera of its own is trained to the middle of its last stage; then single steps with
 4096 RGB and 4096 thermal rays are timed on one and the same state, and a view of 320 x 240 is rendered. Every figure
-is a median; ratios are against the named baseline of the same run.
+is a median; ratios are against the named baseline of the same run. There are two: the reference (plain torch on the
+same sparse lattice, skipping what is empty), and once a dense step (plain torch on the whole lattice, every sample
+reading all values of its corners), as in `dense_torch_step.py`.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from pathlib import Path
 
 import torch
 import tyro
+from dense_torch_step import dense_step_seconds
 from nerfstudio.utils.rich_utils import CONSOLE
 from training_run import TrainingRun
 
@@ -44,6 +47,8 @@ class StepSpeed:
     """Steps per median."""
     reference_up_to: int = 128
     """Finest lattice on which the reference is timed too."""
+    dense: int = 128
+    """The lattice on which a dense step in plain torch is timed too, once; 0: none."""
 
     def main(self) -> None:
         """Print the table."""
@@ -60,17 +65,19 @@ class StepSpeed:
         )
         print(
             "| voxels | kept | fused step | against the lattice before | reference step | reference / fused "
-            "| 320 x 240 view | beside the kernels |"
+            "| dense torch step | dense / fused | 320 x 240 view | beside the kernels |"
         )
-        print("|---|---|---|---|---|---|---|---|")
+        print("|---|---|---|---|---|---|---|---|---|---|")
         before = None
         for row in rows:
-            fused, reference = row["fused"], row["reference"]
+            fused, reference, dense = row["fused"], row["reference"], row["dense"]
             print(
                 f"| {row['resolution']} | {row['kept']:.1%} | {1e3 * fused:.0f} ms "
                 f"| {'' if before is None else f'{fused / before:.2f}'} "
                 f"| {'' if reference is None else f'{reference:.2f} s'} "
                 f"| {'' if reference is None else f'{reference / fused:.0f}'} "
+                f"| {'' if dense is None else f'{dense:.1f} s'} "
+                f"| {'' if dense is None else f'{dense / fused:.0f}'} "
                 f"| {1e3 * row['view']:.0f} ms | {row['overhead']:.0%} |"
             )
             before = fused
@@ -92,6 +99,12 @@ class StepSpeed:
                 reference = self.median(run.take_step)
                 config.backend = "auto"
                 torch.set_num_threads(max(1, num_threads() // 2))
+            dense = None
+            if resolution == self.dense:
+                torch.set_num_threads(num_threads())
+                rays, _ = run.pipeline.datamanager.next_train(run.step)
+                dense = dense_step_seconds(model.grid, rays, config.steps_per_voxel)
+                torch.set_num_threads(max(1, num_threads() // 2))
             run.pipeline.eval()
             camera = run.pipeline.datamanager.eval_dataset.cameras[0:1]
             view = self.median(lambda: model.get_outputs_for_camera(camera))
@@ -101,6 +114,7 @@ class StepSpeed:
             "kept": len(voxels) / voxels.mask().size,
             "fused": fused,
             "reference": reference,
+            "dense": dense,
             "view": view,
             "overhead": (fused - kernels) / fused,
         }

@@ -16,6 +16,7 @@ from torch import Tensor
 from thermoxels_ns.field.interpolation import TrilinearPoints, interpolate
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.field.voxel_grid import VoxelGrid
+from thermoxels_ns.scratch import SCRATCH
 
 RowChange = Callable[[Tensor], Tensor]
 """Maps values of the old rows, shape (old rows, channels), to values of the new ones."""
@@ -69,6 +70,7 @@ def refine(grid: VoxelGrid, factor: int = 2) -> RowChange:
     Returns:
         How values of rows change: trilinear interpolation; old corners keep theirs exactly.
     """
+    SCRATCH.release()  # rows are there twice for a moment; what steps on the old lattice needed makes room
     new = split_voxels(grid.voxels, factor)
     at = parents_of_corners(grid.voxels, new, factor)
 
@@ -95,6 +97,7 @@ def prune(grid: VoxelGrid, keep: npt.NDArray[np.bool_]) -> RowChange:
     Returns:
         How values of rows change: those of corners that stay are copied.
     """
+    SCRATCH.release()
     voxels = grid.voxels
     new = KeptVoxels(voxels.lattice, voxels.cells[keep])
     stay: npt.NDArray[np.int64] = np.searchsorted(voxels.corners, new.corners)

@@ -7,7 +7,8 @@ come as row-sparse tensors that hold the touched rows only.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +18,34 @@ from torch import Tensor
 
 from thermoxels_ns.errors import ThermoxelsError, explain
 from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.render import kernels, kernels_backward
+from thermoxels_ns.render import kernels, kernels_backward, kernels_rows
 from thermoxels_ns.render.kernel_cache import forget_stale_kernels
 from thermoxels_ns.render.kernels import Rays, Records, Settings, Sums, Volume
-from thermoxels_ns.render.kernels_backward import RayGradients, RowGradients
+from thermoxels_ns.render.kernels_backward import RayGradients
+from thermoxels_ns.render.kernels_rows import Blocks
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions, near_and_far
-from thermoxels_ns.threads import num_threads, run_ranges, run_tasks
+from thermoxels_ns.render.row_gradients import row_gradients
+from thermoxels_ns.scratch import SCRATCH
+from thermoxels_ns.threads import run_ranges, run_tasks
 
 # Before the first call, which loads what was compiled earlier.
 forget_stale_kernels(
     Path(str(kernels.march_forward.stats.cache_path)),
-    (Path(str(module.__file__)) for module in (kernels, kernels_backward)),
+    (Path(str(module.__file__)) for module in (kernels, kernels_backward, kernels_rows)),
 )
 
 ACTIVATIONS = {"relu": kernels.RELU, "softplus": kernels.SOFTPLUS, "exp": kernels.EXP}
 SMALLEST_VARIATION = 1e-10
 """Added under the root of the total variation; the reference's value."""
 MOST_HARMONICS = 9
+VOXELS_AT_ONCE = 1 << 14
+"""Voxels whose total variation is one task."""
+FEWEST_SAMPLES = 24
+"""Samples per ray that a batch has room for at first, on average over a range."""
+SPARE = 1.25
+"""Room made when that was too little, over what the rays so far took."""
+_room = {"rows": 0, "per ray": FEWEST_SAMPLES}
+"""The room that the last batch had, and the number of rows it was for."""
 NAMES = ("density", "sh", "temperature")
 
 
@@ -49,7 +61,7 @@ class VoxelArrays:
 
 @dataclass(frozen=True)
 class Marched:
-    """Samples of a batch of rays, for statistics: `records` and how to read them."""
+    """Samples of a batch of rays: `records` and how to read them."""
 
     rays: Rays
     volume: Volume
@@ -67,11 +79,31 @@ def march(
     request: RayRequest,
     options: RenderOptions,
 ) -> Marched:
-    """March rays and record their samples; no gradients.
+    """March rays and record their samples without gaps, for statistics; no gradients.
+
+    Returns:
+        The samples; ``records.offset`` has a last entry, the number of all records.
 
     Raises:
         ThermoxelsError: A density on the way is NaN.
     """
+    marched, spans = _march(voxels, density, sh, temperature, activation, request, options)
+    records = marched.records
+    listed = [np.concatenate([field[:0], *(field[a:b] for a, b in spans)]) for field in records[2:]]
+    offset = np.concatenate((np.zeros(1, np.int64), np.cumsum(records.used)))
+    return replace(marched, records=Records(offset, records.used, *listed))
+
+
+def _march(
+    voxels: VoxelArrays,
+    density: Tensor,
+    sh: Tensor | None,
+    temperature: Tensor,
+    activation: str,
+    request: RayRequest,
+    options: RenderOptions,
+) -> tuple[Marched, list[tuple[int, int]]]:
+    """March rays and record their samples; give also the spans of the records in which there are no gaps."""
     dtype = density.detach().numpy().dtype
     lattice = voxels.lattice
     volume = Volume(
@@ -104,24 +136,8 @@ def march(
         int(options.thermal_moves_density),
         MOST_HARMONICS if options.sh_degree is None else (options.sh_degree + 1) ** 2,
     )
-    offset = np.zeros(count + 1, dtype=np.int64)
-    run_ranges(lambda a, b: kernels.count_samples(a, b, rays, volume, settings, offset[1:]), count)
-    np.cumsum(offset, out=offset)
-    total = int(offset[-1])
-    channels = volume.sh.shape[1]
-    records = Records(
-        offset,
-        np.zeros(count, dtype=np.int64),
-        np.empty(total, dtype=np.int32),
-        np.empty(total, dtype=np.int32),
-        np.empty((total, 3), dtype=dtype),
-        np.empty(total, dtype=dtype),
-        np.empty(total, dtype=dtype),
-        np.empty(total, dtype=dtype),
-        np.empty((total if channels else 0, 3), dtype=dtype),
-    )
     sums = Sums(
-        np.empty((count if channels else 0, 3), dtype=dtype),
+        np.empty((count if volume.sh.shape[1] else 0, 3), dtype=dtype),
         np.empty((count, 1), dtype=dtype),
         np.empty(count, dtype=dtype),
         np.empty(count, dtype=dtype),
@@ -129,17 +145,59 @@ def march(
         np.empty(count if options.distortion_scale else 0, dtype=dtype),
         np.empty(count if options.sparsity else 0, dtype=dtype),
     )
-    wrong: Any = run_ranges(lambda a, b: kernels.march_forward(a, b, rays, volume, settings, records, sums), count)
+    records, spans = _record(rays, volume, settings, sums)
+    return Marched(rays, volume, settings, records, sums), spans
+
+
+def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple[Records, list[tuple[int, int]]]:
+    """Fill `sums` and record the samples; every range of rays has room for as many per ray as were ever needed."""
+    count = len(rays.origins)
+    if _room["rows"] != len(volume.density):
+        # Another lattice: what the last one needed says nothing.
+        _room.update({"rows": len(volume.density), "per ray": FEWEST_SAMPLES})
+    while True:
+        room = _room["per ray"]
+        records = _empty_records(count, (room + kernels.AHEAD) * count, volume)
+
+        def work(first: int, last: int, room: int = room, records: Records = records) -> tuple[int, int, int]:
+            begin, end = ((room + kernels.AHEAD) * ray for ray in (first, last))
+            wrong, behind = kernels.march_forward(first, last, rays, volume, settings, records, sums, begin, end)
+            return begin, wrong, behind
+
+        found: Any = run_ranges(work, count)
+        wrong = [number for _, number, _ in found]
+        if min(wrong, default=0) >= 0:
+            break
+        short = [per_ray for _, number, per_ray in found if number < 0]
+        _room["per ray"] = max(room + 1, int(SPARE * max(short)))
+        del records, work  # what was too small is given back before more is taken
+        SCRATCH.release()
     if sum(wrong):
         raise ThermoxelsError(
             explain(
                 "density",
                 expected="numbers >= 0",
-                got=f"NaN on {sum(wrong)} rays",
+                got=f"NaN in {sum(wrong)} places",
                 remedy="Lower the density learning rate and resume from the last checkpoint.",
             )
         )
-    return Marched(rays, volume, settings, records, sums)
+    return records, [(begin, end) for begin, _, end in found]
+
+
+def _empty_records(rays: int, total: int, volume: Volume) -> Records:
+    dtype = volume.density.dtype
+    return Records(
+        np.zeros(rays, dtype=np.int64),
+        np.zeros(rays, dtype=np.int64),
+        SCRATCH.empty(total, np.int32),
+        SCRATCH.empty(total, np.int32),
+        SCRATCH.empty((total, 3), dtype),
+        SCRATCH.empty(total, dtype),
+        SCRATCH.empty(total, dtype),
+        SCRATCH.empty(total, dtype),
+        SCRATCH.empty((total if volume.sh.shape[1] else 0, 3), dtype),
+        SCRATCH.empty(total, np.uint8),
+    )
 
 
 def render(
@@ -196,25 +254,18 @@ class _Render(torch.autograd.Function):
     @staticmethod
     def forward(ctx, density: Tensor, sh: Tensor | None, temperature: Tensor, context: _Context):
         options, voxels = context.options, context.voxels
-        marched = march(voxels, density, sh, temperature, context.activation, context.request, options)
+        marched, _ = _march(voxels, density, sh, temperature, context.activation, context.request, options)
         parameters = {"density": density, "sh": sh, "temperature": temperature}
 
-        def variation(name: str):
-            first, last = options.variation[name]
-            rows = voxels.voxel_rows
-            values = parameters[name].detach().numpy()  # type: ignore[union-attr]
-            low, high = int(rows[first, 0]), int(rows[last - 1, 3]) + 2
-            gradient = np.zeros((high - low, values.shape[1]), values.dtype)
-            value = kernels_backward.block_variation(values, rows, first, last, SMALLEST_VARIATION, low, gradient)
-            return value, low, gradient
-
-        found: Any = run_tasks([lambda name=name: variation(name) for name in options.variation])
-        ctx.blocks = {name: block[1:] for name, block in zip(options.variation, found)}
+        found = [
+            _total_variation(parameters[name].detach().numpy(), voxels.voxel_rows, first, last)  # type: ignore[union-attr]
+            for name, (first, last) in options.variation.items()
+        ]
         ctx.marched, ctx.options = marched, options
         ctx.set_materialize_grads(False)
         sums = [torch.from_numpy(values) for values in marched.sums]
         ctx.mark_non_differentiable(sums[4])
-        return (*sums, *(torch.tensor(block[0], dtype=density.dtype) for block in found))
+        return (*sums, *(torch.tensor(value, dtype=density.dtype) for value in found))
 
     @staticmethod
     def backward(ctx, *grad_outputs: Any):
@@ -227,7 +278,6 @@ class _Render(torch.autograd.Function):
         left = _gradient(transmittance, sums.transmittance)
         if accumulation is not None:
             left = left - _gradient(accumulation, sums.transmittance)
-        rays_moved = any(g is not None for g in grad_outputs[:7])
         grads = RayGradients(
             _gradient(rgb, sums.rgb),
             _gradient(thermal, sums.thermal),
@@ -235,83 +285,38 @@ class _Render(torch.autograd.Function):
             _gradient(distortion, sums.distortion),
             _gradient(sparsity, sums.sparsity),
         )
-        count = len(records.used)
-        used = [np.zeros(len(volume.voxel_rows), dtype=np.uint8) for _ in NAMES]
-        if rays_moved:
+        if any(gradient is not None for gradient in grad_outputs[:7]):
             run_ranges(
                 lambda a, b: kernels_backward.march_backward(
                     a, b, marched.rays, volume, marched.settings, records, grads
                 ),
-                count,
+                len(records.used),
             )
-            run_ranges(
-                lambda a, b: kernels_backward.mark_rows(a, b, marched.rays, volume, marched.settings, records, *used),
-                count,
-            )
-        return (*_row_gradients(marched, used, rays_moved, options, ctx.blocks, variation), None)
+        else:
+            records.used.fill(0)
+        return (*row_gradients(marched, _blocks(options, variation)), None)
 
 
-def _row_gradients(marched: Marched, used, rays_moved: bool, options: RenderOptions, blocks, variation):
-    """Sum the samples' gradients and those of the variations into row-sparse tensors."""
-    volume, records = marched.volume, marched.records
-    num_rows = len(volume.density)
-    parameters = {"density": volume.density, "sh": volume.sh, "temperature": volume.temperature}
-    pushes = {name: g for name, g in zip(options.variation, variation) if g is not None}
-    places = [np.full(num_rows if parameters[name].shape[1] else 0, -1, dtype=np.int32) for name in NAMES]
-
-    def place(index: int) -> np.ndarray:
-        """Number the rows of a parameter that get a gradient and list them."""
-        name = NAMES[index]
-        first, last = options.variation[name] if name in pushes else (0, 0)
-        if not parameters[name].shape[1]:
-            return np.zeros(0, dtype=np.int64)
-        total = kernels_backward.place_rows(used[index], volume.voxel_rows, first, last, places[index])
-        return kernels_backward.list_rows(places[index], total)
-
-    touched: Any = run_tasks([lambda index=index: place(index) for index in range(3)])
-    values = [
-        np.zeros((len(found), parameters[name].shape[1]), parameters[name].dtype) for name, found in zip(NAMES, touched)
-    ]
-    rows = RowGradients(places[0], values[0], places[1], values[1], places[2], values[2])
-    if rays_moved:
-        bounds = _row_ranges(touched[0], num_rows, num_threads())
-        run_tasks(
-            [
-                lambda low=low, high=high: kernels_backward.add_rows(
-                    low, high, marched.rays, volume, marched.settings, records, rows
-                )
-                for low, high in itertools.pairwise(bounds)
-                if high > low
-            ]
-        )
-    gradients = []
-    for index, name in enumerate(NAMES):
-        if name in pushes:
-            low, block = blocks[name]
-            at = places[index][low : low + len(block)]
-            inside = np.flatnonzero(at >= 0)
-            values[index][at[inside]] += block[inside] * values[index].dtype.type(float(pushes[name]))
-        if len(touched[index]) == 0:
-            gradients.append(None)
-            continue
-        gradients.append(
-            torch.sparse_coo_tensor(
-                torch.from_numpy(touched[index])[None],
-                torch.from_numpy(values[index]),
-                parameters[name].shape,
-                is_coalesced=True,
-                check_invariants=False,
-            )
-        )
-    return gradients
+def _total_variation(values: np.ndarray, voxel_rows: np.ndarray, first: int, last: int) -> float:
+    """Mean of the total variation over a block; its parts do not depend on the number of threads."""
+    bounds = [*range(first, last, VOXELS_AT_ONCE), last]
+    parts: Any = run_tasks(
+        [
+            lambda a=a, b=b: kernels_rows.total_variation(values, voxel_rows, a, b, SMALLEST_VARIATION)
+            for a, b in itertools.pairwise(bounds)
+        ]
+    )
+    return sum(parts) / (values.shape[1] * (last - first))
 
 
-def _row_ranges(touched: np.ndarray, num_rows: int, threads: int) -> list[int]:
-    """Bounds of row ranges with about equally many touched rows."""
-    if threads == 1 or len(touched) == 0:
-        return [0, num_rows]
-    cuts = touched[(np.arange(1, threads) * len(touched)) // threads]
-    return [0, *(int(cut) for cut in cuts), num_rows]
+def _blocks(options: RenderOptions, pushes: Sequence[Tensor | None]) -> Blocks:
+    """The total variation that has a gradient."""
+    blocks = Blocks(np.zeros(3, np.int64), np.zeros(3, np.int64), np.zeros(3), SMALLEST_VARIATION)
+    for (name, (first, last)), push in zip(options.variation.items(), pushes):
+        if push is not None:
+            kind = NAMES.index(name)
+            blocks.first[kind], blocks.last[kind], blocks.push[kind] = first, last, float(push)
+    return blocks
 
 
 def _array(values: Tensor) -> np.ndarray:

@@ -22,7 +22,11 @@ OPAQUE = 100.0
 """Optical depth of a step from which it counts as opaque."""
 EXP_LIMIT = 15.0
 """Raw density from which `exp` stays constant."""
+AHEAD = 8
+"""Samples of a ray that are read before they are weighed."""
 RELU, SOFTPLUS, EXP = 0, 1, 2
+DENSITY, COLOUR, TEMPERATURE = 1, 2, 4
+"""Bits: which parameters a sample has a gradient for."""
 
 
 class Volume(NamedTuple):
@@ -75,12 +79,15 @@ class Settings(NamedTuple):
 
 
 class Records(NamedTuple):
-    """What the forward pass remembers of each sample in a kept voxel, ray after ray."""
+    """What the forward pass remembers of each sample in a kept voxel before its ray was opaque, ray after ray.
+
+    Ranges of rays have places of their own, with gaps behind them.
+    """
 
     offset: Ints
-    """First record of each ray, (rays + 1,) int64."""
+    """First record of each ray, (rays,) int64."""
     used: Ints
-    """Records of each ray before it was opaque, (rays,) int64."""
+    """Records of each ray, (rays,) int64."""
     number: Ints
     """Number of the voxel, int32."""
     step: Ints
@@ -95,6 +102,8 @@ class Records(NamedTuple):
     """Weight."""
     rgb: Floats
     """Colour, (records, 3); after the backward pass the gradient of its logits."""
+    uses: Ints
+    """After the backward pass which parameters have a gradient (bits), uint8."""
 
 
 class Sums(NamedTuple):
@@ -171,22 +180,6 @@ def next_sample(i: int, enter: float, length: float, step: float, rays: Rays, r:
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def count_samples(first: int, last: int, rays: Rays, volume: Volume, settings: Settings, counts: Ints):
-    """Number of samples in kept voxels of rays `first` to `last`."""
-    for r in range(first, last):
-        enter, leave = chord(rays, r, volume)
-        count = 0
-        i = 0
-        while True:
-            found = next_sample(i, enter, leave - enter, settings.step, rays, r, volume)
-            if found[0] < 0:
-                break
-            count += 1
-            i = found[0] + 1
-        counts[r] = count
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
 def basis_of(directions: Floats, r: int, count: int, scale: float, basis: Floats):
     """Spherical harmonics of a ray's direction, the first `count` of `harmonics.harmonics`, times `scale`."""
     basis[0] = 0.28209479177387814 * scale
@@ -245,6 +238,12 @@ def gather_one(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
+def place_of(records: Records, n: int):
+    """Place of a sample in its voxel."""
+    return float(records.fraction[n, 0]), float(records.fraction[n, 1]), float(records.fraction[n, 2])
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
 def activate(raw: float, kind: int):
     """Density of an interpolated raw value; a NaN stays one."""
     if kind == RELU:
@@ -255,11 +254,25 @@ def activate(raw: float, kind: int):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def march_forward(first: int, last: int, rays: Rays, volume: Volume, settings: Settings, records: Records, sums: Sums):
-    """Render rays `first` to `last` (paper, eq. 1 and 2) and record their samples.
+def march_forward(
+    first: int,
+    last: int,
+    rays: Rays,
+    volume: Volume,
+    settings: Settings,
+    records: Records,
+    sums: Sums,
+    begin: int,
+    end: int,
+):
+    """Render rays `first` to `last` (paper, eq. 1 and 2) and record their samples from `begin` to before `end`.
+
+    Samples are found, read and weighed a few at a time: reading does not wait for weighing then, and a memory that
+    answers late is asked for several of them at once.
 
     Returns:
-        Number of samples whose density is NaN.
+        Number of samples whose density is NaN, or -1 if there are more samples than places; place behind the last
+        record, or the number of samples per ray so far.
     """
     channels, thermal_channels = volume.sh.shape[1], volume.temperature.shape[1]
     count = channels // 3
@@ -267,45 +280,71 @@ def march_forward(first: int, last: int, rays: Rays, volume: Volume, settings: S
     coefficients = np.empty(channels, volume.sh.dtype)
     thermal_coefficients = np.empty(thermal_channels, volume.temperature.dtype)
     basis, thermal_basis = np.empty(9), np.empty(9)
+    distance, length_of, raw = np.empty(AHEAD), np.empty(AHEAD), np.empty(AHEAD)
     wrong = 0
+    n = begin
     for r in range(first, last):
         enter, leave = chord(rays, r, volume)
         length = leave - enter
         wants_rgb, wants_thermal = (rays.wants[r] & 1) != 0 and channels > 0, (rays.wants[r] & 2) != 0
+        expected, left, depth_sum = 0.0, 1.0, 0.0
+        weight_sum, moment_sum, distortion, sparsity = 0.0, 0.0, 0.0, 0.0
+        start, i = n, 0
+        records.offset[r] = start
+        while i >= 0 and left >= settings.early_stop:
+            if n + AHEAD > end:
+                return -1, (n - begin) // max(1, r - first) + 1
+            found = 0
+            while found < AHEAD:
+                i, number, t, delta, fx, fy, fz = next_sample(i, enter, length, settings.step, rays, r, volume)
+                if i < 0:
+                    break
+                at = n + found
+                records.number[at], records.step[at] = number, i
+                records.fraction[at, 0], records.fraction[at, 1], records.fraction[at, 2] = fx, fy, fz
+                distance[found], length_of[found] = t, delta
+                found += 1
+                i += 1
+            for k in range(found):
+                raw[k] = gather_one(volume.density, volume.voxel_rows, records.number[n + k], *place_of(records, n + k))
+            for k in range(found):
+                density = activate(raw[k], volume.activation)
+                if density != density:
+                    wrong += 1
+                    i = -1
+                    break
+                t, delta = distance[k], length_of[k]
+                optical = min(density * delta, OPAQUE)
+                alpha = -math.expm1(-optical)
+                weight = left * alpha
+                depth_sum += optical
+                left *= math.exp(-optical) if alpha > 0.5 else 1.0 - alpha
+                records.density[n], records.left[n], records.weight[n] = density, left, weight
+                expected += weight * t
+                if settings.distortion_scale > 0.0:
+                    distortion += 2.0 * weight * (t * weight_sum - moment_sum) + weight * weight * delta / 3.0
+                    weight_sum += weight
+                    moment_sum += weight * t
+                if settings.sparsity:
+                    limited = min(density, 1e9)
+                    sparsity += math.log1p(2.0 * limited * limited)
+                n += 1
+                if left < settings.early_stop:
+                    break
+        records.used[r] = n - start
+        opacity = -math.expm1(-depth_sum)
+        sums.transmittance[r], sums.accumulation[r] = left, opacity
+        sums.depth[r] = expected / opacity if opacity > 0.0 else math.inf
+        if settings.distortion_scale > 0.0:
+            sums.distortion[r] = distortion / settings.distortion_scale
+        if settings.sparsity:
+            sums.sparsity[r] = sparsity
+        red, green, blue = 0.0, 0.0, 0.0
         if wants_rgb:
             basis_of(rays.directions, r, active, 1.0, basis)
-        if wants_thermal:
-            basis_of(rays.directions, r, thermal_channels, 1.0 / 0.28209479177387814, thermal_basis)
-        red, green, blue, thermal, expected = 0.0, 0.0, 0.0, 0.0, 0.0
-        left, depth_sum = 1.0, 0.0
-        weight_sum, moment_sum, distortion, sparsity = 0.0, 0.0, 0.0, 0.0
-        n, i = records.offset[r], 0
-        while True:
-            i, number, t, delta, fx, fy, fz = next_sample(i, enter, length, settings.step, rays, r, volume)
-            if i < 0:
-                break
-            density = activate(gather_one(volume.density, volume.voxel_rows, number, fx, fy, fz), volume.activation)
-            if density != density:
-                wrong += 1
-                break
-            optical = min(density * delta, OPAQUE)
-            alpha = -math.expm1(-optical)
-            weight = left * alpha
-            depth_sum += optical
-            left *= math.exp(-optical) if alpha > 0.5 else 1.0 - alpha
-            records.number[n], records.step[n] = number, i
-            records.fraction[n, 0], records.fraction[n, 1], records.fraction[n, 2] = fx, fy, fz
-            records.density[n], records.left[n], records.weight[n] = density, left, weight
-            expected += weight * t
-            if settings.distortion_scale > 0.0:
-                distortion += 2.0 * weight * (t * weight_sum - moment_sum) + weight * weight * delta / 3.0
-                weight_sum += weight
-                moment_sum += weight * t
-            if settings.sparsity:
-                limited = min(density, 1e9)
-                sparsity += math.log1p(2.0 * limited * limited)
-            if records.weight[n] > settings.smallest_weight:  # as rounded: the backward pass asks the same
-                if wants_rgb:
+            for at in range(start, n):
+                if records.weight[at] > settings.smallest_weight:  # as rounded: the backward pass asks the same
+                    number, (fx, fy, fz) = records.number[at], place_of(records, at)
                     if active == count:
                         gather(volume.sh, volume.voxel_rows, number, fx, fy, fz, coefficients)
                     else:
@@ -314,11 +353,24 @@ def march_forward(first: int, last: int, rays: Rays, volume: Volume, settings: S
                         logit = 0.0
                         for k in range(active):
                             logit += coefficients[c * count + k] * basis[k]
-                        records.rgb[n, c] = 1.0 / (1.0 + math.exp(-logit))
-                    red += weight * records.rgb[n, 0]
-                    green += weight * records.rgb[n, 1]
-                    blue += weight * records.rgb[n, 2]
-                if wants_thermal:
+                        records.rgb[at, c] = logit
+            for at in range(start, n):
+                if records.weight[at] > settings.smallest_weight:
+                    weight = records.weight[at]
+                    for c in range(3):
+                        records.rgb[at, c] = 1.0 / (1.0 + math.exp(-records.rgb[at, c]))
+                    red += weight * records.rgb[at, 0]
+                    green += weight * records.rgb[at, 1]
+                    blue += weight * records.rgb[at, 2]
+        if channels:
+            sums.rgb[r, 0], sums.rgb[r, 1], sums.rgb[r, 2] = red, green, blue
+        thermal = 0.0
+        if wants_thermal:
+            if thermal_channels > 1:
+                basis_of(rays.directions, r, thermal_channels, 1.0 / 0.28209479177387814, thermal_basis)
+            for at in range(start, n):
+                if records.weight[at] > settings.smallest_weight:
+                    number, (fx, fy, fz) = records.number[at], place_of(records, at)
                     value = 0.0
                     if thermal_channels == 1:
                         value = gather_one(volume.temperature, volume.voxel_rows, number, fx, fy, fz)
@@ -326,20 +378,6 @@ def march_forward(first: int, last: int, rays: Rays, volume: Volume, settings: S
                         gather(volume.temperature, volume.voxel_rows, number, fx, fy, fz, thermal_coefficients)
                         for k in range(thermal_channels):
                             value += thermal_coefficients[k] * thermal_basis[k]
-                    thermal += weight * value
-            n += 1
-            i += 1
-            if left < settings.early_stop:
-                break
-        records.used[r] = n - records.offset[r]
-        opacity = -math.expm1(-depth_sum)
-        sums.transmittance[r], sums.accumulation[r] = left, opacity
-        sums.depth[r] = expected / opacity if opacity > 0.0 else math.inf
-        if channels:
-            sums.rgb[r, 0], sums.rgb[r, 1], sums.rgb[r, 2] = red, green, blue
+                    thermal += records.weight[at] * value
         sums.thermal[r, 0] = thermal
-        if settings.distortion_scale > 0.0:
-            sums.distortion[r] = distortion / settings.distortion_scale
-        if settings.sparsity:
-            sums.sparsity[r] = sparsity
-    return wrong
+    return wrong, n

@@ -1,8 +1,6 @@
-"""Compiled backward pass of `kernels.march_forward`, without racing adds.
+"""Compiled backward pass of `kernels.march_forward`: gradients of each ray's sums become those of its samples.
 
-First each ray turns the gradients of its sums into gradients of its samples (rays share nothing). Then each thread
-owns a range of rows and adds to them, in the order of rays and samples, whatever falls there: the sums are the same
-bits for any number of threads.
+Rays share nothing here; `kernels_rows` adds up what falls on the same rows.
 """
 
 from __future__ import annotations
@@ -14,12 +12,14 @@ import numpy as np
 from numba import njit
 
 from thermoxels_ns.render.kernels import (
+    COLOUR,
+    DENSITY,
     EXP_LIMIT,
     OPAQUE,
     RELU,
     SOFTPLUS,
+    TEMPERATURE,
     Floats,
-    Ints,
     Rays,
     Records,
     Settings,
@@ -45,22 +45,13 @@ class RayGradients(NamedTuple):
     sparsity: Floats
 
 
-class RowGradients(NamedTuple):
-    """Gradients of the rows that were touched, per parameter: the row's place in the values, -1 for none."""
-
-    density_place: Ints
-    density: Floats
-    sh_place: Ints
-    sh: Floats
-    temperature_place: Ints
-    temperature: Floats
-
-
 @njit(nogil=True, cache=True, error_model="numpy")
 def march_backward(
     first: int, last: int, rays: Rays, volume: Volume, settings: Settings, records: Records, grads: RayGradients
 ):
     """Replace in the records density, left and rgb by the gradients of raw density, temperature and colour logits.
+
+    `uses` says which of them a sample has.
 
     With w_i = T_i (1 - exp(-x_i)), T_{i+1} = T_i exp(-x_i) and x_i the optical depth of step i,
     dL/dx_i = g_i T_{i+1} - sum_{j>i} g_j w_j - g_T T_end, where g_i = dL/dw_i and g_T is the gradient of what is left.
@@ -141,179 +132,7 @@ def march_backward(
                 slope = slope * density if density < _FLAT_EXP else 0.0
             records.density[n] = slope
             records.left[n] = heat * weight if seen else 0.0
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def mark_rows(
-    first: int,
-    last: int,
-    rays: Rays,
-    volume: Volume,
-    settings: Settings,
-    records: Records,
-    density_used: Ints,
-    sh_used: Ints,
-    temperature_used: Ints,
-):
-    """Mark the voxels whose corners get a gradient; threads may mark the same one, the result does not depend on it."""
-    channels = volume.sh.shape[1]
-    for r in range(first, last):
-        wants_rgb, wants_thermal = (rays.wants[r] & 1) != 0 and channels > 0, (rays.wants[r] & 2) != 0
-        for n in range(records.offset[r], records.offset[r] + records.used[r]):
-            number = records.number[n]
-            if records.density[n] != 0.0:
-                density_used[number] = 1
-            if records.weight[n] > settings.smallest_weight:
-                if wants_rgb:
-                    sh_used[number] = 1
-                if wants_thermal:
-                    temperature_used[number] = 1
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def place_rows(used: Ints, voxel_rows: Ints, block_first: int, block_last: int, place: Ints):
-    """Number the rows that get a gradient, ascending.
-
-    Args:
-        used: Marked voxels.
-        voxel_rows: Their rows.
-        block_first: First voxel of the block that total variation looks at.
-        block_last: One behind its last.
-        place: All -1; the place of each row in the values, where it has one.
-
-    Returns:
-        Number of such rows.
-    """
-    for number in range(len(used)):
-        if used[number] != 0 or block_first <= number < block_last:
-            for k in range(4):
-                row = voxel_rows[number, k]
-                place[row] = 0
-                place[row + 1] = 0
-    total = 0
-    for row in range(len(place)):
-        if place[row] == 0:
-            place[row] = total
-            total += 1
-    return total
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def list_rows(place: Ints, total: int):
-    """The `total` rows that `place_rows` numbered, ascending, int64."""
-    rows = np.empty(total, np.int64)
-    for row in range(len(place)):
-        if place[row] >= 0:
-            rows[place[row]] = row
-    return rows
-
-
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
-def add_rows(
-    first_row: int, last_row: int, rays: Rays, volume: Volume, settings: Settings, records: Records, rows: RowGradients
-):
-    """Add the gradients of all samples to rows `first_row` to `last_row` and to no other."""
-    channels, thermal_channels = volume.sh.shape[1], volume.temperature.shape[1]
-    count = channels // 3
-    active = min(count, settings.sh_active)
-    dtype = volume.density.dtype
-    one = dtype.type
-    basis, thermal_basis = np.empty(9), np.empty(9)
-    colour = np.zeros(channels, dtype)
-    for r in range(len(records.used)):
-        start, end = records.offset[r], records.offset[r] + records.used[r]
-        if start == end:
-            continue
-        wants_rgb, wants_thermal = (rays.wants[r] & 1) != 0 and channels > 0, (rays.wants[r] & 2) != 0
-        ready = False
-        for n in range(start, end):
-            number = records.number[n]
-            lowest, highest = volume.voxel_rows[number, 0], volume.voxel_rows[number, 3] + 1
-            if highest < first_row or lowest >= last_row:
-                continue
-            slope = records.density[n]
-            seen = records.weight[n] > settings.smallest_weight
-            if slope == 0.0 and not seen:
-                continue
-            if seen and not ready:
-                ready = True
-                if wants_rgb:
-                    basis_of(rays.directions, r, active, 1.0, basis)
-                if wants_thermal:
-                    basis_of(rays.directions, r, thermal_channels, 1.0 / 0.28209479177387814, thermal_basis)
-            if seen and wants_rgb:
-                for c in range(3):
-                    for k in range(active):
-                        colour[c * count + k] = records.rgb[n, c] * basis[k]
-            heat = records.left[n]
-            fx, fy, fz = float(records.fraction[n, 0]), float(records.fraction[n, 1]), float(records.fraction[n, 2])
-            for corner in range(8):
-                row = volume.voxel_rows[number, corner >> 1] + (corner & 1)
-                if row < first_row or row >= last_row:
-                    continue
-                share = fx if corner & 4 else 1.0 - fx
-                share *= fy if corner & 2 else 1.0 - fy
-                share *= fz if corner & 1 else 1.0 - fz
-                if slope != 0.0:
-                    rows.density[rows.density_place[row], 0] += share * slope
-                if seen:
-                    if wants_rgb:
-                        into = rows.sh[rows.sh_place[row]]
-                        part = one(share)
-                        if active == count:
-                            for k in range(channels):
-                                into[k] += part * colour[k]
-                        else:
-                            for c in range(0, channels, count):
-                                for k in range(c, c + active):
-                                    into[k] += part * colour[k]
-                    if wants_thermal:
-                        at = rows.temperature_place[row]
-                        if thermal_channels == 1:
-                            rows.temperature[at, 0] += share * heat
-                        else:
-                            for k in range(thermal_channels):
-                                rows.temperature[at, k] += share * heat * thermal_basis[k]
-
-
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
-def block_variation(
-    values: Floats, voxel_rows: Ints, first: int, last: int, smallest: float, first_row: int, gradient: Floats
-):
-    """Total variation of a block of voxels (Plenoxels, eq. 4) and its gradient.
-
-    Args:
-        values: Parameter, (rows, channels).
-        voxel_rows: Rows of the voxels.
-        first: First voxel of the block.
-        last: One behind its last.
-        smallest: Added under the root.
-        first_row: Row that the first row of `gradient` stands for.
-        gradient: Zeros; the gradient of the mean over voxels and channels.
-
-    Returns:
-        The mean over voxels and channels of sqrt(dx^2 + dy^2 + dz^2).
-    """
-    channels = values.shape[1]
-    scale = 1.0 / (channels * (last - first))
-    total = 0.0
-    one = values.dtype.type
-    part, tiny = one(scale), one(smallest)
-    lengths = np.empty(channels, values.dtype)
-    for number in range(first, last):
-        a, b, c = voxel_rows[number, 0], voxel_rows[number, 1], voxel_rows[number, 2]
-        here, along_z, along_y, along_x = values[a], values[a + 1], values[b], values[c]
-        g_here, g_z = gradient[a - first_row], gradient[a + 1 - first_row]
-        g_y, g_x = gradient[b - first_row], gradient[c - first_row]
-        for k in range(channels):
-            dx, dy, dz = along_x[k] - here[k], along_y[k] - here[k], along_z[k] - here[k]
-            length = np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
-            lengths[k] = length
-            push = part / length
-            g_x[k] += push * dx
-            g_y[k] += push * dy
-            g_z[k] += push * dz
-            g_here[k] -= push * (dx + dy + dz)
-        for k in range(channels):
-            total += lengths[k]
-    return total * scale
+            uses = DENSITY if records.density[n] != 0.0 else 0
+            if seen:
+                uses |= (COLOUR if wants_rgb else 0) | (TEMPERATURE if wants_thermal else 0)
+            records.uses[n] = uses

@@ -1,0 +1,134 @@
+"""Memory that is lent again: when it comes back, to whom it goes, and that nobody shares it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from tests.reference.two_renderers import random_grid, random_request
+from thermoxels_ns import scratch
+from thermoxels_ns.field.refine import refine
+from thermoxels_ns.ray_rendering import fused_render
+from thermoxels_ns.render.ray_render import RenderOptions
+from thermoxels_ns.scratch import PATIENCE, SMALLEST, Scratch, rounded_size
+
+LARGE = 4 * SMALLEST
+
+
+def address(array: np.ndarray) -> int:
+    return array.ctypes.data
+
+
+def test_memory_comes_back_when_the_last_view_of_it_is_gone():
+    pool = Scratch()
+    array = pool.empty((LARGE // 8, 2), np.float32)
+    assert array.shape == (LARGE // 8, 2) and array.dtype == np.float32
+    where, view, tensor = address(array), array[3:], torch.from_numpy(array)[1:]
+    del array
+    assert pool.held_bytes() == 0
+    del view
+    assert pool.held_bytes() == 0
+    del tensor
+    assert pool.held_bytes() == rounded_size(LARGE)
+    assert address(pool.empty(LARGE // 8, np.float64)) == where
+
+
+def test_two_arrays_in_use_never_share_memory():
+    pool = Scratch()
+    arrays = [pool.empty(LARGE, np.uint8) for _ in range(5)]
+    for number, array in enumerate(arrays):
+        array.fill(number)
+    assert [set(array.tolist()) for array in arrays] == [{number} for number in range(5)]
+
+
+def test_zeros_are_zeros_also_in_memory_that_was_used():
+    pool = Scratch()
+    pool.empty(LARGE, np.float32).fill(7.0)
+    assert pool.held_bytes() > 0
+    assert not pool.zeros(LARGE, np.float32).any()
+
+
+def test_small_arrays_are_not_kept():
+    pool = Scratch()
+    small = pool.empty(SMALLEST - 1, np.uint8)
+    assert small.base is None
+    del small
+    assert pool.held_bytes() == 0
+
+
+@pytest.mark.parametrize("shape", [0, (0, 27), (5, 0)])
+def test_empty_arrays(shape):
+    assert Scratch().empty(shape, np.float32).size == 0
+
+
+@pytest.mark.parametrize("size", [1, 3, 1023, 1024, 1025, 99_999, 2**20 + 1])
+def test_rounding_adds_at_most_a_quarter(size):
+    assert size <= rounded_size(size) <= max(1.25 * size, size + 1)
+    assert rounded_size(rounded_size(size)) == rounded_size(size)
+
+
+def test_what_nobody_asks_for_is_given_back():
+    pool = Scratch()
+    del [pool.empty(LARGE, np.uint8)][0]
+    assert pool.held_bytes() == LARGE
+    for _ in range(2 * PATIENCE):
+        pool.empty(2 * LARGE, np.uint8)
+    assert pool.held_bytes() == 2 * LARGE
+
+
+def test_release_gives_back_what_is_not_lent():
+    pool = Scratch()
+    kept = pool.zeros(LARGE, np.uint8)
+    pool.empty(LARGE, np.uint8)
+    pool.release()
+    assert pool.held_bytes() == 0
+    assert not kept.any()
+    del kept
+    assert pool.held_bytes() == LARGE
+
+
+def rendered(grid, request):
+    seen = fused_render(grid, request, RenderOptions(distortion_scale=2.0))
+    assert seen.rgb is not None and seen.distortion is not None
+    return seen.rgb.sum() + seen.thermal.sum() + seen.distortion.sum()
+
+
+def gradients(grid) -> list[torch.Tensor]:
+    return [parameter.grad.to_dense().clone() for parameter in grid.parameters()]
+
+
+def test_renders_that_wait_for_their_gradient_keep_their_records():
+    """Two renders, then their gradients in either order, are each what they are alone."""
+    grid = random_grid(2, density=0.0)
+    requests = [random_request(grid, 600, seed) for seed in (0, 1)]
+    alone = []
+    for request in requests:
+        grid.zero_grad()
+        rendered(grid, request).backward()
+        alone.append(gradients(grid))
+    losses = [rendered(grid, request) for request in requests]
+    for which in (1, 0):
+        grid.zero_grad()
+        losses[which].backward()
+        assert all(torch.equal(a, b) for a, b in zip(gradients(grid), alone[which]))
+
+
+def test_gradients_are_not_overwritten_by_the_next_step():
+    grid = random_grid(2, density=0.0)
+    rendered(grid, random_request(grid, 600, 0)).backward()
+    held = [parameter.grad for parameter in grid.parameters()]
+    before = gradients(grid)
+    grid.zero_grad(set_to_none=True)
+    for seed in (1, 2):
+        rendered(grid, random_request(grid, 600, seed)).backward()
+    assert all(torch.equal(kept.to_dense(), value) for kept, value in zip(held, before))
+
+
+def test_a_new_lattice_gives_back_what_the_old_one_needed():
+    grid = random_grid(2, density=0.0)
+    rendered(grid, random_request(grid, 2000)).backward()
+    grid.zero_grad(set_to_none=True)
+    assert scratch.SCRATCH.held_bytes() > 0
+    refine(grid, 2)
+    assert scratch.SCRATCH.held_bytes() == 0

@@ -1,0 +1,315 @@
+"""Compiled sums over rows: what samples and total variation give to each row, without racing adds.
+
+Samples are put in the order of their voxels first, so that those that fall on the same rows follow each other and rows
+are passed in the order in which they lie in memory. Each thread owns a range of rows and adds, in that order, whatever
+falls there: the sums are the same bits for any number of threads.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from thermoxels_ns.render.kernels import (
+    COLOUR,
+    DENSITY,
+    TEMPERATURE,
+    Floats,
+    Ints,
+    Rays,
+    Records,
+    Settings,
+    Volume,
+    basis_of,
+)
+
+
+class Order(NamedTuple):
+    """Samples with a gradient in the order of their voxels; of those in one group of voxels, in the order of rays."""
+
+    shift: int
+    """A group is 2^shift voxels."""
+    group: Ints
+    """First of each group in the lists below and one behind the last, (groups + 1,) int64."""
+    record: Ints
+    """Record, int32."""
+    ray: Ints
+    """Its ray, int32."""
+
+
+class Blocks(NamedTuple):
+    """Total variation to add: one entry per parameter, in the order density, colour, temperature."""
+
+    first: Ints
+    """First voxel, (3,) int64."""
+    last: Ints
+    """One behind the last voxel; the first where there is no block."""
+    push: Floats
+    """Gradient of the block's total variation, (3,) float64."""
+    smallest: float
+    """Added under the root."""
+
+
+class RowGradients(NamedTuple):
+    """Gradients of the rows that have one."""
+
+    uses: Ints
+    """Which parameters each row has a gradient for (bits), (rows,) uint8."""
+    place: Ints
+    """Where, in the arrays below, (rows, 3) int32; for density, colour, temperature."""
+    density_rows: Ints
+    density: Floats
+    sh_rows: Ints
+    sh: Floats
+    sh_sums: Floats
+    """Of the harmonics that take part, for three channels one after the other; `sh` itself if that is all."""
+    temperature_rows: Ints
+    temperature: Floats
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def order_records(records: Records, order: Order):
+    """Fill `order` by counting; `order.group` holds zeros before."""
+    group = order.group
+    for r in range(len(records.used)):
+        for n in range(records.offset[r], records.offset[r] + records.used[r]):
+            if records.uses[n]:
+                group[(records.number[n] >> order.shift) + 1] += 1
+    for g in range(1, len(group)):
+        group[g] += group[g - 1]
+    for r in range(len(records.used)):
+        for n in range(records.offset[r], records.offset[r] + records.used[r]):
+            if records.uses[n]:
+                g = records.number[n] >> order.shift
+                order.record[group[g]], order.ray[group[g]] = n, r
+                group[g] += 1
+    for g in range(len(group) - 1, 0, -1):
+        group[g] = group[g - 1]
+    group[0] = 0
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def first_voxel(voxel_rows: Ints, corner: int, row: int):
+    """The first voxel whose row of a corner is at least `row`; such rows ascend."""
+    low, high = 0, len(voxel_rows)
+    while low < high:
+        middle = (low + high) >> 1
+        if voxel_rows[middle, corner] < row:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def use_rows(first_row: int, last_row: int, volume: Volume, records: Records, order: Order, blocks: Blocks, uses: Ints):
+    """Mark which parameters rows `first_row` to `last_row` have a gradient for.
+
+    Returns:
+        Number of rows with a gradient of density, colour and temperature.
+    """
+    rows = volume.voxel_rows
+    uses[first_row:last_row] = 0
+    begin, end = first_voxel(rows, 3, first_row - 1), first_voxel(rows, 0, last_row)
+    for at in range(order.group[begin >> order.shift], order.group[_groups_before(end, order)]):
+        n = order.record[at]
+        number, bits = records.number[n], records.uses[n]
+        if rows[number, 0] >= first_row and rows[number, 3] + 1 < last_row:
+            for corner in range(4):
+                row = rows[number, corner]
+                uses[row] |= bits
+                uses[row + 1] |= bits
+        else:
+            for corner in range(8):
+                row = rows[number, corner >> 1] + (corner & 1)
+                if first_row <= row < last_row:
+                    uses[row] |= bits
+    for kind in range(3):
+        bit = np.uint8(1 << kind)
+        for number in range(max(begin, blocks.first[kind]), min(end, blocks.last[kind])):
+            a, b, c = np.int64(rows[number, 0]), np.int64(rows[number, 1]), np.int64(rows[number, 2])
+            if a >= first_row and c < last_row:
+                uses[a] |= bit
+                uses[a + 1] |= bit
+                uses[b] |= bit
+                uses[c] |= bit
+            else:
+                for row in (a, a + 1, b, c):
+                    if first_row <= row < last_row:
+                        uses[row] |= bit
+    density, colour, temperature = 0, 0, 0
+    for row in range(first_row, last_row):
+        bits = uses[row]
+        density += bits & 1
+        colour += (bits >> 1) & 1
+        temperature += (bits >> 2) & 1
+    return density, colour, temperature
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _groups_before(number: int, order: Order):
+    """Number of groups that reach the voxels before `number`."""
+    return (number + (1 << order.shift) - 1) >> order.shift
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def list_rows(first_row: int, last_row: int, density: int, colour: int, temperature: int, rows: RowGradients):
+    """List the rows of a range that have a gradient, from the given places on, and set their sums to 0."""
+    for row in range(first_row, last_row):
+        bits = rows.uses[row]
+        if bits == 0:
+            continue
+        if bits & DENSITY:
+            rows.place[row, 0], rows.density_rows[density] = density, row
+            rows.density[density, 0] = 0.0
+            density += 1
+        if bits & COLOUR:
+            rows.place[row, 1], rows.sh_rows[colour] = colour, row
+            rows.sh_sums[colour, :] = 0.0
+            colour += 1
+        if bits & TEMPERATURE:
+            rows.place[row, 2], rows.temperature_rows[temperature] = temperature, row
+            rows.temperature[temperature, :] = 0.0
+            temperature += 1
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+def add_samples(
+    first_row: int,
+    last_row: int,
+    rays: Rays,
+    volume: Volume,
+    settings: Settings,
+    records: Records,
+    order: Order,
+    rows: RowGradients,
+):
+    """Add the gradients of samples to rows `first_row` to `last_row` and to no other."""
+    channels, thermal_channels = volume.sh.shape[1], volume.temperature.shape[1]
+    active = min(channels // 3, settings.sh_active)
+    dtype = volume.density.dtype
+    one = dtype.type
+    basis, thermal_basis = np.empty(9), np.empty(9)
+    colour = np.zeros(3 * active, dtype)
+    begin, end = first_voxel(volume.voxel_rows, 3, first_row - 1), first_voxel(volume.voxel_rows, 0, last_row)
+    for at in range(order.group[begin >> order.shift], order.group[_groups_before(end, order)]):
+        n, r = order.record[at], order.ray[at]
+        number, bits = records.number[n], records.uses[n]
+        if volume.voxel_rows[number, 3] + 1 < first_row or volume.voxel_rows[number, 0] >= last_row:
+            continue
+        slope, heat = records.density[n], records.left[n]
+        if bits & COLOUR:
+            basis_of(rays.directions, r, active, 1.0, basis)
+            for c in range(3):
+                for k in range(active):
+                    colour[c * active + k] = records.rgb[n, c] * basis[k]
+        if bits & TEMPERATURE and thermal_channels > 1:
+            basis_of(rays.directions, r, thermal_channels, 1.0 / 0.28209479177387814, thermal_basis)
+        fx, fy, fz = float(records.fraction[n, 0]), float(records.fraction[n, 1]), float(records.fraction[n, 2])
+        for corner in range(8):
+            row = volume.voxel_rows[number, corner >> 1] + (corner & 1)
+            if row < first_row or row >= last_row:
+                continue
+            share = fx if corner & 4 else 1.0 - fx
+            share *= fy if corner & 2 else 1.0 - fy
+            share *= fz if corner & 1 else 1.0 - fz
+            if bits & DENSITY:
+                rows.density[rows.place[row, 0], 0] += share * slope
+            if bits & COLOUR:
+                place, part = rows.place[row, 1], one(share)
+                for k in range(3 * active):
+                    rows.sh_sums[place, k] += part * colour[k]
+            if bits & TEMPERATURE:
+                place = rows.place[row, 2]
+                if thermal_channels == 1:
+                    rows.temperature[place, 0] += share * heat
+                else:
+                    for k in range(thermal_channels):
+                        rows.temperature[place, k] += share * heat * thermal_basis[k]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def spread_harmonics(first: int, last: int, rows: RowGradients):
+    """Put the sums of places `first` to `last` where their harmonics stand among all; the others get 0."""
+    count, active = rows.sh.shape[1] // 3, rows.sh_sums.shape[1] // 3
+    for place in range(first, last):
+        rows.sh[place, :] = 0.0
+        for c in range(3):
+            for k in range(active):
+                rows.sh[place, c * count + k] = rows.sh_sums[place, c * active + k]
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+def total_variation(values: Floats, voxel_rows: Ints, first: int, last: int, smallest: float):
+    """Sum over voxels `first` to `last` and channels of sqrt(dx^2 + dy^2 + dz^2) (Plenoxels, eq. 4)."""
+    channels = values.shape[1]
+    tiny = values.dtype.type(smallest)
+    totals = np.zeros(channels)
+    for number in range(first, last):
+        a = voxel_rows[number, 0]
+        here, along_z = values[a], values[a + 1]
+        along_y, along_x = values[voxel_rows[number, 1]], values[voxel_rows[number, 2]]
+        for k in range(channels):
+            dx, dy, dz = along_x[k] - here[k], along_y[k] - here[k], along_z[k] - here[k]
+            totals[k] += np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
+    total = 0.0
+    for k in range(channels):
+        total += totals[k]
+    return total
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+def add_variation(
+    first_row: int,
+    last_row: int,
+    values: Floats,
+    voxel_rows: Ints,
+    kind: int,
+    blocks: Blocks,
+    place: Ints,
+    gradient: Floats,
+):
+    """Add the gradient of the mean total variation of a parameter's block to rows `first_row` to `last_row`.
+
+    Args:
+        first_row: First row of the range.
+        last_row: One behind its last.
+        values: Parameter, (rows, channels).
+        voxel_rows: Rows of the voxels.
+        kind: Number of the parameter.
+        blocks: The blocks.
+        place: Where rows stand in `gradient`, (rows, 3).
+        gradient: Gradients of the rows that have one, (n, channels).
+    """
+    channels = values.shape[1]
+    first, last = blocks.first[kind], blocks.last[kind]
+    one = values.dtype.type
+    tiny = one(blocks.smallest)
+    scale = one(blocks.push[kind] / (channels * max(1, last - first)))
+    px, py, pz = np.empty(channels, values.dtype), np.empty(channels, values.dtype), np.empty(channels, values.dtype)
+    begin, end = first_voxel(voxel_rows, 2, first_row), first_voxel(voxel_rows, 0, last_row)
+    for number in range(max(begin, first), min(end, last)):
+        a, b, c = voxel_rows[number, 0], voxel_rows[number, 1], voxel_rows[number, 2]
+        here, along_z, along_y, along_x = values[a], values[a + 1], values[b], values[c]
+        for k in range(channels):
+            dx, dy, dz = along_x[k] - here[k], along_y[k] - here[k], along_z[k] - here[k]
+            push = scale / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
+            px[k], py[k], pz[k] = push * dx, push * dy, push * dz
+        if first_row <= a < last_row:
+            into = gradient[place[a, kind]]
+            for k in range(channels):
+                into[k] -= px[k] + py[k] + pz[k]
+        if first_row <= a + 1 < last_row:
+            into = gradient[place[a + 1, kind]]
+            for k in range(channels):
+                into[k] += pz[k]
+        if first_row <= b < last_row:
+            into = gradient[place[b, kind]]
+            for k in range(channels):
+                into[k] += py[k]
+        if first_row <= c < last_row:
+            into = gradient[place[c, kind]]
+            for k in range(channels):
+                into[k] += px[k]

@@ -1,0 +1,99 @@
+"""Memory that is used again: arrays as large as a batch, without asking the system for pages at every step.
+
+A page that a program touches for the first time costs several times what filling it costs, and a training step needs
+the same tens of megabytes as the step before.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+SMALLEST = 1 << 15
+"""Bytes below which an array is made as usual."""
+PATIENCE = 2048
+"""Loans after which memory that nobody asked for is given back to the system."""
+
+
+class Scratch:
+    """Lends arrays; the memory of one comes back when nothing refers to it or to a view of it any more."""
+
+    def __init__(self) -> None:
+        self._free: dict[int, list[tuple[npt.NDArray[np.uint8], int]]] = {}
+        self._loans = 0
+        self._lock = threading.RLock()  # a loan may end inside of any other call, when garbage is collected
+
+    def empty(self, shape: int | tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+        """An array with whatever stands in the memory it gets.
+
+        Args:
+            shape: Its shape.
+            dtype: Its type.
+        """
+        shape = (shape,) if isinstance(shape, int) else shape
+        wanted = np.dtype(dtype)
+        count = math.prod(shape)
+        size = count * wanted.itemsize
+        if size < SMALLEST:
+            return np.empty(shape, wanted)
+        length = rounded_size(size)
+        with self._lock:
+            self._loans += 1
+            if self._loans % PATIENCE == 0:
+                self._forget()
+            waiting = self._free.setdefault(length, [])
+            block = waiting.pop()[0] if waiting else np.empty(length, np.uint8)
+        return np.asarray(_Loan(self, block))[:size].view(wanted).reshape(shape)
+
+    def zeros(self, shape: int | tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+        """An array of zeros."""
+        array = self.empty(shape, dtype)
+        array.fill(0)
+        return array
+
+    def release(self) -> None:
+        """Give back to the system what is not lent."""
+        with self._lock:
+            self._free.clear()
+
+    def held_bytes(self) -> int:
+        """Memory that waits to be lent again, [bytes]."""
+        with self._lock:
+            return sum(length * len(blocks) for length, blocks in self._free.items())
+
+    def _take_back(self, block: npt.NDArray[np.uint8]) -> None:
+        with self._lock:
+            self._free.setdefault(len(block), []).append((block, self._loans))
+
+    def _forget(self) -> None:
+        for blocks in self._free.values():
+            blocks[:] = [kept for kept in blocks if self._loans - kept[1] < PATIENCE]
+
+
+class _Loan:
+    """Owner of a block while arrays look at it."""
+
+    def __init__(self, scratch: Scratch, block: npt.NDArray[np.uint8]):
+        self._scratch, self._block = scratch, block
+        self.__array_interface__ = block.__array_interface__
+
+    def __del__(self) -> None:
+        self._scratch._take_back(self._block)
+
+
+def rounded_size(size: int) -> int:
+    """`size` rounded up to one of four sizes per doubling, so that steps that need a little more fit too.
+
+    >>> [rounded_size(n) for n in (1024, 1025, 1400, 1800)]
+    [1024, 1280, 1536, 2048]
+    """
+    quarter = max(1, 1 << max(0, (size - 1).bit_length() - 3))
+    return -(-size // quarter) * quarter
+
+
+SCRATCH = Scratch()
+"""What the compiled renderer lends from."""
