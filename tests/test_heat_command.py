@@ -331,7 +331,8 @@ def test_no_u_value_where_more_than_two_airs_acts(folder, tmp_path) -> None:
 def test_no_u_value_of_a_body_without_an_inside(folder, tmp_path) -> None:
     mesh = wall()
     assert mesh.boundary is not None
-    boundary = replace(mesh.boundary, patch=np.zeros_like(mesh.boundary.patch), patch_names=("outer", "interior"))
+    names = ("exterior-side", "interior")
+    boundary = replace(mesh.boundary, patch=np.zeros_like(mesh.boundary.patch), patch_names=names)
     write_mesh(tmp_path / "mesh.vtu", replace(mesh, boundary=boundary))
     (tmp_path / "steady.yaml").write_text(STEADY.replace("air_c: 20.0,", "air_c: 20.0, patches: [interior],"))
     run = compute_heat(Heat(tmp_path / "mesh.vtu", str(tmp_path / "steady.yaml"), tmp_path))

@@ -14,8 +14,8 @@ from thermoxels_ns.fem.answers import plain_values
 from thermoxels_ns.fem.error_budget import Tolerance
 from thermoxels_ns.fem.heat_scene import HeatScene
 from thermoxels_ns.fem.lumped_body import LumpedBody, lumped_body
-from thermoxels_ns.fem.memory import check_memory, describe_bytes, needed_bytes
-from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.memory import check_memory, describe_bytes, peak_bytes
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
 from thermoxels_ns.fem.screening import Screening, screen
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 from thermoxels_ns.fem.solution_nodes import Solution
@@ -150,8 +150,8 @@ def solve_scene(options: Heat, scene: HeatScene, problem: HeatProblem, say: Say,
         return SolvedScene(screening.problem, lumped.solution, screening, lumped, accuracy)
     if asked:
         return _to_tolerance(options, scene, screening, lumped, say)
-    mesh, times = problem.mesh, 1 if scene.time is None else scene.time.num_times
-    needed = needed_bytes(len(mesh.tets), len(mesh.points_m), times=times)
+    times = 1 if scene.time is None else scene.time.num_times
+    needed = peak_bytes(screening.problem, times=times, adaptive=isinstance(scene.time, AdaptiveSteps))
     say(f"Memory: about {describe_bytes(needed)} at most.")
     check_memory(needed, options.memory_gb * 2**30, "Pass a larger --memory-gb, or export a coarser mesh.")
     if scene.time is None:

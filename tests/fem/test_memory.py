@@ -1,16 +1,73 @@
+"""The memory that a computation takes is what was said before."""
+
 from __future__ import annotations
 
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
+from tests.heat_meshes import box_mesh
+from tests.stuffed_shapes import SHAPES, tet_mesh
 from thermoxels_ns.errors import HeatError
-from thermoxels_ns.fem.memory import check_memory, describe_bytes, needed_bytes
+from thermoxels_ns.fem.effects import Convection, Radiation
+from thermoxels_ns.fem.memory import check_memory, describe_bytes, peak_bytes
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.refine_mesh import refine_mesh
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.mesh.stuffing import stuff
+
+MIXED = (Convection(("*",), 8.0, 10.0), Radiation(("*",), 0.9, 0.0))
 
 
-def test_need_grows_with_order_refinement_and_times() -> None:
-    one = needed_bytes(1000, 200)
-    assert needed_bytes(1000, 200, refinements=2) == 64.0 * one
-    assert needed_bytes(1000, 200, order=2) > 10.0 * one
-    assert needed_bytes(1000, 200, times=11) == one + 8.0 * 10 * 200
+@pytest.fixture(scope="module", params=["lattice", "stuffed"])
+def mesh(request):
+    if request.param == "lattice":
+        mesh = box_mesh(*[np.linspace(0.0, 1.0, 15)] * 3)
+    else:
+        mesh = tet_mesh(stuff(SHAPES["sphere"].level(20)), 0.05)
+    return replace(mesh, temperature_c=20.0 + 5.0 * np.sin(9.0 * mesh.points_m[:, 0]))
+
+
+def peak(run) -> int:
+    """Most memory that numpy had while something ran the second time, when kernels and modules are loaded."""
+    run()
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        run()
+        return tracemalloc.get_traced_memory()[1] - before
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("effects", [(), MIXED], ids=["conduction", "radiation"])
+@pytest.mark.parametrize("kept", [2, 60])
+def test_steps_take_what_was_said(mesh, concrete, effects, kept) -> None:
+    problem = HeatProblem(mesh, concrete, effects=effects)
+    taken = peak(lambda: solve_heat(problem, TimeSteps(kept - 1, 5.0)))
+    assert 1 / 1.5 < peak_bytes(problem, times=kept) / taken < 1.5
+
+
+def test_adaptive_steps_take_what_was_said(mesh, concrete) -> None:
+    problem = HeatProblem(mesh, concrete, effects=MIXED[:1])
+    taken = peak(lambda: solve_heat(problem, AdaptiveSteps(600.0, 0.5, outputs=9)))
+    assert 1 / 1.5 < peak_bytes(problem, times=10, adaptive=True) / taken < 1.5
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_steady_states_take_what_was_said(mesh, concrete, order) -> None:
+    problem = HeatProblem(mesh, concrete, effects=MIXED[:1])
+    taken = peak(lambda: solve_steady(problem, order=order))
+    assert 1 / 1.5 < peak_bytes(problem, order=order) / taken < 1.5
+
+
+@pytest.mark.parametrize("wrong", [{"order": 3}, {"times": 0}])
+def test_what_makes_no_sense_is_refused(mesh, concrete, wrong) -> None:
+    with pytest.raises(HeatError, match=next(iter(wrong))):
+        peak_bytes(HeatProblem(mesh, concrete), **wrong)
 
 
 @pytest.mark.parametrize(
@@ -26,3 +83,11 @@ def test_what_does_not_fit_is_refused() -> None:
         HeatError, match=r"memory of the heat problem: expected at most 1 GiB, got about 2 GiB\. Wait\."
     ):
         check_memory(2.0**31, 2.0**30, "Wait.")
+
+
+def test_halving_the_mesh_size_takes_eight_times_as_much(concrete) -> None:
+    problem = HeatProblem(box_mesh(*(np.linspace(0.0, 1.0, 5) for _ in range(3))), concrete)
+    for order in (1, 2):
+        assert peak_bytes(problem, order=order, refinements=2) == 64.0 * peak_bytes(problem, order=order)
+    finer = replace(problem, mesh=refine_mesh(refine_mesh(problem.mesh)))
+    assert peak_bytes(finer) == pytest.approx(peak_bytes(problem, refinements=2), rel=0.4)

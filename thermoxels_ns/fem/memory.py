@@ -1,34 +1,69 @@
-"""How much memory a solution needs, said and refused before it is taken."""
+"""How much memory a heat computation takes at its peak, said and refused before it is taken.
+
+The arrays that are alive together are counted: matrices by the number of nodes and of couplings between them, vectors
+by the number of nodes. Couplings are counted on a sample, because lattices have none along edges between right angles.
+Measured on lattices and on conforming meshes; interpreter and libraries, which need about 150 MB, come on top, and so
+does multigrid, which takes over where conjugate gradients are slow and needs about as much as the matrices.
+"""
 
 from __future__ import annotations
 
+import numpy as np
+
 from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 DEFAULT_MEMORY_BYTES = 4 * 2**30
 """Most memory that a solution may need, [bytes]."""
 
-_BYTES_PER_TET = {1: 250, 2: 3000}
-"""Memory of a solution by order, measured on lattices and doubled, because meshes without right angles have twice as
-many entries in their matrices."""
-_CHILDREN = 8
-"""Tetrahedra, and about as many times more nodes, that halving all edges makes of one."""
+_SAMPLE = 4000
+"""Tetrahedra of the sample."""
+_RUNS = 4
+"""Runs of successive tetrahedra in it."""
+_RIGHT = 1e-9
+"""Cosine up to which an angle between faces counts as right."""
+_PAIRS = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+_VECTORS = 15
+"""Vectors of the nodes that are alive at the peak, besides the temperatures that are kept."""
+_FRAGMENTS = 1.15
+"""What the allocator and what lives shortly add, by measurement."""
+_BYTES_PER_TET_OF_ORDER_2, _BYTES_PER_UNKNOWN_OF_ORDER_2 = 850.0, 480.0
+"""Element matrices that are being added up; matrices and vectors."""
 
 
-def needed_bytes(num_tets: int, num_nodes: int, *, order: int = 1, refinements: int = 0, times: int = 1) -> float:
-    """Estimate the most memory that a solution takes, [bytes].
+def peak_bytes(
+    problem: HeatProblem, *, order: int = 1, refinements: int = 0, times: int = 1, adaptive: bool = False
+) -> float:
+    """Estimate the most memory that a computation takes besides the problem itself, [bytes].
 
     Args:
-        num_tets: Tetrahedra of the given mesh.
-        num_nodes: Its nodes.
+        problem: Body, materials and effects.
         order: 1 for linear tetrahedra, 2 for quadratic ones.
-        refinements: How often the size of the given mesh is halved first.
-        times: Number of times whose temperatures are kept.
+        refinements: How often the mesh size of the problem is halved first, which makes eight tetrahedra, and about
+            eight nodes, of each.
+        times: Number of times whose temperatures are kept; 1 for a steady state.
+        adaptive: Whether the length of the time steps changes, so that matrices of two lengths are kept.
 
-    >>> needed_bytes(1000, 200, times=10)
-    266000.0
+    Raises:
+        HeatError: The order or the number of times makes no sense.
     """
-    finer = float(_CHILDREN**refinements)
-    return _BYTES_PER_TET[order] * num_tets * finer + 8.0 * times * num_nodes * finer
+    if order not in (1, 2):
+        raise HeatError(explain("order", expected="1 or 2", got=repr(order), remedy="Use 1 or 2."))
+    if times < 1:
+        raise HeatError(explain("times", expected="at least 1", got=repr(times), remedy="Count the start as one."))
+    mesh, finer = problem.mesh, 8.0**refinements
+    nodes, edges = float(len(mesh.points_m)), _count_edges(mesh)
+    states = 8.0 * times * nodes
+    if order == 2:
+        matrices = _BYTES_PER_TET_OF_ORDER_2 * len(mesh.tets) + _BYTES_PER_UNKNOWN_OF_ORDER_2 * (nodes + edges)
+        return finer * (matrices + states)
+    couplings = edges * _coupled_share(mesh)
+    matrix, half = 24.0 * couplings + 16.0 * nodes, 12.0 * couplings
+    radiates = any(effect.kind == "radiation" for effect in problem.effects)
+    # K, the matrix of a step and its upper half; what radiation adds; the same for a second length and for estimates.
+    matrices = 2.0 * matrix + half + radiates * 1.3 * matrix + 2.0 * adaptive * (matrix + half)
+    return finer * (_FRAGMENTS * (matrices + 8.0 * _VECTORS * nodes) + states)
 
 
 def describe_bytes(amount: float) -> str:
@@ -54,3 +89,26 @@ def check_memory(needed: float, allowed: float, remedy: str) -> None:
     if needed > allowed:
         expected, got = f"at most {describe_bytes(allowed)}", f"about {describe_bytes(needed)}"
         raise HeatError(explain("memory of the heat problem", expected=expected, got=got, remedy=remedy))
+
+
+def _count_edges(mesh: TetMesh) -> float:
+    """Edges by Euler's formula, nodes - edges + faces - tetrahedra = 1; each tetrahedron has four halves of a face."""
+    return float(len(mesh.points_m) + len(mesh.tets) + len(mesh.facets) // 2)
+
+
+def _coupled_share(mesh: TetMesh) -> float:
+    """Share of the edges in some runs of tetrahedra that do not lie between faces at a right angle only."""
+    length, total = _SAMPLE // _RUNS, len(mesh.tets)
+    begins = np.linspace(0, max(total - length, 0), _RUNS).astype(np.int64)
+    chosen = np.unique(np.minimum(begins[:, None] + np.arange(length), total - 1))
+    tets = mesh.tets[chosen]
+    corner = mesh.points_m[tets]
+    a, b, c = (corner[:, i] - corner[:, 0] for i in (1, 2, 3))
+    normal = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+    normal = np.concatenate([-normal.sum(axis=1, keepdims=True), normal], axis=1)
+    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
+    cosines = np.einsum("tei,tei->te", normal[:, _PAIRS[:, 0]], normal[:, _PAIRS[:, 1]])
+    ends = np.sort(tets[:, _PAIRS].reshape(-1, 2), axis=1)
+    edges, number = np.unique(ends, axis=0, return_inverse=True)
+    coupled = np.bincount(number.ravel(), np.abs(cosines).ravel() > _RIGHT, len(edges))
+    return float(np.mean(coupled > 0.0))

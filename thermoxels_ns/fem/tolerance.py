@@ -20,7 +20,7 @@ from thermoxels_ns.fem.error_budget import (
 )
 from thermoxels_ns.fem.error_estimate import HALF_THE_SIZE, ErrorRatios, error_ratios, recovered_error, richardson
 from thermoxels_ns.fem.linear_start import linear_start
-from thermoxels_ns.fem.memory import DEFAULT_MEMORY_BYTES, describe_bytes, needed_bytes
+from thermoxels_ns.fem.memory import DEFAULT_MEMORY_BYTES, describe_bytes, peak_bytes
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
 from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
@@ -171,8 +171,7 @@ class _Run:
 
     def lacks_memory(self, order: int, refinements: int, times: int = 1) -> str:
         """Say what a solution on the given mesh with its size halved so often takes; return that it does not fit."""
-        mesh = self.given.mesh
-        needed = needed_bytes(len(mesh.tets), len(mesh.points_m), order=order, refinements=refinements, times=times)
+        needed = peak_bytes(self.given, order=order, refinements=refinements, times=times, adaptive=times > 1)
         where = "the given mesh" if refinements == 0 else f"the mesh size halved {refinements}x"
         what = f"P{order} on {where} needs about {describe_bytes(needed)}"
         if needed <= self._memory_bytes:
