@@ -43,8 +43,8 @@ def photograph(
                 2: degrees(abs(latitude)),
                 3: "E" if longitude >= 0 else "W",
                 4: degrees(abs(longitude)),
-                5: b"\x00",
-                6: IFDRational(round(altitude * 1000), 1000),
+                5: b"\x01" if altitude < 0 else b"\x00",
+                6: IFDRational(round(abs(altitude) * 1000), 1000),
             }
         )
     Image.fromarray(pixels).save(path, format="JPEG", quality=95, exif=exif)

@@ -20,12 +20,13 @@ def test_time_with_its_fraction(tmp_path, fraction, microsecond):
     assert (facts.taken_at.second, facts.taken_at.microsecond) == (43, microsecond)
 
 
-def test_place_lens_and_orientation(tmp_path):
-    path = photograph(tmp_path / "a.jpg", gps=(-33.5, 151.25, 12.5), orientation=6, focal=(4.0, 100.0))
+@pytest.mark.parametrize("altitude_m", [12.5, -430.5])
+def test_place_lens_and_orientation(tmp_path, altitude_m):
+    path = photograph(tmp_path / "a.jpg", gps=(-33.5, 151.25, altitude_m), orientation=6, focal=(4.0, 100.0))
     facts = read_photograph_facts(path)
     assert facts.gps is not None
     assert (facts.gps.latitude_deg, facts.gps.longitude_deg) == pytest.approx((-33.5, 151.25), abs=1e-8)
-    assert facts.gps.altitude_m == pytest.approx(12.5)
+    assert facts.gps.altitude_m == pytest.approx(altitude_m)
     assert facts.focal_px == pytest.approx(40.0)  # 4 mm at 10 pixels per mm
     assert facts.orientation == 6
 

@@ -58,6 +58,17 @@ def test_u_values_of_two_walls_side_by_side() -> None:
     assert wall.coldest.point_m[0] == 0.0 and wall.coldest.point_m[1] <= 1.0 and wall.coldest.patches[0] == "x0"
 
 
+def test_of_a_cooled_room_the_warmest_spot_is_the_worst() -> None:
+    problem, mesh = two_walls()
+    effects = (Convection(("x0",), 8.0, 5.0), Convection(("x1",), 25.0, 35.0))
+    problem = dataclasses.replace(problem, effects=effects)
+    wall = wall_answer(problem, solve_steady(problem), ("x0",), 5.0, 35.0, facet_region=regions_of(mesh))
+    u = 1.0 / (1 / 8 + 0.2 / 0.7 + 1 / 25)
+    assert wall.temperature_factor == pytest.approx(1.0 - u / 8.0, rel=1e-9)
+    assert wall.coldest.temperature_c == pytest.approx(5.0 + 30.0 * u / 8.0, rel=1e-9)
+    assert wall.coldest.point_m[1] <= 1.0 and wall.heat_w < 0.0
+
+
 def test_a_wall_between_equal_airs_or_without_an_inside_is_refused() -> None:
     problem, mesh = two_walls()
     solution, behind = solve_steady(problem), regions_of(mesh)
