@@ -6,13 +6,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
 from thermoxels_ns.checks import check_finite, check_shape
 from thermoxels_ns.errors import MeshError, explain
 from thermoxels_ns.lattice import CORNER_OFFSETS
 from thermoxels_ns.mesh.boundary import BoundaryMode, tag_boundary
 from thermoxels_ns.mesh.components import node_parts, renumbered
+from thermoxels_ns.mesh.morphology import bounding_box, connected, face_connected
 from thermoxels_ns.mesh.node_values import interpolate_corners
 from thermoxels_ns.mesh.patch_rules import PatchRules
 from thermoxels_ns.mesh.patches import apply_regions, idle_patch_rules, idle_region_rules
@@ -250,11 +250,10 @@ def _without_voxels_of(solid: SolidCells, points: npt.NDArray[np.float64]) -> tu
 
     Centres of solid voxels near the surface are nodes, and voxels that share a face are in one part.
     """
-    part = np.zeros(solid.cells.shape, dtype=np.int32)
-    count = int(ndimage.label(solid.cells, output=part))  # type: ignore[arg-type]
+    part = face_connected(solid.cells)
     voxel = np.floor(points).astype(np.int64)
     centres = voxel[np.all(points == voxel + 0.5, axis=1)]
-    goes = np.zeros(count + 1, dtype=bool)
+    goes = np.zeros(int(part.max()) + 1, dtype=bool)
     goes[part[tuple(centres.T)]] = True
     goes[0] = False
     return _without(solid, goes[part])
@@ -271,16 +270,19 @@ def _without_unobserved_parts(
 ) -> tuple[SolidCells, int, int]:
     """Leave out bodies without an observed corner, unless that is all of them; also their number and their voxels."""
     # Voxels share a node if they touch by a face, an edge or a corner.
-    part = np.zeros(solid.cells.shape, dtype=np.int32)
-    count = int(ndimage.label(solid.cells, structure=np.ones((3, 3, 3)), output=part))  # type: ignore[arg-type]
-    nx, ny, nz = solid.cells.shape
-    touched = np.zeros(solid.cells.shape, dtype=bool)
-    for dx, dy, dz in CORNER_OFFSETS:
-        touched |= observed_corners[dx : dx + nx, dy : dy + ny, dz : dz + nz]
-    seen = np.bincount(part[solid.cells & touched], minlength=count + 1) > 0
+    box = bounding_box(solid.cells)
+    cells = solid.cells[box]
+    part = connected(cells)
+    touched = np.zeros(cells.shape, dtype=bool)
+    for offset in CORNER_OFFSETS:
+        shifted = tuple(slice(s.start + int(d), s.stop + int(d)) for s, d in zip(box, offset))
+        touched |= observed_corners[shifted]
+    seen = np.bincount(part[cells & touched], minlength=int(part.max()) + 1) > 0
     if seen[1:].all() or not seen.any():
         return solid, 0, 0
-    kept, num_voxels = _without(solid, solid.cells & ~seen[part])
+    goes = np.zeros_like(solid.cells)
+    goes[box] = cells & ~seen[part]
+    kept, num_voxels = _without(solid, goes)
     return kept, int(np.count_nonzero(~seen[1:])), num_voxels
 
 

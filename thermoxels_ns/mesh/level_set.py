@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from thermoxels_ns.mesh.morphology import bounding_box
 from thermoxels_ns.mesh.surface_ramp import surface_ramp
 from thermoxels_ns.mesh.volume_keeping import keep_volume
 
@@ -63,21 +64,11 @@ def level_of(
         The level, shape of `cells`, in [-1, 1], never 0; -1 far outside.
     """
     level = np.full(cells.shape, -1.0, dtype=np.float32)
-    near = _around(cells)
+    near = bounding_box(cells, MARGIN)
     level[near] = _level_nearby(
         density[near], threshold, _deep_ratio(density[dense], threshold), dense[near], cells[near], makes_up_volume
     )
     return level
-
-
-def _around(cells: BoolArray) -> tuple[slice, ...]:
-    """The box of voxels that holds all solid ones and `MARGIN` more to each side, as slices."""
-    slices = []
-    for axis in range(3):
-        others = tuple({0, 1, 2} - {axis})
-        used = np.flatnonzero(cells.any(axis=others))
-        slices.append(slice(max(int(used[0]) - MARGIN, 0), int(used[-1]) + 1 + MARGIN) if len(used) else slice(0, 0))
-    return tuple(slices)
 
 
 def _level_nearby(

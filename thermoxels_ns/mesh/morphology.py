@@ -12,18 +12,28 @@ BoolArray = npt.NDArray[np.bool_]
 _PLANES_AT_A_TIME = 64
 
 
+def bounding_box(cells: BoolArray, margin: int = 0) -> tuple[slice, ...]:
+    """Find the box of voxels that holds all solid ones and `margin` more to each side; empty if none is solid.
+
+    >>> bounding_box(np.array([[[False, False, True, True, False]]]), 1)
+    (slice(0, 2, None), slice(0, 2, None), slice(1, 5, None))
+    """
+    slices = []
+    for axis in range(3):
+        others = tuple({0, 1, 2} - {axis})
+        used = np.flatnonzero(cells.any(axis=others))
+        slices.append(slice(max(int(used[0]) - margin, 0), int(used[-1]) + 1 + margin) if len(used) else slice(0, 0))
+    return tuple(slices)
+
+
 def face_connected(cells: BoolArray) -> npt.NDArray[np.int32]:
     """Number the bodies whose voxels touch by faces: 1, 2, ... in C order of their first voxel, 0 elsewhere."""
-    labels = np.zeros(cells.shape, dtype=np.int32)
-    ndimage.label(cells, output=labels)
-    return labels
+    return _numbered(cells, ndimage.generate_binary_structure(3, 1))
 
 
 def connected(cells: BoolArray) -> npt.NDArray[np.int32]:
     """Number the bodies whose voxels touch by faces, edges or corners, as `face_connected` does."""
-    labels = np.zeros(cells.shape, dtype=np.int32)
-    ndimage.label(cells, structure=np.ones((3, 3, 3)), output=labels)
-    return labels
+    return _numbered(cells, np.ones((3, 3, 3)))
 
 
 def grow(cells: BoolArray, by: int) -> BoolArray:
@@ -105,6 +115,15 @@ def convex_hull(cells: BoolArray, of_centres: bool = False) -> BoolArray:
         low = np.maximum(low, z.max(axis=0, where=(c < 0) & ~upright, initial=-np.inf))
     centre = np.arange(nz) + 0.5
     return (centre >= low[..., None] - 1e-9) & (centre <= high[..., None] + 1e-9)
+
+
+def _numbered(cells: BoolArray, structure: npt.NDArray) -> npt.NDArray[np.int32]:
+    """Look only where something is solid: a lattice is mostly empty."""
+    labels, box = np.zeros(cells.shape, dtype=np.int32), bounding_box(cells)
+    inside = np.zeros(cells[box].shape, dtype=np.int32)
+    ndimage.label(cells[box], structure=structure, output=inside)
+    labels[box] = inside
+    return labels
 
 
 def _spread(cells: BoolArray, axis: int, by: int) -> BoolArray:
