@@ -13,6 +13,7 @@ from torch.nn import Parameter
 
 from thermoxels_ns.errors import PruningError, explain
 from thermoxels_ns.field.refine import RowChange, prune, refine
+from thermoxels_ns.photo_start import start_from_photographs
 from thermoxels_ns.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
 from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
 
@@ -48,6 +49,19 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     def count(step: int) -> None:
         model.update_to_step(step)
 
+    def start(step: int) -> None:
+        """Set the density at the first step of a training, not at the first of a resumed one."""
+        assert attributes.pipeline is not None
+        if step == 0:
+            start_from_photographs(model, attributes.pipeline.datamanager)
+
+    def hold(step: int) -> None:
+        """Let the density stand while colours are still those of nothing; its moments are already followed."""
+        assert attributes.optimizers is not None
+        if step < model.config.hold_density:
+            for group in attributes.optimizers.optimizers["density"].param_groups:
+                group["lr"] = 0.0  # the scheduler sets it anew after each step
+
     def follow(old: dict[str, Parameter], change: RowChange) -> None:
         """Point the optimisers to the rows that took the place of `old`; their state changes as the rows did."""
         assert attributes.optimizers is not None
@@ -75,8 +89,10 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             follow(old, refine(model.grid, factors[step]))
             CONSOLE.log(f"step {step}: lattice refined to {' x '.join(map(str, model.grid.lattice.cell_shape))} voxels")
 
+    from_photographs = model.config.start == "photographs"
     return [
         TrainingCallback(before, count),
+        *([TrainingCallback(before, start, iters=(0,)), TrainingCallback(before, hold)] if from_photographs else []),
         TrainingCallback(before, change_lattice, iters=tuple(sorted(steps | decisions))),
     ]
 

@@ -78,7 +78,7 @@ def geometry_metrics(
         say(f"Geometry is not compared with the truth: {problem}")
         return {}
     try:
-        cells = select_solid(snapshot, SolidSelection()).cells
+        cells = select_solid(snapshot, SolidSelection(), makes_up_volume=False).cells
     except MeshError as problem:
         say(f"The geometry scores 0: {problem}")
         return dict.fromkeys(("fscore", "precision", "recall", "fscore_128"), 0.0)

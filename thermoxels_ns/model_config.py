@@ -100,6 +100,11 @@ class ThermoxelsModelConfig(ModelConfig):
     """Maps interpolated values to density: relu is the paper's; exp and softplus hold a sharp surface in one voxel."""
     start_density: float = 0.1
     """Density everywhere at the start, per world unit in a scene of size 2: near-transparent, or floaters form."""
+    start: Literal["plain", "photographs"] = "plain"
+    """Density at the start: plain: the same everywhere; photographs: denser where the photographs that see a point
+    agree about its colour, thinner where they do not. Without photographs from several places it is plain."""
+    hold_density: int = 20
+    """Steps for which a start from photographs stands, while colours find their values."""
     thermal_density_gradient: bool = False
     """Let thermal images move the geometry (off: temperature is painted on what the RGB images show)."""
     steps_per_voxel: float = 2.0
@@ -166,6 +171,7 @@ class ThermoxelsModelConfig(ModelConfig):
             "thin_threshold": (0.0, 1.0, "from 0 to 1"),
             "prune_dilation": (0, 100, "from 0 to 100"),
             "temperature_degree": (0, 2, "0, 1 or 2"),
+            "hold_density": (0, 1e9, "0 or more"),
             "start_density": (1e-30, 1e30, "a finite number above 0"),
             "steps_per_voxel": (0.1, 1000.0, "from 0.1 to 1000"),
             "near_plane": (0.0, 1e30, "0 or more"),
