@@ -5,12 +5,14 @@ from __future__ import annotations
 import csv
 import json
 import re
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import pyvista as pv
+import tyro
 
 from tests.scene_bodies import room, tagged_body, wall
 from thermoxels_ns import cli
@@ -22,6 +24,7 @@ from thermoxels_ns.fem.scene_file import load_heat_scene
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.heat_command import Heat
+from thermoxels_ns.heat_files import command_line
 from thermoxels_ns.heat_pictures import PICTURES, cut_open, plot_over_time
 from thermoxels_ns.heat_report import HeatReport, Section, Table, build_report
 from thermoxels_ns.heat_run import compute_heat, run_heat
@@ -315,6 +318,28 @@ def test_a_body_without_rooms_is_warned_about(folder, tmp_path, capsys) -> None:
     assert "--interior hollow" in answers(tmp_path / "out")["warnings"][0]
     assert "<h2>Look at this first</h2>" in (tmp_path / "out" / "report.html").read_text()
     assert compute_heat(Heat(folder / "room" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path)).warnings == ()
+
+
+def test_the_command_in_the_report_is_the_one_that_was_typed() -> None:
+    options = Heat(
+        Path("a b/mesh.vtu"),
+        "winter-night",
+        Path("out"),
+        probes=((1234.5678, 0.12345678, -1234567.8),),
+        tolerance=0.0123456789,
+        pictures=False,
+    )
+    words = shlex.split(command_line(options))
+    assert words[:2] == ["thermoxels", "heat"]
+    assert tyro.cli(Heat, args=words[2:], config=(tyro.conf.FlagConversionOff,)) == options
+
+
+def test_a_shell_is_warned_about(folder, tmp_path) -> None:
+    write_mesh(tmp_path / "mesh.vtu", room())
+    summary = {"length_unit": "m", "options": {"interior": "hollow", "wall_thickness": None}}
+    (tmp_path / "summary.json").write_text(json.dumps({**summary, "mesh": {"volume": 3.0, "area": 60.0}}))
+    run = compute_heat(Heat(tmp_path / "mesh.vtu", str(folder / "steady.yaml"), tmp_path))
+    assert run.warnings[0].startswith("The mesh is a shell (--interior hollow), 0.1 m thick on average.")
 
 
 def test_no_u_value_where_more_than_two_airs_acts(folder, tmp_path) -> None:

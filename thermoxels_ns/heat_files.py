@@ -133,17 +133,18 @@ def command_line(options: Heat) -> str:
     """Write the command as it is typed."""
     words = ["thermoxels", "heat", str(options.mesh), "--scene", options.scene, "--output-dir", str(options.output_dir)]
     if options.probes:
-        words += ["--probes", *(f"{part:g}" for point in options.probes for part in point)]
+        words += ["--probes", *(repr(float(part)) for point in options.probes for part in point)]
     for name, value in (
         ("--tolerance", options.tolerance),
         ("--flow-tolerance", options.flow_tolerance),
         ("--leave-out-below-k", options.leave_out_below_k),
     ):
-        words += [] if value is None else [name, f"{value:g}"]
-    words += ["--memory-gb", f"{options.memory_gb:g}"] if options.memory_gb != Heat.memory_gb else []
+        words += [] if value is None else [name, repr(float(value))]
+    words += ["--memory-gb", repr(float(options.memory_gb))] if options.memory_gb != Heat.memory_gb else []
     words += ["--allow-unmet", "True"] if options.allow_unmet else []
     if options.up is not None:
-        words += ["--up", *(f"{part:g}" for part in options.up)]
+        words += ["--up", *(repr(float(part)) for part in options.up)]
+    words += [] if options.pictures else ["--pictures", "False"]
     return shlex.join(words)
 
 

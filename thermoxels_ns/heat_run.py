@@ -121,7 +121,7 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     say(f"Mesh: {len(mesh.tets):,} tetrahedra, {len(mesh.points_m):,} nodes.")
     say(f"Scene: {scene.description or options.scene}.")
 
-    warnings = scene_doubts(scene, mesh, problem.up)
+    warnings = (*scene_doubts(scene, mesh, problem.up), *_shell_doubts(scene, export))
     for warning in warnings:
         say(f"Warning: {warning}")
 
@@ -167,6 +167,24 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     )
     lap("answers")
     return run
+
+
+def _shell_doubts(scene: HeatScene, export: Mapping[str, Any]) -> tuple[str, ...]:
+    """Warn that the walls of a hollow export are as thick as photographs happened to make them."""
+    options, mesh = export.get("options"), export.get("mesh")
+    if scene.inside_air is None or not isinstance(options, dict) or not isinstance(mesh, dict):
+        return ()
+    if options.get("interior") != "hollow" or options.get("wall_thickness") is not None:
+        return ()
+    try:
+        thickness_m = 2.0 * float(mesh["volume"]) / float(mesh["area"])
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return ()
+    return (
+        f"The mesh is a shell (--interior hollow), {thickness_m:.2g} m thick on average. Photographs do not show how "
+        "thick walls are, nor what no camera saw, such as floors: heat losses and U-values are those of this shell, "
+        "with its holes and loose parts. Where you know the walls, export with --wall-thickness.",
+    )
 
 
 def _export_summary(mesh: Path, say: Say) -> dict[str, Any]:
@@ -230,6 +248,8 @@ def _wall(
         return None, ""
     if inside.air_c == outside.air_c:
         return None, ""
+    if scene_doubts(scene, problem.mesh, problem.up):
+        return None, "There is no U-value, because it is doubtful which surface faces the air inside."
     other = not_only_airs(problem, inside.air_c, outside.air_c)
     if other:
         return None, f"There is no U-value, because its heat would count in it: {other}. Ask for the two airs alone."

@@ -109,7 +109,11 @@ def check_accuracy_options(options: Heat, scene: HeatScene) -> None:
     if options.tolerance is not None:
         check_positive("tolerance", options.tolerance, "Give it in kelvin, such as 0.05.", HeatError)
     if options.flow_tolerance is not None:
-        check_positive("flow-tolerance", options.flow_tolerance, "Give a share, such as 0.01 for 1 %.", HeatError)
+        remedy = "Give a share, such as 0.01 for 1 %."
+        check_positive("flow-tolerance", options.flow_tolerance, remedy, HeatError)
+        if options.flow_tolerance >= 1.0:
+            got = f"{options.flow_tolerance:g}, which is {100.0 * options.flow_tolerance:g} %"
+            raise HeatError(explain("flow-tolerance", expected="less than 1", got=got, remedy=remedy))
     if scene.time is not None and options.flow_tolerance is not None and options.tolerance is None:
         remedy = "Pass --tolerance too: steps in time are chosen by it."
         raise HeatError(
@@ -235,7 +239,11 @@ def _say_what_is_built(screening: Screening, say: Say) -> None:
     for entry in screening.left_out:
         say(f"Left out: {entry.effect}, at most {entry.bound_k:.2g} K and {entry.bound_w:.3g} W: {entry.reason}.")
     for entry in screening.kept:
-        bound = "" if entry.bound_k is None else f" (up to {entry.bound_k:.2g} K)"
+        bound = "" if entry.bound_k is None else f" (up to {min(entry.bound_k, 100.0):.2g} K{_or_more(entry.bound_k)})"
         say(f"Built: {entry.effect}{bound}")
     if not screening.kept and not screening.left_out:
         say("Nothing acts on the body: its surface is insulated.")
+
+
+def _or_more(bound_k: float) -> str:
+    return " or more" if bound_k > 100.0 else ""

@@ -212,7 +212,7 @@ def test_a_step_that_would_overshoot_is_taken_with_backward_euler(monkeypatch) -
     problem = HeatProblem(bar(20, 0.0), CONCRETE, effects=(FixedTemperature(("x0",), 1.0),))
     solution = solve_heat(problem, AdaptiveSteps(1000 * STEP_S, 100.0))
     assert "taken with backward Euler because SDIRK2 would have overshot" in solution.status
-    assert solution.temperature_c.max() <= 1.0 + 1e-9 and solution.temperature_c.min() >= -1e-9
+    assert solution.temperature_c.max() <= 1.0 + 1e-6 and solution.temperature_c.min() >= -1e-6
     assert solution.energy_residual_of_spread < 1e-12
 
 

@@ -185,3 +185,28 @@ def test_differences_and_flows() -> None:
     assert Tolerance(4.0, 0.1).excess(ErrorSize(2.0, 0.2)) == 2.0
     assert Tolerance(4.0).excess(ErrorSize(2.0, 0.2)) == 0.5
     assert ErrorSize(1.0, 0.1) + ErrorSize(2.0, 0.25) == ErrorSize(3.0, 0.35)
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+def test_heat_that_rushes_in_at_the_start_is_not_missed(outputs: int) -> None:
+    """A rod whose end is suddenly held at 100 C: the mean flow through it is 2 k dT / sqrt(pi a t)."""
+    mesh = box_mesh(np.linspace(0.0, 1.2, 13), [0.0, 0.2], [0.0, 0.2], temperature_c=4.0)
+    problem = HeatProblem(mesh, CONCRETE, effects=(FixedTemperature(("x0",), 100.0),))
+    found = solve_to_tolerance(
+        problem, Tolerance(2.0, 0.02), duration_s=36_000.0, outputs=outputs, allow_unmet=True, log=silent
+    )
+    exact_w = 0.04 * 2.0 * 1.7 * 96.0 / np.sqrt(np.pi * CONCRETE.diffusivity_m2_s * 36_000.0)
+    (flow_w,) = mean_flows_w(found.solution).values()
+    assert found.settings.refinements >= 1
+    assert not found.met or abs(flow_w / exact_w - 1.0) < WITHIN * 0.02
+
+
+def test_where_nothing_flows_any_share_of_it_is_met() -> None:
+    mesh = box_mesh(*(np.linspace(0.0, 0.2, 3) for _ in range(3)), temperature_c=20.0)
+    for effects in (
+        (FixedTemperature(("x0",), 5.0),),
+        (FixedTemperature(("x0",), 5.0), Convection(("x1",), 8.0, 5.0)),
+        (Convection(("x0",), 8.0, 5.3), Radiation(("x1",), 0.9, 5.3)),
+    ):
+        found = solve_to_tolerance(HeatProblem(mesh, CONCRETE, effects=effects), Tolerance(None, 0.01), log=silent)
+        assert found.met and found.settings.refinements == 0 and found.settings.error.heat_flow == 0.0

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.heat_meshes import Nodal
+from tests.heat_meshes import Nodal, box_mesh
 from tests.stuffed_shapes import SHAPES, box_distance, centres, stiffness, tet_mesh, turn
 from thermoxels_ns.errors import HeatError
 from thermoxels_ns.fem.effects import Convection, Effect, FixedTemperature, Radiation
@@ -159,3 +159,21 @@ def test_fixed_steps_say_when_a_temperature_leaves_its_range(options) -> None:
     solution = solve_heat(jump(), TimeSteps(2, 1e-2 * STEP_S), **options)
     assert solution.temperature_c.min() < 20.0 - 1e-3
     assert "In 2 a temperature left its range" in solution.status or "In 1 a temperature" in solution.status
+
+
+def test_round_off_near_equilibrium_is_no_temperature_out_of_range() -> None:
+    mesh = box_mesh(*(np.linspace(0.0, 0.3, 4) for _ in range(3)))
+    mesh = replace(mesh, temperature_c=20.0 + mesh.points_m[:, 0])
+    for step_s in (600.0, 7200.0, 86400.0):
+        problem = HeatProblem(mesh, Material("concrete", 1.7, 2200.0, 880.0), effects=(Convection(("*",), 10.0, 5.0),))
+        status = solve_heat(problem, TimeSteps(40, step_s)).status
+        assert "range" not in status and "obtuse" not in status, status
+
+
+def test_steps_are_not_shortened_for_less_than_a_thousandth_of_the_tolerance() -> None:
+    mesh = tet_mesh(stuff(SHAPES["sphere"].level(12)), 0.1)
+    mesh = replace(mesh, temperature_c=np.full(len(mesh.points_m), 20.0))
+    problem = HeatProblem(mesh, Material("concrete", 1.7, 2200.0, 880.0), effects=(Convection(("*",), 10.0, 5.0),))
+    found = solve_heat(problem, AdaptiveSteps(10 * 86400.0, 0.01))
+    assert found.temperature_c.min() > 5.0 - 1e-5 and found.temperature_c.max() < 20.0 + 1e-5
+    assert found.steps < 260  # watching to round-off takes 480

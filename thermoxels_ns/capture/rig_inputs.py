@@ -128,8 +128,7 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
         raise SceneError(
             explain(str(file), expected="'thermal_camera' and 'rig'", got=f"no {problem}", remedy=remedy)
         ) from problem
-    rotation = transform[:3, :3] if transform.shape == (4, 4) else np.zeros((3, 3))
-    if not np.isfinite(transform).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2:
+    if not _is_rigid(transform):
         raise SceneError(
             explain(
                 f"{file}: rig", expected="4 x 4 numbers, a rotation and a shift", got=transform.tolist(), remedy=remedy
@@ -145,7 +144,7 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
             )
         )
     theirs = content.get("metres_per_unit")
-    if metres_per_unit is not None and isinstance(theirs, (int, float)) and theirs > 0.0:
+    if metres_per_unit is not None and isinstance(theirs, (int, float)) and 0.0 < theirs < math.inf:
         transform[:3, 3] *= theirs / metres_per_unit
         lengths = "its lengths converted by the two scales"
     else:
@@ -161,6 +160,15 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
         score_after=math.nan,
         projection_sigma_px=math.nan,
     )
+
+
+def _is_rigid(transform: np.ndarray) -> bool:
+    """Whether a 4 x 4 is a rotation, which keeps left and right, and a shift."""
+    if transform.shape != (4, 4) or not np.isfinite(transform).all():
+        return False
+    rotation = transform[:3, :3]
+    turns = np.abs(rotation @ rotation.T - np.eye(3)).max() <= 1e-2 and np.linalg.det(rotation) > 0.0
+    return bool(turns) and np.array_equal(transform[3], [0.0, 0.0, 0.0, 1.0])
 
 
 def kept_start(start: RigStart, why: str) -> RigEstimate:

@@ -39,8 +39,8 @@ def edge_surplus(problem: HeatProblem, solution: HeatSolution) -> Surplus:
 
     The error obeys the heat equation too. With what the temperatures leave unbalanced in the equations of quadratic
     tetrahedra as its source, it is followed from output to output by backward Euler; so few and long steps are enough
-    for an estimate, and cost less than the solution. Of the heat that flows through surfaces with a given temperature
-    the estimate is too large, by up to a factor of 4 where the mesh is too coarse for the layer that has been warmed.
+    for an estimate, and cost less than the solution. Heat flows are those at the ends of intervals: what rushes in
+    when a surface is suddenly warmed is over by then, and most of its error is missed.
 
     Args:
         problem: What was solved.

@@ -11,6 +11,10 @@ import numpy as np
 from thermoxels_ns.checks import check_positive
 from thermoxels_ns.errors import HeatError, explain
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
+from thermoxels_ns.units import ZERO_CELSIUS_K
+
+_EQUAL = 1e-9
+"""Temperatures that differ by less than this share of the absolute temperature are equal."""
 
 Flows = Mapping[str, float]
 """Mean heat flow into the body of each effect, [W]."""
@@ -79,6 +83,21 @@ def mean_flows_w(solution: SteadySolution | HeatSolution) -> dict[str, float]:
     return {heat.effect: float(lengths @ heat.heat_w / lengths.sum()) for heat in solution.effects}
 
 
+def flow_error(difference: Flows, solution: SteadySolution | HeatSolution) -> float:
+    """Largest error of a solution's mean heat flows as a share of what flows through the body.
+
+    Where all temperatures are equal nothing flows but round-off, which has no share of it.
+
+    Args:
+        difference: What the flows err by, by effect, [W].
+        solution: The solution.
+    """
+    level_k = float(np.abs(solution.temperature_c).max()) + ZERO_CELSIUS_K
+    if float(np.ptp(solution.temperature_c)) <= _EQUAL * level_k:
+        return 0.0
+    return share_of_flow(difference, mean_flows_w(solution))
+
+
 def share_of_flow(difference: Flows, flows: Flows) -> float:
     """Largest difference between heat flows as a share of what flows through the body, half the sum of their sizes.
 
@@ -103,6 +122,6 @@ def difference_between(
         num_nodes: Number of nodes of the mesh that both have in common; they come first in both.
     """
     change_k = fine.temperature_c[..., :num_nodes] - coarse.temperature_c[..., :num_nodes]
-    before, after = mean_flows_w(coarse), mean_flows_w(fine)
-    change_w = {group: flow - before[group] for group, flow in after.items()}
-    return ErrorSize(float(np.max(np.abs(change_k))), share_of_flow(change_w, after))
+    before = mean_flows_w(coarse)
+    change_w = {group: flow - before[group] for group, flow in mean_flows_w(fine).items()}
+    return ErrorSize(float(np.max(np.abs(change_k))), flow_error(change_w, fine))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermoxels_ns.fem.error_budget import ErrorSize, share_of_flow
+from thermoxels_ns.fem.error_budget import ErrorSize, flow_error
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.solution import SteadySolution, heat_by_effect
 from thermoxels_ns.fem.stage import Stage
@@ -42,9 +42,8 @@ def linear_start(problem: HeatProblem, *, time_s: float, relative_tolerance: flo
     change_w = dict.fromkeys((effect for effect, _ in surplus.groups), 0.0)
     for (effect, _), heat_w in zip(surplus.groups, surplus.group_heat_w[0].tolist()):
         change_w[effect] += heat_w
-    flows = {heat.effect: float(heat.heat_w[0]) for heat in solution.effects}
     return LinearStart(
-        solution, ErrorSize(float(np.max(np.abs(surplus.temperature_k))), share_of_flow(change_w, flows))
+        solution, ErrorSize(float(np.max(np.abs(surplus.temperature_k))), flow_error(change_w, solution))
     )
 
 

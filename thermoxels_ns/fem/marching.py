@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
-from thermoxels_ns.fem.range_keeper import RangeKeeper, allowed_range, is_in_range
+from thermoxels_ns.fem.range_keeper import RangeKeeper, RangeWatch, is_in_range
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, Scheme
 from thermoxels_ns.fem.stepper import Step, Stepper
 from thermoxels_ns.fem.system import HeatSystem
@@ -19,6 +19,8 @@ Vector = npt.NDArray[np.float64]
 STEP_SHARE = 0.1
 """Share of the tolerance that one step may use. Conduction forgets errors, so that those of many steps do not add up
 to their sum."""
+RANGE_SHARE = 1e-3
+"""Share of the tolerance by which a temperature may leave its range: less than that is not worth shorter steps."""
 _SAFETY = 0.9
 _SHRINK, _GROW = 0.2, 5.0
 _KEEP_BELOW = 1.25
@@ -62,6 +64,7 @@ def equal_steps(
     """
     keeper = RangeKeeper(system, relative_tolerance=tolerance) if scheme is BACKWARD_EULER else None
     stepper, relative_k = Stepper(system, scheme, relative_tolerance=tolerance), start_k
+    watch = RangeWatch(system)
     for number, begin_s in enumerate(time.times_s[:-1]):
         limited = False
         if keeper is not None:
@@ -69,7 +72,7 @@ def equal_steps(
         else:
             step = stepper.step(relative_k, float(begin_s), time.step_seconds)
             times = tuple(float(begin_s) + node * time.step_seconds for node in (0.0, *scheme.nodes))
-            in_range = step.converged and is_in_range(step, *allowed_range(system, relative_k, times))
+            in_range = step.converged and is_in_range(step, *watch.at(relative_k, times))
         failure = ""
         if not step.converged:
             remedy = "Use shorter steps or check the mesh's quality."
@@ -99,8 +102,8 @@ class AdaptiveMarch:
 
     A step whose result leaves the range that temperatures may have, that of its start and of all surroundings, is
     taken with backward Euler and a `RangeKeeper` instead, which never leave it; the difference between both is then the
-    estimate. So nothing overshoots, and second order returns as soon as it is safe. No step is longer than effects can
-    be followed by, so that none steps over a day of sunshine.
+    estimate. So nothing overshoots by more than a thousandth of the tolerance or a millionth of the range, and second
+    order returns as soon as it is safe. No step is longer than effects can be followed by, so that none steps over a day of sunshine.
     """
 
     def __init__(
@@ -121,6 +124,8 @@ class AdaptiveMarch:
         self._scheme = Stepper(system, scheme, relative_tolerance=relative_tolerance)
         self._safe = RangeKeeper(system, relative_tolerance=relative_tolerance)
         self._allowed_k = STEP_SHARE * time.tolerance_k
+        self._slack_k = RANGE_SHARE * time.tolerance_k
+        self._range = RangeWatch(system)
         self._longest_s = system.problem.resolution_s
         self.repeated = 0
         """Steps that had to be repeated with a shorter length."""
@@ -169,7 +174,7 @@ class AdaptiveMarch:
         plain = _Attempt(step, self._scheme.scheme.order + 1)
         if not step.converged or step.error_k > self._allowed_k or self._in_range(step, start_k, now_s, step_s):
             return plain
-        safe, limited, in_range = self._safe.step(start_k, now_s, step_s)
+        safe, limited, in_range = self._safe.step(start_k, now_s, step_s, self._slack_k)
         if not in_range:
             return replace(plain, in_range=False)
         safe = replace(
@@ -182,7 +187,7 @@ class AdaptiveMarch:
 
     def _in_range(self, step: Step, start_k: Vector, now_s: float, step_s: float) -> bool:
         times = (now_s, *(now_s + node * step_s for node in self._scheme.scheme.nodes))
-        return is_in_range(step, *allowed_range(self._system, start_k, times))
+        return is_in_range(step, *self._range.at(start_k, times, self._slack_k))
 
     def _factor(self, attempt: _Attempt) -> float:
         """How much longer the next step may be."""

@@ -20,11 +20,16 @@ from scipy import sparse
 from thermoxels_ns.fem.schemes import BACKWARD_EULER
 from thermoxels_ns.fem.stepper import Step, Stepper
 from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.units import ZERO_CELSIUS_K
 
 Vector = npt.NDArray[np.float64]
 
 RANGE_ROUND_OFF = 1e-9
-"""How far out of its range a temperature may be, as a share of the range."""
+"""How far out of its range a temperature may be, as a share of the range of the whole computation so far."""
+MOST_SLACK = 1e-6
+"""The most that a temperature may be out of range besides round-off, as such a share, however loose a tolerance is."""
+LEVEL_ROUND_OFF = 1e-12
+"""The same as a share of the absolute temperature: what the linear solver and floating point leave."""
 _ATTEMPTS = 8
 """Repetitions after which all wrong-signed couplings are left out."""
 
@@ -41,15 +46,17 @@ class RangeKeeper:
         """
         self._system, self._relative_tolerance = system, relative_tolerance
         self._plain = Stepper(system, BACKWARD_EULER, relative_tolerance=relative_tolerance)
+        self._range = RangeWatch(system)
         self._wrong: tuple[npt.NDArray[np.int32], npt.NDArray[np.int32], Vector] | None = None
 
-    def step(self, start_k: Vector, time_s: float, step_s: float) -> tuple[Step, bool, bool]:
+    def step(self, start_k: Vector, time_s: float, step_s: float, slack_k: float = 0.0) -> tuple[Step, bool, bool]:
         """Take one step.
 
         Args:
             start_k: Temperatures at the start, relative to the system's reference, shape (n,), [K].
             time_s: Time at the start.
             step_s: Length, [s].
+            slack_k: As in `RangeWatch.at`.
 
         Returns:
             step: Its outcome; iterations of all repetitions count.
@@ -60,7 +67,7 @@ class RangeKeeper:
         step = self._plain.step(start_k, time_s, step_s)
         if not step.converged:
             return step, False, False
-        low, high = allowed_range(self._system, start_k, (time_s, time_s + step_s))
+        low, high = self._range.at(start_k, (time_s, time_s + step_s), slack_k)
         if is_in_range(step, low, high):
             return step, False, True
         if not self._system.lumped:
@@ -101,17 +108,37 @@ class RangeKeeper:
         return sparse.csr_matrix(self._system.stiffness + change)
 
 
-def allowed_range(system: HeatSystem, start_k: Vector, times_s: tuple[float, ...]) -> tuple[float, float]:
-    """Range that temperatures may have after a step from a start, with some slack for round-off, [K].
+class RangeWatch:
+    """The range that temperatures may have, with slack for round-off.
 
-    Args:
-        system: The equations.
-        start_k: Temperatures at the start, relative to the system's reference, shape (n,), [K].
-        times_s: Times at which the surroundings count, [s].
+    Near equilibrium the range of a single step shrinks to nothing, round-off does not; so its slack is a share of the
+    widest range so far.
     """
-    low, high = system.allowed_range_k(start_k, times_s)
-    slack = RANGE_ROUND_OFF * (high - low) if np.isfinite(high - low) else RANGE_ROUND_OFF
-    return low - slack, high + slack
+
+    def __init__(self, system: HeatSystem) -> None:
+        """Begin.
+
+        Args:
+            system: The equations.
+        """
+        self._system, self._widest_k = system, 0.0
+
+    def at(self, start_k: Vector, times_s: tuple[float, ...], slack_k: float = 0.0) -> tuple[float, float]:
+        """Give lowest and highest temperature after a step, [K].
+
+        Args:
+            start_k: Temperatures at the start, relative to the system's reference, shape (n,), [K].
+            times_s: Times at which the surroundings count, [s].
+            slack_k: How far out of it a temperature may be besides round-off, [K], but no more than `MOST_SLACK` of the
+                widest range.
+        """
+        low, high = self._system.allowed_range_k(start_k, times_s)
+        if np.isfinite(high - low):
+            self._widest_k = max(self._widest_k, high - low)
+        level_k = float(np.abs(start_k).max()) + abs(self._system.reference_c + ZERO_CELSIUS_K)
+        slack_k = min(slack_k, MOST_SLACK * self._widest_k)
+        slack_k = max(slack_k, RANGE_ROUND_OFF * self._widest_k, LEVEL_ROUND_OFF * level_k)
+        return low - slack_k, high + slack_k
 
 
 def is_in_range(step: Step, low: float, high: float) -> bool:

@@ -15,8 +15,7 @@ from thermoxels_ns.fem.error_budget import (
     ErrorSize,
     Tolerance,
     difference_between,
-    mean_flows_w,
-    share_of_flow,
+    flow_error,
 )
 from thermoxels_ns.fem.error_estimate import HALF_THE_SIZE, ErrorRatios, error_ratios, recovered_error, richardson
 from thermoxels_ns.fem.linear_start import linear_start
@@ -189,11 +188,12 @@ class _Run:
         status = f"{'Not within' if failure else 'Within'} {allowed}: {last.describe()}, {seconds:.2f} s in all."
         if failure:
             status += (
-                f" {failure}. Allow more memory or a larger error; the worst temperature is often at a sharp edge."
+                f" {failure}. Allow more memory (--memory-gb) or a larger error, or take what there is (--allow-unmet "
+                "True); the worst temperature is often at a sharp edge."
             )
-        self._log(status)
         if failure and not allow_unmet:
             raise HeatError(status)
+        self._log(status)
         return ToleratedSolution(self.solution, self.problem, last, not failure, status, seconds, tuple(self.levels))
 
 
@@ -249,9 +249,11 @@ def _in_time(run: _Run, steps: AdaptiveSteps) -> str:
         in_time = _of_steps(solution)
         run.add(given, solution, in_time + in_space, refinements=0, step_tolerance_k=tolerance_k)
     problem, base, refinements = given, solution, 0
-    while run.excess > 1.0:
+    # The estimate looks at the ends of intervals. Heat that rushes in at the start it may miss, a finer mesh does not.
+    while run.excess > 1.0 or (refinements == 0 and run.tolerance.heat_flow is not None):
         left = 1.0 - run.tolerance.excess(in_time)
-        halvings = max(int(np.ceil(np.log(run.tolerance.excess(in_space) / left) / np.log(_HALVING_GAINS))), 1)
+        wanted = max(run.tolerance.excess(in_space) / left, 1.0)
+        halvings = max(int(np.ceil(np.log(wanted) / np.log(_HALVING_GAINS))), 1)
         failure = run.lacks_memory(1, refinements + halvings, times)
         if failure:
             return failure
@@ -293,7 +295,7 @@ def _size(surplus: Surplus, solution: HeatSolution) -> ErrorSize:
     for (effect, _), heat_w in zip(surplus.groups, mean_w):
         change_w[effect] += float(heat_w)
     largest_k = float(np.max(np.abs(surplus.temperature_k)))
-    return ErrorSize(largest_k, share_of_flow(change_w, mean_flows_w(solution)))
+    return ErrorSize(largest_k, flow_error(change_w, solution))
 
 
 def _same(ratio: float) -> ErrorRatios:

@@ -1,0 +1,49 @@
+"""The rig of an earlier capture: lengths follow the scales, and what is no rotation and shift is refused."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.capture.rig_inputs import read_rig
+from thermoxels_ns.errors import SceneError
+
+CAMERA = {"w": 64, "h": 48, "fl_x": 70.0, "fl_y": 70.0, "cx": 32.0, "cy": 24.0}
+
+
+def rig_file(folder, **changed):
+    rig = np.eye(4)
+    rig[:3, 3] = 0.1, 0.0, 0.02
+    content = {"thermal_camera": CAMERA, "rig": rig.tolist(), "metres_per_unit": 0.5, **changed}
+    path = folder / "transforms.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+@pytest.mark.parametrize(("ours", "shift"), [(0.5, 0.1), (0.25, 0.2), (None, 0.1)])
+def test_lengths_follow_the_scales(tmp_path, ours, shift):
+    rig = read_rig(rig_file(tmp_path), (64, 48), ours)
+    assert rig.visible_to_thermal[0, 3] == pytest.approx(shift)
+    assert ("converted" in rig.explanation) == (ours is not None)
+
+
+@pytest.mark.parametrize(
+    "rig",
+    [
+        np.diag([1.0, 1.0, -1.0, 1.0]),
+        np.diag([1.0, 1.0, 1.0, 5.0]),
+        np.diag([2.0, 2.0, 2.0, 1.0]),
+        np.full((4, 4), np.nan),
+        np.eye(3),
+    ],
+)
+def test_mirrors_and_other_matrices_are_refused(tmp_path, rig):
+    with pytest.raises(SceneError, match="rig: expected 4 x 4 numbers, a rotation and a shift"):
+        read_rig(rig_file(tmp_path, rig=rig.tolist()), (64, 48))
+
+
+def test_an_infinite_scale_is_none(tmp_path):
+    rig = read_rig(rig_file(tmp_path, metres_per_unit=float("inf")), (64, 48), 1.0)
+    assert np.isfinite(rig.visible_to_thermal).all() and "not both have a scale" in rig.explanation
