@@ -320,6 +320,15 @@ def test_a_body_without_rooms_is_warned_about(folder, tmp_path, capsys) -> None:
     assert compute_heat(Heat(folder / "room" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path)).warnings == ()
 
 
+def test_long_solutions_say_how_far_they_are(folder, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("thermoxels_ns.heat_solving.SAY_EVERY_S", 0.0)
+    lines: list[str] = []
+    options = Heat(folder / "room" / "mesh.vtu", str(folder / "hour.yaml"), tmp_path, leave_out_below_k=0.0)
+    compute_heat(options, lines.append)
+    said = [line for line in lines if "of the time after" in line]
+    assert said and all(re.fullmatch(r"\d+% of the time after \d+ steps; about \d+ s left\.", line) for line in said)
+
+
 def test_the_command_in_the_report_is_the_one_that_was_typed() -> None:
     options = Heat(
         Path("a b/mesh.vtu"),

@@ -1,4 +1,4 @@
-"""Training callbacks: refine, prune, and decide what stands behind the box."""
+"""Training callbacks: start, refine, prune, and decide what stands behind the box."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from torch.nn import Parameter
 
 from thermoxels_ns.errors import PruningError, explain
 from thermoxels_ns.field.refine import RowChange, prune, refine
-from thermoxels_ns.photo_start import start_from_photographs
 from thermoxels_ns.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
 from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
 
@@ -51,12 +50,13 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
 
     def start(step: int) -> None:
         """Set the density at the first step of a training, not at the first of a resumed one."""
+        from thermoxels_ns.photo_start import start_from_photographs
+
         assert attributes.pipeline is not None
-        if step == 0:
-            start_from_photographs(model, attributes.pipeline.datamanager)
+        start_from_photographs(model, attributes.pipeline.datamanager)
 
     def hold(step: int) -> None:
-        """Let the density stand while colours are still those of nothing; its moments are already followed."""
+        """Let the density stand while colours are still those of nothing; its gradients are already followed."""
         assert attributes.optimizers is not None
         if step < model.config.hold_density:
             for group in attributes.optimizers.optimizers["density"].param_groups:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -31,6 +32,8 @@ LEFT_OUT_SHARE = 0.2
 """Share of the tolerance that effects which are left out may use together; the solver gets what they do not use."""
 LEAVE_OUT_BELOW_K = 0.01
 """The same without a tolerance, [K]: a fifth of the default tolerance of the time steps."""
+SAY_EVERY_S = 10.0
+"""Time between two lines of progress, [s]."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +163,9 @@ def solve_scene(options: Heat, scene: HeatScene, problem: HeatProblem, say: Say,
     check_memory(needed, options.memory_gb * 2**30, "Pass a larger --memory-gb, or export a coarser mesh.")
     if scene.time is None:
         return SolvedScene(screening.problem, solve_steady(screening.problem), screening, None, None)
-    return SolvedScene(screening.problem, solve_heat(screening.problem, scene.time), screening, lumped, None)
+    return SolvedScene(
+        screening.problem, solve_heat(screening.problem, scene.time, progress=_Progress(say)), screening, lumped, None
+    )
 
 
 def _to_tolerance(
@@ -176,6 +181,7 @@ def _to_tolerance(
         memory_bytes=options.memory_gb * 2**30,
         allow_unmet=options.allow_unmet,
         log=say,
+        progress=_Progress(say),
     )
     return SolvedScene(found.problem, found.solution, screening, lumped, _of_levels(options, screening, found))
 
@@ -243,6 +249,25 @@ def _say_what_is_built(screening: Screening, say: Say) -> None:
         say(f"Built: {entry.effect}{bound}")
     if not screening.kept and not screening.left_out:
         say("Nothing acts on the body: its surface is insulated.")
+
+
+class _Progress:
+    """Says every now and then how far a solution has come, and when it will be done at that pace."""
+
+    def __init__(self, say: Say) -> None:
+        self._say, self._share = say, 0.0
+        self._begin_s = self._said_s = clock.perf_counter()
+
+    def __call__(self, share: float, steps: int) -> None:
+        """Take the share of the duration that is done, and the number of steps."""
+        now_s = clock.perf_counter()
+        if share < self._share:  # the next solution has begun
+            self._begin_s = now_s
+        self._share = share
+        if now_s - self._said_s >= SAY_EVERY_S and 0.0 < share < 1.0:
+            left_s = (now_s - self._begin_s) * (1.0 - share) / share
+            self._said_s = now_s
+            self._say(f"{share:.0%} of the time after {steps} steps; about {left_s:.0f} s left.")
 
 
 def _or_more(bound_k: float) -> str:

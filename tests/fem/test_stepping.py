@@ -101,6 +101,7 @@ def test_failure_to_converge_raises_and_can_be_a_status(random_body, concrete, m
             super().__init__(matrix, **{**options, "max_iterations": 2})
 
     monkeypatch.setattr(solver_choice, "ConjugateGradients", Hasty)
+    monkeypatch.setattr(solver_choice, "suits_sweeps", lambda matrix: False)
     problem = HeatProblem(random_body, concrete)
     with pytest.raises(HeatError, match=r"Step 1 of 10 failed.*stopped after 2 iterations"):
         solve_heat(problem, PAPER)

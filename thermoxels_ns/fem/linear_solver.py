@@ -13,6 +13,8 @@ from scipy import sparse
 from thermoxels_ns.errors import HeatError, explain
 from thermoxels_ns.fem.sparsity import product_and_bound
 
+Vector = npt.NDArray[np.float64]
+
 _RECURSION_SLACK = 10.0
 _ROUND_OFF = 1e-14
 _SOLVES_SOMETHING = 0.5
@@ -37,6 +39,9 @@ class LinearSolution:
 
 class ConjugateGradients:
     """Solver for A x = b with one matrix and many right-hand sides; preconditioned by the diagonal (Jacobi)."""
+
+    _manner = ""
+    """How it iterates, for the status."""
 
     def __init__(
         self,
@@ -69,6 +74,7 @@ class ConjugateGradients:
         self._matrix = matrix
         self._norm = float(np.max(product_and_bound(matrix, np.ones(len(diagonal)))[1]))
         self._size = np.sqrt(diagonal)
+        """Square roots of the diagonal of the preconditioner, shape (n,): iterations see it as ones."""
         self._upper = _scaled_upper_triangle(matrix, self._size)
         self._relative_tolerance = relative_tolerance
         self._max_iterations = max_iterations
@@ -99,9 +105,8 @@ class ConjugateGradients:
                 _residual(*whole, right_hand_side, scale, x, r, False)
             x *= self._size
         r /= self._size
-        direction, image = np.zeros_like(r), np.zeros_like(r)
         tolerance = self._relative_tolerance * size
-        count, stopped = _iterate(*self._upper, self._size, x, r, direction, image, tolerance, self._max_iterations)
+        count, stopped = self._iterate(x, r, tolerance)
         x /= self._size
         error, length = _residual(*whole, right_hand_side, scale, x, r, True)
         residual = error / size if size > 0 else error
@@ -110,12 +115,26 @@ class ConjugateGradients:
         round_off = error <= _ROUND_OFF * (self._norm * length + size) and residual < _SOLVES_SOMETHING
         converged = math.isfinite(length) and (exact_enough or round_off)
         if converged:
-            status = f"Converged in {count} iterations to a relative residual of {residual:.1e}."
+            status = f"Converged in {count} iterations{self._manner} to a relative residual of {residual:.1e}."
         else:
             reason = f"stopped after {count} iterations" if stopped else "lost accuracy to round-off"
             status = f"Conjugate gradients {reason} at a relative residual of {residual:.1e}."
         x *= scale
         return LinearSolution(x, count, residual, converged, status)
+
+    def _iterate(self, x: Vector, r: Vector, tolerance: float) -> tuple[int, bool]:
+        """Move x, in multiples of 1 / size, until the norm of size * r is within the tolerance.
+
+        Args:
+            x: Solution to move, shape (n,).
+            r: Residual at it, divided by the sizes, shape (n,); overwritten.
+            tolerance: Norm of the residual to reach.
+
+        Returns:
+            The number of iterations, and whether they ended before the tolerance was reached.
+        """
+        direction, image = np.zeros_like(r), np.zeros_like(r)
+        return _iterate(*self._upper, self._size, x, r, direction, image, tolerance, self._max_iterations)
 
 
 def _scaled_upper_triangle(

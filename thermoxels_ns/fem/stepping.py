@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +31,7 @@ def solve_heat(
     lumped_boundary: bool = True,
     relative_tolerance: float = 1e-12,
     allow_unconverged: bool = False,
+    progress: Callable[[float, int], None] | None = None,
 ) -> HeatSolution:
     """Follow the temperatures of a body through time.
 
@@ -48,6 +49,7 @@ def solve_heat(
         relative_tolerance: Of the linear solver in each step.
         allow_unconverged: Return what was computed, with `converged` False and the reason in `status`, instead
             of raising when a step cannot be solved.
+        progress: Called after every step with the share of the duration that is done and the number of steps.
 
     Returns:
         Temperatures at the start and after every step or interval, and the heat balance.
@@ -75,6 +77,8 @@ def solve_heat(
         if failure:
             break
         account.add(taken)
+        if progress is not None:
+            progress(account.followed_s / time.duration_s, account.steps)
     if failure and not allow_unconverged:
         raise HeatError(failure)
     return account.close(failure or account.success(march) + _skips(problem, time), not failure, adaptive=bool(march))
@@ -86,15 +90,23 @@ class _Account:
     def __init__(self, system: HeatSystem, states_k: Vector, times_s: Vector) -> None:
         self._system, self._states, self._times = system, states_k, times_s
         self._done = self._steps = self._most_iterations = 0
+        self.followed_s = 0.0
+        """Time that has been followed, [s]."""
         self._heat_j = np.zeros((len(times_s) - 1, len(system.groups)))
         self._exchanged_j = np.zeros(len(times_s) - 1)
         self._iterations = np.zeros((len(times_s) - 1, 2), dtype=np.int64)
         self._error_k = 0.0
         self._limited = self._out_of_range = 0
 
+    @property
+    def steps(self) -> int:
+        """Number of steps so far."""
+        return self._steps
+
     def add(self, taken: Taken) -> None:
         """Count a step."""
         step, row = taken.step, self._done
+        self.followed_s += taken.step_s
         self._heat_j[row] += taken.step_s * step.group_heat_w
         self._exchanged_j[row] += taken.step_s * float(np.abs(step.group_heat_w).sum())
         self._iterations[row] += step.iterations, step.newton_iterations

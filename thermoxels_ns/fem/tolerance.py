@@ -99,6 +99,7 @@ def solve_to_tolerance(
     memory_bytes: float = DEFAULT_MEMORY_BYTES,
     allow_unmet: bool = False,
     log: Callable[[str], None] = print,
+    progress: Callable[[float, int], None] | None = None,
 ) -> ToleratedSolution:
     """Solve a problem with the cheapest choice of order, mesh size and time steps whose estimated error is allowed.
 
@@ -120,6 +121,7 @@ def solve_to_tolerance(
         allow_unmet: Return the last solution that fits into memory, with `met` False and the reason in `status`,
             instead of raising.
         log: Takes a line per solution and one on the outcome; print by default.
+        progress: As in `solve_heat`, of each solution through time.
 
     Raises:
         HeatError: The tolerance cannot be met within the memory, or a solution fails.
@@ -129,7 +131,8 @@ def solve_to_tolerance(
     if duration_s is None:
         failure = _steady(run, time_s)
     else:
-        failure = _in_time(run, AdaptiveSteps(duration_s, tolerance_k=_needs_kelvin(tolerance), outputs=outputs))
+        steps = AdaptiveSteps(duration_s, tolerance_k=_needs_kelvin(tolerance), outputs=outputs)
+        failure = _in_time(run, steps, progress)
     return run.close(failure, allow_unmet)
 
 
@@ -228,7 +231,7 @@ def _steady(run: _Run, time_s: float) -> str:
     return ""
 
 
-def _in_time(run: _Run, steps: AdaptiveSteps) -> str:
+def _in_time(run: _Run, steps: AdaptiveSteps, progress: Callable[[float, int], None] | None) -> str:
     """Follow the body through time well enough; returns why that was not possible, or nothing."""
     given, times = run.given, steps.outputs + 1
     failure = run.lacks_memory(2, 0, 3 * times)
@@ -236,7 +239,7 @@ def _in_time(run: _Run, steps: AdaptiveSteps) -> str:
         return failure
 
     def solve(problem: HeatProblem, tolerance_k: float) -> HeatSolution:
-        return solve_heat(problem, replace(steps, tolerance_k=tolerance_k))
+        return solve_heat(problem, replace(steps, tolerance_k=tolerance_k), progress=progress)
 
     tolerance_k = _STEPS_OVER_TOLERANCE * steps.tolerance_k
     solution = solve(given, tolerance_k)
