@@ -210,3 +210,12 @@ def test_where_nothing_flows_any_share_of_it_is_met() -> None:
     ):
         found = solve_to_tolerance(HeatProblem(mesh, CONCRETE, effects=effects), Tolerance(None, 0.01), log=silent)
         assert found.met and found.settings.refinements == 0 and found.settings.error.heat_flow == 0.0
+
+
+def test_a_body_of_given_temperatures_alone_has_nothing_to_solve() -> None:
+    mesh = box_mesh([0.0, 0.1], [0.0, 0.1, 0.2], [0.0, 0.1, 0.2], temperature_c=10.0)
+    problem = HeatProblem(mesh, CONCRETE, effects=(FixedTemperature(("x0",), 20.0), FixedTemperature(("x1",), 0.0)))
+    assert solve_heat(problem, AdaptiveSteps(3600.0)).converged
+    steady = solve_to_tolerance(problem, Tolerance(0.05), log=silent)
+    assert steady.met and steady.solution.temperature_c.max() == 20.0
+    assert solve_to_tolerance(problem, Tolerance(5.0), duration_s=3600.0, log=silent).met

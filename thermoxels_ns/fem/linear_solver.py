@@ -72,7 +72,7 @@ class ConjugateGradients:
                 )
             )
         self._matrix = matrix
-        self._norm = float(np.max(product_and_bound(matrix, np.ones(len(diagonal)))[1]))
+        self._norm = float(np.max(product_and_bound(matrix, np.ones(len(diagonal)))[1], initial=0.0))
         self._size = np.sqrt(diagonal)
         """Square roots of the diagonal of the preconditioner, shape (n,): iterations see it as ones."""
         self._upper = _scaled_upper_triangle(matrix, self._size)

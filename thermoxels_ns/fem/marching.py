@@ -103,7 +103,8 @@ class AdaptiveMarch:
     A step whose result leaves the range that temperatures may have, that of its start and of all surroundings, is
     taken with backward Euler and a `RangeKeeper` instead, which never leave it; the difference between both is then the
     estimate. So nothing overshoots by more than a thousandth of the tolerance or a millionth of the range, and second
-    order returns as soon as it is safe. No step is longer than effects can be followed by, so that none steps over a day of sunshine.
+    order returns as soon as it is safe. No step is longer than effects can be followed by, so that none steps over a
+    day of sunshine.
     """
 
     def __init__(
