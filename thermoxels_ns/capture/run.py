@@ -39,6 +39,8 @@ from thermoxels_ns.data.radiometry import RadiometryOptions
 from thermoxels_ns.errors import SceneError, explain
 
 PAGE_NAME = "capture.html"
+_MOST_NAMED = 10
+"""Files left out that are named while the command runs."""
 _LEAST_POINTS = 50
 """Sightings of scene points below which thermal images and photographs cannot be compared."""
 _OVERLAY_FILE = "overlay.npy"
@@ -173,6 +175,12 @@ class _Run:
                     )
                 )
             self.say(f"pairs: {len(search.pairs)}, files without a partner: {len(search.unpaired)}")
+            left_out = [(path.name, why) for path, why in unreadable.items()]
+            left_out += [(Path(name).name, why) for name, why in search.unpaired.items()]
+            for name, why in left_out[:_MOST_NAMED]:
+                self.say(f"left out: {name}: {why}")
+            if len(left_out) > _MOST_NAMED:
+                self.say(f"left out: {len(left_out) - _MOST_NAMED} more; {PAGE_NAME} names all")
 
         folder = self.cache.run("pairs", depends, work)
         pairs, unpaired = results.load_pairs(folder, self.source)
