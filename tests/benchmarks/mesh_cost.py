@@ -240,6 +240,7 @@ def plot(rows: Sequence[dict], path: Path) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib import ticker
 
     names = list(dict.fromkeys(row["body"] for row in rows))
     figure, axes = plt.subplots(
@@ -267,6 +268,10 @@ def plot(rows: Sequence[dict], path: Path) -> None:
                         seconds, stairs, color=colour, marker="s", ls=":", alpha=0.6, label="voxel, plain area"
                     )
             panel.grid(True, which="major", alpha=0.3)
+            panel.margins(x=0.2)
+            panel.xaxis.set_major_locator(ticker.LogLocator(subs=(1.0, 3.0)))
+            panel.xaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+            panel.xaxis.set_minor_formatter(ticker.NullFormatter())
             if column == 0:
                 panel.set_ylabel(f"{title} [%]")
             if line == 0:
