@@ -121,7 +121,8 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     say(f"Mesh: {len(mesh.tets):,} tetrahedra, {len(mesh.points_m):,} nodes.")
     say(f"Scene: {scene.description or options.scene}.")
 
-    warnings = (*scene_doubts(scene, mesh, problem.up), *_shell_doubts(scene, export))
+    doubts = scene_doubts(scene, mesh, problem.up)
+    warnings = (*doubts, *_shell_doubts(scene, export))
     for warning in warnings:
         say(f"Warning: {warning}")
 
@@ -142,7 +143,7 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
 
     facet_region = solved.mesh.region[facet_owners(solved.mesh.tets, solved.mesh.facets)[0]]
     nodes = solution_nodes(solved, solution)
-    wall, no_wall = _wall(scene, solved, solution, facet_region, nodes)
+    wall, no_wall = _wall(scene, solved, solution, facet_region, nodes, doubtful=bool(doubts))
     # Around each probe in the mesh that was solved.
     probes = place_probes(solved.mesh, probes.points_m)
     run = HeatRun(
@@ -239,6 +240,8 @@ def _wall(
     solution: Solution,
     facet_region: npt.NDArray[np.int64],
     nodes: SolutionNodes,
+    *,
+    doubtful: bool,
 ) -> tuple[WallAnswer | None, str]:
     """The body as a wall, if the scene asks for a steady state between two airs of different temperature and nothing
     else, or why that cannot be said.
@@ -248,7 +251,7 @@ def _wall(
         return None, ""
     if inside.air_c == outside.air_c:
         return None, ""
-    if scene_doubts(scene, problem.mesh, problem.up):
+    if doubtful:
         return None, "There is no U-value, because it is doubtful which surface faces the air inside."
     other = not_only_airs(problem, inside.air_c, outside.air_c)
     if other:

@@ -14,8 +14,6 @@ from thermoxels_ns.mesh.patches import (
     apply_regions,
     default_patches,
     facing,
-    idle_patch_rules,
-    idle_region_rules,
 )
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "configs" / "patches-example.yaml"
@@ -85,12 +83,12 @@ BEFORE = ["exterior-up", "interior-down", "exterior-side", "exterior-side", "int
 
 def named(rules: PatchRules, colours: np.ndarray | None = None) -> list[str]:
     """Name of each facet's patch."""
-    patch, names = apply_patches(rules, **FACETS, colours=colours)
+    patch, names, _ = apply_patches(rules, **FACETS, colours=colours)
     return [names[p] for p in patch]
 
 
 def test_without_rules_the_default_patches_come_back() -> None:
-    patch, names = apply_patches(PatchRules(), **FACETS)
+    patch, names, _ = apply_patches(PatchRules(), **FACETS)
     expected, _ = default_patches(FACETS["normals"], UP, FACETS["seen"], FACETS["on_box"])
     assert np.array_equal(patch, expected)
     assert names == DEFAULT_PATCHES
@@ -188,7 +186,7 @@ regions:
     )
     centroids = np.array([[0, 0, 0.2], [0, 0, 0.4], [3, 0, 0.2], [0, 0, 1.0], [9.5, 9.5, 9.5]])
     colours = np.array([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0.95, 0, 0], [1.0, 0, 0]], dtype=np.float32)
-    region, names = apply_regions(rules, centroids, colours)
+    region, names, _ = apply_regions(rules, centroids, colours)
     assert names == ("solid", "slab", "east", "brick")
     assert [names[r] for r in region] == ["slab", "solid", "east", "brick", "slab"]
     assert apply_regions(PatchRules(), centroids)[0].tolist() == [0] * 5
@@ -217,9 +215,9 @@ def test_the_example_is_read_and_does_what_its_comments_say() -> None:
         "on_box": np.zeros(6, dtype=bool),
         "colours": np.array([[0.2, 0.2, 0.3]] * 5 + [[0.6, 0.3, 0.25]]),
     }
-    patch, names = apply_patches(rules, **facets)
+    patch, names, _ = apply_patches(rules, **facets)
     assert [names[p] for p in patch] == ["window", "window", "interior-side", "roof", "exterior-up", "brick"]
-    region, regions = apply_regions(rules, np.array([[0, 0, 0.29], [0, 0, 0.31]]))
+    region, regions, _ = apply_regions(rules, np.array([[0, 0, 0.29], [0, 0, 0.31]]))
     assert [regions[r] for r in region] == ["slab", "solid"]
 
 
@@ -348,8 +346,9 @@ def test_rules_that_nothing_follows_are_named() -> None:
         "seen": np.ones(3, dtype=bool),
         "on_box": np.zeros(3, dtype=bool),
     }
-    idle = idle_patch_rules(rules, **facets)
+    idle = apply_patches(rules, **facets).idle
     assert idle == ("patch wall (entry 1)", "patch typo (entry 2)", "patch wall (entry 3)", "patch roof (entry 4)")
-    assert idle_patch_rules(PatchRules(rules.patches[:4]), **facets) == ("patch typo (entry 2)", "patch wall (entry 3)")
-    assert idle_region_rules(rules, np.zeros((2, 3))) == ("region pipe (entry 2)",)
-    assert idle_region_rules(PatchRules(), np.zeros((2, 3))) == ()
+    fewer = PatchRules(rules.patches[:4])
+    assert apply_patches(fewer, **facets).idle == ("patch typo (entry 2)", "patch wall (entry 3)")
+    assert apply_regions(rules, np.zeros((2, 3))).idle == ("region pipe (entry 2)",)
+    assert apply_regions(PatchRules(), np.zeros((2, 3))).idle == ()

@@ -33,6 +33,13 @@ class Surplus:
     groups: tuple[tuple[str, str], ...]
     """Effect and patch or region of each column."""
 
+    def by_effect(self, group_w: Vector) -> dict[str, float]:
+        """Add up values of the columns, shape (g,), by effect."""
+        total = dict.fromkeys((effect for effect, _ in self.groups), 0.0)
+        for (effect, _), heat_w in zip(self.groups, group_w.tolist()):
+            total[effect] += heat_w
+        return total
+
 
 def edge_surplus(problem: HeatProblem, solution: HeatSolution) -> Surplus:
     """Estimate the error that the mesh makes at each of a solution's times.

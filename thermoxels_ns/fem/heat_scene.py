@@ -282,10 +282,5 @@ def _given(value: Value | None) -> Value:
     return value
 
 
-def _literal(name: str) -> str:
-    """Make a pattern that matches a name and nothing else."""
-    return "".join(f"[{letter}]" if letter in "*?[" else letter for letter in name)
-
-
 def _wrong(name: str, expected: str, got: object, remedy: str) -> HeatError:
     return HeatError(explain(name, expected=expected, got=got, remedy=remedy))

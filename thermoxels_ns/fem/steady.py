@@ -23,6 +23,7 @@ def solve_steady(
     lumped_boundary: bool | None = None,
     relative_tolerance: float = 1e-12,
     allow_unconverged: bool = False,
+    system: HeatSystem | None = None,
 ) -> SteadySolution:
     """Find the temperatures at which the effects of a problem balance, div(k grad T) + s = 0.
 
@@ -38,6 +39,8 @@ def solve_steady(
         relative_tolerance: Of the linear solver, and of Newton's method if there is radiation.
         allow_unconverged: Return what was computed, with `converged` False and the reason in `status`, instead of
             raising.
+        system: The equations of the problem if they have been made already; `order` and `lumped_boundary` then say
+            nothing. None: they are made here.
 
     Returns:
         Temperatures and heat flows.
@@ -46,7 +49,8 @@ def solve_steady(
         HeatError: A piece of the body exchanges heat with nothing whose temperature is known, two effects fix one node
             differently, quadratic tetrahedra are to be lumped, or the solver does not converge.
     """
-    system = HeatSystem(problem, lumped=order == 1, lumped_boundary=lumped_boundary, order=order)
+    if system is None:
+        system = HeatSystem(problem, lumped=order == 1, lumped_boundary=lumped_boundary, order=order)
     _check_held(system, time_s)
     start_k = system.start_k
     stage = Stage(system, time_s, np.inf, relative_tolerance=relative_tolerance)

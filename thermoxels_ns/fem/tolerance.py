@@ -38,6 +38,8 @@ _TIME_SHARE = 0.3
 """Share of the allowed error that time steps may make once their error is known."""
 _LONGEST_STEPS = 64.0
 """Most that the tolerance of the steps is raised by at once."""
+_LEAST_LEFT = 0.1
+"""Share of the allowed error that the mesh may make at least, however much time steps take of it."""
 _HALVING_GAINS = 4.0
 """What half the mesh size may divide an error by. A mesh that turns out too coarse costs a tenth of the next."""
 
@@ -254,7 +256,7 @@ def _in_time(run: _Run, steps: AdaptiveSteps, progress: Callable[[float, int], N
     problem, base, refinements = given, solution, 0
     # The estimate looks at the ends of intervals. Heat that rushes in at the start it may miss, a finer mesh does not.
     while run.excess > 1.0 or (refinements == 0 and run.tolerance.heat_flow is not None):
-        left = 1.0 - run.tolerance.excess(in_time)
+        left = max(1.0 - run.tolerance.excess(in_time), _LEAST_LEFT)
         wanted = max(run.tolerance.excess(in_space) / left, 1.0)
         halvings = max(int(np.ceil(np.log(wanted) / np.log(_HALVING_GAINS))), 1)
         failure = run.lacks_memory(1, refinements + halvings, times)
@@ -294,11 +296,8 @@ def _size(surplus: Surplus, solution: HeatSolution) -> ErrorSize:
     rows = surplus.group_heat_w
     # Mean heat flows of intervals, from those at their ends.
     mean_w = np.mean(0.5 * (rows[1:] + rows[:-1]), axis=0)
-    change_w = dict.fromkeys((effect for effect, _ in surplus.groups), 0.0)
-    for (effect, _), heat_w in zip(surplus.groups, mean_w):
-        change_w[effect] += float(heat_w)
     largest_k = float(np.max(np.abs(surplus.temperature_k)))
-    return ErrorSize(largest_k, flow_error(change_w, solution))
+    return ErrorSize(largest_k, flow_error(surplus.by_effect(mean_w), solution))
 
 
 def _same(ratio: float) -> ErrorRatios:

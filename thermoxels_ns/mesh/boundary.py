@@ -31,7 +31,7 @@ def tag_boundary(
     mode: BoundaryMode,
     up: tuple[float, float, float],
     rules: PatchRules,
-) -> Boundary:
+) -> tuple[Boundary, tuple[str, ...]]:
     """Find out what physics needs to know of every boundary triangle.
 
     Args:
@@ -46,7 +46,7 @@ def tag_boundary(
         rules: Patches of the user.
 
     Returns:
-        Normals, area factors, visibility and patches.
+        Normals, area factors, visibility and patches; and the rules that no triangle follows.
 
     Raises:
         MeshError: A rule cannot be applied, or `up` is no direction.
@@ -65,7 +65,7 @@ def tag_boundary(
         seen = np.ones(len(mesh.facets), dtype=bool)
     else:
         seen = seen_facets(solid.cells, views, lattice, lattice.index_to_world(centroids), in_world)
-    patch, names = apply_patches(
+    patch, names, idle = apply_patches(
         rules,
         centroids_m=mesh.points_m[mesh.facets].mean(axis=1),
         normals=normal,
@@ -74,4 +74,4 @@ def tag_boundary(
         on_box=on_box,
         colours=None if mesh.colour is None else mesh.colour[mesh.facets].mean(axis=1),
     )
-    return Boundary(normal=normal, area_factor=factor, seen=seen, patch=patch, patch_names=names)
+    return Boundary(normal=normal, area_factor=factor, seen=seen, patch=patch, patch_names=names), idle

@@ -15,7 +15,7 @@ from thermoxels_ns.mesh.components import node_parts, renumbered
 from thermoxels_ns.mesh.morphology import bounding_box, connected, face_connected
 from thermoxels_ns.mesh.node_values import interpolate_corners
 from thermoxels_ns.mesh.patch_rules import PatchRules
-from thermoxels_ns.mesh.patches import apply_regions, idle_patch_rules, idle_region_rules
+from thermoxels_ns.mesh.patches import apply_regions
 from thermoxels_ns.mesh.sharp_edges import sharpen
 from thermoxels_ns.mesh.solid import SolidCells, SolidSelection, select_solid
 from thermoxels_ns.mesh.stuffing import stuff
@@ -149,8 +149,7 @@ def build_mesh(
     points_m = apply_transform(transform, snapshot.lattice.index_to_world(shape.points))
     colour = _colour(snapshot, shape.points)
     of_tets = points_m[tets].mean(axis=1), None if colour is None else colour[tets].mean(axis=1)
-    region, region_names = apply_regions(options.rules, *of_tets)
-    idle = idle_region_rules(options.rules, *of_tets) if options.rules.regions else ()
+    region, region_names, idle_regions = apply_regions(options.rules, *of_tets)
     mesh = TetMesh(
         points_m=points_m,
         tets=np.ascontiguousarray(tets),
@@ -162,7 +161,7 @@ def build_mesh(
         region_names=region_names,
         colour=colour,
     )
-    boundary = tag_boundary(
+    boundary, idle_patches = tag_boundary(
         mesh,
         shape.points,
         solid,
@@ -173,20 +172,11 @@ def build_mesh(
         options.up,
         options.rules,
     )
-    if options.rules.patches:
-        of_facets = idle_patch_rules(
-            options.rules,
-            centroids_m=points_m[mesh.facets].mean(axis=1),
-            normals=boundary.normal,
-            up=options.up,
-            seen=boundary.seen,
-            on_box=mesh.facet_tags == FACET_BOX,
-            colours=None if colour is None else colour[mesh.facets].mean(axis=1),
-        )
-        idle = (*of_facets, *idle)
     measured_c = snapshot.temperature_c[snapshot.observed_weight >= least]
     observed_range_c = float(measured_c.min()), float(measured_c.max())
-    return BuiltMesh(replace(mesh, boundary=boundary), solid, num_parts, num_voxels, observed_range_c, idle)
+    return BuiltMesh(
+        replace(mesh, boundary=boundary), solid, num_parts, num_voxels, observed_range_c, (*idle_patches, *idle_regions)
+    )
 
 
 def _voxel_shape(cells: npt.NDArray[np.bool_]) -> _Shape:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,18 @@ from thermoxels_ns.mesh.patch_rules import DEFAULT_PATCHES, DEFAULT_REGION, FACI
 
 _COS_45 = math.sqrt(0.5) + 1e-9
 """A little above the cosine of 45 degrees, so that a roof of exactly 45 degrees is a side whatever its rounding."""
+
+
+class Applied(NamedTuple):
+    """What rules make of some elements."""
+
+    number: npt.NDArray[np.int64]
+    """Index of each element's patch or region, shape (n,)."""
+    names: tuple[str, ...]
+    """Names of all patches or regions."""
+    idle: tuple[str, ...]
+    """Rules that no element follows, such as "patch roof (entry 2)": none meets their conditions, or later rules take
+    all that do."""
 
 
 def facing(normals: npt.NDArray[np.float64], up: npt.ArrayLike) -> npt.NDArray[np.int64]:
@@ -82,7 +95,7 @@ def apply_patches(
     seen: npt.NDArray[np.bool_],
     on_box: npt.NDArray[np.bool_],
     colours: npt.NDArray | None = None,
-) -> tuple[npt.NDArray[np.int64], tuple[str, ...]]:
+) -> Applied:
     """Default patches with a user's rules over them.
 
     Args:
@@ -95,67 +108,30 @@ def apply_patches(
         colours: Red, green, blue in [0, 1] of each triangle, shape (f, 3); None if not known.
 
     Returns:
-        Index of each triangle's patch, shape (f,), and the names: the default ones, then the rules' in their order.
+        Each triangle's patch; the default names come first, then the rules' in their order.
 
     Raises:
         MeshError: A rule asks for colours and there are none, `up` is no direction, or shapes do not fit.
     """
     patch, names = default_patches(normals, up, seen, on_box)
-    owner = _patch_rule_of_each(rules, centroids_m, normals, up, seen, on_box, colours)
-    return _renamed(rules.patches, owner, patch, names)
-
-
-def idle_patch_rules(
-    rules: PatchRules,
-    *,
-    centroids_m: npt.NDArray[np.float64],
-    normals: npt.NDArray[np.float64],
-    up: npt.ArrayLike,
-    seen: npt.NDArray[np.bool_],
-    on_box: npt.NDArray[np.bool_],
-    colours: npt.NDArray | None = None,
-) -> tuple[str, ...]:
-    """Rules for patches that no triangle follows: none meets their conditions, or later rules take all that do.
-
-    Args:
-        rules: The user's rules; the other arguments are those of `apply_patches`.
-
-    Returns:
-        What to call each of these rules, in their order, such as "patch roof (entry 2)".
-
-    Raises:
-        MeshError: As `apply_patches`.
-    """
-    owner = _patch_rule_of_each(rules, centroids_m, normals, up, seen, on_box, colours)
-    return _idle(rules.patches, "patch", owner)
-
-
-def _patch_rule_of_each(
-    rules: PatchRules,
-    centroids_m: npt.NDArray[np.float64],
-    normals: npt.NDArray[np.float64],
-    up: npt.ArrayLike,
-    seen: npt.NDArray[np.bool_],
-    on_box: npt.NDArray[np.bool_],
-    colours: npt.NDArray | None,
-) -> npt.NDArray[np.int64]:
     direction = facing(normals, up)
     parts = {
         "exterior": ~on_box & seen,
         "interior": ~on_box & ~seen,
         "cut": on_box,
-        "all": np.ones(len(direction), dtype=bool),
+        "all": np.ones(len(patch), dtype=bool),
     }
     allowed = [
         parts[rule.only] & (True if rule.facing == "any" else direction == FACINGS.index(rule.facing))
         for rule in rules.patches
     ]
-    return _rule_of_each(rules.patches, "patch", allowed, len(direction), centroids_m, colours)
+    owner = _rule_of_each(rules.patches, "patch", allowed, len(patch), centroids_m, colours)
+    return _applied(rules.patches, "patch", owner, patch, names)
 
 
 def apply_regions(
     rules: PatchRules, tet_centroids: npt.NDArray[np.float64], tet_colours: npt.NDArray | None = None
-) -> tuple[npt.NDArray[np.int64], tuple[str, ...]]:
+) -> Applied:
     """Regions of tetrahedra by a user's rules; what no rule claims is region 0, "solid".
 
     Args:
@@ -164,44 +140,33 @@ def apply_regions(
         tet_colours: Red, green, blue in [0, 1] of each tetrahedron, shape (t, 3); None if not known.
 
     Returns:
-        Index of each tetrahedron's region, shape (t,), and the names of all regions.
+        Each tetrahedron's region.
 
     Raises:
         MeshError: A rule asks for colours and there are none, or shapes do not fit.
     """
-    owner = _region_rule_of_each(rules, tet_centroids, tet_colours)
-    return _renamed(rules.regions, owner, np.zeros(len(tet_centroids), dtype=np.int64), (DEFAULT_REGION,))
+    count = len(tet_centroids)
+    allowed = [np.ones(count, dtype=bool)] * len(rules.regions)
+    owner = _rule_of_each(rules.regions, "region", allowed, count, tet_centroids, tet_colours)
+    return _applied(rules.regions, "region", owner, np.zeros(count, dtype=np.int64), (DEFAULT_REGION,))
 
 
-def idle_region_rules(
-    rules: PatchRules, tet_centroids: npt.NDArray[np.float64], tet_colours: npt.NDArray | None = None
-) -> tuple[str, ...]:
-    """Rules for regions that no tetrahedron follows, as `idle_patch_rules` names them."""
-    return _idle(rules.regions, "region", _region_rule_of_each(rules, tet_centroids, tet_colours))
-
-
-def _region_rule_of_each(
-    rules: PatchRules, tet_centroids: npt.NDArray[np.float64], tet_colours: npt.NDArray | None
-) -> npt.NDArray[np.int64]:
-    allowed = [np.ones(len(tet_centroids), dtype=bool)] * len(rules.regions)
-    return _rule_of_each(rules.regions, "region", allowed, len(tet_centroids), tet_centroids, tet_colours)
-
-
-def _idle(rules: Sequence[Rule], kind: str, owner: npt.NDArray[np.int64]) -> tuple[str, ...]:
-    followed = np.bincount(owner[owner >= 0], minlength=len(rules)) > 0
-    return tuple(f"{kind} {rule.name} (entry {n})" for n, rule in enumerate(rules, start=1) if not followed[n - 1])
-
-
-def _renamed(
-    rules: Sequence[Rule], owner: npt.NDArray[np.int64], start: npt.NDArray[np.int64], names: tuple[str, ...]
-) -> tuple[npt.NDArray[np.int64], tuple[str, ...]]:
+def _applied(
+    rules: Sequence[Rule],
+    kind: str,
+    owner: npt.NDArray[np.int64],
+    start: npt.NDArray[np.int64],
+    names: tuple[str, ...],
+) -> Applied:
     """Overwrite `start` where a rule owns the element, and append the rules' names."""
     all_names = tuple(dict.fromkeys((*names, *(rule.name for rule in rules))))
     number = np.array([all_names.index(rule.name) for rule in rules], dtype=np.int64)
     index = start.copy()
     owned = owner >= 0
     index[owned] = number[owner[owned]]
-    return index, all_names
+    followed = np.bincount(owner[owned], minlength=len(rules)) > 0
+    idle = (f"{kind} {rule.name} (entry {n})" for n, rule in enumerate(rules, start=1) if not followed[n - 1])
+    return Applied(index, all_names, tuple(idle))
 
 
 def _rule_of_each(
