@@ -56,7 +56,7 @@ def test_synthetic_writes_the_scene_that_was_asked_for(tmp_path, capsys):
     assert all((folder / frame["thermal_file_path"]).suffix == ".tiff" for frame in content["frames"])
     truth = load_truth(folder)
     assert truth is not None and truth.name == "sphere"
-    assert f"ns-train thermoxels thermal-data --data {folder}" in capsys.readouterr().out
+    assert f"Train with: ns-train thermoxels --data '{folder}'" in capsys.readouterr().out
 
 
 def test_synthetic_with_a_camera_for_each_band(tmp_path):

@@ -174,7 +174,7 @@ def test_a_command_of_another_environment_is_not_used(fake_commands, tmp_path, c
     ],
 )
 def test_a_target_is_met_at_its_bound_and_never_by_nan(measured, at_least, met):
-    target = Target("x", measured, 1.0, at_least, "{:.2f} m")
+    target = Target("x", measured, 1.0, at_least, "{:.2f} m", "how far")
     assert target.met is met
     assert target.measured_text == ("not measured" if math.isnan(measured) else f"{measured:.2f} m")
     assert target.bound_text == ("≥ 1.00 m" if at_least else "≤ 1.00 m")
@@ -253,7 +253,7 @@ def quick_demo(fake_commands, monkeypatch):
             after
             + picture
             + "folder = after('--output-dir')\nos.makedirs(folder)\n"
-            + "Image.new('RGB', (8, 6)).save(f'{folder}/mesh-measured.png')\n"
+            + "for name in ('mesh', 'mesh-measured'): Image.new('RGB', (8, 6)).save(f'{folder}/{name}.png')\n"
             + "three = Image.new('RGB', (24, 6), 'red')\nthree.paste('blue', (8, 0, 16, 6))\n"
             + "three.paste('lime', (16, 0, 24, 6))\nthree.save(f'{folder}/heat.png')\n"
             + f"json.dump({summary}, open(f'{{folder}}/summary.json', 'w'))",
@@ -273,9 +273,10 @@ def test_the_whole_demo_leaves_a_page(quick_demo, tmp_path, capfd):
         assert f"$ {word} " in out
     page = (folder / "index.html").read_text(encoding="utf-8")
     assert "Thermoxels demo: sphere" in page
-    assert page.count("<img") == 2 * 6 + 4 * 2 + 4
+    assert page.count("<img") == 3 + 2 * 6 + 4 * 2 + 4
     assert ">10.0<" in page and ">40.0&nbsp;°C<" in page  # the bounds of the sphere's temperatures
     assert page.count(">yes<") == 4 and ">no<" not in page
+    assert f"ns-viewer --load-config {folder}/outputs/demo/thermoxels/run/config.yml" in page
     assert sorted(path.name for path in (folder / "logs").iterdir()) == [
         *("ns-eval.log", "ns-export.log", "ns-render.log", "ns-train.log")
     ]

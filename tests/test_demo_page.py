@@ -30,12 +30,14 @@ def page() -> DemoPage:
     return DemoPage(
         title="Demo <of> & all",
         intro='A "small" scene.',
-        checks=(Check("PSNR", "27.00 dB", "≥ 26.00 dB", True), Check("Error", "1.20 °C", "≤ 1.00 °C", False)),
+        at_a_glance=(Figure(picture("pink"), "In"), Figure(picture("brown"), "Out")),
+        checks=(Check("PSNR", "27.00 dB", "≥ 26.00 dB", True), Check("Error", "1.20 °C", "≤ 1.00 °C", False, "In K.")),
         more_figures=(("Volume", "0.1 m³"),),
         training_pairs=((picture("white", "JPEG"), picture("black", "JPEG")),),
         views=(view("frame_eval_00001"), view("frame_eval_00002")),
         colour_bar=ColourBar(("#000004", "#fcffa4"), 10.0, 30.0),
         mesh_pictures=(Figure(picture("grey"), "Before"), Figure(picture("orange"), "After")),
+        next_steps=(("ns-viewer --load-config x", "Look at it:"),),
         seconds=(("Train", 30.0), ("Export", 10.0)),
         commands=("ns-train thermoxels", "ns-eval --load-config 'a b'"),
         files=(("export/mesh.vtu", "the mesh"),),
@@ -82,21 +84,22 @@ class Outline(HTMLParser):
 def test_results_are_rows_that_say_yes_or_no(page):
     rows = Outline(build_page(page)).rows
     assert ["PSNR", "27.00 dB", "≥ 26.00 dB", "yes"] in rows
-    assert ["Error", "1.20 °C", "≤ 1.00 °C", "no"] in rows
+    assert ["ErrorIn K.", "1.20 °C", "≤ 1.00 °C", "no"] in rows and "<small>In K.</small>" in build_page(page)
     assert ["Volume", "0.1 m³"] in rows
 
 
 def test_every_picture_is_embedded_in_the_order_of_its_place(page):
     images = Outline(build_page(page)).images
     contents = [base64.b64decode(str(image["src"]).split("base64,")[1]) for image in images]
-    expected = [image for pair in page.training_pairs for image in pair]
+    expected = [figure.image for figure in page.at_a_glance]
+    expected += [image for pair in page.training_pairs for image in pair]
     for seen in page.views:
         expected += [seen.measured_rgb, seen.rendered_rgb, seen.measured_thermal, seen.rendered_thermal]
     expected += [figure.image for figure in page.mesh_pictures]
     assert contents == expected
     assert all(image["alt"] for image in images)
     kinds = [str(image["src"]).split(";")[0] for image in images]
-    assert kinds == ["data:image/jpeg"] * 2 + ["data:image/png"] * 10
+    assert kinds == ["data:image/png"] * 2 + ["data:image/jpeg"] * 2 + ["data:image/png"] * 10
 
 
 def test_nothing_is_fetched_and_no_script_runs(page):
@@ -112,10 +115,12 @@ def test_words_stay_words(page):
         page,
         title=hostile,
         intro=hostile,
-        checks=(Check(hostile, hostile, hostile, True),),
+        at_a_glance=(replace(page.at_a_glance[0], caption=hostile),),
+        checks=(Check(hostile, hostile, hostile, True, hostile),),
         more_figures=((hostile, hostile),),
         views=(replace(page.views[0], name=hostile),),
         mesh_pictures=(replace(page.mesh_pictures[0], caption=hostile),),
+        next_steps=((hostile, hostile),),
         seconds=((hostile, 1.0),),
         commands=(hostile,),
         files=((hostile, hostile),),
@@ -123,8 +128,9 @@ def test_words_stay_words(page):
     )
     text = build_page(changed)
     assert "<script" not in text
-    # Title (twice), intro, check (3), figure (2), view, caption, step, command, file (2); colours are no words.
-    assert "".join(Outline(text).words).count(hostile) == 14
+    # Title (twice), intro, glance, check (4), figure (2), view, caption, step, command, next (2), file (2); colours are
+    # no words.
+    assert "".join(Outline(text).words).count(hostile) == 18
 
 
 def test_the_colour_bar_says_the_temperatures_of_its_quarters(page):
@@ -149,6 +155,7 @@ def test_commands_are_shown_as_typed(page):
     words = Outline(build_page(page)).words
     assert "ns-train thermoxels" in words
     assert "ns-eval --load-config 'a b'" in words
+    assert words.index("Look at it:") < words.index("ns-viewer --load-config x")
 
 
 def test_the_same_page_is_the_same_text(page):

@@ -13,6 +13,7 @@ from thermoxels_ns.data.synthetic import make_scene, visible_surface_points, wri
 from thermoxels_ns.errors import MeshError, SceneError
 from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh
+from thermoxels_ns.mesh.quality import signed_volumes
 from thermoxels_ns.mesh.solid import SolidSelection, select_solid
 from thermoxels_ns.snapshot import GridSnapshot, Views
 from thermoxels_ns.truth_comparison import KnownTruth, compare_with_truth, load_known_truth
@@ -184,11 +185,24 @@ def test_only_measured_boundary_nodes_near_the_surface_count(hot_object):
     assert (result["temperature_nodes"], result["temperature_mae_c"]) == (0, None)
 
 
-def test_the_scale_of_the_mesh_is_undone(hot_object):
+def test_the_comparison_is_in_the_units_of_the_mesh(hot_object):
     mesh, cells, lattice = exact_mesh(hot_object)
     scaled = replace(mesh, points_m=3.0 * mesh.points_m)
     result = compare(cells, lattice, IDENTITY, hot_object, scaled, metres_per_unit=3.0)
-    assert result == pytest.approx(compare(cells, lattice, IDENTITY, hot_object, mesh))
+    plain = compare(cells, lattice, IDENTITY, hot_object, mesh)
+    for names, factor in (
+        (("voxel_size_m", "mean_distance_m", "chamfer_m", "hausdorff_m"), 3.0),
+        (("area_m2", "true_area_m2", "mesh_area_m2"), 9.0),
+        (("volume_m3", "filled_volume_m3", "true_volume_m3", "mesh_volume_m3"), 27.0),
+    ):
+        for name in names:
+            assert result.pop(name) == pytest.approx(factor * plain.pop(name)), name
+    # Shares, voxels and temperatures have nothing to do with it.
+    assert result == pytest.approx(plain) and not [name for name in plain if name.endswith(("_m", "_m2", "_m3"))]
+    volume = float(signed_volumes(scaled.points_m, scaled.tets).sum())
+    assert compare(cells, lattice, IDENTITY, hot_object, scaled, metres_per_unit=3.0)["mesh_volume_m3"] == (
+        pytest.approx(volume)
+    )
     with pytest.raises(MeshError, match="metres_per_unit"):
         compare(cells, lattice, IDENTITY, hot_object, mesh, metres_per_unit=0.0)
 
@@ -265,14 +279,15 @@ def test_mesh_of_the_exact_voxels_is_near_the_truth_in_shape_and_temperature(sph
     assert result["mesh_area_m2"] == pytest.approx(result["true_area_m2"], rel=0.03)
 
 
-def test_distances_and_sizes_are_in_units_of_the_truth_whatever_the_scale_of_the_mesh(sphere) -> None:
+def test_a_mesh_built_with_a_scale_is_compared_in_its_own_units(sphere) -> None:
     truth = sphere
     mesh, cells, lattice = exact_mesh(truth)
     plain = compare(cells, lattice, IDENTITY, truth, mesh)
     scaled_mesh, _, _ = exact_mesh(truth, np.diag([3.0, 3.0, 3.0, 1.0]))
     scaled = compare(cells, lattice, IDENTITY, truth, scaled_mesh, 3.0)
-    for name in ("chamfer_m", "hausdorff_m", "mesh_volume_m3", "mesh_area_m2", "temperature_seen_mae_c"):
-        assert scaled[name] == pytest.approx(plain[name], rel=1e-6)
+    powers = {"chamfer_m": 1, "hausdorff_m": 1, "mesh_volume_m3": 3, "mesh_area_m2": 2, "temperature_seen_mae_c": 0}
+    for name, power in powers.items():
+        assert scaled[name] == pytest.approx(3.0**power * plain[name], rel=1e-6), name
 
 
 def shell_that_cameras_see(truth: KnownTruth, resolution: int) -> GridSnapshot:

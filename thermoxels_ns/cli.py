@@ -5,6 +5,7 @@ Only light imports at the top, so that ``--help`` answers at once.
 
 from __future__ import annotations
 
+import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,7 +77,7 @@ class Synthetic:
             own_thermal_camera=self.own_thermal_camera,
         )
         Console(highlight=False).print(
-            f"Written to {folder}. Train with: ns-train thermoxels thermal-data --data {folder}",
+            f"Written to {folder}. Train with: ns-train thermoxels --data {shlex.quote(str(folder))}",
             markup=False,
             soft_wrap=True,
         )

@@ -201,6 +201,7 @@ def assemble_page(
     Raises:
         ThermoxelsError: A picture that a command should have written is missing.
     """
+    from thermoxels_ns.demo_commands import command_line
     from thermoxels_ns.demo_page import Check, DemoPage, Figure, HeldOutView
 
     bar = _colour_bar(folder / "scene")
@@ -208,6 +209,7 @@ def assemble_page(
     names = sorted(path.name for path in (folder / "scene" / "images").glob("frame_eval_*.png"))
     export = folder / "export"
     before, after, change = _panels(export / "heat.png", 3)
+    pairs = tuple(_training_pairs(folder / "scene"))
     return DemoPage(
         title=f"Thermoxels demo: {scene}",
         intro=(
@@ -215,9 +217,14 @@ def assemble_page(
             "and a heat computation. The scene is synthetic: its shape and temperature are known exactly, so the "
             "result can be measured."
         ),
-        checks=tuple(Check(t.name, t.measured_text, t.bound_text, t.met) for t in results.targets),
+        at_a_glance=(
+            Figure(pairs[0][0], f"In: {_TRAIN_VIEWS} photographs"),
+            Figure(pairs[0][1], "and their thermal images."),
+            Figure(_picture(export / "mesh.png"), "Out: a solid with temperatures, which heat can flow in."),
+        ),
+        checks=tuple(Check(t.name, t.measured_text, t.bound_text, t.met, t.meaning) for t in results.targets),
         more_figures=results.others,
-        training_pairs=tuple(_training_pairs(folder / "scene")),
+        training_pairs=pairs,
         views=tuple(
             HeldOutView(
                 Path(name).stem, *(_picture(renders / o / name) for o in ("gt-rgb", "rgb", "gt-thermal", "thermal"))
@@ -231,6 +238,17 @@ def assemble_page(
             Figure(change, "The change, on a scale of its own."),
             Figure(_picture(export / "mesh-measured.png"), "Grey: no thermal ray saw the surface; it is interpolated."),
         ),
+        next_steps=(
+            (
+                command_line(["ns-viewer", "--load-config", folder / "outputs/demo/thermoxels/run/config.yml"]),
+                "Walk around the trained model in a browser:",
+            ),
+            (
+                command_line(["thermoxels", "capture", "PHOTOGRAPHS", "--output", "SCENE"]),
+                "Make a scene of your own from a folder of photographs and thermal images:",
+            ),
+            ("ns-train thermoxels --data SCENE", "Train on it, and then go on with ns-export as above:"),
+        ),
         seconds=tuple(seconds),
         commands=tuple(commands),
         files=(
@@ -239,7 +257,9 @@ def assemble_page(
             ("eval.json", "figures of the held-out views"),
             ("renders/test/", "rendered and measured held-out views"),
             ("export/mesh.vtu", "the mesh with temperatures, for ParaView or a solver"),
-            ("export/heat.pvd", "temperatures over time"),
+            ("export/mesh.glb", "its surface, for a browser or a phone"),
+            ("export/quality.png", "how good its tetrahedra are"),
+            ("export/heat.pvd", "temperatures over time, for ParaView"),
             ("export/summary.json", "figures of mesh, heat and truth, and all options"),
             ("logs/", "what every command said"),
         ),

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
 from thermoxels_ns.errors import ThermoxelsError, explain
-
-_SIGNATURES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
+from thermoxels_ns.page_style import embedded_image, html_page, scrolling
 
 
 @dataclass(frozen=True)
@@ -24,6 +22,8 @@ class Check:
     """What it should be, with its unit."""
     met: bool
     """Whether it is."""
+    meaning: str = ""
+    """What the figure says, for somebody who meets it for the first time."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,8 @@ class DemoPage:
     """Heading."""
     intro: str
     """One or two sentences on what the page shows."""
+    at_a_glance: tuple[Figure, ...]
+    """What went in and what came out, side by side."""
     checks: tuple[Check, ...]
     """The figures that have a target."""
     more_figures: tuple[tuple[str, str], ...]
@@ -84,6 +86,8 @@ class DemoPage:
     """Colours of all thermal images of the page, but not of the mesh pictures, which have their own."""
     mesh_pictures: tuple[Figure, ...]
     """The mesh, before and after heat."""
+    next_steps: tuple[tuple[str, str], ...]
+    """Commands to try next, and what each does."""
     seconds: tuple[tuple[str, float], ...]
     """Steps in order and the time each took, [s]."""
     commands: tuple[str, ...]
@@ -101,30 +105,30 @@ def build_page(page: DemoPage) -> str:
     title = escape(page.title)
     parts = [
         f"<header><h1>{title}</h1><p>{escape(page.intro)}</p></header>",
+        f'<div class="glance">{"".join(map(_figure, page.at_a_glance))}</div>',
         _section("Result", _checks(page.checks) + _more_figures(page.more_figures)),
     ]
     if page.training_pairs:
         pairs = "".join(
-            f"<div>{_img(rgb, f'input photograph {n}')}{_img(thermal, f'input thermal image {n}')}</div>"
+            "<div>"
+            + embedded_image(rgb, f"input photograph {n}")
+            + embedded_image(thermal, f"input thermal image {n}")
+            + "</div>"
             for n, (rgb, thermal) in enumerate(page.training_pairs, start=1)
         )
         parts.append(_section("What went in", f'<div class="inputs">{pairs}</div>'))
     parts += [
         _section("Views that training never saw", _bar(page.colour_bar) + "".join(map(_view, page.views))),
         _section(
-            "The mesh, before and after heat", f'<div class="meshes">{"".join(map(_figure, page.mesh_pictures))}</div>'
+            "The mesh, before and after heat",
+            f'<div class="pictures">{"".join(map(_figure, page.mesh_pictures))}</div>',
         ),
         _section("What it cost", _seconds(page.seconds)),
         _section("Do it yourself", _commands(page.commands)),
+        _section("What next", _next_steps(page.next_steps)),
         _section("Where the files lie", _files(page.files)),
     ]
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{title}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n<main>\n"
-        + "\n".join(parts)
-        + "\n</main>\n</body>\n</html>\n"
-    )
+    return html_page(page.title, "\n".join(parts), _STYLE)
 
 
 def _section(heading: str, content: str) -> str:
@@ -132,25 +136,29 @@ def _section(heading: str, content: str) -> str:
 
 
 def _checks(checks: Sequence[Check]) -> str:
-    rows = "".join(
-        f"<tr><td>{escape(c.name)}</td><td class=num>{escape(c.measured)}</td><td class=num>{escape(c.target)}</td>"
-        f"<td class={'yes' if c.met else 'no'}>{'yes' if c.met else 'no'}</td></tr>"
-        for c in checks
-    )
+    rows = "".join(map(_check, checks))
     head = "<tr><th></th><th class=num>measured</th><th class=num>target</th><th>met</th></tr>"
-    return f"<table><thead>{head}</thead><tbody>{rows}</tbody></table>"
+    return f"<div class=result>{scrolling(f'<table><thead>{head}</thead><tbody>{rows}</tbody></table>')}</div>"
+
+
+def _check(check: Check) -> str:
+    meaning = f"<small>{escape(check.meaning)}</small>" if check.meaning else ""
+    figures = "".join(f"<td class=num>{escape(text)}</td>" for text in (check.measured, check.target))
+    met = "yes" if check.met else "no"
+    return f"<tr><td>{escape(check.name)}{meaning}</td>{figures}<td class={met}>{met}</td></tr>"
 
 
 def _more_figures(rows: Sequence[tuple[str, str]]) -> str:
     if not rows:
         return ""
     body = "".join(f"<tr><td>{escape(name)}</td><td class=num>{escape(value)}</td></tr>" for name, value in rows)
-    return f"<details><summary>More figures</summary><table><tbody>{body}</tbody></table></details>"
+    table = scrolling(f"<table><tbody>{body}</tbody></table>")
+    return f"<details class=result><summary>More figures</summary>{table}</details>"
 
 
 def _view(view: HeldOutView) -> str:
     cells = "".join(
-        f"<figure>{_img(image, f'{view.name}, {words}')}<figcaption>{words}</figcaption></figure>"
+        f"<figure>{embedded_image(image, f'{view.name}, {words}')}<figcaption>{words}</figcaption></figure>"
         for words, image in (
             ("photograph", view.measured_rgb),
             ("rendered", view.rendered_rgb),
@@ -163,7 +171,7 @@ def _view(view: HeldOutView) -> str:
 
 def _figure(figure: Figure) -> str:
     caption = escape(figure.caption)
-    return f"<figure>{_img(figure.image, figure.caption)}<figcaption>{caption}</figcaption></figure>"
+    return f"<figure>{embedded_image(figure.image, figure.caption)}<figcaption>{caption}</figcaption></figure>"
 
 
 def _bar(bar: ColourBar) -> str:
@@ -193,10 +201,8 @@ def _seconds(seconds: Sequence[tuple[str, float]]) -> str:
         f'<div style="width: {100.0 * value / total if total > 0 else 0.0:.1f}%"></div></td></tr>'
         for name, value in seconds
     )
-    return (
-        f"<table><tbody>{rows}<tr class=total><td>all together</td><td class=num>{total:.1f} s</td><td></td></tr>"
-        "</tbody></table>"
-    )
+    rows += f"<tr class=total><td>all together</td><td class=num>{total:.1f} s</td><td></td></tr>"
+    return f"<div class=cost>{scrolling(f'<table><tbody>{rows}</tbody></table>')}</div>"
 
 
 def _commands(commands: Sequence[str]) -> str:
@@ -208,70 +214,30 @@ def _files(files: Sequence[tuple[str, str]]) -> str:
         f'<tr><td><a href="{escape(path, quote=True)}"><code>{escape(path)}</code></a></td><td>{escape(what)}</td></tr>'
         for path, what in files
     )
-    return f"<table><tbody>{rows}</tbody></table>"
+    return f"<div class=files>{scrolling(f'<table><tbody>{rows}</tbody></table>')}</div>"
 
 
-def _img(image: bytes, words: str) -> str:
-    """Embed an image."""
-    kind = next((kind for signature, kind in _SIGNATURES.items() if image.startswith(signature)), None)
-    if kind is None:
-        raise ThermoxelsError(
-            explain(
-                words,
-                expected="the content of a PNG or JPEG file",
-                got=f"{len(image)} bytes that begin with {image[:8]!r}",
-                remedy="Write the picture again.",
-            )
-        )
-    return f'<img src="data:{kind};base64,{base64.b64encode(image).decode()}" alt="{escape(words, quote=True)}">'
+def _next_steps(steps: Sequence[tuple[str, str]]) -> str:
+    return "".join(f"<p>{escape(what)}</p><pre>{escape(command)}</pre>" for command, what in steps)
 
 
 _STYLE = """
-:root { color-scheme: light; --ink: #1d2430; --soft: #5c6675; --line: #e1e5ea; --accent: #b3431e; }
-* { box-sizing: border-box; }
-body { margin: 0; background: #fff; color: var(--ink);
-  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; }
-main { max-width: 1100px; margin: 0 auto; padding: 2rem 1.25rem 4rem; }
-h1 { font-size: 1.9rem; line-height: 1.2; margin: 0 0 .5rem; }
-header p { color: var(--soft); max-width: 46rem; margin: 0; }
-h2 { font-size: 1.2rem; margin: 2.5rem 0 .75rem; padding-bottom: .3rem; border-bottom: 2px solid var(--accent); }
-h3 { font-size: .85rem; font-weight: 600; color: var(--soft); margin: 1.1rem 0 .3rem; }
-table { border-collapse: collapse; width: 100%; max-width: 46rem; }
-th, td { text-align: left; padding: .4rem .75rem .4rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
-th { font-size: .85rem; font-weight: 600; color: var(--soft); }
-.num { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
-td.yes { color: #1c7c3c; font-weight: 600; }
-td.no { color: #c0212c; font-weight: 600; }
+.result, .files, .cost { max-width: 50rem; }
+.glance { display: grid; grid-template-columns: repeat(3, 1fr); gap: .75rem; margin-top: 1.5rem; align-items: end; }
 .total td { font-weight: 600; }
 .share { width: 40%; vertical-align: middle; }
 .share div { height: .6rem; background: var(--accent); border-radius: 2px; opacity: .75; }
-details { margin-top: .9rem; }
-summary { cursor: pointer; color: var(--soft); }
-figure { margin: 0; }
-figcaption { font-size: .8rem; color: var(--soft); margin-top: .15rem; }
-img { display: block; width: 100%; height: auto; border-radius: 3px; }
 .inputs { display: grid; grid-template-columns: repeat(6, 1fr); gap: .4rem; }
 .inputs img + img { margin-top: .4rem; }
-.view { display: grid; grid-template-columns: repeat(4, 1fr); gap: .6rem; }
-.meshes { display: grid; grid-template-columns: repeat(2, 1fr); gap: 1rem; }
-.meshes img { border: 1px solid var(--line); }
+.view { display: grid; grid-template-columns: repeat(4, 1fr); gap: .6rem; break-inside: avoid; }
 .bar { max-width: 46rem; margin-bottom: .5rem; }
 .bar > div:first-child { height: .9rem; border-radius: 3px; }
 .ticks { display: flex; justify-content: space-between; font-size: .8rem; color: var(--soft);
   font-variant-numeric: tabular-nums; }
-pre { background: #f5f6f8; border: 1px solid var(--line); border-radius: 4px; padding: .8rem; margin: 0;
-  white-space: pre-wrap; overflow-wrap: anywhere; }
-pre div { padding-left: 2ch; text-indent: -2ch; }
-pre div + div { margin-top: .5rem; }
-pre, code { font-family: ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace; font-size: .85rem; }
-code { overflow-wrap: anywhere; }
-a { color: var(--accent); }
-@media (max-width: 640px) {
-  main { padding: 1.25rem .9rem 3rem; }
-  h1 { font-size: 1.5rem; }
+@media screen and (max-width: 640px) {
   .view { grid-template-columns: repeat(2, 1fr); gap: .4rem; }
   .inputs { grid-template-columns: repeat(3, 1fr); }
-  .meshes { grid-template-columns: 1fr; }
-  th, td { padding-right: .5rem; font-size: .9rem; }
+  .glance { grid-template-columns: repeat(2, 1fr); }
+  .glance figure:last-child { grid-column: 1 / -1; }
 }
 """

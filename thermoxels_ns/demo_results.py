@@ -25,6 +25,8 @@ class Target:
     """True: the figure should be at least the bound. False: at most."""
     form: str
     """How to write the figure and the bound, for instance ``{:.1f} dB``."""
+    meaning: str
+    """What the figure says, for somebody who meets it for the first time."""
 
     @property
     def met(self) -> bool:
@@ -66,10 +68,22 @@ def read_results(eval_json: Path, summary_json: Path) -> DemoResults:
     truth, heat, mesh = (_Section(summary_json, name) for name in ("truth", "heat", "mesh"))
     tolerance = truth.number("tolerance_voxels")
     targets = (
-        Target("RGB PSNR, held-out views", images.number("psnr"), 26.0, True, "{:.2f} dB"),
-        Target("Temperature error, all pixels, mean", images.number("thermal_mae_c"), 1.0, False, "{:.2f} °C"),
-        Target(f"Surface F-score at {tolerance:g} voxels", truth.number("fscore"), 0.6, True, "{:.3f}"),
-        Target("Heat conserved, relative error", heat.number("energy_residual"), 1e-9, False, "{:.0e}"),
+        Target(
+            *("RGB PSNR, held-out views", images.number("psnr"), 26.0, True, "{:.2f} dB"),
+            "How like the photographs the model's pictures are, at places where it was never shown one.",
+        ),
+        Target(
+            *("Temperature error, all pixels, mean", images.number("thermal_mae_c"), 1.0, False, "{:.2f} °C"),
+            "The same for the thermal images.",
+        ),
+        Target(
+            *(f"Surface F-score at {tolerance:g} voxels", truth.number("fscore"), 0.6, True, "{:.3f}"),
+            f"1: the surface is nowhere further than {tolerance:g} voxels from the true one, and none is missing.",
+        ),
+        Target(
+            *("Heat conserved, relative error", heat.number("energy_residual"), 1e-9, False, "{:.0e}"),
+            "Change of the heat in the insulated solid while heat flows inside it.",
+        ),
     )
     others = (
         ("RGB SSIM", f"{images.number('ssim'):.3f}"),

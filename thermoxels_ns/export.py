@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import pickle
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.checks import check_shape
 from thermoxels_ns.errors import CheckpointError, ThermoxelsError, explain
-from thermoxels_ns.export_options import ExportOptions, Viewpoint, check_options
+from thermoxels_ns.export_options import ExportOptions, Viewpoint, check_options, scale_of
 from thermoxels_ns.export_snapshot import export_snapshot, prepare_folder
 
 if TYPE_CHECKING:
@@ -71,10 +72,21 @@ class ExportThermoxelsMesh(ExportOptions):
         Raises:
             ThermoxelsError: If an option, the checkpoint, the mesh or the heat problem is not usable.
         """
-        scaled = check_options(self).distance is not None or self.metres_per_unit is not None
+        checked = check_options(self)
+        scaled = checked.distance is not None or self.metres_per_unit is not None
         prepare_folder(self.output_dir, heat=scaled)
         say(f"Loading {self.load_config}")
-        scene = load_trained_scene(self.load_config)
+
+        def check_scale(scene_folder: Path) -> None:
+            """Refuse what needs a scale before photographs and checkpoint are loaded."""
+            try:
+                content = scene_json(scene_folder)
+            except (OSError, ValueError):
+                return  # whoever reads the scene says what is wrong with it
+            if content or scene_folder.is_dir():
+                scale_of(self, checked, content)
+
+        scene = load_trained_scene(self.load_config, check_scale)
 
         def compare(solid: SolidCells, mesh: TetMesh, scale: float) -> dict[str, Any] | None:
             from thermoxels_ns.truth_comparison import compare_with_truth
@@ -107,11 +119,12 @@ def scene_json(scene_folder: Path) -> dict[str, Any]:
     return {}
 
 
-def load_trained_scene(load_config: Path) -> TrainedScene:
+def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] = lambda _: None) -> TrainedScene:
     """Load a trained Thermoxels model through nerfstudio.
 
     Args:
         load_config: The config.yml that ns-train wrote.
+        check_scene: Called with the photographs' folder before anything slow; what it raises is raised.
 
     Returns:
         The trained field and where it lies.
@@ -132,8 +145,13 @@ def load_trained_scene(load_config: Path) -> TrainedScene:
     import yaml
     from nerfstudio.utils.eval_utils import eval_setup
 
+    def check(config: TrainerConfig) -> TrainerConfig:
+        _check_config(config)
+        check_scene(_scene_folder(config))
+        return config
+
     try:
-        _, pipeline, _, _ = eval_setup(load_config, test_mode="test", update_config_callback=_check_config)
+        _, pipeline, _, _ = eval_setup(load_config, test_mode="test", update_config_callback=check)
     except ThermoxelsError:
         raise
     except (yaml.YAMLError, AssertionError, KeyError, UnicodeDecodeError) as problem:
@@ -240,6 +258,12 @@ def input_from_world(transform: npt.ArrayLike, scale: float) -> npt.NDArray[np.f
     inverse[:3, :3] = np.linalg.inv(rotation) / scale
     inverse[:3, 3] = -np.linalg.inv(rotation) @ shift
     return inverse
+
+
+def _scene_folder(config: TrainerConfig) -> Path:
+    """Where the photographs are: what ns-train was told with --data, else with the dataparser's own --data."""
+    manager: Any = config.pipeline.datamanager
+    return Path(manager.dataparser.data if getattr(manager, "data", None) is None else manager.data)
 
 
 def _check_config(config: TrainerConfig) -> TrainerConfig:

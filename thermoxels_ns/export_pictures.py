@@ -16,9 +16,6 @@ if TYPE_CHECKING:
 
 Look = Mapping[str, Any]
 
-_LEAST_CHANGE_K = 1e-3
-"""Half the span of the smallest scale of temperature changes, [K]."""
-
 
 def draw_mesh(paths: Sequence[Path], mesh: TetMesh, look: Look, length_unit: str) -> None:
     """Draw the mesh twice: all temperatures, and with grey where no thermal ray measured one.
@@ -50,23 +47,22 @@ def draw_heat(path: Path, mesh: TetMesh, solution: HeatSolution, look: Look) -> 
 
     from PIL import Image
 
-    from thermoxels_ns.mesh.pictures import picture_of_mesh
+    from thermoxels_ns.mesh.pictures import change_colours, picture_of_mesh
 
     shown = np.unique(mesh.facets)
     before, after = solution.temperature_c[0], solution.temperature_c[-1]
     change = after - before
     ends = np.concatenate([before[shown], after[shown]])
-    most = max(float(np.abs(change[shown]).max()), _LEAST_CHANGE_K)
+    diverging, note = change_colours(change[shown])
     first, last = f"{solution.times_s[0]:g} s", f"{solution.times_s[-1]:g} s"
     same: Any = {"clim": (float(ends.min()), float(ends.max()))}
-    diverging: Any = {"clim": (-most, most), "colour_map": "coolwarm", "bar_title": "change [K]"}
     panels = []
     with tempfile.TemporaryDirectory() as scratch:
         for number, (title, values, colours) in enumerate(
             (
                 (f"Surface temperature at {first}", before, same),
                 (f"Surface temperature at {last}", after, same),
-                (f"Change from {first} to {last}", change, diverging),
+                (f"Change from {first} to {last}", change, {**diverging, "note": note}),
             )
         ):
             panel_path = Path(scratch) / f"{number}.png"

@@ -195,14 +195,25 @@ def _mesh_files(suffixes: Iterable[str]) -> list[str]:
     return [path.name for suffix in suffixes for path in mesh_file_paths(f"{_MESH_STEM}{suffix}")]
 
 
+def volume_in_words(volume_m3: float) -> str:
+    """Write a volume in cubic metres, below one in litres.
+
+    >>> volume_in_words(13.49), volume_in_words(0.0461)
+    ('13.5 m^3', '46.1 l')
+    """
+    if volume_m3 < 1.0:
+        return f"{1e3 * volume_m3:.3g} l"
+    return f"{volume_m3:.3g} m^3" if volume_m3 < 1e3 else f"{volume_m3:,.0f} m^3"
+
+
 def _tell(built: BuiltMesh, volume: float, unit: str, voxel_size: float | None, say: Say) -> None:
     """Say how the solid was found, step by step, and what the mesh has."""
     for step in built.solid.steps:
         amounts = []
         for sign, voxels in (("+", step.added), ("-", step.removed)):
-            litres = "" if voxel_size is None else f" ({1e3 * voxels * voxel_size**3:.3g} l)"
+            size = "" if voxel_size is None else f" ({volume_in_words(voxels * voxel_size**3)})"
             if voxels:
-                amounts.append(f"{sign}{voxels} voxels{litres}")
+                amounts.append(f"{sign}{voxels} voxels{size}")
         say(f"Solid, {step.name}: {', '.join(amounts) or 'nothing changed'}. {step.remark}")
     mesh = built.mesh
     say(f"Mesh: {len(mesh.tets)} tetrahedra, {len(mesh.points_m)} nodes, volume {volume:.6g} {unit}^3")

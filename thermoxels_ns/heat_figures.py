@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 
@@ -17,3 +20,60 @@ def figure(value: float) -> str:
         digits = max(0, 3 - int(np.floor(np.log10(abs(value)))))
         return f"{value:,.{digits}f}"
     return f"{value:.3e}"
+
+
+def degrees(value_c: float) -> str:
+    """Write a temperature to a hundredth of a degree; what rounds to 0 has no sign.
+
+    >>> degrees(-0.001), degrees(-0.006)
+    ('0.00', '-0.01')
+    """
+    return f"{round(float(value_c), 2) + 0.0:.2f}"
+
+
+def unit_signs(unit: str) -> str:
+    """Write the powers of a unit as signs, and keep it on one line.
+
+    >>> unit_signs("W/(m2 K4)") == "W/(m²\\N{NO-BREAK SPACE}K⁴)"
+    True
+    """
+    for plain, sign in (("m2", "m²"), ("m3", "m³"), ("K4", "K⁴"), (" ", "\N{NO-BREAK SPACE}")):
+        unit = unit.replace(plain, sign)
+    return unit
+
+
+@dataclass(frozen=True)
+class Dust:
+    """Heat flows so small that they are rounding: of a steady body, what flows in and out of it again."""
+
+    below_w: float
+    """Flows smaller than this are dust, [W]."""
+
+    def flow(self, heat_w: float) -> str:
+        """Write a heat flow; dust is 0.
+
+        >>> Dust(1e-6).flow(6e-10), Dust(1e-6).flow(-12.5)
+        ('0', '-12.50')
+        """
+        return "0" if abs(heat_w) < self.below_w else figure(heat_w)
+
+    def per_area(self, heat_w_m2: float, heat_w: float) -> str:
+        """Write a heat flow per area; that of dust is 0."""
+        return "0" if abs(heat_w) < self.below_w else figure(heat_w_m2)
+
+
+def dust_of(flows_w: Sequence[float], area_m2: float) -> Dust:
+    """Say what is dust in a body.
+
+    It is less than a billionth of the largest flow, which a balance need not close to, or less than a billionth of a
+    watt per square metre, which is what rounding makes of a surface as warm as the air beside it.
+
+    Args:
+        flows_w: Heat flows of everything that acts, [W].
+        area_m2: Area of the surface, [m^2].
+
+    >>> f"{dust_of((1e3, -1e3), 200.0).below_w:g} {dust_of((), 200.0).below_w:g}"
+    '1e-06 2e-07'
+    """
+    largest = max((abs(flow) for flow in flows_w), default=0.0)
+    return Dust(1e-9 * max(largest, area_m2))

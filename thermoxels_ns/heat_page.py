@@ -17,6 +17,7 @@ from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.system import effect_labels
 from thermoxels_ns.heat_accuracy_page import accuracy_card, accuracy_sections, how_time_was_followed
+from thermoxels_ns.heat_figures import Dust, degrees, dust_of, unit_signs
 from thermoxels_ns.heat_figures import figure as _figure
 from thermoxels_ns.heat_pictures import in_words, plot_over_time
 from thermoxels_ns.heat_report import HeatReport, Section, Table
@@ -56,7 +57,10 @@ def heat_page(run: HeatRun, pictures: Mapping[str, bytes], command: str, files: 
         words = ("Heat flows are means over each interval between two kept times.",)
         sections.append(Section("Over time", words=words, svg=plot))
     if pictures:
-        captioned = tuple((png, _CAPTIONS[name]) for name, png in pictures.items())
+        captioned = tuple(
+            (png, _CAPTIONS[name].replace(" at the end", "") if run.scene.steady else _CAPTIONS[name])
+            for name, png in pictures.items()
+        )
         sections.append(Section("Pictures", pictures=captioned))
     sections += [_asked(run), _built(run), _made(run, command, files)]
     return HeatReport(
@@ -78,18 +82,22 @@ def _summary(run: HeatRun) -> str:
 
 def _figures(run: HeatRun) -> tuple[tuple[str, str], ...]:
     """The figures that matter most."""
-    answers, cards = run.answers, []
+    answers, cards, dust = run.answers, [], _dust(run)
     steady = run.scene.steady
     lost = -sum(effect.heat_w for effect in answers.effects if effect.heat_w < 0.0)
     won = sum(effect.heat_w for effect in answers.effects if effect.heat_w > 0.0)
-    cards.append((f"{_figure(lost)} W", "heat loss" if steady else "mean heat loss"))
+    cards.append((f"{dust.flow(lost)} W", "heat loss" if steady else "mean heat loss"))
     if not steady:
-        cards.append((f"{_figure(won)} W", "mean heat gain"))
+        cards.append((f"{dust.flow(won)} W", "mean heat gain"))
     if run.wall is not None:
-        cards.append((f"{run.wall.u_value_w_m2k:.3f} W/(m\N{SUPERSCRIPT TWO} K)", "mean U-value of the inner surface"))
+        cards.append((f"{run.wall.u_value_w_m2k:.3f} {unit_signs('W/(m2 K)')}", "mean U-value of the inner surface"))
         cards.append((f"{run.wall.temperature_factor:.3f}", "surface temperature factor f_Rsi"))
-    cards.append((f"{answers.coldest.temperature_c:.2f} \N{DEGREE SIGN}C", f"coldest spot {_place(answers.coldest)}"))
-    cards.append((f"{answers.hottest.temperature_c:.2f} \N{DEGREE SIGN}C", f"hottest spot {_place(answers.hottest)}"))
+    cards.append(
+        (f"{degrees(answers.coldest.temperature_c)} \N{DEGREE SIGN}C", f"coldest spot {_place(answers.coldest)}")
+    )
+    cards.append(
+        (f"{degrees(answers.hottest.temperature_c)} \N{DEGREE SIGN}C", f"hottest spot {_place(answers.hottest)}")
+    )
     cards += accuracy_card(run.accuracy)
     return tuple(cards)
 
@@ -99,7 +107,7 @@ def _doubts(run: HeatRun) -> list[Section]:
 
 
 def _answers(run: HeatRun) -> Section:
-    answers, steady = run.answers, run.scene.steady
+    answers, steady, dust = run.answers, run.scene.steady, _dust(run)
     flow = "W" if steady else "mean W"
     last = () if steady else ("last interval W",)
     effects = Table(
@@ -108,9 +116,9 @@ def _answers(run: HeatRun) -> Section:
             (
                 effect.effect,
                 _optional(effect.area_m2),
-                _figure(effect.heat_w),
-                _optional(effect.heat_w_m2),
-                *(() if steady else (_figure(effect.last_heat_w),)),
+                dust.flow(effect.heat_w),
+                "" if effect.heat_w_m2 is None else dust.per_area(effect.heat_w_m2, effect.heat_w),
+                *(() if steady else (dust.flow(effect.last_heat_w),)),
             )
             for effect in answers.effects
         ),
@@ -123,9 +131,10 @@ def _answers(run: HeatRun) -> Section:
         ),
         tuple(
             (
-                *(patch.patch, _figure(patch.area_m2), _figure(patch.heat_w), _figure(patch.heat_w_m2)),
-                *(() if steady else (_figure(patch.last_heat_w),)),
-                *(f"{patch.mean_c:.2f}", _warm_and_where(patch.coldest), _warm_and_where(patch.hottest)),
+                *(patch.patch, _figure(patch.area_m2)),
+                *(dust.flow(patch.heat_w), dust.per_area(patch.heat_w_m2, patch.heat_w)),
+                *(() if steady else (dust.flow(patch.last_heat_w),)),
+                *(degrees(patch.mean_c), _warm_and_where(patch.coldest), _warm_and_where(patch.hottest)),
             )
             for patch in answers.patches
         ),
@@ -140,8 +149,8 @@ def _answers(run: HeatRun) -> Section:
         tuple(
             (
                 *(region.region, region.material, _figure(region.volume_m3), _figure(region.area_m2)),
-                *(_figure(region.heat_w), _figure(region.heat_w_m2)),
-                *(f"{region.mean_c:.2f}", f"{region.min_c:.2f}", f"{region.max_c:.2f}"),
+                *(dust.flow(region.heat_w), dust.per_area(region.heat_w_m2, region.heat_w)),
+                *(degrees(region.mean_c), degrees(region.min_c), degrees(region.max_c)),
             )
             for region in answers.regions
         ),
@@ -159,8 +168,8 @@ def _wall(run: HeatRun) -> list[Section]:
         f"Between {wall.inside_c:g} \N{DEGREE SIGN}C inside and {wall.outside_c:g} \N{DEGREE SIGN}C outside, "
         f"{_figure(wall.heat_w)} W flow into the inner surface of {_figure(wall.area_m2)} m\N{SUPERSCRIPT TWO}: a "
         f"thermal coupling of {_figure(wall.coupling_w_k)} W/K. The inner surface is worst at "
-        f"{wall.coldest.temperature_c:.2f} \N{DEGREE SIGN}C {_place(wall.coldest)}, which is a temperature factor of "
-        f"{wall.temperature_factor:.3f} (1: as warm as the air inside). For the risk of mould ISO 13788 asks for "
+        f"{degrees(wall.coldest.temperature_c)} \N{DEGREE SIGN}C {_place(wall.coldest)}, which is a temperature factor "
+        f"of {wall.temperature_factor:.3f} (1: as warm as the air inside). For the risk of mould ISO 13788 asks for "
         "it with a resistance of the inner surface of 0.25 m\N{SUPERSCRIPT TWO} K/W, coefficient_w_m2k: 4.",
     )
     columns = ("Inner surface", "area m\N{SUPERSCRIPT TWO}", "W", "U-value W/(m\N{SUPERSCRIPT TWO} K)")
@@ -191,11 +200,13 @@ def _probes(run: HeatRun) -> list[Section]:
 def _balance(run: HeatRun) -> Section:
     balance = run.answers.balance
     scale, unit = (1.0, "W") if balance.unit == "W" else (3.6e6, "kWh")
+    dust = _dust(run).below_w * (1.0 if balance.unit == "W" else _duration_s(run))
+    left = 0.0 if abs(balance.residual) < dust else balance.residual
     rows = (
         ("into the body", f"{_figure(balance.into_body / scale)} {unit}"),
         ("out of the body", f"{_figure(balance.out_of_body / scale)} {unit}"),
         ("stored in it", f"{_figure(balance.stored / scale)} {unit}"),
-        ("stored - in + out: accounted for by nothing", f"{balance.residual / scale:.1e} {unit}"),
+        ("stored - in + out: accounted for by nothing", f"{_figure(left / scale)} {unit}"),
         ("the same as a share", f"{balance.relative_residual:.1e}"),
     )
     return Section("Energy balance", tables=(Table(("", ""), rows),))
@@ -304,7 +315,7 @@ def _values(effect: Effect, selection: Selection) -> list[str]:
             continue
         value, unit = getattr(effect, field.name), effect.bounds[field.name].unit
         name = field.name.rsplit("_w_m", 1)[0].removesuffix("_c").removesuffix("_m2k").replace("_", " ")
-        unit = {"1": "", "degrees Celsius": " \N{DEGREE SIGN}C"}.get(unit, f" {unit}")
+        unit = {"1": "", "degrees Celsius": " \N{DEGREE SIGN}C"}.get(unit, f" {unit_signs(unit)}")
         if not isinstance(value, Varying):
             shown.append(f"{name} {value:g}{unit}")
         elif isinstance(effect, FixedTemperature):
@@ -321,6 +332,16 @@ def _values(effect: Effect, selection: Selection) -> list[str]:
     return shown
 
 
+def _dust(run: HeatRun) -> Dust:
+    answers = run.answers
+    flows = [flow for effect in answers.effects for flow in (effect.heat_w, effect.last_heat_w)]
+    return dust_of(flows, sum(patch.area_m2 for patch in answers.patches))
+
+
+def _duration_s(run: HeatRun) -> float:
+    return float(run.nodes.times_s[-1] - run.nodes.times_s[0])
+
+
 def _probe_names(run: HeatRun) -> list[str]:
     return [f"({', '.join(f'{part:.4g}' for part in point)}) m" for point in run.probes.points_m]
 
@@ -331,7 +352,7 @@ def _place(spot: Spot) -> str:
 
 
 def _warm_and_where(spot: Spot) -> str:
-    return f"{spot.temperature_c:.2f} {_place(spot)}"
+    return f"{degrees(spot.temperature_c)}\n{_place(spot)}"
 
 
 def _up_to(bound_k: float | None) -> str:

@@ -18,8 +18,6 @@ Vector = npt.NDArray[np.float64]
 PICTURES = ("surface-start.png", "surface-end.png", "surface-change.png", "cut.png")
 """Names of the pictures; of a steady state there are the second and the last only."""
 
-_LEAST_CHANGE_K = 1e-3
-"""Half the span of the smallest scale of temperature changes, [K]."""
 _MOST_LINES = 8
 """Curves in one plot; more cannot be told apart."""
 
@@ -41,7 +39,7 @@ def draw_surface(
     Returns:
         Names of the files.
     """
-    from thermoxels_ns.mesh.pictures import picture_of_mesh
+    from thermoxels_ns.mesh.pictures import change_colours, picture_of_mesh
 
     start, end, change, cut = PICTURES
     seen = mesh.facet_tags != FACET_BOX
@@ -61,12 +59,10 @@ def draw_surface(
     if steady:
         return [end, cut]
     difference = states_c[-1] - states_c[0]
-    (low, high), beyond = _colour_ends(difference[shown])
-    most = max(abs(low), abs(high), _LEAST_CHANGE_K)
-    diverging: Any = {"clim": (-most, most), "colour_map": "coolwarm", "bar_title": "change [K]", "up": up}
+    diverging, note = change_colours(difference[shown])
     picture_of_mesh(folder / start, mesh, states_c[0], title=f"Surface temperature at {first}{few}", **same)
-    few = "; colours: middle 99 %" if beyond else ""
-    picture_of_mesh(folder / change, mesh, difference, title=f"Change from {first} to {last}{few}", **diverging)
+    title = f"Change from {first} to {last}"
+    picture_of_mesh(folder / change, mesh, difference, title=title, note=note, up=up, **diverging)
     return list(PICTURES)
 
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-from thermoxels_ns.errors import ThermoxelsError, explain
-
-_PNG = b"\x89PNG\r\n\x1a\n"
+from thermoxels_ns.page_style import embedded_image, html_page, scrolling
 
 
 @dataclass(frozen=True)
@@ -19,7 +16,7 @@ class Table:
     columns: tuple[str, ...]
     """Headings of the columns."""
     rows: tuple[tuple[str, ...], ...]
-    """As many entries each as there are columns."""
+    """As many entries each as there are columns; further lines of an entry are written small below its first."""
     figures_from: int = 1
     """First column of figures."""
     note: str = ""
@@ -68,13 +65,8 @@ def build_report(report: HeatReport) -> str:
         f"<div><strong>{escape(value)}</strong><span>{escape(name)}</span></div>" for value, name in report.figures
     )
     body = "".join(_section(section) for section in report.sections)
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(report.title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n<main>\n"
-        f"<header><h1>{escape(report.title)}</h1><p>{escape(report.summary)}</p></header>\n"
-        f"<div class=cards>{cards}</div>\n{body}</main>\n</body>\n</html>\n"
-    )
+    header = f"<header><h1>{escape(report.title)}</h1><p>{escape(report.summary)}</p></header>"
+    return html_page(report.title, f"{header}\n<div class=cards>{cards}</div>\n{body}", _STYLE)
 
 
 def _section(section: Section) -> str:
@@ -92,65 +84,32 @@ def _section(section: Section) -> str:
 def _table(table: Table) -> str:
     def cells(tag: str, row: Sequence[str]) -> str:
         return "".join(
-            f"<{tag}{' class=num' if number >= table.figures_from else ''}>{escape(text)}</{tag}>"
+            f"<{tag}{' class=num' if number >= table.figures_from else ''}>{_cell(text)}</{tag}>"
             for number, text in enumerate(row)
         )
 
     rows = "".join(f"<tr>{cells('td', row)}</tr>" for row in table.rows)
     head = f"<thead><tr>{cells('th', table.columns)}</tr></thead>" if any(table.columns) else ""
     note = f"<p class=note>{escape(table.note)}</p>" if table.note else ""
-    return f"<div class=scroll><table>{head}<tbody>{rows}</tbody></table></div>{note}"
+    return f"{scrolling(f'<table>{head}<tbody>{rows}</tbody></table>')}{note}"
+
+
+def _cell(text: str) -> str:
+    """The first line of an entry, and the others small below it."""
+    first, *more = text.split("\n")
+    return escape(first) + "".join(f"<small>{escape(line)}</small>" for line in more)
 
 
 def _picture(png: bytes, caption: str) -> str:
-    if not png.startswith(_PNG):
-        raise ThermoxelsError(
-            explain(
-                caption,
-                expected="the content of a PNG file",
-                got=f"{len(png)} bytes that begin with {png[:8]!r}",
-                remedy="Draw the picture again.",
-            )
-        )
-    source = f"data:image/png;base64,{base64.b64encode(png).decode()}"
-    image = f'<img src="{source}" alt="{escape(caption, quote=True)}">'
-    return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"
+    return f"<figure>{embedded_image(png, caption)}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
 _STYLE = """
-:root { color-scheme: light; --ink: #1d2430; --soft: #5c6675; --line: #e1e5ea; --accent: #b3431e; }
-* { box-sizing: border-box; }
-body { margin: 0; background: #fff; color: var(--ink);
-  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; }
-main { max-width: 1100px; margin: 0 auto; padding: 2rem 1.25rem 4rem; }
-h1 { font-size: 1.9rem; line-height: 1.2; margin: 0 0 .5rem; }
-header p { color: var(--soft); max-width: 50rem; margin: 0; }
-h2 { font-size: 1.2rem; margin: 2.5rem 0 .75rem; padding-bottom: .3rem; border-bottom: 2px solid var(--accent); }
-section p { max-width: 50rem; margin: .5rem 0; }
-.note { font-size: .85rem; color: var(--soft); margin: .35rem 0 1rem; }
-.cards { display: flex; flex-wrap: wrap; gap: .75rem; margin-top: 1.5rem; }
-.cards div { flex: 1 1 11rem; border: 1px solid var(--line); border-radius: 4px; padding: .7rem .9rem; }
-.cards strong { display: block; font-size: 1.35rem; font-variant-numeric: tabular-nums; }
+.cards { display: grid; gap: .75rem; grid-template-columns: repeat(auto-fit, minmax(11.5rem, 1fr));
+  margin-top: 1.5rem; }
+.cards div { border: 1px solid var(--line); border-radius: 4px; padding: .7rem .9rem;
+  break-inside: avoid; }
+.cards strong { display: block; font-size: 1.35rem; font-variant-numeric: tabular-nums; white-space: nowrap; }
 .cards span { font-size: .85rem; color: var(--soft); }
-.scroll { overflow-x: auto; margin: .75rem 0; }
-table { border-collapse: collapse; width: 100%; }
-th, td { text-align: left; padding: .4rem .9rem .4rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
-th { font-size: .85rem; font-weight: 600; color: var(--soft); }
-th:last-child, td:last-child { padding-right: 0; }
-.num { text-align: right; font-variant-numeric: tabular-nums; }
-td.num { white-space: nowrap; }
-.plot svg { display: block; width: 100%; height: auto; }
-.pictures { display: grid; grid-template-columns: repeat(2, 1fr); gap: 1rem; }
-figure { margin: 0; }
-figcaption { font-size: .8rem; color: var(--soft); margin-top: .15rem; }
-img { display: block; width: 100%; height: auto; border: 1px solid var(--line); border-radius: 3px; }
-pre { background: #f5f6f8; border: 1px solid var(--line); border-radius: 4px; padding: .8rem; margin: 0;
-  white-space: pre-wrap; overflow-wrap: anywhere;
-  font: .85rem/1.5 ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace; }
-@media (max-width: 640px) {
-  main { padding: 1.25rem .9rem 3rem; }
-  h1 { font-size: 1.5rem; }
-  .pictures { grid-template-columns: 1fr; }
-  th, td { font-size: .9rem; }
-}
+@media print { .cards { grid-template-columns: repeat(3, 1fr); } .plot svg { max-height: 120mm; } }
 """

@@ -111,7 +111,8 @@ def compare_with_truth(
             which a synthetic scene is written in metres.
         truth: The scene folder (or its ``transforms.json``), or its truth if it is at hand.
         mesh: The mesh of these voxels, for its temperatures. None: they are not compared.
-        metres_per_unit: The scale that was applied to the mesh's nodes after `world_to_truth`, above 0.
+        metres_per_unit: The scale that was applied to the mesh's nodes after `world_to_truth`, above 0. All lengths,
+            areas and volumes of the result, those of the exact scene too, are in the units of the mesh.
 
     Returns:
         A mapping that json can write, or None if the truth is not known: ``scene``, ``voxel_size_m``,
@@ -168,7 +169,13 @@ def compare_with_truth(
     if mesh is not None:
         result |= _mesh_errors(known.scene, mesh, seen, voxel_m, metres_per_unit)
         result |= _temperature_errors(known.scene, mesh, tolerance_m, metres_per_unit)
-    return result
+    return {name: _scaled(name, value, metres_per_unit) for name, value in result.items()}
+
+
+def _scaled(name: str, value: Any, metres_per_unit: float) -> Any:
+    """A figure in the units of the mesh: the ending of its name says how it grows with the scale."""
+    power = next((power for ending, power in (("_m", 1), ("_m2", 2), ("_m3", 3)) if name.endswith(ending)), 0)
+    return value if value is None or power == 0 else value * metres_per_unit**power
 
 
 def points_seen(known: KnownTruth) -> npt.NDArray[np.float64]:

@@ -1,11 +1,16 @@
 """What accuracy costs in meshing: resolution against errors, tetrahedra, seconds and memory, for both boundary modes.
 
     python tests/benchmarks/mesh_cost.py --csv mesh-cost.csv --plot docs/mesh-cost.png
+    python tests/benchmarks/mesh_cost.py --bodies hot-object --modes voxel --resolutions 128 --csv mesh-cost.csv
+    python tests/benchmarks/mesh_cost.py --bodies --csv mesh-cost.csv --plot docs/mesh-cost.png
     python tests/benchmarks/mesh_cost.py --speed
 
 The fields are exact: at voxel centres the logarithm of the density is the signed distance to a body whose area and
 volume are known. Each case runs in a process of its own, so that its peak memory is its own; the seconds are those of
 `build_mesh` with all tags, 40 cameras on a sphere around the body, the median of `--repeats` runs.
+
+Every case is put into the csv file as soon as it is measured, in the place of an earlier one of the same body, lattice
+and boundary, and the plot shows all that the file holds: parts can be measured apart (second line), or nothing (third).
 
 `--speed` times a lattice of 128^3 voxels, 5 % of them solid, beside a plain Python loop over the same voxels.
 """
@@ -21,11 +26,13 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.checks import replace_when_done
 from thermoxels_ns.lattice import CORNER_OFFSETS, Lattice
 from thermoxels_ns.snapshot import GridSnapshot, Views
 
@@ -45,7 +52,9 @@ class Body:
 
 def sphere() -> Body:
     """Radius 1."""
-    return Body(lambda p: np.linalg.norm(p, axis=1) - 1.0, 4 * np.pi, 4 / 3 * np.pi, ((-1.1,) * 3, (1.1,) * 3))
+    return Body(
+        lambda p: np.linalg.norm(p, axis=1) - 1.0, 4 * np.pi, 4 / 3 * np.pi, ((-1.1, -1.1, -1.1), (1.1, 1.1, 1.1))
+    )
 
 
 def torus(large: float = 0.7, small: float = 0.3) -> Body:
@@ -69,7 +78,7 @@ def tilted_slab(degrees: float = 30.0, size: tuple[float, float, float] = (1.6, 
         return np.linalg.norm(np.maximum(q, 0.0), axis=1) + np.minimum(q.max(axis=1), 0.0)
 
     a, b, c = size
-    return Body(distance, 2 * (a * b + b * c + a * c), a * b * c, ((-1.1,) * 3, (1.1,) * 3))
+    return Body(distance, 2 * (a * b + b * c + a * c), a * b * c, ((-1.1, -1.1, -1.1), (1.1, 1.1, 1.1)))
 
 
 def demo_scene(name: str) -> Body:
@@ -182,7 +191,7 @@ def shell_snapshot(voxels: int = 128, share: float = 0.05) -> GridSnapshot:
         lambda p: np.abs(np.linalg.norm(p - middle, axis=1) - radius) - 0.5 * thickness,
         0.0,
         0.0,
-        ((0.0,) * 3, (float(voxels),) * 3),
+        ((0.0, 0.0, 0.0), (float(voxels), float(voxels), float(voxels))),
     )
     return exact_snapshot(body, voxels)
 
@@ -262,7 +271,12 @@ def plot(rows: Sequence[dict], path: Path) -> None:
                         textcoords="offset points",
                         fontsize=7,
                     )
-                if key == "area_error" and mode == "voxel" and np.isfinite(chosen[0]["area_error_of_triangles"]):
+                if (
+                    chosen
+                    and key == "area_error"
+                    and mode == "voxel"
+                    and np.isfinite(chosen[0]["area_error_of_triangles"])
+                ):
                     stairs = [abs(100 * row["area_error_of_triangles"]) for row in chosen]
                     panel.loglog(
                         seconds, stairs, color=colour, marker="s", ls=":", alpha=0.6, label="voxel, plain area"
@@ -283,11 +297,45 @@ def plot(rows: Sequence[dict], path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
+def read_rows(path: Path | None) -> list[dict]:
+    """What an earlier run measured; nothing without a file."""
+    if path is None or not path.is_file():
+        return []
+    with path.open(newline="") as file:
+        rows: list[dict] = list(csv.DictReader(file))
+    whole = ("voxels", "tets")
+    words = ("body", "mode")
+    return [
+        {name: value if name in words else (int if name in whole else float)(value) for name, value in row.items()}
+        for row in rows
+    ]
+
+
+def with_row(rows: Sequence[dict], new: dict) -> list[dict]:
+    """The rows with a new one, in the place of that of the same case, bodies in their order and lattices by size."""
+
+    def case(row: dict) -> tuple:
+        return row["body"], row["voxels"], row["mode"]
+
+    order = list(BODIES)
+    kept = [row for row in rows if case(row) != case(new)]
+    return sorted([*kept, new], key=lambda row: (order.index(row["body"]), row["voxels"], MODES.index(row["mode"])))
+
+
+def write_rows(path: Path, rows: Sequence[dict]) -> None:
+    """Write the csv file, whole or not at all."""
+    with replace_when_done(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--resolutions", type=int, nargs="+", default=[16, 32, 64, 128])
-    parser.add_argument("--bodies", nargs="+", default=list(BODIES), choices=list(BODIES))
+    parser.add_argument("--bodies", nargs="*", default=list(BODIES), choices=list(BODIES))
+    parser.add_argument("--modes", nargs="+", default=list(MODES), choices=list(MODES))
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--csv", type=Path)
     parser.add_argument("--plot", type=Path)
@@ -296,27 +344,24 @@ def main() -> None:
     if arguments.speed:
         speed(arguments.repeats)
         return
-    rows = []
+    rows = read_rows(arguments.csv)
     spawn = multiprocessing.get_context("spawn")
     print("| body | voxels | boundary | tets | s | MB | area | volume | Hausdorff | IoU |")
     print("|---|---:|---|---:|---:|---:|---:|---:|---:|---:|")
-    for name in arguments.bodies:
-        for voxels in arguments.resolutions:
-            for mode in MODES:
-                with spawn.Pool(1) as pool:
-                    row = pool.apply(measure, (name, voxels, mode, arguments.repeats))
-                rows.append(row)
-                print(
-                    f"| {name} | {voxels} | {mode} | {row['tets']:,} | {row['seconds']:.2f} | {row['peak_mb']:.0f} "
-                    f"| {100 * row['area_error']:+.2f} % | {100 * row['volume_error']:+.2f} % "
-                    f"| {row['hausdorff_voxels']:.2f} | {row['iou']:.4f} |",
-                    flush=True,
-                )
-    if arguments.csv:
-        with arguments.csv.open("w", newline="") as file:
-            writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
+    for name, voxels, mode in product(arguments.bodies, arguments.resolutions, arguments.modes):
+        with spawn.Pool(1) as pool:
+            row = pool.apply(measure, (name, voxels, mode, arguments.repeats))
+        rows = with_row(rows, row)
+        if arguments.csv:
+            write_rows(arguments.csv, rows)
+        print(
+            f"| {name} | {voxels} | {mode} | {row['tets']:,} | {row['seconds']:.2f} | {row['peak_mb']:.0f} "
+            f"| {100 * row['area_error']:+.2f} % | {100 * row['volume_error']:+.2f} % "
+            f"| {row['hausdorff_voxels']:.2f} | {row['iou']:.4f} |",
+            flush=True,
+        )
+    if not rows:
+        parser.error("nothing was measured and the csv file holds nothing: name --bodies, or a --csv that exists")
     if arguments.plot:
         plot(rows, arguments.plot)
     print(json.dumps({"worst_angles": [min(r["dihedral_min"] for r in rows), max(r["dihedral_max"] for r in rows)]}))

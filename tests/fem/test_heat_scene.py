@@ -5,6 +5,7 @@ from datetime import datetime, timezone
 
 import numpy as np
 import pytest
+import yaml
 
 from tests.scene_bodies import room, wall
 from thermoxels_ns.errors import HeatError
@@ -153,6 +154,28 @@ def test_every_patch_is_spoken_of() -> None:
     assert len(effects(wall(), adiabatic=("cut",), outside_air=OUTSIDE, inside_air=INSIDE)) == 2
     with pytest.raises(HeatError, match=r"nothing on cut \(13.3 % of the surface\)"):
         effects(adiabatic=(), outside_air=OUTSIDE, inside_air=INSIDE)
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("roof", 'patches: ["exterior-*", roof], or write adiabatic: [cut, roof].'),
+        ("a: b", '["exterior-*", "a: b"]'),
+        ("no", '["exterior-*", "no"]'),
+        ("12", '["exterior-*", "12"]'),
+    ],
+)
+def test_a_patch_with_a_name_of_its_own_is_to_be_named_beside_the_others(name: str, shown: str) -> None:
+    mesh = room()
+    assert mesh.boundary is not None
+    names = tuple(name if patch == "exterior-up" else patch for patch in mesh.boundary.patch_names)
+    mesh = replace(mesh, boundary=replace(mesh.boundary, patch_names=names))
+    with pytest.raises(HeatError, match=f"nothing on {name} ") as caught:
+        effects(mesh, adiabatic=("cut",), outside_air=OUTSIDE, inside_air=INSIDE)
+    assert shown in str(caught.value)
+    suggested = str(caught.value).split("patches: ")[1].split("]")[0] + "]"
+    air = replace(OUTSIDE, patches=tuple(yaml.safe_load(suggested)))
+    assert len(effects(mesh, adiabatic=("cut",), outside_air=air, inside_air=INSIDE)) == 2
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pyvista
 from PIL import Image
 
 from thermoxels_ns.errors import MeshError, OutputError
-from thermoxels_ns.mesh.pictures import _view_axes, picture_of_mesh
+from thermoxels_ns.mesh.pictures import _view_axes, change_colours, picture_of_mesh
 
 SIZE = (400, 300)
 
@@ -141,3 +141,22 @@ def test_a_few_hot_nodes_do_not_take_all_the_colours() -> None:
     assert _colour_limits(_without_outliers(with_lamp)) == pytest.approx((10.0, 12.0), abs=0.05)
     assert _colour_limits(_without_outliers(level)) == (10.0, 12.0)
     assert _colour_limits(_without_outliers(np.append(np.full(1000, 5.0), 9.0))) == (5.0, 9.0)
+
+
+def test_a_few_large_changes_do_not_make_all_others_grey() -> None:
+    change = np.concatenate([np.linspace(-0.1, 0.1, 99), [-3.4]])
+    colours, note = change_colours(change)
+    low, high = colours["clim"]
+    assert low == -high and 0.09 < high < 0.11
+    assert note == "colours: 95 % of the nodes; all: -3.4 to 0.1 K"
+    even, nothing_to_say = change_colours(np.linspace(-2.0, 1.0, 50))
+    assert even["clim"] == (-2.0, 2.0) and nothing_to_say == ""
+
+
+def test_no_change_at_all_has_a_scale() -> None:
+    for change in (np.zeros(5), np.array([0.0] * 99 + [1e-9])):
+        colours, note = change_colours(change)
+        assert colours["clim"] == (-1e-3, 1e-3) and note == ""
+    # All but a few did not change: the scale reaches the few.
+    colours, note = change_colours(np.array([0.0] * 99 + [2.0]))
+    assert colours["clim"] == (-2.0, 2.0) and note == ""

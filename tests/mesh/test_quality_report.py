@@ -11,7 +11,7 @@ import skfem
 from skfem.models.poisson import laplace
 
 from thermoxels_ns.errors import MeshError
-from thermoxels_ns.mesh.promises import Evidence, judge
+from thermoxels_ns.mesh.promises import DIHEDRAL_BOUNDS_DEG, BoundaryMode, Evidence, angle_bins, judge
 from thermoxels_ns.mesh.quality import check_mesh
 from thermoxels_ns.mesh.quality_report import QualityReport, quality_report
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
@@ -23,10 +23,8 @@ NAMES = (
     "boundary_closed",
     "dihedral_within_bounds",
     "temperatures_in_range",
-    "non_obtuse",
-    "stiffness_monotone",
-    "boundary_manifold",
 )
+VOXEL_NAMES = (*NAMES, "non_obtuse", "stiffness_monotone")
 
 
 def mesh_from(points: np.ndarray, tets: np.ndarray) -> TetMesh:
@@ -42,7 +40,7 @@ def figure_of(report: QualityReport, name: str) -> float:
 
 def test_a_voxel_mesh_keeps_every_promise(box_mesh):
     report = quality_report(box_mesh, "voxel")
-    assert tuple(promise.name for promise in report.promises) == NAMES
+    assert tuple(promise.name for promise in report.promises) == VOXEL_NAMES
     assert report.broken == ()
     # Edges of voxels, diagonals of their faces, diagonals of voxels.
     assert (report.num_nodes, report.num_tets, report.num_edges) == (60, 144, 133 + 98 + 24)
@@ -53,15 +51,22 @@ def test_a_voxel_mesh_keeps_every_promise(box_mesh):
     assert (len(report.components), report.num_cavities) == (1, 0)
 
 
+def bin_of(angle_deg: float, boundary_mode: BoundaryMode) -> int:
+    bins = angle_bins(boundary_mode)
+    return int((angle_deg - bins.first_centre_deg) / bins.width_deg + 0.5)
+
+
 def test_histograms_of_a_voxel_mesh_by_hand(box_mesh):
     report = quality_report(box_mesh, "voxel")
-    angles = {5 * number: count for number, count in enumerate(report.dihedral_counts) if count}
-    assert angles == {45: 2 * 144, 60: 144, 90: 3 * 144}  # of each tetrahedron
+    angles = {number: count for number, count in enumerate(report.dihedral_counts) if count}
+    # Of each tetrahedron; 45 and 90 degrees are the bounds, and lie within.
+    assert angles == {10: 2 * 144, 13: 144, 19: 3 * 144}
+    assert [bin_of(angle, "voxel") for angle in (45, 60, 90)] == [10, 13, 19]
     # Legs a, a, a at right angles in a row: r = 6 V / (2 A) with V = a^3 / 6, A = (1 + sqrt 2) a^2; R = sqrt(3) a / 2.
     ratio = 3 * (1 / (2 * (1 + np.sqrt(2)))) / (np.sqrt(3) / 2)
     assert report.radius_ratio_range == pytest.approx((ratio, ratio))
     assert np.flatnonzero(report.radius_ratio_counts).tolist() == [int(ratio / 0.05)]
-    assert len(report.dihedral_counts) == 37 and len(report.radius_ratio_counts) == 20
+    assert len(report.dihedral_counts) == 40 and len(report.radius_ratio_counts) == 20
     assert sum(report.dihedral_counts) == 6 * 144 and sum(report.radius_ratio_counts) == 144
 
 
@@ -69,7 +74,7 @@ def test_the_regular_tetrahedron_is_in_the_last_bin():
     points = np.array([[1.0, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1]])
     report = quality_report(mesh_from(points, np.array([[0, 1, 2, 3]])), "conforming")
     assert report.radius_ratio_counts[-1] == 1 and report.radius_ratio_mean == pytest.approx(1.0)
-    assert report.dihedral_counts[14] == 6  # 70.5 degrees
+    assert report.dihedral_counts[bin_of(70.53, "conforming")] == 6
     assert report.broken == ()
 
 
@@ -80,7 +85,7 @@ def test_figures_agree_with_the_mesh_check(mesh_of_cells, random_cells):
         assert report.num_non_manifold_edges == quality.num_non_manifold_edges
         assert report.dihedral_range_deg == (quality.min_dihedral_deg, quality.max_dihedral_deg)
         assert (report.volume_m3, report.area_m2) == (quality.volume_m3, quality.area_m2)
-        assert set(report.broken) <= {"boundary_manifold"}
+        assert report.broken == ()
 
 
 def test_true_area_is_area_times_factor(box_mesh):
@@ -139,7 +144,7 @@ def test_dihedral_bounds_depend_on_the_mode(degrees, broken):
     assert figure_of(report, "dihedral_within_bounds") == pytest.approx(degrees - 10.7)
     assert ("dihedral_within_bounds" in report.broken) == broken
     assert "dihedral_within_bounds" in quality_report(mesh, "voxel").broken
-    assert "non_obtuse" not in report.broken
+    assert report.share_obtuse == 0.0
 
 
 def test_temperatures_outside_the_observed_range(box_mesh):
@@ -159,8 +164,9 @@ def test_obtuse_angles_break_the_maximum_principle_only_where_an_edge_sums_above
     # Edges 0-3 and 1-2 cross above each other, so the angles there are obtuse and both edges are positive.
     flat = np.array([[1.0, 0, 0.4], [0, 2, 0], [0, -2, 0], [-1, 0, 0.4]])
     report = quality_report(mesh_from(flat, np.array([[0, 1, 2, 3]])), "conforming")
-    assert set(report.broken) == {"non_obtuse", "stiffness_monotone"}
     assert (report.share_obtuse, report.share_positive_edges) == (1.0, pytest.approx(2 / 6))
+    as_voxels = quality_report(mesh_from(flat, np.array([[0, 1, 2, 3]])), "voxel")
+    assert {"non_obtuse", "stiffness_monotone"} <= set(as_voxels.broken)
     # A voxel mesh whose inner node is moved a little: every tetrahedron around it, half of all, becomes obtuse, but
     # at few edges do the neighbours not make up for it.
     corners, tets = kuhn_tets(np.ones((2, 2, 2), dtype=bool))
@@ -189,7 +195,7 @@ def test_bodies_that_touch_are_counted_both_ways(mesh_of_cells):
     report = quality_report(mesh_of_cells(cells), "voxel")
     assert (report.bodies_by_node, report.bodies_by_face) == (2, 3)
     assert (report.num_non_manifold_edges, report.num_non_manifold_vertices) == (0, 1)
-    assert report.broken == ("boundary_manifold",)
+    assert report.broken == ()
     assert (report.genus, len(report.components)) == (0, 3)
 
 
@@ -228,10 +234,12 @@ def test_mapping_is_json_and_complete(mesh_of_cells):
         "genus": 0,
         "is_cavity": False,
     }
-    assert mapping["dihedral_counts"]["bin_width"] == 5.0 and sum(mapping["dihedral_counts"]["counts"]) == 6 * 180
+    angles = mapping["dihedral_counts"]
+    assert angles["bin_width"] == pytest.approx(4.5) and sum(angles["counts"]) == 6 * 180
+    assert angles["first_centre"] == pytest.approx(2.25, abs=1e-4)
     assert mapping["dihedral_range_deg"] == {"min": 45.0, "max": 90.0}
     assert mapping["length_unit"] == "input unit"
-    assert [promise["name"] for promise in mapping["promises"]] == list(NAMES)
+    assert [promise["name"] for promise in mapping["promises"]] == list(VOXEL_NAMES)
     assert set(mapping["promises"][0]) == {"name", "sentence", "kept", "figure", "found"}
     assert "input unit³" in mapping["promises"][0]["found"]
 
@@ -258,7 +266,7 @@ def test_bad_input_is_refused(box_mesh):
 
 
 def test_shares_in_words_do_not_look_like_none_or_all():
-    evidence = Evidence(1.0, 0, 0, 0, 0, (45.0, 90.0), -1.0, 1e-9, 1.0 - 1e-9, 0)
+    evidence = Evidence(1.0, 0, 0, 0, 0, (45.0, 90.0), -1.0, 1e-9, 1.0 - 1e-9)
     found = {promise.name: promise.found for promise in judge(evidence, "voxel")}
     assert found["non_obtuse"].startswith("< 0.01 %") and found["stiffness_monotone"].startswith("99.99 %")
     assert {p.name for p in judge(evidence, "voxel") if not p.kept} == {"non_obtuse", "stiffness_monotone"}
@@ -276,7 +284,28 @@ def test_shares_in_words_do_not_look_like_none_or_all():
     ],
 )
 def test_both_dihedral_bounds_count(mode, angles, margin):
-    promises = {p.name: p for p in judge(Evidence(1.0, 0, 0, 0, 0, angles, 0.0, 0.0, 0.0, 0), mode)}
+    promises = {p.name: p for p in judge(Evidence(1.0, 0, 0, 0, 0, angles, 0.0, 0.0, 0.0), mode)}
     promise = promises["dihedral_within_bounds"]
     assert promise.figure == pytest.approx(margin, abs=1e-12)
     assert promise.kept == (margin > -1e-6)
+
+
+def test_a_mode_is_judged_by_its_own_promises_only():
+    obtuse = Evidence(1.0, 0, 0, 0, 0, (45.0, 90.0), 0.0, 0.2, 0.1)
+    conforming, voxel = judge(obtuse, "conforming"), judge(obtuse, "voxel")
+    assert tuple(promise.name for promise in conforming) == NAMES and all(promise.kept for promise in conforming)
+    assert tuple(promise.name for promise in voxel if not promise.kept) == ("non_obtuse", "stiffness_monotone")
+
+
+@pytest.mark.parametrize("mode", ["voxel", "conforming"])
+def test_no_bin_of_angles_lies_on_both_sides_of_a_bound(mode):
+    bins = angle_bins(mode)
+    edges = bins.first_centre_deg + bins.width_deg * (np.arange(bins.number + 1) - 0.5)
+    for bound in DIHEDRAL_BOUNDS_DEG[mode]:
+        assert np.abs(edges - bound).min() < 1e-5
+        assert bin_of(bound - 1e-9, mode) == bin_of(bound + 1e-9, mode)  # rounding does not carry an angle over
+    assert edges[0] <= 0.0 < edges[1] and edges[-2] < 180.0 <= edges[-1]
+    assert 4.0 < bins.width_deg < 6.0
+    # Angles of lattices are well within a bin, or rounding would share them out between two.
+    for angle in (45.0, 60.0, 90.0, 120.0):
+        assert bin_of(angle - 1e-9, mode) == bin_of(angle + 1e-9, mode)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 from itertools import combinations
@@ -12,6 +14,11 @@ from thermoxels_ns.errors import HeatError, explain
 from thermoxels_ns.fem.scene_fields import Surface
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+_SIDES = ("exterior-", "interior-")
+_OF_THE_MESHER = ("cut",)
+_PLAIN = re.compile(r"(?!(?:true|false|yes|no|on|off|null|y|n)$)[^\W\d](?:[\w -]*\w)?", re.IGNORECASE)
+"""Names that yaml reads as they stand, in a list too."""
 
 
 class ScenePatches:
@@ -101,7 +108,8 @@ class ScenePatches:
                     "heat scene",
                     expected="something that acts on every patch, or the patch named adiabatic",
                     got=f"nothing on {', '.join(shares)}",
-                    remedy=f"Add what acts there, or write adiabatic: [{', '.join((*adiabatic, *forgotten))}].",
+                    remedy=f"{_what_may_act(acting, forgotten)}, or write "
+                    f"adiabatic: {_yaml_list((*adiabatic, *forgotten))}.",
                 )
             )
 
@@ -122,6 +130,21 @@ def check_disjoint(what: str, entries: Sequence[tuple[str, set[str]]], remedy: s
         if both:
             got = f"{second} on {', '.join(both)} as well"
             raise HeatError(explain(first, expected=f"{what} once on each patch", got=got, remedy=remedy))
+
+
+def _what_may_act(acting: set[str], forgotten: Sequence[str]) -> str:
+    """What to do about patches on which nothing acts; those with names of the user's own left exterior-... for them."""
+    own = [name for name in forgotten if name not in _OF_THE_MESHER and not name.startswith(_SIDES)]
+    if not own:
+        return "Add what acts there"
+    sides = [f"{side}*" for side in _SIDES if any(name.startswith(side) for name in acting)][:1]
+    patches = _yaml_list((*sides, *(_as_pattern(name) for name in own)))
+    return f"Name them in the entry that acts on them, such as patches: {patches}"
+
+
+def _yaml_list(names: Sequence[str]) -> str:
+    """Names as a list of a scene file; in quotes where yaml would read more into one."""
+    return f"[{', '.join(name if _PLAIN.fullmatch(name) else json.dumps(name, ensure_ascii=False) for name in names)}]"
 
 
 def _as_pattern(name: str) -> str:

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,9 @@ _GREY = "#b8b8b8"
 _INK = "#202020"
 BAR_TITLE = "temperature [\N{DEGREE SIGN}C]"
 """What a colour bar says unless told otherwise."""
+_LEAST_CHANGE_K = 1e-3
+"""Half the span of the smallest scale of changes, [K]."""
+_SHARE_OF_CHANGES = 0.95
 _DARKEST = 0.1
 """Share of inferno left out at its dark end, where shading could not be told from cold."""
 
@@ -45,6 +48,7 @@ def picture_of_mesh(
     length_unit: str = "m",
     colour_map: str = "inferno",
     bar_title: str = BAR_TITLE,
+    note: str = "",
     window_size: tuple[int, int] = (1200, 900),
 ) -> None:
     """Draw the surface of a mesh, coloured by temperature, as a PNG with a white background.
@@ -67,6 +71,7 @@ def picture_of_mesh(
         length_unit: Name of the unit of the node positions, written below the picture.
         colour_map: Name of a colour map of matplotlib, such as "coolwarm" for changes to both sides of 0.
         bar_title: Quantity and unit, written beside the colour bar.
+        note: Words below the size of the mesh.
         window_size: Width and height, [pixels].
 
     Raises:
@@ -120,11 +125,33 @@ def picture_of_mesh(
             if unseen.any():
                 surface = pv.PolyData.from_regular_faces(mesh.points_m, mesh.facets[unseen])
                 plotter.add_mesh(surface, color=_GREY, **edges, **matter)
-            _add_words(plotter, mesh, title, font, length_unit, unseen=bool(unseen.any()), extremes=extremes)
+            _add_words(plotter, mesh, title, font, length_unit, note, unseen=bool(unseen.any()), extremes=extremes)
             _frame(plotter, mesh.points_m[np.unique(mesh.facets)], right, true_up, towards_camera)
             plotter.screenshot(str(temporary), return_img=False)
         finally:
             plotter.close()
+
+
+def change_colours(change: npt.NDArray[np.floating]) -> tuple[dict[str, Any], str]:
+    """Colours for changes to both sides of 0.
+
+    Where a few nodes changed far more than the rest, all others would be as grey as no change: the scale then ends
+    where 95 % of the sizes do.
+
+    Args:
+        change: Changes of the nodes that are shown, [K].
+
+    Returns:
+        colours: Arguments `clim`, `colour_map` and `bar_title` of `picture_of_mesh`.
+        note: What to write below the picture if some changed by more than the colours reach; else empty.
+    """
+    size = np.abs(change)
+    most, end = float(size.max()), float(np.quantile(size, _SHARE_OF_CHANGES))
+    beyond = most > 2.0 * end > _LEAST_CHANGE_K
+    end = max(end if beyond else most, _LEAST_CHANGE_K)
+    extremes = f"{float(change.min()):.2g} to {float(change.max()):.2g} K"
+    note = f"colours: {100 * _SHARE_OF_CHANGES:.0f} % of the nodes; all: {extremes}" if beyond else ""
+    return {"clim": (-end, end), "colour_map": "coolwarm", "bar_title": "change [K]"}, note
 
 
 def _view_axes(
@@ -198,8 +225,8 @@ def _add_colour_bar(plotter: pv.Plotter, font: str, title: str, span: float) -> 
         position_y=0.2,
         width=0.06,
         height=0.6,
-        title_font_size=round(height / 50),
-        label_font_size=round(height / 50),
+        title_font_size=round(height / 38),
+        label_font_size=round(height / 38),
         n_labels=5,
         # VTK 9.6 went from printf's to Python's way of writing formats.
         fmt=f"{{:.{decimals}f}}" if pv.vtk_version_info >= (9, 6) else f"%.{decimals}f",
@@ -207,7 +234,7 @@ def _add_colour_bar(plotter: pv.Plotter, font: str, title: str, span: float) -> 
         unconstrained_font_size=True,
         render=False,
     )
-    bar.SetVerticalTitleSeparation(round(height / 45))
+    bar.SetVerticalTitleSeparation(round(height / 40))
     for words in (bar.GetTitleTextProperty(), bar.GetLabelTextProperty()):
         words.SetFontFamily(4)  # VTK_FONT_FILE
         words.SetFontFile(font)
@@ -233,6 +260,7 @@ def _add_words(
     title: str,
     font: str,
     length_unit: str,
+    note: str,
     *,
     unseen: bool,
     extremes: tuple[float, float] | None,
@@ -249,8 +277,10 @@ def _add_words(
         words += "; grey: no thermal ray"
     if extremes is not None:
         words += f"\ncolours: middle 99 %; all: {extremes[0]:.1f} to {extremes[1]:.1f}"
+    if note:
+        words += f"\n{note}"
     plotter.add_text(
-        words, position=(0.17, 0.04), viewport=True, font_size=round(height / 90), color=_INK, font_file=font
+        words, position=(0.17, 0.04), viewport=True, font_size=round(height / 78), color=_INK, font_file=font
     )
     plotter.renderer.add_axes(viewport=(0.0, 0.0, 0.15, 0.155), line_width=3, color=_INK)
 

@@ -1,4 +1,4 @@
-"""One picture of a mesh's quality: angles, radius ratios, sizes and promises."""
+"""One picture of a mesh's quality: angles, radius ratios, figures and promises."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from thermoxels_ns.checks import replace_when_done, writable_folder
 from thermoxels_ns.errors import OutputError, explain
-from thermoxels_ns.mesh.promises import DIHEDRAL_BOUNDS_DEG
-from thermoxels_ns.mesh.quality_report import DIHEDRAL_BIN_DEG, RATIO_BIN, QualityReport
+from thermoxels_ns.mesh.promises import DIHEDRAL_BOUNDS_DEG, angle_bins, in_percent
+from thermoxels_ns.mesh.quality_report import RATIO_BIN, QualityReport
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,7 +20,7 @@ _KEPT, _BROKEN = "#2a7f3f", "#b3261e"
 
 
 def picture_of_quality(path: Path | str, report: QualityReport, title: str = "") -> None:
-    """Draw the report as a PNG: two histograms above, sizes and promises below.
+    """Draw the report as a PNG: two histograms above, figures and promises below.
 
     Counts are on a logarithmic axis, because a solver stumbles over the few worst tetrahedra.
 
@@ -49,7 +49,7 @@ def picture_of_quality(path: Path | str, report: QualityReport, title: str = "")
     _draw_angles(figure.add_subplot(grid[0, 0]), report)
     _draw_ratios(figure.add_subplot(grid[0, 1]), report)
     sizes, promises = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
-    _write_lines(sizes, "Sizes", _size_lines(report))
+    _write_lines(sizes, "Figures", _size_lines(report))
     _write_promises(promises, report)
     for axis in (sizes, promises):
         axis.set_axis_off()
@@ -60,7 +60,8 @@ def picture_of_quality(path: Path | str, report: QualityReport, title: str = "")
 
 def _draw_angles(axis: Axes, report: QualityReport) -> None:
     low, high = DIHEDRAL_BOUNDS_DEG[report.boundary_mode]
-    _draw_bars(axis, report.dihedral_counts, 0.0, DIHEDRAL_BIN_DEG)
+    bins = angle_bins(report.boundary_mode)
+    _draw_bars(axis, report.dihedral_counts, bins.first_centre_deg, bins.width_deg)
     for bound, side, shift in ((low, "left", 4), (high, "right", -4)):
         axis.axvline(bound, color=_BOUND, linestyle="--", linewidth=1.3)
         axis.annotate(
@@ -120,21 +121,31 @@ def _size_lines(report: QualityReport) -> list[tuple[str, str]]:
         ("boundary components; cavities", f"{len(report.components):,}; {report.num_cavities:,}"),
         ("genus (handles)", "none: not a manifold" if report.genus is None else f"{report.genus:,}"),
         ("Euler characteristic of the boundary", f"{report.euler_characteristic:,}"),
-        ("non-manifold edges, vertices", f"{pinched[0]:,}, {pinched[1]:,}"),
+        ("edges, points where it touches itself", f"{pinched[0]:,}, {pinched[1]:,}"),
+        ("tetrahedra with an obtuse angle", in_percent(report.share_obtuse)),
+        ("edges with a positive stiffness entry", in_percent(report.share_positive_edges)),
     ]
 
 
 def _write_lines(axis: Axes, heading: str, lines: list[tuple[str, str]]) -> None:
     _write(axis, 0.0, 0.98, heading, _INK, size=12.0, bold=True)
     for number, (name, value) in enumerate(lines):
-        y = 0.89 - 0.082 * number
+        y = 0.89 - 0.07 * number
         _write(axis, 0.0, y, name, _PALE)
         _write(axis, 0.55, y, value, _INK)
 
 
 def _write_promises(axis: Axes, report: QualityReport) -> None:
     kept = len(report.promises) - len(report.broken)
-    _write(axis, 0.0, 0.98, f"Promises: {kept} of {len(report.promises)} kept", _INK, size=12.0, bold=True)
+    _write(
+        axis,
+        0.0,
+        0.98,
+        f"Promises of a {report.boundary_mode} boundary: {kept} of {len(report.promises)} kept",
+        _INK,
+        size=12.0,
+        bold=True,
+    )
     for number, promise in enumerate(report.promises):
         y = 0.89 - 0.113 * number
         _write(axis, 0.0, y, *(("yes", _KEPT) if promise.kept else ("no", _BROKEN)), bold=True)

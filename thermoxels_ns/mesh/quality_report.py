@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.errors import MeshError, explain
 from thermoxels_ns.mesh.face_count import IntArray, edges_of_rows, group_edges, group_faces
-from thermoxels_ns.mesh.promises import BoundaryMode, Evidence, Promise, judge
+from thermoxels_ns.mesh.promises import AngleBins, BoundaryMode, Evidence, Promise, angle_bins, judge
 from thermoxels_ns.mesh.quality import check_arrays, count_overlaps, count_twin_nodes, count_wrong_facets, facet_areas
 from thermoxels_ns.mesh.tet_shapes import shapes_in_chunks
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
@@ -22,9 +22,6 @@ from thermoxels_ns.mesh.topology import (
     tets_across_faces,
 )
 
-DIHEDRAL_BIN_DEG = 5.0
-"""Width of the bins of the dihedral angles, [degrees]; centred on 0, 5, ..., 180, as lattice tetrahedra have angles
-of 45, 60 and 90 degrees."""
 RATIO_BIN = 0.05
 """Width of the bins of the radius ratio; 20 of them from 0 to 1, the last includes 1."""
 
@@ -63,7 +60,7 @@ class QualityReport:
     dihedral_range_deg: tuple[float, float]
     """Smallest and largest angle between two faces of a tetrahedron, [degrees]."""
     dihedral_counts: tuple[int, ...]
-    """Number of these angles, six per tetrahedron, in bins 5 degrees wide around 0, 5, ..., 180."""
+    """Number of these angles, six per tetrahedron, in the bins of `promises.angle_bins`."""
     radius_ratio_range: tuple[float, float]
     """Smallest and largest of 3 r / R with the radii of the inscribed and the circumscribed sphere, 1 at best; 0 where
     the volume is not above 0."""
@@ -91,7 +88,7 @@ class QualityReport:
     num_non_manifold_vertices: int
     """Boundary vertices whose triangles are not one fan."""
     promises: tuple[Promise, ...]
-    """What the mesher promises, and whether this mesh keeps it."""
+    """What the mesher promises of such a boundary, and whether this mesh keeps it."""
 
     @property
     def num_cavities(self) -> int:
@@ -107,7 +104,11 @@ class QualityReport:
         """The report as json can hold it; of the boundary's components the 20 largest are listed."""
         mapping = asdict(self)
         listed, promises = mapping.pop("components"), mapping.pop("promises")
-        bins = (("dihedral_counts", 0.0, DIHEDRAL_BIN_DEG), ("radius_ratio_counts", 0.5 * RATIO_BIN, RATIO_BIN))
+        angles = angle_bins(self.boundary_mode)
+        bins = (
+            ("dihedral_counts", angles.first_centre_deg, angles.width_deg),
+            ("radius_ratio_counts", 0.5 * RATIO_BIN, RATIO_BIN),
+        )
         for name, first, width in bins:
             mapping[name] = {"first_centre": first, "bin_width": width, "counts": list(mapping[name])}
         for name in ("dihedral_range_deg", "radius_ratio_range"):
@@ -144,7 +145,7 @@ def quality_report(
         raise MeshError(explain("boundary_mode", expected=modes, got=repr(boundary_mode), remedy="Pass one of these."))
     check_arrays(mesh)
     low_c, high_c = _observed_range(mesh, observed_range_c)
-    shapes = _measure_shapes(mesh)
+    shapes = _measure_shapes(mesh, angle_bins(boundary_mode))
     edges = group_edges(mesh.tets)
     ends = edges_of_rows(mesh.tets, edges.order[edges.start])
     lengths = np.linalg.norm(mesh.points_m[ends[:, 0]] - mesh.points_m[ends[:, 1]], axis=1)
@@ -168,7 +169,6 @@ def quality_report(
         temperature_excess_k=float(max(low_c - temperature.min(), temperature.max() - high_c)),
         share_obtuse=shapes.share_obtuse,
         share_positive_edges=share_positive,
-        num_non_manifold=surface.num_non_manifold_edges + surface.num_non_manifold_vertices,
     )
     return QualityReport(
         boundary_mode=boundary_mode,
@@ -217,15 +217,16 @@ class _Shapes:
     """Rows as in `face_count.group_edges`, shape (6 t,)."""
 
 
-def _measure_shapes(mesh: TetMesh) -> _Shapes:
+def _measure_shapes(mesh: TetMesh, bins: AngleBins) -> _Shapes:
     num = len(mesh.tets)
     volumes, ratios, stiffness = np.empty(num), np.empty(num), np.empty((num, 6))
-    angle_counts = np.zeros(round(180.0 / DIHEDRAL_BIN_DEG) + 1, dtype=np.int64)
+    angle_counts = np.zeros(bins.number, dtype=np.int64)
+    before = bins.first_centre_deg / bins.width_deg - 0.5
     smallest, largest, obtuse = 180.0, 0.0, 0
     for which, shapes in shapes_in_chunks(mesh.points_m, mesh.tets):
         cosines = shapes.dihedral_cosines()
         angles = np.degrees(np.arccos(cosines))
-        angle_counts += _histogram(angles.ravel() / DIHEDRAL_BIN_DEG + 0.5, len(angle_counts))
+        angle_counts += _histogram(angles.ravel() / bins.width_deg - before, bins.number)
         smallest, largest = min(smallest, float(angles.min())), max(largest, float(angles.max()))
         obtuse += int(np.count_nonzero(cosines.min(axis=0) < 0.0))
         volumes[which], ratios[which] = shapes.volumes, shapes.radius_ratios()
