@@ -6,11 +6,14 @@ import json
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.capture.posed_model import CAMERA, ring_model
+from thermoxels_ns.capture.colmap_log import quiet_colmap
 from thermoxels_ns.capture.colmap_model import camera_of_colmap, model_of_colmap, read_colmap
-from thermoxels_ns.capture.given_poses import in_order, read_given_poses
-from thermoxels_ns.errors import SceneError
+from thermoxels_ns.capture.given_poses import fitted_to_photographs, in_order, read_given_poses
+from thermoxels_ns.capture.poses import Poses, add_points
+from thermoxels_ns.errors import SceneError, ThermoxelsError
 
 MODEL = ring_model(5, points=60)
 SOURCES = {name: f"visible/{name}-visible.jpg" for name in MODEL.frames}
@@ -59,6 +62,96 @@ def test_what_is_no_pose_is_refused(tmp_path):
         read_given_poses(tmp_path / "nowhere", SOURCES)
     with pytest.raises(SceneError, match="a COLMAP model"):
         read_given_poses(tmp_path, SOURCES)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"w": 0}, "positive focal lengths and size"),
+        ({"w": 1e400}, "numbers as intrinsics"),
+        ({"fl_x": float("nan")}, "finite intrinsics"),
+        ({"fl_y": -100.0}, "positive focal lengths"),
+        ({"cx": "middle"}, "numbers as intrinsics"),
+        ({"camera_model": ["OPENCV"]}, "camera_model"),
+        ({"frames": {}}, "a list 'frames'"),
+        ({"frames": [7]}, "a list 'frames'"),
+        ({"frames": []}, "no known one"),
+    ],
+)
+def test_cameras_that_cannot_be_are_refused(tmp_path, change, said):
+    path = transforms(tmp_path)
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    with pytest.raises(SceneError, match=said):
+        read_given_poses(path, SOURCES)
+
+
+MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda pose: (pose @ MIRROR).tolist(), "a rotation in the upper left"),
+        (lambda pose: (pose * 2).tolist(), "a rotation in the upper left"),
+        (lambda pose: np.where(pose == pose[0, 3], np.nan, pose).tolist(), "finite numbers"),
+        (lambda pose: pose[:2].tolist(), "4 x 4 numbers"),
+        (lambda pose: None, "4 x 4 numbers"),
+        (lambda pose: "pose", "4 x 4 numbers"),
+    ],
+)
+def test_poses_that_cannot_be_are_refused_with_their_frame(tmp_path, change, said):
+    path = transforms(tmp_path)
+    content = json.loads(path.read_text())
+    content["frames"][2]["transform_matrix"] = change(MODEL.camera_to_world[2])
+    path.write_text(json.dumps(content))
+    with pytest.raises(SceneError, match=f"frame 2: transform_matrix: expected {said}"):
+        read_given_poses(path, SOURCES)
+
+
+def photographs(folder, sizes):
+    files = {}
+    for name, size in zip(MODEL.frames, sizes):
+        files[name] = folder / f"{name}.png"
+        Image.new("L", size).save(files[name])
+    return files
+
+
+def test_poses_of_reduced_photographs_are_those_of_the_originals(tmp_path):
+    size = (2 * CAMERA.width, 2 * CAMERA.height)
+    files = photographs(tmp_path, [size] * len(MODEL.frames))
+    fitted = fitted_to_photographs(Poses(MODEL, {}), files).model
+    assert (fitted.camera.width, fitted.camera.height) == size
+    assert fitted.camera.fl_x == 2 * CAMERA.fl_x and fitted.camera.k1 == CAMERA.k1
+    assert np.array_equal(fitted.sighting_pixel, 2 * MODEL.sighting_pixel)
+    assert np.array_equal(fitted.camera_to_world, MODEL.camera_to_world)
+    assert fitted.sighting_error_px() == pytest.approx(2 * MODEL.sighting_error_px(), abs=1e-9)
+
+
+def test_poses_of_cropped_or_turned_photographs_are_refused(tmp_path):
+    for size in ((CAMERA.height, CAMERA.width), (CAMERA.width, CAMERA.height - 8)):
+        files = photographs(tmp_path, [size] * len(MODEL.frames))
+        with pytest.raises(SceneError, match=rf"proportions of .*got {size[0]} x {size[1]}.*cropped"):
+            fitted_to_photographs(Poses(MODEL, {}), files)
+
+
+def test_one_pose_is_too_few_for_points(tmp_path):
+    model = MODEL.without(MODEL.frames[1:])
+    with pytest.raises(SceneError, match="at least 2 photographs"):
+        add_points(model, photographs(tmp_path, [(CAMERA.width, CAMERA.height)]), tmp_path)
+
+
+def test_what_colmap_refuses_is_an_error_with_a_remedy():
+    for problem in (ValueError("[sfm.cc:671] Check failed"), RuntimeError("disk")):
+        with pytest.raises(ThermoxelsError, match=r"COLMAP: expected to end.*--from-stage poses"), quiet_colmap():
+            raise problem
+
+
+def test_a_photograph_of_another_size_is_left_out_of_given_poses(tmp_path):
+    sizes = [(CAMERA.width, CAMERA.height)] * (len(MODEL.frames) - 1) + [(64, 48)]
+    fitted = fitted_to_photographs(Poses(MODEL, {"x": "no pose"}), photographs(tmp_path, sizes))
+    assert fitted.model.frames == MODEL.frames[:-1]
+    assert fitted.model.camera == CAMERA
+    assert set(fitted.dropped) == {"x", MODEL.frames[-1]} and "64 x 48" in fitted.dropped[MODEL.frames[-1]]
 
 
 def test_distortion_that_the_camera_cannot_hold_is_refused(tmp_path):

@@ -39,6 +39,8 @@ def names(search: PairSearch) -> list[tuple[str, str]]:
         ("RGB_0004.png", "IR_0004.tif"),
         ("20180528_120000_V.jpg", "20180528_120000_R.tiff"),
         ("Halle (2) rgb.JPG", "Halle (2) thermal.csv"),
+        ("Küche_visible.jpg", "Ku\u0308che_thermal.tif"),
+        ("壁-rgb.png", "壁-ir.npy"),
     ],
 )
 def test_equal_names_belong_together(photo, thermal):

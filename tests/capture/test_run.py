@@ -218,7 +218,7 @@ def test_folders_that_are_not_ours_are_not_written_to(capture, tmp_path, output)
 
 def test_a_folder_without_pairs_says_what_was_found(tmp_path):
     photograph(tmp_path / "card" / "a.jpg")
-    with pytest.raises(ThermoxelsError, match=r"none; a\.jpg: no partner"):
+    with pytest.raises(ThermoxelsError, match=r"1 photograph, no thermal images \(a\.jpg: no partner"):
         run_capture(tmp_path / "card", tmp_path / "scene", settings())
     with pytest.raises(ThermoxelsError, match="nothing at"):
         run_capture(tmp_path / "nowhere", tmp_path / "scene", settings())

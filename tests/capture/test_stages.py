@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from thermoxels_ns.capture.stages import StageCache, fingerprint, prepare_output, read_json
+from thermoxels_ns.capture.stages import CACHE_FOLDER, StageCache, fingerprint, prepare_output, read_json
 from thermoxels_ns.errors import OutputError, ThermoxelsError
 
 
@@ -59,9 +59,13 @@ def test_a_result_that_is_gone_is_made_again(tmp_path):
 
 
 def test_a_damaged_result_says_what_to_do(tmp_path):
-    (tmp_path / "pairs.json").write_text("{")
-    with pytest.raises(ThermoxelsError, match="--from-stage pairs"):
-        read_json(tmp_path / "pairs.json")
+    own, given = tmp_path / CACHE_FOLDER / "pairs.json", tmp_path / "transforms.json"
+    own.parent.mkdir()
+    for path, said in ((own, "--from-stage pairs"), (given, "pass another file")):
+        for content in ("{", "[" * 100_000, None):
+            path.unlink() if content is None else path.write_text(content)
+            with pytest.raises(ThermoxelsError, match=rf"{path.name}.*{said}"):
+                read_json(path)
 
 
 def test_a_file_that_was_replaced_is_noticed(tmp_path):

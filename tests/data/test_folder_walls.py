@@ -39,6 +39,13 @@ def test_names_that_lead_out_are_refused_by_where_they_stand(tmp_path, name):
         path_inside(tmp_path, name, "transforms.json: frame 3")
 
 
+def test_a_link_to_itself_and_an_endless_name_are_refused(tmp_path):
+    (tmp_path / "loop").symlink_to("loop")
+    for name, said in (("loop/a.tiff", "link"), ("loop", "link|levels"), ("x" * 5000, "too long")):
+        with pytest.raises(SceneError, match=rf"frame 0: expected a file inside.*{said}"):
+            path_inside(tmp_path, name, "frame 0")
+
+
 def test_a_link_that_leads_out_is_refused_and_one_inside_is_not(tmp_path):
     outside, folder = tmp_path / "outside", tmp_path / "scene"
     outside.mkdir()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import unicodedata
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -12,6 +14,7 @@ from typing import Literal
 from PIL import Image
 
 from thermoxels_ns.capture.photograph import read_photograph_facts
+from thermoxels_ns.data.decoders import naming
 from thermoxels_ns.data.dji_rjpeg import is_dji_rjpeg
 from thermoxels_ns.data.exif_facts import read_exif_facts
 from thermoxels_ns.data.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
@@ -29,6 +32,8 @@ _THERMAL_WORDS = frozenset({"thermal", "radiometric", "temperature", "temperatur
 _PHOTOGRAPH_WORDS = frozenset({"visible", "vis", "rgb", "colour", "color", "photo", "photos", "optical"})
 _OTHER_WORDS = frozenset({"image", "images", "raw"})
 ROLE_WORDS = _THERMAL_WORDS | _PHOTOGRAPH_WORDS | _OTHER_WORDS
+_UNPRINTED = ("Cc", "Cs")
+"""Kinds of characters that break a line or a terminal, or are bytes that no encoding explains."""
 _LAST_LETTERS = {"t": "thermal", "v": "photograph", "w": "photograph", "r": "thermal"}
 """Single letters that stand for a camera at the end of a name, after a separator."""
 
@@ -41,6 +46,8 @@ class CameraFile:
     role: Role
     taken_at: datetime | None
     """As the camera's clock showed it, without a zone."""
+    dji: bool = False
+    """Whether it is DJI's R-JPEG, which only DJI's own library reads."""
 
 
 @dataclass(frozen=True)
@@ -53,15 +60,18 @@ class CameraFolder:
     """Why, by file."""
     others: int = 0
     """Files of other kinds, which were not looked at."""
+    passed_over: dict[Path, str] = field(default_factory=dict)
+    """What is not followed or not opened (links that lead out, folders that are shut), and why."""
 
 
 def words_of(name: str) -> tuple[str, ...]:
-    """Cut a name into words of letters and digits, in small letters.
+    """Cut a name into words of letters (of any alphabet) and digits, in small letters.
 
     >>> words_of("10-58-15-636-Visible")
     ('10', '58', '15', '636', 'visible')
     """
-    return tuple(word for word in re.split(r"[^a-z0-9]+", name.lower()) if word)
+    whole = unicodedata.normalize("NFC", name)  # some disks keep a letter and its accent apart
+    return tuple(word for word in re.split(r"[\W_]+", whole.lower()) if word)
 
 
 def natural_key(path: Path) -> list[tuple[int, str, int]]:
@@ -71,7 +81,7 @@ def natural_key(path: Path) -> list[tuple[int, str, int]]:
     'b2'
     """
     parts = re.findall(r"\d+|\D+", path.as_posix().lower())
-    return [(0, "", int(part)) if part.isdigit() else (1, part, 0) for part in parts]
+    return [(0, "", int(part)) if part.isdecimal() else (1, part, 0) for part in parts]
 
 
 def scan_folder(
@@ -79,7 +89,8 @@ def scan_folder(
 ) -> CameraFolder:
     """Look at every picture and table in a folder and the folders in it.
 
-    Hidden files and folders are passed over, and so are links that lead out of the folder.
+    Hidden files and folders are passed over. Links that lead out of the folder, linked folders, folders that are shut
+    and what is no file are passed over and named.
 
     Args:
         folder: What the user hands over.
@@ -98,26 +109,81 @@ def scan_folder(
                 remedy="Pass the folder that the memory card was copied to.",
             )
         )
-    root = folder.resolve()
-    skipped = [path.resolve() for path in without]
     files, unreadable, others = [], dict[Path, str](), 0
-    found = [path for path in folder.rglob("*") if path.is_file()]
-    found = sorted(found, key=lambda path: natural_key(path.relative_to(folder)))
+    found, passed_over = files_below(folder, without)
     for number, path in enumerate(found):
-        real = path.resolve()
-        hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
-        if hidden or not real.is_relative_to(root) or any(real.is_relative_to(each) for each in skipped):
-            continue
         if path.suffix.lower() not in SUFFIXES:
             others += 1
             continue
         try:
+            _check_name(path.relative_to(folder))
             files.append(look_at(path, folder))
-        except (ThermoxelsError, OSError) as problem:
+        except ThermoxelsError as problem:
             unreadable[path] = str(problem)
         if (number + 1) % 100 == 0:
             say(f"files: {number + 1} of {len(found)}")
-    return CameraFolder(folder, tuple(files), unreadable, others)
+    return CameraFolder(folder, tuple(files), unreadable, others, passed_over)
+
+
+def files_below(folder: Path, without: Sequence[Path] = ()) -> tuple[list[Path], dict[Path, str]]:
+    """List the files of a folder and of the folders in it, sorted as people sort names.
+
+    Args:
+        folder: Where to look.
+        without: Folders in it to leave out.
+
+    Returns:
+        The files, and why other things with a name that is not hidden are not among them.
+    """
+    root, skipped = folder.resolve(), [path.resolve() for path in without]
+    files, passed_over = [], dict[Path, str]()
+
+    def shut(problem: OSError) -> None:
+        passed_over[Path(problem.filename)] = f"a folder that cannot be opened ({problem.strerror})"
+
+    for place, folders, names in os.walk(folder, onerror=shut):
+        here = Path(place)
+        for name in [name for name in folders if (here / name).is_symlink() and not name.startswith(".")]:
+            passed_over[here / name] = "a link to a folder, which is not followed; copy the folder itself"
+        folders[:] = [
+            name
+            for name in folders
+            if not name.startswith(".") and not any((here / name).resolve().is_relative_to(each) for each in skipped)
+        ]
+        for path in (here / name for name in names if not name.startswith(".")):
+            if not path.is_file():
+                passed_over[path] = "no file" if path.exists() else "a link to nothing"
+            elif path.is_symlink() and not path.resolve().is_relative_to(root):
+                passed_over[path] = "a link that leads out of the folder; copy the file itself"
+            else:
+                files.append(path)
+    # Names that differ in capitals alone come in one order on every disk.
+    files.sort(key=lambda path: (natural_key(path.relative_to(folder)), path.as_posix()))
+    return files, passed_over
+
+
+def shown_name(path: Path) -> str:
+    """Name of a file as it can be printed and written: what is no letter in any alphabet is escaped.
+
+    >>> shown_name(Path("two\\nlines.jpg"))
+    'two\\\\nlines.jpg'
+    """
+    return "".join(
+        each.encode("unicode_escape").decode("ascii") if unicodedata.category(each) in _UNPRINTED else each
+        for each in path.name
+    )
+
+
+def _check_name(name: Path) -> None:
+    if any(unicodedata.category(each) in _UNPRINTED for each in str(name)):
+        raise SceneError(
+            explain(
+                "/".join(shown_name(Path(part)) for part in name.parts),
+                expected="a name that can be printed",
+                got="one with line breaks, control characters or bytes of no encoding",
+                remedy="Rename the file.",
+            )
+        )
 
 
 def look_at(path: Path, folder: Path) -> CameraFile:
@@ -126,6 +192,11 @@ def look_at(path: Path, folder: Path) -> CameraFile:
     Raises:
         SceneError, ThermalFileError: It is empty, damaged or no picture.
     """
+    with naming(path, "a camera file"):
+        return _look_at(path, folder)
+
+
+def _look_at(path: Path, folder: Path) -> CameraFile:
     check_file_size(path)
     suffix = path.suffix.lower()
     if suffix in (".npy", ".csv"):
@@ -139,9 +210,10 @@ def look_at(path: Path, folder: Path) -> CameraFile:
         with path.open("rb") as stream:
             head = stream.read(2**18)
         if is_dji_rjpeg(head) or is_dji_rjpeg(path.read_bytes()):
-            return CameraFile(path, "thermal", read_photograph_facts(path).taken_at)
+            return CameraFile(path, "thermal", read_photograph_facts(path).taken_at, dji=True)
     else:
-        found = _count_image(path)
+        with naming(path, "a TIFF or PNG that can be decoded"):
+            found = _count_image(path)
         if found is not None:
             return found
     facts = read_photograph_facts(path)
@@ -150,23 +222,11 @@ def look_at(path: Path, folder: Path) -> CameraFile:
 
 def _count_image(path: Path) -> CameraFile | None:
     """A TIFF or PNG of one channel of more than 8 bits, which no photograph is; None for others."""
-    try:
-        with Image.open(path) as image:
-            if image.mode != "F" and not image.mode.startswith("I"):
-                return None
-            check_thermal_size(path, *image.size)
-            return CameraFile(path, "thermal", read_exif_facts(image).taken_at)
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as problem:
-        if isinstance(problem, ThermoxelsError):
-            raise
-        raise SceneError(
-            explain(
-                str(path),
-                expected="a TIFF or PNG that can be decoded",
-                got=str(problem) or type(problem).__name__,
-                remedy="The file is damaged; copy it from the camera again.",
-            )
-        ) from problem
+    with Image.open(path) as image:
+        if image.mode != "F" and not image.mode.startswith("I"):
+            return None
+        check_thermal_size(path, *image.size)
+        return CameraFile(path, "thermal", read_exif_facts(image).taken_at)
 
 
 def _named_thermal(path: Path, folder: Path) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,8 @@ import numpy.typing as npt
 
 from thermoxels_ns.capture.colmap_log import quiet_colmap
 from thermoxels_ns.capture.contract import CameraModel
+from thermoxels_ns.checks import remove_file
+from thermoxels_ns.errors import OutputError, explain
 
 Matching = Literal["auto", "exhaustive", "sequential"]
 LensModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV"]
@@ -24,6 +27,9 @@ away."""
 _ANCHORS = 40
 """Sequential matching: so many photographs spread over the capture are matched with each other, so that a path that
 returns to its start is closed."""
+_BYTES_PER_FEATURE, _BYTES_PER_MATCH, _LEAST_BYTES = 200, 8, 2_000_000
+"""Of the database: 152 bytes of a feature and its row; 7.5 bytes per feature and pair of photographs were measured
+where all photographs show the same room, fewer elsewhere."""
 _CHUNK = 8
 _PAIR_CHUNK = 200
 
@@ -83,7 +89,7 @@ def fill_database(
     """Find features in photographs and match them; what an interrupted run has done is not done again.
 
     Args:
-        database: COLMAP's file, made where it does not exist.
+        database: COLMAP's file, made where it does not exist; what it may need must be free on its disk.
         images: Folder of the photographs, all of one size.
         names: Their names in it, in the order they were taken.
         camera: Start value of their lens, at their size.
@@ -91,9 +97,15 @@ def fill_database(
         masks: Folder of pictures that are black where no feature is looked for; None: everywhere.
         options: How much and what is compared.
         say: Told how far it is.
+
+    Raises:
+        OutputError: There is too little free space for features and matches, which COLMAP would end the process at.
+        ThermoxelsError: COLMAP stopped.
     """
     import pycolmap
 
+    pairs = image_pairs(len(names), options.matching)
+    _check_free_space(database, options.max_features, len(names), len(pairs))
     with quiet_colmap():
         _add_images(database, names, camera, options.lens, known_focal)
         reader = pycolmap.ImageReaderOptions(camera_model=options.lens, existing_camera_id=1)
@@ -110,7 +122,6 @@ def fill_database(
         matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=options.threads)
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = options.seed
-        pairs = image_pairs(len(names), options.matching)
         listed = database.with_name("pairs.txt")
         for start in range(0, len(pairs), _PAIR_CHUNK):
             some = pairs[start : start + _PAIR_CHUNK]
@@ -119,6 +130,21 @@ def fill_database(
             pairing.match_list_path = str(listed)
             pycolmap.match_image_pairs(database, matching, pairing, verification)
             say(f"matches: {start + len(some)} of {len(pairs)} pairs of photographs")
+
+
+def _check_free_space(database: Path, max_features: int, images: int, pairs: int) -> None:
+    there = database.stat().st_size if database.is_file() else 0
+    needed = _LEAST_BYTES + max_features * (_BYTES_PER_FEATURE * images + _BYTES_PER_MATCH * pairs) - there
+    free = shutil.disk_usage(database.parent).free
+    if free < needed:
+        raise OutputError(
+            explain(
+                str(database.parent),
+                expected=f"up to {needed / 1e6:.0f} MB free for features and matches",
+                got=f"{free / 1e6:.0f} MB",
+                remedy="Make space, choose another --output, or lower --max-features; finished stages are kept.",
+            )
+        )
 
 
 def lens_parameters(camera: CameraModel, lens: LensModel) -> list[float]:
@@ -135,9 +161,12 @@ def _add_images(database: Path, names: Sequence[str], camera: CameraModel, lens:
     import pycolmap
 
     with pycolmap.Database.open(database) as opened:
-        if opened.num_images() == len(names):
+        # A frame is written after its image; where there is one frame per name, no killed run left a part.
+        if opened.num_images() == len(names) == opened.num_frames():
             return
-        opened.clear_all_tables()
+    for path in database.parent.glob(f"{database.name}*"):  # with its journal
+        remove_file(path)
+    with pycolmap.Database.open(database) as opened:
         colmap_camera = pycolmap.Camera(
             camera_id=1,
             model=lens,

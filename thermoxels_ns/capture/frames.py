@@ -18,6 +18,7 @@ from thermoxels_ns.capture.stages import read_json, write_json
 from thermoxels_ns.data.dead_pixels import find_dead_pixels
 from thermoxels_ns.data.flir_records import PictureInPicture
 from thermoxels_ns.data.flir_rjpeg import read_flir_jpeg
+from thermoxels_ns.data.radiometric_conditions import Conditions
 from thermoxels_ns.data.radiometry import RadiometryOptions, read_thermogram
 from thermoxels_ns.errors import SceneError, ThermoxelsError, explain
 
@@ -57,6 +58,10 @@ class CaptureFrame:
     picture_in_picture: PictureInPicture | None = None
     """Factory alignment of FLIR cameras."""
     celsius_per_count: float | None = None
+    format: str | None = None
+    """Of the thermal file, by its content."""
+    conditions: Conditions | None = None
+    """Emissivity and the rest that the temperatures were computed with."""
     masked: int = 0
     """Thermal pixels without a temperature."""
 
@@ -122,6 +127,7 @@ def read_frames(
 
     Raises:
         ThermoxelsError: A file cannot be read and `skip_bad` is off, or no pair is left.
+        OSError: What was read cannot be written.
     """
     (folder / "thermal").mkdir(exist_ok=True)
     (folder / "photographs").mkdir(exist_ok=True)
@@ -131,7 +137,7 @@ def read_frames(
             frame, shape = _read(pair, root, folder, radiometry)
             frames.append(frame)
             sizes.append(shape)
-        except (ThermoxelsError, OSError) as problem:
+        except ThermoxelsError as problem:  # of the files that are read; a full disk is no bad file
             if not skip_bad:
                 raise
             dropped[pair.name] = str(problem)
@@ -202,6 +208,8 @@ def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -
         thermal_field_of_view_deg=metadata.field_of_view_deg,
         picture_in_picture=metadata.picture_in_picture,
         celsius_per_count=metadata.celsius_per_count,
+        format=metadata.format,
+        conditions=metadata.conditions,
         masked=thermogram.report.masked,
     )
     height, width = thermogram.temperature_c.shape
@@ -244,4 +252,6 @@ def _frame_of(row: dict[str, Any]) -> CaptureFrame:
         row["gimbal_deg"] = (row["gimbal_deg"][0], row["gimbal_deg"][1])
     if row["picture_in_picture"] is not None:
         row["picture_in_picture"] = PictureInPicture(**row["picture_in_picture"])
+    if row.get("conditions") is not None:
+        row["conditions"] = Conditions(**row["conditions"])
     return CaptureFrame(**row)

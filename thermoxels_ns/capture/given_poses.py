@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -11,7 +12,7 @@ import numpy as np
 
 from thermoxels_ns.capture.colmap_model import model_of_colmap, read_colmap
 from thermoxels_ns.capture.contract import CameraModel
-from thermoxels_ns.capture.poses import Poses
+from thermoxels_ns.capture.poses import Poses, common_size
 from thermoxels_ns.capture.sfm_model import SfmModel
 from thermoxels_ns.capture.stages import read_json
 from thermoxels_ns.data.folder_walls import path_inside
@@ -50,6 +51,48 @@ def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
     order = {name: number for number, name in enumerate(photographs)}
     missing = {name: f"{path.name} has no pose of it" for name in photographs if name not in model.frames}
     return Poses(in_order(model, lambda name: order[name]), missing)
+
+
+def fitted_to_photographs(poses: Poses, photographs: Mapping[str, Path]) -> Poses:
+    """Express given poses in the pixels of the photographs; they may come from photographs that were reduced.
+
+    Args:
+        poses: As `read_given_poses` found them.
+        photographs: Files by the frame's name.
+
+    Returns:
+        The same poses, without the frames whose photographs have another size than most.
+
+    Raises:
+        SceneError: The photographs have other proportions than the images that the poses come from.
+    """
+    size, other = common_size({name: photographs[name] for name in poses.model.frames})
+    dropped = dict(poses.dropped) | {
+        name: f"{w} x {h} pixels, the others {size[0]} x {size[1]}: another camera or mode"
+        for name, (w, h) in other.items()
+    }
+    model, camera = poses.model.without(list(other)), poses.model.camera
+    if size == (camera.width, camera.height):
+        return Poses(model, dropped)
+    factors = np.array([size[0] / camera.width, size[1] / camera.height])
+    # The sides of a reduced image are rounded to whole pixels.
+    if abs(factors[0] / factors[1] - 1.0) > 1.0 / min(*size, camera.width, camera.height):
+        raise SceneError(
+            explain(
+                "given poses",
+                expected=f"photographs with the proportions of {camera.width} x {camera.height} pixels, as their "
+                "camera has",
+                got=f"{size[0]} x {size[1]}",
+                remedy="Use the photographs that the poses were computed from, neither cropped nor turned.",
+            )
+        )
+    fitted = replace(
+        model,
+        camera=camera.resized(*size),
+        point_error_px=model.point_error_px * float(factors.mean()),
+        sighting_pixel=model.sighting_pixel * factors,
+    )
+    return Poses(fitted, dropped)
 
 
 def in_order(model: SfmModel, key: Callable[[str], Any]) -> SfmModel:
@@ -133,7 +176,7 @@ def _frames_of(names: list[str], photographs: Mapping[str, str], path: Path) -> 
             if len(frames) == 1:
                 found[name] = frames[0]
                 break
-    twice = {frame for frame in found.values() if list(found.values()).count(frame) > 1}
+    twice = {frame for frame, count in Counter(found.values()).items() if count > 1}
     if not found or twice:
         raise SceneError(
             explain(

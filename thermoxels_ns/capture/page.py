@@ -14,12 +14,16 @@ from thermoxels_ns.capture.charts import bars, histogram
 from thermoxels_ns.capture.contract import CameraModel, DriftEstimate, RigEstimate
 from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.gravity import Up
+from thermoxels_ns.capture.measurement import measurement_rows
 from thermoxels_ns.capture.metric_scale import MetricScale
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.sfm_model import SfmModel
 from thermoxels_ns.checks import replace_when_done
+from thermoxels_ns.data.dead_pixels import MIN_FRAMES
+from thermoxels_ns.page_style import html_page, scrolling
 
 _PERCENTILES = (0.1, 99.9)
+_TOO_FEW = f"not looked for in fewer than {MIN_FRAMES} frames"
 
 
 @dataclass(frozen=True)
@@ -33,6 +37,8 @@ class Overlay:
     """The same with the rig that was found."""
     thermal_url: str
     """The thermal image alone."""
+    shown_c: tuple[float, float] | None = None
+    """Temperatures of its darkest and its brightest colour, [degrees C]; None: it has none."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +80,6 @@ def write_page(page: CapturePage, path: Path) -> None:
 
 def build_page(page: CapturePage) -> str:
     """Build the html text; it depends on `page` alone."""
-    title = escape(page.title)
     sections = [
         ("In short", _summary(page)),
         ("Judge for yourself: thermal colours over the photographs", _overlays(page)),
@@ -88,12 +93,7 @@ def build_page(page: CapturePage) -> str:
         ("Time", _rows([(name, f"{took:.1f} s") for name, took in page.seconds])),
     ]
     body = "\n".join(f"<section><h2>{escape(heading)}</h2>{content}</section>" for heading, content in sections)
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{title}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n<main>\n<h1>{title}</h1>\n{body}\n"
-        "</main>\n</body>\n</html>\n"
-    )
+    return html_page(page.title, f"<h1>{escape(page.title)}</h1>\n{body}", _STYLE)
 
 
 def _summary(page: CapturePage) -> str:
@@ -102,8 +102,8 @@ def _summary(page: CapturePage) -> str:
     rows = [
         ("Pairs found", str(pairs)),
         ("Frames in the scene", f"{registered} of {pairs}"),
-        ("Rig", "found from the images" if page.rig.determined else "not determined: the start value is kept"),
-        ("Drift and vignetting", "corrected" if page.drift.used else "not corrected"),
+        ("Rig", _rig_text(page.rig)),
+        ("Drift and vignetting", _drift_text(page.drift)),
         ("Scale", _scale_text(page)),
     ]
     if len(error):
@@ -111,9 +111,24 @@ def _summary(page: CapturePage) -> str:
     return _rows(rows)
 
 
+def _rig_text(rig: RigEstimate) -> str:
+    if not rig.determined:
+        return "not determined: the start value is kept, look at the pictures below before you trust it"
+    if not np.isfinite(rig.projection_sigma_px):
+        return "known"
+    return f"found from the images, a point's place is known to {rig.projection_sigma_px:.2f} thermal pixels"
+
+
+def _drift_text(drift: DriftEstimate) -> str:
+    if not (np.isfinite(drift.before_k) and np.isfinite(drift.after_k)):
+        return "corrected" if drift.used else "not corrected"
+    before = f"two frames of one point differ by {drift.before_k:.2f} K"
+    return f"corrected: {before} before, {drift.after_k:.2f} K after" if drift.used else f"not corrected: {before}"
+
+
 def _scale_text(page: CapturePage) -> str:
     if page.scale is None:
-        return f"unknown: {page.scale_missing}"
+        return f"unknown ({page.scale_missing}); give a length when you export the mesh, or areas and watts are missing"
     error = page.scale.standard_error
     plus = "" if error is None else f" ± {error:.2g} ({100 * error / page.scale.metres_per_unit:.1f} %)"
     return f"{page.scale.metres_per_unit:.5g}{plus} m per unit"
@@ -131,10 +146,16 @@ def _overlays(page: CapturePage) -> str:
     cells = "".join(
         f"<h3>{escape(one.name)}</h3><div class=three>"
         f"{_figure(one.start_url, 'start value')}{_figure(one.found_url, 'as written')}"
-        f"{_figure(one.thermal_url, 'thermal image')}</div>"
+        f"{_figure(one.thermal_url, _colours_text(one.shown_c))}</div>"
         for one in page.overlays
     )
     return f"<p>{escape(words)}</p>{cells}"
+
+
+def _colours_text(shown_c: tuple[float, float] | None) -> str:
+    if shown_c is None:
+        return "thermal image"
+    return f"thermal image: {shown_c[0]:.1f} °C and less are black, {shown_c[1]:.1f} °C and more are bright yellow"
 
 
 def _figure(url: str, words: str) -> str:
@@ -147,7 +168,8 @@ def _dropped(dropped: Mapping[str, str]) -> str:
     if not dropped:
         return "<p>Nothing: every file is in a pair and every pair has a pose.</p>"
     rows = "".join(f"<tr><td>{escape(name)}</td><td>{escape(why)}</td></tr>" for name, why in dropped.items())
-    return f"<table><thead><tr><th>file or frame</th><th>why</th></tr></thead><tbody>{rows}</tbody></table>"
+    head = "<tr><th>file or frame</th><th>why</th></tr>"
+    return scrolling(f"<table><thead>{head}</thead><tbody>{rows}</tbody></table>")
 
 
 def _cameras(page: CapturePage) -> str:
@@ -184,7 +206,8 @@ def _cameras(page: CapturePage) -> str:
         extra.append(("agreement of edges", f"{page.rig.score_before:.3f} before, {page.rig.score_after:.3f} after"))
     if np.isfinite(page.rig.projection_sigma_px):
         extra.append(("standard error of a point's place", f"{page.rig.projection_sigma_px:.2f} thermal pixels"))
-    return f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{rows}</tbody></table>{_rows(extra)}"
+    table = scrolling(f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{rows}</tbody></table>")
+    return table + _rows(extra)
 
 
 def _with_error(value: float, error: float) -> str:
@@ -209,18 +232,17 @@ def _poses(page: CapturePage) -> str:
             f"<tr><td>{escape(page.scene_names[index])}</td><td>{escape(name)}</td><td class=num>{len(own)}</td>"
             f"<td class=num>{median}</td></tr>"
         )
-    table = (
-        "<details><summary>Frame by frame</summary><table><thead><tr><th>in the scene</th><th>frame</th>"
-        "<th class=num>points</th><th class=num>median error, pixels</th></tr></thead><tbody>"
-        + "".join(rows)
-        + "</tbody></table></details>"
+    head = (
+        "<tr><th>in the scene</th><th>frame</th><th class=num>points</th><th class=num>median error, pixels</th></tr>"
     )
+    table = scrolling(f"<table><thead>{head}</thead><tbody>{''.join(rows)}</tbody></table>")
+    details = f"<details><summary>Frame by frame</summary>{table}</details>"
     figures = [
         ("source", page.poses_source),
         ("points", f"{len(page.model.points)}"),
         ("mean and median error", f"{error.mean():.2f} and {np.median(error):.2f} pixels"),
     ]
-    return _rows(figures) + chart + table
+    return _rows(figures) + chart + details
 
 
 def _scale(page: CapturePage) -> str:
@@ -228,8 +250,8 @@ def _scale(page: CapturePage) -> str:
     if page.scale is not None:
         rows.append(("from", page.scale.source))
     spread = "" if page.up.spread_deg is None else f" Single photographs differ by {page.up.spread_deg:.1f} degrees."
-    direction = ", ".join(f"{value:.3f}" for value in page.up.direction)
-    return _rows([*rows, ("up", f"({direction}). {page.up.source}{spread}")])
+    direction = ", ".join(f"{value + 0.0:.3f}" for value in np.round(page.up.direction, 3))
+    return _rows([*rows, ("up, as x, y, z", f"{direction}. {page.up.source}{spread}")])
 
 
 def _temperatures(page: CapturePage) -> str:
@@ -238,13 +260,15 @@ def _temperatures(page: CapturePage) -> str:
         return "<p>No thermal pixel has a temperature.</p>"
     low, high = (float(value) for value in np.percentile(values, _PERCENTILES))
     rows = [
+        *measurement_rows(page.frames),
         ("lowest, median, highest", f"{values.min():.1f}, {np.median(values):.1f}, {values.max():.1f} degrees C"),
         ("pixels without a temperature", f"{100 * page.masked_share:.2f} %"),
-        ("stuck pixels of the sensor", str(page.dead_pixels)),
+        ("stuck pixels of the sensor", str(page.dead_pixels) if len(page.frames) >= MIN_FRAMES else _TOO_FEW),
     ]
     if page.overlay_share is not None:
         rows.append(("photographs masked", f"{100 * page.overlay_share:.1f} %"))
-    return _rows(rows) + histogram(values, "temperature, degrees C", limits=(low, high))
+    label = "temperature, degrees C; how many pixels of a sample, without the coldest and hottest 0.1 %"
+    return _rows(rows) + histogram(values, label, limits=(low, high))
 
 
 def _drift(page: CapturePage) -> str:
@@ -264,39 +288,24 @@ def _pairs(page: CapturePage) -> str:
         f"<td>{escape(pair.how)}</td></tr>"
         for pair in page.pairs
     )
-    return (
-        "<details><summary>All pairs</summary><table><thead><tr><th>frame</th><th>photograph</th><th>thermal</th>"
-        f"<th>how</th></tr></thead><tbody>{rows}</tbody></table></details>"
-    )
+    head = "<tr><th>frame</th><th>photograph</th><th>thermal</th><th>how</th></tr>"
+    table = scrolling(f"<table><thead>{head}</thead><tbody>{rows}</tbody></table>")
+    return f"<details><summary>All pairs</summary>{table}</details>"
 
 
 def _rows(rows: Sequence[tuple[str, str]]) -> str:
     body = "".join(f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in rows)
-    return f"<table><tbody>{body}</tbody></table>"
+    return f"<div class=rows>{scrolling(f'<table><tbody>{body}</tbody></table>')}</div>"
 
 
 _STYLE = """
-:root { color-scheme: light; --ink: #1d2430; --soft: #5c6675; --line: #e1e5ea; --accent: #b3431e; }
-* { box-sizing: border-box; }
-body { margin: 0; background: #fff; color: var(--ink);
-  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; }
-main { max-width: 1150px; margin: 0 auto; padding: 2rem 1.25rem 4rem; }
-h1 { font-size: 1.8rem; margin: 0 0 .5rem; overflow-wrap: anywhere; }
-h2 { font-size: 1.2rem; margin: 2.2rem 0 .7rem; padding-bottom: .3rem; border-bottom: 2px solid var(--accent); }
-h3 { font-size: .85rem; font-weight: 600; color: var(--soft); margin: 1rem 0 .3rem; }
-table { border-collapse: collapse; width: 100%; max-width: 56rem; margin-bottom: .8rem; }
-th, td { text-align: left; padding: .35rem .75rem .35rem 0; border-bottom: 1px solid var(--line); vertical-align: top;
-  overflow-wrap: anywhere; }
-th { font-size: .85rem; font-weight: 600; color: var(--soft); }
-.num { text-align: right; font-variant-numeric: tabular-nums; }
-.three { display: grid; grid-template-columns: repeat(3, 1fr); gap: .6rem; align-items: start; }
-figure { margin: 0; }
-figcaption { font-size: .8rem; color: var(--soft); }
-img { display: block; width: 100%; height: auto; border-radius: 3px; }
-svg { display: block; width: 100%; max-width: 46rem; font-size: 11px; }
+.rows { max-width: 56rem; }
+.rows td:first-child { width: 17rem; }
+td { overflow-wrap: anywhere; }
+.three { display: grid; grid-template-columns: repeat(3, 1fr); gap: .6rem; align-items: start; break-inside: avoid; }
+svg { max-width: 46rem; font-size: 11px; }
 svg rect { fill: var(--accent); opacity: .8; }
 svg line { stroke: var(--soft); }
 svg text { fill: var(--soft); }
-summary { cursor: pointer; color: var(--soft); }
-@media (max-width: 640px) { .three { grid-template-columns: 1fr; } main { padding: 1.25rem .9rem 3rem; } }
+@media screen and (max-width: 640px) { .three { grid-template-columns: 1fr; } .rows td:first-child { width: 40%; } }
 """

@@ -77,7 +77,7 @@ def find_pairs(found: CameraFolder, options: PairOptions | None = None) -> PairS
     """
     options = options or PairOptions()
     pairs: list[tuple[CameraFile, CameraFile, str]] = []
-    unpaired: dict[Path, str] = {}
+    unpaired = dict(found.passed_over)
     both = [file for file in found.files if file.role == "both"]
     pairs += [(file, file, "both in one file") for file in both]
     photographs = [file for file in found.files if file.role == "photograph"]
@@ -215,16 +215,26 @@ def _groups(files: Iterable[CameraFile], key: Callable[[CameraFile], tuple]) -> 
 
 
 def _parted(group: list[CameraFile], folder: Path) -> list[list[CameraFile]]:
-    """Files of one name, by the folder they lie in where one name occurs in several places."""
-    photos = sum(file.role == "photograph" for file in group)
-    if photos <= 1 and sum(file.role == "thermal" for file in group) <= 1:
+    """Files of one name, by the folder they lie in and by capital letters where one name occurs more than once."""
+    if _one_of_each(group):
         return [group]
 
     def place(file: CameraFile) -> tuple[str, ...]:
         parents = file.path.relative_to(folder).parts[:-1]
         return tuple(word for part in parents for word in words_of(part) if word not in ROLE_WORDS)
 
-    return _groups(group, place)
+    def exact(file: CameraFile) -> tuple[str, ...]:
+        return tuple(word for word in re.split(r"[\W_]+", file.path.stem) if word.lower() not in ROLE_WORDS)
+
+    return [
+        part
+        for placed in _groups(group, place)
+        for part in ([placed] if _one_of_each(placed) else _groups(placed, exact))
+    ]
+
+
+def _one_of_each(group: list[CameraFile]) -> bool:
+    return all(sum(file.role == role for file in group) <= 1 for role in ("photograph", "thermal"))
 
 
 def _shot(stem: str) -> tuple[str, ...]:
@@ -286,21 +296,27 @@ def _names(photographs: Sequence[Path], folder: Path) -> list[str]:
         return re.sub(r"[^A-Za-z0-9._-]+", "_", text).strip("._-")[:100] or "frame"
 
     stems = [slug(_without_role(path.stem)) for path in photographs]
-    counted = Counter(stems)
+    counted = Counter(stem.lower() for stem in stems)
     longer = [
-        stem if counted[stem] == 1 else slug("-".join((*path.relative_to(folder).parts[:-1], _without_role(path.stem))))
+        stem
+        if counted[stem.lower()] == 1
+        else slug("-".join((*path.relative_to(folder).parts[:-1], _without_role(path.stem))))
         for stem, path in zip(stems, photographs)
     ]
-    seen: Counter[str] = Counter()
-    names = []
+    # Files are named by them, and some disks take A and a for one.
+    names, taken, used = [], set[str](), Counter[str]()
     for name in longer:
-        seen[name] += 1
-        names.append(name if seen[name] == 1 else f"{name}-{seen[name]}")
+        unique = name
+        while unique.lower() in taken:
+            used[name.lower()] += 1
+            unique = f"{name}-{used[name.lower()] + 1}"
+        taken.add(unique.lower())
+        names.append(unique)
     return names
 
 
 def _without_role(stem: str) -> str:
-    cut = re.split(r"([^A-Za-z0-9]+)", stem)
+    cut = re.split(r"([\W_]+)", stem)
     words = [word for word in cut[::2]]
     while len(words) > 1 and (words[-1].lower() in ROLE_WORDS or words[-1].lower() in _LAST_LETTERS):
         words.pop()

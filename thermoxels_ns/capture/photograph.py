@@ -13,12 +13,16 @@ from typing import Any
 
 from PIL import Image
 
+from thermoxels_ns.data.decoders import naming
 from thermoxels_ns.data.exif_facts import ExifFacts, read_exif_facts
 from thermoxels_ns.errors import SceneError, explain
 
 LARGEST_SIDE = 30000
 """Pixels along a side of a photograph that is believed; a header that claims more is damaged."""
-_LARGEST_PIXELS = 400_000_000
+_LARGEST_PIXELS = 178_956_970
+"""In all; Pillow opens no more."""
+_EXPECTED = "a photograph that can be decoded"
+_REMEDY = "The file is damaged; copy it from the camera again, or go on without it with --skip-bad True."
 _EXIF, _GPS = 34665, 34853
 _ORIENTATION, _SUBSECOND = 274, (37521, 37520)
 _FOCAL_MM, _FOCAL_35MM, _PLANE_X, _PLANE_UNIT = 37386, 41989, 41486, 41488
@@ -67,15 +71,12 @@ def read_photograph_facts(path: Path, content: bytes | None = None) -> Photograp
     Raises:
         SceneError: It is no picture that can be read, or a header claims an absurd size.
     """
-    try:
-        with Image.open(io.BytesIO(content) if content is not None else path) as image:
-            width, height = image.size
-            facts = read_exif_facts(image)
-            exif = image.getexif()
-            tags, gps = {**exif, **exif.get_ifd(_EXIF)}, exif.get_ifd(_GPS)
+    with naming(path, _EXPECTED, _REMEDY), Image.open(io.BytesIO(content) if content is not None else path) as image:
+        width, height = image.size
+        facts = read_exif_facts(image)
+        exif = image.getexif()
+        tags, gps = {**exif, **exif.get_ifd(_EXIF)}, exif.get_ifd(_GPS)
         head = content if content is not None else _head(path)
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as problem:
-        raise _unreadable(path, problem) from problem
     check_photograph_size(path, width, height)
     orientation = tags.get(_ORIENTATION, 1)
     return PhotographFacts(
@@ -84,7 +85,7 @@ def read_photograph_facts(path: Path, content: bytes | None = None) -> Photograp
         exif=facts,
         taken_at=_with_fraction(facts.taken_at, tags),
         focal_px=_focal_px(tags, width, height),
-        orientation=orientation if orientation in range(1, 9) else 1,
+        orientation=int(orientation) if orientation in range(1, 9) else 1,
         gps=_gps_fix(gps),
         gimbal_deg=_gimbal(head),
     )
@@ -109,25 +110,9 @@ def open_photograph(path: Path, content: bytes | None = None) -> Image.Image:
     Raises:
         SceneError: It is no picture, is cut off, or claims an absurd size.
     """
-    try:
-        with Image.open(io.BytesIO(content) if content is not None else path) as image:
-            check_photograph_size(path, *image.size)
-            return image.convert("RGB")
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as problem:
-        if isinstance(problem, SceneError):
-            raise
-        raise _unreadable(path, problem) from problem
-
-
-def _unreadable(path: Path, problem: Exception) -> SceneError:
-    return SceneError(
-        explain(
-            str(path),
-            expected="a photograph that can be decoded",
-            got=str(problem) or type(problem).__name__,
-            remedy="The file is damaged; copy it from the camera again, or go on without it with --skip-bad True.",
-        )
-    )
+    with naming(path, _EXPECTED, _REMEDY), Image.open(io.BytesIO(content) if content is not None else path) as image:
+        check_photograph_size(path, *image.size)
+        return image.convert("RGB")
 
 
 def _head(path: Path) -> bytes:

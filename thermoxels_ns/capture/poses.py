@@ -16,7 +16,7 @@ from thermoxels_ns.capture.colmap_model import model_of_colmap
 from thermoxels_ns.capture.contract import CameraModel
 from thermoxels_ns.capture.feature_matching import FeatureOptions, LensModel, Matching, fill_database, lens_parameters
 from thermoxels_ns.capture.masks import PhotographMasks
-from thermoxels_ns.capture.photograph import open_photograph
+from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
 from thermoxels_ns.capture.sfm_model import SfmModel
 from thermoxels_ns.errors import SceneError, explain
 
@@ -78,7 +78,9 @@ def find_poses(
         SceneError: Fewer than 3 photographs fit together, or a photograph cannot be decoded.
     """
     options = options or PoseOptions()
-    size, other = _common_size(photographs)
+    if len(photographs) < MIN_FRAMES:
+        raise _too_few(len(photographs), "photographs")
+    size, other = common_size(photographs)
     dropped = {
         name: f"{w} x {h} pixels, the others {size[0]} x {size[1]}: another camera or mode"
         for name, (w, h) in other.items()
@@ -132,13 +134,22 @@ def add_points(
         say: Told how far it is.
 
     Raises:
-        SceneError: The photographs are of another size than the camera's.
+        SceneError: There are fewer than two photographs, or they are of another size than the camera's.
     """
     import pycolmap
 
     options = options or PoseOptions()
     names = list(given.frames)
-    size, other = _common_size({name: photographs[name] for name in names})
+    if len(names) < 2:
+        raise SceneError(
+            explain(
+                "given poses",
+                expected="poses of at least 2 photographs, which see the same points",
+                got=len(names),
+                remedy="Give poses of more photographs, or let thermoxels capture find them.",
+            )
+        )
+    size, other = common_size({name: photographs[name] for name in names})
     if other or size != (given.camera.width, given.camera.height):
         raise SceneError(
             explain(
@@ -202,12 +213,16 @@ class _ReducedImages:
     camera_size: tuple[int, int]
 
 
-def _common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[str, tuple[int, int]]]:
-    """The size that most photographs have, and the frames of another size with theirs."""
+def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[str, tuple[int, int]]]:
+    """Find the size that most photographs have, and the frames of another size with theirs.
+
+    Raises:
+        SceneError: There is no photograph, or one cannot be read.
+    """
     sizes = {}
     for name, path in photographs.items():
-        with Image.open(path) as image:
-            sizes[name] = image.size
+        facts = read_photograph_facts(path)
+        sizes[name] = (facts.width, facts.height)
     if not sizes:
         raise _too_few(0, "photographs")
     counted = list(sizes.values())

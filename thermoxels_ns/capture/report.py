@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from thermoxels_ns.capture.camera_files import shown_name
 from thermoxels_ns.capture.contract import RigEstimate
 from thermoxels_ns.capture.frames import CaptureFrames
 from thermoxels_ns.capture.overlays import colours, data_url, overlay, spread_out
@@ -17,6 +18,8 @@ from thermoxels_ns.capture.rig_inputs import rig_frames
 from thermoxels_ns.capture.scene_writer import Scene, scene_names
 
 _SHOWN = 6
+_SHOWN_PERCENTILES = (2.0, 98.0)
+"""Of a thermal image's temperatures, for its darkest and brightest colours."""
 _SAMPLED_PIXELS = 4000
 """Of every thermal image, for the histogram."""
 
@@ -48,8 +51,11 @@ def report_page(findings: Findings, path: Path) -> None:
             data_url(overlay(paired[index], temperature_c, scene.model.camera, rig))
             for rig in (findings.start, scene.rig)
         ]
-        alone = data_url(colours(temperature_c).astype(np.uint8))
-        overlays.append(Overlay(f"{names[index]}: {scene.frames[index].photograph_source}", urls[0], urls[1], alone))
+        known = temperature_c[np.isfinite(temperature_c)]
+        low, high = (float(each) for each in np.percentile(known, _SHOWN_PERCENTILES)) if known.size else (0.0, 1.0)
+        alone = data_url(colours(temperature_c, (low, high)).astype(np.uint8))
+        title = f"{names[index]}: {scene.frames[index].photograph_source}"
+        overlays.append(Overlay(title, urls[0], urls[1], alone, (low, high) if known.size else None))
     samples, masked, pixels = [], 0, 0
     for index, frame in enumerate(scene.frames):
         temperature_c = scene.drift.corrected(index, np.load(frame.thermal)).ravel()
@@ -58,7 +64,7 @@ def report_page(findings: Findings, path: Path) -> None:
     drawn = scene.masks.overlay
     write_page(
         CapturePage(
-            title=f"Capture of {findings.source.resolve().name}",
+            title=f"Capture of {shown_name(findings.source.resolve())}",
             pairs=findings.pairs,
             dropped=findings.dropped,
             frames=scene.frames,

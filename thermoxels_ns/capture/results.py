@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from thermoxels_ns.capture.camera_files import shown_name
 from thermoxels_ns.capture.contract import CameraModel, DriftEstimate, RigEstimate
 from thermoxels_ns.capture.gravity import Up
 from thermoxels_ns.capture.metric_scale import MetricScale
@@ -30,7 +31,7 @@ def save_pairs(folder: Path, search: PairSearch, root: Path) -> None:
         }
         for pair in search.pairs
     ]
-    unpaired = {_name(path, real): why for path, why in search.unpaired.items()}
+    unpaired = {_name(path, root): why for path, why in search.unpaired.items()}
     write_json(folder / "pairs.json", {"pairs": rows, "unpaired": unpaired})
 
 
@@ -161,5 +162,5 @@ def _camera(numbers: list[float]) -> CameraModel:
 
 
 def _name(path: Path, root: Path) -> str:
-    real = path.resolve()
-    return real.relative_to(root).as_posix() if real.is_relative_to(root) else path.name
+    parts = path.relative_to(root).parts if path.is_relative_to(root) else (path.name,)
+    return "/".join(shown_name(Path(part)) for part in parts)

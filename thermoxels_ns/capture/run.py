@@ -11,12 +11,12 @@ import numpy as np
 from thermoxels_ns.capture import results
 from thermoxels_ns.capture.board_photos import board_of, in_scene_units, rig_from_board_photos
 from thermoxels_ns.capture.board_rig import CheckerBoard
-from thermoxels_ns.capture.camera_files import SUFFIXES, scan_folder
+from thermoxels_ns.capture.camera_files import SUFFIXES, files_below, scan_folder, shown_name
 from thermoxels_ns.capture.contract import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.drift import estimate_drift
 from thermoxels_ns.capture.frame_masks import find_masks, user_masks
 from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames
-from thermoxels_ns.capture.given_poses import in_order, read_given_poses
+from thermoxels_ns.capture.given_poses import fitted_to_photographs, in_order, read_given_poses
 from thermoxels_ns.capture.gravity import Up, find_up, level_rotation
 from thermoxels_ns.capture.masks import PhotographMasks, mask_files
 from thermoxels_ns.capture.metric_scale import (
@@ -26,17 +26,19 @@ from thermoxels_ns.capture.metric_scale import (
     scale_from_gps,
     scale_from_markers,
 )
+from thermoxels_ns.capture.no_pairs import no_pairs
 from thermoxels_ns.capture.pairs import Pair, PairOptions, find_pairs, read_pair_list
 from thermoxels_ns.capture.poses import PoseOptions, add_points, find_poses
 from thermoxels_ns.capture.report import Findings, report_page
 from thermoxels_ns.capture.rig import estimate_rig
 from thermoxels_ns.capture.rig_inputs import kept_start, read_rig, rig_frames, rig_start
-from thermoxels_ns.capture.scene_writer import JSON_NAME, Scene, write_scene_folder
+from thermoxels_ns.capture.scene_writer import JSON_NAME, POINTS_NAME, Scene, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm_model import SfmModel
 from thermoxels_ns.capture.stages import CACHE_FOLDER, StageCache, fingerprint, prepare_output, read_json, write_json
+from thermoxels_ns.checks import remove_stale_temporaries
 from thermoxels_ns.data.radiometry import RadiometryOptions
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.errors import OutputError, SceneError, ThermoxelsError, explain
 
 PAGE_NAME = "capture.html"
 _MOST_NAMED = 10
@@ -81,11 +83,11 @@ def run_capture(
     """
     if not source.is_dir():
         scan_folder(source)  # says what is wrong
-    if output.resolve() == source.resolve():
+    if source.resolve().is_relative_to(output.resolve()):
         raise SceneError(
             explain(
                 "output",
-                expected="another folder than the input",
+                expected="another folder than the input, which does not hold it either",
                 got=output,
                 remedy="Pass a new folder with --output; the camera's files stay as they are.",
             )
@@ -94,7 +96,20 @@ def run_capture(
     if settings.board_photos is not None and not settings.board_photos.is_dir():
         scan_folder(settings.board_photos)
     folder = prepare_output(output)
-    return _Run(source, folder, settings, StageCache(folder, settings.from_stage, say), say, board).all()
+    remove_stale_temporaries(folder, [PAGE_NAME])
+    try:
+        return _Run(source, folder, settings, StageCache(folder, settings.from_stage, say), say, board).all()
+    except ThermoxelsError:
+        raise
+    except OSError as problem:
+        raise OutputError(
+            explain(
+                str(problem.filename2 or problem.filename or folder),
+                expected="a file that can be read or written",
+                got=problem.strerror or str(problem),
+                remedy="Check free space and permissions, and run the command again: finished stages are kept.",
+            )
+        ) from problem
 
 
 @dataclass
@@ -119,7 +134,7 @@ class _Run:
         rig, start = self.find_rig(model, frames, read, scale, missing, board)
         drift = self.find_drift(model, frames, rig)
         scene = Scene(frames, model, rig, drift, scale, up, self.masks(frames, model))
-        written = [self.output / name for name in (JSON_NAME, "images", "thermal")]
+        written = [self.output / name for name in (JSON_NAME, POINTS_NAME, "images", "thermal", "masks")]
         self.cache.run("scene", {}, lambda _: self._write_scene(scene), written)
         findings = Findings(
             source=self.source,
@@ -142,41 +157,35 @@ class _Run:
         settings = self.settings
         options = PairOptions(settings.time_limit_s, settings.clock_offset_s)
         listed = [] if settings.pairs is None else [settings.pairs]
-        inside = [path for path in self.source.rglob("*") if path.is_file() and path.suffix.lower() in SUFFIXES]
-        inside = [path for path in inside if not path.resolve().is_relative_to(self.output.resolve())]
+        inside, passed_over = files_below(self.source, [self.output])
+        if settings.pairs is None:
+            inside = [path for path in inside if path.suffix.lower() in SUFFIXES]
         depends = {
             "options": options,
             "files": fingerprint(inside, self.source),
+            "passed_over": sorted(map(str, passed_over)),
             "list": _fingerprints(listed),
             "skip_bad": settings.skip_bad,
         }
 
         def work(folder: Path) -> None:
+            unreadable: dict[Path, str] = {}
             if settings.pairs is not None:
-                search, unreadable = read_pair_list(settings.pairs, self.source), {}
+                search = read_pair_list(settings.pairs, self.source)
             else:
                 found = scan_folder(self.source, [self.output], self.say)
                 search, unreadable = find_pairs(found, options), found.unreadable
-            if unreadable and not settings.skip_bad:
-                first = next(iter(unreadable.values()))
-                more = f" {len(unreadable) - 1} more cannot be read." if len(unreadable) > 1 else ""
-                raise SceneError(f"{first}{more} To go on without such files, pass --skip-bad True.")
+                if unreadable and not settings.skip_bad:
+                    first = next(iter(unreadable.values()))
+                    more = f" {len(unreadable) - 1} more cannot be read." if len(unreadable) > 1 else ""
+                    remedy = "" if "--skip-bad" in first else " To go on without such files, pass --skip-bad True."
+                    raise SceneError(f"{first}{more}{remedy}")
+                if not search.pairs:
+                    raise no_pairs(found, search.unpaired, settings.dji_library is not None)
             results.save_pairs(folder, search, self.source)
-            write_json(folder / "unreadable.json", {path.name: why for path, why in unreadable.items()})
-            if not search.pairs:
-                example = next(iter(search.unpaired.items()), None)
-                got = "no camera files" if example is None else f"none; {Path(example[0]).name}: {example[1]}"
-                raise SceneError(
-                    explain(
-                        str(self.source),
-                        expected="photographs with thermal images",
-                        got=got,
-                        remedy="Give both of a shot the same name or time, or list them in a file with --pairs.",
-                    )
-                )
+            write_json(folder / "unreadable.json", {shown_name(path): why for path, why in unreadable.items()})
             self.say(f"pairs: {len(search.pairs)}, files without a partner: {len(search.unpaired)}")
-            left_out = [(path.name, why) for path, why in unreadable.items()]
-            left_out += [(Path(name).name, why) for name, why in search.unpaired.items()]
+            left_out = [(shown_name(path), why) for path, why in (unreadable | search.unpaired).items()]
             for name, why in left_out[:_MOST_NAMED]:
                 self.say(f"left out: {name}: {why}")
             if len(left_out) > _MOST_NAMED:
@@ -190,7 +199,13 @@ class _Run:
     def read_temperatures(self, pairs: tuple[Pair, ...]) -> CaptureFrames:
         settings = self.settings
         options = self.radiometry()
-        depends = {"options": options, "skip_bad": settings.skip_bad, "mask": _fingerprints([settings.thermal_mask])}
+        library = settings.dji_library if settings.dji_library and settings.dji_library.is_file() else None
+        depends = {
+            "options": options,
+            "library": _fingerprints([library]),
+            "skip_bad": settings.skip_bad,
+            "mask": _fingerprints([settings.thermal_mask]),
+        }
 
         def work(folder: Path) -> None:
             read = read_frames(pairs, self.source, folder, options, settings.skip_bad, settings.thermal_mask, self.say)
@@ -227,11 +242,11 @@ class _Run:
             settings.seed,
             settings.threads,
         )
-        given = [] if settings.poses is None else _files_of(settings.poses)
+        files = [] if settings.poses is None else _files_of(settings.poses)
         user = [] if settings.masks is None else list(mask_files(settings.masks).values())
         depends = {
             "options": options,
-            "poses": _fingerprints(given),
+            "poses": _fingerprints(files),
             "masks": _fingerprints(user),
             "overlays": settings.find_overlays,
         }
@@ -250,7 +265,8 @@ class _Run:
                 order = {name: number for number, name in enumerate(photographs)}
                 model = in_order(poses.model, lambda name: order[name])
             else:
-                poses = read_given_poses(settings.poses, {f.name: f.photograph_source for f in read.frames})
+                given = read_given_poses(settings.poses, {f.name: f.photograph_source for f in read.frames})
+                poses = fitted_to_photographs(given, photographs)
                 model = poses.model
                 if not len(model.points):
                     model = add_points(model, photographs, folder, masks, options, self.say)

@@ -23,7 +23,7 @@ from thermoxels_ns.capture.stages import CACHE_FOLDER, write_json
 from thermoxels_ns.checks import remove_file, replace_when_done, writable_folder
 
 JSON_NAME = "transforms.json"
-_POINTS_NAME = "sparse_points.ply"
+POINTS_NAME = "sparse_points.ply"
 _FOLDERS = ("images", "thermal", "masks")
 _COPIED = {"JPEG": ".jpg", "PNG": ".png"}
 _MOST_POINT_ERROR_PX = 2.0
@@ -81,14 +81,14 @@ def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = 
         entries.append(_write_frame(scene, number, frame, name, new))
         if (number + 1) % 20 == 0:
             say(f"scene: {number + 1} of {len(scene.frames)} frames")
-    write_points(new / _POINTS_NAME, *_good_points(scene.model))
+    write_points(new / POINTS_NAME, *_good_points(scene.model))
     write_json(new / JSON_NAME, _content(scene, entries))
     remove_file(output / JSON_NAME)
     for name in _FOLDERS:
         shutil.rmtree(output / name, ignore_errors=True)
         if (new / name).is_dir():
             (new / name).rename(output / name)
-    for name in (_POINTS_NAME, JSON_NAME):
+    for name in (POINTS_NAME, JSON_NAME):
         (new / name).replace(output / name)
     shutil.rmtree(new, ignore_errors=True)
     return output / JSON_NAME
@@ -170,7 +170,7 @@ def _content(scene: Scene, entries: list[dict[str, Any]]) -> dict[str, Any]:
         },
     }
     if len(scene.model.points):
-        content["ply_file_path"] = _POINTS_NAME
+        content["ply_file_path"] = POINTS_NAME
     if scene.scale is not None:
         content["metres_per_unit"] = scene.scale.metres_per_unit
         if scene.scale.standard_error is not None:

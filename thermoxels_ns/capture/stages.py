@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from thermoxels_ns import __version__
-from thermoxels_ns.checks import replace_when_done, writable_folder
+from thermoxels_ns.checks import remove_file, replace_when_done, writable_folder
 from thermoxels_ns.errors import OutputError, ThermoxelsError, explain
 
 StageName = Literal["pairs", "temperatures", "poses", "scale", "board", "rig", "drift", "scene", "page"]
@@ -54,10 +54,14 @@ class StageCache:
             depends_on: Everything but the earlier stages that its result depends on; json must be able to hold it.
             work: Writes the result into the folder that it is given; that may hold what an interrupted run with the
                 same key left.
-            writes: Files that the stage writes elsewhere; where one is gone, the stage runs again.
+            writes: Files and folders that the stage writes elsewhere; where one of them, or a file in one, is gone or
+                has another size than the stage gave it, the stage runs again.
 
         Returns:
             The folder with the result.
+
+        Raises:
+            OutputError: An earlier result cannot be removed, or the new one cannot be written.
         """
         content = json.dumps([__version__, name, self._previous, depends_on], sort_keys=True, default=str)
         key = hashlib.sha256(content.encode()).hexdigest()
@@ -66,22 +70,24 @@ class StageCache:
         forced = self.from_stage is not None and STAGES.index(name) >= STAGES.index(self.from_stage)
         title = f"{STAGES.index(name) + 1}/{len(STAGES)} {name}"
         stale = forced or _read_key(folder) != key
-        done = None if stale or not all(path.exists() for path in writes) else _read_done(folder)
+        done = None if stale else _read_done(folder, self.folder, writes)
         if done is not None:
             self.say(f"{title}: as before")
             self.seconds.append((name, done))
             return folder
+        remove_file(folder / _DONE_FILE)
         if stale:
-            shutil.rmtree(folder, ignore_errors=True)
+            # The key goes before the files: whoever is killed between them leaves nothing that is taken for whole.
+            remove_file(folder / _KEY_FILE)
+            _remove_folder(folder)
         writable_folder(folder)
-        (folder / _DONE_FILE).unlink(missing_ok=True)
-        (folder / _KEY_FILE).write_text(key, encoding="utf-8")
+        with replace_when_done(folder / _KEY_FILE) as temporary:
+            temporary.write_text(key, encoding="utf-8")
         self.say(title)
         start = time.monotonic()
         work(folder)
         took = time.monotonic() - start
-        with replace_when_done(folder / _DONE_FILE) as temporary:
-            temporary.write_text(json.dumps({"seconds": took}), encoding="utf-8")
+        write_json(folder / _DONE_FILE, {"seconds": took, "written": _sizes(self.folder, writes)})
         self.seconds.append((name, took))
         return folder
 
@@ -123,20 +129,21 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read json that a stage wrote.
+    """Read json that a stage wrote or that the user gives.
 
     Raises:
         ThermoxelsError: The file is missing or damaged.
     """
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as problem:
+    except (OSError, ValueError, RecursionError) as problem:
+        own = CACHE_FOLDER in path.parts
         raise ThermoxelsError(
             explain(
                 str(path),
-                expected="what an earlier stage of the capture wrote",
+                expected="what an earlier stage of the capture wrote" if own else "a file of json",
                 got=str(problem),
-                remedy="Run it again with --from-stage pairs.",
+                remedy="Run it again with --from-stage pairs." if own else "Write it again, or pass another file.",
             )
         ) from problem
 
@@ -148,8 +155,33 @@ def _read_key(folder: Path) -> str | None:
         return None
 
 
-def _read_done(folder: Path) -> float | None:
+def _read_done(folder: Path, output: Path, writes: Sequence[Path]) -> float | None:
+    """Seconds that a stage took; None where it did not end, or where what it wrote elsewhere is no longer whole."""
     try:
-        return float(json.loads((folder / _DONE_FILE).read_text(encoding="utf-8"))["seconds"])
+        done = json.loads((folder / _DONE_FILE).read_text(encoding="utf-8"))
+        seconds = float(done["seconds"])
+        return seconds if done["written"] == _sizes(output, writes) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
+
+
+def _sizes(output: Path, writes: Sequence[Path]) -> dict[str, int]:
+    """Bytes of every file that a stage wrote, by its name in the output folder."""
+    files = [each for path in writes for each in ([path] if path.is_file() else path.rglob("*")) if each.is_file()]
+    return {path.relative_to(output).as_posix(): path.stat().st_size for path in sorted(files)}
+
+
+def _remove_folder(folder: Path) -> None:
+    try:
+        shutil.rmtree(folder)
+    except FileNotFoundError:
+        pass
+    except OSError as problem:
+        raise OutputError(
+            explain(
+                str(folder),
+                expected="an earlier result of the capture, which can be removed",
+                got=problem.strerror or str(problem),
+                remedy="Remove the folder by hand, or choose another one with --output.",
+            )
+        ) from problem

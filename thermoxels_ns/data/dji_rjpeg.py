@@ -17,8 +17,9 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from thermoxels_ns.data.decoders import naming
 from thermoxels_ns.data.exif_facts import ExifFacts, read_exif_facts
-from thermoxels_ns.data.jpeg_segments import APP1, APP3, JPEG_START, DamagedJpegError, jpeg_segments
+from thermoxels_ns.data.jpeg_segments import APP1, APP3, JPEG_START, DamagedJpegError, check_jpeg, jpeg_segments
 from thermoxels_ns.data.radiometric_conditions import ConditionOverrides, Conditions
 from thermoxels_ns.data.thermal_size import check_thermal_size
 from thermoxels_ns.errors import ThermalFileError, ThermoxelsError, explain
@@ -90,8 +91,21 @@ def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrid
         overrides: Measurement parameters that replace the file's.
 
     Raises:
-        ThermalFileError: There is no library, it is another one, or it refuses the file or the parameters.
+        ThermalFileError: The file is cut off; there is no library, it is another one, or it refuses the file or the
+            parameters.
     """
+    content = path.read_bytes()
+    try:
+        check_jpeg(content)  # before a library in another language takes it
+    except DamagedJpegError as problem:
+        raise ThermalFileError(
+            explain(
+                str(path),
+                expected="a whole DJI R-JPEG, as the drone wrote it",
+                got=str(problem),
+                remedy="Copy the file from the drone again.",
+            )
+        ) from problem
     if library is None:
         raise ThermalFileError(
             explain(
@@ -102,7 +116,6 @@ def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrid
             )
         )
     dirp = _load(library)
-    content = path.read_bytes()
     data = (ctypes.c_uint8 * len(content)).from_buffer_copy(content)
     handle = ctypes.c_void_p()
 
@@ -171,7 +184,10 @@ def _measure(path: Path, call: Callable[..., None], handle: ctypes.c_void_p, ove
     temperature_c = np.full((size.height, size.width), np.nan, dtype=np.float32)
     pointer = temperature_c.ctypes.data_as(ctypes.POINTER(ctypes.c_float))
     call("dirp_measure_ex", handle, pointer, ctypes.c_int32(temperature_c.nbytes))
-    with Image.open(path, formats=("JPEG", "MPO")) as image:
+    with (
+        naming(path, "a JPEG with readable tags", error=ThermalFileError),
+        Image.open(path, formats=("JPEG", "MPO")) as image,
+    ):
         return DjiImage(temperature_c, before, after, read_exif_facts(image))
 
 

@@ -29,6 +29,8 @@ RAW_DATA, EMBEDDED_PICTURE, CAMERA_INFO, PICTURE_IN_PICTURE = 0x01, 0x0E, 0x20, 
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _IMAGE_HEADER_BYTES = 32
 _MOST_RECORDS = 1000
+_MOST_PIXELS = 2**24
+"""Counts of an R-JPEG: several times its largest images. A PNG of zeros, which is small, can claim far more."""
 
 
 class DamagedRecordError(ValueError):
@@ -96,8 +98,8 @@ class CameraInfo:
     taken_at: datetime | None
 
 
-def fff_records(fff: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield type and content of every record that an FFF block lists.
+def fff_records(fff: bytes) -> Iterator[tuple[int, memoryview]]:
+    """Yield type and content of every record that an FFF block lists; the content is a view into the block.
 
     Raises:
         DamagedRecordError: The block or a record of it is cut off.
@@ -120,7 +122,7 @@ def fff_records(fff: bytes) -> Iterator[tuple[int, bytes]]:
             raise DamagedRecordError(
                 f"record {number} (type {kind:#04x}) up to byte {offset + length} of {len(fff)}: the file is cut off"
             )
-        yield kind, fff[offset : offset + length]
+        yield kind, memoryview(fff)[offset : offset + length]
 
 
 def read_counts(path: Path, content: bytes) -> npt.NDArray[np.uint16]:
@@ -136,6 +138,8 @@ def read_counts(path: Path, content: bytes) -> npt.NDArray[np.uint16]:
     record = Record(content, "raw data")
     width, height = (int(number) for number in record.numbers(2, "HH"))
     check_thermal_size(path, width, height)
+    if width * height > _MOST_PIXELS:
+        raise DamagedRecordError(f"{width} x {height} counts, more than {_MOST_PIXELS}")
     data = content[_IMAGE_HEADER_BYTES:]
     if not data.startswith(_PNG_START):
         if len(data) < 2 * width * height:

@@ -32,6 +32,7 @@ from thermoxels_ns.data.radiometric_conditions import Conditions
 from thermoxels_ns.data.radiometric_model import RadiometricModel
 from thermoxels_ns.errors import ThermalFileError, explain
 
+_WANTED = (RAW_DATA, CAMERA_INFO, PICTURE_IN_PICTURE, EMBEDDED_PICTURE)
 _FLIR_MARK = b"FLIR\0"
 _FLIR_HEADER_BYTES = 8
 _FIRST_SEGMENT = re.compile(rb"\xff\xe1..FLIR\0", re.DOTALL)
@@ -86,7 +87,9 @@ def read_flir_jpeg(path: Path) -> FlirImage:
     try:
         records = dict[int, bytes]()
         for kind, content in fff_records(_flir_block(path.read_bytes())):
-            records.setdefault(kind, content)
+            # Records may overlap: a thousand of them that each claim the whole block are not copied.
+            if kind in _WANTED and kind not in records:
+                records[kind] = bytes(content)
         for kind, name in ((RAW_DATA, "raw counts"), (CAMERA_INFO, "calibration")):
             if kind not in records:
                 raise DamagedRecordError(f"no record with {name}")

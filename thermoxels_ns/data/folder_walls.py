@@ -6,6 +6,9 @@ from pathlib import Path, PureWindowsPath
 
 from thermoxels_ns.errors import SceneError, explain
 
+_SHOWN = 200
+"""Letters of a name that a message repeats."""
+
 
 def path_inside(folder: Path, name: str, where: str) -> Path:
     """Turn a file name found in a json or in metadata into a path inside a folder.
@@ -31,10 +34,15 @@ def path_inside(folder: Path, name: str, where: str) -> Path:
     elif ".." in windows.parts:
         got = f"{name!r}, which climbs out"
     else:
-        path = (root / Path(*windows.parts)).resolve()
-        if path.is_relative_to(root):
-            return path
-        got = f"{name!r}, a link to {path}"
+        try:
+            path = (root / Path(*windows.parts)).resolve()
+            path.exists()
+        except (OSError, RuntimeError) as problem:  # a link to itself, or a name longer than names can be
+            got = f"{name[:_SHOWN]!r} ({problem.strerror if isinstance(problem, OSError) else 'a link to itself'})"
+        else:
+            if path.is_relative_to(root):
+                return path
+            got = f"{name!r}, a link to {path}"
     raise SceneError(
         explain(
             where,

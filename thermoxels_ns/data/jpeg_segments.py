@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 JPEG_START = b"\xff\xd8\xff"
 APP1, APP3 = 0xE1, 0xE3
 _START_OF_SCAN, _END_OF_IMAGE, _FILL = 0xDA, 0xD9, 0xFF
+_FILL_BYTES = re.compile(rb"\xff+")
 
 
 class DamagedJpegError(ValueError):
@@ -28,7 +30,8 @@ def jpeg_segments(content: bytes) -> Iterator[tuple[int, bytes]]:
             raise DamagedJpegError(f"no marker at byte {at}")
         marker = content[at + 1]
         if marker == _FILL:
-            at += 1
+            # Any number of fill bytes may stand before a marker; the last of them begins it.
+            at = _FILL_BYTES.match(content, at).end() - 1  # type: ignore[union-attr]
             continue
         if marker == _START_OF_SCAN:
             # The last one ends the picture; those of thumbnails lie in segments before it.
@@ -41,3 +44,9 @@ def jpeg_segments(content: bytes) -> Iterator[tuple[int, bytes]]:
         yield marker, content[at + 4 : end]
         at = end
     raise DamagedJpegError(f"no picture in {len(content)} bytes: the file is cut off")
+
+
+def check_jpeg(content: bytes) -> None:
+    """Raise a `DamagedJpegError` if a JPEG's segments are not whole or no picture comes after them."""
+    for _ in jpeg_segments(content):
+        pass

@@ -73,7 +73,7 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
     values = {**meta, **entry}
     remedy = "Correct the json."
     model = values.get("camera_model", "OPENCV")
-    camera_type = CAMERA_MODEL_TO_TYPE.get(model)
+    camera_type = CAMERA_MODEL_TO_TYPE.get(model) if isinstance(model, str) else None
     if camera_type not in _CENTRAL:
         raise SceneError(
             explain(
@@ -97,7 +97,7 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
         raise SceneError(
             explain(where, expected="intrinsics fl_x, fl_y, cx, cy, w, h", got=f"no {problem.args[0]}", remedy=remedy)
         ) from problem
-    except (TypeError, ValueError) as problem:
+    except (TypeError, ValueError, OverflowError) as problem:
         raise SceneError(explain(where, expected="numbers as intrinsics", got=problem, remedy=remedy)) from problem
     good = np.isfinite((*focal, *distortion)).all() and len(distortion) == 6 and min(width, height) > 0
     if not good or min(focal[:2]) <= 0:

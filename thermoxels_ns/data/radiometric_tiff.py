@@ -8,6 +8,7 @@ from typing import Any
 
 from PIL import Image
 
+from thermoxels_ns.data.decoders import naming
 from thermoxels_ns.data.exif_facts import ExifFacts, read_exif_facts
 from thermoxels_ns.data.thermal_cameras import COUNT_SCALES, CameraName, known_cameras, recognised_camera
 from thermoxels_ns.data.thermal_files import ThermalImage, ThermalUnit, read_thermal_file
@@ -47,21 +48,12 @@ def read_count_image(
     Raises:
         ThermalFileError: The file is damaged, too large, of 8 bits or in colour, or its counts have no known unit.
     """
-    try:
-        with Image.open(path, formats=("TIFF", "PNG")) as image:
-            check_thermal_size(path, *image.size)
-            mode, depth, exif = image.mode, _depth(image), read_exif_facts(image)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as problem:
-        if isinstance(problem, ThermalFileError):
-            raise
-        raise ThermalFileError(
-            explain(
-                str(path),
-                expected="a readable TIFF or PNG",
-                got=str(problem) or type(problem).__name__,
-                remedy="The file is damaged; copy it from the camera again.",
-            )
-        ) from problem
+    with (
+        naming(path, "a readable TIFF or PNG", error=ThermalFileError),
+        Image.open(path, formats=("TIFF", "PNG")) as image,
+    ):
+        check_thermal_size(path, *image.size)
+        mode, depth, exif = image.mode, _depth(image), read_exif_facts(image)
     if mode != "F" and mode not in _COUNT_MODES:
         raise ThermalFileError(
             explain(

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from thermoxels_ns.data.dji_rjpeg import is_dji_rjpeg, read_dji_rjpeg
 from thermoxels_ns.data.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
-from thermoxels_ns.data.jpeg_segments import JPEG_START
+from thermoxels_ns.data.jpeg_segments import JPEG_START, DamagedJpegError, check_jpeg
 from thermoxels_ns.data.radiometric_conditions import ConditionOverrides, Conditions
 from thermoxels_ns.data.radiometric_model import corrected_temperature_c
 from thermoxels_ns.data.radiometric_tiff import read_count_image
@@ -150,8 +150,20 @@ def detect_format(path: Path) -> ThermogramFormat:
 def _jpeg_format(path: Path) -> ThermogramFormat:
     if is_flir_jpeg(path):
         return "FLIR R-JPEG"
-    if is_dji_rjpeg(path.read_bytes()):
+    content = path.read_bytes()
+    if is_dji_rjpeg(content):
         return "DJI R-JPEG"
+    try:
+        check_jpeg(content)
+    except DamagedJpegError as problem:
+        raise ThermalFileError(
+            explain(
+                str(path),
+                expected="a whole radiometric JPEG",
+                got=str(problem),
+                remedy="Copy the file from the camera again.",
+            )
+        ) from problem
     raise ThermalFileError(
         explain(
             str(path),

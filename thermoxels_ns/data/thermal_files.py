@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from thermoxels_ns.data.decoders import quiet_decoders
 from thermoxels_ns.data.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
 from thermoxels_ns.data.thermal_size import check_thermal_size
 from thermoxels_ns.errors import ThermalFileError, explain
@@ -155,7 +156,8 @@ def read_thermal_file(
     """
     suffix = (suffix or path.suffix).lower()
     try:
-        raw = _read_raw(path, suffix)
+        with quiet_decoders():
+            raw = _read_raw(path, suffix)
     except ThermalFileError:
         raise
     except Exception as problem:  # decoders raise OSError, SyntaxError, ValueError, struct.error, EOFError, ...

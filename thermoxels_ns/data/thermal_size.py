@@ -40,7 +40,7 @@ def check_file_size(path: Path) -> None:
         raise ThermalFileError(
             explain(
                 str(path),
-                expected="a thermal file",
+                expected="a camera file",
                 got="a file of zero bytes",
                 remedy="Copy it from the camera again, or remove it.",
             )

@@ -12,6 +12,8 @@ from thermoxels_ns.data.thermal_size import check_thermal_size
 from thermoxels_ns.errors import ThermalFileError, explain
 
 NPY_START = b"\x93NUMPY"
+_LONGEST_LINE = 2**20
+"""More characters in a line are no row of a thermal image: 8192 numbers of 30 characters are a quarter of it."""
 _NUMBERS = re.compile(rb"(?:\xef\xbb\xbf)?[-+0-9.,;eE\s\"]|nan|na|n/a|null|none", re.IGNORECASE)
 _TEXT = re.compile(rb"[\t\n\r -~\xef\xbb\xbf]*")
 
@@ -31,9 +33,20 @@ def read_csv(path: Path, valid_range_c: tuple[float, float]) -> ThermalImage:
     Raises:
         ThermalFileError: The table is larger than a thermal image, its rows differ in length, or a cell is no number.
     """
-    with path.open("rb") as stream:
-        first = stream.readline(2**20)
-    check_thermal_size(path, 1 + max(first.count(b","), first.count(b";")), 1)
+    width = height = 0
+    with path.open(encoding="latin-1") as stream:  # counts alone: the reader below knows the file's own encoding
+        while line := stream.readline(_LONGEST_LINE):
+            width, height = max(width, 1 + max(line.count(","), line.count(";"))), height + 1
+            if len(line) == _LONGEST_LINE:
+                raise ThermalFileError(
+                    explain(
+                        str(path),
+                        expected=f"a table with lines below {_LONGEST_LINE} characters",
+                        got=f"a longer one, line {height}",
+                        remedy="The file is damaged or no table; write one row of the image per line.",
+                    )
+                )
+            check_thermal_size(path, width, height)
     return read_thermal_file(path, ThermalUnit.celsius(), valid_range_c, suffix=".csv")
 
 

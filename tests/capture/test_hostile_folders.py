@@ -1,0 +1,232 @@
+"""Folders as they are not meant to be: strange names, links, shut folders, pipes, and none that belongs together."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.capture.camera_card import counts, photograph
+from tests.data.flir_file import picture_bytes, segment
+from thermoxels_ns.capture.camera_files import files_below, natural_key, scan_folder, shown_name
+from thermoxels_ns.capture.pairs import find_pairs
+from thermoxels_ns.capture.results import load_pairs, save_pairs
+from thermoxels_ns.capture.run import run_capture
+from thermoxels_ns.capture.settings import CaptureSettings
+from thermoxels_ns.errors import OutputError, SceneError, ThermoxelsError
+
+
+def dji_thermal(path: Path) -> Path:
+    """What tells DJI's R-JPEG: its name in the first segment and counts in the third kind."""
+    plain = picture_bytes()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(plain[:2] + segment(0xE1, b"DJI") + segment(0xE3, bytes(24)) + plain[2:])
+    return path
+
+
+def capture(card: Path, **more: object) -> None:
+    run_capture(card, card.parent / "scene", CaptureSettings(**more))  # type: ignore[arg-type]
+
+
+def no_pairs_said(card: Path, **more: object) -> str:
+    with pytest.raises(SceneError) as caught:
+        capture(card, **more)
+    return str(caught.value)
+
+
+def test_a_folder_without_camera_files_says_what_is_in_it(tmp_path):
+    card = tmp_path / "card"
+    card.mkdir()
+    (card / "film.mp4").write_bytes(b"1")
+    said = no_pairs_said(card)
+    assert "no photographs, no thermal images, 1 file of other kinds" in said and "memory card" in said
+
+
+def test_photographs_alone_lack_the_thermal_files(tmp_path):
+    for number in range(3):
+        photograph(tmp_path / "card" / f"a{number}.jpg")
+    said = no_pairs_said(tmp_path / "card")
+    assert "3 photographs, no thermal images" in said and "Copy the thermal files as the camera wrote them" in said
+
+
+def test_pictures_for_the_eye_alone_have_no_temperatures(tmp_path):
+    for number in range(2):
+        photograph(tmp_path / "card" / f"{number}-thermal.jpg")
+    said = no_pairs_said(tmp_path / "card")
+    assert "2 pictures for the eye, named thermal, without temperatures" in said
+    assert "Copy the thermal files as the camera wrote them" in said
+
+
+def test_thermal_files_alone_lack_the_photographs(tmp_path):
+    counts(tmp_path / "card" / "a.tiff")
+    said = no_pairs_said(tmp_path / "card")
+    assert "no photographs, 1 thermal image (a.tiff" in said and "Copy the photographs" in said and "DJI" not in said
+
+
+def test_a_lone_dji_file_lacks_its_partner_and_djis_library(tmp_path):
+    dji_thermal(tmp_path / "card" / "DJI_0001_T.JPG")
+    said = no_pairs_said(tmp_path / "card")
+    for words in ("DJI_0001_T.JPG: no partner", "_V or _W in place of _T", "--dji-library"):
+        assert words in said
+    assert "--dji-library" not in no_pairs_said(tmp_path / "card", dji_library=tmp_path / "libdirp.so")
+
+
+def test_photographs_and_thermal_files_of_other_shots_are_to_be_paired_by_hand(tmp_path):
+    photograph(tmp_path / "card" / "a.jpg")
+    counts(tmp_path / "card" / "b.tiff")
+    said = no_pairs_said(tmp_path / "card")
+    assert "1 photograph, 1 thermal image" in said and "--pairs" in said and "--clock-offset-s" in said
+
+
+def test_one_pair_is_too_few_for_poses(tmp_path):
+    photograph(tmp_path / "card" / "a-visible.jpg")
+    counts(tmp_path / "card" / "a-radiometric.tiff")
+    with pytest.raises(SceneError, match=r"at least 3 photographs, got 1\..*--poses"):
+        capture(tmp_path / "card")
+
+
+def test_what_is_not_looked_at_is_named(tmp_path):
+    card, outside = tmp_path / "card", tmp_path / "outside"
+    photograph(outside / "a-visible.jpg")
+    counts(card / "a-radiometric.tiff")
+    (card / "a-visible.jpg").symlink_to(outside / "a-visible.jpg")
+    (card / "more").symlink_to(outside)
+    (card / "gone.jpg").symlink_to("nowhere.jpg")
+    (card / "loop.jpg").symlink_to("loop.jpg")
+    os.mkfifo(card / "pipe.jpg")
+    found = scan_folder(card)
+    assert [file.path.name for file in found.files] == ["a-radiometric.tiff"]
+    said = {path.name: why for path, why in found.passed_over.items()}
+    assert set(said) == {"a-visible.jpg", "more", "gone.jpg", "loop.jpg", "pipe.jpg"}
+    assert "leads out" in said["a-visible.jpg"] and "not followed" in said["more"] and said["pipe.jpg"] == "no file"
+    assert set(found.passed_over) < set(find_pairs(found).unpaired)
+    assert "Not looked at: " in no_pairs_said(card)
+
+
+def test_a_folder_that_is_shut_is_named(tmp_path, monkeypatch):
+    photograph(tmp_path / "open" / "a.jpg")
+    photograph(tmp_path / "shut" / "b.jpg")
+    really = os.scandir
+
+    def refuse(path):
+        if Path(path).name == "shut":
+            raise PermissionError(13, "Permission denied", str(path))
+        return really(path)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    files, passed_over = files_below(tmp_path)
+    assert [path.name for path in files] == ["a.jpg"]
+    assert passed_over == {tmp_path / "shut": "a folder that cannot be opened (Permission denied)"}
+
+
+def test_a_file_that_may_not_be_read_says_so(tmp_path, monkeypatch):
+    path = photograph(tmp_path / "a.jpg")
+    really = Path.open
+
+    def refuse(self, *arguments, **more):
+        if self == path:
+            raise PermissionError(13, "Permission denied", str(self))
+        return really(self, *arguments, **more)
+
+    monkeypatch.setattr(Path, "open", refuse)
+    assert "got Permission denied. Check its permissions" in scan_folder(tmp_path).unreadable[path]
+
+
+@pytest.mark.parametrize("name", [b"two\nlines.jpg", b"caf\xe9.jpg", b"\x1b[31mred.jpg"])
+def test_a_name_that_cannot_be_printed_is_refused_and_can_be_left_out(tmp_path, name):
+    path = photograph(Path(os.fsdecode(os.fsencode(tmp_path / "card") + b"/" + name)))
+    photograph(tmp_path / "card" / "ok.jpg")
+    found = scan_folder(tmp_path / "card")
+    assert "Rename the file" in found.unreadable[path]
+    assert [file.path.name for file in found.files] == ["ok.jpg"]
+    for text in (shown_name(path), found.unreadable[path], no_pairs_said(tmp_path / "card", skip_bad=True)):
+        assert text.isprintable() and text.encode("utf-8")
+
+
+def test_names_in_any_alphabet_are_read_and_sorted(tmp_path):
+    names = ("Москва 2 visible.jpg", "²5.jpg", "壁.jpg", "x" * 240 + ".jpg", "٣.jpg")
+    for name in names:
+        photograph(tmp_path / name)
+    assert {file.path.name for file in scan_folder(tmp_path).files} == set(names)
+    assert natural_key(Path("²5")) != natural_key(Path("25"))
+
+
+def test_frames_have_different_names_also_where_a_disk_takes_capitals_for_small_letters(tmp_path):
+    stems = ("shot 1", "shot_1", "shot_1-2", "Shot_1", "壁", "床")
+    for number, stem in enumerate(stems):
+        photograph(tmp_path / f"{number}" / f"{stem}-visible.jpg")
+        counts(tmp_path / f"{number}" / f"{stem}-radiometric.tiff")
+    for stem in ("a-2", "a", "A"):
+        photograph(tmp_path / f"{stem}-visible.jpg")
+        counts(tmp_path / f"{stem}-radiometric.tiff")
+    pairs = find_pairs(scan_folder(tmp_path)).pairs
+    assert len(pairs) == len(stems) + 3
+    assert len({pair.name.lower() for pair in pairs}) == len(pairs)
+    assert all(pair.photograph.stem.split("-vis")[0] == pair.thermal.stem.split("-rad")[0] for pair in pairs)
+
+
+def test_what_is_in_no_pair_keeps_its_printable_name(tmp_path):
+    photograph(tmp_path / "card" / "day" / "a.jpg")
+    (tmp_path / "card" / "b\n.jpg").symlink_to("nowhere")
+    save_pairs(tmp_path, find_pairs(scan_folder(tmp_path / "card")), tmp_path / "card")
+    assert list(load_pairs(tmp_path, tmp_path / "card")[1]) == ["b\\n.jpg", "day/a.jpg"]
+
+
+def test_an_input_inside_the_output_is_not_touched(tmp_path):
+    """The images of an earlier capture are replaced by the next one: they are no input for it."""
+    scene = tmp_path / "scene"
+    (scene / ".capture").mkdir(parents=True)
+    kept = photograph(scene / "images" / "a-visible.jpg")
+    counts(scene / "images" / "a-radiometric.tiff")
+    for source in (scene / "images", scene):
+        with pytest.raises(SceneError, match="output: expected another folder"):
+            run_capture(source, scene, CaptureSettings())
+    assert kept.is_file()
+
+
+def test_an_output_inside_the_input_is_no_part_of_it(tmp_path):
+    photograph(tmp_path / "card" / "a-visible.jpg")
+    counts(tmp_path / "card" / "a-radiometric.tiff")
+    out = tmp_path / "card" / "with space"
+    photograph(out / "images" / "b.jpg")
+    (out / ".capture").mkdir()
+    files, passed_over = files_below(tmp_path / "card", [out])
+    assert [path.name for path in files] == ["a-radiometric.tiff", "a-visible.jpg"] and not passed_over
+
+
+def test_a_full_disk_is_no_bad_file_and_says_so(tmp_path, monkeypatch):
+    for name in "abc":
+        photograph(tmp_path / "card" / f"{name}-visible.jpg")
+        counts(tmp_path / "card" / f"{name}-radiometric.tiff")
+
+    def full(path, *_):
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr("thermoxels_ns.capture.frames.np.save", full)
+    with pytest.raises(OutputError, match=r"a\.npy: expected .* No space left on device.*finished stages are kept"):
+        capture(tmp_path / "card", skip_bad=True)
+
+
+def test_too_little_space_for_features_is_said_before_colmap_starts(tmp_path, monkeypatch):
+    for name in "abc":
+        photograph(tmp_path / "card" / f"{name}-visible.jpg")
+        counts(tmp_path / "card" / f"{name}-radiometric.tiff")
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1_000_000))
+    with pytest.raises(OutputError, match=r"up to 4 MB free for features and matches, got 1 MB.*--max-features"):
+        capture(tmp_path / "card", max_features=4000)
+
+
+def test_what_colmap_cannot_open_says_how_to_begin_anew(tmp_path):
+    for name in "abc":
+        photograph(tmp_path / "card" / f"{name}-visible.jpg")
+        counts(tmp_path / "card" / f"{name}-radiometric.tiff")
+    with pytest.raises(SceneError):  # grey photographs have no features; what is left is that of an interrupted stage
+        capture(tmp_path / "card")
+    (tmp_path / "scene" / ".capture" / "poses" / "features.db").write_bytes(b"no database" * 500)
+    with pytest.raises(ThermoxelsError, match="--from-stage poses"):
+        capture(tmp_path / "card")
+    with pytest.raises(SceneError, match="photographs that fit together"):
+        capture(tmp_path / "card", from_stage="poses")

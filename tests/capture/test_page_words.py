@@ -1,0 +1,109 @@
+"""What the page says is what an auditor asks: how sure the rig is, how degrees were measured, what is missing."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.capture.posed_model import ring_model
+from thermoxels_ns.capture.contract import CameraModel, DriftEstimate, RigEstimate
+from thermoxels_ns.capture.frames import CaptureFrame
+from thermoxels_ns.capture.gravity import Up
+from thermoxels_ns.capture.metric_scale import MetricScale
+from thermoxels_ns.capture.page import CapturePage, Overlay, build_page
+from thermoxels_ns.capture.pairs import Pair
+from thermoxels_ns.data.radiometric_conditions import Conditions
+
+MODEL = ring_model(4)
+
+
+@pytest.fixture
+def page() -> CapturePage:
+    rig = RigEstimate(
+        *(CameraModel(80, 60, 70.0, 70.0, 41.0, 29.0), np.eye(4), ("rx",), np.eye(1), True, "Found.", 0.1, 0.4, 0.33)
+    )
+    conditions = Conditions(emissivity=0.95, reflected_c=20.0)
+    frames = [
+        CaptureFrame(name, Path(f"{name}.jpg"), Path(f"{name}.npy"), f"{name}.jpg", f"{name}.tiff", format="TIFF")
+        for name in MODEL.frames
+    ]
+    return CapturePage(
+        title="Capture of card",
+        pairs=[Pair(name, Path(f"{name}.jpg"), Path(f"{name}.tiff"), "equal names") for name in MODEL.frames],
+        dropped={},
+        frames=[replace(frame, conditions=conditions) for frame in frames],
+        scene_names=[f"frame_{name}" for name in MODEL.frames],
+        model=MODEL,
+        rig=rig,
+        start=rig,
+        drift=DriftEstimate(np.array([0.5, -0.5, 0.1, -0.1]), (), 1.553, 0.111, True, "Corrected."),
+        scale=None,
+        scale_missing="no photograph has a GPS position",
+        up=Up(np.array([-1e-9, -1e-12, 1.0]), "Assumed.", None),
+        overlays=[Overlay("a", "data:a", "data:b", "data:c", (12.34, 20.06))],
+        temperatures_c=np.linspace(10, 20, 100, dtype=np.float32),
+        masked_share=0.0,
+        dead_pixels=0,
+        poses_source="Given.",
+        overlay_share=None,
+        seconds=[("pairs", 1.0)],
+    )
+
+
+def words(page: CapturePage) -> str:
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", build_page(page)))
+
+
+def test_how_the_degrees_were_measured(page):
+    assert "thermal files TIFF" in words(page)
+    assert "computed with emissivity 0.95, reflected temperature 20 °C" in words(page)
+
+
+def test_how_sure_the_rig_is(page):
+    assert "a point&#x27;s place is known to 0.33 thermal pixels" in words(page)
+    assert "Rig known" in words(replace(page, rig=replace(page.rig, projection_sigma_px=np.nan)))
+    unsure = words(replace(page, rig=replace(page.rig, determined=False, explanation="Too flat.")))
+    assert "not determined: the start value is kept" in unsure and "Too flat." in unsure
+
+
+def test_what_the_correction_of_drift_changed(page):
+    assert "corrected: two frames of one point differ by 1.55 K before, 0.11 K after" in words(page)
+    assert "not corrected: two frames of one point differ by 1.55 K" in words(
+        replace(page, drift=replace(page.drift, used=False))
+    )
+    off = replace(page.drift, used=False, before_k=np.nan, after_k=np.nan)
+    assert "Drift and vignetting not corrected Scale" in words(replace(page, drift=off))
+
+
+def test_a_scale_that_is_missing_says_what_it_costs(page):
+    said = words(page)
+    assert "unknown (no photograph has a GPS position); give a length when you export the mesh" in said
+    known = words(replace(page, scale=MetricScale(0.5, 0.01, "GPS.")))
+    assert "0.5 ± 0.01 (2.0 %) m per unit" in known and "unknown" not in known
+
+
+def test_colours_say_their_degrees(page):
+    assert "12.3 °C and less are black, 20.1 °C and more are bright yellow" in words(page)
+
+
+def test_zeros_have_no_sign(page):
+    assert "up, as x, y, z 0.000, 0.000, 1.000. Assumed." in words(page)
+
+
+def test_stuck_pixels_that_were_not_looked_for_are_not_counted_as_none(page):
+    assert "stuck pixels of the sensor not looked for in fewer than 5 frames" in words(page)
+    more = replace(page, frames=[*page.frames, *page.frames])
+    assert "stuck pixels of the sensor 0" in words(more)
+
+
+def test_names_of_files_are_no_markup(page):
+    evil = "<script>alert(1)</script>"
+    frames = [replace(frame, camera=evil) for frame in page.frames]
+    pairs = [Pair("a", Path(f"{evil}.jpg"), Path("a.tiff"), evil)]
+    text = build_page(replace(page, title=evil, dropped={evil: evil}, frames=frames, pairs=pairs, scale_missing=evil))
+    assert "<script" not in text
+    assert text.count("&lt;script&gt;") >= 6

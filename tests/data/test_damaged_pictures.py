@@ -1,0 +1,214 @@
+"""Pictures that are damaged or made to do harm: an error that names the file, in little memory, and nothing else."""
+
+from __future__ import annotations
+
+import io
+import struct
+import tracemalloc
+import zlib
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.capture.camera_card import counts, photograph
+from tests.data.flir_file import FlirFile, picture_bytes, segment, smooth_counts
+from thermoxels_ns.capture.camera_files import look_at
+from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
+from thermoxels_ns.data.decoders import naming
+from thermoxels_ns.data.flir_rjpeg import read_flir_jpeg
+from thermoxels_ns.data.jpeg_segments import DamagedJpegError, check_jpeg, jpeg_segments
+from thermoxels_ns.data.radiometry import RadiometryOptions, read_thermogram
+from thermoxels_ns.data.thermal_size import LARGEST_SIDE
+from thermoxels_ns.errors import SceneError, ThermalFileError, ThermoxelsError
+
+READERS: tuple[Callable[[Path], object], ...] = (
+    lambda path: look_at(path, path.parent),
+    read_photograph_facts,
+    open_photograph,
+    lambda path: read_thermogram(path, RadiometryOptions(camera="workswell")),
+)
+
+
+def whole_files(folder: Path) -> dict[str, bytes]:
+    pixels = np.random.default_rng(0).integers(0, 255, (16, 24, 3), dtype=np.uint8)
+    photo = photograph(folder / "p.jpg", pixels, "2024:01:01 10:00:00", "5", (47.0, 8.0, 400.0), 6, (4.5, 2000.0))
+    double, lzw, deep = io.BytesIO(), io.BytesIO(), io.BytesIO()
+    Image.fromarray(pixels).save(double, "MPO", save_all=True, append_images=[Image.fromarray(pixels)])
+    Image.fromarray(pixels).save(lzw, "TIFF", compression="tiff_lzw")
+    Image.fromarray(smooth_counts()).save(deep, "PNG")
+    return {
+        "photo.jpg": photo.read_bytes(),
+        "double.jpg": double.getvalue(),
+        "counts.tiff": counts(folder / "c.tiff", taken_at=datetime(2024, 1, 1)).read_bytes(),
+        "lzw.tif": lzw.getvalue(),
+        "deep.png": deep.getvalue(),
+        "flir.jpg": FlirFile(smooth_counts(), photograph=picture_bytes(), alignment=(1.0, 0, 0)).jpeg(),
+    }
+
+
+@pytest.mark.parametrize("name", ["photo.jpg", "double.jpg", "counts.tiff", "lzw.tif", "deep.png", "flir.jpg"])
+def test_random_damage_ends_in_an_error_that_names_the_file(tmp_path, name, capfd, recwarn):
+    content = whole_files(tmp_path)[name]
+    rng = np.random.default_rng(sum(name.encode()))
+    path = tmp_path / f"damaged-{name}"
+    refused = 0
+    for _ in range(120):
+        damaged = bytearray(content)
+        for at in rng.integers(0, min(len(damaged), 600), int(rng.integers(1, 6))):
+            damaged[at] = int(rng.choice([0, 1, 255, rng.integers(256)]))
+        path.write_bytes(damaged[: len(damaged) - int(rng.integers(0, 2) * rng.integers(0, 40))])
+        for read in READERS:
+            try:
+                read(path)
+            except ThermoxelsError as problem:
+                assert path.name in str(problem)
+                refused += 1
+    assert refused > 120  # photographs are no thermograms
+    assert [str(warning.message) for warning in recwarn] == []
+    capfd.readouterr()  # the TIFF library writes to the process's own error stream
+
+
+def test_a_tag_that_cannot_be_read_is_a_damaged_file(tmp_path):
+    """A tag with more numbers than fit into the file is listed and cannot be read."""
+    content = counts(tmp_path / "c.tiff").read_bytes()
+    entry = struct.pack("<HHI", 262, 3, 1)
+    assert content.count(entry) == 1
+    path = tmp_path / "damaged.tiff"
+    path.write_bytes(content.replace(entry, struct.pack("<HHI", 262, 3, 255)))
+    with pytest.raises(SceneError, match=r"damaged\.tiff: expected a TIFF or PNG"):
+        look_at(path, tmp_path)
+    with pytest.raises(ThermalFileError, match=r"damaged\.tiff: expected a readable TIFF"):
+        read_thermogram(path, RadiometryOptions(camera="workswell"))
+
+
+@pytest.mark.parametrize(
+    "problem", [KeyError(262), struct.error("short"), TypeError(), MemoryError(), RecursionError()]
+)
+def test_whatever_a_decoder_raises_names_the_file(problem):
+    said = r"x\.jpg: expected a picture, got .+\. Copy it\."
+    with pytest.raises(SceneError, match=said), naming("x.jpg", "a picture", "Copy it."):
+        raise problem
+
+
+def test_a_file_that_may_not_be_read_is_not_called_damaged():
+    said = r"x\.jpg: .*Permission denied\. Check its permissions"
+    with pytest.raises(ThermalFileError, match=said), naming("x.jpg", "a picture", "Damaged.", ThermalFileError):
+        raise PermissionError(13, "Permission denied")
+    with pytest.raises(ThermalFileError, match="ours"), naming("x.jpg", "a picture"):
+        raise ThermalFileError("ours")
+
+
+def test_a_picture_larger_than_the_decoder_opens_is_refused_by_its_size(tmp_path):
+    for path in (tmp_path / "wide.png", tmp_path / "wide.jpg"):
+        Image.new("L", (1, 1)).save(path)
+    png = (tmp_path / "wide.png").read_bytes()
+    head = b"IHDR" + struct.pack(">II", 20000, 15000) + png[24:29]
+    (tmp_path / "wide.png").write_bytes(png[:12] + head + struct.pack(">I", zlib.crc32(head)) + png[33:])
+    jpeg = (tmp_path / "wide.jpg").read_bytes()
+    at = jpeg.index(b"\xff\xc0") + 5
+    (tmp_path / "wide.jpg").write_bytes(jpeg[:at] + struct.pack(">HH", 15000, 20000) + jpeg[at + 4 :])
+    for name in ("wide.png", "wide.jpg"):
+        with pytest.raises(SceneError, match=rf"{name}: .*300000000 pixels.*Reduce the picture"):
+            look_at(tmp_path / name, tmp_path)
+
+
+def test_tags_that_point_at_themselves_end(tmp_path):
+    """The folder of EXIF tags inside the first one is the first one again."""
+    folder_at = 8
+    entries = [(0x8769, 4, 1, folder_at), (0x8825, 4, 1, folder_at), (0x0112, 3, 1, 6)]
+    tags = b"II*\0" + struct.pack("<IH", folder_at, len(entries))
+    tags += b"".join(struct.pack("<HHII", *entry) for entry in entries) + struct.pack("<I", folder_at)
+    plain = picture_bytes()
+    path = tmp_path / "loop.jpg"
+    path.write_bytes(plain[:2] + segment(0xE1, b"Exif\0\0" + tags) + plain[2:])
+    assert read_photograph_facts(path).orientation == 6
+    assert look_at(path, tmp_path).role == "photograph"
+
+
+def test_fill_bytes_before_a_marker_are_passed(tmp_path):
+    plain = picture_bytes()
+    ours = segment(0xE5, b"here")
+    for fill in (0, 1, 2, 100_000):
+        content = plain[:2] + b"\xff" * fill + ours + b"\xff" * fill + plain[2:]
+        assert next(jpeg_segments(content)) == (0xE5, b"here")
+        assert [kind for kind, _ in jpeg_segments(content)][1:] == [kind for kind, _ in jpeg_segments(plain)]
+    with pytest.raises(DamagedJpegError, match="cut off"):
+        check_jpeg(plain[:2] + b"\xff" * 1000)
+
+
+def test_a_million_segments_are_read_one_by_one(tmp_path):
+    plain = picture_bytes()
+    path = tmp_path / "many.jpg"
+    path.write_bytes(plain[:2] + segment(0xE5, b"") * 200_000 + plain[2:])
+    with pytest.raises(ThermalFileError, match=r"many\.jpg.*plain JPEG"):
+        read_thermogram(path)
+    assert look_at(path, tmp_path).role == "photograph"
+
+
+def test_records_that_overlap_are_not_copied(tmp_path):
+    """Each of 900 entries claims the whole block; together they would be a thousand times the file."""
+    content = FlirFile(smooth_counts(400, 300)).fff()
+    start, known = 64, 3
+    entries = content[start : start + 32 * known]
+    claims = b"".join(
+        struct.pack(">HHIIII", kind, 1, 100, 1, 0, len(content)).ljust(32, b"\0") for kind in range(0x100, 0x100 + 900)
+    )
+    block = content[:24] + struct.pack(">II", len(content), known + 900) + content[32:] + entries + claims
+    parts = [block[at : at + 60000] for at in range(0, len(block), 60000)]
+    segments = b"".join(segment(0xE1, b"FLIR\0\1" + bytes((n, len(parts) - 1)) + part) for n, part in enumerate(parts))
+    plain = picture_bytes()
+    path = tmp_path / "claims.jpg"
+    path.write_bytes(plain[:2] + segments + plain[2:])
+    tracemalloc.start()
+    read = read_flir_jpeg(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert np.array_equal(read.counts, smooth_counts(400, 300))
+    assert peak < 20 * path.stat().st_size
+
+
+@pytest.mark.parametrize(("offset", "length"), [(2**32 - 1, 1), (0, 2**32 - 1), (10**6, 10)])
+def test_a_record_outside_the_file_is_refused(tmp_path, offset, length):
+    content = FlirFile(smooth_counts()).jpeg()
+    at = content.index(struct.pack(">HHII", 0x01, 1, 100, 1))
+    damaged = content[: at + 12] + struct.pack(">II", offset, length) + content[at + 20 :]
+    (tmp_path / "a.jpg").write_bytes(damaged)
+    with pytest.raises(ThermalFileError, match=r"a\.jpg: .*record 1 \(type 0x01\) up to byte"):
+        read_thermogram(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("1\n" * (LARGEST_SIDE + 1), f"1 x {LARGEST_SIDE + 1}"),
+        ("1,2\n" + "3," * 2**20 + "\n", "longer one, line 2"),
+        ("1,2\n" + "3," * 9000 + "\n", "9001 x 2"),
+    ],
+)
+def test_a_table_larger_than_a_thermal_image_is_not_read(tmp_path, text, said):
+    (tmp_path / "a.csv").write_text(text)
+    tracemalloc.start()
+    with pytest.raises(ThermalFileError, match=said):
+        read_thermogram(tmp_path / "a.csv")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 20e6
+
+
+def test_a_jpeg_that_is_cut_off_is_not_called_a_picture_for_the_eye(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(picture_bytes()[:-2])
+    with pytest.raises(ThermalFileError, match=r"a\.jpg: .*cut off"):
+        read_thermogram(tmp_path / "a.jpg")
+
+
+def test_a_dji_file_that_is_cut_off_never_reaches_djis_library(tmp_path):
+    plain = picture_bytes()
+    content = plain[:2] + segment(0xE1, b"DJI") + segment(0xE3, bytes(24)) + plain[2:]
+    for name, cut in (("inside.jpg", 40), ("end.jpg", len(content) - 2)):
+        (tmp_path / name).write_bytes(content[:cut])
+        with pytest.raises(ThermalFileError, match=rf"{name}: expected a whole DJI R-JPEG.*cut off"):
+            read_thermogram(tmp_path / name, RadiometryOptions(dji_library=tmp_path / "libdirp.so"))
