@@ -17,6 +17,7 @@ from tests.reference.two_renderers import (
     random_request,
     see,
 )
+from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.render import fused, row_gradients
 from thermoxels_ns.render.kernels import AHEAD, Records
 from thermoxels_ns.render.kernels_rows import Order, first_voxel, order_records
@@ -44,6 +45,7 @@ def records_with(offset, used, number, uses) -> Records:
         nothing,
         nothing,
         np.zeros((total, 3), np.float32),
+        nothing,
         np.array(uses, np.uint8),
     )
 
@@ -109,9 +111,25 @@ def test_a_batch_that_needs_more_room_than_the_last_one_is_complete(monkeypatch)
     request = random_request(grid, 500)
     expected = see("fused", grid, request)
     for room in (1, AHEAD):
-        monkeypatch.setitem(fused._room, "rows", len(grid.density))
-        monkeypatch.setitem(fused._room, "per ray", room)
+        monkeypatch.setitem(fused._room, len(grid.density), room)
         found = see("fused", grid, request)
-        assert fused._room["per ray"] > room
+        assert fused._room[len(grid.density)] > room
         assert all(torch.equal(found.gradients[name], value) for name, value in expected.gradients.items())
         assert all(torch.equal(found.values[name], value) for name, value in expected.values.items())
+
+
+def test_models_that_take_turns_march_each_batch_once(monkeypatch):
+    """What one needed is not forgotten while another is at it; of many lattices only the last ones are remembered."""
+    grids = [random_grid(1, density=-3.0, lattice=Lattice.covering((-1, -1, -1), (1, 1, 1), n)) for n in (24, 32)]
+    monkeypatch.setattr(fused, "FEWEST_SAMPLES", 1)
+    monkeypatch.setattr(fused, "_room", {rows: 1 for rows in range(fused.MOST_ROOMS)})
+    marches = []
+    march = fused.kernels.march_forward
+    monkeypatch.setattr(fused.kernels, "march_forward", lambda *a: marches.append(len(a[3].density)) or march(*a))
+    for grid in grids:
+        see("fused", grid, random_request(grid, 50))
+    assert all(marches.count(len(grid.density)) > 1 for grid in grids) and len(fused._room) == fused.MOST_ROOMS
+    marches.clear()
+    for grid in grids * 2:
+        see("fused", grid, random_request(grid, 50))
+    assert marches == [len(grid.density) for grid in grids * 2]

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from thermoxels_ns.errors import ThermoxelsError, explain
 from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.render import kernels, kernels_backward, kernels_rows
+from thermoxels_ns.render import kernels, kernels_backward, kernels_rows, kernels_shading, prefetch
 from thermoxels_ns.render.kernel_cache import forget_stale_kernels
 from thermoxels_ns.render.kernels import Rays, Records, Settings, Sums, Volume
 from thermoxels_ns.render.kernels_backward import RayGradients
@@ -31,7 +31,7 @@ from thermoxels_ns.threads import run_ranges, run_tasks
 # Before the first call, which loads what was compiled earlier.
 forget_stale_kernels(
     Path(str(kernels.march_forward.stats.cache_path)),
-    (Path(str(module.__file__)) for module in (kernels, kernels_backward, kernels_rows)),
+    (Path(str(module.__file__)) for module in (kernels, kernels_backward, kernels_rows, kernels_shading, prefetch)),
 )
 
 ACTIVATIONS = {"relu": kernels.RELU, "softplus": kernels.SOFTPLUS, "exp": kernels.EXP}
@@ -44,8 +44,10 @@ FEWEST_SAMPLES = 24
 """Samples per ray that a batch has room for at first, on average over a range."""
 SPARE = 1.25
 """Room made when that was too little, over what the rays so far took."""
-_room = {"rows": 0, "per ray": FEWEST_SAMPLES}
-"""The room that the last batch had, and the number of rows it was for."""
+MOST_ROOMS = 16
+"""Numbers of rows whose room is remembered."""
+_room: dict[int, int] = {}
+"""Samples per ray that batches had room for, by the number of rows: two models that take turns keep theirs."""
 NAMES = ("density", "sh", "temperature")
 
 
@@ -152,16 +154,17 @@ def _march(
 def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple[Records, list[tuple[int, int]]]:
     """Fill `sums` and record the samples; every range of rays has room for as many per ray as were ever needed."""
     count = len(rays.origins)
-    if _room["rows"] != len(volume.density):
-        # Another lattice: what the last one needed says nothing.
-        _room.update({"rows": len(volume.density), "per ray": FEWEST_SAMPLES})
+    rows = len(volume.density)
     while True:
-        room = _room["per ray"]
+        # Of another lattice nothing is known.
+        room = _room.get(rows, FEWEST_SAMPLES)
         records = _empty_records(count, (room + kernels.AHEAD) * count, volume)
 
         def work(first: int, last: int, room: int = room, records: Records = records) -> tuple[int, int, int]:
             begin, end = ((room + kernels.AHEAD) * ray for ray in (first, last))
             wrong, behind = kernels.march_forward(first, last, rays, volume, settings, records, sums, begin, end)
+            if wrong == 0:
+                kernels_shading.shade(first, last, rays, volume, settings, records, sums)
             return begin, wrong, behind
 
         found: Any = run_ranges(work, count)
@@ -169,7 +172,10 @@ def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple
         if min(wrong, default=0) >= 0:
             break
         short = [per_ray for _, number, per_ray in found if number < 0]
-        _room["per ray"] = max(room + 1, int(SPARE * max(short)))
+        _room.pop(rows, None)
+        if len(_room) >= MOST_ROOMS:
+            del _room[next(iter(_room))]
+        _room[rows] = max(room + 1, int(SPARE * max(short)))
         del records, work  # what was too small is given back before more is taken
         SCRATCH.release()
     if sum(wrong):
@@ -196,6 +202,7 @@ def _empty_records(rays: int, total: int, volume: Volume) -> Records:
         SCRATCH.empty(total, dtype),
         SCRATCH.empty(total, dtype),
         SCRATCH.empty((total if volume.sh.shape[1] else 0, 3), dtype),
+        SCRATCH.empty(total, dtype),
         SCRATCH.empty(total, np.uint8),
     )
 

@@ -1,4 +1,4 @@
-"""Compiled forward pass: march rays, skip empty voxels, weigh, and read colour and temperature where there is weight.
+"""Compiled march: follow rays, skip empty voxels, read density and weigh; `kernels_shading` reads the rest.
 
 Plain loops for numba. Every function works on a range of rays, so that threads can share a batch: no two rays write
 the same place. Geometry and sums are in double precision whatever the parameters are.
@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from numba import njit
+
+from thermoxels_ns.render.prefetch import prefetch
 
 Floats = npt.NDArray[np.floating]
 Ints = Any  # arrays of integers; numba knows which
@@ -102,6 +104,8 @@ class Records(NamedTuple):
     """Weight."""
     rgb: Floats
     """Colour, (records, 3); after the backward pass the gradient of its logits."""
+    thermal: Floats
+    """Temperature."""
     uses: Ints
     """After the backward pass which parameters have a gradient (bits), uint8."""
 
@@ -139,23 +143,52 @@ def chord(rays: Rays, r: int, volume: Volume):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def next_sample(i: int, enter: float, length: float, step: float, rays: Rays, r: int, volume: Volume):
+def path_of(rays: Rays, r: int, volume: Volume):
+    """Where a ray begins, its direction, and the distance it takes per world unit along each axis.
+
+    Across its direction the latter is so large that the ray gets nowhere, and finite, so that no
+    product with it is NaN.
+    """
+    never = 1e200
+    dx, dy, dz = float(rays.directions[r, 0]), float(rays.directions[r, 1]), float(rays.directions[r, 2])
+    return (
+        (float(rays.origins[r, 0]), float(rays.origins[r, 1]), float(rays.origins[r, 2])),
+        (dx, dy, dz),
+        (
+            1.0 / dx if abs(dx) > 1e-100 else never,
+            1.0 / dy if abs(dy) > 1e-100 else never,
+            1.0 / dz if abs(dz) > 1e-100 else never,
+        ),
+    )
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def next_sample(i: int, enter: float, length: float, step: float, path, volume: Volume):
     """The first sample from step `i` on that lies in a kept voxel.
+
+    Args:
+        i: Step to begin with.
+        enter: Distance at which the ray enters the box.
+        length: Length of the ray in the box.
+        step: Length of a step.
+        path: The ray, see `path_of`.
+        volume: The kept voxels.
 
     Returns:
         Its step, the voxel's number, distance, step length and place in the voxel; step -1 if there is none.
     """
-    ox, oy, oz = float(rays.origins[r, 0]), float(rays.origins[r, 1]), float(rays.origins[r, 2])
-    dx, dy, dz = float(rays.directions[r, 0]), float(rays.directions[r, 1]), float(rays.directions[r, 2])
+    (ox, oy, oz), (dx, dy, dz), (ix, iy, iz) = path
     lx, ly, lz = volume.lo[0], volume.lo[1], volume.lo[2]
     h = volume.size
     nx, ny, nz = volume.cells[0], volume.cells[1], volume.cells[2]
     by, bz = (ny + BLOCK - 1) // BLOCK, (nz + BLOCK - 1) // BLOCK
+    per_step = 1.0 / step
     while True:
         delta = min(step, length - i * step)
         if delta <= 0.0:
             return -1, -1, 0.0, 0.0, 0.0, 0.0, 0.0
         t = enter + i * step + 0.5 * delta
+        # In this order, as the reference does: on a face between two voxels rounding decides.
         ux = min(max((ox + dx * t - lx) / h, 0.0), float(nx))
         uy = min(max((oy + dy * t - ly) / h, 0.0), float(ny))
         uz = min(max((oz + dz * t - lz) / h, 0.0), float(nz))
@@ -168,14 +201,11 @@ def next_sample(i: int, enter: float, length: float, step: float, rays: Rays, r:
             i += 1
             continue
         # Empty block: on to the first sample behind its far side (a little early rather than late).
-        leave = math.inf
-        if dx != 0.0:
-            leave = min(leave, (lx + ((x >> 3) + (1 if dx > 0.0 else 0)) * BLOCK * h - ox) / dx)
-        if dy != 0.0:
-            leave = min(leave, (ly + ((y >> 3) + (1 if dy > 0.0 else 0)) * BLOCK * h - oy) / dy)
-        if dz != 0.0:
-            leave = min(leave, (lz + ((z >> 3) + (1 if dz > 0.0 else 0)) * BLOCK * h - oz) / dz)
-        ahead = (min(leave, enter + length + step) - enter) / step - 0.5 - 1e-6
+        face_x = lx + ((x >> 3) + (1 if ix > 0.0 else 0)) * BLOCK * h
+        face_y = ly + ((y >> 3) + (1 if iy > 0.0 else 0)) * BLOCK * h
+        face_z = lz + ((z >> 3) + (1 if iz > 0.0 else 0)) * BLOCK * h
+        leave = min((face_x - ox) * ix, (face_y - oy) * iy, (face_z - oz) * iz, enter + length + step)
+        ahead = (leave - enter) * per_step - 0.5 - 1e-6
         i = max(i + 1, int(ahead) + 1 if ahead >= 0.0 else 0)
 
 
@@ -228,13 +258,27 @@ def gather_some(
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
-def gather_one(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: float):
-    """Interpolate the first channel at a place in a voxel."""
+def gather_one(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: float, k: int):
+    """Interpolate channel `k` at a place in a voxel."""
     gx, gy, gz = 1.0 - fx, 1.0 - fy, 1.0 - fz
-    a, b, c, d = rows[number, 0], rows[number, 1], rows[number, 2], rows[number, 3]
+    a, b = np.uint64(rows[number, 0]), np.uint64(rows[number, 1])
+    c, d = np.uint64(rows[number, 2]), np.uint64(rows[number, 3])
+    next_one = np.uint64(1)
     return gx * (
-        gy * (gz * values[a, 0] + fz * values[a + 1, 0]) + fy * (gz * values[b, 0] + fz * values[b + 1, 0])
-    ) + fx * (gy * (gz * values[c, 0] + fz * values[c + 1, 0]) + fy * (gz * values[d, 0] + fz * values[d + 1, 0]))
+        gy * (gz * values[a, k] + fz * values[a + next_one, k])
+        + fy * (gz * values[b, k] + fz * values[b + next_one, k])
+    ) + fx * (
+        gy * (gz * values[c, k] + fz * values[c + next_one, k])
+        + fy * (gz * values[d, k] + fz * values[d + next_one, k])
+    )
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def prefetch_corners(values: Floats, rows: Ints, number: int):
+    """Ask for the first channel of a voxel's corners."""
+    for corner in range(4):
+        row = np.int64(rows[number, corner])
+        prefetch(values, row, 0)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -265,7 +309,7 @@ def march_forward(
     begin: int,
     end: int,
 ):
-    """Render rays `first` to `last` (paper, eq. 1 and 2) and record their samples from `begin` to before `end`.
+    """Weigh the samples of rays `first` to `last` (paper, eq. 1) and record them from `begin` to before `end`.
 
     Samples are found, read and weighed a few at a time: reading does not wait for weighing then, and a memory that
     answers late is asked for several of them at once.
@@ -274,19 +318,13 @@ def march_forward(
         Number of samples whose density is NaN, or -1 if there are more samples than places; place behind the last
         record, or the number of samples per ray so far.
     """
-    channels, thermal_channels = volume.sh.shape[1], volume.temperature.shape[1]
-    count = channels // 3
-    active = min(count, settings.sh_active)
-    coefficients = np.empty(channels, volume.sh.dtype)
-    thermal_coefficients = np.empty(thermal_channels, volume.temperature.dtype)
-    basis, thermal_basis = np.empty(9), np.empty(9)
     distance, length_of, raw = np.empty(AHEAD), np.empty(AHEAD), np.empty(AHEAD)
     wrong = 0
     n = begin
     for r in range(first, last):
         enter, leave = chord(rays, r, volume)
         length = leave - enter
-        wants_rgb, wants_thermal = (rays.wants[r] & 1) != 0 and channels > 0, (rays.wants[r] & 2) != 0
+        path = path_of(rays, r, volume)
         expected, left, depth_sum = 0.0, 1.0, 0.0
         weight_sum, moment_sum, distortion, sparsity = 0.0, 0.0, 0.0, 0.0
         start, i = n, 0
@@ -296,9 +334,10 @@ def march_forward(
                 return -1, (n - begin) // max(1, r - first) + 1
             found = 0
             while found < AHEAD:
-                i, number, t, delta, fx, fy, fz = next_sample(i, enter, length, settings.step, rays, r, volume)
+                i, number, t, delta, fx, fy, fz = next_sample(i, enter, length, settings.step, path, volume)
                 if i < 0:
                     break
+                prefetch(volume.voxel_rows, number, 0)
                 at = n + found
                 records.number[at], records.step[at] = number, i
                 records.fraction[at, 0], records.fraction[at, 1], records.fraction[at, 2] = fx, fy, fz
@@ -306,7 +345,10 @@ def march_forward(
                 found += 1
                 i += 1
             for k in range(found):
-                raw[k] = gather_one(volume.density, volume.voxel_rows, records.number[n + k], *place_of(records, n + k))
+                prefetch_corners(volume.density, volume.voxel_rows, records.number[n + k])
+            for k in range(found):
+                number, (fx, fy, fz) = records.number[n + k], place_of(records, n + k)
+                raw[k] = gather_one(volume.density, volume.voxel_rows, number, fx, fy, fz, 0)
             for k in range(found):
                 density = activate(raw[k], volume.activation)
                 if density != density:
@@ -339,45 +381,4 @@ def march_forward(
             sums.distortion[r] = distortion / settings.distortion_scale
         if settings.sparsity:
             sums.sparsity[r] = sparsity
-        red, green, blue = 0.0, 0.0, 0.0
-        if wants_rgb:
-            basis_of(rays.directions, r, active, 1.0, basis)
-            for at in range(start, n):
-                if records.weight[at] > settings.smallest_weight:  # as rounded: the backward pass asks the same
-                    number, (fx, fy, fz) = records.number[at], place_of(records, at)
-                    if active == count:
-                        gather(volume.sh, volume.voxel_rows, number, fx, fy, fz, coefficients)
-                    else:
-                        gather_some(volume.sh, volume.voxel_rows, number, fx, fy, fz, count, active, coefficients)
-                    for c in range(3):
-                        logit = 0.0
-                        for k in range(active):
-                            logit += coefficients[c * count + k] * basis[k]
-                        records.rgb[at, c] = logit
-            for at in range(start, n):
-                if records.weight[at] > settings.smallest_weight:
-                    weight = records.weight[at]
-                    for c in range(3):
-                        records.rgb[at, c] = 1.0 / (1.0 + math.exp(-records.rgb[at, c]))
-                    red += weight * records.rgb[at, 0]
-                    green += weight * records.rgb[at, 1]
-                    blue += weight * records.rgb[at, 2]
-        if channels:
-            sums.rgb[r, 0], sums.rgb[r, 1], sums.rgb[r, 2] = red, green, blue
-        thermal = 0.0
-        if wants_thermal:
-            if thermal_channels > 1:
-                basis_of(rays.directions, r, thermal_channels, 1.0 / 0.28209479177387814, thermal_basis)
-            for at in range(start, n):
-                if records.weight[at] > settings.smallest_weight:
-                    number, (fx, fy, fz) = records.number[at], place_of(records, at)
-                    value = 0.0
-                    if thermal_channels == 1:
-                        value = gather_one(volume.temperature, volume.voxel_rows, number, fx, fy, fz)
-                    else:
-                        gather(volume.temperature, volume.voxel_rows, number, fx, fy, fz, thermal_coefficients)
-                        for k in range(thermal_channels):
-                            value += thermal_coefficients[k] * thermal_basis[k]
-                    thermal += records.weight[at] * value
-        sums.thermal[r, 0] = thermal
     return wrong, n

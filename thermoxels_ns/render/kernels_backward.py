@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
 from numba import njit
 
 from thermoxels_ns.render.kernels import (
@@ -24,10 +23,7 @@ from thermoxels_ns.render.kernels import (
     Records,
     Settings,
     Volume,
-    basis_of,
     chord,
-    gather,
-    gather_one,
 )
 
 _FLAT_EXP = math.exp(EXP_LIMIT) * (1.0 - 1e-6)
@@ -56,9 +52,7 @@ def march_backward(
     With w_i = T_i (1 - exp(-x_i)), T_{i+1} = T_i exp(-x_i) and x_i the optical depth of step i,
     dL/dx_i = g_i T_{i+1} - sum_{j>i} g_j w_j - g_T T_end, where g_i = dL/dw_i and g_T is the gradient of what is left.
     """
-    channels, thermal_channels = volume.sh.shape[1], volume.temperature.shape[1]
-    thermal_coefficients = np.empty(thermal_channels, volume.temperature.dtype)
-    thermal_basis = np.empty(9)
+    channels = volume.sh.shape[1]
     for r in range(first, last):
         start, used = records.offset[r], records.used[r]
         if used == 0:
@@ -66,8 +60,6 @@ def march_backward(
         end = start + used
         wants_rgb, wants_thermal = (rays.wants[r] & 1) != 0 and channels > 0, (rays.wants[r] & 2) != 0
         thermal_weight = wants_thermal and settings.thermal_moves_density != 0
-        if thermal_weight:
-            basis_of(rays.directions, r, thermal_channels, 1.0 / 0.28209479177387814, thermal_basis)
         red = green = blue = 0.0
         if wants_rgb:
             red, green, blue = grads.rgb[r, 0], grads.rgb[r, 1], grads.rgb[r, 2]
@@ -98,15 +90,7 @@ def march_backward(
                 records.rgb[n, 1] = green * weight * cg * (1.0 - cg)
                 records.rgb[n, 2] = blue * weight * cb * (1.0 - cb)
             if seen and thermal_weight:
-                value = 0.0
-                fx, fy, fz = records.fraction[n, 0], records.fraction[n, 1], records.fraction[n, 2]
-                if thermal_channels == 1:
-                    value = gather_one(volume.temperature, volume.voxel_rows, records.number[n], fx, fy, fz)
-                else:
-                    gather(volume.temperature, volume.voxel_rows, records.number[n], fx, fy, fz, thermal_coefficients)
-                    for k in range(thermal_channels):
-                        value += thermal_coefficients[k] * thermal_basis[k]
-                gain += heat * value
+                gain += heat * records.thermal[n]
             if spread != 0.0:
                 t = enter + i * settings.step + 0.5 * delta
                 weight_before = weight_sum - weight_after - weight

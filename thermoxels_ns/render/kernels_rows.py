@@ -24,6 +24,10 @@ from thermoxels_ns.render.kernels import (
     Volume,
     basis_of,
 )
+from thermoxels_ns.render.prefetch import prefetch
+
+NEAR, FAR = 8, 16
+"""Samples ahead whose sums, and whose places of sums, are asked for; records are asked for at twice the latter."""
 
 
 class Order(NamedTuple):
@@ -175,6 +179,37 @@ def list_rows(first_row: int, last_row: int, density: int, colour: int, temperat
             temperature += 1
 
 
+@njit(nogil=True, cache=True, error_model="numpy")
+def prefetch_record(records: Records, n: int):
+    """Ask for what is needed of a record."""
+    prefetch(records.number, n, 0)
+    prefetch(records.fraction, n, 0)
+    prefetch(records.density, n, 0)
+    prefetch(records.left, n, 0)
+    prefetch(records.rgb, n, 0)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def prefetch_sums(rows: RowGradients, voxel_rows: Ints, number: int):
+    """Ask for the sums of a voxel's corners, as far as they are in the range whose places are known."""
+    for corner in range(4):
+        row = voxel_rows[number, corner]
+        prefetch(rows.density, rows.place[row, 0], 0)
+        prefetch(rows.sh_sums, rows.place[row, 1], 0)
+        prefetch(rows.temperature, rows.place[row, 2], 0)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def corner_shares(records: Records, n: int, shares: Floats):
+    """Trilinear weights of a sample's corners, in the order of `lattice.CORNER_OFFSETS`."""
+    one = shares.dtype.type(1.0)
+    fx, fy, fz = records.fraction[n, 0], records.fraction[n, 1], records.fraction[n, 2]
+    gx, gy, gz = one - fx, one - fy, one - fz
+    a, b, c, d = gx * gy, gx * fy, fx * gy, fx * fy
+    shares[0], shares[1], shares[2], shares[3] = a * gz, a * fz, b * gz, b * fz
+    shares[4], shares[5], shares[6], shares[7] = c * gz, c * fz, d * gz, d * fz
+
+
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 def add_samples(
     first_row: int,
@@ -190,15 +225,26 @@ def add_samples(
     channels, thermal_channels = volume.sh.shape[1], volume.temperature.shape[1]
     active = min(channels // 3, settings.sh_active)
     dtype = volume.density.dtype
-    one = dtype.type
     basis, thermal_basis = np.empty(9), np.empty(9)
-    colour = np.zeros(3 * active, dtype)
+    colour, shares = np.zeros(3 * active, dtype), np.empty(8, dtype)
+    flat = active == 1
     begin, end = first_voxel(volume.voxel_rows, 3, first_row - 1), first_voxel(volume.voxel_rows, 0, last_row)
-    for at in range(order.group[begin >> order.shift], order.group[_groups_before(end, order)]):
+    stop = order.group[_groups_before(end, order)]
+    for at in range(order.group[begin >> order.shift], stop):
+        if at + 2 * FAR < stop:
+            prefetch_record(records, order.record[at + 2 * FAR])
+        if at + FAR < stop:
+            number = records.number[order.record[at + FAR]]
+            for corner in range(4):
+                prefetch(rows.place, volume.voxel_rows[number, corner], 0)
+        if at + NEAR < stop:
+            number = records.number[order.record[at + NEAR]]
+            prefetch_sums(rows, volume.voxel_rows, number)
         n, r = order.record[at], order.ray[at]
         number, bits = records.number[n], records.uses[n]
         if volume.voxel_rows[number, 3] + 1 < first_row or volume.voxel_rows[number, 0] >= last_row:
             continue
+        inside = volume.voxel_rows[number, 0] >= first_row and volume.voxel_rows[number, 3] + 1 < last_row
         slope, heat = records.density[n], records.left[n]
         if bits & COLOUR:
             basis_of(rays.directions, r, active, 1.0, basis)
@@ -207,20 +253,23 @@ def add_samples(
                     colour[c * active + k] = records.rgb[n, c] * basis[k]
         if bits & TEMPERATURE and thermal_channels > 1:
             basis_of(rays.directions, r, thermal_channels, 1.0 / 0.28209479177387814, thermal_basis)
-        fx, fy, fz = float(records.fraction[n, 0]), float(records.fraction[n, 1]), float(records.fraction[n, 2])
+        corner_shares(records, n, shares)
         for corner in range(8):
             row = volume.voxel_rows[number, corner >> 1] + (corner & 1)
-            if row < first_row or row >= last_row:
+            if not (inside or first_row <= row < last_row):
                 continue
-            share = fx if corner & 4 else 1.0 - fx
-            share *= fy if corner & 2 else 1.0 - fy
-            share *= fz if corner & 1 else 1.0 - fz
+            share = shares[corner]
             if bits & DENSITY:
                 rows.density[rows.place[row, 0], 0] += share * slope
             if bits & COLOUR:
-                place, part = rows.place[row, 1], one(share)
-                for k in range(3 * active):
-                    rows.sh_sums[place, k] += part * colour[k]
+                place = rows.place[row, 1]
+                if flat:
+                    rows.sh_sums[place, 0] += share * colour[0]
+                    rows.sh_sums[place, 1] += share * colour[1]
+                    rows.sh_sums[place, 2] += share * colour[2]
+                else:
+                    for k in range(3 * active):
+                        rows.sh_sums[place, k] += share * colour[k]
             if bits & TEMPERATURE:
                 place = rows.place[row, 2]
                 if thermal_channels == 1:
