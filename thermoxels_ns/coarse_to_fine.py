@@ -12,7 +12,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch.nn import Parameter
 
 from thermoxels_ns.errors import PruningError, explain
-from thermoxels_ns.field.refine import RowChange, prune, refine
+from thermoxels_ns.field.refine import RowChange, prune
 from thermoxels_ns.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
 from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
 
@@ -33,9 +33,17 @@ RAYS_PER_IMAGE = 4096
 
 def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
     """The callbacks of one training run, in the order in which they act at a step."""
+    # They load compiled kernels, which importing the configuration must not.
+    from thermoxels_ns.photo_start import find_start, hold_density, set_density
+    from thermoxels_ns.start_choice import decide_start
+
     before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
+    verdict = decide_start(model, attributes)
     factors = model.config.refinements()
     steps = {*factors, *model.config.prune_at, *model.config.thin_at}
+    from_photographs = verdict.start == "photographs"
+    for step in model.config.skipped_refinements() if from_photographs else ():
+        del factors[step]  # pruning stays at these steps
     end = None
     if attributes.trainer is not None:
         end = attributes.trainer._start_step + attributes.trainer.config.max_num_iterations
@@ -50,17 +58,17 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
 
     def start(step: int) -> None:
         """Set the density at the first step of a training, not at the first of a resumed one."""
-        from thermoxels_ns.photo_start import start_from_photographs
-
         assert attributes.pipeline is not None
-        start_from_photographs(model, attributes.pipeline.datamanager)
+        found = verdict.found or find_start(model, attributes.pipeline.datamanager)
+        old = model.grid.row_parameters()
+        change = model.split(model.config.skipped_factor())
+        if change is not None:
+            follow(old, change)
+        set_density(model, found)
 
     def hold(step: int) -> None:
-        """Let the density stand while colours are still those of nothing; its gradients are already followed."""
         assert attributes.optimizers is not None
-        if step < model.config.hold_density:
-            for group in attributes.optimizers.optimizers["density"].param_groups:
-                group["lr"] = 0.0  # the scheduler sets it anew after each step
+        hold_density(attributes.optimizers.optimizers["density"], step, model.config.hold_density)
 
     def follow(old: dict[str, Parameter], change: RowChange) -> None:
         """Point the optimisers to the rows that took the place of `old`; their state changes as the rows did."""
@@ -84,12 +92,12 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             follow(old, change)
             CONSOLE.log(f"step {step}: {'thinning' if thin else 'pruning'} {report}")
         if step in factors:
-            model.check_memory(factors[step])
             old = model.grid.row_parameters()
-            follow(old, refine(model.grid, factors[step]))
+            change = model.split(factors[step])
+            assert change is not None
+            follow(old, change)
             CONSOLE.log(f"step {step}: lattice refined to {' x '.join(map(str, model.grid.lattice.cell_shape))} voxels")
 
-    from_photographs = model.config.start == "photographs"
     return [
         TrainingCallback(before, count),
         *([TrainingCallback(before, start, iters=(0,)), TrainingCallback(before, hold)] if from_photographs else []),

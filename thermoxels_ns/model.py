@@ -22,6 +22,7 @@ from thermoxels_ns.field.background import SkyTemperature, SphereImage
 from thermoxels_ns.field.field import VoxelField
 from thermoxels_ns.field.harmonics import harmonics, num_coefficients
 from thermoxels_ns.field.memory import check_memory
+from thermoxels_ns.field.refine import RowChange, refine
 from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.metrics import lpips, lpips_available, psnr, ssim, thermal_metrics
 from thermoxels_ns.model_config import ThermoxelsModelConfig
@@ -40,6 +41,7 @@ class ThermoxelsModel(Model):
     temperature_bounds_c: Tensor
     backdrop_on: Tensor
     trained_steps: Tensor
+    start_index: Tensor
 
     def populate_modules(self) -> None:
         """Build the field, the background and what belongs to single images."""
@@ -85,6 +87,8 @@ class ThermoxelsModel(Model):
         self.thermal_offset = nn.Parameter(torch.zeros(self.num_train_data)) if config.per_image_offset else None
         # How far training got; part of the checkpoint, because view-dependence begins at some step.
         self.register_buffer("trained_steps", torch.tensor(0))
+        # Which start the training took, a place in `start_choice.STARTS`; a resumed training goes on with its course.
+        self.register_buffer("start_index", torch.tensor(0))
         self.step = 0
 
     @property
@@ -113,6 +117,17 @@ class ThermoxelsModel(Model):
     ) -> list[TrainingCallback]:
         """Refinement, pruning and the decision about the background."""
         return coarse_to_fine_callbacks(self, training_callback_attributes)
+
+    def split(self, factor: int) -> RowChange | None:
+        """Split every kept voxel into factor^3, and return how values of rows change; None where the factor is 1.
+
+        Raises:
+            MemoryBudgetError: The next lattice needs more than `memory_budget_gb`.
+        """
+        if factor == 1:
+            return None
+        self.check_memory(factor)
+        return refine(self.grid, factor)
 
     def check_memory(self, factor: int) -> None:
         """Say what splitting every kept voxel into factor^3 will need, and refuse what exceeds the budget.

@@ -14,6 +14,8 @@ from thermoxels_ns.ray_rendering import Backend
 from thermoxels_ns.schedule import QUALITIES, schedule_for
 
 _STANDARD = schedule_for(*QUALITIES["standard"])
+FINEST_START = 64
+"""Voxels along the longest side of the finest lattice on which a training begins from photographs."""
 
 
 @dataclass(frozen=True)
@@ -100,14 +102,15 @@ class ThermoxelsModelConfig(ModelConfig):
     """Maps interpolated values to density: relu is the paper's; exp and softplus hold a sharp surface in one voxel."""
     start_density: float = 0.1
     """Density everywhere at the start, per world unit in a scene of size 2: near-transparent, or floaters form."""
-    start: Literal["plain", "photographs"] = "plain"
-    """Density at the start: plain: the same everywhere; photographs: denser where the photographs that see a point
-    agree about its colour, thinner where they do not. Try the second where a flat wall comes out too far forward, with
-    resolutions 64 128, refine-at 600, prune-at 200 800 and optimizers.density.optimizer.eps 1e-8, and keep what gives
-    held-out photographs the better PSNR: most scenes are better off with plain. Without three photographs from
-    different places it is plain, and the log says so."""
+    start: Literal["auto", "plain", "photographs"] = "auto"
+    """Density at the start. plain: the same everywhere; photographs: denser where the photographs that see a point
+    agree about its colour, thinner where they do not, from the finest lattice of at most 64 voxels on. auto: both are
+    tried for trial-steps, some photographs held back, and that which shows those better is taken; the log gives both
+    figures. It costs the time of the trials. Needs 16 photographs and a run of at least three trials, else plain."""
+    trial_steps: int = 250
+    """Steps of each trial of the start auto."""
     hold_density: int = 20
-    """First steps in which the density stands if start is photographs, while colours find their values."""
+    """First steps in which the density stands after a start from photographs, while colours find their values."""
     thermal_density_gradient: bool = False
     """Let thermal images move the geometry (off: temperature is painted on what the RGB images show)."""
     steps_per_voxel: float = 2.0
@@ -175,6 +178,7 @@ class ThermoxelsModelConfig(ModelConfig):
             "prune_dilation": (0, 100, "from 0 to 100"),
             "temperature_degree": (0, 2, "0, 1 or 2"),
             "hold_density": (0, 1e9, "0 or more"),
+            "trial_steps": (1, 1e9, "at least 1"),
             "start_density": (1e-30, 1e30, "a finite number above 0"),
             "steps_per_voxel": (0.1, 1000.0, "from 0.1 to 1000"),
             "near_plane": (0.0, 1e30, "0 or more"),
@@ -222,6 +226,17 @@ class ThermoxelsModelConfig(ModelConfig):
                 )
             )
         return {step: b // a for step, (a, b) in zip(self.refine_at, pairs)}
+
+    def skipped_refinements(self) -> tuple[int, ...]:
+        """Steps of refinements that come before the first step of a start from photographs.
+
+        Where photographs agree is too thin for coarse lattices, so it begins on the finest one of at most 64 voxels.
+        """
+        return tuple(step for step, voxels in zip(self.refine_at, self.resolutions[1:]) if voxels <= FINEST_START)
+
+    def skipped_factor(self) -> int:
+        """Factor by which a start from photographs splits voxels before the first step."""
+        return self.resolutions[len(self.skipped_refinements())] // self.resolutions[0]
 
 
 def _model_class() -> type:

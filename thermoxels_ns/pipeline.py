@@ -22,6 +22,7 @@ from thermoxels_ns.warm_up import compile_kernels
 
 _GRID = "_model.field.grid."
 _ACTIVATION = "_model.field.grid.activation_index"
+_START = "_model.start_index"
 
 
 @dataclass
@@ -95,6 +96,7 @@ class ThermoxelsPipeline(VanillaPipeline):
                 )
             )
         own = self.state_dict()
+        state.setdefault(_START, own[_START])  # of a training from before there was a choice
         self._check_settings(own, state)
         super().load_pipeline(state, step)
 

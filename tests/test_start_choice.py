@@ -1,0 +1,187 @@
+"""Which start a training takes: trials that leave no trace, and a choice that is remembered."""
+
+from __future__ import annotations
+
+import math
+import re
+from copy import deepcopy
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes
+
+from tests.short_training import train_with_optimizers
+from thermoxels_ns import start_choice
+from thermoxels_ns.data.synthetic import make_scene, write_scene
+from thermoxels_ns.model_config import ThermoxelsModelConfig
+from thermoxels_ns.photo_start import SMALLEST_EPS
+from thermoxels_ns.pipeline import ThermoxelsPipeline
+from thermoxels_ns.start_choice import HELD_BACK, RAYS_SHARE, STARTS, _Trial, decide_start
+from thermoxels_ns.streams import RGB_STREAM
+
+TWO_LATTICES = {"resolutions": [8, 16], "refine_at": [3], "prune_threshold": 0.0, "hold_density": 2}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("choice") / "scene"
+    return write_scene(make_scene("sphere"), folder, 17, 1, width=40, height=30, progress=False)
+
+
+def trained(scene, steps: int = 6, **options: Any) -> ThermoxelsPipeline:
+    return train_with_optimizers(scene, steps, {**TWO_LATTICES, **options}, rays=64)[0]
+
+
+def attributes(pipeline: ThermoxelsPipeline, optimizers: Any, steps: int, first: int = 0) -> TrainingCallbackAttributes:
+    trainer: Any = SimpleNamespace(_start_step=first, config=SimpleNamespace(max_num_iterations=steps))
+    return TrainingCallbackAttributes(optimizers, None, pipeline, trainer)  # type: ignore[arg-type]
+
+
+def errors_of_trials(monkeypatch, plain: float, photographs: float) -> list[int]:
+    """Let trials give these errors without training, and return the lengths that were asked for."""
+    asked: list[int] = []
+
+    def error_after(trial: _Trial, steps: int) -> float:
+        asked.append(steps)
+        return plain if trial.found is None else photographs
+
+    monkeypatch.setattr(_Trial, "error_after", error_after)
+    return asked
+
+
+def test_a_chosen_training_is_to_the_bit_the_one_asked_for_by_name(scene, capsys):
+    chosen = trained(scene, trial_steps=2)
+    log = " ".join(capsys.readouterr().out.split())
+    name = STARTS[int(chosen.model.start_index)]
+    assert name in ("plain", "photographs") and f"start: {name}, as photographs held back from 2 steps" in log
+    assert len(re.findall(r"\d\d\.\d\d dB", log)) == 2
+    named = trained(scene, start=name).model.state_dict()
+    assert named.keys() == chosen.model.state_dict().keys()
+    assert all(torch.equal(value, named[key]) for key, value in chosen.model.state_dict().items())
+    other = trained(scene, start="plain" if name == "photographs" else "photographs").model
+    assert not torch.equal(other.grid.density, chosen.model.grid.density)
+
+
+@pytest.mark.parametrize(
+    ("plain", "photographs", "expected"),
+    [(0.02, 0.01, "photographs"), (0.01, 0.02, "plain"), (0.01, 0.01, "plain"), (0.01, math.nan, "plain")],
+)
+def test_the_smaller_error_wins(scene, monkeypatch, plain, photographs, expected):
+    asked = errors_of_trials(monkeypatch, plain, photographs)
+    pipeline = trained(scene, trial_steps=2)
+    assert STARTS[int(pipeline.model.start_index)] == expected and asked == [2, 2]
+
+
+def test_trials_never_train_on_what_judges_them(scene):
+    pipeline, optimizers = train_with_optimizers(scene, 1, {**TWO_LATTICES, "start": "plain"}, rays=256)
+    trial = _Trial(pipeline.model, pipeline.datamanager, optimizers.config, None)
+    rays, _ = pipeline.datamanager.next_train(5)
+    assert rays.camera_indices is not None
+    drawn = rays.camera_indices[:, 0]
+    parts = {held: trial._rays(5, held_back=held) for held in (False, True)}
+    for held, (some, batch) in parts.items():
+        assert some.camera_indices is not None
+        judging = some.camera_indices[:, 0] % HELD_BACK == HELD_BACK // 2
+        assert bool((judging == held).all()) and len(judging) == len(batch["image"]) > 0
+        assert bool((some.metadata["stream"] == RGB_STREAM).all())
+    held = int((drawn % HELD_BACK == HELD_BACK // 2).sum())
+    sizes = {key: len(batch["image"]) for key, (_, batch) in parts.items()}
+    assert sizes == {True: held, False: math.ceil((256 - held) / RAYS_SHARE)}
+
+
+def test_a_trial_leaves_model_and_optimisers_as_they_are(scene):
+    pipeline, optimizers = train_with_optimizers(scene, 1, {**TWO_LATTICES, "start": "plain"}, rays=64)
+    before = deepcopy(pipeline.model.state_dict()), deepcopy(optimizers.config), torch.random.get_rng_state()
+    trial = _Trial(pipeline.model, pipeline.datamanager, optimizers.config, None)
+    error = trial.error_after(3)
+    assert 0.0 < error < 1.0 and trial.model.grid.lattice.cell_shape[0] == 16
+    assert all(torch.equal(value, before[0][key]) for key, value in pipeline.model.state_dict().items())
+    assert str(optimizers.config) == str(before[1]) and torch.equal(torch.random.get_rng_state(), before[2])
+    assert not torch.equal(trial.model.grid.density, torch.full_like(trial.model.grid.density, math.log(0.1)))
+
+
+def test_longer_trials_are_nearer_to_photographs_that_they_never_saw(scene):
+    pipeline, optimizers = train_with_optimizers(scene, 1, {**TWO_LATTICES, "start": "plain"}, rays=512)
+    short, long = (
+        _Trial(pipeline.model, pipeline.datamanager, optimizers.config, None).error_after(steps) for steps in (2, 40)
+    )
+    assert long < 0.75 * short
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"trial_steps": 3}, "as the run is shorter than 3 trials of 3 steps"),
+        ({"trial_steps": 2, "recipe": "paper"}, "as published for the recipe paper"),
+        ({"trial_steps": 2, "sh_degree": None, "thermal_density_gradient": True}, "as no photographs train"),
+        ({"trial_steps": 2, "resolutions": [65], "refine_at": []}, "as trials need a lattice of at most 64 voxels"),
+    ],
+)
+def test_where_trials_tell_nothing_the_start_is_plain(scene, capsys, monkeypatch, options, reason):
+    asked = errors_of_trials(monkeypatch, 2.0, 1.0)
+    pipeline = trained(scene, **options)
+    assert f"start: plain, {reason}" in " ".join(capsys.readouterr().out.split())
+    assert STARTS[int(pipeline.model.start_index)] == "plain" and asked == []
+
+
+def test_too_few_photographs_to_hold_some_back(scene, capsys, monkeypatch):
+    monkeypatch.setattr(start_choice, "FEWEST_PHOTOGRAPHS", 18)
+    pipeline = trained(scene, trial_steps=2)
+    assert "start: plain, as 17 photographs are too few" in " ".join(capsys.readouterr().out.split())
+    assert STARTS[int(pipeline.model.start_index)] == "plain"
+
+
+@pytest.mark.parametrize("start", ["plain", "photographs"])
+def test_a_resumed_training_goes_on_with_its_course(scene, start, monkeypatch):
+    """The lattice of a start from photographs is not split again where a plain one is."""
+    asked = errors_of_trials(monkeypatch, 2.0 if start == "photographs" else 1.0, 1.5)
+    pipeline, optimizers = train_with_optimizers(scene, 6, {**TWO_LATTICES, "trial_steps": 2}, rays=64)
+    model, state = pipeline.model, pipeline.state_dict()
+    assert model.grid.lattice.cell_shape[0] == 16 and len(asked) == 2
+    fresh, resumed = train_with_optimizers(scene, 1, {**TWO_LATTICES, "start": "plain"}, rays=64)
+    fresh.model.config.start = "auto"
+    fresh.load_pipeline({f"module.{key}": value for key, value in state.items()}, 5)
+    resumed.load_optimizers({name: optimizer.state_dict() for name, optimizer in optimizers.optimizers.items()})
+    given = attributes(fresh, resumed, 20, first=6)
+    verdict = decide_start(fresh.model, given)
+    assert verdict.start == start and len(asked) == 2
+    for callback in fresh.model.get_training_callbacks(given):
+        callback.run_callback(TWO_LATTICES["refine_at"][0])
+    # Only the course of a plain start splits voxels at this step.
+    assert fresh.model.grid.lattice.cell_shape[0] == (16 if start == "photographs" else 32)
+
+
+def test_a_checkpoint_from_before_there_was_a_choice_is_loaded(scene):
+    pipeline, optimizers = train_with_optimizers(scene, 1, {**TWO_LATTICES, "start": "plain"}, rays=64)
+    state = pipeline.state_dict()
+    del state["_model.start_index"]
+    pipeline.model.start_index.zero_()
+    pipeline.load_pipeline(state, 0)
+    assert decide_start(pipeline.model, attributes(pipeline, optimizers, 5000, first=1)).start == "plain"
+
+
+def test_a_start_from_photographs_begins_on_a_finer_lattice_and_its_optimisers_follow(scene):
+    pipeline, optimizers = train_with_optimizers(scene, 1, {**TWO_LATTICES, "start": "photographs"}, rays=64)
+    grid = pipeline.model.grid
+    assert grid.lattice.cell_shape == (16, 16, 16)
+    for name, parameter in grid.row_parameters().items():
+        assert optimizers.optimizers[name].param_groups[0]["params"] == [parameter]
+    assert optimizers.optimizers["density"].param_groups[0]["eps"] == SMALLEST_EPS
+    assert optimizers.optimizers["sh"].param_groups[0]["eps"] == 1e-15
+
+
+@pytest.mark.parametrize(
+    ("resolutions", "refine_at", "skipped", "factor"),
+    [
+        ((32, 64, 128), (300, 750), (300,), 2),
+        ((64, 128), (600,), (), 1),
+        ((16, 32, 64), (10, 20), (10, 20), 4),
+        ((33, 66), (10,), (), 1),
+        ((128, 256), (10,), (), 1),
+    ],
+)
+def test_lattices_of_at_most_64_voxels_are_skipped(resolutions, refine_at, skipped, factor):
+    config = ThermoxelsModelConfig(resolutions=resolutions, refine_at=refine_at)
+    assert config.skipped_refinements() == skipped and config.skipped_factor() == factor
