@@ -56,7 +56,7 @@ def how_time_was_followed(time: TimeSteps | AdaptiveSteps | None, accuracy: Accu
         duration = in_words(float(time.times_s[-1]))
         if accuracy.step_tolerance_k is None:
             return f"{duration}, without steps"
-        return f"{duration} in steps chosen by the tolerance (each controlled to {accuracy.step_tolerance_k:.2g} K)"
+        return f"{duration} in steps chosen by the tolerance (they may err by {accuracy.step_tolerance_k:.2g} K)"
     if isinstance(time, TimeSteps):
         return f"{time.steps} steps of {time.step_seconds:g} s"
     return f"{in_words(time.duration_s)} in steps that keep within {time.tolerance_k:g} K"

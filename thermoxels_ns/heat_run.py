@@ -19,7 +19,7 @@ from thermoxels_ns.fem.lumped_body import LumpedBody
 from thermoxels_ns.fem.probes import Probes, place_probes
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.savings import seconds_saved
-from thermoxels_ns.fem.scene_doubts import scene_doubts
+from thermoxels_ns.fem.scene_doubts import scene_doubts, unused_settings
 from thermoxels_ns.fem.scene_file import load_heat_scene
 from thermoxels_ns.fem.screening import Screening
 from thermoxels_ns.fem.solution import SteadySolution
@@ -122,7 +122,7 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     say(f"Scene: {scene.description or options.scene}.")
 
     doubts = scene_doubts(scene, mesh, problem.up)
-    warnings = (*doubts, *_shell_doubts(scene, export))
+    warnings = (*doubts, *unused_settings(scene), *_shell_doubts(scene, export))
     for warning in warnings:
         say(f"Warning: {warning}")
 

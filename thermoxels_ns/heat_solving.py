@@ -16,7 +16,7 @@ from thermoxels_ns.fem.error_budget import Tolerance
 from thermoxels_ns.fem.heat_scene import HeatScene
 from thermoxels_ns.fem.lumped_body import LumpedBody, lumped_body
 from thermoxels_ns.fem.memory import check_memory, describe_bytes, peak_bytes
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.screening import Screening, screen
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 from thermoxels_ns.fem.solution_nodes import Solution
@@ -34,6 +34,8 @@ LEAVE_OUT_BELOW_K = 0.01
 """The same without a tolerance, [K]: a fifth of the default tolerance of the time steps."""
 SAY_EVERY_S = 10.0
 """Time between two lines of progress, [s]."""
+SAY_FIRST_S = 1.0
+"""Time of a first step from which on it is said, [s]: then the next ones will take some, too."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +166,11 @@ def solve_scene(options: Heat, scene: HeatScene, problem: HeatProblem, say: Say,
     if scene.time is None:
         return SolvedScene(screening.problem, solve_steady(screening.problem), screening, None, None)
     return SolvedScene(
-        screening.problem, solve_heat(screening.problem, scene.time, progress=_Progress(say)), screening, lumped, None
+        screening.problem,
+        solve_heat(screening.problem, scene.time, progress=_Progress(say, scene.time)),
+        screening,
+        lumped,
+        None,
     )
 
 
@@ -181,7 +187,7 @@ def _to_tolerance(
         memory_bytes=options.memory_gb * 2**30,
         allow_unmet=options.allow_unmet,
         log=say,
-        progress=_Progress(say),
+        progress=_Progress(say, None),
     )
     return SolvedScene(found.problem, found.solution, screening, lumped, _of_levels(options, screening, found))
 
@@ -252,22 +258,48 @@ def _say_what_is_built(screening: Screening, say: Say) -> None:
 
 
 class _Progress:
-    """Says every now and then how far a solution has come, and when it will be done at that pace."""
+    """Says after the first step how long it took, and every now and then how far a solution has come.
 
-    def __init__(self, say: Say) -> None:
+    The pace of the first step, which makes the matrices too, is about the slowest of equal steps. Those that are chosen
+    by their error begin short, and how many will follow is not known yet.
+    """
+
+    def __init__(self, say: Say, time: TimeSteps | AdaptiveSteps | None) -> None:
         self._say, self._share = say, 0.0
-        self._begin_s = self._said_s = clock.perf_counter()
+        self._equal = isinstance(time, TimeSteps)
+        self._begin_s = self._said_s = self._called_s = clock.perf_counter()
 
     def __call__(self, share: float, steps: int) -> None:
         """Take the share of the duration that is done, and the number of steps."""
         now_s = clock.perf_counter()
         if share < self._share:  # the next solution has begun
-            self._begin_s = now_s
-        self._share = share
-        if now_s - self._said_s >= SAY_EVERY_S and 0.0 < share < 1.0:
-            left_s = (now_s - self._begin_s) * (1.0 - share) / share
+            self._begin_s = self._called_s
+        took_s = now_s - self._begin_s
+        self._share, self._called_s = share, now_s
+        if steps == 1 and share < 1.0:
+            self._say_first(share, took_s)
+        elif now_s - self._said_s >= SAY_EVERY_S and 0.0 < share < 1.0:
+            left_s = took_s * (1.0 - share) / share
             self._said_s = now_s
-            self._say(f"{share:.0%} of the time after {steps} steps; about {left_s:.0f} s left.")
+            self._say(f"{share:.0%} of the time after {steps} steps; about {_duration(left_s)} left.")
+
+    def _say_first(self, share: float, took_s: float) -> None:
+        left_s = took_s * (1.0 - share) / share
+        if self._equal and left_s >= SAY_EVERY_S:
+            self._say(f"The first step took {took_s:.1f} s; at that pace about {_duration(left_s)} left.")
+        elif not self._equal and took_s >= SAY_FIRST_S:
+            self._say(f"The first step took {took_s:.1f} s, for {share:.1g} of the time; later ones are longer.")
+
+
+def _duration(seconds: float) -> str:
+    """Say a time in the unit that suits it.
+
+    >>> [_duration(seconds) for seconds in (90.0, 1000.0, 20000.0)]
+    ['90 s', '17 min', '5.6 h']
+    """
+    if seconds < 120.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
 
 
 def _or_more(bound_k: float) -> str:

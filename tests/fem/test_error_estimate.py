@@ -13,6 +13,7 @@ from thermoxels_ns.fem.error_estimate import RecoveredError, error_ratios, recov
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
 from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.recovered_gradient import curvature_k
 from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
@@ -136,6 +137,15 @@ def replace_mesh(problem: HeatProblem, times: int) -> HeatProblem:
     for _ in range(times):
         problem = replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=None)
     return problem
+
+
+def test_straight_temperatures_have_no_curvature_and_bent_ones_four_times_less_on_half_the_size() -> None:
+    sizes = []
+    for parts in (4, 8):
+        mesh = smooth(parts).mesh
+        assert curvature_k(mesh, (mesh.points_m @ [1.0, 2.0, 3.0])[None]) < 1e-9
+        sizes.append(curvature_k(mesh, np.stack([0.0 * mesh.points_m[:, 0], exact(mesh.points_m)])))
+    assert 3.0 < sizes[0] / sizes[1] < 5.0, sizes
 
 
 def test_the_surplus_follows_the_error_through_time() -> None:

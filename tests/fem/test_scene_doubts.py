@@ -8,7 +8,8 @@ import pytest
 from tests.scene_bodies import Z_UP, room, tagged_body, wall
 from thermoxels_ns.fem.heat_scene import HeatScene
 from thermoxels_ns.fem.materials import Material
-from thermoxels_ns.fem.scene_doubts import scene_doubts
+from thermoxels_ns.fem.problem import TimeSteps
+from thermoxels_ns.fem.scene_doubts import scene_doubts, unused_settings
 from thermoxels_ns.fem.scene_fields import InsideAir, OutsideAir
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -58,3 +59,10 @@ def test_a_room_seen_from_within_is_inside_out() -> None:
 def test_up_decides_what_an_underside_is(up) -> None:
     """What faces down as the mesh was made is a wall if another direction is up."""
     assert scene_doubts(HeatScene(CONCRETE, **AIRS), filled(), up) == ()
+
+
+def test_a_start_that_a_steady_state_does_not_know_is_named() -> None:
+    (said,) = unused_settings(HeatScene(CONCRETE, initial_c=15.0, **AIRS))
+    assert "initial temperature of 15 degrees" in said and "initial changes nothing" in said
+    assert unused_settings(HeatScene(CONCRETE, **AIRS)) == ()
+    assert unused_settings(HeatScene(CONCRETE, TimeSteps(2, 60.0), initial_c=15.0, **AIRS)) == ()

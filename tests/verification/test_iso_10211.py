@@ -2,7 +2,7 @@
 
 A program is a three-dimensional steady-state high precision method if its temperatures are within 0.1 C of the listed
 ones, its heat flow is within 0.1 W/m in case 2 and within 1 % in case 3, and flows change by less than 1 % when the
-number of subdivisions is doubled. Case 4 (a bar through insulation) is not among them here.
+number of subdivisions is doubled. Case 4, a bar through insulation, is beside them.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ class Surplus:
         return total
 
 
-def edge_surplus(problem: HeatProblem, solution: HeatSolution) -> Surplus:
+def edge_surplus(problem: HeatProblem, solution: HeatSolution, *, system: HeatSystem | None = None) -> Surplus:
     """Estimate the error that the mesh makes at each of a solution's times.
 
     The error obeys the heat equation too. With what the temperatures leave unbalanced in the equations of quadratic
@@ -52,6 +52,7 @@ def edge_surplus(problem: HeatProblem, solution: HeatSolution) -> Surplus:
     Args:
         problem: What was solved.
         solution: From `solve_heat`.
+        system: The equations that were solved, of linear tetrahedra; None: they are made here.
 
     Returns:
         The surplus at each time, 0 at the start: the mesh's own temperatures are what the body starts from.
@@ -59,7 +60,7 @@ def edge_surplus(problem: HeatProblem, solution: HeatSolution) -> Surplus:
     Raises:
         HeatError: The equations of the error could not be solved.
     """
-    linear, quadratic = HeatSystem(problem), HeatSystem(problem, lumped=False, order=2)
+    linear, quadratic = system or HeatSystem(problem), HeatSystem(problem, lumped=False, order=2)
     times_s, num_mesh_nodes = solution.times_s, linear.num_nodes
     added_k, added_w = np.zeros((len(times_s), num_mesh_nodes)), np.zeros((len(times_s), len(linear.groups)))
     error_k, stage = np.zeros(quadratic.num_nodes), None
@@ -67,19 +68,49 @@ def edge_surplus(problem: HeatProblem, solution: HeatSolution) -> Surplus:
         if stage is None or quadratic.matrix_in_time or abs(stage.step_s - step_s) > 1e-9 * step_s:
             stage = Stage(quadratic, time_s, step_s, relative_tolerance=_SOLVER_TOLERANCE)
         relative_k = solution.temperature_c[row] - linear.reference_c
-        rate_k_s = _rate(linear, relative_k, time_s, step_s)
         begin_k = quadratic.space.from_mesh_nodes(relative_k)
+        rate_k_s = _rate(linear, relative_k, time_s, step_s)
         # M (rate + d error / dt) = net heat of P2 at the temperature and its error together.
         kept_w = quadratic.mass_product(quadratic.space.from_mesh_nodes(rate_k_s) - error_k / step_s)
-        found = stage.solve(begin_k, time_s, -kept_w, -quadratic.pieces.sums(kept_w))
-        if not found.converged:
+        found = (_solved if quadratic.nonlinear else _balanced)(stage, begin_k, time_s, kept_w)
+        if found.status:
             raise HeatError(f"The error of the mesh could not be estimated. {found.status} Check the mesh's quality.")
-        error_k = found.relative_k - begin_k
+        error_k = found.error_k
         added_k[row] = error_k[:num_mesh_nodes]
         stored_w = kept_w + quadratic.mass_product(error_k) / step_s
         before_w = heat_of_groups_w(linear, relative_k, time_s, linear.mass_product(rate_k_s))
-        added_w[row] = heat_of_groups_w(quadratic, found.relative_k, time_s, stored_w) - before_w
+        added_w[row] = heat_of_groups_w(quadratic, begin_k + error_k, time_s, stored_w) - before_w
     return Surplus(added_k, added_w, linear.groups)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A solution of the equations of the error."""
+
+    error_k: Vector
+    """Minus the error, shape (n,), [K]."""
+    status: str
+    """Why it is none, or nothing."""
+
+
+def _solved(stage: Stage, begin_k: Vector, time_s: float, kept_w: Vector) -> _Found:
+    """Solve by Newton's method."""
+    found = stage.solve(begin_k, time_s, -kept_w, -stage.system.pieces.sums(kept_w))
+    return _Found(found.relative_k - begin_k, "" if found.converged else found.status)
+
+
+def _balanced(stage: Stage, begin_k: Vector, time_s: float, kept_w: Vector) -> _Found:
+    """Solve linear equations: at once, and no better than an estimate asks for."""
+    system, error_k = stage.system, np.zeros_like(begin_k)
+    fixed = system.fixed.nodes
+    heat_w = -kept_w
+    if len(fixed):
+        error_k[fixed] = system.fixed.temperature_k(time_s) - begin_k[fixed]
+        if error_k.any():
+            heat_w -= system.mass_product(error_k) / stage.step_s
+    heat_w += system.net_heat(begin_k + error_k, time_s)[0]
+    found_k, linear = stage.balance(heat_w, np.where(stage.floating, system.pieces.sums(heat_w), 0.0))
+    return _Found(error_k + found_k, "" if linear.converged else linear.status)
 
 
 def _rate(system: HeatSystem, relative_k: Vector, time_s: float, step_s: float) -> Vector:

@@ -65,10 +65,6 @@ class ErrorSize:
     heat_flow: float
     """Largest error of the mean heat flow of an effect, as a share of all heat that flows through the body."""
 
-    def __add__(self, other: ErrorSize) -> ErrorSize:
-        """Both together, at worst."""
-        return ErrorSize(self.temperature_k + other.temperature_k, self.heat_flow + other.heat_flow)
-
     def describe(self) -> str:
         """Say it in words."""
         return f"{self.temperature_k:.2g} K and {100.0 * self.heat_flow:.2g} % of the heat flow"

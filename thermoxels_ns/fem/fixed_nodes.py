@@ -16,6 +16,8 @@ Vector = npt.NDArray[np.float64]
 
 _SAME_TEMPERATURE_K = 1e-9
 """Two effects may fix the same node if their temperatures differ by no more than this, [K]."""
+_KEPT_TIMES = 4
+"""Times whose temperatures are kept: what begins a step has ended the one before."""
 
 
 class FixedNodes:
@@ -37,14 +39,18 @@ class FixedNodes:
             (form.effect, patch) for form in forms for patch in form.groups
         )
         """Effect and patch of each row of `shares`."""
-        areas = [form.node_area_m2[:, self.nodes] for form in forms]
-        area = sparse.vstack(areas).tocsr() if areas else sparse.csr_matrix((0, len(self.nodes)))
-        total = np.asarray(area.sum(axis=0)).ravel()
-        self.shares: sparse.csr_matrix = sparse.csr_matrix(area @ sparse.diags(1.0 / total))
-        """Share of each node's heat that belongs to each group, by the area around the node, shape (g, d)."""
         self._num_nodes = num_nodes
+        self._kept: dict[float, Vector] = {}
         self.in_time = any(form.in_time for form in forms)
         """Whether a temperature changes with time."""
+
+    @cached_property
+    def shares(self) -> sparse.csr_matrix:
+        """Share of each node's heat that belongs to each group, by the area around the node, shape (g, d)."""
+        areas = [form.node_area_m2[:, self.nodes] for form in self._forms]
+        area = sparse.vstack(areas).tocsr() if areas else sparse.csr_matrix((0, len(self.nodes)))
+        total = np.asarray(area.sum(axis=0)).ravel()
+        return sparse.csr_matrix(area @ sparse.diags(1.0 / total))
 
     @cached_property
     def free(self) -> npt.NDArray[np.int64]:
@@ -59,21 +65,42 @@ class FixedNodes:
         Raises:
             HeatError: Two effects fix different temperatures at one node.
         """
-        fixed = np.full(len(self.nodes), np.nan)
+        known = self._kept.get(time_s)
+        if known is None:
+            known = self._with(self._steady, time_s, in_time=True) if self.in_time else self._steady
+            known.setflags(write=False)
+            while len(self._kept) >= _KEPT_TIMES:
+                del self._kept[next(iter(self._kept))]
+            self._kept[time_s] = known
+        return known
+
+    @cached_property
+    def _places(self) -> list[npt.NDArray[np.int64]]:
+        """Where the nodes of each form stand in `nodes`."""
+        return [np.searchsorted(self.nodes, form.nodes) for form in self._forms]
+
+    @cached_property
+    def _steady(self) -> Vector:
+        """What does not change with time; NaN elsewhere."""
+        return self._with(np.full(len(self.nodes), np.nan), 0.0, in_time=False)
+
+    def _with(self, others: Vector, time_s: float, *, in_time: bool) -> Vector:
+        """Fill in what some forms say at a time."""
+        fixed = others.copy()
         for number, form in enumerate(self._forms):
-            place, wanted = np.searchsorted(self.nodes, form.nodes), form.temperature_k(time_s)
-            clash = np.abs(fixed[place] - wanted) > _SAME_TEMPERATURE_K
-            if clash.any():
-                raise HeatError(self._explain_clash(number, form.nodes[clash], wanted[clash], time_s))
-            fixed[place] = wanted
+            if form.in_time == in_time:
+                place, wanted = self._places[number], form.temperature_k(time_s)
+                clash = np.abs(fixed[place] - wanted) > _SAME_TEMPERATURE_K
+                if clash.any():
+                    raise HeatError(self._explain_clash(number, form.nodes[clash], wanted[clash], time_s))
+                fixed[place] = wanted
         return fixed
 
     def _explain_clash(self, number: int, nodes: npt.NDArray[np.int64], wanted: Vector, time_s: float) -> str:
         form = self._forms[number]
-        for other in self._forms[:number]:
-            place = np.flatnonzero(np.isin(other.nodes, nodes))
-            if len(place):
-                break
+        others = [other for other in self._forms if other is not form and np.isin(other.nodes, nodes).any()]
+        other = others[0]
+        place = np.flatnonzero(np.isin(other.nodes, nodes))
         node = int(other.nodes[place[0]])
         first = other.temperature_k(time_s)[place[0]] + other.reference_c
         second = wanted[np.flatnonzero(nodes == node)[0]] + form.reference_c

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,7 @@ from thermoxels_ns.fem.assembly import assemble_stiffness
 from thermoxels_ns.fem.elements import capacities
 from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.fem.selection import Selection
-from thermoxels_ns.fem.sparsity import mesh_edges, symmetric_matrix
+from thermoxels_ns.fem.sparsity import MeshEdges, mesh_edges, symmetric_matrix
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,11 @@ class LinearSpace:
         self.lumped = lumped
         self.rule = CORNERS if lumped_boundary else SIX_POINTS
 
+    @cached_property
+    def edges(self) -> MeshEdges:
+        """The edges of the mesh."""
+        return mesh_edges(self.selection.mesh.tets, len(self.selection.mesh.points_m))
+
     @property
     def num_nodes(self) -> int:
         """Number of unknowns."""
@@ -73,7 +79,7 @@ class LinearSpace:
     def stiffness(self, conductivity_w_mk: float | npt.NDArray[np.float64]) -> sparse.csr_matrix:
         """K, entries integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]."""
         mesh = self.selection.mesh
-        return assemble_stiffness(mesh.points_m, mesh.tets, conductivity_w_mk)
+        return assemble_stiffness(mesh.points_m, mesh.tets, conductivity_w_mk, edges=self.edges)
 
     def mass(
         self, heat_capacity_j_m3k: float | npt.NDArray[np.float64]
@@ -82,7 +88,7 @@ class LinearSpace:
         mesh = self.selection.mesh
         if self.lumped:
             return None, capacities(mesh.points_m, mesh.tets, heat_capacity_j_m3k)[0]
-        edges = mesh_edges(mesh.tets, self.num_nodes)
+        edges = self.edges
         nodal, along = capacities(mesh.points_m, mesh.tets, heat_capacity_j_m3k, edges)
         # phi_i^2 integrates to V / 10 in each tetrahedron around node i, phi_i to V / 4.
         return symmetric_matrix(edges, along, 0.4 * nodal), nodal

@@ -25,7 +25,7 @@ _SAFETY = 0.9
 _SHRINK, _GROW = 0.2, 5.0
 _KEEP_BELOW = 1.25
 """A step that could be longer by less than this stays as it is, and so do its matrices."""
-_SHORTEST = 1e-30
+_SHORTEST = 1e-60
 """Shortest step as a share of the duration; bodies with next to no heat capacity begin with such short ones."""
 
 
@@ -68,7 +68,8 @@ def equal_steps(
     for number, begin_s in enumerate(time.times_s[:-1]):
         limited = False
         if keeper is not None:
-            step, limited, in_range = keeper.step(relative_k, float(begin_s), time.step_seconds)
+            kept = keeper.step(relative_k, float(begin_s), time.step_seconds)
+            step, limited, in_range = kept.step, kept.limited, kept.in_range
         else:
             step = stepper.step(relative_k, float(begin_s), time.step_seconds)
             times = tuple(float(begin_s) + node * time.step_seconds for node in (0.0, *scheme.nodes))
@@ -101,10 +102,11 @@ class AdaptiveMarch:
     """Steps as long as a tolerance allows, by the estimate of an embedded scheme.
 
     A step whose result leaves the range that temperatures may have, that of its start and of all surroundings, is
-    taken with backward Euler and a `RangeKeeper` instead, which never leave it; the difference between both is then the
-    estimate. So nothing overshoots by more than a thousandth of the tolerance or a millionth of the range, and second
-    order returns as soon as it is safe. No step is longer than effects can be followed by, so that none steps over a
-    day of sunshine.
+    taken with backward Euler and a `RangeKeeper` instead, which never leave it; the difference between both schemes is
+    then the estimate. What couplings that are left out change is the mesh's error, not the step's, and no part of it:
+    it would ask for ever shorter steps. So nothing overshoots by more than a thousandth of the tolerance or a millionth
+    of the range, and second order returns as soon as it is safe. No step is longer than effects can be followed by, so
+    that none steps over a day of sunshine.
     """
 
     def __init__(
@@ -175,16 +177,16 @@ class AdaptiveMarch:
         plain = _Attempt(step, self._scheme.scheme.order + 1)
         if not step.converged or step.error_k > self._allowed_k or self._in_range(step, start_k, now_s, step_s):
             return plain
-        safe, limited, in_range = self._safe.step(start_k, now_s, step_s, self._slack_k)
-        if not in_range:
+        kept = self._safe.step(start_k, now_s, step_s, self._slack_k)
+        if not kept.in_range:
             return replace(plain, in_range=False)
         safe = replace(
-            safe,
-            error_k=float(np.max(np.abs(safe.relative_k - step.relative_k))),
-            iterations=safe.iterations + step.iterations,
-            newton_iterations=safe.newton_iterations + step.newton_iterations,
+            kept.step,
+            error_k=float(np.max(np.abs(kept.plain_k - step.relative_k))),
+            iterations=kept.step.iterations + step.iterations,
+            newton_iterations=kept.step.newton_iterations + step.newton_iterations,
         )
-        return _Attempt(safe, BACKWARD_EULER.order + 1, made_safe=1, limited=limited)
+        return _Attempt(safe, BACKWARD_EULER.order + 1, made_safe=1, limited=kept.limited)
 
     def _in_range(self, step: Step, start_k: Vector, now_s: float, step_s: float) -> bool:
         times = (now_s, *(now_s + node * step_s for node in self._scheme.scheme.nodes))

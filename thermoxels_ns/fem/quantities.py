@@ -44,7 +44,34 @@ class Varying:
     """Whether the numbers change with time. False: they are asked for once, at the time 0."""
     resolution_s: float = math.inf
     """Numbers this far apart in time say how they change in between, above 0, [s]; steps that are chosen by their error
-    are no longer. Infinite: nobody knows."""
+    are no longer. Infinite: nobody knows, and what happens between two such steps is missed."""
+
+
+def tabulated(times_s: npt.ArrayLike, values: npt.ArrayLike) -> Varying:
+    """Make a quantity that changes with time as a table says, in straight lines from entry to entry.
+
+    It is held at the first and the last entry before and after them. Adaptive steps are no longer than the shortest
+    time between two entries, so that none is stepped over.
+
+    Args:
+        times_s: Times, ascending, at least two, shape (k,), [s].
+        values: What it is at these times, shape (k,).
+
+    Raises:
+        HeatError: The table is none.
+
+    >>> tabulated([0.0, 3600.0, 7200.0], [10.0, 20.0, 10.0]).resolution_s
+    3600.0
+    """
+    times, entries = np.asarray(times_s, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    fits = times.ndim == 1 and len(times) >= 2 and entries.shape == times.shape
+    if not (fits and np.isfinite(times).all() and np.isfinite(entries).all() and np.all(np.diff(times) > 0.0)):
+        expected = "at least two times, ascending, and as many values, all finite"
+        got = f"times of shape {times.shape} and values of shape {entries.shape}"
+        raise HeatError(explain("table", expected=expected, got=got, remedy="Sort it by time and remove repetitions."))
+    return Varying(
+        lambda _, time_s: float(np.interp(time_s, times, entries)), resolution_s=float(np.min(np.diff(times)))
+    )
 
 
 Quantity: TypeAlias = float | Varying
@@ -118,6 +145,11 @@ class Bounded:
     def in_time(self) -> bool:
         """Whether it changes with time."""
         return isinstance(self.quantity, Varying) and self.quantity.in_time
+
+    @property
+    def unresolved(self) -> bool:
+        """Whether it changes with time and nobody knows how fast."""
+        return self.in_time and math.isinf(self.resolution_s)
 
     @property
     def resolution_s(self) -> float:

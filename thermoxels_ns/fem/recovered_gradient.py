@@ -11,6 +11,7 @@ from numba import njit
 
 from thermoxels_ns.fem.edge_midpoints import TET_EDGES
 from thermoxels_ns.fem.quadratic_elements import mass_table
+from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _LINEAR_MEANS = (np.ones((4, 4)) + np.eye(4)) / 20.0
 
@@ -53,6 +54,26 @@ def gradient_defect(
         defect,
     )
     return defect
+
+
+def curvature_k(mesh: TetMesh, temperature_c: npt.NDArray[np.float64]) -> float:
+    """Estimate roughly what temperatures of linear tetrahedra miss by being straight, [K].
+
+    That is a quarter of the size of a tetrahedron times how far its gradient is from that of its surroundings, the
+    largest of all.
+
+    Args:
+        mesh: The mesh.
+        temperature_c: Temperatures of its nodes, one row per time, shape (s, n).
+    """
+    side = mesh.points_m[mesh.tets[:, 1:]] - mesh.points_m[mesh.tets[:, :1]]
+    volume = np.abs(np.linalg.det(side)) / 6.0
+    share = volume ** (2.0 / 3.0 - 1.0) / 16.0
+    largest = 0.0
+    for row in temperature_c:
+        defect = gradient_defect(mesh.points_m, mesh.tets, mesh.tets, row, mesh.region)
+        largest = max(largest, float(np.max(share * defect)))
+    return largest**0.5
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

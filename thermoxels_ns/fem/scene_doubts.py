@@ -1,4 +1,4 @@
-"""What looks wrong about a heat scene around a body although it is possible."""
+"""What looks wrong about a heat scene around a body although it is possible, and what it gives for nothing."""
 
 from __future__ import annotations
 
@@ -57,6 +57,24 @@ def scene_doubts(scene: HeatScene, mesh: TetMesh, up: Vector) -> tuple[str, ...]
             "name the inner surface with --patches."
         )
     return tuple(doubts)
+
+
+def unused_settings(scene: HeatScene) -> tuple[str, ...]:
+    """Find what a scene gives and its question does not ask for.
+
+    Args:
+        scene: The scene.
+
+    Returns:
+        A sentence or two each.
+    """
+    if not scene.steady or scene.initial_c is None:
+        return ()
+    return (
+        f"The scene gives an initial temperature of {scene.initial_c:g} degrees Celsius, but asks for the steady "
+        "state, which does not depend on the start: initial changes nothing. Remove it, or give time in place of "
+        "steady.",
+    )
 
 
 def _chosen(selection: Selection, patterns: tuple[str, ...]) -> npt.NDArray[np.bool_]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +28,8 @@ _NEWTON_TOLERANCE = 1e-6
 """Relative tolerance of the linear solver in a step of Newton's method: the next step corrects the rest."""
 _UNEXPLAINED = 1e-11
 """Largest share of the stored heat that may be unaccounted for where nodes are fixed."""
+_WORTH_A_GUESS = 2000
+"""Unknowns from which on to find where to start takes less time than the iterations that it saves."""
 _EPS = float(np.finfo(np.float64).eps)
 ROUND_OFF = 8.0 * _EPS
 """Round-off of a sum as a share of the sum of sizes."""
@@ -83,8 +86,10 @@ class Stage:
         """Row sums of M / step + R, shape (n,), [W / K]."""
         self.floating: npt.NDArray[np.bool_] = ~system.pieces.touched(system.fixed.nodes)
         """Pieces without fixed nodes, shape (p,)."""
-        self._solver: SystemSolver | None = None
-        self._guess = StartingGuess()
+        self.floats = bool(self.floating.any())
+        """Whether there are any."""
+        self._rough_solver: SystemSolver | None = None
+        self._guess = StartingGuess() if len(self.matrix.indptr) > _WORTH_A_GUESS else None
 
     def solve(
         self,
@@ -108,20 +113,55 @@ class Stage:
             return StageSolution(balance.base_k, balance.base_k - start_k, 0, 0, True, status)
         if self.system.nonlinear:
             found = newton(balance, len(first.heat_w), relative_tolerance=self._relative_tolerance)
-            return balance.solution(found.u, found.linear_iterations, found.iterations, found.converged, found.status)
-        if self._solver is None:
-            self._solver = self.system.linear_solver(self.matrix, self._relative_tolerance)
-        change, linear = self.correction(self._solver, self.held_w_k, first, self._guess)
+            u, spent = found.u, found.linear_iterations
+            rest = self._unexplained(balance, u) if found.converged else None
+            if rest is not None:
+                more, linear = balance.correction(u, rest)
+                u, spent = u + more if linear.converged else u, spent + linear.iterations
+            return balance.solution(u, spent, found.iterations, found.converged, found.status)
+        change, linear = self.correction(self._own_solver, self.held_w_k, first, self._guess)
         iterations = linear.iterations
-        if self._free is not None and linear.converged and np.isfinite(self.step_s):
-            rest = balance.residual(change)
-            stored_w = self.at_free(self.system.mass_product(self.everywhere(change))) / self.step_s
-            # In a long step, what is nothing beside the heat that flows may be much beside what is stored.
-            if abs(np.sum(rest.heat_w)) > _UNEXPLAINED * np.sum(np.abs(stored_w)) and not rest.is_round_off:
-                more, again = self.correction(self._solver, self.held_w_k, rest)
-                iterations += again.iterations
-                change = change + more if again.converged else change
+        rest = self._unexplained(balance, change) if linear.converged else None
+        if rest is not None:
+            more, again = self.correction(self._own_solver, self.held_w_k, rest)
+            iterations += again.iterations
+            change = change + more if again.converged else change
         return balance.solution(change, iterations, 0, linear.converged, linear.status)
+
+    def _unexplained(self, balance: _Balance, change: Vector) -> Residual | None:
+        """What is left to balance after a step with fixed nodes, if it is much beside what is stored.
+
+        In a long step, what is nothing beside the heat that flows may be much beside what is stored.
+        """
+        if self._free is None or not np.isfinite(self.step_s):
+            return None
+        rest = balance.residual(change)
+        stored_w = self.at_free(self.system.mass_product(self.everywhere(change))) / self.step_s
+        much = abs(np.sum(rest.heat_w)) > _UNEXPLAINED * np.sum(np.abs(stored_w))
+        return rest if much and not rest.is_round_off else None
+
+    def balance(self, heat_w: Vector, piece_heat_w: Vector) -> tuple[Vector, LinearSolution]:
+        """Solve (M / step + K + R) change = heat with what was learned from earlier solutions; linear equations only.
+
+        Args:
+            heat_w: Shape (n,), [W]; what stands at fixed nodes does not matter.
+            piece_heat_w: Its sum over each piece without the round-off of conduction, 0 of those with fixed nodes,
+                shape (p,), [W].
+
+        Returns:
+            The change, 0 at fixed nodes, shape (n,), [K], and how well it was found.
+        """
+        heat_w = self.at_free(heat_w)
+        if not self.floats:
+            found = _solved(self._own_solver, heat_w, self._guess)
+            return self.everywhere(found.x), found
+        rest = Residual(heat_w, piece_heat_w, np.zeros_like(heat_w), np.zeros_like(piece_heat_w))
+        change, linear = self.correction(self._own_solver, self.held_w_k, rest, self._guess)
+        return self.everywhere(change), linear
+
+    @cached_property
+    def _own_solver(self) -> SystemSolver:
+        return self.system.linear_solver(self.matrix, self._relative_tolerance)
 
     def damped(self, heat_w: Vector, piece_heat_w: Vector, relative_k: Vector, time_s: float) -> Vector:
         """Solve (M / step + K + R + slope of radiation) e = heat roughly, for error estimates; shape (n,), [K].
@@ -132,13 +172,19 @@ class Stage:
             relative_k: Temperatures at which the slope of radiation is taken, shape (n,), [K].
             time_s: Time at which it is taken.
         """
-        matrix, held_w_k = self.matrix, self.held_w_k
+        held_w_k = self.held_w_k
         if self.system.nonlinear:
             slope = self.system.radiation_slope(relative_k, time_s)
-            matrix = sparse.csr_matrix(matrix + self.free_block(slope))
+            matrix = sparse.csr_matrix(self.matrix + self.free_block(slope))
             held_w_k = held_w_k + slope @ np.ones(self.system.num_nodes)
-        solver = self.system.linear_solver(matrix, _ESTIMATE_TOLERANCE)
+            solver = self.system.linear_solver(matrix, _ESTIMATE_TOLERANCE)
+        else:
+            if self._rough_solver is None:
+                self._rough_solver = self.system.linear_solver(self.matrix, _ESTIMATE_TOLERANCE)
+            solver = self._rough_solver
         heat_w = self.at_free(heat_w)
+        if not self.floats:
+            return self.everywhere(solver.solve(heat_w).x)
         nothing = np.zeros_like(heat_w)
         balance = Residual(heat_w, np.where(self.floating, piece_heat_w, 0.0), nothing, np.zeros_like(piece_heat_w))
         return self.everywhere(self.correction(solver, held_w_k, balance)[0])
@@ -154,7 +200,7 @@ class Stage:
             residual: What is to be balanced.
             guess: Earlier solutions with this matrix, to which this one is added; None: start from nothing.
         """
-        if not self.floating.any():
+        if not self.floats:
             linear = _solved(solver, residual.heat_w, guess)
             return linear.x, linear
         pieces, full_w = self.system.pieces, self.everywhere(residual.heat_w)

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.loose_pieces import check_held
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.solution import SteadySolution, heat_by_effect
-from thermoxels_ns.fem.stage import Stage, StageSolution
+from thermoxels_ns.fem.stage import StageSolution
+from thermoxels_ns.fem.steady_range import state_in_range
 from thermoxels_ns.fem.system import HeatSystem, effect_labels
 from thermoxels_ns.units import ZERO_CELSIUS_K
 
 _ROUND_OFF = 64.0 * float(np.finfo(np.float64).eps)
 """Share of the terms of a sum that round-off leaves of it at most."""
+_NOTHING = 1e-10
+"""Share of the terms that flows are differences of below which they are what the linear solver leaves of none."""
 
 
 def solve_steady(
@@ -27,15 +31,18 @@ def solve_steady(
 ) -> SteadySolution:
     """Find the temperatures at which the effects of a problem balance, div(k grad T) + s = 0.
 
+    With the defaults no temperature leaves the range of the surroundings, unless a flux or source drives it out, on any
+    mesh: where obtuse angles would let one leave, see `state_in_range`. If other choices let one leave, the status
+    says so.
+
     Args:
         problem: Body, materials and effects. Its initial temperatures are where iterations start.
         time_s: Time at which effects that change are taken, [s].
         order: 1 for linear tetrahedra; 2 for quadratic ones, which have eight times as many unknowns and an error that
             falls with the cube of the mesh size where the solution is smooth, but may overshoot the surroundings.
         lumped_boundary: Evaluate convection and radiation at the nodes, which keeps temperatures in the range of the
-            surroundings on meshes without obtuse angles. False integrates them over each triangle: on smooth
-            problems the error is smaller by a constant. None: at the nodes of linear tetrahedra; quadratic ones are
-            always integrated.
+            surroundings. False integrates them over each triangle: on smooth problems the error is smaller by a
+            constant. None: at the nodes of linear tetrahedra; quadratic ones are always integrated.
         relative_tolerance: Of the linear solver, and of Newton's method if there is radiation.
         allow_unconverged: Return what was computed, with `converged` False and the reason in `status`, instead of
             raising.
@@ -51,10 +58,9 @@ def solve_steady(
     """
     if system is None:
         system = HeatSystem(problem, lumped=order == 1, lumped_boundary=lumped_boundary, order=order)
-    _check_held(system, time_s)
-    start_k = system.start_k
-    stage = Stage(system, time_s, np.inf, relative_tolerance=relative_tolerance)
-    solution = stage.solve(start_k, time_s)
+    check_held(system, time_s)
+    state = state_in_range(system, time_s, relative_tolerance=relative_tolerance)
+    solution, system = state.solution, state.system
     failure = _failure(system, solution)
     if failure and not allow_unconverged:
         raise HeatError(failure)
@@ -65,7 +71,7 @@ def solve_steady(
         temperature_c=relative_k[:num_mesh_nodes] + system.reference_c,
         effects=heat_by_effect(effect_labels(problem), system.groups, group_heat[None]),
         energy_residual=_residual(system, relative_k, time_s, group_heat),
-        status=failure or f"The steady state was found. {solution.status}",
+        status=failure or f"The steady state was found. {solution.status}{state.describe()}",
         converged=not failure,
         iterations=solution.iterations,
         newton_iterations=solution.newton_iterations,
@@ -83,7 +89,10 @@ def _residual(system: HeatSystem, relative_k: np.ndarray, time_s: float, group_h
     exchanged_w, terms_w = system.exchanged_heat(relative_k, time_s)
     flows_w = float(np.abs(exchanged_w).sum() + np.abs(system.net_heat_at_fixed(relative_k, time_s)).sum())
     surplus_w, terms = abs(float(group_heat_w.sum())), float(terms_w.sum())
-    if surplus_w <= _ROUND_OFF * terms:
+    if surplus_w > _ROUND_OFF * terms and len(system.fixed.nodes):
+        # What flows to and from fixed nodes is a difference of conduction's terms.
+        terms += float(system.conducted_heat(relative_k)[1][system.fixed.nodes].sum())
+    if surplus_w <= _ROUND_OFF * terms or flows_w <= _NOTHING * terms:
         flows_w = max(flows_w, terms)
     return surplus_w / flows_w if flows_w > 0.0 else 0.0
 
@@ -121,24 +130,4 @@ def too_cold(system: HeatSystem, relative_k: np.ndarray) -> str:
         f"The temperature falls to {coldest_k:.6g} K, below absolute zero: the given fluxes or sources take out more "
         "heat than can flow in. Check their sign (positive is into the body). In long steps, schemes other than "
         "backward Euler may overshoot, too."
-    )
-
-
-def _check_held(system: HeatSystem, time_s: float) -> None:
-    """Refuse a body of which a piece may have any temperature."""
-    loose = np.flatnonzero(~system.exchanging_pieces(time_s))
-    if len(loose) == 0:
-        return
-    sizes = np.bincount(system.pieces.number, minlength=system.pieces.count)
-    piece = int(loose[np.argmax(sizes[loose])])
-    points = system.space.points_m[system.pieces.number == piece]
-    low, high = (", ".join(f"{part:.4g}" for part in corner) for corner in (points.min(axis=0), points.max(axis=0)))
-    raise HeatError(
-        explain(
-            "steady heat problem",
-            expected="convection, radiation, ground contact or a fixed temperature on every connected piece of a body",
-            got=f"none on {len(loose)} of {system.pieces.count} pieces; the largest has {sizes[piece]} nodes in the "
-            f"box from ({low}) to ({high}) m",
-            remedy="Remove the piece, give its boundary an effect, or follow it through time instead.",
-        )
     )

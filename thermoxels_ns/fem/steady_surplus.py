@@ -10,9 +10,7 @@ from thermoxels_ns.errors import HeatError
 from thermoxels_ns.fem.edge_exchange import EdgeExchange, EdgeSpace
 from thermoxels_ns.fem.edge_operator import EdgeOperator
 from thermoxels_ns.fem.edge_surplus import Surplus
-from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solver_choice import LinearSolver
-from thermoxels_ns.fem.sparsity import mesh_edges
 from thermoxels_ns.fem.steady import heat_of_groups_w
 from thermoxels_ns.fem.system import HeatSystem
 
@@ -67,12 +65,12 @@ class _Bubbles:
         mesh = problem.mesh
         self._relative_k, self._time_s = relative_k, time_s
         self._num_nodes = len(mesh.points_m)
-        edges = mesh_edges(mesh.tets, self._num_nodes)
+        edges = system.space.edges
         self._low, self._high = edges.smaller_nodes(), edges.other
-        self._space = EdgeSpace(Selection(mesh, problem.up), edges)
+        self._space = EdgeSpace(system.space.selection, edges)
         self._operator = EdgeOperator(problem, self._space.tet_edges, len(edges.other))
         self._exchange = EdgeExchange(problem, self._space, system.reference_c)
-        self._everywhere_k = self._space.from_mesh_nodes(relative_k)
+        self._everywhere_k = self._with_means(relative_k)
         self._slopes = self._exchange.slopes(self._everywhere_k, time_s)
         self._diagonal = self._operator.edge_diagonal() + self._exchange.diagonal(self._slopes)[self._num_nodes :]
         nodes_w, edges_w = self._split(self._exchange.heat(self._everywhere_k, time_s))
@@ -104,13 +102,13 @@ class _Bubbles:
         """Take what a change that balanced the nodes takes from the edges."""
         edges_w = self._operator.conducted_to_edges(change_k)
         if self._slopes:
-            edges_w += self._exchange.taken(self._slopes, self._space.from_mesh_nodes(change_k))[self._num_nodes :]
+            edges_w += self._exchange.taken(self._slopes, self._with_means(change_k))[self._num_nodes :]
         self._less(self.nodes_w, edges_w)
 
     def flows_w(self, nodal_k: Vector) -> Vector:
         """Heat flow of each group with the bubbles and a change of the nodes, shape (g,), [W]."""
         exchange, fixed = self._exchange, self._exchange.fixed
-        full_k = self._everywhere_k + self._space.from_mesh_nodes(nodal_k)
+        full_k = self._everywhere_k + self._with_means(nodal_k)
         full_k[self._num_nodes :] += self._bubble
         flows = exchange.group_heat_w(full_k, self._time_s)
         if len(fixed.nodes) == 0:
@@ -119,6 +117,10 @@ class _Bubbles:
         kept_w = np.concatenate([nodes_w - 0.5 * self._at_ends(edges_w), edges_w])
         kept_w -= exchange.heat(full_k, self._time_s)
         return np.concatenate([flows, fixed.shares @ kept_w[fixed.nodes]])
+
+    def _with_means(self, nodal: Vector) -> Vector:
+        """Values of nodes and their means along edges, shape (n + e,)."""
+        return np.concatenate([nodal, 0.5 * (nodal[self._low] + nodal[self._high])])
 
     def _less(self, nodes_w: Vector, edges_w: Vector) -> None:
         self.nodes_w, self._edges_w = self.nodes_w - nodes_w, self._edges_w - edges_w

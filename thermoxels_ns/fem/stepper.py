@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import isclose
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,8 @@ Vector = npt.NDArray[np.float64]
 
 _KEPT_STAGES = 2
 """Lengths of stages whose matrices are kept."""
+_SAME_LENGTH = 1e-12
+"""Relative difference up to which two lengths are one."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +136,10 @@ class Stepper:
         return float(np.max(np.abs(error)))
 
     def _stage(self, time_s: float, step_s: float) -> Stage:
-        key = (time_s if self._system.matrix_in_time else 0.0, step_s)
+        time_s = time_s if self._system.matrix_in_time else 0.0
+        # Lengths that are differences of times differ in the last digits.
+        alike = (key for key in self._stages if key[0] == time_s and isclose(key[1], step_s, rel_tol=_SAME_LENGTH))
+        key = next(alike, (time_s, step_s))
         stage = self._stages.pop(key, None)
         if stage is None:
             stage = Stage(self._system, time_s, step_s, relative_tolerance=self._relative_tolerance)

@@ -8,13 +8,14 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.loose_pieces import check_stored
 from thermoxels_ns.fem.marching import AdaptiveMarch, Taken, equal_steps
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, SDIRK2, Scheme
-from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect, left_out
+from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.steady import too_cold
+from thermoxels_ns.fem.step_account import StepAccount
 from thermoxels_ns.fem.system import HeatSystem, effect_labels
-from thermoxels_ns.units import celsius_to_kelvin
 
 Vector = npt.NDArray[np.float64]
 
@@ -55,15 +56,17 @@ def solve_heat(
         Temperatures at the start and after every step or interval, and the heat balance.
 
     Raises:
-        HeatError: If the temperatures of all times do not fit into memory, an effect does not fit the mesh, a step's
-            solver does not converge, or the temperature falls below absolute zero.
+        HeatError: If the temperatures of all times do not fit into memory, an effect does not fit the mesh, heat flows
+            into a piece that neither stores nor passes it on, a step's solver does not converge, or the temperature
+            falls below absolute zero.
     """
     states = _room_for_states(time.num_times, len(problem.mesh.points_m))
     system = HeatSystem(problem, lumped=lumped, lumped_boundary=lumped_boundary)
     states[0] = problem.start_c - system.reference_c
     if len(system.fixed.nodes):
         states[0, system.fixed.nodes] = system.fixed.temperature_k(0.0)
-    account = _Account(system, states, time.times_s)
+    check_stored(system, time.duration_s)
+    account = StepAccount(system, states, time.times_s)
     march: AdaptiveMarch | None = None
     if isinstance(time, TimeSteps):
         steps: Iterator[Taken] = equal_steps(system, scheme or BACKWARD_EULER, states[0], time, relative_tolerance)
@@ -84,98 +87,18 @@ def solve_heat(
     return account.close(failure or account.success(march) + _skips(problem, time), not failure, adaptive=bool(march))
 
 
-class _Account:
-    """Keeps states at the ends of intervals and adds up the heat that flowed in between."""
-
-    def __init__(self, system: HeatSystem, states_k: Vector, times_s: Vector) -> None:
-        self._system, self._states, self._times = system, states_k, times_s
-        self._done = self._steps = self._most_iterations = 0
-        self.followed_s = 0.0
-        """Time that has been followed, [s]."""
-        self._heat_j = np.zeros((len(times_s) - 1, len(system.groups)))
-        self._exchanged_j = np.zeros(len(times_s) - 1)
-        self._iterations = np.zeros((len(times_s) - 1, 2), dtype=np.int64)
-        self._error_k = 0.0
-        self._limited = self._out_of_range = 0
-
-    @property
-    def steps(self) -> int:
-        """Number of steps so far."""
-        return self._steps
-
-    def add(self, taken: Taken) -> None:
-        """Count a step."""
-        step, row = taken.step, self._done
-        self.followed_s += taken.step_s
-        self._heat_j[row] += taken.step_s * step.group_heat_w
-        self._exchanged_j[row] += taken.step_s * float(np.abs(step.group_heat_w).sum())
-        self._iterations[row] += step.iterations, step.newton_iterations
-        self._most_iterations = max(self._most_iterations, step.iterations)
-        self._error_k += step.error_k
-        self._steps += 1
-        self._limited += taken.limited
-        self._out_of_range += not taken.in_range
-        if taken.ends_interval:
-            self._done += 1
-            self._states[self._done] = step.relative_k
-
-    def success(self, march: AdaptiveMarch | None) -> str:
-        """Say that all went well, and how."""
-        sentence = f"All {self._steps} steps converged, in {self._most_iterations} iterations at most."
-        if march is not None and march.repeated:
-            sentence += f" {march.repeated} more were repeated with a shorter length."
-        if march is not None and march.made_safe:
-            sentence += f" {march.made_safe} were taken with backward Euler because {march.name} would have overshot."
-        if self._limited:
-            sentence += (
-                f" In {self._limited}, obtuse angles would have let a temperature leave its range; couplings with the "
-                "wrong sign were left out there."
-            )
-        if self._out_of_range:
-            sentence += (
-                f" In {self._out_of_range} a temperature left its range, which schemes other than backward Euler, "
-                "consistent masses and integrated boundary exchange may do."
-            )
-        return sentence
-
-    def close(self, status: str, converged: bool, *, adaptive: bool) -> HeatSolution:
-        """Balance the heat and convert to degrees Celsius, in place because the states may be large."""
-        system, done = self._system, self._done
-        states_k, times_s = self._states[: done + 1], self._times[: done + 1]
-        heat_j, mass = self._heat_j[:done], system.nodal_mass_j_k
-        total_mass = float(mass.sum())
-        relative_content = states_k @ mass
-        content = relative_content + total_mass * celsius_to_kelvin(system.reference_c)
-        supplied = np.concatenate([[0.0], np.cumsum(heat_j.sum(axis=1))])
-        unexplained = float(np.max(np.abs(relative_content - relative_content[0] - supplied)))
-        exchanged = float(self._exchanged_j[:done].sum())
-        mean = relative_content[0] / total_mass
-        spread = float(mass @ np.abs(states_k[0] - mean))
-        states_k += system.reference_c
-        lengths = np.diff(times_s)
-        kinds = [effect.kind for effect in system.problem.effects]
-        return HeatSolution(
-            times_s=times_s,
-            temperature_c=states_k,
-            heat_w=np.diff(relative_content) / lengths,
-            heat_content_j=content,
-            energy_residual=_share(unexplained, max(float(content[0]), exchanged)),
-            energy_residual_of_spread=_share(unexplained, spread + exchanged),
-            status=status,
-            converged=converged,
-            iterations=self._iterations[:done, 0],
-            skipped_effects=left_out(kinds),
-            effects=heat_by_effect(effect_labels(system.problem), system.groups, heat_j / lengths[:, None]),
-            newton_iterations=self._iterations[:done, 1],
-            steps=self._steps,
-            time_error_k=self._error_k if adaptive else float("nan"),
-            assembled=system.assembled,
-        )
-
-
 def _skips(problem: HeatProblem, time: TimeSteps | AdaptiveSteps) -> str:
-    """Say that equal steps are too long to see how an effect changes, or nothing."""
-    if isinstance(time, AdaptiveSteps) or time.step_seconds <= problem.resolution_s:
+    """Say that steps may be too long to see how an effect changes, or nothing."""
+    if isinstance(time, AdaptiveSteps):
+        labelled = zip(effect_labels(problem), problem.effects)
+        names = [label for label, effect in labelled if any(effect.bounded(name).unresolved for name in effect.bounds)]
+        if not names:
+            return ""
+        return (
+            f" Nothing says how fast {', '.join(names)} may change with time: what happens between two steps is "
+            "missed. Give the Varying its resolution_s, or use tabulated."
+        )
+    if time.step_seconds <= problem.resolution_s:
         return ""
     return (
         f" Steps of {time.step_seconds:g} s are longer than the {problem.resolution_s:g} s by which effects that "
@@ -208,10 +131,3 @@ def _room_for_states(num_times: int, num_nodes: int) -> Vector:
             remedy=f"Take at most {max(MAX_STATE_BYTES // (8 * num_nodes) - 1, 1)} steps, or a coarser mesh.",
         )
     )
-
-
-def _share(part: float, whole: float) -> float:
-    """Part of a whole; nothing of nothing is 0, something of nothing is infinite."""
-    if part == 0.0:
-        return 0.0
-    return part / whole if whole > 0.0 else float("inf")

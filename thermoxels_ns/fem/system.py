@@ -25,6 +25,11 @@ from thermoxels_ns.fem.two_level import SystemSolver, TwoLevelConjugateGradients
 
 Vector = npt.NDArray[np.float64]
 
+_FEW, _ROUGH = 5000, 1e-3
+"""So few unknowns are solved for so roughly without a coarse level, which would take longer to make and to use."""
+_KEPT_RANGES = 64
+"""Times at which the range of the surroundings is kept."""
+
 
 class HeatSystem:
     """What schemes and the steady solver ask of a problem. Constant parts are assembled once, when first asked for.
@@ -81,8 +86,10 @@ class HeatSystem:
         """Effect and patch or region of each heat flow of `group_heat_w`, then of each of the fixed nodes."""
         self._mass: tuple[sparse.csr_matrix | None, Vector] | None = None
         self._kept_exchange: sparse.csr_matrix | None = None
+        self._kept_matrix: sparse.csr_matrix | None = None
         self._kept_load: Vector | None = None
         self._fixed_rows: sparse.csr_matrix | None = None
+        self._kept_ranges: dict[float, tuple[float, float]] = {}
         self._prolongation: sparse.csr_matrix | None = None
 
     @property
@@ -108,7 +115,7 @@ class HeatSystem:
     def with_stiffness(self, stiffness: sparse.csr_matrix) -> HeatSystem:
         """Copy the system with another K between the same nodes; all else is shared."""
         other = copy(self)
-        other._stiffness, other._fixed_rows = stiffness, None
+        other._stiffness, other._fixed_rows, other._kept_matrix = stiffness, None, None
         return other
 
     @property
@@ -136,9 +143,13 @@ class HeatSystem:
 
     def matrix(self, time_s: float, step_s: float) -> sparse.csr_matrix:
         """M / step + K + R, shape (n, n), [W / K]; without M for a step without end."""
-        exchange = self.exchange_matrix(time_s)
-        matrix = self._stiffness if exchange is None else sparse.csr_matrix(self._stiffness + exchange)
+        matrix = self._kept_matrix
+        if matrix is None:
+            exchange = self.exchange_matrix(time_s)
+            matrix = self._stiffness if exchange is None else sparse.csr_matrix(self._stiffness + exchange)
         if np.isinf(step_s):
+            # An estimate of the error asks for it again.
+            self._kept_matrix = None if self.matrix_in_time else matrix
             return matrix
         mass, nodal = self._masses()
         per_second = sparse.diags(nodal / step_s, format="csr") if mass is None else mass / step_s
@@ -146,7 +157,8 @@ class HeatSystem:
 
     def linear_solver(self, matrix: sparse.csr_matrix, relative_tolerance: float) -> SystemSolver:
         """Make the solver for a matrix between the free nodes that suits the tetrahedra."""
-        if not isinstance(self._space, QuadraticSpace):
+        few = len(matrix.indptr) <= _FEW and relative_tolerance >= _ROUGH
+        if few or not isinstance(self._space, QuadraticSpace):
             return LinearSolver(matrix, relative_tolerance=relative_tolerance)
         if self._prolongation is None:
             free, num_mesh_nodes = self.fixed.free, len(self.problem.mesh.points_m)
@@ -227,7 +239,8 @@ class HeatSystem:
             return np.zeros(0)
         if self._fixed_rows is None:
             self._fixed_rows = sparse.csr_matrix(self._stiffness[nodes])
-        return self.exchanged_heat(relative_k, time_s)[0][nodes] - self._fixed_rows @ relative_k
+        from_nodes_w = self._fixed_rows @ relative_k
+        return self.exchanged_heat(relative_k, time_s)[0][nodes] - from_nodes_w if self.exchanges else -from_nodes_w
 
     def radiation_magnitude(self, relative_k: Vector, time_s: float) -> Vector:
         """Sum of the sizes of what `radiation_load` adds up, shape (n,), [W]."""
@@ -252,16 +265,26 @@ class HeatSystem:
 
         A source or flux opens it on the side that it pushes to.
         """
-        low, high = float(relative_k.min()), float(relative_k.max())
-        for time_s in times_s:
-            ambients = [form.ambient_k(time_s) for form in self._robin]
-            ambients += [form.surroundings_k(time_s) for form in self._radiation]
-            ambients += [self.fixed.temperature_k(time_s)] if len(self.fixed.nodes) else []
-            for ambient in ambients:
-                low, high = min(low, float(ambient.min())), max(high, float(ambient.max()))
-            for form in self._loads:
-                cools, heats = form.signs(time_s)
-                low, high = -np.inf if cools else low, np.inf if heats else high
+        ends = [(float(relative_k.min()), float(relative_k.max())), *map(self.surroundings_k, times_s)]
+        return min(low for low, _ in ends), max(high for _, high in ends)
+
+    def surroundings_k(self, time_s: float) -> tuple[float, float]:
+        """Range of all that surrounds the body at a time, [K]; kept for some of the last times that were asked for."""
+        known = self._kept_ranges.get(time_s)
+        if known is not None:
+            return known
+        low, high = np.inf, -np.inf
+        ambients = [form.ambient_k(time_s) for form in self._robin]
+        ambients += [form.surroundings_k(time_s) for form in self._radiation]
+        ambients += [self.fixed.temperature_k(time_s)] if len(self.fixed.nodes) else []
+        for ambient in ambients:
+            low, high = min(low, float(ambient.min())), max(high, float(ambient.max()))
+        for form in self._loads:
+            cools, heats = form.signs(time_s)
+            low, high = -np.inf if cools else low, np.inf if heats else high
+        while len(self._kept_ranges) >= _KEPT_RANGES:
+            del self._kept_ranges[next(iter(self._kept_ranges))]
+        self._kept_ranges[time_s] = low, high
         return low, high
 
     def _add(self, term: Term, fixed: list[FixedForm]) -> None:

@@ -1,0 +1,85 @@
+"""Bodies from isosurface stuffing with patches and regions, whose angles between faces are obtuse here and there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from tests.heat_meshes import Nodal
+from tests.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, tet_mesh
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.mesh.quality import dihedral_range_deg
+from thermoxels_ns.mesh.stuffing import stuff
+from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
+
+CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
+H = 0.05
+"""Size of a voxel, [m]."""
+STEP_S = H**2 / CONCRETE.diffusivity_m2_s
+"""Time in which heat crosses a voxel, [s]."""
+
+
+def stuffed(level: np.ndarray, temperature_c: Nodal = 20.0, regions: bool = False) -> TetMesh:
+    """Mesh a level set with patches x0 and x1 on either half, and regions "even" and "odd" in turns from voxel to
+    voxel."""
+    return dressed(tet_mesh(stuff(level), H), temperature_c, regions)
+
+
+def dressed(mesh: TetMesh, temperature_c: Nodal = 20.0, regions: bool = False) -> TetMesh:
+    """Give any mesh these patches and regions."""
+    corner = mesh.points_m[mesh.facets]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    middle = mesh.points_m.mean(axis=0)
+    patch = (corner.mean(axis=1)[:, 0] > middle[0]).astype(np.int64)
+    boundary = Boundary(normal, np.ones(len(patch)), np.ones(len(patch), bool), patch, ("x0", "x1"))
+    nodal = temperature_c(mesh.points_m) if callable(temperature_c) else np.full(len(mesh.points_m), temperature_c)
+    mesh = replace(mesh, temperature_c=nodal, boundary=boundary)
+    if regions:
+        odd = np.floor(mesh.points_m[mesh.tets].mean(axis=1) / H).sum(axis=1) % 2
+        mesh = replace(mesh, region=odd.astype(np.int64), region_names=("even", "odd"))
+    return mesh
+
+
+AT_THE_BOUNDS = "at the angle bounds"
+"""Name of a body whose angles are as bad as is promised."""
+NEAR_THE_BOUNDS_DEG = 0.1
+"""How far inside the promised range its worst angles are."""
+
+
+def body(shape: str = "slab at 30 degrees", temperature_c: Nodal = 20.0, regions: bool = False) -> TetMesh:
+    """One of the known shapes, 8 voxels wide, or `AT_THE_BOUNDS`."""
+    mesh = at_the_angle_bounds() if shape == AT_THE_BOUNDS else tet_mesh(stuff(SHAPES[shape].level(8)), H)
+    return dressed(mesh, temperature_c, regions)
+
+
+@lru_cache(maxsize=1)
+def at_the_angle_bounds() -> TetMesh:
+    """A sphere whose every node was moved in some direction until an angle beside it came to a bound.
+
+    Meshes of random levels come to 10.95 and 156 degrees by themselves.
+    """
+    mesh = tet_mesh(stuff(SHAPES["sphere"].level(6)), H)
+    points, rng = mesh.points_m.copy(), np.random.default_rng(4)
+    low, high = ANGLE_BOUNDS_DEG[0] + NEAR_THE_BOUNDS_DEG, ANGLE_BOUNDS_DEG[1] - NEAR_THE_BOUNDS_DEG
+    for node in rng.permutation(len(points)):
+        tets = mesh.tets[(mesh.tets == node).any(axis=1)]
+        direction = rng.normal(size=3)
+        direction *= H / np.linalg.norm(direction)
+        step = 0.1
+        # Onwards as long as all angles keep within the bounds, with ever shorter steps.
+        for _ in range(26):
+            before = points[node].copy()
+            points[node] = before + step * direction
+            least, most = dihedral_range_deg(points, tets)
+            corner = points[tets]
+            if least < low or most > high or np.linalg.det(corner[:, 1:] - corner[:, :1]).min() <= 0.0:
+                points[node], step = before, 0.5 * step
+    return replace(mesh, points_m=points)
+
+
+def spots(points: np.ndarray) -> np.ndarray:
+    """Single hot and cold nodes in an even body."""
+    return np.random.default_rng(1).choice([-30.0, 20.0, 90.0], len(points))

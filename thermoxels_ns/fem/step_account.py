@@ -1,0 +1,140 @@
+"""The account of steps in time: which states are kept, and the balance of the heat that flowed in between."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.fem.marching import AdaptiveMarch, Taken
+from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect, left_out
+from thermoxels_ns.fem.system import HeatSystem, effect_labels
+from thermoxels_ns.units import celsius_to_kelvin
+
+Vector = npt.NDArray[np.float64]
+
+_ROUND_OFF = 64.0 * float(np.finfo(np.float64).eps)
+"""Share of the terms of a sum that round-off leaves of it at most."""
+_SUSPICIOUS = 1e-12
+"""Residual from which on it is worth to look whether it is round-off."""
+
+
+class StepAccount:
+    """Keeps states at the ends of intervals and adds up the heat that flowed in between."""
+
+    def __init__(self, system: HeatSystem, states_k: Vector, times_s: Vector) -> None:
+        """Begin with no steps.
+
+        Args:
+            system: The equations.
+            states_k: Room for the states, the first one given, relative to the reference, shape (s + 1, n), [K].
+            times_s: Their times, shape (s + 1,), [s].
+        """
+        self._system, self._states, self._times = system, states_k, times_s
+        self._done = self._steps = self._most_iterations = 0
+        self.followed_s = 0.0
+        """Time that has been followed, [s]."""
+        self._heat_j = np.zeros((len(times_s) - 1, len(system.groups)))
+        self._exchanged_j = np.zeros(len(times_s) - 1)
+        self._iterations = np.zeros((len(times_s) - 1, 2), dtype=np.int64)
+        self._error_k = 0.0
+        self._limited = self._out_of_range = 0
+
+    @property
+    def steps(self) -> int:
+        """Number of steps so far."""
+        return self._steps
+
+    def add(self, taken: Taken) -> None:
+        """Count a step."""
+        step, row = taken.step, self._done
+        self.followed_s += taken.step_s
+        self._heat_j[row] += taken.step_s * step.group_heat_w
+        self._exchanged_j[row] += taken.step_s * float(np.abs(step.group_heat_w).sum())
+        self._iterations[row] += step.iterations, step.newton_iterations
+        self._most_iterations = max(self._most_iterations, step.iterations)
+        self._error_k += step.error_k
+        self._steps += 1
+        self._limited += taken.limited
+        self._out_of_range += not taken.in_range
+        if taken.ends_interval:
+            self._done += 1
+            self._states[self._done] = step.relative_k
+
+    def success(self, march: AdaptiveMarch | None) -> str:
+        """Say that all went well, and how."""
+        sentence = f"All {self._steps} steps converged, in {self._most_iterations} iterations at most."
+        if march is not None and march.repeated:
+            sentence += f" {march.repeated} more were repeated with a shorter length."
+        if march is not None and march.made_safe:
+            sentence += f" {march.made_safe} were taken with backward Euler because {march.name} would have overshot."
+        if self._limited:
+            sentence += (
+                f" In {self._limited}, obtuse angles would have let a temperature leave its range; couplings with the "
+                "wrong sign were left out there."
+            )
+        if self._out_of_range:
+            sentence += (
+                f" In {self._out_of_range} a temperature left its range, which schemes other than backward Euler, "
+                "consistent masses and integrated boundary exchange may do."
+            )
+        return sentence
+
+    def close(self, status: str, converged: bool, *, adaptive: bool) -> HeatSolution:
+        """Balance the heat and convert to degrees Celsius, in place because the states may be large."""
+        system, done = self._system, self._done
+        states_k, times_s = self._states[: done + 1], self._times[: done + 1]
+        heat_j, mass = self._heat_j[:done], system.nodal_mass_j_k
+        total_mass = float(mass.sum())
+        relative_content = states_k @ mass
+        content = relative_content + total_mass * celsius_to_kelvin(system.reference_c)
+        supplied = np.concatenate([[0.0], np.cumsum(heat_j.sum(axis=1))])
+        unexplained = float(np.max(np.abs(relative_content - relative_content[0] - supplied)))
+        exchanged = float(self._exchanged_j[:done].sum())
+        mean = relative_content[0] / total_mass
+        spread = float(mass @ np.abs(states_k[0] - mean))
+        scale, spread_scale = max(float(content[0]), exchanged), spread + exchanged
+        if unexplained > _SUSPICIOUS * min(scale, spread_scale):
+            terms = self._terms_j(states_k, times_s)
+            if unexplained <= _ROUND_OFF * terms:
+                scale, spread_scale = max(scale, terms), max(spread_scale, terms)
+        states_k += system.reference_c
+        lengths = np.diff(times_s)
+        kinds = [effect.kind for effect in system.problem.effects]
+        return HeatSolution(
+            times_s=times_s,
+            temperature_c=states_k,
+            heat_w=np.diff(relative_content) / lengths,
+            heat_content_j=content,
+            energy_residual=_share(unexplained, scale),
+            energy_residual_of_spread=_share(unexplained, spread_scale),
+            status=status,
+            converged=converged,
+            iterations=self._iterations[:done, 0],
+            skipped_effects=left_out(kinds),
+            effects=heat_by_effect(effect_labels(system.problem), system.groups, heat_j / lengths[:, None]),
+            newton_iterations=self._iterations[:done, 1],
+            steps=self._steps,
+            time_error_k=self._error_k if adaptive else float("nan"),
+            assembled=system.assembled,
+        )
+
+    def _terms_j(self, states_k: Vector, times_s: Vector) -> float:
+        """Sizes of all that is added up to the heat that flows in, [J].
+
+        Near equilibrium next to nothing is left of their sum; if a step is far longer than heat takes to leave the
+        body, round-off of it is much beside what the body stores.
+        """
+        system, total_j = self._system, 0.0
+        for state_k, time_s, length_s in zip(states_k[1:], times_s[1:], np.diff(times_s)):
+            terms_w = float(system.exchanged_heat(state_k, float(time_s))[1].sum())
+            if len(system.fixed.nodes):
+                terms_w += float(system.conducted_heat(state_k)[1][system.fixed.nodes].sum())
+            total_j += float(length_s) * terms_w
+        return total_j
+
+
+def _share(part: float, whole: float) -> float:
+    """Part of a whole; nothing of nothing is 0, something of nothing is infinite."""
+    if part == 0.0:
+        return 0.0
+    return part / whole if whole > 0.0 else float("inf")
