@@ -396,6 +396,13 @@ def test_a_mesh_without_a_summary_is_said_to_be_taken_in_metres(folder, tmp_path
     assert any("summary.json is missing; the mesh is taken to be in metres" in line for line in lines)
 
 
+def test_a_mesh_that_is_not_there_is_all_that_is_said(folder, tmp_path) -> None:
+    lines: list[str] = []
+    with pytest.raises(ThermoxelsError, match=r"nowhere\.vtu: expected a file"):
+        compute_heat(Heat(tmp_path / "nowhere.vtu", str(folder / "steady.yaml"), tmp_path), lines.append)
+    assert lines == []
+
+
 def test_help_says_what_it_writes(capsys) -> None:
     with pytest.raises(SystemExit) as stop:
         cli.main(["heat", "--help"])

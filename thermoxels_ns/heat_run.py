@@ -112,8 +112,8 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
 
     scene = load_heat_scene(options.scene)
     check_accuracy_options(options, scene)
-    export = _export_summary(options.mesh, say)
     mesh = read_mesh(options.mesh)
+    export = _export_summary(options.mesh, say)
     up = options.up if options.up is not None else _direction(export.get("up"), options.mesh)
     problem = scene.problem(mesh, up=up)
     probes = place_probes(mesh, np.array(options.probes, dtype=np.float64).reshape(-1, 3))

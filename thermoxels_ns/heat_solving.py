@@ -251,7 +251,7 @@ def _say_what_is_built(screening: Screening, say: Say) -> None:
     for entry in screening.left_out:
         say(f"Left out: {entry.effect}, at most {entry.bound_k:.2g} K and {entry.bound_w:.3g} W: {entry.reason}.")
     for entry in screening.kept:
-        bound = "" if entry.bound_k is None else f" (up to {min(entry.bound_k, 100.0):.2g} K{_or_more(entry.bound_k)})"
+        bound = "" if entry.bound_k is None else f" (up to {_bound(entry.bound_k)})"
         say(f"Built: {entry.effect}{bound}")
     if not screening.kept and not screening.left_out:
         say("Nothing acts on the body: its surface is insulated.")
@@ -261,34 +261,48 @@ class _Progress:
     """Says after the first step how long it took, and every now and then how far a solution has come.
 
     The pace of the first step, which makes the matrices too, is about the slowest of equal steps. Those that are chosen
-    by their error begin short, and how many will follow is not known yet.
+    by their error begin short, and how many will follow is not known yet; later the pace since the last line counts,
+    because that from the start on would tell hours where minutes are left.
     """
 
     def __init__(self, say: Say, time: TimeSteps | AdaptiveSteps | None) -> None:
         self._say, self._share = say, 0.0
         self._equal = isinstance(time, TimeSteps)
         self._begin_s = self._said_s = self._called_s = clock.perf_counter()
+        self._said_share = 0.0
 
     def __call__(self, share: float, steps: int) -> None:
         """Take the share of the duration that is done, and the number of steps."""
         now_s = clock.perf_counter()
         if share < self._share:  # the next solution has begun
-            self._begin_s = self._called_s
+            self._begin_s = self._said_s = self._called_s
+            self._said_share = 0.0
         took_s = now_s - self._begin_s
         self._share, self._called_s = share, now_s
         if steps == 1 and share < 1.0:
             self._say_first(share, took_s)
-        elif now_s - self._said_s >= SAY_EVERY_S and 0.0 < share < 1.0:
-            left_s = took_s * (1.0 - share) / share
-            self._said_s = now_s
-            self._say(f"{share:.0%} of the time after {steps} steps; about {_duration(left_s)} left.")
+        elif now_s - self._said_s >= SAY_EVERY_S and self._said_share < share < 1.0:
+            pace_s = took_s / share if self._equal else (now_s - self._said_s) / (share - self._said_share)
+            left_s = pace_s * (1.0 - share)
+            self._said_s, self._said_share = now_s, share
+            self._say(f"{_percent(share)} of the time after {steps} steps; about {_duration(left_s)} left.")
 
     def _say_first(self, share: float, took_s: float) -> None:
         left_s = took_s * (1.0 - share) / share
         if self._equal and left_s >= SAY_EVERY_S:
             self._say(f"The first step took {took_s:.1f} s; at that pace about {_duration(left_s)} left.")
         elif not self._equal and took_s >= SAY_FIRST_S:
-            self._say(f"The first step took {took_s:.1f} s, for {share:.1g} of the time; later ones are longer.")
+            self._said_s, self._said_share = self._called_s, share
+            self._say(f"The first step took {took_s:.1f} s, for {_percent(share)} of the time.")
+
+
+def _percent(share: float) -> str:
+    """Say a share, also a small one.
+
+    >>> [_percent(share) for share in (0.5, 0.034, 2e-5)]
+    ['50%', '3%', '0.002%']
+    """
+    return f"{share:.0%}" if share >= 0.01 else f"{100.0 * share:.1g}%"
 
 
 def _duration(seconds: float) -> str:
@@ -302,5 +316,10 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
 
 
-def _or_more(bound_k: float) -> str:
-    return " or more" if bound_k > 100.0 else ""
+def _bound(bound_k: float) -> str:
+    """Say a bound; far above what matters its size says nothing.
+
+    >>> [_bound(bound_k) for bound_k in (0.0341, 99.6, 4000.0)]
+    ['0.034 K', '100 K or more', '100 K or more']
+    """
+    return f"{bound_k:.2g} K" if bound_k < 99.5 else "100 K or more"

@@ -148,6 +148,30 @@ def test_straight_temperatures_have_no_curvature_and_bent_ones_four_times_less_o
     assert 3.0 < sizes[0] / sizes[1] < 5.0, sizes
 
 
+@pytest.mark.parametrize("at_once", [1, 1000, 200_000])
+def test_the_surplus_of_all_times_together_is_that_of_one_after_the_other(at_once, monkeypatch) -> None:
+    """A coefficient that may change with time, and does not, gives each time a matrix of its own."""
+    monkeypatch.setattr("thermoxels_ns.fem.edge_surplus._AT_ONCE", at_once)
+    axis = np.linspace(0.0, 0.3, 4)
+    warm = Varying(lambda places, time_s: 60.0 * np.cos(time_s / 1000.0))
+    air = Varying(lambda places, time_s: 5.0 * np.sin(time_s / 500.0))
+
+    def surplus(coefficient: float | Varying):
+        effects = (
+            Convection(("x0",), coefficient, air),
+            FixedTemperature(("x1",), warm),
+            InternalHeat(("*",), 500.0),
+        )
+        problem = HeatProblem(box_mesh(axis, axis, axis, temperature_c=20.0), STEEL, effects=effects)
+        return edge_surplus(problem, solve_heat(problem, AdaptiveSteps(3600.0, 0.1)))
+
+    together, apart = surplus(25.0), surplus(Varying(lambda places, time_s: 25.0))
+    size_k, size_w = np.abs(apart.temperature_k).max(), np.abs(apart.group_heat_w).max()
+    assert size_k > 0.1 and size_w > 0.1 and together.groups == apart.groups
+    np.testing.assert_allclose(together.temperature_k, apart.temperature_k, atol=1e-6 * size_k)
+    np.testing.assert_allclose(together.group_heat_w, apart.group_heat_w, atol=1e-6 * size_w)
+
+
 def test_the_surplus_follows_the_error_through_time() -> None:
     """A block that one hot side warms, against a mesh of half the size twice; heat that flowed in too."""
     axis = np.linspace(0, 0.1, 7)

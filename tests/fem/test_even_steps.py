@@ -107,6 +107,21 @@ def test_their_error_is_known_and_allowed(make, duration_s, allowed_k) -> None:
     assert 1 / 1.5 < estimate_k / true_k < 3.0, (estimate_k, true_k)
 
 
+@pytest.mark.parametrize("parts", [10, 20])
+@pytest.mark.parametrize("allowed_k", [0.3, 0.06])
+def test_their_error_is_known_with_its_sign_where_a_temperature_swings(parts, allowed_k) -> None:
+    problem = rod(parts)
+    even = EvenSteps(HeatSystem(problem), AdaptiveSteps(32.0, allowed_k), allowed_k)
+    exact = solve_heat(problem, TimeSteps(640, 0.05), scheme=SDIRK2).temperature_c[::64]
+    true_k, estimate_k = (even.temperature_c - exact)[1:], -even.errors_k()[1:]
+    assert even.found
+    sizes = np.linalg.norm(estimate_k, axis=1), np.linalg.norm(true_k, axis=1)
+    cosines = np.sum(true_k * estimate_k, axis=1) / (sizes[0] * sizes[1])
+    assert cosines.min() > 0.9, cosines
+    ratios = np.abs(estimate_k).max(axis=1) / np.abs(true_k).max(axis=1)
+    assert ratios.min() > 0.6 and ratios.max() < 1.7, ratios
+
+
 def test_only_a_sudden_start_takes_short_steps() -> None:
     times: list[tuple[float, int]] = []
     problem = suddenly_hot(52)
@@ -115,8 +130,15 @@ def test_only_a_sudden_start_takes_short_steps() -> None:
     counts = np.diff([0, *(steps for _, steps in times)])
     assert counts[0] >= 4 and counts[-1] == 1 and np.all(np.diff(counts) <= 0), counts
     assert [share for share, _ in times] == pytest.approx(np.arange(1, 11) / 10)
-    start = EvenSteps(HeatSystem(problem), time, 0.2, only_at_start=True)
-    assert start.start_error_k <= 0.2 and even.found
+    looked_at: list[float] = []
+
+    def starts_well(temperature_c: np.ndarray, error_k: float) -> bool:
+        assert temperature_c.shape == (len(problem.mesh.points_m),) and temperature_c.max() == pytest.approx(100.0)
+        looked_at.append(error_k)
+        return error_k <= 0.2
+
+    start = EvenSteps(HeatSystem(problem), time, ANY_K, starts_well=starts_well)
+    assert start.start_error_k == looked_at[-1] <= 0.2 < looked_at[0] and even.found
     assert np.abs(start.errors_k()).max() >= np.abs(even.errors_k()).max()
 
 

@@ -30,11 +30,27 @@ def test_a_table_is_straight_from_entry_to_entry_and_held_outside() -> None:
 
 @pytest.mark.parametrize(
     ("times_s", "values"),
-    [([0.0], [1.0]), ([0.0, 1.0], [1.0]), ([1.0, 0.0], [1.0, 2.0]), ([0.0, 0.0], [1.0, 2.0]), ([0.0, np.nan], [1, 2])],
+    [
+        ([0.0], [1.0]),
+        ([0.0, 1.0], [1.0]),
+        ([1.0, 0.0], [1.0, 2.0]),
+        ([0.0, 0.0], [1.0, 2.0]),
+        ([0.0, np.nan], [1, 2]),
+        (["a", "b"], [1.0, 2.0]),
+        ([0.0, [1.0, 2.0]], [1.0, 2.0]),
+    ],
 )
 def test_a_table_that_is_none_is_refused(times_s, values) -> None:
     with pytest.raises(HeatError, match="table: expected at least two times, ascending"):
         tabulated(times_s, values)
+
+
+def test_a_table_stays_as_it_was_given() -> None:
+    times, values = np.array([0.0, 10.0]), np.array([1.0, 3.0])
+    table = tabulated(times, values)
+    times *= 2.0
+    values[:] = 0.0
+    assert table.function(Places(np.zeros((1, 3)), np.zeros((1, 3))), 5.0) == 2.0
 
 
 def test_adaptive_steps_do_not_step_over_a_table() -> None:

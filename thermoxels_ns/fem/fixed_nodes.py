@@ -16,8 +16,9 @@ Vector = npt.NDArray[np.float64]
 
 _SAME_TEMPERATURE_K = 1e-9
 """Two effects may fix the same node if their temperatures differ by no more than this, [K]."""
-_KEPT_TIMES = 4
-"""Times whose temperatures are kept: what begins a step has ended the one before."""
+_KEPT_TIMES, _KEPT_NUMBERS = 4, 20_000
+"""Times whose temperatures are kept at least, because what begins a step has ended the one before, and numbers that are
+kept where more times are: an estimate of the error asks for them again."""
 
 
 class FixedNodes:
@@ -47,10 +48,18 @@ class FixedNodes:
     @cached_property
     def shares(self) -> sparse.csr_matrix:
         """Share of each node's heat that belongs to each group, by the area around the node, shape (g, d)."""
-        areas = [form.node_area_m2[:, self.nodes] for form in self._forms]
-        area = sparse.vstack(areas).tocsr() if areas else sparse.csr_matrix((0, len(self.nodes)))
-        total = np.asarray(area.sum(axis=0)).ravel()
-        return sparse.csr_matrix(area @ sparse.diags(1.0 / total))
+        rows, columns, areas, before = [], [], [], 0
+        for form in self._forms:
+            width = form.owners.shape[1]
+            rows.append(np.repeat(before + form.group, width))
+            columns.append(np.searchsorted(self.nodes, form.owners.ravel()))
+            areas.append(np.repeat(form.area_m2, width))
+            before += len(form.groups)
+        if not rows:
+            return sparse.csr_matrix((0, 0))
+        column, area = np.concatenate(columns), np.concatenate(areas)
+        share = area / np.bincount(column, area, len(self.nodes))[column]
+        return sparse.csr_matrix((share, (np.concatenate(rows), column)), (before, len(self.nodes)))
 
     @cached_property
     def free(self) -> npt.NDArray[np.int64]:
@@ -69,7 +78,8 @@ class FixedNodes:
         if known is None:
             known = self._with(self._steady, time_s, in_time=True) if self.in_time else self._steady
             known.setflags(write=False)
-            while len(self._kept) >= _KEPT_TIMES:
+            most = max(_KEPT_TIMES, _KEPT_NUMBERS // max(len(self.nodes), 1))
+            while len(self._kept) >= most:
                 del self._kept[next(iter(self._kept))]
             self._kept[time_s] = known
         return known

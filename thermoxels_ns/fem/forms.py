@@ -243,11 +243,12 @@ class FixedForm:
         self.in_time = term.temperature_c.in_time
         used, group = np.unique(selection.facet_patch[term.facets], return_inverse=True)
         self.groups = tuple(selection.patch_names[number] for number in used)
-        width = facet_nodes.shape[1]
-        weight = np.repeat(selection.facet_area_m2[term.facets], width)
-        place = (np.repeat(group, width), facet_nodes.ravel())
-        self.node_area_m2 = sparse.csr_matrix((weight, place), (len(used), space.num_nodes))
-        """Area around each node by patch, shape (g, n), to share a node's heat by."""
+        self.owners: npt.NDArray[np.int64] = facet_nodes
+        """Nodes of each triangle, shape (k, m)."""
+        self.group: npt.NDArray[np.int64] = group
+        """Patch of each triangle, shape (k,)."""
+        self.area_m2: Vector = selection.facet_area_m2[term.facets]
+        """Area of each triangle, shape (k,), to share a node's heat by."""
 
     def temperature_k(self, time_s: float) -> Vector:
         """Temperatures of `nodes`, relative to the reference, [K]."""

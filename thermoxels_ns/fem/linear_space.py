@@ -118,17 +118,18 @@ class LinearSpace:
 
     def node_places(self, nodes: npt.NDArray[np.int64]) -> Places:
         """Give the positions of nodes, with the mean normal of the boundary around them."""
-        selection = self.selection
-        owners = self.facet_nodes(np.arange(len(selection.mesh.facets)))
-        width = owners.shape[1]
-        weighted = selection.facet_normal * selection.facet_area_m2[:, None]
-        total = np.stack(
-            [sums_by_number(owners.ravel(), np.repeat(weighted[:, i], width), self.num_nodes)[nodes] for i in range(3)],
-            axis=1,
-        )
+        total = self._normals[nodes]
         length = np.sqrt(np.einsum("ki,ki->k", total, total))[:, None]
         normals = np.divide(total, length, out=np.zeros_like(total), where=length > 0.0)
-        return Places(self.points_m[nodes], normals, selection.up)
+        return Places(self.points_m[nodes], normals, self.selection.up)
+
+    @cached_property
+    def _normals(self) -> npt.NDArray[np.float64]:
+        """Sums of the normals around each node by area, shape (n, 3), [m2]."""
+        selection = self.selection
+        owners = self.facet_nodes(np.arange(len(selection.mesh.facets)))
+        weighted = np.repeat(selection.facet_normal * selection.facet_area_m2[:, None], owners.shape[1], axis=0)
+        return np.stack([sums_by_number(owners.ravel(), part, self.num_nodes) for part in weighted.T], axis=1)
 
 
 def sums_by_number(numbers: npt.NDArray[np.int64], values: npt.NDArray, count: int) -> npt.NDArray[np.float64]:

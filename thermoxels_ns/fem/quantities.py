@@ -63,7 +63,10 @@ def tabulated(times_s: npt.ArrayLike, values: npt.ArrayLike) -> Varying:
     >>> tabulated([0.0, 3600.0, 7200.0], [10.0, 20.0, 10.0]).resolution_s
     3600.0
     """
-    times, entries = np.asarray(times_s, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    try:
+        times, entries = np.array(times_s, dtype=np.float64), np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        times = entries = np.zeros(0)
     fits = times.ndim == 1 and len(times) >= 2 and entries.shape == times.shape
     if not (fits and np.isfinite(times).all() and np.isfinite(entries).all() and np.all(np.diff(times) > 0.0)):
         expected = "at least two times, ascending, and as many values, all finite"
@@ -164,7 +167,10 @@ class Bounded:
         """
         if not isinstance(self.quantity, Varying):
             return np.full(len(places), self.quantity, dtype=np.float64)
-        values = self.bounds.check(self.quantity.function(places, time_s if self.in_time else 0.0))
+        value = self.quantity.function(places, time_s if self.in_time else 0.0)
+        if isinstance(value, float) and self.bounds.low < value < self.bounds.high:
+            return np.full(len(places), value, dtype=np.float64)
+        values = self.bounds.check(value)
         if values.shape not in ((), (len(places),)):
             raise HeatError(
                 explain(

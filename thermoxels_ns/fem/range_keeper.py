@@ -121,10 +121,16 @@ class RangeWatch:
             slack_k: How far out of it a temperature may be besides round-off, [K], but no more than `MOST_SLACK` of the
                 widest range.
         """
-        low, high = self._system.allowed_range_k(start_k, times_s)
+        return self.after(float(start_k.min()), float(start_k.max()), times_s, slack_k)
+
+    def after(
+        self, coldest_k: float, warmest_k: float, times_s: tuple[float, ...], slack_k: float
+    ) -> tuple[float, float]:
+        """As `at`, where the range of the temperatures at the start is known."""
+        low, high = self._system.allowed_range_k((coldest_k, warmest_k), times_s)
         if np.isfinite(high - low):
             self._widest_k = max(self._widest_k, high - low)
-        level_k = float(np.abs(start_k).max()) + abs(self._system.reference_c + ZERO_CELSIUS_K)
+        level_k = max(abs(coldest_k), abs(warmest_k)) + abs(self._system.reference_c + ZERO_CELSIUS_K)
         slack_k = min(slack_k, MOST_SLACK * self._widest_k)
         slack_k = max(slack_k, RANGE_ROUND_OFF * self._widest_k, LEVEL_ROUND_OFF * level_k)
         return low - slack_k, high + slack_k

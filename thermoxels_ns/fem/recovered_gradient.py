@@ -39,8 +39,7 @@ def gradient_defect(
         One integral per tetrahedron, shape (t,), [K2 m].
     """
     defect = np.zeros(len(tets))
-    by_group = np.argsort(group, kind="stable")
-    ends = np.concatenate([[0], np.cumsum(np.bincount(group))])
+    by_group, ends = _groups(group)
     means = _LINEAR_MEANS if nodes.shape[1] == 4 else mass_table()
     _defect(
         np.ascontiguousarray(points_m, np.float64),
@@ -69,11 +68,18 @@ def curvature_k(mesh: TetMesh, temperature_c: npt.NDArray[np.float64]) -> float:
     side = mesh.points_m[mesh.tets[:, 1:]] - mesh.points_m[mesh.tets[:, :1]]
     volume = np.abs(np.linalg.det(side)) / 6.0
     share = volume ** (2.0 / 3.0 - 1.0) / 16.0
-    largest = 0.0
-    for row in temperature_c:
-        defect = gradient_defect(mesh.points_m, mesh.tets, mesh.tets, row, mesh.region)
+    points, tets = np.ascontiguousarray(mesh.points_m, np.float64), np.ascontiguousarray(mesh.tets, np.int64)
+    by_group, ends = _groups(mesh.region)
+    largest, defect = 0.0, np.zeros(len(tets))
+    for row in np.ascontiguousarray(temperature_c, np.float64):
+        _defect(points, tets, tets, row, by_group, ends, TET_EDGES, _LINEAR_MEANS, defect)
         largest = max(largest, float(np.max(share * defect)))
     return largest**0.5
+
+
+def _groups(group: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Tetrahedra in the order of their groups, and where each group ends."""
+    return np.argsort(group, kind="stable"), np.concatenate([[0], np.cumsum(np.bincount(group))])
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

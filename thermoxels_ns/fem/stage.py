@@ -12,6 +12,7 @@ from scipy import sparse
 
 from thermoxels_ns.fem.forms import COLDEST_SLOPE_K
 from thermoxels_ns.fem.linear_solver import LinearSolution
+from thermoxels_ns.fem.matrix_parts import block_of
 from thermoxels_ns.fem.newton import Residual, newton
 from thermoxels_ns.fem.piece_balance import is_within, weighted_sums, without_sums
 from thermoxels_ns.fem.solver_choice import LinearSolver
@@ -222,7 +223,7 @@ class Stage:
 
     def free_block(self, matrix: sparse.csr_matrix) -> sparse.csr_matrix:
         """Rows and columns of the nodes that are not fixed."""
-        return matrix if self._free is None else sparse.csr_matrix(matrix[self._free][:, self._free])
+        return matrix if self._free is None else block_of(matrix, self._free)
 
     def everywhere(self, free: Vector) -> Vector:
         """Put 0 at the fixed nodes."""

@@ -13,10 +13,12 @@ from thermoxels_ns.fem.steady_range import state_in_range
 from thermoxels_ns.fem.system import HeatSystem, effect_labels
 from thermoxels_ns.units import ZERO_CELSIUS_K
 
+_SUSPICIOUS = 1e-12
+"""Residual from which on it is worth to look whether it is a share of nothing."""
 _ROUND_OFF = 64.0 * float(np.finfo(np.float64).eps)
-"""Share of the terms of a sum that round-off leaves of it at most."""
-_NOTHING = 1e-10
-"""Share of the terms that flows are differences of below which they are what the linear solver leaves of none."""
+"""Share of the absolute temperature below which a difference is round-off."""
+_LEVEL = 1e-10
+"""Share of the terms of a sum below which a level temperature balances them, if the linear solver allows it."""
 
 
 def solve_steady(
@@ -70,7 +72,7 @@ def solve_steady(
     return SteadySolution(
         temperature_c=relative_k[:num_mesh_nodes] + system.reference_c,
         effects=heat_by_effect(effect_labels(problem), system.groups, group_heat[None]),
-        energy_residual=_residual(system, relative_k, time_s, group_heat),
+        energy_residual=_residual(system, relative_k, time_s, group_heat, relative_tolerance),
         status=failure or f"The steady state was found. {solution.status}{state.describe()}",
         converged=not failure,
         iterations=solution.iterations,
@@ -80,21 +82,46 @@ def solve_steady(
     )
 
 
-def _residual(system: HeatSystem, relative_k: np.ndarray, time_s: float, group_heat_w: np.ndarray) -> float:
+def _residual(
+    system: HeatSystem,
+    relative_k: np.ndarray,
+    time_s: float,
+    group_heat_w: np.ndarray,
+    relative_tolerance: float = 1e-12,
+) -> float:
     """Heat that comes in and does not go out, as a share of the heat that flows through the nodes.
 
-    Opposite flows through one patch cancel in the sum of its group, not in that of its nodes. Where nothing flows, as
-    between equal airs, what is left is round-off of the terms that cancel, and a share of these.
+    Opposite flows through one patch cancel in the sum of its group, not in that of its nodes. Where nothing makes heat
+    flow, as between equal airs, what is left is round-off of the terms that cancel, and a share of these.
     """
     exchanged_w, terms_w = system.exchanged_heat(relative_k, time_s)
     flows_w = float(np.abs(exchanged_w).sum() + np.abs(system.net_heat_at_fixed(relative_k, time_s)).sum())
-    surplus_w, terms = abs(float(group_heat_w.sum())), float(terms_w.sum())
-    if surplus_w > _ROUND_OFF * terms and len(system.fixed.nodes):
+    surplus_w = abs(float(group_heat_w.sum()))
+    if surplus_w > _SUSPICIOUS * flows_w and is_still(system, relative_k, time_s, relative_tolerance):
         # What flows to and from fixed nodes is a difference of conduction's terms.
-        terms += float(system.conducted_heat(relative_k)[1][system.fixed.nodes].sum())
-    if surplus_w <= _ROUND_OFF * terms or flows_w <= _NOTHING * terms:
-        flows_w = max(flows_w, terms)
+        conducted_w = system.conducted_heat(relative_k)[1][system.fixed.nodes]
+        flows_w = max(flows_w, float(terms_w.sum() + conducted_w.sum()))
     return surplus_w / flows_w if flows_w > 0.0 else 0.0
+
+
+def is_still(system: HeatSystem, relative_k: np.ndarray, time_s: float, relative_tolerance: float = 1e-12) -> bool:
+    """Whether nothing makes heat flow: each connected piece, at one temperature, balances what acts on every node.
+
+    Args:
+        system: The equations.
+        relative_k: Temperatures, relative to the system's reference, shape (n,), [K].
+        time_s: Time.
+        relative_tolerance: Of the linear solver that found them.
+    """
+    pieces, fixed = system.pieces, system.fixed.nodes
+    mean_k = pieces.sums(relative_k) / pieces.sums(np.ones_like(relative_k))
+    level_k = np.zeros_like(relative_k) + pieces.at_nodes(mean_k)
+    round_off_k = _ROUND_OFF * (np.abs(level_k).max() + abs(system.reference_c + ZERO_CELSIUS_K))
+    share = max(_LEVEL, 100.0 * relative_tolerance)
+    heat_w, terms_w = system.exchanged_heat(level_k, time_s)
+    allowed_w = share * terms_w + round_off_k * system.held_w_k(time_s, np.inf)
+    apart_k = np.abs(relative_k[fixed] - level_k[fixed])
+    return bool(np.all(apart_k <= share * np.abs(level_k[fixed]) + round_off_k) and np.all(np.abs(heat_w) <= allowed_w))
 
 
 def heat_of_groups_w(
@@ -123,11 +150,17 @@ def _failure(system: HeatSystem, solution: StageSolution) -> str:
 
 def too_cold(system: HeatSystem, relative_k: np.ndarray) -> str:
     """Say that temperatures are impossible, or nothing."""
-    coldest_k = float(relative_k.min()) + system.reference_c + ZERO_CELSIUS_K
-    if coldest_k >= -1e-6:
+    coldest_k = float(relative_k.min())
+    if not is_too_cold(system, coldest_k):
         return ""
+    coldest_k += system.reference_c + ZERO_CELSIUS_K
     return (
         f"The temperature falls to {coldest_k:.6g} K, below absolute zero: the given fluxes or sources take out more "
         "heat than can flow in. Check their sign (positive is into the body). In long steps, schemes other than "
         "backward Euler may overshoot, too."
     )
+
+
+def is_too_cold(system: HeatSystem, coldest_k: float) -> bool:
+    """Whether the coldest temperature, relative to the system's reference, is below absolute zero."""
+    return not coldest_k + system.reference_c + ZERO_CELSIUS_K >= -1e-6

@@ -10,6 +10,7 @@ from thermoxels_ns.errors import HeatError
 from thermoxels_ns.fem.edge_exchange import EdgeExchange, EdgeSpace
 from thermoxels_ns.fem.edge_operator import EdgeOperator
 from thermoxels_ns.fem.edge_surplus import Surplus
+from thermoxels_ns.fem.matrix_parts import block_of
 from thermoxels_ns.fem.solver_choice import LinearSolver
 from thermoxels_ns.fem.steady import heat_of_groups_w
 from thermoxels_ns.fem.system import HeatSystem
@@ -154,7 +155,7 @@ class _Followers:
         if system.nonlinear:
             matrix = sparse.csr_matrix(matrix + system.radiation_slope(relative_k, time_s))
         if self._some_fixed:
-            matrix = sparse.csr_matrix(matrix[free][:, free])
+            matrix = block_of(matrix, free)
         self._solver = LinearSolver(matrix, relative_tolerance=_SOLVER_TOLERANCE)
 
     def balance(self, nodes_w: Vector) -> Vector:

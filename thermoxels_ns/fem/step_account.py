@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.fem.marching import AdaptiveMarch, Taken
 from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect, left_out
+from thermoxels_ns.fem.steady import is_still
 from thermoxels_ns.fem.system import HeatSystem, effect_labels
 from thermoxels_ns.units import celsius_to_kelvin
 
@@ -119,13 +120,15 @@ class StepAccount:
         )
 
     def _terms_j(self, states_k: Vector, times_s: Vector) -> float:
-        """Sizes of all that is added up to the heat that flows in, [J].
+        """Sizes of all that is added up to the heat that flows in, up to states at which nothing makes heat flow, [J].
 
-        Near equilibrium next to nothing is left of their sum; if a step is far longer than heat takes to leave the
-        body, round-off of it is much beside what the body stores.
+        There next to nothing is left of their sum; if a step is far longer than heat takes to leave the body, round-off
+        of it is much beside what the body stores. Where heat flows, what is unaccounted for is a share of that.
         """
         system, total_j = self._system, 0.0
         for state_k, time_s, length_s in zip(states_k[1:], times_s[1:], np.diff(times_s)):
+            if not is_still(system, state_k, float(time_s)):
+                continue
             terms_w = float(system.exchanged_heat(state_k, float(time_s))[1].sum())
             if len(system.fixed.nodes):
                 terms_w += float(system.conducted_heat(state_k)[1][system.fixed.nodes].sum())

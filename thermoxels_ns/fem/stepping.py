@@ -84,11 +84,16 @@ def solve_heat(
             progress(account.followed_s / time.duration_s, account.steps)
     if failure and not allow_unconverged:
         raise HeatError(failure)
-    return account.close(failure or account.success(march) + _skips(problem, time), not failure, adaptive=bool(march))
+    return account.close(failure or account.success(march) + skips(problem, time), not failure, adaptive=bool(march))
 
 
-def _skips(problem: HeatProblem, time: TimeSteps | AdaptiveSteps) -> str:
-    """Say that steps may be too long to see how an effect changes, or nothing."""
+def skips(problem: HeatProblem, time: TimeSteps | AdaptiveSteps) -> str:
+    """Say that steps may be too long to see how an effect changes, or nothing.
+
+    Args:
+        problem: The effects.
+        time: The steps.
+    """
     if isinstance(time, AdaptiveSteps):
         labelled = zip(effect_labels(problem), problem.effects)
         names = [label for label, effect in labelled if any(effect.bounded(name).unresolved for name in effect.bounds)]

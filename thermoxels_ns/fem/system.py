@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from thermoxels_ns.fem.account import Assembled
 from thermoxels_ns.fem.fixed_nodes import FixedNodes
 from thermoxels_ns.fem.forms import FixedForm, FluxForm, Form, RadiationForm, RobinForm, SourceForm
 from thermoxels_ns.fem.linear_space import CORNERS, LinearSpace
+from thermoxels_ns.fem.matrix_parts import with_more_on_diagonal
 from thermoxels_ns.fem.pieces import Pieces
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quadratic_space import QuadraticSpace
@@ -128,6 +130,11 @@ class HeatSystem:
         """Row sums of the mass matrix, shape (n,), [J / K]."""
         return self._masses()[1]
 
+    @property
+    def mass_matrix(self) -> sparse.csr_matrix | None:
+        """M, shape (n, n), [J / K]; None if it is lumped."""
+        return self._masses()[0]
+
     def mass_product(self, relative_k: Vector) -> Vector:
         """M T, shape (n,), [J]."""
         matrix, nodal = self._masses()
@@ -152,8 +159,9 @@ class HeatSystem:
             self._kept_matrix = None if self.matrix_in_time else matrix
             return matrix
         mass, nodal = self._masses()
-        per_second = sparse.diags(nodal / step_s, format="csr") if mass is None else mass / step_s
-        return sparse.csr_matrix(matrix + per_second)
+        if mass is None:
+            return with_more_on_diagonal(matrix, nodal / step_s)
+        return sparse.csr_matrix(matrix + mass / step_s)
 
     def linear_solver(self, matrix: sparse.csr_matrix, relative_tolerance: float) -> SystemSolver:
         """Make the solver for a matrix between the free nodes that suits the tetrahedra."""
@@ -237,10 +245,20 @@ class HeatSystem:
         nodes = self.fixed.nodes
         if len(nodes) == 0:
             return np.zeros(0)
-        if self._fixed_rows is None:
-            self._fixed_rows = sparse.csr_matrix(self._stiffness[nodes])
-        from_nodes_w = self._fixed_rows @ relative_k
+        from_nodes_w = self._rows_of_fixed() @ relative_k
         return self.exchanged_heat(relative_k, time_s)[0][nodes] - from_nodes_w if self.exchanges else -from_nodes_w
+
+    def conducted_from_fixed(self, states_k: Sequence[Vector]) -> Vector:
+        """Heat that flows from the fixed nodes to their neighbours in each of some states, shape (d, s), [W]."""
+        rows = self._rows_of_fixed()
+        used, columns = np.unique(rows.indices, return_inverse=True)
+        near = sparse.csr_matrix((rows.data, columns, rows.indptr), (len(self.fixed.nodes), len(used)))
+        return near @ np.stack([state_k[used] for state_k in states_k], axis=1)
+
+    def _rows_of_fixed(self) -> sparse.csr_matrix:
+        if self._fixed_rows is None:
+            self._fixed_rows = sparse.csr_matrix(self._stiffness[self.fixed.nodes])
+        return self._fixed_rows
 
     def radiation_magnitude(self, relative_k: Vector, time_s: float) -> Vector:
         """Sum of the sizes of what `radiation_load` adds up, shape (n,), [W]."""
@@ -260,12 +278,12 @@ class HeatSystem:
             marks |= self.pieces.touched(form.exchanging_nodes(time_s))
         return marks
 
-    def allowed_range_k(self, relative_k: Vector, times_s: tuple[float, ...]) -> tuple[float, float]:
-        """Range that temperatures cannot leave in a step: that of the start and of all surroundings at these times.
+    def allowed_range_k(self, start_k: tuple[float, float], times_s: tuple[float, ...]) -> tuple[float, float]:
+        """Range that temperatures cannot leave in a step: from the start's and all surroundings' at these times.
 
         A source or flux opens it on the side that it pushes to.
         """
-        ends = [(float(relative_k.min()), float(relative_k.max())), *map(self.surroundings_k, times_s)]
+        ends = [start_k, *map(self.surroundings_k, times_s)]
         return min(low for low, _ in ends), max(high for _, high in ends)
 
     def surroundings_k(self, time_s: float) -> tuple[float, float]:

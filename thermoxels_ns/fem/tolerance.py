@@ -49,8 +49,8 @@ def solve_to_tolerance(
     allows, which is followed from each to the next. The surplus of quadratic tetrahedra tells the error of the given
     mesh, and the mesh is made as fine as the tolerance asks for; where neighbouring gradients differ so much that the
     given mesh is clearly too coarse, a finer one follows at once. How a finer mesh differs from the given one tells its
-    error. Squares of the errors of mesh and steps are added. The body is the one that the
-    mesh describes: what flat facets lack of a round body's area is not estimated.
+    error. Those of mesh and steps are added, node by node and with their signs. The body is the one that the mesh
+    describes: what flat facets lack of a round body's area is not estimated.
 
     Args:
         problem: Body, materials, initial temperatures and effects.

@@ -12,6 +12,7 @@ from thermoxels_ns.fem.edge_surplus import edge_surplus
 from thermoxels_ns.fem.error_budget import ErrorSize, flow_error, mean_flows_w
 from thermoxels_ns.fem.error_estimate import HALF_THE_SIZE, richardson
 from thermoxels_ns.fem.even_steps import EvenSteps
+from thermoxels_ns.fem.loose_pieces import check_stored
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
 from thermoxels_ns.fem.recovered_gradient import curvature_k
 from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
@@ -23,7 +24,7 @@ from thermoxels_ns.fem.tolerance_run import Run
 Vector = npt.NDArray[np.float64]
 
 _TIME_SHARE = 0.6
-"""Share of the allowed error that time steps may make: with four fifths for the mesh, their squares add up to one."""
+"""Share of the allowed error that time steps may make."""
 _CLOSE = 0.95
 """Share of the allowed error below which that of the mesh is small enough, and shorter steps do the rest."""
 _LEAST_TIME_SHARE = 0.05
@@ -50,7 +51,8 @@ class _Followed:
     solution: HeatSolution
     """Temperatures and heat flows."""
     error_k: Vector
-    """Size of the error of the steps at the outputs, shape (s + 1, n) or (1, 1) if it is one for all, [K]."""
+    """Minus the error of the steps at the outputs, shape (s + 1, n), or, where its sign is unknown, its size, shape
+    (1, 1), [K]."""
 
 
 @dataclass(frozen=True)
@@ -58,14 +60,15 @@ class _OfMesh:
     """Error that a mesh makes."""
 
     error_k: Vector
-    """Its size at the outputs and nodes of the given mesh, shape (s + 1, n) or (1, 1) if it is one for all, [K]."""
+    """Minus the error at the outputs and nodes of the given mesh, shape (s + 1, n), or, where its sign is unknown, its
+    size, shape (1, 1), [K]."""
     of_flow: float
     """Of the heat flow, as a share of it."""
 
     @property
     def size(self) -> ErrorSize:
         """The largest."""
-        return ErrorSize(float(self.error_k.max()), self.of_flow)
+        return ErrorSize(float(np.abs(self.error_k).max()), self.of_flow)
 
 
 @dataclass(frozen=True)
@@ -108,7 +111,7 @@ class _Climb:
         while not run.levels or run.excess > 1.0 or (refinements == 0 and run.tolerance.heat_flow is not None):
             excess = run.tolerance.excess(space.size)
             if run.levels and run.excess > 1.0 and excess <= _CLOSE and self._share > _LEAST_TIME_SHARE:
-                self._share = max(0.5 * self._share, _LEAST_TIME_SHARE)
+                self._share = max(min(0.5 * self._share, 1.0 - excess), _LEAST_TIME_SHARE)
                 self._add(problem, self._follow(problem), space, refinements)
                 continue
             halvings = _halvings(excess)
@@ -129,17 +132,29 @@ class _Climb:
         """Follow the given mesh. Where it is clearly too coarse that is no solution; it tells a finer one's error."""
         run, given = self._run, self._run.given
         system = HeatSystem(given)
+        check_stored(system, self._steps.duration_s)
         if run.tolerance.heat_flow is not None:
-            low, high = system.allowed_range_k(system.start_k, (0.0, self._steps.duration_s))
+            start_k = system.start_k
+            ends_k = float(start_k.min()), float(start_k.max())
+            low, high = system.allowed_range_k(ends_k, (0.0, self._steps.duration_s))
             self._range_k = high - low if np.isfinite(high - low) else 0.0
-        even = EvenSteps(system, self._steps, self._allowed_k(), only_at_start=True, progress=self._progress)
+
+        def starts_well(temperature_c: Vector, error_k: float) -> bool:
+            if error_k <= self._allowed_k():
+                return True
+            # Of a mesh that is left at once, errors of steps are divided as the difference of both meshes is.
+            excess = self._rough_excess(temperature_c[None])
+            return excess > _CLEARLY and error_k * richardson(1.0, HALF_THE_SIZE ** _halvings(excess)) <= (
+                _ROUGH_START * self._steps.tolerance_k
+            )
+
+        even = EvenSteps(system, self._steps, self._allowed_k(), starts_well=starts_well, progress=self._progress)
         if even.found and even.start_error_k > _ROUGH_START * self._allowed_k():
             self._first_count = 2
         if even.found and run.tolerance.heat_flow is None:
-            rough_k = curvature_k(given.mesh, even.temperature_c)
-            excess = rough_k / self._steps.tolerance_k
+            excess = self._rough_excess(even.temperature_c)
             if excess > _CLEARLY and not run.lacks_memory(1, _halvings(excess), self._times):
-                space = _OfMesh(np.full((1, 1), rough_k), 0.0)
+                space = _OfMesh(np.full((1, 1), excess * self._steps.tolerance_k), 0.0)
                 return _Base(even.temperature_c, even.mean_flows_w()), space
         first = self._checked(even)
         if first is None:
@@ -150,9 +165,15 @@ class _Climb:
         rows = surplus.group_heat_w
         # Mean heat flows of intervals, from those at their ends.
         flows_w = surplus.by_effect(np.mean(0.5 * (rows[1:] + rows[:-1]), axis=0))
-        space = _OfMesh(np.abs(surplus.temperature_k), flow_error(flows_w, solution))
+        space = _OfMesh(surplus.temperature_k, flow_error(flows_w, solution))
         self._add(given, first, space, 0)
         return _Base(solution.temperature_c, mean_flows_w(solution)), space
+
+    def _rough_excess(self, temperature_c: Vector) -> float:
+        """Rough error of the given mesh over what is allowed; nothing is rough where heat flows matter."""
+        if self._run.tolerance.heat_flow is not None:
+            return 0.0
+        return curvature_k(self._run.given.mesh, temperature_c) / self._steps.tolerance_k
 
     def _allowed_k(self) -> float:
         """Error that steps may make, [K]; of heat flows they err by no larger share than of temperatures."""
@@ -187,22 +208,26 @@ class _Climb:
         """What even steps found, if it holds and their error is allowed."""
         if not even.found:
             return None
-        error_k = np.abs(even.errors_k())
-        solution = even.solution() if error_k.max() <= self._allowed_k() else None
+        error_k = even.errors_k()
+        solution = even.solution() if float(np.abs(error_k).max()) <= self._allowed_k() else None
         return None if solution is None else _Followed(solution, error_k)
 
     def _against(self, base: _Base, solution: HeatSolution, refinements: int) -> _OfMesh:
         """Error of a finer mesh by how it differs from the given one."""
         ratio = HALF_THE_SIZE**refinements
-        change_k = np.abs(solution.temperature_c[:, : self._num_nodes] - base.temperature_c)
+        change_k = solution.temperature_c[:, : self._num_nodes] - base.temperature_c
         change_w = {effect: flow_w - base.flows_w[effect] for effect, flow_w in mean_flows_w(solution).items()}
         return _OfMesh(change_k * richardson(1.0, ratio), richardson(flow_error(change_w, solution), ratio))
 
     def _add(self, problem: HeatProblem, followed: _Followed, space: _OfMesh, refinements: int) -> None:
-        """Keep a solution. Errors of mesh and steps have no reason to share a sign: their squares add up."""
+        """Keep a solution. Errors of mesh and steps add up, node by node; where a sign is unknown, their sizes do."""
         in_time_k, range_k = followed.error_k[:, : self._num_nodes], float(np.ptp(followed.solution.temperature_c))
-        of_flow = float(in_time_k.max()) / range_k if range_k > 0.0 else 0.0
-        error = ErrorSize(float(np.hypot(space.error_k, in_time_k).max()), float(np.hypot(space.of_flow, of_flow)))
+        of_flow = float(np.abs(in_time_k).max()) / range_k if range_k > 0.0 else 0.0
+        if space.error_k.shape == in_time_k.shape and in_time_k.size > 1:
+            error_k = np.abs(space.error_k + in_time_k)
+        else:
+            error_k = np.abs(space.error_k) + np.abs(in_time_k)
+        error = ErrorSize(float(error_k.max()), space.of_flow + of_flow)
         allowed_k = self._allowed_k()
         self._run.add(problem, followed.solution, error, refinements=refinements, step_tolerance_k=allowed_k)
 

@@ -1,0 +1,104 @@
+"""An energy balance that does not close is said not to, however small the heat that flows is beside its terms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.heat_meshes import SIDES, box_mesh
+from thermoxels_ns.fem import steady
+from thermoxels_ns.fem.effects import Convection, Effect, FixedTemperature, Radiation
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+from thermoxels_ns.fem.solution import EffectHeat
+from thermoxels_ns.fem.steady import is_still, solve_steady
+from thermoxels_ns.fem.step_account import StepAccount
+from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.system import HeatSystem
+
+COPPER = Material("copper", 400.0, 8900.0, 385.0)
+INSULATION = Material("insulation", 0.03, 30.0, 1400.0)
+WRONG = 1e-6
+"""Share of the heat that flows by which a balance is made wrong."""
+
+
+def sheet(thickness_m: float, *effects: Effect) -> HeatProblem:
+    """Two layers of copper on insulation: at a fixed side, conduction's terms are far more than the heat that flows."""
+    across = [0.0, 0.02, 0.04]
+    regions = {"copper": lambda c: c[..., 0] < 2 * thickness_m, "insulation": lambda c: c[..., 0] > 2 * thickness_m}
+    mesh = box_mesh([0.0, thickness_m, 2 * thickness_m, 0.1], across, across, temperature_c=0.0, regions=regions)
+    return HeatProblem(mesh, {"copper": COPPER, "insulation": INSULATION}, effects=effects)
+
+
+GIVEN = (FixedTemperature(("x0",), 20.0), FixedTemperature(("x1",), -5.0))
+HARDLY = (FixedTemperature(("x0",), 20.0), FixedTemperature(("x1",), 19.99))
+AIR = (FixedTemperature(("x0",), 20.0), Convection(("x1",), 25.0, -5.0))
+SKY = (FixedTemperature(("x0",), 20.0), Radiation(("x1",), 0.9, -5.0))
+FLOWING = pytest.mark.parametrize("effects", [GIVEN, HARDLY, AIR, SKY], ids=["given", "hardly", "air", "sky"])
+
+
+@FLOWING
+@pytest.mark.parametrize("thickness_m", [1e-3, 1e-4, 1e-5, 1e-6])
+def test_a_steady_balance_that_is_wrong_is_seen(monkeypatch, effects, thickness_m) -> None:
+    problem, right = sheet(thickness_m, *effects), steady.heat_of_groups_w
+    solution = solve_steady(problem)
+    flows_w = np.array([heat.heat_w[0] for heat in solution.effects])
+    # The share of the heat that flows is said as it is: in and out are counted.
+    assert solution.energy_residual == pytest.approx(abs(flows_w.sum()) / np.abs(flows_w).sum(), rel=0.1, abs=1e-13)
+
+    def wrong(*arguments) -> np.ndarray:
+        heat_w = right(*arguments)
+        heat_w[0] += WRONG * np.abs(heat_w).max() * np.sign(heat_w.sum())
+        return heat_w
+
+    monkeypatch.setattr(steady, "heat_of_groups_w", wrong)
+    assert solve_steady(problem).energy_residual > 0.3 * WRONG
+
+
+@FLOWING
+@pytest.mark.parametrize("thickness_m", [1e-3, 1e-5])
+@pytest.mark.parametrize("step_s", [60.0, 86400.0, 1e8])
+def test_a_balance_through_time_that_is_wrong_is_seen(monkeypatch, effects, thickness_m, step_s) -> None:
+    def moved_j(heat: EffectHeat) -> float:
+        return float(np.abs(heat.heat_w).sum()) * step_s
+
+    problem, steps, add = sheet(thickness_m, *effects), TimeSteps(3, step_s), StepAccount.add
+
+    def wrong(account, taken) -> None:
+        heat_w = taken.step.group_heat_w.copy()
+        heat_w[0] *= 1.0 + WRONG
+        add(account, replace(taken, step=replace(taken.step, group_heat_w=heat_w)))
+
+    monkeypatch.setattr(StepAccount, "add", wrong)
+    solution = solve_heat(problem, steps)
+    share = moved_j(solution.effects[0]) / sum(moved_j(heat) for heat in solution.effects)
+    # What the body stores in differences counts too, and is up to a hundred times as much as flows in a short time.
+    assert share > 0.1 and solution.energy_residual_of_spread > 0.005 * share * WRONG
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        (FixedTemperature(("x0",), 20.0),),
+        (FixedTemperature(SIDES, 20.0),),
+        (Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, 20.0)),
+        (Radiation(SIDES, 0.9, 20.0), Convection(("x1",), 25.0, 20.0)),
+        (FixedTemperature(("x0",), 0.0), Convection(("x1",), 25.0, 0.0)),
+    ],
+    ids=["one", "all", "equal airs", "air and sky", "as at the start"],
+)
+@pytest.mark.parametrize("relative_tolerance", [1e-12, 1e-8])
+def test_where_nothing_makes_heat_flow_round_off_is_no_share_of_itself(effects, relative_tolerance) -> None:
+    solution = solve_steady(sheet(1e-3, *effects), relative_tolerance=relative_tolerance)
+    assert solution.energy_residual < 1e-9
+
+
+def test_still_is_only_where_nothing_makes_heat_flow() -> None:
+    for effects, still in ((GIVEN, False), (HARDLY, False), (AIR, False), (SKY, False), (GIVEN[:1], True), ((), True)):
+        system = HeatSystem(sheet(1e-4, *effects))
+        level_k = np.full(system.num_nodes, 20.0 - system.reference_c)
+        if len(system.fixed.nodes):
+            level_k[system.fixed.nodes] = system.fixed.temperature_k(0.0)
+        assert is_still(system, level_k, 0.0) is still

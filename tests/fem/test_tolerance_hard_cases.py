@@ -1,0 +1,51 @@
+"""What a solution to a tolerance says and refuses is what one with given steps does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.heat_meshes import box_mesh
+from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.effects import Convection, Effect, HeatFlux
+from thermoxels_ns.fem.error_budget import Tolerance
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.tolerance import ToleratedSolution, solve_to_tolerance
+
+CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
+EMPTY = Material("next to nothing", 1.0, 1e-3, 1e-3)
+HOUR_S = 3600.0
+
+
+def followed(tolerance_k: float, material: Material, *effects: Effect) -> ToleratedSolution:
+    mesh = box_mesh(np.linspace(0.0, 0.2, 5), [0.0, 0.1], [0.0, 0.1])
+    assert mesh.boundary is not None
+    tags = replace(mesh.boundary, patch_names=(*mesh.boundary.patch_names, "without triangles"))
+    problem = HeatProblem(replace(mesh, boundary=tags), material, effects=effects)
+    return solve_to_tolerance(problem, Tolerance(tolerance_k), duration_s=HOUR_S, log=lambda _: None)
+
+
+@pytest.mark.parametrize("tolerance_k", [5.0, 0.1], ids=["given mesh", "left at once"])
+def test_an_effect_that_acts_nowhere_brings_nothing(tolerance_k) -> None:
+    air, nowhere = Convection(("x0",), 50.0, 0.0), Convection(("without triangles",), 20.0, 0.0)
+    found = followed(tolerance_k, CONCRETE, air, nowhere)
+    assert found.levels[0].refinements == (0 if tolerance_k == 5.0 else 2)
+    assert found.met and not found.solution.effects[1].heat_w.any()
+    alone = followed(tolerance_k, CONCRETE, air)
+    np.testing.assert_array_equal(found.solution.temperature_c, alone.solution.temperature_c)
+
+
+def test_heat_that_nothing_can_store_is_refused() -> None:
+    with pytest.raises(HeatError, match="heat problem: expected heat capacity"):
+        followed(0.5, EMPTY, HeatFlux(("x0",), 100.0))
+
+
+@pytest.mark.parametrize(("resolution_s", "said"), [(np.inf, True), (600.0, False)])
+def test_what_may_be_stepped_over_is_said(resolution_s, said) -> None:
+    sun = Varying(lambda _, time_s: 100.0 * np.sin(time_s / HOUR_S), resolution_s=resolution_s)
+    status = followed(5.0, CONCRETE, HeatFlux(("x0",), sun)).solution.status
+    assert ("Nothing says how fast heat flux on x0 may change with time" in status) is said
