@@ -61,6 +61,16 @@ class KnownCapture:
         )
 
 
+def changes_between(start: RigStart, camera: CameraModel, transform: FloatArray) -> FloatArray:
+    """The ten changes (`rig_parameters.PARAMETERS`) that make a rig of a start that is not turned, shape (10,)."""
+    turn, before = transform[:3, :3], start.thermal_camera
+    angles = np.arctan2(turn[2, 1], turn[2, 2]), -np.arcsin(turn[2, 0]), np.arctan2(turn[1, 0], turn[0, 0])
+    shift = transform[:3, 3] - start.visible_to_thermal[:3, 3]
+    growth = np.log(camera.fl_x / before.fl_x)
+    lens = growth, camera.cx - before.cx, camera.cy - before.cy, camera.k1 - before.k1
+    return np.array([*angles, *shift, *lens], dtype=np.float64)
+
+
 def projection_difference_px(
     frames: list[RigFrame], first: tuple[CameraModel, FloatArray], second: tuple[CameraModel, FloatArray]
 ) -> float:
@@ -93,15 +103,20 @@ def known_capture(
     radial: tuple[float, float] = (1.2, 0.5),
     points_per_frame: int = 900,
     seed: int = 0,
+    centre_px: tuple[float, float] = (0.0, 0.0),
 ) -> KnownCapture:
-    """Photograph a scene; scene points come from the photographs' depth and are shared where two frames see them."""
+    """Photograph a scene; scene points come from the photographs' depth and are shared where two frames see them.
+
+    `centre_px` is how far the thermal principal point lies from the image's centre.
+    """
     scene, draw = make_scene(scene_name), np.random.default_rng(seed)
     plain = scene.camera(photograph_width, photograph_width * 3 // 4)
     small = scene.camera(thermal_width, thermal_width * 4 // 5)
     focal = small.fl_x * zoom
-    pinhole = PinholeCamera(small.width, small.height, focal, focal, small.cx, small.cy)
+    cx, cy = small.cx + centre_px[0], small.cy + centre_px[1]
+    pinhole = PinholeCamera(small.width, small.height, focal, focal, cx, cy)
     visible = CameraModel(plain.width, plain.height, plain.fl_x, plain.fl_y, plain.cx, plain.cy)
-    thermal = CameraModel(small.width, small.height, focal, focal, small.cx, small.cy)
+    thermal = CameraModel(small.width, small.height, focal, focal, cx, cy)
     rig = np.eye(4)
     rig[:3, :3], rig[:3, 3] = turned(*turn_deg), baseline_m
     to_visible = OPENGL_FROM_OPENCV @ np.linalg.inv(rig) @ OPENGL_FROM_OPENCV
@@ -137,6 +152,34 @@ def known_capture(
             )
         )
     return KnownCapture(frames, visible, thermal, rig, offsets, radial)
+
+
+def drawn_capture(
+    scene_name: str, ratio: int, thermal_width: int, baseline_m: float, seed: int
+) -> tuple[KnownCapture, RigStart]:
+    """A capture whose turn, lenses' direction, angle of view and principal point are drawn, and what is known of it.
+
+    That is an angle of view up to 5 % off, and nothing else: no ruler was held against the cameras.
+    """
+    draw = np.random.default_rng(1000 + seed)
+    turn, zoom = draw.normal(0.0, 1.2, 3), 1.0 + draw.uniform(0.0, 0.1)
+    between = draw.normal(size=3) * (1.0, 0.4, 0.2)
+    between *= baseline_m / np.linalg.norm(between)
+    centre = draw.normal(0.0, 0.005 * thermal_width, 2)
+    capture = known_capture(
+        scene_name,
+        6 + seed % 3,
+        thermal_width * ratio,
+        thermal_width,
+        (between[0], between[1], between[2]),
+        (turn[0], turn[1], turn[2]),
+        zoom,
+        seed=seed,
+        centre_px=(centre[0], centre[1]),
+    )
+    width, height = capture.thermal.width, capture.thermal.height
+    focal = capture.thermal.fl_x * (1.0 + draw.uniform(-0.05, 0.05))
+    return capture, RigStart(CameraModel(width, height, focal, focal, width / 2, height / 2))
 
 
 def painted_sky(

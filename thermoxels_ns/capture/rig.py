@@ -13,9 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.capture.contract import CameraModel, RigEstimate, RigFrame, RigStart
+from thermoxels_ns.capture.rig_certainty import certainty_text
 from thermoxels_ns.capture.rig_fit import RigClimber
 from thermoxels_ns.capture.rig_levels import PreparedFrames, prepare_frames
 from thermoxels_ns.capture.rig_parameters import PARAMETERS, RigModel, prior_sigmas
+from thermoxels_ns.capture.rig_polish import polish
 from thermoxels_ns.capture.rig_score import RigScore
 from thermoxels_ns.capture.rig_start import RoughRig, RoughSearch
 from thermoxels_ns.errors import SceneError, explain
@@ -112,19 +114,31 @@ class _RigSearch:
             climber = RigClimber(score, sigmas, depth)
             change = climber.climb(change).change
         covariance = climber.covariance(change)
-        self.progress("Rig found", 1.0)
         before, after = score.value(unchanged), score.value(change)
         error_px = self._projection_sigma(rig, change, covariance)
         reason = self._doubt(change, sigmas, before, after, error_px)
         if reason is not None:
             return self._kept(rig, sigmas, before, reason)
+        self.progress("Comparing windows", 0.9)
+        better = polish(self.prepared, rig, change, sigmas)
+        windows = ""
+        if better is not None:
+            error_px = self._projection_sigma(rig, better.change, better.covariance)
+            reason = self._doubt(better.change, sigmas, before, after, error_px)
+            if reason is None:
+                change, covariance = better.change, better.covariance
+                after = score.value(change)
+                windows = f" and {better.windows} windows of them that agree"
+            error_px = self._projection_sigma(rig, change, covariance)
+        self.progress("Rig found", 1.0)
         camera, transform = rig.changed(change)
         turn_deg = np.degrees(np.arccos(np.clip(0.5 * (np.trace(transform[:3, :3]) - 1.0), -1.0, 1.0)))
         explanation = (
-            f"Found from {len(self.prepared.frames)} frames: focal length {camera.fl_x:.1f} pixels, "
+            f"Found from {len(self.prepared.frames)} frames{windows}: focal length {camera.fl_x:.1f} pixels, "
             f"{turn_deg:.2f} degrees and {np.linalg.norm(transform[:3, 3]):.3g} world units from the visible camera; "
-            f"scene points fall within {error_px:.2f} thermal pixels (standard error). Start: {self.start.source}."
-        )
+            f"scene points fall within {error_px:.2f} thermal pixels (standard error). Start: {self.start.source}. "
+            f"{certainty_text(covariance, sigmas)}"
+        ).rstrip()
         return RigEstimate(camera, transform, PARAMETERS, covariance, True, explanation, before, after, error_px)
 
     def _best_top(self, coarse: RigScore, rough: Sequence[RoughRig], sigmas: FloatArray) -> FloatArray:

@@ -3,18 +3,34 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
 
-from thermoxels_ns.capture.rig_score import RigScore
+from thermoxels_ns.capture.rig_parameters import RigModel
 
 FloatArray = npt.NDArray[np.float64]
 
 _DIFFERENCE_PX = 0.05
 _MOST_STEPS = 20
 _GRADIENT_TOLERANCE = 3e-2
+
+
+class Climbed(Protocol):
+    """What can be climbed: a score of rigs that knows its derivative."""
+
+    rig: RigModel
+    """What changes count from."""
+
+    def value(self, change: FloatArray) -> float:
+        """Score of all frames together."""
+        ...
+
+    def slopes(self, change: FloatArray) -> tuple[float, FloatArray]:
+        """What is climbed, and its derivative split by the parts that it comes from, shape (parts, 10)."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +51,13 @@ class RigClimber:
     contributions to the slope, the covariance of the top alone is H^-1 G H^-1 (the sandwich of M-estimators, Huber
     1967, frames taken as independent), which (weight * H)^-1 equals if weight * G = H. The median over H's principal
     directions is taken, because those that the images hardly determine have no reliable ratio.
+
+    Parts that show the same things err alike: where `alike` of them do, the scatter counts that many times.
     """
 
-    def __init__(self, score: RigScore, sigmas: FloatArray, median_depth: float) -> None:
-        """Take the score at one size, the prior standard deviations and the scene's median depth."""
+    def __init__(self, score: Climbed, sigmas: FloatArray, median_depth: float, alike: float = 1.0) -> None:
+        """Take a score, the prior standard deviations, the scene's median depth and how many parts err alike."""
+        self._alike = alike
         self._score = score
         self._sigmas = sigmas
         self._free = np.flatnonzero(sigmas > 0.0)
@@ -86,7 +105,7 @@ class RigClimber:
         own = slopes[:, self._free] * self._scale
         total, frames = own.sum(axis=0), len(own)
         centred = own - own.mean(axis=0)
-        scatter: FloatArray = centred.T @ centred * (frames / max(frames - 1, 1))
+        scatter: FloatArray = centred.T @ centred * (self._alike * frames / max(frames - 1, 1))
         curvature: FloatArray = np.empty((len(z), len(z)))
         for number, step in enumerate(self._step):
             moved = z.copy()

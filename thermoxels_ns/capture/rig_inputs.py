@@ -110,7 +110,8 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
         metres_per_unit: Scale of this capture; where the json has one too, lengths are converted.
 
     Raises:
-        SceneError: One of them is missing or no camera, or no rotation and shift, or the camera has another size.
+        SceneError: One of them is missing or no camera, or no rotation and shift, or the camera has another size or one
+            that is no whole number of pixels.
     """
     content: Any = read_json(file)
     remedy = "Pass the transforms.json of an earlier capture with the same camera."
@@ -119,15 +120,16 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
         names = ("fl_x", "fl_y", "cx", "cy")
         lens = {name: float(entries.get(name, 0.0)) for name in ("k1", "k2", "p1", "p2")}
         camera = CameraModel(
-            int(entries["w"]), int(entries["h"]), **{name: float(entries[name]) for name in names}, **lens
+            *(_pixels(entries, name, file) for name in ("w", "h")),
+            **{name: float(entries[name]) for name in names},
+            **lens,
         )
         transform = np.array(content["rig"], dtype=np.float64)
     except (KeyError, TypeError, ValueError, AttributeError) as problem:
         if isinstance(problem, SceneError):
             raise
-        raise SceneError(
-            explain(str(file), expected="'thermal_camera' and 'rig'", got=f"no {problem}", remedy=remedy)
-        ) from problem
+        got = f"no {problem}" if isinstance(problem, KeyError) else str(problem)
+        raise SceneError(explain(str(file), expected="'thermal_camera' and 'rig'", got=got, remedy=remedy)) from problem
     if not _is_rigid(transform):
         raise SceneError(
             explain(
@@ -160,6 +162,21 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
         score_after=math.nan,
         projection_sigma_px=math.nan,
     )
+
+
+def _pixels(entries: Any, name: str, file: Path) -> int:
+    """Width or height of a camera in a json."""
+    number = float(entries[name])
+    if not number.is_integer():  # neither infinity nor NaN is one
+        raise SceneError(
+            explain(
+                f"{file.name}: thermal_camera.{name}",
+                expected="a whole number of pixels",
+                got=entries[name],
+                remedy="Pass the transforms.json of an earlier capture with the same camera.",
+            )
+        )
+    return int(number)
 
 
 def _is_rigid(transform: np.ndarray) -> bool:

@@ -23,9 +23,9 @@ _COARSEST_WIDTH = 80
 _MOST_POINTS = 6_000
 _STRONGEST_SHARE = 0.35
 _WEAKEST_EDGE = 0.05
-_FARTHEST_FROM_POINT = 0.06
+FARTHEST_FROM_POINT = 0.06
 """Distance on the plane at depth 1 to the next scene point, beyond which an edge's depth is not known."""
-_SURE_DISTANCE = 0.01
+SURE_DISTANCE = 0.01
 """Distance on that plane up to which an edge's depth is that of the scene points around it."""
 _EDGE_REACH = 2.0
 """Half the width of an edge, in standard deviations of its blur."""
@@ -97,14 +97,14 @@ class PreparedFrames:
             keep = np.sort(np.argsort(-np.abs(value), kind="stable")[:most])
             value, rays, rows, columns = value[keep], rays[keep], rows[keep], columns[keep]
         depth, distance = frame.depth.at(rays)
-        known = distance < _FARTHEST_FROM_POINT
+        known = distance < FARTHEST_FROM_POINT
         turn = level.transform[:3, :3]
         roll = np.exp(2j * np.arctan2(turn[1, 0], turn[0, 0])).astype(np.complex64)
-        trust = _even_trust(rows, columns, distance, field.shape, blur_px * scale / same)[known]
+        trust = even_trust(rows, columns, distance, field.shape, blur_px * scale / same)[known]
         return EdgePoints(rays[known] * depth[known, None], value[known] * trust * roll)
 
 
-def _even_trust(
+def even_trust(
     rows: npt.NDArray, columns: npt.NDArray, distance: npt.NDArray, shape: tuple[int, ...], blur_px: float
 ) -> FloatImage:
     """How much edges count by their distance to the next scene point, shape (n,).
@@ -113,7 +113,7 @@ def _even_trust(
     it would move the edge.
     """
     trust = np.zeros(shape, np.float32)
-    trust[rows, columns] = 1.0 / (1.0 + (distance / _SURE_DISTANCE) ** 4)
+    trust[rows, columns] = 1.0 / (1.0 + (distance / SURE_DISTANCE) ** 4)
     reach = 2 * int(np.ceil(_EDGE_REACH * (blur_px + 1.0))) + 1
     widened = cv2.dilate(trust, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
     return widened[rows, columns].astype(np.float32)

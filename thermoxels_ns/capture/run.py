@@ -35,7 +35,16 @@ from thermoxels_ns.capture.rig_inputs import kept_start, read_rig, rig_frames, r
 from thermoxels_ns.capture.scene_writer import JSON_NAME, POINTS_NAME, Scene, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm_model import SfmModel
-from thermoxels_ns.capture.stages import CACHE_FOLDER, StageCache, fingerprint, prepare_output, read_json, write_json
+from thermoxels_ns.capture.stages import (
+    CACHE_FOLDER,
+    StageCache,
+    files_of,
+    fingerprint,
+    given_fingerprints,
+    prepare_output,
+    read_json,
+    write_json,
+)
 from thermoxels_ns.checks import remove_stale_temporaries
 from thermoxels_ns.data.radiometry import RadiometryOptions
 from thermoxels_ns.errors import OutputError, SceneError, ThermoxelsError, explain
@@ -164,7 +173,7 @@ class _Run:
             "options": options,
             "files": fingerprint(inside, self.source),
             "passed_over": sorted(map(str, passed_over)),
-            "list": _fingerprints(listed),
+            "list": given_fingerprints(listed),
             "skip_bad": settings.skip_bad,
         }
 
@@ -202,9 +211,9 @@ class _Run:
         library = settings.dji_library if settings.dji_library and settings.dji_library.is_file() else None
         depends = {
             "options": options,
-            "library": _fingerprints([library]),
+            "library": given_fingerprints([library]),
             "skip_bad": settings.skip_bad,
-            "mask": _fingerprints([settings.thermal_mask]),
+            "mask": given_fingerprints([settings.thermal_mask]),
         }
 
         def work(folder: Path) -> None:
@@ -242,12 +251,12 @@ class _Run:
             settings.seed,
             settings.threads,
         )
-        files = [] if settings.poses is None else _files_of(settings.poses)
+        files = [] if settings.poses is None else files_of(settings.poses)
         user = [] if settings.masks is None else list(mask_files(settings.masks).values())
         depends = {
             "options": options,
-            "poses": _fingerprints(files),
-            "masks": _fingerprints(user),
+            "poses": given_fingerprints(files),
+            "masks": given_fingerprints(user),
             "overlays": settings.find_overlays,
         }
 
@@ -312,7 +321,7 @@ class _Run:
             return None
         depends = {
             "board": board,
-            "files": fingerprint(_files_of(pictures), pictures),
+            "files": fingerprint(files_of(pictures), pictures),
             "angle": settings.thermal_field_of_view_deg,
         }
 
@@ -335,7 +344,7 @@ class _Run:
         board: RigEstimate | None,
     ) -> tuple[RigEstimate, RigEstimate]:
         settings = self.settings
-        depends = {"angle": settings.thermal_field_of_view_deg, "rig": _fingerprints([settings.rig])}
+        depends = {"angle": settings.thermal_field_of_view_deg, "rig": given_fingerprints([settings.rig])}
 
         def work(folder: Path) -> None:
             metres = None if scale is None else scale.metres_per_unit
@@ -398,18 +407,3 @@ class _Run:
         if self.settings.poses is not None:
             return f"Given in {self.settings.poses.name}."
         return "Structure from motion on the photographs (COLMAP)."
-
-
-def _fingerprints(paths: list[Path] | list[Path | None]) -> list[tuple[str, int, int]]:
-    """Fingerprints of files that the user names, which need not lie in the capture."""
-    there = [path for path in paths if path is not None]
-    for path in there:
-        if not path.is_file():
-            raise SceneError(
-                explain(str(path), expected="a file", got="nothing there", remedy="Check the path, or leave it out.")
-            )
-    return fingerprint(there, Path("/")) if there else []
-
-
-def _files_of(path: Path) -> list[Path]:
-    return sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else [path]

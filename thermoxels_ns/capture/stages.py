@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args
 
 from thermoxels_ns import __version__
 from thermoxels_ns.checks import remove_file, replace_when_done, writable_folder
-from thermoxels_ns.errors import OutputError, ThermoxelsError, explain
+from thermoxels_ns.errors import OutputError, SceneError, ThermoxelsError, explain
 
 StageName = Literal["pairs", "temperatures", "poses", "scale", "board", "rig", "drift", "scene", "page"]
 """The stages in order."""
@@ -100,6 +100,26 @@ def fingerprint(paths: Sequence[Path], root: Path) -> list[tuple[str, int, int]]
         name = path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
         rows.append((name, status.st_size, status.st_mtime_ns))
     return rows
+
+
+def given_fingerprints(paths: Sequence[Path | None]) -> list[tuple[str, int, int]]:
+    """Fingerprints of files that the user names, which need not lie in the capture; None: the user names none.
+
+    Raises:
+        SceneError: A file is not there.
+    """
+    there = [path for path in paths if path is not None]
+    for path in there:
+        if not path.is_file():
+            raise SceneError(
+                explain(str(path), expected="a file", got="nothing there", remedy="Check the path, or leave it out.")
+            )
+    return fingerprint(there, Path("/")) if there else []
+
+
+def files_of(path: Path) -> list[Path]:
+    """All files of a folder and the folders in it, or the file itself."""
+    return sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else [path]
 
 
 def prepare_output(folder: Path) -> Path:

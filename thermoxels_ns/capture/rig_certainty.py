@@ -1,0 +1,63 @@
+"""What the covariance of a rig says, in words: which numbers stand for each other, and which the images do not tell."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.capture.rig_parameters import PARAMETERS
+
+FloatArray = npt.NDArray[np.float64]
+
+_WORDS = {
+    "rx": "the tilt up or down",
+    "ry": "the turn left or right",
+    "rz": "the roll",
+    "tx": "the shift to the side",
+    "ty": "the shift up or down",
+    "tz": "the shift ahead",
+    "log_focal": "the focal length",
+    "cx": "the principal point's column",
+    "cy": "the principal point's row",
+    "k1": "the distortion",
+}
+_EXCHANGED = (("rx", "cy"), ("ry", "cx"), ("rx", "ty"), ("ry", "tx"), ("log_focal", "tz"), ("log_focal", "k1"))
+"""Numbers that move the image of a narrow lens, or of a scene of one depth, almost alike."""
+_SAME = 0.8
+"""Correlation from which on two numbers stand for each other: knowing one would make the other 1.7 times as sure."""
+_NOTHING_LEARNT = 0.8
+"""Share of the first standard deviation that is left where the images say next to nothing."""
+
+
+def certainty_text(covariance: FloatArray, sigmas: FloatArray) -> str:
+    """Say which of the ten numbers of a rig are not to be trusted alone; empty where all are.
+
+    Args:
+        covariance: Of the ten changes, shape (10, 10).
+        sigmas: Their standard deviations before the images were looked at, 0 for what is kept fixed, shape (10,).
+
+    >>> certainty_text(np.diag(np.full(10, 0.01)), np.ones(10))
+    ''
+    >>> certainty_text(np.diag([0.01] * 9 + [0.81]), np.ones(10))
+    'The images say next to nothing about the distortion: it is as unsure as at the start.'
+    """
+    errors = np.sqrt(np.diag(covariance))
+    sentences = []
+    pairs = []
+    for first, second in _EXCHANGED:
+        a, b = PARAMETERS.index(first), PARAMETERS.index(second)
+        if errors[a] > 0.0 and errors[b] > 0.0 and abs(covariance[a, b]) > _SAME * errors[a] * errors[b]:
+            pairs.append(f"{_WORDS[first]} and {_WORDS[second]}")
+    if pairs:
+        sentences.append(
+            f"The images hardly tell apart {'; '.join(pairs)}: where points fall is surer than each of these numbers."
+        )
+    unknown = [
+        _WORDS[name]
+        for name, error, sigma in zip(PARAMETERS, errors, sigmas)
+        if sigma > 0.0 and error > _NOTHING_LEARNT * sigma
+    ]
+    if unknown:
+        rest = "it is as unsure as at the start" if len(unknown) == 1 else "they are as unsure as at the start"
+        sentences.append(f"The images say next to nothing about {', '.join(unknown)}: {rest}.")
+    return " ".join(sentences)

@@ -1,0 +1,160 @@
+"""The last step of the search for a rig: windows in which the thermal images follow the photographs exactly.
+
+The comparison of edges leaves some tenths of a pixel, always to the same side, because edges in a photograph and in a
+thermal image are not of the same strength. Windows that one gain explains almost wholly do not have that error
+(`rig_patches`); they are chosen anew after each climb.
+
+Frames show the same things, so what errs in one errs in all: together they count as one frame in the standard errors
+and against what was known before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.capture.rig_fit import RigClimber
+from thermoxels_ns.capture.rig_levels import (
+    FARTHEST_FROM_POINT,
+    SURE_DISTANCE,
+    PreparedFrame,
+    PreparedFrames,
+)
+from thermoxels_ns.capture.rig_parameters import RigModel
+from thermoxels_ns.capture.rig_patches import THERMAL_BLUR_PX, PatchDesign, PatchScore, SmoothThermal, patch_design
+
+FloatArray = npt.NDArray[np.float64]
+
+_PITCH = 1.3
+"""Pixels of the reduced photograph per thermal pixel."""
+_WINDOW_PX = 1.0
+_LENS_BLURS_PX = (0.0, 0.5, 0.8, 1.2, 1.6)
+"""Blurs of the thermal camera that are tried, beside the pixel itself [thermal pixels]."""
+_BLUR_FRAMES, _BLUR_WINDOWS = 8, 1000
+"""From how many frames and windows of each the blur is chosen, and whether windows agree at all is seen."""
+_MOST_WINDOWS = 3000
+_AGREEMENT = 0.9
+"""R2 from which on a window counts."""
+_REACHES_PX = (0.5, 0.25, 0.0, 0.0)
+"""How far around its place a window may agree to count, in every round [thermal pixels]."""
+_FEWEST_WINDOWS = 150
+_ABOVE_CHANCE = 3.0
+_ELSEWHERE_PX = 5.0
+_MOST_SHIFT_PX = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Polished:
+    """The rig after the last step."""
+
+    change: FloatArray
+    """The ten changes."""
+    covariance: FloatArray
+    """Of the ten changes, shape (10, 10)."""
+    windows: int
+    """How many windows it rests on."""
+
+
+def polish(prepared: PreparedFrames, rig: RigModel, change: FloatArray, sigmas: FloatArray) -> Polished | None:
+    """Move a rig that is right to about a pixel to where the windows agree best.
+
+    Args:
+        prepared: All frames.
+        rig: What changes count from, at full size.
+        change: The ten changes so far.
+        sigmas: Standard deviations of the ten changes (`rig_parameters.prior_sigmas`).
+
+    Returns:
+        The better rig; None where too few windows agree, or hardly more than by chance.
+    """
+    view = _View.of(prepared, rig, change)
+    count = len(prepared.frames)
+    some = np.unique(np.linspace(0, count - 1, min(count, _BLUR_FRAMES)).astype(int))
+    few = [prepared.frames[number] for number in some]
+    smooth = [SmoothThermal(frame.contrast) for frame in few]
+    trials = {
+        blur_px: PatchScore([_design(frame, prepared, view, blur_px, _BLUR_WINDOWS) for frame in few], smooth, rig)
+        for blur_px in _LENS_BLURS_PX
+    }
+    blur_px = max(trials, key=lambda tried: _explained(trials[tried], change))
+    if not _agrees(trials[blur_px], change, _FEWEST_WINDOWS * len(few) / count):
+        return None
+    thermal = [SmoothThermal(frame.contrast) for frame in prepared.frames]
+    designs = [_design(frame, prepared, view, blur_px, _MOST_WINDOWS) for frame in prepared.frames]
+    score = PatchScore(designs, thermal, rig)
+    start, chosen, climber = change, score, RigClimber(score, sigmas, prepared.median_depth)
+    for reach_px in _REACHES_PX:
+        chosen = score.selected(_agreeing(score, change, reach_px))
+        if chosen.windows < _FEWEST_WINDOWS:
+            return None
+        climber = RigClimber(chosen, sigmas, prepared.median_depth, count)
+        change = climber.climb(change).change
+    points = np.concatenate([design.points for design in score.designs])
+    moved = np.linalg.norm(rig.project(change, points) - rig.project(start, points), axis=1)
+    if not np.nanmedian(moved) < _MOST_SHIFT_PX:
+        return None
+    return Polished(change, climber.covariance(change), chosen.windows)
+
+
+def _agreeing(score: PatchScore, change: FloatArray, reach_px: float) -> list[npt.NDArray[np.bool_]]:
+    """Which windows of each frame agree at their place or near it."""
+    steps = (-reach_px, 0.0, reach_px) if reach_px > 0.0 else (0.0,)
+    around = [score.agreement(change, (x, y)) for x in steps for y in steps]
+    return [np.max(found, axis=0) > _AGREEMENT for found in zip(*around)]
+
+
+def _explained(score: PatchScore, change: FloatArray) -> float:
+    """How well the windows that agree do so: the sum of -log(1 - R2)."""
+    counted = [found[found > _AGREEMENT] for found in score.agreement(change)]
+    return float(np.sum(-np.log1p(-np.concatenate([np.zeros(0), *counted]))))
+
+
+def _agrees(score: PatchScore, change: FloatArray, fewest: float) -> bool:
+    """Whether enough windows agree here, and clearly more than some pixels away."""
+
+    def count(shift_px: tuple[float, float]) -> int:
+        return sum(int(np.count_nonzero(found > _AGREEMENT)) for found in score.agreement(change, shift_px))
+
+    far, here = _ELSEWHERE_PX, count((0.0, 0.0))
+    elsewhere = np.mean([count(shift) for shift in ((far, far), (-far, far), (far, -far), (-far, -far))])
+    return here >= fewest and here > _ABOVE_CHANCE * max(float(elsewhere), 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """The reduced photograph's pixels, the same for all photographs."""
+
+    size: tuple[int, int]
+    """Width and height."""
+    pitch: float
+    """Its pixels per thermal pixel."""
+    rays: FloatArray
+    """Points at depth 1 that the pixels see, shape (height * width, 3)."""
+    inside: npt.NDArray[np.bool_]
+    """Which of them the thermal camera sees too, shape (height, width)."""
+
+    @classmethod
+    def of(cls, prepared: PreparedFrames, rig: RigModel, change: FloatArray) -> _View:
+        visible = prepared.visible
+        same = rig.camera.fl_x / visible.fl_x
+        scale = min(_PITCH * same, *(frame.grey.shape[1] / visible.width for frame in prepared.frames))
+        size = max(round(visible.width * scale), 8), max(round(visible.height * scale), 8)
+        rows, columns = np.mgrid[: size[1], : size[0]]
+        rays = visible.resized(*size).rays(np.column_stack([columns.ravel() + 0.5, rows.ravel() + 0.5]))
+        inside = rig.camera.contains(rig.project(change, rays * prepared.median_depth))
+        return cls(size, scale / same, rays, inside.reshape(size[1], size[0]))
+
+
+def _design(frame: PreparedFrame, prepared: PreparedFrames, view: _View, lens_blur_px: float, most: int) -> PatchDesign:
+    """Windows of a photograph, reduced and blurred to what the thermal camera sees of it."""
+    pitch = view.pitch
+    small = cv2.resize(frame.grey, view.size, interpolation=cv2.INTER_AREA)
+    # The thermal pixel is a box of 1, the reduced photograph's one of 1 / pitch; a box of w has variance w^2 / 12.
+    variance = THERMAL_BLUR_PX**2 + lens_blur_px**2 + (1.0 - 1.0 / pitch**2) / 12.0
+    small = cv2.GaussianBlur(small, (0, 0), np.sqrt(max(variance, 0.01)) * pitch, borderType=cv2.BORDER_REPLICATE)
+    window_px = float(np.hypot(_WINDOW_PX, lens_blur_px))
+    design = patch_design(small.astype(np.float32), view.rays, view.inside, pitch, window_px, most)
+    return design.at_depth(*frame.depth.at(design.points), FARTHEST_FROM_POINT, SURE_DISTANCE)
