@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
@@ -17,6 +18,8 @@ from thermoxels_ns.errors import MemoryBudgetError, PruningError
 from thermoxels_ns.model import ThermoxelsModel
 from thermoxels_ns.model_config import ThermoxelsModelConfig
 from thermoxels_ns.optim import RowAdam
+from thermoxels_ns.sightlines import Sightlines
+from thermoxels_ns.track_carving import empty_voxels
 from thermoxels_ns.units import TemperatureRange
 
 
@@ -126,6 +129,30 @@ def test_optimisers_follow_the_schedule():
     # The slab fills 4 of 16 layers; its front with a neighbour on either side, then what a surface alone needs.
     assert sizes[:3] == [512] * 3 and sizes[3:5] == [192 * 8] * 2 and sizes[5] == sizes[6] < sizes[4]
     assert sizes[7] == sizes[9] < sizes[6] and model.step == 9
+
+
+@pytest.mark.parametrize("carve", ["auto", "off"])
+def test_air_is_carved_at_the_start_and_after_a_refinement_and_optimisers_follow(carve):
+    """Lines from the middle of one side to points on the other, of which each lattice carves what it can resolve."""
+    side = np.linspace(-0.6, 0.6, 13)
+    points = np.stack(np.meshgrid([0.93], side, side, indexing="ij"), axis=-1).reshape(-1, 3)
+    count = len(points)
+    lines = Sightlines(np.tile([-0.99, 0.01, 0.01], (count, 1)), np.arange(count), points, np.zeros(count))
+    model = model_of(resolutions=(8, 16), refine_at=(3,), prune_at=(), thin_at=(), prune_threshold=0.0, carve=carve)
+    model.sightlines = lines
+    given = attributes(model, 10)
+    callbacks = model.get_training_callbacks(given)
+    for step in range(4):
+        for callback in callbacks:
+            callback.run_callback(step)
+        kept, empty = model.grid.kept.numpy(), empty_voxels(model.grid.lattice, lines)
+        if carve == "off":
+            assert kept.all()
+        else:
+            assert empty.any() and not (kept & empty).any()
+        for name, parameter in model.grid.row_parameters().items():
+            assert given.optimizers.parameters[name] == [parameter]
+            assert len(parameter) == model.grid.voxels.num_rows
 
 
 def test_a_refinement_beyond_the_budget_leaves_the_lattice_as_it_is():

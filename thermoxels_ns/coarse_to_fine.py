@@ -15,6 +15,7 @@ from thermoxels_ns.errors import PruningError, explain
 from thermoxels_ns.field.refine import RowChange, prune
 from thermoxels_ns.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
 from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
+from thermoxels_ns.track_carving import carve_air
 
 if TYPE_CHECKING:
     from thermoxels_ns.model import ThermoxelsModel
@@ -56,6 +57,13 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     def count(step: int) -> None:
         model.update_to_step(step)
 
+    def carve(step: int) -> None:
+        """Drop what lines of sight show to be air; at the first step of a training, not of a resumed one."""
+        old = model.grid.row_parameters()
+        change = carve_air(model)
+        if change is not None:
+            follow(old, change)
+
     def start(step: int) -> None:
         """Set the density at the first step of a training, not at the first of a resumed one."""
         assert attributes.pipeline is not None
@@ -64,6 +72,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         change = model.split(model.config.skipped_factor())
         if change is not None:
             follow(old, change)
+        carve(step)
         set_density(model, found)
 
     def hold(step: int) -> None:
@@ -97,10 +106,15 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             assert change is not None
             follow(old, change)
             CONSOLE.log(f"step {step}: lattice refined to {' x '.join(map(str, model.grid.lattice.cell_shape))} voxels")
+            carve(step)
 
     return [
         TrainingCallback(before, count),
-        *([TrainingCallback(before, start, iters=(0,)), TrainingCallback(before, hold)] if from_photographs else []),
+        *(
+            [TrainingCallback(before, start, iters=(0,)), TrainingCallback(before, hold)]
+            if from_photographs
+            else [TrainingCallback(before, carve, iters=(0,))]
+        ),
         TrainingCallback(before, change_lattice, iters=tuple(sorted(steps | decisions))),
     ]
 

@@ -29,8 +29,10 @@ from thermoxels_ns.model_config import ThermoxelsModelConfig
 from thermoxels_ns.ray_rendering import GridSamples, render_rays, sample_rays
 from thermoxels_ns.ray_statistics import FieldEvidence, field_evidence
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
+from thermoxels_ns.sightlines import Sightlines
 from thermoxels_ns.snapshot import GridSnapshot, RayEvidence, Views
 from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
+from thermoxels_ns.track_loss import TrackRays, track_loss
 from thermoxels_ns.units import TemperatureRange
 
 
@@ -90,6 +92,10 @@ class ThermoxelsModel(Model):
         # Which start the training took, a place in `start_choice.STARTS`; a resumed training goes on with its course.
         self.register_buffer("start_index", torch.tensor(0))
         self.step = 0
+        # What training photographs see of the tracks of structure from motion.
+        self.sightlines: Sightlines | None = (self.kwargs.get("metadata") or {}).get("sightlines")
+        seen = self.sightlines is not None and len(self.sightlines.point) and config.sh_degree is not None
+        self.track_rays = TrackRays(self.sightlines) if self.sightlines is not None and seen else None
 
     @property
     def grid(self):
@@ -275,7 +281,17 @@ class ThermoxelsModel(Model):
             terms["beta_loss"] = weights.beta * losses.beta_loss(seen.accumulation)
         if seen.distortion is not None:
             terms["distortion_loss"] = self._distortion_weight() * seen.distortion.mean()
+        if weights.tracks and self.track_rays is not None:
+            terms["track_loss"] = weights.tracks * self._track_loss(self.track_rays)
         return terms
+
+    def _track_loss(self, rays: TrackRays) -> Tensor:
+        """How far this step's lines of sight are from ending at their points."""
+        config, near = self.config, self.config.near_plane * self.unit
+        generator = torch.Generator().manual_seed((config.seed + 1) * 2_000_003 + self.step)
+        request = rays.request(config.track_rays, near, self.grid.lattice.voxel_size, generator, self.device)
+        seen = render_rays(self.grid, request, self._options(), config.backend)
+        return track_loss(seen.accumulation, seen.transmittance)
 
     def _distortion_weight(self) -> float:
         """Weight of the distortion term at this step: it grows over its ramp."""

@@ -38,6 +38,8 @@ class LossWeights:
     """Push rays to be opaque or empty."""
     distortion: float
     """Gather each ray's weight in one short interval."""
+    tracks: float = 0.0
+    """Lines of sight to points of structure from motion end at these points; needs a scene with tracks."""
 
 
 LOSS_RECIPES: Mapping[str, LossWeights] = {
@@ -51,6 +53,7 @@ LOSS_RECIPES: Mapping[str, LossWeights] = {
         sparsity=0.0,
         beta=0.0,
         distortion=0.1,
+        tracks=0.05,
     ),
     # The published training configuration of the original code (TV, sparsity and beta as there).
     "paper": LossWeights(
@@ -111,6 +114,11 @@ class ThermoxelsModelConfig(ModelConfig):
     """Steps of each trial of the start auto."""
     hold_density: int = 20
     """First steps in which the density stands after a start from photographs, while colours find their values."""
+    carve: Literal["auto", "off"] = "auto"
+    """Drop voxels that are air because structure from motion saw points through them. auto: where the scene has tracks
+    (tracks_file_path in its json, as thermoxels capture writes it), at the start and after every refinement."""
+    track_rays: int = 512
+    """Lines of sight that each step looks at."""
     thermal_density_gradient: bool = False
     """Let thermal images move the geometry (off: temperature is painted on what the RGB images show)."""
     steps_per_voxel: float = 2.0
@@ -137,7 +145,7 @@ class ThermoxelsModelConfig(ModelConfig):
     """Set of loss weights; paper: the published one."""
     loss_overrides: dict[str, float] = field(default_factory=dict)
     """Loss weights that replace the recipe's, by name: rgb, thermal, tv_density, tv_sh, tv_temperature, sparsity,
-    beta, distortion."""
+    beta, distortion, tracks."""
     thermal_l2_share: float = 0.5
     """lambda of the paper's eq. 4."""
     distortion_ramp: tuple[int, int] = _STANDARD.distortion_ramp
@@ -179,6 +187,7 @@ class ThermoxelsModelConfig(ModelConfig):
             "temperature_degree": (0, 2, "0, 1 or 2"),
             "hold_density": (0, 1e9, "0 or more"),
             "trial_steps": (1, 1e9, "at least 1"),
+            "track_rays": (1, 1e9, "at least 1"),
             "start_density": (1e-30, 1e30, "a finite number above 0"),
             "steps_per_voxel": (0.1, 1000.0, "from 0.1 to 1000"),
             "near_plane": (0.0, 1e30, "0 or more"),

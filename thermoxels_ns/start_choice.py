@@ -25,6 +25,7 @@ from thermoxels_ns.photo_consistency import DensityStart
 from thermoxels_ns.photo_start import find_start, hold_density, set_density
 from thermoxels_ns.scratch import SCRATCH
 from thermoxels_ns.streams import RGB_STREAM
+from thermoxels_ns.track_carving import carve_air
 
 if TYPE_CHECKING:
     from thermoxels_ns.model import ThermoxelsModel
@@ -147,6 +148,7 @@ class _Trial:
         # Temperature does not move the density, and a trial knows the geometry by its colours alone.
         self.model.loss_weights = replace(model.loss_weights, thermal=0.0, tv_temperature=0.0)
         self.model.split(model.config.skipped_factor())
+        carve_air(self.model)
         if found is not None:
             set_density(self.model, found)
         self.optimizers = Optimizers(deepcopy(settings), self.model.get_param_groups())

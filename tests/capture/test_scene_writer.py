@@ -16,9 +16,10 @@ from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.gravity import Up
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.metric_scale import MetricScale
-from thermoxels_ns.capture.scene_writer import Scene, scene_names, write_scene_folder
+from thermoxels_ns.capture.scene_writer import TRACKS_NAME, Scene, scene_names, write_scene_folder
 from thermoxels_ns.capture.stages import prepare_output
 from thermoxels_ns.data.scene_file import read_scene_file
+from thermoxels_ns.data.sparse_tracks import read_tracks
 from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.thermal_files import read_temperature_c
 from thermoxels_ns.scene_scale import scale_from_scene_file, up_from_scene_file
@@ -112,6 +113,20 @@ def test_the_scene_box_holds_the_scene_points(scene, tmp_path):
     assert "points" in source
     assert inside.mean() > 0.95
     assert (box[1] - box[0] < 6).all()
+
+
+def test_tracks_say_which_training_photograph_sees_which_point(scene, tmp_path):
+    output = prepare_output(tmp_path / "scene")
+    write_scene_folder(scene, output)
+    outputs = ThermalDataParserConfig(data=output).setup().get_dataparser_outputs("train")
+    tracks = read_tracks(output / TRACKS_NAME)
+    assert np.array_equal(tracks.points, scene.model.points)
+    assert np.array_equal(tracks.sighting_point, scene.model.sighting_point)
+    seen = np.bincount(scene.model.sighting_frame, minlength=COUNT)
+    train = [number for number, name in enumerate(tracks.frames) if "train" in name]
+    lines = outputs.metadata["sightlines"]
+    assert len(lines.origins) == pytest.approx(seen[train].sum(), rel=0.05)
+    assert len(lines.origins) <= seen[train].sum()
 
 
 def test_masks_are_written_for_all_frames(scene, tmp_path):

@@ -32,7 +32,7 @@ from thermoxels_ns.capture.poses import PoseOptions, add_points, find_poses
 from thermoxels_ns.capture.report import Findings, report_page
 from thermoxels_ns.capture.rig import estimate_rig
 from thermoxels_ns.capture.rig_inputs import kept_start, read_rig, rig_frames, rig_start
-from thermoxels_ns.capture.scene_writer import JSON_NAME, POINTS_NAME, Scene, write_scene_folder
+from thermoxels_ns.capture.scene_writer import JSON_NAME, POINTS_NAME, TRACKS_NAME, Scene, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm_model import SfmModel
 from thermoxels_ns.capture.stages import (
@@ -143,7 +143,7 @@ class _Run:
         rig, start = self.find_rig(model, frames, read, scale, missing, board)
         drift = self.find_drift(model, frames, rig)
         scene = Scene(frames, model, rig, drift, scale, up, self.masks(frames, model))
-        written = [self.output / name for name in (JSON_NAME, POINTS_NAME, "images", "thermal", "masks")]
+        written = [self.output / name for name in (JSON_NAME, POINTS_NAME, TRACKS_NAME, "images", "thermal", "masks")]
         self.cache.run("scene", {}, lambda _: self._write_scene(scene), written)
         findings = Findings(
             source=self.source,

@@ -21,9 +21,11 @@ from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.sfm_model import SfmModel
 from thermoxels_ns.capture.stages import CACHE_FOLDER, write_json
 from thermoxels_ns.checks import remove_file, replace_when_done, writable_folder
+from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, SparseTracks, write_tracks
 
 JSON_NAME = "transforms.json"
 POINTS_NAME = "sparse_points.ply"
+TRACKS_NAME = "sparse_tracks.npz"
 _FOLDERS = ("images", "thermal", "masks")
 _COPIED = {"JPEG": ".jpg", "PNG": ".png"}
 _MOST_POINT_ERROR_PX = 2.0
@@ -82,13 +84,14 @@ def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = 
         if (number + 1) % 20 == 0:
             say(f"scene: {number + 1} of {len(scene.frames)} frames")
     write_points(new / POINTS_NAME, *_good_points(scene.model))
+    write_tracks(new / TRACKS_NAME, _tracks(scene.model, [entry["file_path"] for entry in entries]))
     write_json(new / JSON_NAME, _content(scene, entries))
     remove_file(output / JSON_NAME)
     for name in _FOLDERS:
         shutil.rmtree(output / name, ignore_errors=True)
         if (new / name).is_dir():
             (new / name).rename(output / name)
-    for name in (POINTS_NAME, JSON_NAME):
+    for name in (POINTS_NAME, TRACKS_NAME, JSON_NAME):
         (new / name).replace(output / name)
     shutil.rmtree(new, ignore_errors=True)
     return output / JSON_NAME
@@ -146,6 +149,10 @@ def _good_points(model: SfmModel) -> tuple[FloatArray, npt.NDArray[np.uint8]]:
     return model.points[good], model.colours[good]
 
 
+def _tracks(model: SfmModel, names: Sequence[str]) -> SparseTracks:
+    return SparseTracks(model.points, model.point_error_px, tuple(names), model.sighting_frame, model.sighting_point)
+
+
 def _content(scene: Scene, entries: list[dict[str, Any]]) -> dict[str, Any]:
     rig, drift = scene.rig, scene.drift
     disagreement = {"before": drift.before_k, "after": drift.after_k}
@@ -171,6 +178,8 @@ def _content(scene: Scene, entries: list[dict[str, Any]]) -> dict[str, Any]:
     }
     if len(scene.model.points):
         content["ply_file_path"] = POINTS_NAME
+    if len(scene.model.sighting_point):
+        content[TRACKS_KEY] = TRACKS_NAME
     if scene.scale is not None:
         content["metres_per_unit"] = scene.scale.metres_per_unit
         if scene.scale.standard_error is not None:

@@ -18,9 +18,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from thermoxels_ns.data.pose_file_cameras import Intrinsics
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
+from thermoxels_ns.data.sparse_tracks import find_sightlines
 from thermoxels_ns.data.splits import Split, split_frames
 from thermoxels_ns.data.thermal_survey import ThermalSurvey, survey_thermal_files
 from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.sightlines import Sightlines
 
 SCENE_SIZE = 2.0
 """Longest side of the scene box in nerfstudio's world; learning rates of the field rely on it."""
@@ -95,6 +97,8 @@ class _Scene:
     survey: ThermalSurvey
     world: _World
     box: SceneBox
+    sightlines: Sightlines | None
+    """What the training photographs see of the tracks; nerfstudio's world."""
 
 
 class ThermalDataParser(DataParser):
@@ -102,7 +106,8 @@ class ThermalDataParser(DataParser):
 
     The outputs' metadata hold: ``temperature_range`` (`TemperatureRange`), ``thermal_filenames``, ``thermal_cameras``
     (`Cameras` of the split, or None where a pair shares camera and resolution), ``thermal_unit``, ``valid_range_c``,
-    ``thermal_dead_pixels`` (a mask per resolution), ``image_scale`` (1 / downscale_factor) and ``scene_name``.
+    ``thermal_dead_pixels`` (a mask per resolution), ``image_scale`` (1 / downscale_factor), ``scene_name`` and, for
+    train, ``sightlines`` (`Sightlines`, or None where the scene has no tracks).
     """
 
     config: ThermalDataParserConfig
@@ -147,6 +152,7 @@ class ThermalDataParser(DataParser):
                 "valid_range_c": tuple(self.config.valid_range_c),
                 "thermal_dead_pixels": scene.survey.dead_pixels,
                 "scene_name": scene.file.folder.resolve().name,
+                "sightlines": scene.sightlines if split == "train" else None,
             },
         )
 
@@ -183,7 +189,10 @@ class ThermalDataParser(DataParser):
         )
         if file.left_out:
             CONSOLE.print(f"Left out, no pair: {', '.join(file.left_out)}", style="bold yellow")
-        return _Scene(file, split, survey, world, box)
+        lines = find_sightlines(file, split.train)
+        if lines is not None:
+            lines = lines.moved(world.rotation, world.translation, world.scale)
+        return _Scene(file, split, survey, world, box, lines)
 
     def _place(self, file: SceneFile) -> tuple[_World, SceneBox, str]:
         """Choose orientation, origin and scale, and express the scene box in the new world."""

@@ -1,0 +1,138 @@
+"""Tracks beside a scene: what is written is read, evaluation photographs stay out, wrong files are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.data.scene_file import read_scene_file
+from thermoxels_ns.data.sparse_tracks import (
+    TRACKS_KEY,
+    SparseTracks,
+    read_tracks,
+    sightlines,
+    write_tracks,
+)
+from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
+from thermoxels_ns.errors import SceneError
+
+TAGS = ["train", "train", "eval", "train", "train", "train"]
+NAMES = [f"frame_{tag}_{number:05d}" for number, tag in enumerate(TAGS)]
+
+
+@pytest.fixture
+def scene(scene_folder):
+    """A scene of six photographs that all see all points."""
+    folder = scene_folder(frames=len(NAMES), names=NAMES)
+    files = tuple(entry["file_path"] for entry in folder.meta["frames"])
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3))
+    frame, point = (axis.reshape(-1) for axis in np.meshgrid(range(len(files)), range(30), indexing="ij"))
+    tracks = SparseTracks(points, np.full(30, 0.5), files, frame, point)
+    folder.meta[TRACKS_KEY] = "tracks.npz"
+    folder.rewrite()
+    write_tracks(folder.path / "tracks.npz", tracks)
+    return folder, tracks
+
+
+def lines_of(folder, split: str = "train", **options):
+    return ThermalDataParserConfig(data=folder.path, **options).setup().get_dataparser_outputs(split)
+
+
+def test_what_is_written_is_read(scene):
+    folder, tracks = scene
+    read = read_tracks(folder.path / "tracks.npz")
+    assert read.frames == tracks.frames
+    for name in ("points", "point_error_px", "sighting_frame", "sighting_point"):
+        assert np.array_equal(getattr(read, name), getattr(tracks, name)), name
+
+
+def test_lines_begin_at_training_cameras_only_and_end_at_the_points_of_the_new_world(scene):
+    folder, tracks = scene
+    outputs = lines_of(folder, scale_factor=0.5)
+    lines = outputs.metadata["sightlines"]
+    centres = outputs.cameras.camera_to_worlds[:, :, 3].double().numpy()
+    assert len(lines.origins) == 5 * 30
+    nearest = np.linalg.norm(lines.origins[:, None] - centres, axis=2)
+    assert nearest.min(axis=1).max() < 1e-5
+    assert np.bincount(nearest.argmin(axis=1)).tolist() == [30] * 5
+    transform = outputs.dataparser_transform.double().numpy()
+    moved = outputs.dataparser_scale * (tracks.points @ transform[:, :3].T + transform[:, 3])
+    assert lines.points == pytest.approx(moved, abs=1e-6)
+    assert (np.diff(lines.point) >= 0).all()
+    assert lines_of(folder, "val").metadata["sightlines"] is None
+
+
+def test_points_that_only_evaluation_sees_a_third_time_are_left_out(scene):
+    folder, tracks = scene
+    of_eval = tracks.frames.index(next(name for name in tracks.frames if "eval" in name))
+    others = [number for number in range(6) if number != of_eval][:2]
+    few = np.isin(tracks.sighting_frame, [of_eval, *others]) | (tracks.sighting_point >= 3)
+    tracks = replace(tracks, sighting_frame=tracks.sighting_frame[few], sighting_point=tracks.sighting_point[few])
+    write_tracks(folder.path / "tracks.npz", tracks)
+    assert len(lines_of(folder).metadata["sightlines"].points) == 27
+
+
+def test_badly_known_points_are_left_out(scene):
+    folder, tracks = scene
+    error = tracks.point_error_px.copy()
+    error[:4] = 3.0
+    points = tracks.points.copy()
+    points[4] = np.nan
+    frames = [frame for frame in read_scene_file(folder.path).frames if "train" in frame.name]
+    lines = sightlines(replace(tracks, point_error_px=error, points=points), frames)
+    assert np.array_equal(lines.points, tracks.points[5:])
+    # Cameras at one place know no distances.
+    together = [replace(frame, pose=frames[0].pose) for frame in frames]
+    assert len(sightlines(tracks, together).points) == 0
+
+
+def test_the_error_of_a_length_is_that_of_a_triangulation(scene):
+    folder, _ = scene
+    frame = read_scene_file(folder.path).frames[0]
+    frames = []
+    for number, x in enumerate((-1.0, 0.0, 1.0)):
+        pose = np.eye(4)
+        pose[:3, 3] = (x, 0.0, 2.0)
+        frames.append(replace(frame, name=str(number), pose=pose))
+    one = SparseTracks(np.zeros((1, 3)), np.ones(1), ("0", "1", "2"), np.arange(3), np.zeros(3, dtype=np.int64))
+    lines = sightlines(one, frames)
+    angle = 2.0 * np.arctan2(1.0, 2.0)
+    expected = 1.0 / frame.intrinsics.fx / np.sin(angle) * np.sqrt([5.0, 4.0, 5.0])
+    assert lines.uncertainty == pytest.approx(expected)
+
+
+def test_without_tracks_there_are_no_lines(scene_folder):
+    assert lines_of(scene_folder()).metadata["sightlines"] is None
+
+
+def test_tracks_of_other_photographs_or_poses_are_refused(scene):
+    folder, tracks = scene
+    path = folder.path / "tracks.npz"
+    write_tracks(path, replace(tracks, frames=tuple(f"other_{n}" for n in range(6))))
+    with pytest.raises(SceneError, match=r"tracks\.npz.*photographs of this scene.*other_0"):
+        lines_of(folder)
+    write_tracks(path, replace(tracks, points=tracks.points + np.array([0.0, 0.0, 100.0])))
+    with pytest.raises(SceneError, match=r"tracks\.npz.*behind"):
+        lines_of(folder)
+
+
+def test_a_missing_or_damaged_file_is_named(scene):
+    folder, tracks = scene
+    path: Path = folder.path / "tracks.npz"
+    content = path.read_bytes()
+    for damaged in (b"", b"not a zip", content[: len(content) // 2]):
+        path.write_bytes(damaged)
+        with pytest.raises(SceneError, match=r"tracks\.npz.*expected an \.npz with points"):
+            lines_of(folder)
+    np.savez(path, points=tracks.points)
+    with pytest.raises(SceneError, match=r"tracks\.npz.*point_error_px"):
+        lines_of(folder)
+    write_tracks(path, replace(tracks, sighting_point=tracks.sighting_point + 1))
+    with pytest.raises(SceneError, match=r"tracks\.npz.*pairs of their numbers"):
+        lines_of(folder)
+    path.unlink()
+    with pytest.raises(SceneError, match=r"tracks\.npz"):
+        lines_of(folder)

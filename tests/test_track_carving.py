@@ -1,0 +1,108 @@
+"""Voxels that lines of sight show to be air."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import thermoxels_ns.track_carving as track_carving
+from thermoxels_ns.field.voxel_grid import VoxelGrid
+from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.sightlines import Sightlines
+from thermoxels_ns.track_carving import MARGIN_VOXELS, carve_air, empty_voxels
+
+BOX = Lattice.covering((-1, -1, -1), (1, 1, 1), 20)
+
+
+def lines(origins, points, uncertainty=0.0) -> Sightlines:
+    """Every camera sees every point."""
+    origins, points = np.atleast_2d(origins).astype(float), np.atleast_2d(points).astype(float)
+    number = np.repeat(np.arange(len(points)), len(origins))
+    return Sightlines(
+        np.tile(origins, (len(points), 1)), number, points, np.full(len(number), uncertainty, dtype=float)
+    )
+
+
+def room(count: int = 4000, seed: int = 0) -> tuple[Sightlines, np.ndarray]:
+    """A room with walls at +-0.65 seen from inside, and the voxels that are free: nothing of a wall in them."""
+    random = np.random.default_rng(seed)
+    points = random.uniform(-0.65, 0.65, (count, 3))
+    points[np.arange(count), random.integers(0, 3, count)] = random.choice([-0.65, 0.65], count)
+    free = (np.abs(BOX.cell_centres()) + 0.5 * BOX.voxel_size < 0.65).all(axis=-1)
+    return lines(random.uniform(-0.3, 0.3, (5, 3)), points), free
+
+
+def test_of_a_room_seen_from_inside_only_free_voxels_are_carved_and_most_of_them() -> None:
+    sight, free = room()
+    empty = empty_voxels(BOX, sight)
+    assert not (empty & ~free).any()
+    assert empty.sum() > 0.6 * free.sum()
+
+
+@pytest.mark.parametrize("resolution", [7, 20, 33])
+def test_no_voxel_that_holds_a_point_is_carved(resolution: int) -> None:
+    lattice = Lattice.covering((-1, -1, -1), (1, 1, 1), resolution)
+    random = np.random.default_rng(resolution)
+    sight = lines(random.uniform(-1.5, 1.5, (6, 3)), random.uniform(-1, 1, (500, 3)))
+    empty = empty_voxels(lattice, sight)
+    held = np.floor(lattice.world_to_index(sight.points)).astype(int)
+    assert empty.any()
+    assert not empty[tuple(held.T)].any()
+
+
+def test_a_single_point_carves_nothing_however_many_see_it() -> None:
+    origins = np.random.default_rng(1).uniform(-0.1, 0.1, (40, 3)) + np.array([-0.8, 0.03, 0.03])
+    assert not empty_voxels(BOX, lines(origins, [0.8, 0.05, 0.05])).any()
+    assert empty_voxels(BOX, lines(origins, [[0.8, 0.05, 0.05], [0.8, 0.051, 0.05]])).any()
+
+
+@pytest.mark.parametrize("uncertainty", [0.0, 0.1])
+def test_what_is_carved_ends_before_the_points_by_the_margin_and_the_uncertainty(uncertainty: float) -> None:
+    sight = lines([-0.95, 0.05, 0.05], [[0.87, 0.05, 0.05], [0.88, 0.05, 0.05]], uncertainty)
+    carved = np.flatnonzero(empty_voxels(BOX, sight)[:, 10, 10])
+    ends = BOX.index_to_world([[carved.max() + 1, 0, 0]])[0, 0]
+    limit = 0.87 - MARGIN_VOXELS * BOX.voxel_size - 3.0 * uncertainty
+    assert carved.tolist() == list(range(carved.max() + 1))
+    assert limit - BOX.voxel_size < ends <= limit + 1e-9
+
+
+def test_lines_along_faces_and_from_outside_count_as_any() -> None:
+    along_a_face = lines([-3.0, 0.1, 0.1], [[0.95, 0.1, 0.1], [0.96, 0.1, 0.1]])
+    empty = empty_voxels(BOX, along_a_face)
+    assert empty.any(axis=(1, 2))[:17].all()
+    assert not empty_voxels(BOX, lines([-3.0, 5.0, 0.0], [[3.0, 5.0, 0.0], [3.0, 5.1, 0.0]])).any()
+    assert not empty_voxels(BOX, lines(np.zeros((0, 3)), np.zeros((0, 3)))).any()
+
+
+def test_how_lines_are_cut_into_pieces_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    sight, _ = room(300)
+    whole = empty_voxels(BOX, sight)
+    monkeypatch.setattr(track_carving, "_SAMPLES_AT_ONCE", 50)
+    assert np.array_equal(empty_voxels(BOX, sight), whole)
+
+
+def carved_model(sight: Sightlines | None, carve: str = "auto") -> tuple[Any, Any]:
+    model: Any = SimpleNamespace(
+        sightlines=sight, config=SimpleNamespace(carve=carve), grid=VoxelGrid(BOX, sh_degree=0)
+    )
+    return model, carve_air(model)
+
+
+def test_carved_voxels_are_no_longer_stored_and_rows_follow() -> None:
+    sight, _ = room()
+    model, change = carved_model(sight)
+    kept = model.grid.kept.numpy()
+    assert np.array_equal(kept, ~empty_voxels(BOX, sight))
+    rows = torch.arange(BOX.num_corners)[:, None]
+    assert change is not None
+    assert torch.equal(change(rows)[:, 0], torch.from_numpy(model.grid.voxels.corners))
+
+
+def test_without_tracks_and_switched_off_nothing_changes() -> None:
+    for model, change in (carved_model(None), carved_model(room()[0], "off")):
+        assert change is None
+        assert bool(model.grid.kept.all())

@@ -1,0 +1,187 @@
+"""Tracks of structure from motion beside a scene: which photographs see which point, so which rays cross only air."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from thermoxels_ns.checks import replace_when_done
+from thermoxels_ns.data.scene_file import Frame, SceneFile
+from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.sightlines import FloatArray, IntArray, Sightlines
+
+TRACKS_KEY = "tracks_file_path"
+"""Name in transforms.json under which the file of tracks is given."""
+FEWEST_VIEWS = 3
+"""Photographs that must see a point: two agree about many wrong ones."""
+MOST_ERROR_PX = 2.0
+"""Mean reprojection error above which a point is left out."""
+LEAST_PARALLAX_DEG = 2.0
+"""Largest angle between the rays of a point below which its distance is not known."""
+MOST_BEHIND = 0.1
+"""Share of sightings behind their camera above which tracks belong to other poses."""
+_REMEDY = f"Write the scene again with thermoxels capture, or remove {TRACKS_KEY} from the json to train without it."
+
+
+@dataclass(frozen=True, eq=False)
+class SparseTracks:
+    """Points and the photographs that see them; the content of a file of tracks, arrays by these names."""
+
+    points: FloatArray
+    """Shape (n, 3), in the coordinates of the poses."""
+    point_error_px: FloatArray
+    """Mean reprojection error of each point, shape (n,), [pixels of the photographs]."""
+    frames: tuple[str, ...]
+    """``file_path`` of the photographs, as transforms.json has it."""
+    sighting_frame: IntArray
+    """Index into `frames`, shape (s,)."""
+    sighting_point: IntArray
+    """Index into `points`, shape (s,)."""
+
+
+def write_tracks(path: Path, tracks: SparseTracks) -> None:
+    """Write tracks as a compressed .npz.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    with replace_when_done(path) as temporary:
+        np.savez_compressed(
+            temporary,
+            points=tracks.points,
+            point_error_px=tracks.point_error_px.astype(np.float32),
+            frames=np.array(tracks.frames, dtype=np.str_),
+            sighting_frame=tracks.sighting_frame.astype(np.int32),
+            sighting_point=tracks.sighting_point.astype(np.int32),
+        )
+
+
+def read_tracks(path: Path) -> SparseTracks:
+    """Read and check a file of tracks.
+
+    Raises:
+        SceneError: It is missing, no such file, or contradicts itself.
+    """
+    names = ("points", "point_error_px", "frames", "sighting_frame", "sighting_point")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            points, error, frames, frame, point = (file[name] for name in names)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, AttributeError, TypeError) as problem:
+        raise SceneError(
+            explain(path.name, expected=f"an .npz with {', '.join(names)}", got=problem, remedy=_REMEDY)
+        ) from problem
+    good = (
+        points.ndim == 2
+        and points.shape[1] == 3
+        and points.dtype.kind == error.dtype.kind == "f"
+        and error.shape == points.shape[:1]
+        and frames.ndim == 1
+        and frames.dtype.kind == "U"
+        and frame.dtype.kind == point.dtype.kind == "i"
+        and frame.ndim == 1
+        and frame.shape == point.shape
+        and (frame.size == 0 or (min(frame.min(), point.min()) >= 0))
+        and (frame.size == 0 or (frame.max() < len(frames) and point.max() < len(points)))
+    )
+    if not good:
+        arrays = (points, error, frames, frame, point)
+        shapes = ", ".join(f"{name} {array.dtype}{array.shape}" for name, array in zip(names, arrays))
+        raise SceneError(
+            explain(path.name, expected="points, frames and pairs of their numbers", got=shapes, remedy=_REMEDY)
+        )
+    return SparseTracks(
+        points.astype(np.float64),
+        error.astype(np.float64),
+        tuple(str(name) for name in frames),
+        frame.astype(np.int64),
+        point.astype(np.int64),
+    )
+
+
+def find_sightlines(scene: SceneFile, training: Sequence[int]) -> Sightlines | None:
+    """The lines of sight of the photographs that train, if the scene's json names a file of tracks.
+
+    Args:
+        scene: The scene.
+        training: Numbers of its frames that train; what others see is not used.
+
+    Returns:
+        Lines in input coordinates; None where the json names no tracks.
+
+    Raises:
+        SceneError: The file cannot be used, or does not fit the poses.
+    """
+    if TRACKS_KEY not in scene.meta:
+        return None
+    path = scene.folder / str(scene.meta[TRACKS_KEY])
+    return sightlines(read_tracks(path), [scene.frames[index] for index in training], path.name)
+
+
+def sightlines(tracks: SparseTracks, frames: Sequence[Frame], name: str = "tracks") -> Sightlines:
+    """Lines from frames to the points that they see and that are well known.
+
+    A point counts if at least `FEWEST_VIEWS` of the frames see it, more than `LEAST_PARALLAX_DEG` apart, with a mean
+    reprojection error of at most `MOST_ERROR_PX`. The standard error of a line's length is that of a triangulation: the
+    error in the image, over the focal length and the sine of that angle, times the length.
+
+    Args:
+        tracks: Points and who sees them.
+        frames: Frames whose sightings are used, in any order.
+        name: What the tracks are called in messages.
+
+    Raises:
+        SceneError: None of the frames is in the tracks, or the tracks belong to other poses.
+    """
+    place = {frame.name: number for number, frame in enumerate(frames)}
+    number = np.array([place.get(known, -1) for known in tracks.frames], dtype=np.int64)
+    if len(frames) and not (number >= 0).any():
+        raise SceneError(
+            explain(
+                name,
+                expected="photographs of this scene",
+                got=f"{len(tracks.frames)} others, such as {', '.join(tracks.frames[:2]) or 'none'}",
+                remedy=_REMEDY,
+            )
+        )
+    known = np.isfinite(tracks.points).all(axis=1) & (tracks.point_error_px <= MOST_ERROR_PX)
+    used = (number[tracks.sighting_frame] >= 0) & known[tracks.sighting_point]
+    frame, point = number[tracks.sighting_frame[used]], tracks.sighting_point[used]
+    order = np.lexsort((frame, point))
+    frame, point = frame[order], point[order]
+    poses = np.stack([one.pose for one in frames]) if len(frames) else np.zeros((0, 4, 4))
+    focal = np.array([min(one.intrinsics.fx, one.intrinsics.fy) for one in frames])
+    line = tracks.points[point] - poses[frame, :3, 3]
+    behind = (line * -poses[frame, :3, 2]).sum(axis=1) <= 0.0
+    if behind.sum() > MOST_BEHIND * len(behind):
+        raise SceneError(
+            explain(
+                name,
+                expected="points in front of the photographs that see them",
+                got=f"{behind.mean():.0%} of the sightings behind: the poses are others",
+                remedy=_REMEDY,
+            )
+        )
+    frame, point, line = frame[~behind], point[~behind], line[~behind]
+    length = np.linalg.norm(line, axis=1)
+    angle = _parallax(line / np.maximum(length, 1e-300)[:, None], point, len(tracks.points))
+    views = np.bincount(point, minlength=len(tracks.points))
+    good = (views >= FEWEST_VIEWS) & (angle > np.radians(LEAST_PARALLAX_DEG))
+    chosen = good[point]
+    renumbered = np.cumsum(good) - 1
+    frame, point, length = frame[chosen], point[chosen], length[chosen]
+    error = tracks.point_error_px[point] / focal[frame] / np.sin(np.minimum(angle[point], np.pi / 2))
+    return Sightlines(poses[frame, :3, 3], renumbered[point], tracks.points[good], error * length)
+
+
+def _parallax(directions: FloatArray, point: IntArray, count: int) -> FloatArray:
+    """Twice the largest angle between each point's directions and their mean, shape (count,), [radians]."""
+    mean = np.stack([np.bincount(point, directions[:, axis], count) for axis in range(3)], axis=1)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-300)[:, None]
+    off = np.zeros(count)
+    across = np.linalg.norm(np.cross(directions, mean[point]), axis=1)
+    np.maximum.at(off, point, np.arctan2(across, (directions * mean[point]).sum(axis=1)))
+    return 2.0 * off

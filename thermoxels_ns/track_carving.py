@@ -1,0 +1,121 @@
+"""Which voxels are air, from the lines between cameras and the points that they see.
+
+Photographs of plain walls leave training free to paint them on fog right before the cameras. Structure from motion
+knows better: from where a photograph sees a point, nothing stands in between (space carving along the rays of tracks).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from thermoxels_ns.field.refine import RowChange, prune
+from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.sightlines import FloatArray, IntArray, Sightlines
+
+if TYPE_CHECKING:
+    from thermoxels_ns.model import ThermoxelsModel
+
+FEWEST_POINTS = 2
+"""Different points whose lines must cross a voxel: a single one may be wrong."""
+MARGIN_VOXELS = 1.5
+"""Voxels before a point that are not judged by the lines to it."""
+MARGIN_ERRORS = 3.0
+"""Standard errors of a line's length that are not judged either."""
+_STEPS_PER_VOXEL = 2.0
+_SAMPLES_AT_ONCE = 1 << 20
+
+
+def carve_air(model: ThermoxelsModel) -> RowChange | None:
+    """Drop the kept voxels of a model's grid that lines of sight show to be air, and say how many.
+
+    Returns:
+        How values of rows change; None where nothing changes: without tracks, or switched off.
+    """
+    lines = model.sightlines
+    if model.config.carve == "off" or lines is None:
+        return None
+    voxels = model.grid.voxels
+    empty = empty_voxels(voxels.lattice, lines).reshape(-1)[voxels.cells]
+    carved = int(empty.sum())
+    if carved in (0, len(empty)):
+        return None
+    CONSOLE.log(
+        f"tracks: {carved:,} of {len(empty):,} voxels are air ({carved / len(empty):.1%}), crossed by the "
+        f"{len(lines.origins):,} lines of sight to {len(lines.points):,} points"
+    )
+    return prune(model.grid, ~empty)
+
+
+def empty_voxels(lattice: Lattice, lines: Sightlines) -> npt.NDArray[np.bool_]:
+    """Find the voxels that are air.
+
+    A voxel is air if the lines to at least `FEWEST_POINTS` points cross it and leave it `MARGIN_VOXELS` voxels and
+    `MARGIN_ERRORS` standard errors before their points, and no point lies in it.
+
+    Args:
+        lattice: The voxels.
+        lines: Lines of sight, world units.
+
+    Returns:
+        One boolean per voxel, shape of the lattice's voxels.
+    """
+    shape = np.asarray(lattice.cell_shape)
+    crossing = np.zeros(int(shape.prod()), dtype=np.int64)
+    for point, voxel in _crossings(lattice, lines):
+        pairs = np.unique(point * len(crossing) + voxel)  # each point counts once per voxel
+        crossing += np.bincount(pairs % len(crossing), minlength=len(crossing))
+    empty = (crossing >= FEWEST_POINTS).reshape(lattice.cell_shape)
+    held = np.floor(lattice.world_to_index(lines.points)).astype(np.int64)
+    held = held[((held >= 0) & (held < shape)).all(axis=1)]
+    empty[tuple(held.T)] = False
+    return empty
+
+
+def _crossings(lattice: Lattice, lines: Sightlines) -> Iterator[tuple[IntArray, IntArray]]:
+    """Points and flat voxels that lines to them cross, all lines of a point in one piece."""
+    shape = np.asarray(lattice.cell_shape)
+    origin = lattice.world_to_index(lines.origins)
+    along = lattice.world_to_index(lines.points)[lines.point] - origin
+    length = np.linalg.norm(along, axis=1)
+    direction = along / np.maximum(length, 1e-12)[:, None]
+    last = length - MARGIN_VOXELS - MARGIN_ERRORS * lines.uncertainty / lattice.voxel_size
+    first, end = _inside(origin, direction, shape)
+    steps = np.maximum(np.ceil((np.minimum(end, last) - first) * _STEPS_PER_VOXEL), 0.0).astype(np.int64)
+    for piece in _pieces(lines.point, steps):
+        line = np.repeat(np.arange(piece.start, piece.stop), steps[piece])
+        number = np.arange(len(line)) - np.repeat(np.cumsum(steps[piece]) - steps[piece], steps[piece])
+        at = first[line] + (number + 0.5) / _STEPS_PER_VOXEL
+        place = origin[line] + at[:, None] * direction[line]
+        voxel = np.floor(place).astype(np.int64)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            left = (voxel + (direction[line] > 0) - place) / direction[line]
+        leaves = at + np.where(direction[line] == 0.0, np.inf, left).min(axis=1)
+        crossed = ((voxel >= 0) & (voxel < shape)).all(axis=1) & (leaves <= last[line])
+        voxel = voxel[crossed]
+        yield lines.point[line[crossed]], (voxel[:, 0] * shape[1] + voxel[:, 1]) * shape[2] + voxel[:, 2]
+
+
+def _inside(origin: FloatArray, direction: FloatArray, shape: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Where lines from `origin` enter the box [0, shape] (at 0 if they begin in it) and leave it, in voxels."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sides = np.sort(np.stack([-origin / direction, (shape - origin) / direction]), axis=0)
+    # A line along a face of the box: 0 / 0.
+    near = np.where(np.isnan(sides[0]), -np.inf, sides[0]).max(axis=1)
+    far = np.where(np.isnan(sides[1]), np.inf, sides[1]).min(axis=1)
+    return np.maximum(near, 0.0), far
+
+
+def _pieces(point: IntArray, steps: IntArray) -> Iterator[slice]:
+    """Cut lines, sorted by point, between points, into pieces of not many more than `_SAMPLES_AT_ONCE` samples."""
+    ends = np.flatnonzero(np.diff(point, append=-1)) + 1
+    done = np.cumsum(steps)[ends - 1] if len(ends) else np.zeros(0, dtype=np.int64)
+    cuts = np.flatnonzero(np.diff(done // _SAMPLES_AT_ONCE, append=-1))
+    first = 0
+    for last in ends[cuts]:
+        yield slice(first, int(last))
+        first = int(last)
