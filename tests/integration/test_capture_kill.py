@@ -59,6 +59,6 @@ def test_kill_9_at_any_stage_changes_nothing_in_the_scene(tmp_path):
     again = run(*command(card, tmp_path / "killed"))
     assert again.returncode == 0, again.stdout
     assert "8/9 scene: as before" in again.stdout and "9/9 page: as before" not in again.stdout
-    assert len(files_of(tmp_path / "killed")) == 2 * COUNT + 2
+    assert len(files_of(tmp_path / "killed")) == 2 * COUNT + 3  # json, points, tracks
     assert files_of(tmp_path / "killed") == files_of(tmp_path / "alone")
     assert (tmp_path / "killed" / "capture.html").is_file()
