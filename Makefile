@@ -25,11 +25,11 @@ demo: setup ## A synthetic scene from photographs to heat flow, with pictures
 	$(call activate,$(VENV)) thermoxels demo $(ARGS)
 
 test: setup ## Run the tests
-	$(call activate,$(VENV)) pytest $(ARGS)
+	$(call activate,$(VENV)) OMP_NUM_THREADS=1 pytest --numprocesses logical --dist loadfile $(ARGS)
 
 test-newest: ## Run the tests with the newest versions that pyproject.toml allows
 	@VENV="$(NEWEST_VENV)" CONSTRAINTS= tools/setup.sh
-	$(call activate,$(NEWEST_VENV)) pytest $(ARGS)
+	$(call activate,$(NEWEST_VENV)) OMP_NUM_THREADS=1 pytest --numprocesses logical --dist loadfile $(ARGS)
 
 lint: setup ## Check format, style and types
 	$(call activate,$(VENV)) ruff format --check .
