@@ -119,6 +119,16 @@ def test_tracks_of_other_photographs_or_poses_are_refused(scene):
         lines_of(folder)
 
 
+@pytest.mark.parametrize("outside", ["../tracks.npz", "{folder}/../tracks.npz"])
+def test_tracks_outside_the_scene_are_refused(scene, outside):
+    folder, tracks = scene
+    write_tracks(folder.path.parent / "tracks.npz", tracks)
+    folder.meta[TRACKS_KEY] = outside.format(folder=folder.path)
+    folder.rewrite()
+    with pytest.raises(SceneError, match=r"tracks_file_path.*tracks\.npz"):
+        lines_of(folder)
+
+
 def test_a_missing_or_damaged_file_is_named(scene):
     folder, tracks = scene
     path: Path = folder.path / "tracks.npz"

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from thermoxels_ns.checks import replace_when_done
+from thermoxels_ns.data.folder_walls import path_inside
 from thermoxels_ns.data.scene_file import Frame, SceneFile
 from thermoxels_ns.errors import SceneError, explain
 from thermoxels_ns.sightlines import FloatArray, IntArray, Sightlines
@@ -113,11 +114,11 @@ def find_sightlines(scene: SceneFile, training: Sequence[int]) -> Sightlines | N
         Lines in input coordinates; None where the json names no tracks.
 
     Raises:
-        SceneError: The file cannot be used, or does not fit the poses.
+        SceneError: The file lies outside the scene, cannot be used, or does not fit the poses.
     """
     if TRACKS_KEY not in scene.meta:
         return None
-    path = scene.folder / str(scene.meta[TRACKS_KEY])
+    path = path_inside(scene.folder, str(scene.meta[TRACKS_KEY]), f"transforms.json: {TRACKS_KEY}")
     return sightlines(read_tracks(path), [scene.frames[index] for index in training], path.name)
 
 
