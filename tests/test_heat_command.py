@@ -15,7 +15,7 @@ import pyvista as pv
 import tyro
 
 from tests.scene_bodies import room, tagged_body, wall
-from thermoxels_ns import cli
+from thermoxels_ns import cli, heat_run
 from thermoxels_ns.errors import HeatError, OutputError, ThermoxelsError
 from thermoxels_ns.fem.probes import place_probes
 from thermoxels_ns.fem.problem import AdaptiveSteps
@@ -130,6 +130,17 @@ def test_what_does_not_matter_is_left_out_and_said_so(hour) -> None:
     assert found["seconds_saved"] >= 0.0
     page = (hour / "report.html").read_text()
     assert "radiation on exterior-up" in page and left[0]["reason"] in page and "saved about" in page
+
+
+def test_a_solution_outlives_the_question_what_was_saved(folder, monkeypatch) -> None:
+    def fail(*_) -> float:
+        raise HeatError("singular")
+
+    monkeypatch.setattr(heat_run, "seconds_saved", fail)
+    said: list[str] = []
+    run = compute_heat(Heat(folder / "room" / "mesh.vtu", str(folder / "hour.yaml"), folder), said.append)
+    assert run.seconds_saved is None and np.isfinite(run.mean_c).all()
+    assert any("not known" in line and "singular" in line for line in said)
 
 
 def test_everything_is_built_at_a_tolerance_of_0(folder) -> None:

@@ -25,6 +25,7 @@ import tyro
 from scipy import sparse
 
 from thermoxels_ns.fem.assembly import assemble
+from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.fixed_nodes import FixedNodes
 from thermoxels_ns.fem.linear_solver import ConjugateGradients
 from thermoxels_ns.fem.materials import Material
@@ -38,7 +39,7 @@ from thermoxels_ns.fem.solver_choice import LinearSolver
 from thermoxels_ns.fem.sparsity import product_and_bound
 from thermoxels_ns.fem.stepper import Stepper
 from thermoxels_ns.fem.stepping import solve_heat
-from thermoxels_ns.fem.system import HeatSystem, effect_labels
+from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.mesh.patches import default_patches
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets

@@ -11,6 +11,12 @@ short steps. Then the driver gets each problem with several tolerances: its esti
 and its time with that of the cheapest setting by hand whose true error is within the tolerance, which nobody knows
 beforehand.
 
+Times are processor times. All settings of a problem, by hand and the driver's, take turns in one process: in every
+round each runs once, after one run of each that does not count, so that a disturbance or a change of the processor's
+clock meets all of them alike. What counts is the median of at least seven rounds, or of three for settings that take
+longer than `LONG_S`. The ratio of the driver to a setting by hand is the median of the ratios within the rounds in
+which both ran, and the best setting is the one with the largest such ratio: no lucky run makes a setting the best.
+
 Prints all rows, and writes them to a csv file and the errors against the seconds to a picture.
 """
 
@@ -18,11 +24,12 @@ from __future__ import annotations
 
 import csv
 import gc
+import statistics
 import sys
 import time
 import types
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,10 +54,13 @@ from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
-from thermoxels_ns.fem.tolerance import solve_to_tolerance
+from thermoxels_ns.fem.tolerance import ToleratedSolution, solve_to_tolerance
 
 DURATION_S = 32.0
 OUTPUTS = 10
+LEAST_REPEATS, LONG_REPEATS = 7, 3
+LONG_S = 1.0
+"""Settings that take longer run in `LONG_REPEATS` rounds only: a disturbance is little of what they take."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +85,28 @@ class Row:
 
 
 @dataclass
+class Contest:
+    """A setting that takes turns with others."""
+
+    method: str
+    setting: str
+    run: Callable[[], Any]
+    seconds: list[float] = field(default_factory=list)
+    """Processor time of each round, [s]."""
+    result: Any = None
+    """Of the last round."""
+
+    @property
+    def median_s(self) -> float:
+        """The median, [s]."""
+        return statistics.median(self.seconds)
+
+    def over(self, other: Contest) -> float:
+        """Median of the time over that of another setting in the same round."""
+        return statistics.median(mine / its for mine, its in zip(self.seconds, other.seconds))
+
+
+@dataclass
 class HeatAccuracy:
     """Error against seconds."""
 
@@ -82,8 +114,8 @@ class HeatAccuracy:
     """Where the rows go."""
     picture: Path = Path("docs/heat-accuracy.png")
     """Where the picture goes."""
-    repeats: int = 3
-    """Runs of which the fastest counts."""
+    repeats: int = 7
+    """Rounds of which the median counts; fewer than 7 are not taken."""
 
     def main(self) -> None:
         """Measure, print and write."""
@@ -104,17 +136,11 @@ class HeatAccuracy:
             problems.append(replace(problems[-1], mesh=refine_mesh(problems[-1].mesh), initial_temperature_c=None))
         exact = solve_steady(problems[-1], order=2, relative_tolerance=1e-9)
         settings = [(1, 0), (1, 1), (1, 2), (2, 0), (2, 1)] + ([(2, 2)] if finest > 2 else [])
-        rows = []
-        for order, refinements in settings:
-            run = _refined_solution(given, order, refinements)
-            seconds, solution = self.fastest(run)
-            unknowns = len(solution.temperature_c) + len(solution.edge_temperature_c)
-            setting = f"mesh size / {2**refinements}"
-            rows.append(_row(name, f"P{order}", setting, unknowns, seconds, _error(given, solution, exact)))
-            print(rows[-1], flush=True)
-        for tolerance_k in tolerances:
-            rows.append(self.drive(name, given, tolerance_k, None, rows, lambda s: _error(given, s, exact)))
-        return rows
+        by_hand = [
+            Contest(f"P{order}", f"mesh size / {2**refinements}", _refined_solution(given, order, refinements))
+            for order, refinements in settings
+        ]
+        return self.contest(name, given, by_hand, tolerances, None, lambda solution: _error(given, solution, exact))
 
     def in_time(self) -> list[Row]:
         """Rows of NAFEMS T3."""
@@ -132,76 +158,64 @@ class HeatAccuracy:
             missed = max(abs(float(heat.heat_w.mean()) - flows[heat.effect]) for heat in solution.effects)
             return ErrorSize(largest_k, missed / through)
 
-        rows = []
-        for refinements in range(3):
-            for scheme in (BACKWARD_EULER, CRANK_NICOLSON, SDIRK2):
-                for steps in (10, 20, 40, 80, 160):
-                    run = _refined_march(given, refinements, scheme, steps)
-                    seconds, solution = self.fastest(run)
-                    setting = f"mesh size / {2**refinements}, step {DURATION_S / steps:g} s"
-                    unknowns = solution.temperature_c.shape[1]
-                    rows.append(_row(name, scheme.name, setting, unknowns, seconds, error(solution)))
-                    print(rows[-1], flush=True)
-        for tolerance_k in (2.0, 0.5, 0.15):
-            rows.append(self.drive(name, given, tolerance_k, DURATION_S, rows, error))
-        return rows
+        by_hand = [
+            Contest(
+                scheme.name,
+                f"mesh size / {2**refinements}, step {DURATION_S / steps:g} s",
+                _refined_march(given, refinements, scheme, steps),
+            )
+            for refinements in range(3)
+            for scheme in (BACKWARD_EULER, CRANK_NICOLSON, SDIRK2)
+            for steps in (10, 20, 40, 80, 160)
+        ]
+        return self.contest(name, given, by_hand, (2.0, 0.5, 0.15), DURATION_S, error)
 
-    def drive(
+    def contest(
         self,
         name: str,
         given: HeatProblem,
-        tolerance_k: float,
+        by_hand: list[Contest],
+        tolerances: tuple[float, ...],
         duration_s: float | None,
-        by_hand: list[Row],
         error: Callable[[Any], ErrorSize],
-    ) -> Row:
-        """Row of the driver."""
+    ) -> list[Row]:
+        """Rows of all settings by hand and of the driver with each tolerance, which take turns."""
+        driven = [Contest("driver", f"{tolerance}", _driven(given, tolerance, duration_s)) for tolerance in tolerances]
+        self.take_turns([*by_hand, *driven])
+        rows, errors = [], {}
+        for one in by_hand:
+            errors[one.setting, one.method] = true = error(one.result)
+            unknowns = one.result.temperature_c.shape[-1]
+            if isinstance(one.result, SteadySolution):
+                unknowns += len(one.result.edge_temperature_c)
+            rows.append(_row(name, one.method, one.setting, unknowns, one.median_s, true))
+            print(rows[-1], flush=True)
+        for tolerance_k, one in zip(tolerances, driven):
+            good = [other for other in by_hand if errors[other.setting, other.method].temperature_k <= tolerance_k]
+            over_best = max((one.over(other) for other in good), default=float("nan"))
+            rows.append(_driver_row(name, one, tolerance_k, over_best, error(one.result.solution)))
+            print(rows[-1], flush=True)
+        return rows
 
-        def run() -> Any:
-            return solve_to_tolerance(
-                given, Tolerance(tolerance_k), duration_s=duration_s, outputs=OUTPUTS, log=lambda line: None
-            )
-
-        seconds, found = self.fastest(run)
-        true = error(found.solution)
-        good = [row.seconds for row in by_hand if row.method != "driver" and row.error_k <= tolerance_k]
-        level = found.settings
-        setting = f"P{level.order}, mesh size / {2**level.refinements}"
-        if level.step_tolerance_k is not None:
-            setting += f", steps to {level.step_tolerance_k:.2g} K"
-        row = Row(
-            name,
-            "driver",
-            setting,
-            level.num_nodes,
-            seconds,
-            true.temperature_k,
-            true.heat_flow,
-            tolerance_k,
-            level.error.temperature_k / true.temperature_k,
-            seconds / min(good) if good else float("nan"),
-        )
-        print(row, flush=True)
-        return row
-
-    def fastest(self, run: Callable[[], Any]) -> tuple[float, Any]:
-        """Processor seconds of the fastest of some runs and the result of the last; long ones run once."""
-        best, result = np.inf, None
-        for _ in range(self.repeats):
-            result = None
-            gc.collect()
-            begin = time.process_time()
-            result = run()
-            best = min(best, time.process_time() - begin)
-            if best > 5.0:
-                break
-        return best, result
+    def take_turns(self, all_of_them: list[Contest]) -> None:
+        """Run all in turns, long ones in the first rounds only."""
+        rounds = max(self.repeats, LEAST_REPEATS)
+        for number in range(rounds + 1):
+            for one in all_of_them:
+                if number > LONG_REPEATS and one.median_s > LONG_S:
+                    continue
+                one.result = None
+                gc.collect()
+                begin = time.process_time()
+                one.result = one.run()
+                if number:
+                    one.seconds.append(time.process_time() - begin)
 
     def write(self, rows: list[Row]) -> None:
         """Write the csv file."""
         self.output.parent.mkdir(parents=True, exist_ok=True)
         with replace_when_done(self.output) as path, path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, [field.name for field in fields(Row)])
+            writer = csv.DictWriter(file, [column.name for column in fields(Row)])
             writer.writeheader()
             for row in rows:
                 writer.writerow({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in asdict(row).items()})
@@ -269,6 +283,22 @@ def _refined_march(given: HeatProblem, refinements: int, scheme: Any, steps: int
         return replace(solution, temperature_c=solution.temperature_c[::every])
 
     return run
+
+
+def _driven(given: HeatProblem, tolerance_k: float, duration_s: float | None) -> Callable[[], ToleratedSolution]:
+    return lambda: solve_to_tolerance(
+        given, Tolerance(tolerance_k), duration_s=duration_s, outputs=OUTPUTS, log=lambda line: None
+    )
+
+
+def _driver_row(name: str, driven: Contest, tolerance_k: float, over_best: float, true: ErrorSize) -> Row:
+    level = driven.result.settings
+    setting = f"P{level.order}, mesh size / {2**level.refinements}"
+    if level.step_tolerance_k is not None:
+        setting += f", steps to {level.step_tolerance_k:.2g} K"
+    over_true = level.error.temperature_k / true.temperature_k
+    errors = true.temperature_k, true.heat_flow
+    return Row(name, "driver", setting, level.num_nodes, driven.median_s, *errors, tolerance_k, over_true, over_best)
 
 
 def _error(given: HeatProblem, solution: SteadySolution, exact: SteadySolution) -> ErrorSize:

@@ -142,12 +142,41 @@ def test_only_a_sudden_start_takes_short_steps() -> None:
     assert np.abs(start.errors_k()).max() >= np.abs(even.errors_k()).max()
 
 
-def test_what_jumps_over_the_range_is_no_solution() -> None:
-    """One long step after a sudden start overshoots; adaptive steps then take a safe one."""
+def test_what_jumps_over_the_range_is_taken_again_with_shorter_steps() -> None:
+    """One long step after a sudden start overshoots."""
     problem = cube(Convection(("*",), 25.0, 0.0))
     even = EvenSteps(HeatSystem(problem), AdaptiveSteps(360_000.0, 1e-3), ANY_K)
     assert even.found and even.temperature_c.min() < -0.1
+    solution = even.solution()
+    assert solution is not None and solution.steps > 10
+    assert solution.temperature_c.min() > -1e-4 and solution.temperature_c.max() <= 60.0
+    np.testing.assert_array_equal(even.temperature_c, solution.temperature_c)
+    assert solution.time_error_k == np.abs(even.errors_k()).max()
+
+
+def test_where_many_steps_jump_over_the_range_there_is_no_solution() -> None:
+    """Adaptive steps then take safe ones."""
+    problem = cube(Convection(("*",), 25.0, 0.0))
+    even = EvenSteps(HeatSystem(problem), AdaptiveSteps(36_000_000.0, 1e-3), ANY_K)
+    assert even.found and even.temperature_c.min() < -0.1
     assert even.solution() is None
+
+
+@pytest.mark.parametrize("start_c", [10.0, 20.0])
+def test_a_day_of_outdoor_air_suits_them(start_c) -> None:
+    """A thin wall follows the air, and where that turns, steps whose error is allowed take it beyond the air."""
+    mesh = box_mesh(np.linspace(0.0, 0.02, 5), [0.0, 0.1], [0.0, 0.1], temperature_c=start_c)
+    air = Varying(lambda places, time_s: 10.0 + 8.0 * np.sin(2.0 * np.pi * time_s / 86_400.0))
+    problem = HeatProblem(mesh, CONCRETE, effects=(Convection(("*",), 25.0, air),))
+    even = EvenSteps(HeatSystem(problem), AdaptiveSteps(86_400.0, 0.05, outputs=20), 0.03)
+    assert even.temperature_c[1:].max() > 18.0 + 1e-3
+    solution = even.solution()
+    assert solution is not None and 20 < solution.steps < 80
+    assert solution.temperature_c.min() > 2.0 - 1e-4 and solution.temperature_c[1:].max() < 18.0 + 1e-4
+    exact = solve_heat(problem, TimeSteps(320, 270.0), scheme=SDIRK2).temperature_c[::16]
+    true_k = float(np.abs(solution.temperature_c - exact).max())
+    assert true_k <= 0.03 and 1 / 1.5 < solution.time_error_k / true_k < 3.0, (solution.time_error_k, true_k)
+    assert solution.energy_residual_of_spread < 1e-9
 
 
 @pytest.mark.parametrize(

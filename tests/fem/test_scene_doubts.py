@@ -40,7 +40,7 @@ def test_rooms_and_walls_are_trusted() -> None:
 
 def test_a_filled_body_has_no_rooms() -> None:
     (doubt,) = scene_doubts(HeatScene(CONCRETE, **AIRS), filled(), Z_UP)
-    assert "of the 9 m2 that no photograph saw" in doubt and "--interior hollow" in doubt and "--patches" in doubt
+    assert "of the 9 m² that no photograph saw" in doubt and "--interior hollow" in doubt and "--patches" in doubt
 
 
 def test_without_air_inside_a_filled_body_is_fine() -> None:

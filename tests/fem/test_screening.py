@@ -10,6 +10,7 @@ import pytest
 
 from tests.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.effects import (
     AbsorbedSolar,
     Convection,
@@ -28,7 +29,6 @@ from thermoxels_ns.fem.screening import screen
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.sun import moving_sun
-from thermoxels_ns.fem.system import effect_labels
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)

@@ -189,3 +189,19 @@ def test_shares_of_fixed_nodes_add_up(box, concrete) -> None:
     assert set(SIDES[:3]) == {"x0", "x1", "y0"}
     edge = np.flatnonzero((box.points_m[system.fixed.nodes] == [0.0, 0.0, 0.1]).all(axis=1))
     np.testing.assert_allclose(shares[:, edge].toarray().ravel(), [0.5, 0.0, 0.5], atol=0.01)
+
+
+def test_labels_differ_even_where_a_patch_is_named_like_a_number() -> None:
+    """Two equal labels would count the heat of both effects twice."""
+    from tests.heat_meshes import box_mesh
+    from thermoxels_ns.fem.effect_forms import effect_labels
+    from thermoxels_ns.fem.effects import Convection
+    from thermoxels_ns.fem.materials import Material
+    from thermoxels_ns.fem.problem import HeatProblem
+
+    side = [0.0, 0.1]
+    airs = tuple(Convection((name,), 8.0, 0.0) for name in ("wall (2)", "wall", "wall", "wall (2)"))
+    problem = HeatProblem(box_mesh(side, side, side), Material("concrete", 1.7, 2200.0, 880.0), effects=airs)
+    labels = effect_labels(problem)
+    assert len(set(labels)) == 4, labels
+    assert labels[:3] == tuple(f"convection on {name}" for name in ("wall (2)", "wall", "wall (3)"))

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.fem.edge_midpoints import TET_EDGES, edge_numbers
+from thermoxels_ns.fem.effect_forms import effect_forms
 from thermoxels_ns.fem.fixed_nodes import FixedNodes
-from thermoxels_ns.fem.forms import COLDEST_SLOPE_K, FixedForm, FluxForm, RadiationForm, RobinForm, SourceForm
+from thermoxels_ns.fem.forms import COLDEST_SLOPE_K, RadiationForm, RobinForm
 from thermoxels_ns.fem.linear_space import SIX_POINTS, FacetRule, LinearSpace, sums_by_number
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quadratic_elements import edge_shapes
 from thermoxels_ns.fem.quadratic_space import QuadraticSpace
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.sparsity import MeshEdges
-from thermoxels_ns.fem.system import effect_labels
-from thermoxels_ns.fem.terms import FluxTerm, RadiationTerm, RobinTerm, SourceTerm
 from thermoxels_ns.units import ZERO_CELSIUS_K
 
 Vector = npt.NDArray[np.float64]
@@ -56,48 +53,30 @@ class EdgeExchange:
             reference_c: What temperatures are relative to, [degrees Celsius].
         """
         self._space, self._reference_k = space, reference_c + ZERO_CELSIUS_K
-        self._robin: list[tuple[RobinForm, RobinTerm]] = []
-        self._loads: list[FluxForm | SourceForm] = []
-        self._radiation: list[tuple[RadiationForm, RadiationTerm]] = []
-        fixed: list[FixedForm] = []
-        for label, effect in zip(effect_labels(problem), problem.effects):
-            for bare in effect.terms(space.selection):
-                if not len(bare.tets if isinstance(bare, SourceTerm) else bare.facets):
-                    continue
-                term = replace(bare, effect=label)
-                if isinstance(term, RobinTerm):
-                    self._robin.append((RobinForm(term, space, reference_c), term))
-                elif isinstance(term, FluxTerm):
-                    self._loads.append(FluxForm(term, space))
-                elif isinstance(term, SourceTerm):
-                    self._loads.append(SourceForm(term, space))
-                elif isinstance(term, RadiationTerm):
-                    self._radiation.append((RadiationForm(term, space, reference_c), term))
-                else:
-                    fixed.append(FixedForm(term, space, reference_c))
-        self.fixed = FixedNodes(fixed, space.num_nodes)
+        self._forms = effect_forms(problem, space, reference_c)
+        self.fixed = FixedNodes(self._forms.fixed, space.num_nodes)
         """Nodes and edges whose temperature is given."""
 
     def heat(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat into the body at quadratic temperatures, shape (n,), [W]."""
         total = np.zeros(self._space.num_nodes)
-        for form, term in self._robin:
+        for form in self._forms.robin:
             ambient = form.ambient_k(time_s)[:, None]
-            point = self._strength(form, term, time_s) * (ambient - self._at_points(form, relative_k))
+            point = self._strength(form, time_s) * (ambient - self._at_points(form, relative_k))
             total += self._spread(form, point)
-        for load in self._loads:
+        for load in self._forms.loads:
             total += load.load(time_s)
-        for form, _ in self._radiation:
+        for form in self._forms.radiation:
             total += form.load(relative_k, time_s)
         return total
 
     def slopes(self, relative_k: Vector, time_s: float) -> list[tuple[RobinForm | RadiationForm, Vector]]:
         """Heat that exchange takes per kelvin at the points of each form's triangles, shapes (k, q), [W / K]."""
         found: list[tuple[RobinForm | RadiationForm, Vector]] = [
-            (form, self._strength(form, term, time_s)) for form, term in self._robin
+            (form, self._strength(form, time_s)) for form in self._forms.robin
         ]
-        for form, term in self._radiation:
-            emitted = term.stefan_boltzmann_w_m2k4 * form.at(term.emissivity, time_s) * form.area_m2
+        for form in self._forms.radiation:
+            emitted = form.term.stefan_boltzmann_w_m2k4 * form.at(form.term.emissivity, time_s) * form.area_m2
             kelvin = np.maximum(np.abs(self._at_points(form, relative_k) + self._reference_k), COLDEST_SLOPE_K)
             found.append((form, 4.0 * emitted[:, None] * form.rule.weights * kelvin**3))
         return found
@@ -119,11 +98,11 @@ class EdgeExchange:
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat flow into the body of each group but those of fixed nodes, in the order of a system, [W]."""
-        forms = (*(form for form, _ in self._robin), *self._loads, *(form for form, _ in self._radiation))
-        return np.concatenate([np.zeros(0), *(form.group_heat_w(relative_k, time_s) for form in forms)])
+        flows = (form.group_heat_w(relative_k, time_s) for form in self._forms.exchanging)
+        return np.concatenate([np.zeros(0), *flows])
 
-    def _strength(self, form: RobinForm, term: RobinTerm, time_s: float) -> Vector:
-        return (form.at(term.coefficient_w_m2k, time_s) * form.area_m2)[:, None] * form.rule.weights
+    def _strength(self, form: RobinForm, time_s: float) -> Vector:
+        return (form.at(form.term.coefficient_w_m2k, time_s) * form.area_m2)[:, None] * form.rule.weights
 
     def _at_points(self, form: RobinForm | RadiationForm, values: Vector) -> Vector:
         return values[form.nodes] @ form.rule.shapes.T

@@ -78,12 +78,13 @@ def _by_one_matrix(linear: HeatSystem, quadratic: HeatSystem, solution: HeatSolu
     step_s = float(times_s[1] - times_s[0])
     stage = Stage(quadratic, float(times_s[1]), step_s, relative_tolerance=_SOLVER_TOLERANCE)
     width = max(_AT_ONCE // quadratic.num_nodes, 1)
-    error_k = np.zeros(quadratic.num_nodes)
+    error_k = held_w = np.zeros(quadratic.num_nodes)
     added_k, added_w = [np.zeros((1, linear.num_nodes))], [np.zeros((1, len(linear.groups)))]
     for begin in range(1, len(times_s), width):
         now_s = times_s[begin : begin + width].tolist()
         states_k = solution.temperature_c[begin : begin + width].T - linear.reference_c
-        rates_k_s = _rates(linear, states_k, now_s, step_s)
+        net_w = _net_heat(linear, states_k, now_s)
+        rates_k_s = _rates(linear, net_w, now_s, step_s)
         start_k = quadratic.space.from_mesh_nodes(states_k)
         kept_w = _stored(quadratic, quadratic.space.from_mesh_nodes(rates_k_s))
         given_k = np.zeros_like(start_k)
@@ -92,19 +93,19 @@ def _by_one_matrix(linear: HeatSystem, quadratic: HeatSystem, solution: HeatSolu
         sources_w = _net_heat(quadratic, start_k + given_k, now_s) - kept_w
         if given_k.any():
             sources_w -= _stored(quadratic, given_k) / step_s
-        errors_k, before_w = np.empty((len(now_s), len(error_k))), np.empty((len(now_s), len(error_k)))
+        errors_k, more_w = np.empty((len(now_s), len(error_k))), np.empty((len(now_s), len(error_k)))
         for column in range(len(now_s)):
-            before_w[column] = quadratic.mass_product(error_k) / step_s
-            heat_w = sources_w[:, column] + before_w[column]
+            heat_w = sources_w[:, column] + held_w
             sums_w = np.where(stage.floating, quadratic.pieces.sums(heat_w), 0.0) if stage.floats else _NONE
             found_k, outcome = stage.balance(heat_w, sums_w)
             if not outcome.converged:
                 raise HeatError(_explain(outcome.status))
             error_k = errors_k[column] = given_k[:, column] + found_k
-        full_k, stored_w = start_k + errors_k.T, kept_w - before_w.T
-        stored_w += _stored(quadratic, errors_k.T) / step_s
-        flows_w = _heat_of_groups(quadratic, full_k, now_s, stored_w)
-        added_w.append(flows_w - _heat_of_groups(linear, states_k, now_s, _stored(linear, rates_k_s)))
+            before_w, held_w = held_w, quadratic.mass_product(error_k) / step_s
+            more_w[column] = held_w - before_w
+        full_k, stored_w = start_k + errors_k.T, kept_w + more_w.T
+        flows_w = _heat_of_groups(quadratic, full_k, now_s, stored_w - _net_heat(quadratic, full_k, now_s))
+        added_w.append(flows_w - _heat_of_groups(linear, states_k, now_s, _stored(linear, rates_k_s) - net_w))
         added_k.append(errors_k[:, : linear.num_nodes])
     return Surplus(np.concatenate(added_k), np.concatenate(added_w), linear.groups)
 
@@ -126,9 +127,9 @@ def _stored(system: HeatSystem, states_k: Vector) -> Vector:
     return system.nodal_mass_j_k[:, None] * states_k if matrix is None else matrix @ states_k
 
 
-def _rates(system: HeatSystem, states_k: Vector, times_s: list[float], step_s: float) -> Vector:
-    """As `_rate`, of one state per column, shape (n, s), [K / s]."""
-    rates_k_s = _net_heat(system, states_k, times_s) / system.nodal_mass_j_k[:, None]
+def _rates(system: HeatSystem, net_w: Vector, times_s: list[float], step_s: float) -> Vector:
+    """As `_rate`, of one state per column, from `_net_heat`, shape (n, s), [K / s]."""
+    rates_k_s = net_w / system.nodal_mass_j_k[:, None]
     if len(system.fixed.nodes):
         earlier_s = [time_s - _SHORT * step_s for time_s in times_s]
         change_k = _fixed(system, times_s) - _fixed(system, earlier_s) if system.fixed.in_time else 0.0
@@ -141,22 +142,15 @@ def _fixed(system: HeatSystem, times_s: list[float]) -> Vector:
     return np.stack([system.fixed.temperature_k(time_s) for time_s in times_s], axis=1)
 
 
-def _heat_of_groups(system: HeatSystem, states_k: Vector, times_s: list[float], stored_w: Vector) -> Vector:
-    """As `heat_of_groups_w`, of one state per column, shape (s, g), [W]."""
-    fixed = system.fixed.nodes
+def _heat_of_groups(system: HeatSystem, states_k: Vector, times_s: list[float], kept_w: Vector) -> Vector:
+    """As `heat_of_groups_w`, of one state per column, shape (s, g), [W]; what is kept is stored less `_net_heat`."""
     flows_w = np.zeros((len(times_s), len(system.groups)))
     given = len(system.groups) - len(system.fixed.groups)
     if given:
         for row, time_s in enumerate(times_s):
             flows_w[row, :given] = system.group_heat_w(states_k[:, row], time_s)
-    if len(fixed):
-        kept_w = stored_w[fixed] + (system.stiffness @ states_k)[fixed]
-        if system.exchanges:
-            exchanged_w = [
-                system.exchanged_heat(state_k, now_s)[0][fixed] for state_k, now_s in zip(states_k.T, times_s)
-            ]
-            kept_w -= np.stack(exchanged_w, axis=1)
-        flows_w[:, given:] = (system.fixed.shares @ kept_w).T
+    if len(system.fixed.nodes):
+        flows_w[:, given:] = (system.fixed.shares @ kept_w[system.fixed.nodes]).T
     return flows_w
 
 

@@ -12,13 +12,16 @@ there before along as it does any temperature, so that conduction forgets it. Me
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.fem.marching import RANGE_SHARE, Taken
+from thermoxels_ns.fem.effect_forms import effect_labels
+from thermoxels_ns.fem.marching import RANGE_SHARE
+from thermoxels_ns.fem.matrix_parts import product_of_rows
 from thermoxels_ns.fem.problem import AdaptiveSteps
 from thermoxels_ns.fem.range_keeper import RangeWatch
 from thermoxels_ns.fem.schemes import SDIRK2
@@ -26,9 +29,8 @@ from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.stage import Stage
 from thermoxels_ns.fem.steady import is_too_cold
 from thermoxels_ns.fem.step_account import StepAccount
-from thermoxels_ns.fem.stepper import Step
 from thermoxels_ns.fem.stepping import skips
-from thermoxels_ns.fem.system import HeatSystem, effect_labels
+from thermoxels_ns.fem.system import HeatSystem
 
 Vector = npt.NDArray[np.float64]
 
@@ -54,6 +56,8 @@ _EASY = 0.2
 much."""
 _MOST_STEPS = 64
 """Steps in an interval beyond which adaptive ones are better."""
+_MOST_IN_RANGE = 16
+"""The same where only the range asks for shorter steps."""
 
 
 @dataclass
@@ -64,6 +68,8 @@ class _Leap:
     """Time at its start."""
     length_s: float
     """Its length, [s]."""
+    times_s: tuple[float, float]
+    """Times of its stages, [s]."""
     states: tuple[Vector, Vector, Vector]
     """Temperatures at the start and after each stage."""
     stage: Stage
@@ -78,6 +84,11 @@ class _Leap:
     """Minus the error of all steps so far, shape (n,), [K]; None: not looked at yet."""
     ends_interval: bool = False
     """Whether temperatures are kept at its end."""
+
+
+def _ends(relative_k: Vector) -> tuple[float, float]:
+    """The smallest and the largest."""
+    return float(relative_k.min()), float(relative_k.max())
 
 
 class EvenSteps:
@@ -106,13 +117,14 @@ class EvenSteps:
         """
         self._system, self._time, self._allowed_k = system, time, allowed_k
         self._starts_well, self._progress = starts_well, progress
-        self._first_count, self._times_s = first_count, time.times_s.tolist()
+        self._times_s: list[float] = time.times_s.tolist()
         self._exchange = system.exchange_matrix(0.0)
+        self._last_load: tuple[float, Vector] | None = None
         self._no_pieces = np.zeros(system.pieces.count)
         self._stages: dict[int, Stage] = {}
         self._leaps: list[_Leap] = []
         suits = not (system.nonlinear or system.matrix_in_time)
-        self.found: bool = suits and self._march()
+        self.found: bool = suits and self._march(0, first_count)
         """Whether there are temperatures. There are none where coefficients change or radiation acts, effects change
         faster than can be followed, or the solver or the error of the steps does not converge."""
 
@@ -143,19 +155,16 @@ class EvenSteps:
     def solution(self) -> HeatSolution | None:
         """Complete the account of the heat; None if temperatures leave their range or the heat does not balance."""
         system, time = self._system, self._time
+        if not self._stays_in_range():
+            return None
         states = np.empty((time.num_times, system.num_nodes))
         states[0] = self._leaps[0].states[0]
-        account, watch = StepAccount(system, states, time.times_s), RangeWatch(system)
-        slack_k = RANGE_SHARE * time.tolerance_k
-        before_k = float(states[0].min()), float(states[0].max())
-        for leap, heat_w in zip(self._leaps, self._heat_w):
-            times_s = (leap.begin_s, *(leap.begin_s + node * leap.length_s for node in SDIRK2.nodes))
-            low, high = watch.after(*before_k, times_s, slack_k)
-            before_k = float(leap.states[2].min()), float(leap.states[2].max())
-            if not (low <= before_k[0] and before_k[1] <= high) or is_too_cold(system, before_k[0]):
-                return None
-            step = Step(leap.states[2], heat_w, leap.iterations, 0, 0.0, True, "The step converged.")
-            account.add(Taken(step, leap.length_s, leap.ends_interval))
+        ends = [number for number, leap in enumerate(self._leaps) if leap.ends_interval]
+        for row, number in enumerate(ends, start=1):
+            states[row] = self._leaps[number].states[2]
+        account = StepAccount(system, states, time.times_s)
+        intervals = np.searchsorted(ends, np.arange(len(self._leaps)))
+        account.add_all(intervals, self._lengths_s, self._heat_w, [leap.iterations for leap in self._leaps])
         solution = account.close(account.success(None) + skips(system.problem, time), True, adaptive=True)
         if solution.energy_residual_of_spread > _UNBALANCED:
             return None
@@ -163,22 +172,69 @@ class EvenSteps:
 
     def mean_flows_w(self) -> dict[str, float]:
         """Mean heat flow into the body of each effect over all times, [W], as `error_budget.mean_flows_w`."""
-        lengths_s = np.array([leap.length_s for leap in self._leaps])
-        mean_w = lengths_s @ self._heat_w / self._time.duration_s
+        mean_w = self._lengths_s @ self._heat_w / self._time.duration_s
         flows = dict.fromkeys(effect_labels(self._system.problem), 0.0)
         for (effect, _), heat_w in zip(self._system.groups, mean_w.tolist()):
             flows[effect] += heat_w
         return flows
 
-    def _march(self) -> bool:
-        times_s, count = self._times_s, self._first_count
-        state_k, fixed = self._system.start_k, self._system.fixed.nodes
-        if len(fixed):
-            state_k[fixed] = self._system.fixed.temperature_k(0.0)
-        error_k, size_k = np.zeros(self._system.num_nodes), 0.0
-        for begin_s in times_s[:-1]:
+    @cached_property
+    def _lengths_s(self) -> Vector:
+        """Length of each step, shape (l,), [s]."""
+        return np.array([leap.length_s for leap in self._leaps])
+
+    def _stays_in_range(self) -> bool:
+        """Whether no temperature leaves the range of those before the step and of the surroundings.
+
+        Where one does, by an error that is allowed or in the middle of an interval, as air that turns makes one that
+        follows it do, the interval is taken again with more steps, and so is what comes after.
+        """
+        watch, ends_k, first = RangeWatch(self._system), _ends(self._leaps[0].states[0]), 0
+        for number in range(len(self._times_s) - 1):
+            last = next(k for k in range(first, len(self._leaps)) if self._leaps[k].ends_interval)
+            earlier, end_k = copy(watch), self._watched(watch, self._leaps[first : last + 1], ends_k)
+            if end_k is None:
+                self.errors_k()
+                count = last + 1 - first
+                del self._leaps[first:]
+                if not self._march(number, 2 * count, earlier):
+                    return False
+                break
+            ends_k, first = end_k, last + 1
+        return not is_too_cold(self._system, min(float(leap.states[2].min()) for leap in self._leaps))
+
+    def _watched(
+        self, watch: RangeWatch, leaps: list[_Leap], ends_k: tuple[float, float]
+    ) -> tuple[float, float] | None:
+        """Coldest and warmest temperature after some steps, from those before, [K]; None if one has left its range."""
+        slack_k = RANGE_SHARE * self._time.tolerance_k
+        for leap in leaps:
+            low, high = watch.after(*ends_k, (leap.begin_s, *leap.times_s), slack_k)
+            ends_k = _ends(leap.states[2])
+            if not (low <= ends_k[0] and ends_k[1] <= high):
+                return None
+        return ends_k
+
+    def _march(self, first: int, count: int, watch: RangeWatch | None = None) -> bool:
+        """Take steps from an interval on; with a watch, as many in each as keep temperatures in range, within limits.
+
+        Args:
+            first: Number of the interval.
+            count: Steps in it to begin with.
+            watch: The range of what came before.
+        """
+        times_s, fixed, most = self._times_s, self._system.fixed, _MOST_STEPS if watch is None else _MOST_IN_RANGE
+        if self._leaps:
+            state_k, error_k = self._leaps[-1].states[2], self._leaps[-1].error_k
+        else:
+            state_k, error_k = self._system.start_k, None
+            if len(fixed.nodes):
+                state_k[fixed.nodes] = fixed.temperature_k(0.0)
+        error_k = np.zeros(self._system.num_nodes) if error_k is None else error_k
+        size_k = 0.0
+        for begin_s in times_s[first:-1]:
             while True:
-                if count > _MOST_STEPS:
+                if count > most:
                     return False
                 if times_s[1] / count > self._system.problem.resolution_s:
                     count *= 2
@@ -186,14 +242,17 @@ class EvenSteps:
                 leaps = self._interval(state_k, begin_s, count)
                 if leaps is None:
                     return False
-                if self._starts_well is not None and self._leaps:
+                looked_at = watch is None and self._starts_well is not None and bool(self._leaps)
+                if looked_at:
                     break
                 end_k = error_k
                 for leap in leaps:
                     leap.error_k = end_k = self._followed(leap, end_k)
                 size_k = float(np.max(np.abs(end_k)))
-                if self._is_allowed(leaps[-1].states[2], size_k):
-                    error_k = end_k
+                tried = None if watch is None else copy(watch)
+                in_range = tried is None or self._watched(tried, leaps, _ends(state_k)) is not None
+                if in_range and self._is_allowed(leaps[-1].states[2], size_k):
+                    error_k, watch = end_k, tried
                     break
                 count *= 2
             leaps[-1].ends_interval = True
@@ -206,7 +265,7 @@ class EvenSteps:
         return True
 
     def _is_allowed(self, relative_k: Vector, size_k: float) -> bool:
-        if self._starts_well is None:
+        if self._starts_well is None or self._leaps:
             return size_k <= self._allowed_k
         return self._starts_well(relative_k + self._system.reference_c, size_k)
 
@@ -229,31 +288,28 @@ class EvenSteps:
     def _leap(self, stage: Stage, begin_k: Vector, begin_s: float, length_s: float) -> _Leap | None:
         """Take a step; what is balanced is as in `Stage`."""
         system, fixed, iterations = self._system, self._system.fixed, 0
-        mass_w_k, conducted_w = system.nodal_mass_j_k / stage.step_s, system.stiffness @ begin_k
-        first_w = self._exchanged(begin_k, begin_s)
+        times_s = begin_s + SDIRK2.nodes[0] * length_s, begin_s + SDIRK2.nodes[1] * length_s
+        moved_k = [fixed.temperature_k(now_s) - begin_k[fixed.nodes] for now_s in times_s]
+        conducted_w, lost_w, left_w = self._lost(begin_k, moved_k)
+        mass_w_k, first_w = system.nodal_mass_j_k / stage.step_s, self._loaded(begin_s) - lost_w
         net_w, to_pieces_w = first_w - conducted_w, self._sums(stage, first_w)
         lacking_w, lacking_in_pieces_w = _MORE[0] * net_w, _MORE[0] * to_pieces_w
         given_w, given_to_pieces_w, states = 0.0, 0.0, [begin_k]
-        for node, more, of_load in zip(SDIRK2.nodes, _MORE[1:], _LOADS):
-            now_s = begin_s + node * length_s
-            exchanged_w = self._exchanged(begin_k, now_s)
+        for number, (now_s, more, of_load) in enumerate(zip(times_s, _MORE[1:], _LOADS)):
+            exchanged_w = self._loaded(now_s) - lost_w
             heat_w = exchanged_w - conducted_w
-            change_k = np.zeros(system.num_nodes)
-            if len(fixed.nodes):
-                change_k[fixed.nodes] = fixed.temperature_k(now_s) - begin_k[fixed.nodes]
-                heat_w -= system.stiffness @ change_k
-                if self._exchange is not None:
-                    heat_w -= self._exchange @ change_k
+            if left_w is not None:
+                heat_w -= left_w[:, number]
             lacking_w += of_load * (heat_w - net_w)
             heat_w += given_w
             found_k, linear = stage.balance(heat_w, self._sums(stage, exchanged_w) + given_to_pieces_w)
             if not linear.converged:
                 return None
             iterations += linear.iterations
-            change_k += found_k
-            states.append(begin_k + change_k)
-            system.surroundings_k(now_s)  # Kept for the check of the range.
-            flow_w = mass_w_k * change_k - given_w
+            if len(fixed.nodes):
+                found_k[fixed.nodes] = moved_k[number]
+            states.append(begin_k + found_k)
+            flow_w = mass_w_k * found_k - given_w
             lacking_w += more * flow_w
             given_w = _EARLIER * flow_w
             if stage.floats:
@@ -263,7 +319,7 @@ class EvenSteps:
                 lacking_in_pieces_w = lacking_in_pieces_w + more * flow_to_pieces_w
                 given_to_pieces_w = _EARLIER * flow_to_pieces_w
         after = states[0], states[1], states[2]
-        return _Leap(begin_s, length_s, after, stage, lacking_w, lacking_in_pieces_w, iterations)
+        return _Leap(begin_s, length_s, times_s, after, stage, lacking_w, lacking_in_pieces_w, iterations)
 
     def _followed(self, leap: _Leap, error_k: Vector) -> Vector:
         """What a step leaves of an error, and its own, which both stages damp as they do what they solve.
@@ -288,11 +344,11 @@ class EvenSteps:
         given, nodes = len(system.groups) - len(fixed.groups), fixed.nodes
         kept_w = np.zeros((len(nodes), len(self._leaps)))
         if len(nodes):
-            conducted_w = system.conducted_from_fixed([state_k for leap in self._leaps for state_k in leap.states[1:]])
-            kept_w += conducted_w[:, ::2] * SDIRK2.ends[0] + conducted_w[:, 1::2] * SDIRK2.ends[1]
             mass_j_k = system.nodal_mass_j_k[nodes]
             for column, leap in enumerate(self._leaps):
                 kept_w[:, column] += mass_j_k * (leap.states[2][nodes] - leap.states[0][nodes]) / leap.length_s
+                for end, relative_k in zip(SDIRK2.ends, leap.states[1:]):
+                    kept_w[:, column] += end * product_of_rows(system.stiffness, nodes, relative_k)
         if system.exchanges:
             for row, leap in enumerate(self._leaps):
                 for end, node, relative_k in zip(SDIRK2.ends, SDIRK2.nodes, leap.states[1:]):
@@ -304,9 +360,33 @@ class EvenSteps:
             heat_w[:, given:] = (fixed.shares @ kept_w).T
         return heat_w
 
+    def _lost(self, begin_k: Vector, moved_k: list[Vector]) -> tuple[Vector, Vector | float, Vector | None]:
+        """Heat that a step's start conducts away from each node, and that it loses to what is around the body, [W].
+
+        Last comes what nodes lose more in each stage as given temperatures move, shape (n, 2), None if they do not: all
+        products with a matrix are taken together, which reads it once.
+        """
+        stiffness, exchange = self._system.stiffness, self._exchange
+        if not any(part_k.any() for part_k in moved_k):
+            return stiffness @ begin_k, 0.0 if exchange is None else exchange @ begin_k, None
+        together_k = np.zeros((len(begin_k), 1 + len(moved_k)))
+        together_k[:, 0] = begin_k
+        together_k[self._system.fixed.nodes, 1:] = np.stack(moved_k, axis=1)
+        conducted_w: Vector = stiffness @ together_k
+        if exchange is None:
+            return conducted_w[:, 0], 0.0, conducted_w[:, 1:]
+        lost_w: Vector = exchange @ together_k
+        return conducted_w[:, 0], lost_w[:, 0], np.add(conducted_w[:, 1:], lost_w[:, 1:], dtype=np.float64)
+
+    def _loaded(self, time_s: float) -> Vector:
+        """Heat from outside that does not depend on the temperature, shape (n,), [W]; the last one is kept."""
+        if self._last_load is None or (self._last_load[0] != time_s and self._system.exchanges):
+            self._last_load = time_s, self._system.load(time_s)
+        return self._last_load[1]
+
     def _exchanged(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat from outside the body, shape (n,), [W]."""
-        load_w = self._system.load(time_s)
+        load_w = self._loaded(time_s)
         return load_w if self._exchange is None else load_w - self._exchange @ relative_k
 
     def _sums(self, stage: Stage, heat_w: Vector) -> Vector:

@@ -90,6 +90,12 @@ class FixedNodes:
         return [np.searchsorted(self.nodes, form.nodes) for form in self._forms]
 
     @cached_property
+    def _shares_nodes(self) -> list[bool]:
+        """Whether another form fixes any of each form's nodes, too."""
+        owners = np.bincount(np.concatenate([np.zeros(0, np.int64), *self._places]), minlength=len(self.nodes))
+        return [bool(np.any(owners[place] > 1)) for place in self._places]
+
+    @cached_property
     def _steady(self) -> Vector:
         """What does not change with time; NaN elsewhere."""
         return self._with(np.full(len(self.nodes), np.nan), 0.0, in_time=False)
@@ -100,9 +106,10 @@ class FixedNodes:
         for number, form in enumerate(self._forms):
             if form.in_time == in_time:
                 place, wanted = self._places[number], form.temperature_k(time_s)
-                clash = np.abs(fixed[place] - wanted) > _SAME_TEMPERATURE_K
-                if clash.any():
-                    raise HeatError(self._explain_clash(number, form.nodes[clash], wanted[clash], time_s))
+                if self._shares_nodes[number]:
+                    clash = np.abs(fixed[place] - wanted) > _SAME_TEMPERATURE_K
+                    if clash.any():
+                        raise HeatError(self._explain_clash(number, form.nodes[clash], wanted[clash], time_s))
                 fixed[place] = wanted
         return fixed
 

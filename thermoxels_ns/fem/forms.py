@@ -81,7 +81,7 @@ class RobinForm(_Boundary):
 
     def __init__(self, term: RobinTerm, space: LinearSpace, reference_c: float) -> None:
         super().__init__(term.effect, term.facets, space)
-        self._term, self._reference_c = term, reference_c
+        self.term, self._reference_c = term, reference_c
         self.matrix_in_time = term.coefficient_w_m2k.in_time
         self.load_in_time = self.matrix_in_time or term.ambient_c.in_time
 
@@ -95,7 +95,7 @@ class RobinForm(_Boundary):
 
     def ambient_k(self, time_s: float) -> Vector:
         """T_ambient at each triangle, relative to the reference, [K]."""
-        return self.at(self._term.ambient_c, time_s) - self._reference_c
+        return self.at(self.term.ambient_c, time_s) - self._reference_c
 
     def exchanging_nodes(self, time_s: float) -> npt.NDArray[np.int64]:
         """Nodes whose temperature it holds."""
@@ -107,7 +107,7 @@ class RobinForm(_Boundary):
         return self.sums(self._conductance(time_s) * (self.ambient_k(time_s) - surface))
 
     def _conductance(self, time_s: float) -> Vector:
-        return self.at(self._term.coefficient_w_m2k, time_s) * self.area_m2
+        return self.at(self.term.coefficient_w_m2k, time_s) * self.area_m2
 
 
 class FluxForm(_Boundary):
@@ -143,7 +143,7 @@ class SourceForm:
 
     def __init__(self, term: SourceTerm, space: LinearSpace) -> None:
         self.effect = term.effect
-        self._term, self._space = term, space
+        self.term, self._space = term, space
         self._places, self._volumes = space.source_points(term.tets)
         mesh = space.selection.mesh
         used, group = np.unique(mesh.region[term.tets], return_inverse=True)
@@ -153,7 +153,7 @@ class SourceForm:
 
     def load(self, time_s: float) -> Vector:
         """Entries integral(s phi_i), [W]."""
-        return self._space.source_load(self._term.tets, self._heat_w(time_s))
+        return self._space.source_load(self.term.tets, self._heat_w(time_s))
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat set free in each region, [W]."""
@@ -165,7 +165,7 @@ class SourceForm:
         return bool(np.any(heat < 0.0)), bool(np.any(heat > 0.0))
 
     def _heat_w(self, time_s: float) -> Vector:
-        return self._term.source_w_m3.at(self._places, time_s) * self._volumes
+        return self.term.source_w_m3.at(self._places, time_s) * self._volumes
 
 
 class RadiationForm(_Boundary):
@@ -177,7 +177,7 @@ class RadiationForm(_Boundary):
 
     def __init__(self, term: RadiationTerm, space: LinearSpace, reference_c: float) -> None:
         super().__init__(term.effect, term.facets, space)
-        self._term, self._reference_c = term, reference_c
+        self.term, self._reference_c = term, reference_c
         self._reference_k = reference_c + ZERO_CELSIUS_K
 
     def load(self, relative_k: Vector, time_s: float) -> Vector:
@@ -205,7 +205,7 @@ class RadiationForm(_Boundary):
 
     def surroundings_k(self, time_s: float) -> Vector:
         """T_s at each triangle, relative to the reference, [K]."""
-        return self.at(self._term.surroundings_c, time_s) - self._reference_c
+        return self.at(self.term.surroundings_c, time_s) - self._reference_c
 
     def exchanging_nodes(self, time_s: float) -> npt.NDArray[np.int64]:
         """Nodes whose temperature it holds."""
@@ -216,7 +216,7 @@ class RadiationForm(_Boundary):
         return self.sums(self._point_w(relative_k, time_s).sum(axis=1))
 
     def _strength(self, time_s: float) -> Vector:
-        return self._term.stefan_boltzmann_w_m2k4 * self.at(self._term.emissivity, time_s) * self.area_m2
+        return self.term.stefan_boltzmann_w_m2k4 * self.at(self.term.emissivity, time_s) * self.area_m2
 
     def _surface_k(self, relative_k: Vector) -> Vector:
         return relative_k[self.nodes] @ self.rule.shapes.T
@@ -236,7 +236,7 @@ class FixedForm:
         selection = space.selection
         self.effect = term.effect
         self.reference_c = reference_c
-        self._term = term
+        self.term = term
         facet_nodes = space.facet_nodes(term.facets)
         self.nodes = np.unique(facet_nodes)
         self._places = space.node_places(self.nodes)
@@ -252,4 +252,4 @@ class FixedForm:
 
     def temperature_k(self, time_s: float) -> Vector:
         """Temperatures of `nodes`, relative to the reference, [K]."""
-        return self._term.temperature_c.at(self._places, time_s) - self.reference_c
+        return self.term.temperature_c.at(self._places, time_s) - self.reference_c

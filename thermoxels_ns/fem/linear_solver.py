@@ -37,6 +37,29 @@ class LinearSolution:
     """The outcome as a sentence."""
 
 
+def is_solved(error: float, tolerance: float, right_hand_side: float, matrix_times_solution: float) -> bool:
+    """Whether a residual is good enough, for all that iterate.
+
+    It must be within ten times the tolerance, because the residual of a recursion drifts away from b - A x, or its
+    backward error ||b - A x|| / (||A|| ||x|| + ||b||) must be at the level of round-off (1e-14). Of a matrix that is
+    all but singular, a huge x has a small backward error and need not solve anything: half of b must be explained too.
+
+    Args:
+        error: ||b - A x||, from x itself.
+        tolerance: What was asked for.
+        right_hand_side: ||b||.
+        matrix_times_solution: ||A|| ||x||.
+
+    >>> is_solved(5e-12, 1e-12, 1.0, 1.0), is_solved(1e-3, 1e-12, 1.0, 1e12), is_solved(0.9, 1e-12, 1.0, 1e15)
+    (True, True, False)
+    """
+    exact_enough = error <= _RECURSION_SLACK * tolerance
+    round_off = error <= _ROUND_OFF * (matrix_times_solution + right_hand_side)
+    return math.isfinite(matrix_times_solution) and (
+        exact_enough or (round_off and error < _SOLVES_SOMETHING * right_hand_side)
+    )
+
+
 class ConjugateGradients:
     """Solver for A x = b with one matrix and many right-hand sides; preconditioned by the diagonal (Jacobi)."""
 
@@ -84,9 +107,7 @@ class ConjugateGradients:
     ) -> LinearSolution:
         """Solve A x = b.
 
-        CG stops by the residual of its recursion, which can drift away from b - A x. The true residual decides:
-        it must be within ten times the tolerance, or the backward error ||b - A x|| / (||A|| ||x|| + ||b||) must
-        be at the level of round-off (1e-14).
+        CG stops by the residual of its recursion; that of x itself decides, see `is_solved`.
 
         Args:
             right_hand_side: b, shape (n,).
@@ -110,10 +131,7 @@ class ConjugateGradients:
         x /= self._size
         error, length = _residual(*whole, right_hand_side, scale, x, r, True)
         residual = error / size if size > 0 else error
-        exact_enough = error <= _RECURSION_SLACK * tolerance
-        # Of a matrix that is all but singular, a huge x has a small backward error and need not solve anything.
-        round_off = error <= _ROUND_OFF * (self._norm * length + size) and residual < _SOLVES_SOMETHING
-        converged = math.isfinite(length) and (exact_enough or round_off)
+        converged = is_solved(error, tolerance, size, self._norm * length)
         if converged:
             status = f"Converged in {count} iterations{self._manner} to a relative residual of {residual:.1e}."
         else:

@@ -18,11 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
-from scipy.integrate import solve_ivp
 
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.effects import Effect, FixedTemperature
 from thermoxels_ns.fem.linear_space import LinearSpace
+from thermoxels_ns.fem.lumped_pieces import HOT_K, PieceEquations, PieceHistory, TooHardError, follow_pieces
 from thermoxels_ns.fem.maximum_principle import holds_maximum_principle
 from thermoxels_ns.fem.nodal_heat import nodal_heats
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
@@ -30,7 +30,8 @@ from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect, left_out
 from thermoxels_ns.fem.solver_choice import LinearSolver
-from thermoxels_ns.fem.system import HeatSystem, effect_labels
+from thermoxels_ns.fem.steady import is_still, is_too_cold
+from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.units import ZERO_CELSIUS_K
 
 Vector = npt.NDArray[np.float64]
@@ -41,8 +42,8 @@ _OBTUSE_FACTOR = 2.0
 _SLACK = 1e-4
 """How much storage is added to K, per duration, so that it can be inverted; what that changes is bounded too."""
 _SOLVER_TOLERANCE = 1e-10
-_ODE_TOLERANCE = 1e-9
-_HOT_K = 300.0
+_SUSPICIOUS = 1e-12
+"""Residual from which on it is worth to look whether it is round-off."""
 
 
 @dataclass(frozen=True)
@@ -81,14 +82,21 @@ def lumped_body(problem: HeatProblem, time: TimeSteps | AdaptiveSteps, tolerance
     if biot > MOST_BIOT:
         return LumpedBody(biot, None, f"The Biot number is {biot:.3g}, above {MOST_BIOT:g}.", None)
     body = _Body(HeatSystem(problem), time.duration_s)
-    lumped_k, heat_j = body.follow(time.times_s)
+    try:
+        history = body.follow(time.times_s)
+    except TooHardError:
+        return LumpedBody(biot, None, "Its radiation could not be integrated with one temperature.", None)
+    lumped_k = history.relative_k
+    if is_too_cold(body.system, float(lumped_k.min())):
+        # The full equations say so, too, and why.
+        return LumpedBody(biot, None, "One temperature would fall below absolute zero.", None)
     biot = _biot(problem, space, body.system.pieces.number.astype(np.int64), body.conductance_w_k(lumped_k))
     bound = body.bound_k(lumped_k[0], lumped_k[-1])
     if not bound <= tolerance_k:
         reason = f"One temperature could be wrong by {bound:.2g} K, at a Biot number of {biot:.2g}."
         return LumpedBody(biot, bound, reason, None)
     reason = f"One temperature per connected piece is right to {bound:.2g} K: the Biot number is {biot:.2g}."
-    return LumpedBody(biot, bound, reason, body.solution(time.times_s, lumped_k, heat_j, reason))
+    return LumpedBody(biot, bound, reason, body.solution(time.times_s, history, reason))
 
 
 class _Body:
@@ -101,32 +109,30 @@ class _Body:
         self._capacity = system.pieces.sums(self._mass)
         self._start_k = system.problem.start_c - system.reference_c
         self._mean_k = system.pieces.sums(self._mass * self._start_k) / self._capacity
+        self._zero_k = system.reference_c + ZERO_CELSIUS_K
 
-    def follow(self, times_s: Vector) -> tuple[Vector, Vector]:
-        """Integrate; temperatures, shape (s, p), [K], and heat of each group so far, shape (s, g), [J]."""
-        pieces, groups = self.system.pieces.count, len(self.system.groups)
+    def follow(self, times_s: Vector) -> PieceHistory:
+        """Solve the equations of the pieces.
 
-        def rate(time_s: float, state: Vector) -> Vector:
-            at_nodes = self._at_nodes(state[:pieces])
-            heat_w = self.system.exchanged_heat(at_nodes, time_s)[0]
-            into_pieces = self.system.pieces.sums(heat_w) / self._capacity
-            return np.concatenate([into_pieces, self.system.group_heat_w(at_nodes, time_s)])
-
-        begin = np.concatenate([self._mean_k, np.zeros(groups)])
-        scale = np.concatenate([np.ones(pieces), np.full(groups, float(self._capacity.max()))])
-        found = solve_ivp(
-            rate,
-            (0.0, self._duration_s),
-            begin,
-            method="Radau",
-            t_eval=times_s,
-            rtol=_ODE_TOLERANCE,
-            atol=_ODE_TOLERANCE * scale,
+        Raises:
+            TooHardError: Radiation could not be integrated.
+        """
+        system, pieces = self.system, self.system.pieces
+        nothing = np.zeros(pieces.count)
+        absorbed, emitted = nothing, nothing
+        if system.nonlinear:
+            cold, hot = (np.full(system.num_nodes, kelvin - self._zero_k) for kelvin in (0.0, HOT_K))
+            absorbed = pieces.sums(system.radiation_load(cold, 0.0))
+            emitted = absorbed - pieces.sums(system.radiation_load(hot, 0.0))
+        equations = PieceEquations(
+            capacity_j_k=self._capacity,
+            given_w=pieces.sums(system.load(0.0)),
+            held_w_k=pieces.sums(system.held_w_k(0.0, np.inf)),
+            radiated_in_w=absorbed,
+            emitted_at_hot_w=emitted,
+            reference_k=self._zero_k,
         )
-        if not found.success:
-            remedy = "Follow the body with the full equations."
-            raise HeatError(explain("lumped body", expected="a solution", got=found.message, remedy=remedy))
-        return found.y[:pieces].T, found.y[pieces:].T
+        return follow_pieces(equations, self._mean_k, times_s)
 
     def conductance_w_k(self, lumped_k: Vector) -> Vector:
         """Exchange of each node at the warmest temperature of its piece, shape (n,), [W / K]."""
@@ -137,14 +143,14 @@ class _Body:
     def bound_k(self, first_k: Vector, last_k: Vector) -> float:
         """Largest difference to the full equations between two lumped temperatures, shapes (p,)."""
         system = self.system
-        zero_k = system.reference_c + ZERO_CELSIUS_K
+        zero_k = self._zero_k
         exchange = self._without_sum(-system.held_w_k(0.0, np.inf))
         at_start = self._without_sum(system.exchanged_heat(self._at_nodes(first_k), 0.0)[0])
         parts = [(at_start, np.ones_like(first_k)), (exchange, np.abs(last_k - first_k))]
         if system.nonlinear:
-            cold, hot = (np.full(system.num_nodes, kelvin - zero_k) for kelvin in (0.0, _HOT_K))
+            cold, hot = (np.full(system.num_nodes, kelvin - zero_k) for kelvin in (0.0, HOT_K))
             per_fourth_power = system.radiation_load(hot, 0.0) - system.radiation_load(cold, 0.0)
-            change = np.abs((last_k + zero_k) ** 4 - (first_k + zero_k) ** 4) / _HOT_K**4
+            change = np.abs((last_k + zero_k) ** 4 - (first_k + zero_k) ** 4) / HOT_K**4
             parts.append((self._without_sum(per_fourth_power), change))
         solver = LinearSolver(self._matrix(), relative_tolerance=_SOLVER_TOLERANCE)
         sizes, rest = [], np.zeros(system.num_nodes)
@@ -159,32 +165,49 @@ class _Body:
         bound = float(start.max()) + 2.0 * most_psi + float(changes.max()) + self._duration_s * float(rest.max())
         return bound if holds_maximum_principle(self._conduction()) else _OBTUSE_FACTOR * bound
 
-    def solution(self, times_s: Vector, lumped_k: Vector, heat_j: Vector, reason: str) -> HeatSolution:
+    def solution(self, times_s: Vector, history: PieceHistory, reason: str) -> HeatSolution:
         """Put it into the form of a full solution."""
-        system = self.system
+        system, lumped_k = self.system, history.relative_k
         lengths, content = np.diff(times_s), lumped_k @ self._capacity
-        interval_j = np.diff(heat_j, axis=0)
-        unexplained = float(np.max(np.abs(content - content[0] - heat_j.sum(axis=1))))
-        total = content + float(self._capacity.sum()) * (system.reference_c + ZERO_CELSIUS_K)
+        heat_w = np.zeros((len(lengths), len(system.groups)))
+        for row, (mean_k, radiating_k) in enumerate(zip(history.mean_k, history.radiating_k)):
+            heat_w[row] = system.group_heat_w(self._at_nodes(mean_k), 0.0, radiating_k=self._at_nodes(radiating_k))
+        interval_j = heat_w * lengths[:, None]
+        supplied = np.concatenate([[0.0], np.cumsum(interval_j.sum(axis=1))])
+        unexplained = float(np.max(np.abs(content - content[0] - supplied)))
+        total = content + float(self._capacity.sum()) * self._zero_k
         exchanged = float(np.abs(interval_j).sum())
         states = np.stack([self._at_nodes(row) for row in lumped_k]) + system.reference_c
-        spread = float(self._mass @ np.abs(self._start_k - content[0] / self._capacity.sum()))
-        within = spread + exchanged
+        # Not by BLAS, whose sum depends on the number of its threads.
+        spread = float(np.sum(self._mass * np.abs(self._start_k - content[0] / self._capacity.sum())))
+        scale, within = max(float(total[0]), exchanged), spread + exchanged
+        if unexplained > _SUSPICIOUS * min(scale, within):
+            terms_j = self._terms_j(times_s, lumped_k)
+            scale, within = max(scale, terms_j), max(within, terms_j)
         return HeatSolution(
             times_s=times_s,
             temperature_c=states,
             heat_w=np.diff(content) / lengths,
             heat_content_j=total,
-            energy_residual=unexplained / max(float(total[0]), exchanged),
+            energy_residual=unexplained / scale,
             energy_residual_of_spread=unexplained / within if within > 0.0 else 0.0,
             status=f"The lumped model was used, without steps or conduction. {reason}",
             converged=True,
             iterations=np.zeros(len(lengths), np.int64),
             skipped_effects=left_out([effect.kind for effect in system.problem.effects]),
-            effects=heat_by_effect(effect_labels(system.problem), system.groups, interval_j / lengths[:, None]),
+            effects=heat_by_effect(effect_labels(system.problem), system.groups, heat_w),
             newton_iterations=np.zeros(len(lengths), np.int64),
             assembled=system.assembled,
         )
+
+    def _terms_j(self, times_s: Vector, lumped_k: Vector) -> float:
+        """Sizes of all that cancels where nothing makes heat flow any more, [J]: round-off is a share of that."""
+        total_j = 0.0
+        for row_k, length_s in zip(lumped_k[1:], np.diff(times_s).tolist()):
+            state_k = self._at_nodes(row_k)
+            if is_still(self.system, state_k, 0.0):
+                total_j += length_s * float(self.system.exchanged_heat(state_k, 0.0)[1].sum())
+        return total_j
 
     def _at_nodes(self, piece_k: Vector) -> Vector:
         return piece_k[self.system.pieces.number]

@@ -1,4 +1,4 @@
-"""Parts of sparse matrices and changes of their diagonal, in one pass instead of several of scipy's.
+"""Parts of sparse matrices, changes of their diagonal and products of rows, in one pass instead of several of scipy's.
 
 Kernels are kept compiled by numba, which watches a kernel's own file: none may call one of another file.
 """
@@ -45,6 +45,36 @@ def block_of(matrix: sparse.csr_matrix, kept: npt.NDArray[np.int64]) -> sparse.c
     columns, data = np.empty(first[-1], matrix.indices.dtype), np.empty(first[-1], matrix.data.dtype)
     _take_kept(matrix.indptr, matrix.indices, matrix.data, kept, number, columns, data)
     return sparse.csr_matrix((data, columns, first), shape=(len(kept), len(kept)))
+
+
+def product_of_rows(
+    matrix: sparse.csr_matrix, rows: npt.NDArray[np.int64], vector: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Multiply some rows of a matrix by a vector, without making a matrix of them.
+
+    Args:
+        matrix: Shape (n, m).
+        rows: Their numbers, shape (k,).
+        vector: Shape (m,).
+
+    Returns:
+        Shape (k,).
+
+    >>> product_of_rows(sparse.csr_matrix([[2.0, -1.0], [-1.0, 3.0]]), np.array([1]), np.array([1.0, 2.0]))
+    array([5.])
+    """
+    product = np.empty(len(rows))
+    _multiply_rows(matrix.indptr, matrix.indices, matrix.data, rows, vector, product)
+    return product
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _multiply_rows(indptr, indices, data, rows, vector, product):
+    for place in range(len(rows)):
+        total = 0.0
+        for k in range(indptr[rows[place]], indptr[rows[place] + 1]):
+            total += data[k] * vector[indices[k]]
+        product[place] = total
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

@@ -80,7 +80,7 @@ class QuadraticSpace(LinearSpace):
         """M, entries integral(rho c phi_i phi_j), and its row sums, which are negative at corners, [J / K]."""
         capacity = heat_capacity_j_m3k * self.tet_volumes_m3(np.arange(len(self._middles)))
         matrix = mass_matrix(self.tet_nodes(), capacity, self.num_nodes)
-        return matrix, np.asarray(matrix.sum(axis=1)).ravel()
+        return matrix, matrix @ np.ones(self.num_nodes)
 
     def facet_nodes(self, facets: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """Nodes of boundary triangles, corners first, shape (k, 6)."""

@@ -26,6 +26,9 @@ def seconds_saved(problem: HeatProblem, without: HeatProblem, time: TimeSteps | 
 
     Returns:
         The difference, [s]; at least 0.
+
+    Raises:
+        HeatError: A step of the problem with all effects cannot be solved.
     """
     step_s = time.duration_s / max(steps, 1)
     more = [ours - theirs for ours, theirs in zip(_seconds(problem, time, step_s), _seconds(without, time, step_s))]

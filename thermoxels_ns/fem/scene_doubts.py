@@ -51,7 +51,7 @@ def scene_doubts(scene: HeatScene, mesh: TetMesh, up: Vector) -> tuple[str, ...]
     elif inside_air and not _has_rooms(selection, inside):
         area = float(selection.facet_area_m2[inside].sum())
         doubts.append(
-            f"The scene names air inside, but the body has no rooms: of the {area:.4g} m2 that no photograph saw, next "
+            f"The scene names air inside, but the body has no rooms: of the {area:.4g} m² that no photograph saw, next "
             "to nothing is walls or floor of a room. The air acts on what is left, such as the underside, and U-values "
             "and heat losses are those of that. Export again with --interior hollow, which keeps the inside empty, or "
             "name the inner surface with --patches."

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.loose_pieces import check_held
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.solution import SteadySolution, heat_by_effect
 from thermoxels_ns.fem.stage import StageSolution
 from thermoxels_ns.fem.steady_range import state_in_range
-from thermoxels_ns.fem.system import HeatSystem, effect_labels
+from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.units import ZERO_CELSIUS_K
 
 _SUSPICIOUS = 1e-12

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.marching import AdaptiveMarch, Taken
 from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect, left_out
 from thermoxels_ns.fem.steady import is_still
-from thermoxels_ns.fem.system import HeatSystem, effect_labels
+from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.units import celsius_to_kelvin
 
 Vector = npt.NDArray[np.float64]
@@ -61,6 +62,25 @@ class StepAccount:
             self._done += 1
             self._states[self._done] = step.relative_k
 
+    def add_all(
+        self, intervals: npt.NDArray[np.int64], lengths_s: Vector, group_heat_w: Vector, iterations: list[int]
+    ) -> None:
+        """Count all steps at once, of linear equations and within range; whoever calls keeps the states.
+
+        Args:
+            intervals: Number of each step's interval, ascending, shape (l,).
+            lengths_s: Length of each step, shape (l,), [s].
+            group_heat_w: Mean heat flow of each group during each step, shape (l, g), [W].
+            iterations: Iterations of the linear solver in each step.
+        """
+        self.followed_s += float(lengths_s.sum())
+        np.add.at(self._heat_j, intervals, lengths_s[:, None] * group_heat_w)
+        np.add.at(self._exchanged_j, intervals, lengths_s * np.abs(group_heat_w).sum(axis=1))
+        np.add.at(self._iterations[:, 0], intervals, iterations)
+        self._most_iterations = max(self._most_iterations, *iterations)
+        self._steps += len(intervals)
+        self._done = int(intervals[-1]) + 1
+
     def success(self, march: AdaptiveMarch | None) -> str:
         """Say that all went well, and how."""
         sentence = f"All {self._steps} steps converged, in {self._most_iterations} iterations at most."
@@ -95,7 +115,7 @@ class StepAccount:
         spread = float(mass @ np.abs(states_k[0] - mean))
         scale, spread_scale = max(float(content[0]), exchanged), spread + exchanged
         if unexplained > _SUSPICIOUS * min(scale, spread_scale):
-            terms = self._terms_j(states_k, times_s)
+            terms = self._terms_j(states_k, times_s, unexplained / _ROUND_OFF)
             if unexplained <= _ROUND_OFF * terms:
                 scale, spread_scale = max(scale, terms), max(spread_scale, terms)
         states_k += system.reference_c
@@ -119,20 +139,35 @@ class StepAccount:
             assembled=system.assembled,
         )
 
-    def _terms_j(self, states_k: Vector, times_s: Vector) -> float:
+    def _terms_j(self, states_k: Vector, times_s: Vector, least_j: float) -> float:
         """Sizes of all that is added up to the heat that flows in, up to states at which nothing makes heat flow, [J].
 
         There next to nothing is left of their sum; if a step is far longer than heat takes to leave the body, round-off
         of it is much beside what the body stores. Where heat flows, what is unaccounted for is a share of that.
+
+        Args:
+            states_k: Temperatures at all times, shape (s + 1, n), [K].
+            times_s: The times, shape (s + 1,), [s].
+            least_j: Less than that is as good as nothing: if no more can come of it, no state is looked at.
         """
-        system, total_j = self._system, 0.0
-        for state_k, time_s, length_s in zip(states_k[1:], times_s[1:], np.diff(times_s)):
-            if not is_still(system, state_k, float(time_s)):
+        system, fixed, lengths_s = self._system, self._system.fixed.nodes, np.diff(times_s)
+        most_w = np.zeros(len(lengths_s))
+        if len(fixed):
+            around_w_k = float(system.conducted_heat(np.ones(system.num_nodes))[1][fixed].sum())
+            most_w += around_w_k * np.abs(states_k[1:]).max(axis=1)
+        states = list(zip(states_k[1:], times_s[1:].tolist()))
+        if system.exchanges:
+            most_w += [float(system.exchanged_heat(state_k, time_s)[1].sum()) for state_k, time_s in states]
+        if float(lengths_s @ most_w) < least_j:
+            return 0.0
+        total_j = 0.0
+        for (state_k, time_s), length_s in zip(states, lengths_s.tolist()):
+            if not is_still(system, state_k, time_s):
                 continue
-            terms_w = float(system.exchanged_heat(state_k, float(time_s))[1].sum())
-            if len(system.fixed.nodes):
-                terms_w += float(system.conducted_heat(state_k)[1][system.fixed.nodes].sum())
-            total_j += float(length_s) * terms_w
+            terms_w = float(system.exchanged_heat(state_k, time_s)[1].sum())
+            if len(fixed):
+                terms_w += float(system.conducted_heat(state_k)[1][fixed].sum())
+            total_j += length_s * terms_w
         return total_j
 
 

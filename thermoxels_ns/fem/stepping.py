@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.loose_pieces import check_stored
 from thermoxels_ns.fem.marching import AdaptiveMarch, Taken, equal_steps
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
@@ -15,7 +16,7 @@ from thermoxels_ns.fem.schemes import BACKWARD_EULER, SDIRK2, Scheme
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.steady import too_cold
 from thermoxels_ns.fem.step_account import StepAccount
-from thermoxels_ns.fem.system import HeatSystem, effect_labels
+from thermoxels_ns.fem.system import HeatSystem
 
 Vector = npt.NDArray[np.float64]
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.checks import check_shape
 from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.fixed_nodes import FixedNodes
 from thermoxels_ns.fem.forms import FixedForm, FluxForm, Form, RadiationForm, RobinForm
 from thermoxels_ns.fem.linear_space import LinearSpace
@@ -18,7 +19,7 @@ from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quadratic_space import QuadraticSpace
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import EffectHeat, heat_by_effect
-from thermoxels_ns.fem.system import HeatSystem, effect_labels
+from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.fem.terms import FixedTerm, FluxTerm, RadiationTerm, RobinTerm
 
 Vector = npt.NDArray[np.float64]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from copy import copy
-from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -12,8 +10,9 @@ from scipy import sparse
 
 from thermoxels_ns.errors import HeatError, explain
 from thermoxels_ns.fem.account import Assembled
+from thermoxels_ns.fem.effect_forms import effect_forms
 from thermoxels_ns.fem.fixed_nodes import FixedNodes
-from thermoxels_ns.fem.forms import FixedForm, FluxForm, Form, RadiationForm, RobinForm, SourceForm
+from thermoxels_ns.fem.forms import FluxForm, RobinForm, SourceForm
 from thermoxels_ns.fem.linear_space import CORNERS, LinearSpace
 from thermoxels_ns.fem.matrix_parts import with_more_on_diagonal
 from thermoxels_ns.fem.pieces import Pieces
@@ -22,7 +21,6 @@ from thermoxels_ns.fem.quadratic_space import QuadraticSpace
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solver_choice import LinearSolver
 from thermoxels_ns.fem.sparsity import product_and_bound
-from thermoxels_ns.fem.terms import FluxTerm, RadiationTerm, RobinTerm, SourceTerm, Term
 from thermoxels_ns.fem.two_level import SystemSolver, TwoLevelConjugateGradients
 
 Vector = npt.NDArray[np.float64]
@@ -61,14 +59,9 @@ class HeatSystem:
         """What temperatures are relative to, [degrees Celsius]."""
         selection = Selection(problem.mesh, problem.up)
         self._space = _space(selection, lumped, lumped_boundary, order)
-        self._robin: list[RobinForm] = []
-        self._loads: list[FluxForm | SourceForm] = []
-        self._radiation: list[RadiationForm] = []
-        fixed: list[FixedForm] = []
-        for label, effect in zip(effect_labels(problem), problem.effects):
-            for term in effect.terms(selection):
-                self._add(replace(term, effect=label), fixed)
-        self.fixed: FixedNodes = FixedNodes(fixed, self.num_nodes)
+        forms = effect_forms(problem, self._space, self.reference_c, self.assembled)
+        self._robin, self._loads, self._radiation = forms.robin, forms.loads, forms.radiation
+        self.fixed: FixedNodes = FixedNodes(forms.fixed, self.num_nodes)
         """Nodes whose temperature is given."""
         with self.assembled.form("stiffness"):
             self._stiffness = self._space.stiffness(problem.conductivity_w_mk)
@@ -78,11 +71,10 @@ class HeatSystem:
         """Whether the matrix of the linear part changes with time."""
         self.nonlinear: bool = bool(self._radiation)
         """Whether there is radiation."""
-        self._forms: tuple[Form, ...] = (*self._robin, *self._loads, *self._radiation)
-        self.exchanges: bool = bool(self._forms)
+        self.exchanges: bool = bool(forms.exchanging)
         """Whether heat flows into the body other than through fixed nodes."""
         self.groups: tuple[tuple[str, str], ...] = (
-            *((form.effect, group) for form in self._forms for group in form.groups),
+            *((form.effect, group) for form in forms.exchanging for group in form.groups),
             *self.fixed.groups,
         )
         """Effect and patch or region of each heat flow of `group_heat_w`, then of each of the fixed nodes."""
@@ -248,13 +240,6 @@ class HeatSystem:
         from_nodes_w = self._rows_of_fixed() @ relative_k
         return self.exchanged_heat(relative_k, time_s)[0][nodes] - from_nodes_w if self.exchanges else -from_nodes_w
 
-    def conducted_from_fixed(self, states_k: Sequence[Vector]) -> Vector:
-        """Heat that flows from the fixed nodes to their neighbours in each of some states, shape (d, s), [W]."""
-        rows = self._rows_of_fixed()
-        used, columns = np.unique(rows.indices, return_inverse=True)
-        near = sparse.csr_matrix((rows.data, columns, rows.indptr), (len(self.fixed.nodes), len(used)))
-        return near @ np.stack([state_k[used] for state_k in states_k], axis=1)
-
     def _rows_of_fixed(self) -> sparse.csr_matrix:
         if self._fixed_rows is None:
             self._fixed_rows = sparse.csr_matrix(self._stiffness[self.fixed.nodes])
@@ -267,9 +252,18 @@ class HeatSystem:
             total += form.magnitude(relative_k, time_s)
         return total
 
-    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
-        """Heat flow into the body of each group but those of fixed nodes, [W]."""
-        return np.concatenate([np.zeros(0), *(form.group_heat_w(relative_k, time_s) for form in self._forms)])
+    def group_heat_w(self, relative_k: Vector, time_s: float, *, radiating_k: Vector | None = None) -> Vector:
+        """Heat flow into the body of each group but those of fixed nodes, [W].
+
+        Args:
+            relative_k: Temperatures, relative to the reference, shape (n,), [K].
+            time_s: Time.
+            radiating_k: Temperatures of radiation, such as those of a mean fourth power; None: the same.
+        """
+        radiating_k = relative_k if radiating_k is None else radiating_k
+        given = (form.group_heat_w(relative_k, time_s) for form in (*self._robin, *self._loads))
+        radiated = (form.group_heat_w(radiating_k, time_s) for form in self._radiation)
+        return np.concatenate([np.zeros(0), *given, *radiated])
 
     def exchanging_pieces(self, time_s: float) -> npt.NDArray[np.bool_]:
         """Mark the pieces whose temperature convection, radiation or fixed nodes hold, shape (p,)."""
@@ -304,22 +298,6 @@ class HeatSystem:
             del self._kept_ranges[next(iter(self._kept_ranges))]
         self._kept_ranges[time_s] = low, high
         return low, high
-
-    def _add(self, term: Term, fixed: list[FixedForm]) -> None:
-        """Make the form of a term, unless it acts nowhere."""
-        if len(term.tets if isinstance(term, SourceTerm) else term.facets) == 0:
-            return
-        if isinstance(term, RobinTerm):
-            self._robin.append(RobinForm(term, self._space, self.reference_c))
-        elif isinstance(term, FluxTerm):
-            self._loads.append(FluxForm(term, self._space))
-        elif isinstance(term, SourceTerm):
-            self._loads.append(SourceForm(term, self._space))
-        elif isinstance(term, RadiationTerm):
-            self._radiation.append(RadiationForm(term, self._space, self.reference_c))
-        else:
-            with self.assembled.form("fixed"):
-                fixed.append(FixedForm(term, self._space, self.reference_c))
 
     def _masses(self) -> tuple[sparse.csr_matrix | None, Vector]:
         if self._mass is None:
@@ -365,12 +343,3 @@ def _sum_of(first: sparse.csr_matrix | None, second: sparse.csr_matrix | None) -
     if first is None or second is None:
         return second if first is None else first
     return sparse.csr_matrix(first + second)
-
-
-def effect_labels(problem: HeatProblem) -> tuple[str, ...]:
-    """Names of a problem's effects for reports, all different: a second one of the same kind and place is numbered."""
-    labels: list[str] = []
-    for effect in problem.effects:
-        same = sum(label == effect.label or label.startswith(f"{effect.label} (") for label in labels)
-        labels.append(f"{effect.label} ({same + 1})" if same else effect.label)
-    return tuple(labels)

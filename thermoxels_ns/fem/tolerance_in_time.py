@@ -208,9 +208,10 @@ class _Climb:
         """What even steps found, if it holds and their error is allowed."""
         if not even.found:
             return None
-        error_k = even.errors_k()
-        solution = even.solution() if float(np.abs(error_k).max()) <= self._allowed_k() else None
-        return None if solution is None else _Followed(solution, error_k)
+        allowed_k = self._allowed_k()
+        solution = even.solution() if float(np.abs(even.errors_k()).max()) <= allowed_k else None
+        # Steps that left the range of temperatures have been replaced by shorter ones.
+        return None if solution is None or solution.time_error_k > allowed_k else _Followed(solution, even.errors_k())
 
     def _against(self, base: _Base, solution: HeatSolution, refinements: int) -> _OfMesh:
         """Error of a finer mesh by how it differs from the given one."""

@@ -9,13 +9,11 @@ import numpy.typing as npt
 from scipy import sparse
 
 from thermoxels_ns.errors import HeatError, explain
-from thermoxels_ns.fem.linear_solver import LinearSolution
+from thermoxels_ns.fem.linear_solver import LinearSolution, is_solved
 from thermoxels_ns.fem.solver_choice import LinearSolver
 
 Vector = npt.NDArray[np.float64]
 
-_RECURSION_SLACK = 10.0
-_ROUND_OFF = 1e-14
 _COARSE_TOLERANCE = 0.1
 """Relative tolerance of the coarse level: a smaller one costs more than the iterations that it saves."""
 
@@ -80,8 +78,7 @@ class TwoLevelConjugateGradients:
         x, count = self._iterate(b, tolerance)
         error = _norm(b - self._matrix @ x)
         residual = error / size if size > 0.0 else error
-        close = error <= max(_RECURSION_SLACK * tolerance, _ROUND_OFF * (self._norm * _norm(x) + size))
-        converged = bool(np.all(np.isfinite(x))) and close
+        converged = is_solved(error, tolerance, size, self._norm * _norm(x))
         outcome = f"converged in {count} iterations to" if converged else f"stopped after {count} iterations at"
         status = f"Conjugate gradients with {self.name} {outcome} a relative residual of {residual:.1e}."
         return LinearSolution(scale * x, count, residual, converged, status)
