@@ -27,6 +27,10 @@ _SAME = 0.8
 """Correlation from which on two numbers stand for each other: knowing one would make the other 1.7 times as sure."""
 _NOTHING_LEARNT = 0.8
 """Share of the first standard deviation that is left where the images say next to nothing."""
+_WORTH_KNOWING = 0.8
+"""Share of the turn's standard error that is left with the principal point known, below which that is said."""
+_TURN = [PARAMETERS.index(name) for name in ("rx", "ry", "rz")]
+_CENTRE = [PARAMETERS.index(name) for name in ("cx", "cy")]
 
 
 def certainty_text(covariance: FloatArray, sigmas: FloatArray) -> str:
@@ -52,6 +56,12 @@ def certainty_text(covariance: FloatArray, sigmas: FloatArray) -> str:
         sentences.append(
             f"The images hardly tell apart {'; '.join(pairs)}: where points fall is surer than each of these numbers."
         )
+    turn_deg, alone_deg = turn_errors_deg(covariance)
+    if alone_deg < _WORTH_KNOWING * turn_deg:
+        sentences.append(
+            f"The turn is sure to {turn_deg:.2f} degrees; with the principal point known, as a heated board tells it, "
+            f"it would be to {alone_deg:.2f}."
+        )
     unknown = [
         _WORDS[name]
         for name, error, sigma in zip(PARAMETERS, errors, sigmas)
@@ -61,3 +71,24 @@ def certainty_text(covariance: FloatArray, sigmas: FloatArray) -> str:
         rest = "it is as unsure as at the start" if len(unknown) == 1 else "they are as unsure as at the start"
         sentences.append(f"The images say next to nothing about {', '.join(unknown)}: {rest}.")
     return " ".join(sentences)
+
+
+def turn_errors_deg(covariance: FloatArray) -> tuple[float, float]:
+    """Standard error of the turn about all axes together, as it is and were the principal point known [degrees].
+
+    The second is the root of the trace of C_rr - C_rc C_cc^-1 C_cr, the covariance of the turn r given the principal
+    point c (the conditional of a normal distribution).
+
+    Args:
+        covariance: Of the ten changes, shape (10, 10); a principal point that is kept fixed has zeros.
+
+    >>> covariance = np.diag([1e-4, 0, 0, 0, 0, 0, 0, 0, 1.0, 0])
+    >>> covariance[0, 8] = covariance[8, 0] = 0.8e-2
+    >>> [round(each, 3) for each in turn_errors_deg(covariance)]
+    [0.573, 0.344]
+    """
+    turn = covariance[np.ix_(_TURN, _TURN)]
+    shared = covariance[np.ix_(_TURN, _CENTRE)]
+    given = turn - shared @ np.linalg.pinv(covariance[np.ix_(_CENTRE, _CENTRE)], hermitian=True) @ shared.T
+    with_it, without = (float(np.degrees(np.sqrt(max(np.trace(each), 0.0)))) for each in (turn, given))
+    return with_it, without
