@@ -85,6 +85,22 @@ def test_how_lines_are_cut_into_pieces_changes_nothing(monkeypatch: pytest.Monke
     assert np.array_equal(empty_voxels(BOX, sight), whole)
 
 
+def test_of_very_many_lines_some_are_looked_at_and_all_points_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    sight, free = room()
+    whole = empty_voxels(BOX, sight)
+    monkeypatch.setattr(track_carving, "MOST_LINES", -(-len(sight.origins) // 3))
+    seen = []
+    crossings = track_carving._crossings
+    monkeypatch.setattr(track_carving, "_crossings", lambda box, some: seen.append(some) or crossings(box, some))
+    some = empty_voxels(BOX, sight)
+    assert len(seen[0].origins) <= len(sight.origins) // 3 + 5
+    assert np.array_equal(seen[0].points, sight.points[::3])
+    assert seen[0].point.tolist() == np.repeat(np.arange(len(seen[0].points)), 5).tolist()
+    held = np.floor(BOX.world_to_index(sight.points)).astype(int)
+    assert not some[tuple(held.T)].any() and not (some & ~free).any()
+    assert some.sum() > 0.9 * whole.sum()
+
+
 def carved_model(sight: Sightlines | None, carve: str = "auto") -> tuple[Any, Any]:
     model: Any = SimpleNamespace(
         sightlines=sight, config=SimpleNamespace(carve=carve), grid=VoxelGrid(BOX, sh_degree=0)

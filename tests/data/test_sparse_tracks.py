@@ -89,6 +89,40 @@ def test_badly_known_points_are_left_out(scene):
     assert len(sightlines(tracks, together).points) == 0
 
 
+def test_sightings_given_twice_count_once(scene):
+    folder, tracks = scene
+    frames = [frame for frame in read_scene_file(folder.path).frames if "train" in frame.name]
+    twice = replace(
+        tracks,
+        sighting_frame=np.tile(tracks.sighting_frame, 3),
+        sighting_point=np.tile(tracks.sighting_point, 3),
+    )
+    assert len(sightlines(twice, frames).origins) == len(sightlines(tracks, frames).origins) == 5 * 30
+    assert len(sightlines(twice, frames[:2]).points) == 0  # two photographs are not six
+
+
+def test_an_error_that_was_not_computed_is_no_error_and_none_is_not_believed(scene):
+    folder, tracks = scene
+    frames = [frame for frame in read_scene_file(folder.path).frames if "train" in frame.name]
+    error = tracks.point_error_px.copy()
+    error[:3], error[3], error[4] = -1.0, np.nan, 0.0
+    lines = sightlines(replace(tracks, point_error_px=error), frames)
+    assert np.array_equal(lines.points, tracks.points[4:])
+    assert (lines.uncertainty > 0.0).all()
+
+
+def test_one_camera_and_points_behind_it(scene):
+    folder, tracks = scene
+    frames = [frame for frame in read_scene_file(folder.path).frames if "train" in frame.name]
+    assert len(sightlines(tracks, frames[:1]).points) == 0
+    points = tracks.points.copy()
+    points[0] = frames[0].pose[:3, 3] + 50.0 * frames[0].pose[:3, 2]  # behind one camera, and so seen by nobody
+    lines = sightlines(replace(tracks, points=points), frames)
+    axis = np.stack([-frame.pose[:3, 2] for frame in frames])
+    camera = np.linalg.norm(lines.origins[:, None] - np.stack([f.pose[:3, 3] for f in frames]), axis=2).argmin(axis=1)
+    assert ((lines.points[lines.point] - lines.origins) * axis[camera]).sum(axis=1).min() > 0.0
+
+
 def test_the_error_of_a_length_is_that_of_a_triangulation(scene):
     folder, _ = scene
     frame = read_scene_file(folder.path).frames[0]

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from thermoxels_ns.checks import replace_when_done
-from thermoxels_ns.data.folder_walls import path_inside
-from thermoxels_ns.data.scene_file import Frame, SceneFile
+from thermoxels_ns.data.scene_file import Frame
 from thermoxels_ns.errors import SceneError, explain
 from thermoxels_ns.sightlines import FloatArray, IntArray, Sightlines
 
@@ -21,6 +20,8 @@ FEWEST_VIEWS = 3
 """Photographs that must see a point: two agree about many wrong ones."""
 MOST_ERROR_PX = 2.0
 """Mean reprojection error above which a point is left out."""
+LEAST_ERROR_PX = 0.3
+"""Error that a point has at least: what three photographs agree on more closely agrees by luck."""
 LEAST_PARALLAX_DEG = 2.0
 """Largest angle between the rays of a point below which its distance is not known."""
 MOST_BEHIND = 0.1
@@ -103,25 +104,6 @@ def read_tracks(path: Path) -> SparseTracks:
     )
 
 
-def find_sightlines(scene: SceneFile, training: Sequence[int]) -> Sightlines | None:
-    """The lines of sight of the photographs that train, if the scene's json names a file of tracks.
-
-    Args:
-        scene: The scene.
-        training: Numbers of its frames that train; what others see is not used.
-
-    Returns:
-        Lines in input coordinates; None where the json names no tracks.
-
-    Raises:
-        SceneError: The file lies outside the scene, cannot be used, or does not fit the poses.
-    """
-    if TRACKS_KEY not in scene.meta:
-        return None
-    path = path_inside(scene.folder, str(scene.meta[TRACKS_KEY]), f"transforms.json: {TRACKS_KEY}")
-    return sightlines(read_tracks(path), [scene.frames[index] for index in training], path.name)
-
-
 def sightlines(tracks: SparseTracks, frames: Sequence[Frame], name: str = "tracks") -> Sightlines:
     """Lines from frames to the points that they see and that are well known.
 
@@ -149,10 +131,11 @@ def sightlines(tracks: SparseTracks, frames: Sequence[Frame], name: str = "track
             )
         )
     known = np.isfinite(tracks.points).all(axis=1) & (tracks.point_error_px <= MOST_ERROR_PX)
+    known &= tracks.point_error_px >= 0.0  # COLMAP writes -1 for an error that it did not compute
     used = (number[tracks.sighting_frame] >= 0) & known[tracks.sighting_point]
-    frame, point = number[tracks.sighting_frame[used]], tracks.sighting_point[used]
-    order = np.lexsort((frame, point))
-    frame, point = frame[order], point[order]
+    # Sorted by point, each pair once: a photograph that sees a point twice is still one that sees it.
+    pairs = np.unique(tracks.sighting_point[used] * max(1, len(frames)) + number[tracks.sighting_frame[used]])
+    frame, point = pairs % max(1, len(frames)), pairs // max(1, len(frames))
     poses = np.stack([one.pose for one in frames]) if len(frames) else np.zeros((0, 4, 4))
     focal = np.array([min(one.intrinsics.fx, one.intrinsics.fy) for one in frames])
     line = tracks.points[point] - poses[frame, :3, 3]
@@ -174,7 +157,11 @@ def sightlines(tracks: SparseTracks, frames: Sequence[Frame], name: str = "track
     chosen = good[point]
     renumbered = np.cumsum(good) - 1
     frame, point, length = frame[chosen], point[chosen], length[chosen]
-    error = tracks.point_error_px[point] / focal[frame] / np.sin(np.minimum(angle[point], np.pi / 2))
+    error = (
+        np.maximum(tracks.point_error_px[point], LEAST_ERROR_PX)
+        / focal[frame]
+        / np.sin(np.minimum(angle[point], np.pi / 2))
+    )
     return Sightlines(poses[frame, :3, 3], renumbered[point], tracks.points[good], error * length)
 
 

@@ -18,9 +18,9 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from thermoxels_ns.data.pose_file_cameras import Intrinsics
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
-from thermoxels_ns.data.sparse_tracks import find_sightlines
 from thermoxels_ns.data.splits import Split, split_frames
 from thermoxels_ns.data.thermal_survey import ThermalSurvey, survey_thermal_files
+from thermoxels_ns.data.track_sources import TrackSource, find_sightlines
 from thermoxels_ns.errors import SceneError, explain
 from thermoxels_ns.sightlines import Sightlines
 
@@ -65,6 +65,10 @@ class ThermalDataParserConfig(DataParserConfig):
     """A frame without a thermal image: stop, or leave the frame out and name it."""
     valid_range_c: tuple[float, float] = (-100.0, 2000.0)
     """Temperatures outside this range are masked, in degrees Celsius."""
+    tracks: TrackSource = "auto"
+    """Which photographs saw which points, from structure from motion: they tell training what is air. auto: the file
+    that the json names (tracks_file_path), else a COLMAP model in the scene's folder (colmap/sparse/0, colmap or
+    sparse/0) whose poses are those of the json; given: only the file; off: none."""
 
 
 @dataclass(frozen=True)
@@ -189,7 +193,7 @@ class ThermalDataParser(DataParser):
         )
         if file.left_out:
             CONSOLE.print(f"Left out, no pair: {', '.join(file.left_out)}", style="bold yellow")
-        lines = find_sightlines(file, split.train)
+        lines = find_sightlines(file, split.train, config.tracks)
         if lines is not None:
             lines = lines.moved(world.rotation, world.translation, world.scale)
         return _Scene(file, split, survey, world, box, lines)

@@ -1,0 +1,215 @@
+"""Tracks of a COLMAP model beside given poses: found, matched by name, moved to the json's world, or refused."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from thermoxels_ns.data.colmap_files import check_complete
+from thermoxels_ns.data.colmap_tracks import read_colmap_tracks
+from thermoxels_ns.data.scene_file import read_scene_file
+from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, write_tracks
+from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
+from thermoxels_ns.errors import SceneError
+
+TAGS = ["train", "train", "eval", "train", "train", "train"]
+NAMES = [f"frame_{tag}_{number:05d}" for number, tag in enumerate(TAGS)]
+SCALE, SHIFT = 2.5, np.array([0.3, -4.0, 1.0])
+TURN = pycolmap.Rotation3d(np.array([0.1, -0.7, 0.3, 0.64]) / np.linalg.norm([0.1, -0.7, 0.3, 0.64]))
+OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3))
+
+
+def write_model(frames, names, folder: Path, *, text=False, points=POINTS, focal_factor=1.0, error=0.5) -> None:
+    """A model of cameras that all see all points, in a world that is turned, moved and scaled."""
+    turn = TURN.matrix()
+    model = pycolmap.Reconstruction()
+    first = frames[0].intrinsics
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(
+            camera_id=1,
+            model="PINHOLE",
+            width=round(first.width * focal_factor),
+            height=round(first.height * focal_factor),
+            params=[v * focal_factor for v in (first.fx, first.fy, first.cx, first.cy)],
+        )
+    )
+    for number, (frame, name) in enumerate(zip(frames, names), start=1):
+        pose = frame.pose @ OPENCV
+        world = np.eye(4)[:3]
+        world[:, :3] = (turn @ pose[:3, :3]).T
+        world[:, 3] = -world[:, :3] @ (SCALE * turn @ pose[:3, 3] + SHIFT)
+        seen = (points - frame.pose[:3, 3]) @ frame.pose[:3, :3]
+        pixels = np.column_stack((seen[:, 0] / -seen[:, 2], -seen[:, 1] / -seen[:, 2])) * first.fx * focal_factor
+        image = pycolmap.Image(name=name, image_id=number, camera_id=1)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels])
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(world))
+    for number, point in enumerate(points):
+        track = pycolmap.Track()
+        for image in range(1, len(frames) + 1):
+            track.add_element(image, number)
+        model.add_point3D(SCALE * turn @ point + SHIFT, track, np.zeros(3, dtype=np.uint8))
+    for point in model.points3D.values():
+        point.error = error
+    folder.mkdir(parents=True, exist_ok=True)
+    (model.write_text if text else model.write_binary)(str(folder))
+
+
+@pytest.fixture
+def scene(scene_folder):
+    """A scene of six photographs, without a model."""
+    return scene_folder(frames=len(NAMES), names=NAMES, scene_box=[[-1, -1, -1], [1, 1, 1]])
+
+
+def frames_of(folder):
+    return read_scene_file(folder.path).frames
+
+
+def add_model(folder, where="colmap/sparse/0", frames=None, names=None, **options) -> None:
+    frames = frames_of(folder) if frames is None else frames
+    write_model(frames, names or [one.image.name for one in frames], folder.path / where, **options)
+
+
+def lines_of(folder, split="train", **options):
+    return ThermalDataParserConfig(data=folder.path, **options).setup().get_dataparser_outputs(split)
+
+
+@pytest.mark.parametrize("where", ["colmap/sparse/0", "colmap", "sparse/0"])
+@pytest.mark.parametrize("text", [False, True])
+def test_points_come_in_the_worlds_of_the_json_and_of_training(scene, where, text):
+    add_model(scene, where, text=text)
+    tracks = read_colmap_tracks(read_scene_file(scene.path))
+    assert tracks is not None
+    assert np.sort(tracks.points, axis=0) == pytest.approx(np.sort(POINTS, axis=0), abs=1e-6)
+    assert len(tracks.sighting_frame) == 6 * 30
+    outputs = lines_of(scene)
+    lines = outputs.metadata["sightlines"]
+    centres = outputs.cameras.camera_to_worlds[:, :, 3].double().numpy()
+    nearest = np.linalg.norm(lines.origins[:, None] - centres, axis=2)
+    assert len(lines.points) == 30 and len(lines.origins) == 5 * 30  # the one that evaluates is left out
+    assert nearest.min(axis=1).max() < 1e-5
+    assert lines_of(scene, "val").metadata["sightlines"] is None
+
+
+def test_without_a_model_and_switched_off_there_are_no_lines(scene):
+    assert lines_of(scene).metadata["sightlines"] is None
+    add_model(scene)
+    assert lines_of(scene).metadata["sightlines"] is not None
+    assert lines_of(scene, tracks="given").metadata["sightlines"] is None
+    assert lines_of(scene, tracks="off").metadata["sightlines"] is None
+
+
+def test_the_file_that_the_json_names_comes_first(scene):
+    add_model(scene)
+    tracks = read_colmap_tracks(read_scene_file(scene.path))
+    assert tracks is not None
+    few = tracks.sighting_point < 7
+    some = type(tracks)(
+        tracks.points, tracks.point_error_px, tracks.frames, tracks.sighting_frame[few], tracks.sighting_point[few]
+    )
+    write_tracks(scene.path / "tracks.npz", some)
+    scene.meta[TRACKS_KEY] = "tracks.npz"
+    scene.rewrite()
+    assert len(lines_of(scene).metadata["sightlines"].points) == 7
+    assert lines_of(scene, tracks="off").metadata["sightlines"] is None
+
+
+def test_some_wrong_poses_are_left_out_and_named_and_move_nothing(scene, capsys):
+    frames = frames_of(scene)
+    add_model(scene, frames=frames)
+    entry = next(one for one in scene.meta["frames"] if frames[4].image.name in one["file_path"])
+    entry["transform_matrix"][0][3] += 2.0
+    scene.rewrite()
+    tracks = read_colmap_tracks(read_scene_file(scene.path))
+    assert tracks is not None
+    assert np.sort(tracks.points, axis=0) == pytest.approx(np.sort(POINTS, axis=0), abs=1e-6)
+    assert set(tracks.sighting_frame.tolist()) == {0, 1, 2, 3, 5}
+    assert frames[4].name in capsys.readouterr().out.replace("\n", "")
+
+
+def test_a_model_of_other_poses_is_not_used_and_a_warning_says_so(scene, capsys):
+    frames = frames_of(scene)
+    add_model(scene, frames=frames[3:] + frames[:3], names=[one.image.name for one in frames])
+    assert lines_of(scene).metadata["sightlines"] is None
+    said = " ".join(capsys.readouterr().out.split())
+    assert "colmap/sparse/0 is not used" in said and "poses are others" in said
+
+
+def test_a_model_of_other_photographs_or_unreadable_is_not_used(scene, capsys):
+    add_model(scene, names=[f"other_{n}.jpg" for n in range(6)])
+    assert lines_of(scene).metadata["sightlines"] is None
+    assert "no photograph of this scene" in " ".join(capsys.readouterr().out.split())
+    (scene.path / "colmap/sparse/0/images.bin").write_bytes(b"\x07")
+    assert lines_of(scene).metadata["sightlines"] is None
+    assert "cannot be read" in " ".join(capsys.readouterr().out.split())
+
+
+def test_two_photographs_in_common_are_too_few(scene, capsys):
+    frames = frames_of(scene)
+    add_model(scene, frames=frames[:2])
+    assert lines_of(scene).metadata["sightlines"] is None
+    assert "too few" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_model_outside_the_scene_is_not_used(scene, tmp_path, capsys):
+    add_model(scene)
+    outside = tmp_path / "outside"
+    shutil.move(scene.path / "colmap", outside)
+    (scene.path / "colmap").symlink_to(outside)
+    assert lines_of(scene).metadata["sightlines"] is None
+    assert "a file inside" in " ".join(capsys.readouterr().out.split())
+
+
+def test_errors_are_pixels_of_the_photographs(scene):
+    add_model(scene, focal_factor=0.5, error=0.4)
+    tracks = read_colmap_tracks(read_scene_file(scene.path))
+    assert tracks is not None
+    assert tracks.point_error_px == pytest.approx(0.8)
+
+
+def test_errors_that_colmap_did_not_compute_are_computed(scene):
+    add_model(scene, error=-1.0)
+    tracks = read_colmap_tracks(read_scene_file(scene.path))
+    assert tracks is not None
+    assert (tracks.point_error_px >= 0.0).all()
+
+
+def test_photographs_of_one_name_are_told_apart_by_their_folders():
+    from thermoxels_ns.data.colmap_tracks import _matched
+
+    images = ["left/1.jpg", "right/1.jpg", "2.jpg"]
+    assert _matched(images, ["images/right/1.jpg", "images/left/1.jpg", "images/2.jpg"]) == [(1, 0), (0, 1), (2, 2)]
+    assert _matched(images, ["images/1.jpg", "2.jpg"]) == [(2, 1)]
+    assert _matched(["1.jpg"], ["a/1.jpg", "b/1.jpg"]) == []
+
+
+def test_a_file_of_tracks_that_the_json_names_is_still_refused_when_wrong(scene):
+    add_model(scene)
+    scene.meta[TRACKS_KEY] = "nothing.npz"
+    scene.rewrite()
+    with pytest.raises(SceneError, match=r"nothing\.npz"):
+        lines_of(scene)
+
+
+@pytest.mark.parametrize("part", ["cameras", "frames", "images", "points3D"])
+@pytest.mark.parametrize("share", [0.0, 0.25, 0.6, 0.95])
+def test_files_of_an_interrupted_copy_are_refused_before_colmap_reads_them(scene, part, share):
+    add_model(scene)
+    path = scene.path / f"colmap/sparse/0/{part}.bin"
+    check_complete(path.parent)  # complete ones are not refused
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(SceneError, match=rf"{part}\.bin ends before"):
+        check_complete(path.parent)
+
+
+def test_a_cut_off_model_is_not_used_and_a_warning_names_the_file(scene, capsys):
+    add_model(scene)
+    path = scene.path / "colmap/sparse/0/points3D.bin"
+    path.write_bytes(path.read_bytes()[:-1])
+    assert lines_of(scene).metadata["sightlines"] is None
+    assert "points3D.bin ends before its last entry" in " ".join(capsys.readouterr().out.split())

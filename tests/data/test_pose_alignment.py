@@ -1,0 +1,60 @@
+"""The similarity between two worlds of the same cameras: exact, also on a line and with wrong poses among them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from thermoxels_ns.data.pose_alignment import align_poses
+
+TURN = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
+SCALE, SHIFT = 0.37, np.array([5.0, -2.0, 0.3])
+
+
+def worlds(count: int, on_a_line: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Cameras in two worlds."""
+    random = np.random.default_rng(count)
+    source = np.tile(np.eye(4), (count, 1, 1))
+    source[:, :3, :3] = Rotation.from_rotvec(2.0 * random.normal(size=(count, 3))).as_matrix()
+    source[:, :3, 3] = random.normal(size=(count, 3))
+    if on_a_line:
+        source[:, :3, 3] = np.linspace(0, 1, count)[:, None] * [1.0, 2.0, 3.0]
+    target = source.copy()
+    target[:, :3, :3] = TURN @ source[:, :3, :3]
+    target[:, :3, 3] = SCALE * source[:, :3, 3] @ TURN.T + SHIFT
+    return source, target
+
+
+@pytest.mark.parametrize("count, on_a_line", [(3, False), (3, True), (40, False), (40, True)])
+def test_the_similarity_is_found_also_of_cameras_on_one_line(count, on_a_line):
+    found = align_poses(*worlds(count, on_a_line))
+    assert found is not None
+    assert found.rotation == pytest.approx(TURN, abs=1e-9)
+    assert found.scale == pytest.approx(SCALE)
+    assert found.points(np.array([[1.0, 2.0, 3.0]]))[0] == pytest.approx(SCALE * TURN @ [1.0, 2.0, 3.0] + SHIFT)
+
+
+def test_wrong_poses_among_them_move_nothing():
+    source, target = worlds(20)
+    target[:6, :3, 3] += [3.0, 0.0, 0.0]
+    target[3:8, :3, :3] = np.eye(3)
+    found = align_poses(source, target)
+    assert found is not None
+    assert found.rotation == pytest.approx(TURN, abs=1e-9)
+    assert found.translation == pytest.approx(SHIFT, abs=1e-9)
+
+
+def test_rotations_alone_do_not_make_a_mirror():
+    source, target = worlds(10)
+    target[:, 0] *= -1.0
+    found = align_poses(source, target)
+    assert found is None or np.linalg.det(found.rotation) == pytest.approx(1.0)
+
+
+def test_too_few_cameras_or_all_at_one_place_have_no_similarity():
+    source, target = worlds(2)
+    assert align_poses(source, target) is None
+    source, target = worlds(5)
+    source[:, :3, 3] = [1.0, 2.0, 3.0]
+    assert align_poses(source, target) is None

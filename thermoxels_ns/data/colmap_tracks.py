@@ -1,0 +1,205 @@
+"""Tracks out of a COLMAP model beside a scene whose poses are given."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from thermoxels_ns.data.colmap_files import check_complete
+from thermoxels_ns.data.folder_walls import path_inside
+from thermoxels_ns.data.pose_alignment import align_poses
+from thermoxels_ns.data.scene_file import Frame, SceneFile
+from thermoxels_ns.data.sparse_tracks import SparseTracks
+from thermoxels_ns.errors import SceneError
+from thermoxels_ns.sightlines import FloatArray, IntArray
+
+COLMAP_FOLDERS = ("colmap/sparse/0", "colmap/sparse", "colmap", "sparse/0", "sparse")
+"""Where a model may lie in a scene's folder, the first that does counts."""
+MOST_OFF_PX = 2.0
+"""Median distance in a photograph between points as the model's pose and as the given one sees them, above which the
+photograph is left out."""
+LEAST_AGREEING = 0.7
+"""Share of the photographs in common whose poses must agree; with fewer the model belongs to other poses."""
+_PARTS = ("cameras", "images", "points3D")
+_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def read_colmap_tracks(scene: SceneFile) -> SparseTracks | None:
+    """Read the tracks of the COLMAP model in a scene's folder and bring them to the scene's poses.
+
+    Photographs are matched by name. The similarity between the model's cameras and the json's poses moves the points;
+    what it leaves is measured in the photographs: how far apart a point is seen from the model's pose and from the
+    given one. A model that does not agree is not used, and a warning says why.
+
+    Args:
+        scene: The scene; its `Frame.name` become the tracks' names.
+
+    Returns:
+        Tracks of the photographs that agree, in input coordinates; None without a model, or with one that cannot be
+        used.
+    """
+    folder = _model_folder(scene.folder)
+    if folder is None:
+        return None
+    try:
+        return _tracks(scene, folder)
+    except SceneError as problem:
+        warn_unused(folder, str(problem))
+        return None
+
+
+def warn_unused(folder: str, why: str) -> None:
+    """Say that a COLMAP model is not used for tracks."""
+    CONSOLE.print(
+        f"Tracks: the COLMAP model in {folder} is not used, training does without: {why} "
+        "(--tracks off goes without and without this warning)",
+        style="bold yellow",
+    )
+
+
+def _model_folder(folder: Path) -> str | None:
+    for name in COLMAP_FOLDERS:
+        if all(any((folder / name / f"{part}.{suffix}").is_file() for suffix in ("bin", "txt")) for part in _PARTS):
+            return name
+    return None
+
+
+def _tracks(scene: SceneFile, folder: str) -> SparseTracks:
+    model = _read(scene.folder, folder)
+    images = {number: image for number, image in model.images.items() if image.has_pose}
+    numbers = list(images)
+    pairs = _matched([image.name for image in images.values()], [frame.name for frame in scene.frames])
+    if not pairs:
+        names = (next((image.name for image in images.values()), "none"), scene.frames[0].name)
+        raise SceneError(
+            f"it has no photograph of this scene, or several of one name (such as {names[0]} there and {names[1]} here)"
+        )
+    frames = [scene.frames[frame] for _, frame in pairs]
+    place = {numbers[image]: number for number, (image, _) in enumerate(pairs)}
+    source = np.stack([_pose(images[number]) for number in place])
+    target = np.stack([frame.pose for frame in frames])
+    found = align_poses(source, target)
+    if found is None:
+        raise SceneError(f"{len(frames)} photographs in common, too few or all at one place: no common world")
+    points, error_px, frame, point = _points(model, place)
+    widths = [f.intrinsics.width / model.cameras[images[n].camera_id].width for n, f in zip(place, frames)]
+    error_px = error_px * float(np.median(widths))
+    moved = found.points(points)
+    off_px = _off_px(frames, (source, points), (target, moved), frame, point)
+    agree = off_px <= MOST_OFF_PX  # NaN, of a photograph that sees nothing, is False
+    seeing = int(np.isfinite(off_px).sum())
+    if seeing == 0:
+        raise SceneError("it has no points that photographs of this scene see")
+    if agree.sum() < max(3, LEAST_AGREEING * seeing):
+        raise SceneError(
+            f"its poses are others than those of {scene.json_path.name}: {int(agree.sum())} of {seeing} photographs "
+            f"agree within {MOST_OFF_PX:g} pixels (median {np.nanmedian(off_px):.1f})"
+        )
+    CONSOLE.print(
+        f"Tracks of the COLMAP model in {folder}: {len(points):,} points, {int(agree.sum())} of {len(scene.frames)} "
+        f"photographs, whose poses agree within {np.median(off_px[agree]):.2f} pixels (median)."
+    )
+    strays = [one.name for one, good, off in zip(frames, agree, off_px) if not good and np.isfinite(off)]
+    if strays:
+        CONSOLE.print(f"Tracks: other poses than COLMAP's, left out: {', '.join(strays)}", style="bold yellow")
+    kept = agree[frame]
+    return SparseTracks(moved, error_px, tuple(one.name for one in frames), frame[kept], point[kept])
+
+
+def _read(root: Path, folder: str) -> Any:
+    import pycolmap  # slow to import and only needed here
+
+    for path in sorted((root / folder).iterdir()):
+        if path.suffix in (".bin", ".txt"):
+            path_inside(root, f"{folder}/{path.name}", f"COLMAP model {folder}")
+    check_complete(root / folder)
+    try:
+        model = pycolmap.Reconstruction(str(root / folder))
+    except Exception as problem:  # pycolmap raises RuntimeError, ValueError, IndexError by version
+        raise SceneError(f"it cannot be read, {(str(problem).strip() or repr(problem)).splitlines()[-1]}") from problem
+    if any(point.error < 0.0 for point in model.points3D.values()):  # not computed
+        model.update_point_3d_errors()
+    return model
+
+
+def _pose(image: Any) -> FloatArray:
+    """Camera to world, OpenGL axes, shape (4, 4)."""
+    pose = np.eye(4)
+    pose[:3] = image.cam_from_world().inverse().matrix()
+    return pose @ _OPENGL_FROM_OPENCV
+
+
+def _matched(images: Sequence[str], frames: Sequence[str]) -> list[tuple[int, int]]:
+    """Numbers of image and frame that are the same photograph.
+
+    Same name of the file; where several have it, the one whose folders too are those of the frame's name.
+    """
+    of_name: dict[str, list[int]] = {}
+    for number, image in enumerate(images):
+        of_name.setdefault(PurePosixPath(image).name, []).append(number)
+    shared: dict[str, int] = {}
+    for frame in frames:
+        shared[PurePosixPath(frame).name] = shared.get(PurePosixPath(frame).name, 0) + 1
+    pairs = []
+    for number, frame in enumerate(frames):
+        name = PurePosixPath(frame).name
+        found = of_name.get(name, [])
+        if len(found) > 1 or shared[name] > 1:
+            found = [one for one in found if frame == images[one] or frame.endswith(f"/{images[one]}")]
+        if len(found) == 1:
+            pairs.append((found[0], number))
+    once = {image: 0 for image, _ in pairs}
+    for image, _ in pairs:
+        once[image] += 1
+    return [pair for pair in pairs if once[pair[0]] == 1]
+
+
+def _points(model: Any, place: dict[int, int]) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
+    """Points (n, 3), their errors (n,) [pixels], and who sees which: two arrays (s,), without repetitions."""
+    found = model.points3D.values()
+    points = np.array([point.xyz for point in found], dtype=np.float64).reshape(-1, 3)
+    error = np.array([point.error for point in found], dtype=np.float64)
+    images = [[element.image_id for element in point.track.elements] for point in found]
+    point = np.repeat(np.arange(len(images)), [len(seen) for seen in images])
+    image = np.array([number for seen in images for number in seen], dtype=np.int64)
+    of_image = np.full(max([*place, *image.tolist()], default=0) + 1, -1, dtype=np.int64)
+    of_image[list(place)] = list(place.values())
+    frame = of_image[image]
+    known = frame >= 0
+    # A track may hold two features of one photograph.
+    pairs = np.unique(point[known] * max(1, len(place)) + frame[known])
+    return points, error, pairs % max(1, len(place)), pairs // max(1, len(place))
+
+
+def _off_px(
+    frames: Sequence[Frame],
+    model: tuple[FloatArray, FloatArray],
+    given: tuple[FloatArray, FloatArray],
+    frame: IntArray,
+    point: IntArray,
+) -> FloatArray:
+    """Median angle, times the focal length, between a frame's points as its two poses see them, shape (frames,).
+
+    Args:
+        frames: The frames.
+        model: Poses (frames, 4, 4) and points (n, 3) in COLMAP's world.
+        given: The same in the json's world.
+        frame: Frame of each sighting.
+        point: Point of each sighting.
+    """
+    seen = []
+    for poses, points in (model, given):
+        line = np.einsum("sji,sj->si", poses[frame, :3, :3], points[point] - poses[frame, :3, 3])
+        seen.append(line / np.maximum(np.linalg.norm(line, axis=1), 1e-300)[:, None])
+    focal = np.array([min(one.intrinsics.fx, one.intrinsics.fy) for one in frames])
+    off = np.linalg.norm(seen[0] - seen[1], axis=1) * focal[frame]
+    order = np.lexsort((off, frame))
+    counts = np.bincount(frame, minlength=len(frames))
+    middle = np.cumsum(counts) - counts + counts // 2
+    median = np.full(len(frames), np.nan)
+    median[counts > 0] = off[order][middle[counts > 0]]
+    return median
