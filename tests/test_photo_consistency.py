@@ -14,7 +14,16 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from tests.short_training import train_with_optimizers
 from thermoxels_ns.data.synthetic import make_scene, write_scene
 from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.photo_consistency import Photographs, density_from_photographs, deviations, exposures
+from thermoxels_ns.photo_consistency import (
+    Photographs,
+    _colours,
+    _sample,
+    _textured,
+    density_from_photographs,
+    deviations,
+    exposures,
+)
+from thermoxels_ns.photo_kernels import _median
 from thermoxels_ns.photo_start import LONGEST_SIDE, read_photographs
 from thermoxels_ns.threads import set_num_threads
 
@@ -86,6 +95,47 @@ def test_exposures_of_photographs_that_agree():
     assert exposures(colours.astype(np.float32)) == pytest.approx(gains, abs=0.01)
     alike = colours / np.exp(gains)[:, None]
     assert np.array_equal(exposures(alike.astype(np.float32)), np.zeros(7))
+
+
+def test_plain_surroundings_are_not_taken_for_exposures():
+    """Before a wall without texture, brighter the further a photograph was taken to one side, all air agrees."""
+    rng = np.random.default_rng(4)
+    gains = rng.normal(0.0, 0.2, len(EYES))
+    gains -= gains.mean()
+    whole = photographs(gains=np.exp(gains))
+    column, _ = np.meshgrid(np.arange(SIZE), np.arange(SIZE))
+    for k, first in enumerate(whole.firsts):
+        x = EYES[k][0] + (column + 0.5 - SIZE / 2) / FOCAL * (EYES[k][2] - PLANE)
+        surroundings = (np.abs(x) > 0.35).reshape(-1)
+        seen = 0.45 * np.exp(gains[k] + 0.35 * EYES[k][0])
+        whole.colours[first : first + SIZE * SIZE][surroundings] = seen
+    points = _sample(LATTICE)
+    seen, textured = _colours(points, whole), _colours(points, _textured(whole))
+    wrong, found = exposures(seen), exposures(seen, textured)
+    assert np.abs(found - gains).max() < 0.05, found - gains
+    assert np.abs(wrong - gains).max() > 0.2, wrong - gains
+
+
+def test_what_is_textured_does_not_depend_on_exposure():
+    gains = np.exp(np.random.default_rng(3).normal(0.0, 0.12, len(EYES)))
+    shown = [np.isfinite(_textured(photographs(gains=g)).colours).all(1) for g in (None, gains)]
+    assert np.mean(shown[0]) == pytest.approx(0.3, abs=0.01) and np.mean(shown[0] == shown[1]) > 0.99
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 8, 31, 32])
+def test_median_of_the_kernels_is_that_of_numpy(count):
+    rng = np.random.default_rng(count)
+    for values in (rng.normal(size=count), rng.integers(0, 3, count), np.zeros(count)):
+        row = np.append(values, -9.0).astype(np.float32)
+        before = row.copy()
+        assert _median(row, count) == np.median(row[:count]) and np.array_equal(row, before)
+
+
+def test_photographs_that_are_left_out_are_not_read():
+    frames = Frames(60, 40, None)
+    some = read_photographs(frames, left_out=range(4, 40, 8))
+    assert some is not None and len(some) == 32 and not {4.0, 12.0, 20.0, 28.0, 36.0} & set(some.centres[:, 0])
+    assert read_photographs(frames, left_out=range(40)) is None
 
 
 def test_deviation_is_that_of_numpy():

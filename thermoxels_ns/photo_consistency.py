@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
@@ -43,10 +44,16 @@ _FEWEST_POINTS = 25
 _SURFACE_SHARE = 0.01
 """Share of the points at which agreement is measured."""
 _CLEARLY_BETTER = 0.5
-"""Share of the deviation that may remain for exposures to be believed: what lies behind the scene and changes with the
-direction looks like an exposure too, and lowers it a little."""
+"""Share of the deviation that may remain for exposures to be believed."""
 _USABLE = (0.02, 0.98)
 """Channel values between which brightness follows exposure."""
+_TEXTURED_SHARE = 0.3
+"""Share of the pixels, those with most texture, on which exposures are estimated: plain surroundings whose brightness
+changes with the direction agree at every point once each photograph has the exposure that explains them."""
+_LEAST_TEXTURE = 0.01
+"""Standard deviation of the logarithm of brightness below which there is none, however little others have."""
+_TEXTURE_PIXELS = 5
+"""Side of the square of pixels whose brightness varies where there is texture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +114,7 @@ def density_from_photographs(lattice: Lattice, photographs: Photographs) -> Dens
     angle = _parallax_deg(points[enough], known[enough], photographs.centres)
     if angle < LEAST_PARALLAX_DEG:
         return DensityStart(None, f"the photographs look from one place ({angle:.1f} degrees apart)")
-    exposure = exposures(seen[enough])
+    exposure = exposures(seen[enough], _colours(points[enough], _textured(photographs)))
     gain = _log_gain(lattice, _without_exposure(photographs, exposure))
     if not np.any(gain > 0):
         return DensityStart(None, "nowhere do photographs agree more than around")
@@ -119,7 +126,9 @@ def density_from_photographs(lattice: Lattice, photographs: Photographs) -> Dens
     )
 
 
-def exposures(seen: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+def exposures(
+    seen: npt.NDArray[np.float32], textured: npt.NDArray[np.float32] | None = None
+) -> npt.NDArray[np.float64]:
     """Estimate the logarithm of each photograph's exposure, its mean over photographs 0, shape (photographs,).
 
     Photographs are compared with the median of all at the points where they agree best, which are sought anew with each
@@ -127,10 +136,26 @@ def exposures(seen: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
 
     Args:
         seen: Colours of points in photographs, NaN where one does not show a point, shape (points, photographs, 3).
+        textured: The same, NaN also where a photograph shows no texture: what the estimate is made from. None: `seen`.
     """
+    usable, found = _usable(seen), np.zeros(seen.shape[1])
+    if not usable.any():
+        return found
+    found = _estimate(seen if textured is None else textured)
+    rows = usable.any(1)
+    before, after = (_agreement(seen[rows] * np.exp(-e)[:, None]) for e in (np.zeros_like(found), found))
+    return found if after < _CLEARLY_BETTER * before else np.zeros_like(found)
+
+
+def _usable(seen: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+    """Where brightness follows exposure in enough photographs, shape (points, photographs)."""
     usable = ((seen > _USABLE[0]) & (seen < _USABLE[1])).all(-1)
-    usable &= (usable.sum(1) >= FEWEST_VIEWS)[:, None]
-    found = np.zeros(seen.shape[1])
+    return usable & (usable.sum(1) >= FEWEST_VIEWS)[:, None]
+
+
+def _estimate(seen: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+    """The exposures with which photographs agree best; 0 for one that shows too few points."""
+    usable, found = _usable(seen), np.zeros(seen.shape[1])
     rows = usable.any(1)
     if not rows.any():
         return found
@@ -146,15 +171,26 @@ def exposures(seen: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
         enough = np.isfinite(differences).sum(0) >= _FEWEST_POINTS
         found += np.where(enough, np.nan_to_num(_median(differences, 0)), 0.0)
         found -= np.median(found)
-    found -= found.mean()
-    before, after = (_agreement(seen[rows] * np.exp(-e)[:, None]) for e in (np.zeros_like(found), found))
-    return found if after < _CLEARLY_BETTER * before else np.zeros_like(found)
+    return found - found.mean()
 
 
 def _agreement(seen: npt.NDArray[np.float64]) -> float:
     """Deviation of the colours at the points where photographs agree best."""
     apart = np.abs(seen - _median(seen, 1)[:, None]).sum(-1)
     return float(np.quantile(_median(apart, 1), _SURFACE_SHARE))
+
+
+def _textured(photographs: Photographs) -> Photographs:
+    """The same photographs, NaN but for the share of pixels with most texture."""
+    variations = []
+    for (width, height), first in zip(photographs.sizes, photographs.firsts):
+        picture = photographs.colours[first : first + width * height].reshape(height, width, 3)
+        brightness = np.nan_to_num(np.log(np.maximum(picture, _USABLE[0])).mean(-1))
+        mean, square = (cv2.blur(v, (_TEXTURE_PIXELS, _TEXTURE_PIXELS)) for v in (brightness, brightness**2))
+        variations.append((square - mean * mean).reshape(-1))
+    variation = np.concatenate(variations)
+    plain = variation < max(np.quantile(variation, 1.0 - _TEXTURED_SHARE), _LEAST_TEXTURE**2)
+    return replace(photographs, colours=np.where(plain[:, None], np.float32(np.nan), photographs.colours))
 
 
 def _without_exposure(photographs: Photographs, exposure: npt.NDArray[np.float64]) -> Photographs:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -65,36 +66,44 @@ def _raw(density: torch.Tensor, activation: DensityActivation) -> torch.Tensor:
     return torch.log(density) if activation == "exp" else density + torch.log(-torch.expm1(-density))
 
 
-def find_start(model: ThermoxelsModel, datamanager: Any) -> DensityStart:
-    """Ask the photographs, for the lattice on which a start from them begins, and say what was found."""
+def find_start(model: ThermoxelsModel, datamanager: Any, left_out: Collection[int] = ()) -> DensityStart:
+    """Ask the photographs, for the lattice on which a start from them begins, and say what was found.
+
+    Args:
+        model: The untrained model.
+        datamanager: Has the photographs.
+        left_out: Numbers of training photographs that are not asked.
+    """
     begin = time.perf_counter()
-    found = _find(model, datamanager)
+    found = _find(model, datamanager, left_out)
     if found.log_gain is not None:
         CONSOLE.log(f"photographs: {found.report}; {time.perf_counter() - begin:.1f} s")
     return found
 
 
-def _find(model: ThermoxelsModel, datamanager: Any) -> DensityStart:
+def _find(model: ThermoxelsModel, datamanager: Any, left_out: Collection[int]) -> DensityStart:
     if model.grid.sh is None or datamanager.config.streams == "thermal":
         return DensityStart(None, "no photographs train")
-    photographs = read_photographs(datamanager.train_dataset, model.config.near_plane * model.unit)
+    photographs = read_photographs(datamanager.train_dataset, model.config.near_plane * model.unit, left_out)
     if photographs is None:
         return DensityStart(None, "no photograph is one of a perspective camera")
     return density_from_photographs(model.grid.lattice.refined(model.config.skipped_factor()), photographs)
 
 
-def read_photographs(dataset: Any, near: float = 0.0) -> Photographs | None:
+def read_photographs(dataset: Any, near: float = 0.0, left_out: Collection[int] = ()) -> Photographs | None:
     """Read a selection of photographs as small pinhole pictures.
 
     Args:
         dataset: A `ThermalDataset` (any with cameras, get_image_uint8 and get_mask).
         near: Depth up to which they show nothing, [world units].
+        left_out: Numbers of photographs that are not read.
 
     Returns:
         The photographs of perspective cameras; None if there are none.
     """
     cameras = dataset.cameras.to("cpu")
     usable = np.flatnonzero(cameras.camera_type.numpy().reshape(-1) == CameraType.PERSPECTIVE.value)
+    usable = usable[~np.isin(usable, list(left_out))]
     if len(usable) > MOST_PHOTOGRAPHS:
         usable = usable[np.linspace(0, len(usable) - 1, MOST_PHOTOGRAPHS).round().astype(int)]
     if not len(usable):
@@ -113,7 +122,8 @@ def read_photographs(dataset: Any, near: float = 0.0) -> Photographs | None:
 
 def _pinhole(dataset: Any, cameras: Cameras, index: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float64]]:
     """A photograph averaged down and without distortion, shape (h, w, 3), and world -> homogeneous pixels, (3, 4)."""
-    picture = dataset.get_image_uint8(index).numpy().astype(np.float32) / 255.0
+    picture = dataset.get_image_uint8(index).numpy().astype(np.float32)
+    picture /= np.float32(255.0)
     mask = dataset.get_mask(index)
     shown = np.ones(picture.shape[:2], np.float32) if mask is None else mask.numpy()[..., 0].astype(np.float32)
     height, width = picture.shape[:2]
