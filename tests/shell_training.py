@@ -36,11 +36,12 @@ def keep_shell(grid: VoxelGrid, share: float):
     return prune(grid, distance <= np.partition(distance, int(share * shape.prod()) - 1)[int(share * shape.prod()) - 1])
 
 
-def main(resolution: int, share: float, start: int = 64) -> None:
+def main(resolution: int, share: float, sh_degree: int = 2, start: int = 64) -> None:
     """Refine to the resolution as a training does, with optimiser state, and take a step there."""
     torch.set_num_threads(1)
     imports = resident("VmRSS")
-    grid = VoxelGrid(Lattice.covering((-1, -1, -1), (1, 1, 1), start), activation="exp", start_density=1.0)
+    lattice = Lattice.covering((-1, -1, -1), (1, 1, 1), start)
+    grid = VoxelGrid(lattice, sh_degree, activation="exp", start_density=1.0)
     optimizers = {name: RowAdam([p], lr=1e-3) for name, p in grid.row_parameters().items()}
 
     def change(how) -> None:

@@ -13,6 +13,7 @@ from thermoxels_ns.errors import MemoryBudgetError, SceneError, ThermoxelsError
 from thermoxels_ns.field.refine import prune
 from thermoxels_ns.model import ThermoxelsModel
 from thermoxels_ns.model_config import LOSS_RECIPES, ThermoxelsModelConfig
+from thermoxels_ns.sightlines import Sightlines
 from thermoxels_ns.snapshot import Views
 from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.units import TemperatureRange
@@ -20,9 +21,12 @@ from thermoxels_ns.units import TemperatureRange
 BOX = SceneBox(aabb=torch.tensor([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]]))
 
 
-def make(**options) -> ThermoxelsModel:
+LINES = Sightlines(np.array([[0.0, 0.0, 3.0]]), np.array([0]), np.array([[0.1, 0.2, 0.0]]), np.array([0.01]))
+
+
+def make(sightlines: Sightlines | None = None, **options) -> ThermoxelsModel:
     config = ThermoxelsModelConfig(**{"resolutions": (8,), "refine_at": (), "prune_at": (), **options})
-    metadata = {"temperature_range": TemperatureRange(10.0, 30.0)}
+    metadata = {"temperature_range": TemperatureRange(10.0, 30.0), "sightlines": sightlines}
     return config.setup(scene_box=BOX, num_train_data=4, metadata=metadata)
 
 
@@ -55,16 +59,35 @@ def test_outputs_of_an_image():
 
 @pytest.mark.parametrize("recipe", list(LOSS_RECIPES))
 def test_only_terms_of_non_zero_weight_are_computed(recipe):
-    model = make(recipe=recipe, distortion_ramp=(0, 1)).train()
+    model = make(LINES, recipe=recipe, distortion_ramp=(0, 1)).train()
     model.update_to_step(10)
     terms = set(model.get_loss_dict(model(rays()), targets()))
     weights = LOSS_RECIPES[recipe]
-    # The scene has no tracks, for which their term has nothing to say.
-    expected = {f"{name}_loss" for name in vars(weights) if getattr(weights, name) and name != "tracks"}
-    assert terms == expected
+    assert terms == {f"{name}_loss" for name in vars(weights) if getattr(weights, name)}
     off = dict.fromkeys(vars(weights), 0.0) | {"rgb": 1.0}
-    model = make(recipe=recipe, loss_overrides=off).train()
+    model = make(LINES, recipe=recipe, loss_overrides=off).train()
     assert set(model.get_loss_dict(model(rays()), targets())) == {"rgb_loss"}
+
+
+@pytest.mark.parametrize("sightlines, options", [(None, {}), (LINES, {"sh_degree": None})])
+def test_without_tracks_or_photographs_their_term_has_nothing_to_say(sightlines, options):
+    model = make(sightlines, **options).train()
+    outputs = model(rays(stream=THERMAL_STREAM))
+    assert "tracks_loss" not in model.get_loss_dict(outputs, targets())
+    again = make(LINES).train()
+    assert "tracks_loss" in again.get_loss_dict(again(rays(stream=THERMAL_STREAM)), targets())
+
+
+def test_lines_of_sight_move_density_alone_and_weigh_as_asked():
+    values = []
+    for weight in (0.05, 0.1):
+        model = make(LINES, loss_overrides={"tracks": weight}).train()
+        term = model.get_loss_dict(model(rays()), targets())["tracks_loss"]
+        term.backward()
+        assert model.grid.density.grad is not None and bool(model.grid.density.grad.to_dense().any())
+        assert model.grid.temperature.grad is None or not bool(model.grid.temperature.grad.to_dense().any())
+        values.append(float(term.detach()))
+    assert values[1] == pytest.approx(2.0 * values[0]) and values[0] > 0.0
 
 
 def test_distortion_grows_over_its_ramp():

@@ -175,6 +175,26 @@ def test_rounded_numbers_of_updates_count_as_what_they_were():
     torch.testing.assert_close(moved[0], moved[2], rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.parametrize("late", [1, 4095, 4096, 4097, 9999])
+@pytest.mark.parametrize("same", [False, True])
+def test_rows_out_of_order_are_found_wherever_they_are(late, same):
+    """A number smaller than the one before, or the same, in a long list; values are put in order and added up."""
+    listed = torch.arange(1, 10_001)
+    listed[late] = late if same else 0
+    values = torch.arange(10_000.0)[:, None]
+    rows, sums = touched_rows(torch.sparse_coo_tensor(listed[None], values, (10_002, 1)))
+    assert len(rows) == 10_000 - same and bool((rows[1:] > rows[:-1]).all())
+    assert torch.equal(
+        torch.zeros(10_002, 1).index_add(0, rows, sums), torch.zeros(10_002, 1).index_add(0, listed, values)
+    )
+
+
+def test_rows_in_order_are_taken_as_they_are():
+    listed, values = torch.arange(0, 20_000, 2), torch.ones(10_000, 1)
+    rows, given = touched_rows(torch.sparse_coo_tensor(listed[None], values, (20_000, 1)))
+    assert torch.equal(rows, listed) and given.data_ptr() == values.data_ptr()
+
+
 def test_duplicate_and_unsorted_rows_are_summed():
     rows, values = touched_rows(torch.sparse_coo_tensor([[4, 1, 4]], torch.tensor([[1.0], [2.0], [3.0]]), (6, 1)))
     assert rows.tolist() == [1, 4] and values.tolist() == [[2.0], [4.0]]

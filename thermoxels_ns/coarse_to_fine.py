@@ -1,4 +1,4 @@
-"""Training callbacks: start, refine, prune, and decide what stands behind the box."""
+"""Training callbacks: start, refine, prune, widen colour, and decide what stands behind the box."""
 
 from __future__ import annotations
 
@@ -108,6 +108,16 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             CONSOLE.log(f"step {step}: lattice refined to {' x '.join(map(str, model.grid.lattice.cell_shape))} voxels")
             carve(step)
 
+    def widen(step: int) -> None:
+        """Store colour for all directions from the step on at which it depends on them, also in a resumed training."""
+        assert attributes.optimizers is not None
+        old, change = model.grid.sh, model.widen_colour()
+        if old is not None and change is not None:
+            optimizer: Any = attributes.optimizers.optimizers["sh"]
+            assert model.grid.sh is not None
+            optimizer.change_columns(old, model.grid.sh, change)
+            attributes.optimizers.parameters["sh"] = [model.grid.sh]
+
     return [
         TrainingCallback(before, count),
         *(
@@ -116,6 +126,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             else [TrainingCallback(before, carve, iters=(0,))]
         ),
         TrainingCallback(before, change_lattice, iters=tuple(sorted(steps | decisions))),
+        TrainingCallback(before, widen),
     ]
 
 

@@ -27,7 +27,10 @@ def thermal_loss(
 
 
 def total_variation(
-    rows: Float[Tensor, "rows c"], corners: Int64[Tensor, "voxels 8"], smallest: float = 1e-10
+    rows: Float[Tensor, "rows c"],
+    corners: Int64[Tensor, "voxels 8"],
+    smallest: float = 1e-10,
+    channels: int | None = None,
 ) -> Float[Tensor, ""]:
     """Mean over voxels and channels of sqrt(dx^2 + dy^2 + dz^2), differences from corner 0 (Plenoxels, eq. 4).
 
@@ -35,10 +38,14 @@ def total_variation(
         rows: Corner values.
         corners: Rows of the corners of the voxels to look at, in the order of `lattice.CORNER_OFFSETS`.
         smallest: Added under the root so that its gradient is finite where the field is flat.
+        channels: Channels of which the mean is taken, those without a column being 0; None: the columns.
     """
+    columns = rows.shape[1]
+    channels = columns if channels is None else channels
     here = rows[corners[:, 0]]
     dz, dy, dx = rows[corners[:, 1]] - here, rows[corners[:, 2]] - here, rows[corners[:, 4]] - here
-    return torch.mean(torch.sqrt(dx * dx + dy * dy + dz * dz + smallest))
+    total = torch.sum(torch.sqrt(dx * dx + dy * dy + dz * dz + smallest)) / (len(corners) * channels)
+    return total + (1.0 - columns / channels) * math.sqrt(smallest)
 
 
 def random_block(voxels: int, share: float, generator: torch.Generator) -> tuple[int, int]:

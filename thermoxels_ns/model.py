@@ -18,11 +18,12 @@ from torch import Tensor, nn
 from thermoxels_ns import losses
 from thermoxels_ns.coarse_to_fine import coarse_to_fine_callbacks
 from thermoxels_ns.errors import SceneError, explain
-from thermoxels_ns.field.background import SkyTemperature, SphereImage
+from thermoxels_ns.field.background import SkyTemperature, SphereImage, seen_behind
 from thermoxels_ns.field.field import VoxelField
 from thermoxels_ns.field.harmonics import harmonics, num_coefficients
 from thermoxels_ns.field.memory import check_memory
 from thermoxels_ns.field.refine import RowChange, refine
+from thermoxels_ns.field.widen import ColumnChange, widen_colour
 from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.metrics import lpips, lpips_available, psnr, ssim, thermal_metrics
 from thermoxels_ns.model_config import ThermoxelsModelConfig
@@ -70,13 +71,12 @@ class ThermoxelsModel(Model):
         # Densities, distances and learning rates are made for a box 2 long; other sizes are converted.
         self.unit = float((box[1] - box[0]).max()) / 2.0
         lattice = Lattice.covering(box[0], box[1], config.resolutions[0])
-        channels = 1 + num_coefficients(config.temperature_degree)
-        channels += 0 if config.sh_degree is None else 3 * num_coefficients(config.sh_degree)
-        need = check_memory(lattice, int(np.prod(lattice.cell_shape)), channels, config.memory_budget_gb)
+        channels, budget = config.row_channels(config.resolutions[0]), config.memory_budget_gb
+        need = check_memory(lattice, int(np.prod(lattice.cell_shape)), channels, budget)
         CONSOLE.log(f"memory at the start: {need}")
         self.field = VoxelField(
             lattice,
-            config.sh_degree,
+            config.first_sh_degree(),
             config.temperature_degree,
             config.start_density / self.unit,
             config.density_activation,
@@ -142,11 +142,19 @@ class ThermoxelsModel(Model):
             MemoryBudgetError: The next lattice needs more than `memory_budget_gb`.
         """
         lattice = self.grid.lattice.refined(factor)
-        voxels, channels = len(self.grid.voxels) * factor**3, self._row_channels()
+        voxels, channels = len(self.grid.voxels) * factor**3, self.config.row_channels(max(lattice.cell_shape))
         CONSOLE.log(f"memory: {check_memory(lattice, voxels, channels, self.config.memory_budget_gb)}")
 
-    def _row_channels(self) -> int:
-        return sum(parameter.shape[1] for parameter in self.grid.row_parameters().values())
+    def widen_colour(self) -> ColumnChange | None:
+        """Store all harmonics of colour once it depends on the direction.
+
+        Returns:
+            How values of its columns change; None where they stay.
+        """
+        degree, stored = self.config.sh_degree, self.grid.sh_degree
+        if degree is None or stored is None or stored >= degree or self._active_sh_degree() != degree:
+            return None
+        return widen_colour(self.grid, degree)
 
     def update_to_step(self, step: int) -> None:
         """Tell the model which step it is at (schedules, random blocks)."""
@@ -181,6 +189,7 @@ class ThermoxelsModel(Model):
             self._options(),
             distortion_scale=2.0 * self.unit if self._distortion_weight() > 0 else None,
             sparsity=weights.sparsity > 0,
+            colour_channels=None if self.config.sh_degree is None else 3 * num_coefficients(self.config.sh_degree),
             variation={
                 name: losses.random_block(len(grid.voxels), self.config.tv_share, generator)
                 for name in grid.row_parameters()
@@ -201,12 +210,10 @@ class ThermoxelsModel(Model):
         """Colour and temperature of rays with what stands behind the box, and what they were made of."""
         seen = render_rays(self.grid, request, options, self.config.backend)
         rgb_on, thermal_on = self.backdrop_on.tolist()
-        directions = request.directions
-        backdrop = self.background_rgb(directions) if self.background_rgb is not None and rgb_on else None
-        sky = self.background_thermal
+        backdrop, sky = self.background_rgb, self.background_thermal
         rgb, thermal = seen.with_background(
-            backdrop,
-            sky(directions) if sky is not None and thermal_on else None,
+            seen_behind(backdrop, request.directions, request.rgb_rays) if backdrop is not None and rgb_on else None,
+            seen_behind(sky, request.directions, request.thermal_rays) if sky is not None and thermal_on else None,
             request,
             options.thermal_moves_density,
         )
@@ -262,27 +269,27 @@ class ThermoxelsModel(Model):
     ) -> dict[str, Tensor]:
         """The weighted loss terms; those of weight 0 are not computed."""
         weights, terms = self.loss_weights, {}
-        chosen = outputs["rgb_rays"]
-        if weights.rgb and outputs["rgb"] is not None and bool(chosen.any()):
-            terms["rgb_loss"] = weights.rgb * losses.rgb_loss(outputs["rgb"][chosen], batch["image"][chosen])
-        chosen = outputs["thermal_rays"]
-        if weights.thermal and bool(chosen.any()):
-            terms["thermal_loss"] = weights.thermal * losses.thermal_loss(
-                outputs["thermal"][chosen], batch["thermal"][chosen], self.config.thermal_l2_share
-            )
+        (chosen,) = outputs["rgb_rays"].nonzero(as_tuple=True)
+        if weights.rgb and outputs["rgb"] is not None and len(chosen):
+            seen, measured = (values.index_select(0, chosen) for values in (outputs["rgb"], batch["image"]))
+            terms["rgb_loss"] = weights.rgb * losses.rgb_loss(seen, measured)
+        (chosen,) = outputs["thermal_rays"].nonzero(as_tuple=True)
+        if weights.thermal and len(chosen):
+            seen, measured = (values.index_select(0, chosen) for values in (outputs["thermal"], batch["thermal"]))
+            terms["thermal_loss"] = weights.thermal * losses.thermal_loss(seen, measured, self.config.thermal_l2_share)
         if not self.training:
             return terms
-        seen: RayRender = outputs["render"]
-        for name, value in seen.variation.items():
+        render: RayRender = outputs["render"]
+        for name, value in render.variation.items():
             terms[f"tv_{name}_loss"] = getattr(weights, f"tv_{name}") * value
-        if seen.sparsity is not None:
-            terms["sparsity_loss"] = weights.sparsity * seen.sparsity.mean()
+        if render.sparsity is not None:
+            terms["sparsity_loss"] = weights.sparsity * render.sparsity.mean()
         if weights.beta:
-            terms["beta_loss"] = weights.beta * losses.beta_loss(seen.accumulation)
-        if seen.distortion is not None:
-            terms["distortion_loss"] = self._distortion_weight() * seen.distortion.mean()
+            terms["beta_loss"] = weights.beta * losses.beta_loss(render.accumulation)
+        if render.distortion is not None:
+            terms["distortion_loss"] = self._distortion_weight() * render.distortion.mean()
         if weights.tracks and self.track_rays is not None:
-            terms["track_loss"] = weights.tracks * self._track_loss(self.track_rays)
+            terms["tracks_loss"] = weights.tracks * self._track_loss(self.track_rays)
         return terms
 
     def _track_loss(self, rays: TrackRays) -> Tensor:
@@ -302,13 +309,14 @@ class ThermoxelsModel(Model):
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Tensor]:
         """PSNR and temperature error of the batch."""
         metrics = {}
-        chosen = outputs["rgb_rays"]
-        if outputs["rgb"] is not None and bool(chosen.any()):
-            metrics["psnr"] = torch.tensor(psnr(outputs["rgb"][chosen], batch["image"][chosen]))
-        chosen = outputs["thermal_rays"]
-        if bool(chosen.any()):
-            error = (outputs["thermal"][chosen] - batch["thermal"][chosen]).abs().mean()
-            metrics["thermal_mae_c"] = error * self.temperature_range.span_k
+        (chosen,) = outputs["rgb_rays"].nonzero(as_tuple=True)
+        if outputs["rgb"] is not None and len(chosen):
+            seen, measured = (values.index_select(0, chosen) for values in (outputs["rgb"], batch["image"]))
+            metrics["psnr"] = torch.tensor(psnr(seen, measured))
+        (chosen,) = outputs["thermal_rays"].nonzero(as_tuple=True)
+        if len(chosen):
+            seen, measured = (values.index_select(0, chosen) for values in (outputs["thermal"], batch["thermal"]))
+            metrics["thermal_mae_c"] = (seen - measured).abs().mean() * self.temperature_range.span_k
         return metrics
 
     @torch.no_grad()
@@ -389,5 +397,5 @@ class ThermoxelsModel(Model):
         if grid.sh is None or grid.sh_degree is None:
             return None
         constant = harmonics(grid.sh.new_tensor([[0.0, 0.0, 1.0]]), 0)  # the same in all directions
-        mean = grid.sh.view(-1, 3, num_coefficients(grid.sh_degree))[..., 0] * constant
+        mean = grid.sh.view(len(grid.sh), 3, num_coefficients(grid.sh_degree))[..., 0] * constant
         return torch.stack([grid.corner_values(rows, 0.5) for rows in torch.sigmoid(mean).float().unbind(-1)], -1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Literal
@@ -9,6 +10,7 @@ from typing import Literal
 from nerfstudio.models.base_model import ModelConfig
 
 from thermoxels_ns.errors import ThermoxelsError, explain
+from thermoxels_ns.field.harmonics import num_coefficients
 from thermoxels_ns.field.voxel_grid import DensityActivation
 from thermoxels_ns.ray_rendering import Backend
 from thermoxels_ns.schedule import QUALITIES, schedule_for
@@ -98,7 +100,8 @@ class ThermoxelsModelConfig(ModelConfig):
     sh_degree: int | None = 2
     """Degree of the view-dependent colour, 0 to 2. None: no colour (thermal images alone)."""
     view_dependence_from: int = _STANDARD.view_dependence_from
-    """Step from which colour depends on the direction; before, it cannot explain away a surface in the wrong place."""
+    """Step from which colour depends on the direction; before, it cannot explain away a surface in the wrong place, and
+    is stored as one colour per voxel corner."""
     temperature_degree: int = 0
     """Degree of view-dependent temperature; 0 (the paper): surfaces look equally warm from all sides."""
     density_activation: DensityActivation = "exp"
@@ -116,7 +119,8 @@ class ThermoxelsModelConfig(ModelConfig):
     """First steps in which the density stands after a start from photographs, while colours find their values."""
     carve: Literal["auto", "off"] = "auto"
     """Drop voxels that are air because structure from motion saw points through them. auto: where the scene has tracks
-    (tracks_file_path in its json, as thermoxels capture writes it), at the start and after every refinement."""
+    (of thermoxels capture or of a COLMAP model, see the dataparser's tracks), at the start and after every
+    refinement."""
     track_rays: int = 512
     """Lines of sight that each step looks at."""
     thermal_density_gradient: bool = False
@@ -242,6 +246,34 @@ class ThermoxelsModelConfig(ModelConfig):
         Where photographs agree is too thin for coarse lattices, so it begins on the finest one of at most 64 voxels.
         """
         return tuple(step for step, voxels in zip(self.refine_at, self.resolutions[1:]) if voxels <= FINEST_START)
+
+    def first_sh_degree(self) -> int | None:
+        """Degree of colour that a training stores at its beginning: 0 until colour depends on the direction.
+
+        Trials of a start have no callbacks that could raise it, so it is not lower than what they need.
+        """
+        flat_until = self.view_dependence_from - (self.trial_steps if self.start == "auto" else 0)
+        return 0 if self.sh_degree is not None and flat_until > 0 else self.sh_degree
+
+    def row_channels(self, resolution: int) -> int:
+        """Most channels that a row of the lattice of a resolution gets: all, if it is there when colour needs them."""
+        gives_way = dict(zip(self.resolutions, self.refine_at)).get(resolution, math.inf)
+        degree = self.sh_degree if gives_way > self.view_dependence_from else self.first_sh_degree()
+        return 1 + num_coefficients(self.temperature_degree) + (0 if degree is None else 3 * num_coefficients(degree))
+
+    def checkpoint_columns(self) -> dict[str, tuple[int, ...]]:
+        """Columns that each parameter of the grid may have in a checkpoint.
+
+        Colour has one per channel until it depends on the direction. Trainings of earlier versions, and those in
+        which it does from the start, have all of them throughout.
+        """
+        columns: dict[str, tuple[int, ...]] = {
+            "density": (1,),
+            "temperature": (num_coefficients(self.temperature_degree),),
+        }
+        if self.sh_degree is not None:
+            columns["sh"] = tuple(dict.fromkeys((3, 3 * num_coefficients(self.sh_degree))))
+        return columns
 
     def skipped_factor(self) -> int:
         """Factor by which a start from photographs splits voxels before the first step."""

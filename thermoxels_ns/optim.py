@@ -17,6 +17,8 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig, OptimizerConfig
 from torch import Tensor
 
 from thermoxels_ns.field.refine import RowChange
+from thermoxels_ns.field.widen import ColumnChange
+from thermoxels_ns.render.ordered_rows import in_order
 from thermoxels_ns.threads import run_ranges
 
 
@@ -64,14 +66,25 @@ class RowOptimizer(torch.optim.Optimizer):
             new: The one that takes its place.
             change: How values of rows changed.
         """
+        self._follow(old, new, lambda values: change(values.view(len(values), -1)).reshape(-1, *values.shape[1:]))
+
+    def change_columns(self, old: Tensor, new: torch.nn.Parameter, change: ColumnChange) -> None:
+        """Go on with a parameter whose rows have other columns; state that is one number per row stays.
+
+        Args:
+            old: The parameter so far.
+            new: The one that takes its place.
+            change: How values of columns changed.
+        """
+        self._follow(old, new, lambda values: change(values) if values.shape == old.shape else values)
+
+    def _follow(self, old: Tensor, new: torch.nn.Parameter, change: Callable[[Tensor], Tensor]) -> None:
         for group in self.param_groups:
             group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
         state = self.state.pop(old, None)  # type: ignore[arg-type]
         if state:
-            self.state[new] = {
-                name: change(values.view(len(values), -1)).reshape(-1, *values.shape[1:])
-                for name, values in state.items()
-            }
+            # One after the other, so that only one is there twice.
+            self.state[new] = {name: change(state.pop(name)) for name in list(state)}
 
 
 def touched_rows(gradient: Tensor) -> tuple[Tensor, Tensor]:
@@ -79,7 +92,7 @@ def touched_rows(gradient: Tensor) -> tuple[Tensor, Tensor]:
     if gradient.is_sparse:
         rows = gradient._indices()[0]
         # Accumulation into `grad` forgets that a tensor is coalesced; finding out is quicker than doing it again.
-        if not gradient.is_coalesced() and not bool((rows[1:] > rows[:-1]).all()):
+        if not gradient.is_coalesced() and not in_order(rows):
             gradient = gradient.coalesce()
         values = gradient._values()
         return gradient._indices()[0], values.view(len(values), -1)

@@ -80,18 +80,20 @@ class ThermoxelsPipeline(VanillaPipeline):
             CheckpointError: It belongs to another method, to other settings or to another scene.
         """
         state = {name.removeprefix("module."): value for name, value in loaded_state.items()}
-        expected = {_GRID + name: p.shape[1] for name, p in self.model.grid.row_parameters().items()}
+        expected = {_GRID + name: columns for name, columns in self.model.config.checkpoint_columns().items()}
         found = {
             name: tensor.shape[1]
             for name, tensor in state.items()
             if name.startswith(_GRID) and getattr(tensor, "ndim", 0) == 2
         }
-        if expected != found:
+        if expected.keys() != found.keys() or any(found[name] not in columns for name, columns in expected.items()):
             raise CheckpointError(
                 explain(
                     "checkpoint",
                     expected=f"a voxel grid with the columns {_columns(expected)}",
-                    got=_columns(found) if found else "no voxel grid: the checkpoint of another method",
+                    got=_columns({name: (columns,) for name, columns in found.items()})
+                    if found
+                    else "no voxel grid: the checkpoint of another method",
                     remedy="Load it with the config.yml that was written beside it.",
                 )
             )
@@ -209,8 +211,8 @@ class ThermoxelsPipeline(VanillaPipeline):
         return self.model.grid_snapshot(rays, datamanager.training_views())
 
 
-def _columns(grid: dict[str, int]) -> str:
-    return ", ".join(f"{name.removeprefix(_GRID)} {columns}" for name, columns in sorted(grid.items()))
+def _columns(grid: dict[str, tuple[int, ...]]) -> str:
+    return ", ".join(f"{name.removeprefix(_GRID)} {' or '.join(map(str, n))}" for name, n in sorted(grid.items()))
 
 
 def _say(line: str) -> None:

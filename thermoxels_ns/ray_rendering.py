@@ -96,7 +96,9 @@ def reference_render(grid: VoxelGrid, request: RayRequest, options: RenderOption
     corners = grid.voxels.tables(grid.density.device)[0]
     parameters = grid.row_parameters()
     variation = {
-        name: losses.total_variation(parameters[name], corners[first:last])
+        name: losses.total_variation(
+            parameters[name], corners[first:last], channels=options.colour_channels if name == "sh" else None
+        )
         for name, (first, last) in options.variation.items()
     }
     return RayRender(

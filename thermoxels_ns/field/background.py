@@ -8,10 +8,21 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from thermoxels_ns.field.harmonics import harmonics_with_unit_mean, num_coefficients
+
+
+def seen_behind(
+    background: nn.Module, directions: Float[Tensor, "n 3"], wanted: Bool[Tensor, " n"] | None
+) -> Float[Tensor, "n c"]:
+    """What is behind the box along unit directions; 0 for rays that do not want it, which are not asked for."""
+    if wanted is None or bool(wanted.all()):
+        return background(directions)
+    (places,) = wanted.nonzero(as_tuple=True)
+    values = background(directions[places])
+    return values.new_zeros((len(directions), values.shape[1])).index_copy(0, places, values)
 
 
 class SphereImage(nn.Module):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -28,6 +30,17 @@ def num_coefficients(degree: int) -> int:
             explain("SH degree", expected=f"0 to {MAX_DEGREE}", got=degree, remedy="Lower the degree.")
         )
     return (degree + 1) ** 2
+
+
+def degree_of(coefficients: int) -> int:
+    """The degree up to which there are so many harmonics; the inverse of `num_coefficients`.
+
+    >>> degree_of(9)
+    2
+    """
+    degree = math.isqrt(coefficients) - 1
+    assert num_coefficients(degree) == coefficients
+    return degree
 
 
 def harmonics(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n k"]:

@@ -9,12 +9,20 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from thermoxels_ns.field.harmonics import harmonics, harmonics_with_unit_mean, num_coefficients
+from thermoxels_ns.field.harmonics import (
+    MAX_DEGREE,
+    degree_of,
+    harmonics,
+    harmonics_with_unit_mean,
+    num_coefficients,
+)
 from thermoxels_ns.field.interpolation import TrilinearPoints, interpolate
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.lattice import Lattice
 
 DensityActivation = Literal["relu", "softplus", "exp"]
+COLOUR_CHANNELS = tuple(3 * num_coefficients(degree) for degree in range(MAX_DEGREE + 1))
+"""Columns of colour by the degree of its harmonics."""
 
 
 def activate_density(raw: Tensor, kind: DensityActivation) -> Tensor:
@@ -50,7 +58,7 @@ class VoxelGrid(nn.Module):
 
     Args:
         lattice: Start lattice; all its voxels are kept at first.
-        sh_degree: Degree of the colour harmonics; None: no colour.
+        sh_degree: Degree of the colour harmonics that are stored; None: no colour. `widen.py` raises it.
         temperature_degree: Degree of the temperature harmonics; 0: the same from all directions (the paper).
         start_density: Start density everywhere, [1 / world unit]; near-transparent.
         activation: Density activation.
@@ -70,7 +78,7 @@ class VoxelGrid(nn.Module):
         activation: DensityActivation = "relu",
     ):
         super().__init__()
-        self.sh_degree, self.temperature_degree = sh_degree, temperature_degree
+        self.temperature_degree = temperature_degree
         self.activation: DensityActivation = activation
         self._voxels = KeptVoxels(lattice)
         n = lattice.num_corners
@@ -85,6 +93,11 @@ class VoxelGrid(nn.Module):
         self.register_buffer("corner_shape", torch.tensor(lattice.shape))
         self.register_buffer("activation_index", torch.tensor(get_args(DensityActivation).index(activation)))
         self.register_buffer("cells", torch.from_numpy(self._voxels.cells))
+
+    @property
+    def sh_degree(self) -> int | None:
+        """Degree of the colour harmonics that are stored; None: no colour."""
+        return None if self.sh is None else degree_of(self.sh.shape[1] // 3)
 
     @property
     def lattice(self) -> Lattice:
@@ -128,7 +141,7 @@ class VoxelGrid(nn.Module):
         self.cells = torch.from_numpy(voxels.cells).to(device)
 
     def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs):
-        """Take over the checkpoint's kept voxels before its rows are copied."""
+        """Take over the checkpoint's kept voxels and its degree of colour before its rows are copied."""
         names = ("lo", "voxel_size", "corner_shape", "cells")
         if all(prefix + name in state_dict for name in names):
             lo, size, shape, cells = (state_dict[prefix + name] for name in names)
@@ -138,12 +151,18 @@ class VoxelGrid(nn.Module):
             rows = {
                 name: state_dict[prefix + name]
                 for name in self.row_parameters()
-                if prefix + name in state_dict and state_dict[prefix + name].shape[1:] == getattr(self, name).shape[1:]
+                if prefix + name in state_dict and self._fits(name, state_dict[prefix + name])
             }
             fits = all(len(values) == voxels.num_rows for values in rows.values())
             if fits and len(rows) == len(self.row_parameters()):
                 self.replace_voxels(voxels, {k: v.clone() for k, v in rows.items()}, keep_identity=True)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+    def _fits(self, name: str, rows: Tensor) -> bool:
+        """Whether rows of a checkpoint have the columns of a parameter; of colour, those of any degree."""
+        if name == "sh":
+            return rows.ndim == 2 and rows.shape[1] in COLOUR_CHANNELS
+        return rows.shape[1:] == getattr(self, name).shape[1:]
 
     def locate(self, points: Float[Tensor, "n 3"]) -> TrilinearPoints:
         """Find the voxels and trilinear weights of world positions."""

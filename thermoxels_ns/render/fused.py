@@ -7,6 +7,7 @@ come as row-sparse tensors that hold the touched rows only.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -265,8 +266,9 @@ class _Render(torch.autograd.Function):
         parameters = {"density": density, "sh": sh, "temperature": temperature}
 
         found = [
-            _total_variation(parameters[name].detach().numpy(), voxels.voxel_rows, first, last)  # type: ignore[union-attr]
+            _total_variation(values.detach().numpy(), voxels.voxel_rows, first, last, _channels(options, name, values))
             for name, (first, last) in options.variation.items()
+            if (values := parameters[name]) is not None
         ]
         ctx.marched, ctx.options = marched, options
         ctx.set_materialize_grads(False)
@@ -301,10 +303,16 @@ class _Render(torch.autograd.Function):
             )
         else:
             records.used.fill(0)
-        return (*row_gradients(marched, _blocks(options, variation)), None)
+        return (*row_gradients(marched, _blocks(options, variation, volume)), None)
 
 
-def _total_variation(values: np.ndarray, voxel_rows: np.ndarray, first: int, last: int) -> float:
+def _channels(options: RenderOptions, name: str, values: Tensor | np.ndarray) -> int:
+    """Channels of which the total variation of a parameter is the mean."""
+    asked = options.colour_channels if name == "sh" else None
+    return values.shape[1] if asked is None else asked
+
+
+def _total_variation(values: np.ndarray, voxel_rows: np.ndarray, first: int, last: int, channels: int) -> float:
     """Mean of the total variation over a block; its parts do not depend on the number of threads."""
     bounds = [*range(first, last, VOXELS_AT_ONCE), last]
     parts: Any = run_tasks(
@@ -313,12 +321,17 @@ def _total_variation(values: np.ndarray, voxel_rows: np.ndarray, first: int, las
             for a, b in itertools.pairwise(bounds)
         ]
     )
-    return sum(parts) / (values.shape[1] * (last - first))
+    missing = (channels - values.shape[1]) * math.sqrt(SMALLEST_VARIATION)
+    return sum(parts) / (channels * (last - first)) + missing / channels
 
 
-def _blocks(options: RenderOptions, pushes: Sequence[Tensor | None]) -> Blocks:
+def _blocks(options: RenderOptions, pushes: Sequence[Tensor | None], volume: Volume) -> Blocks:
     """The total variation that has a gradient."""
-    blocks = Blocks(np.zeros(3, np.int64), np.zeros(3, np.int64), np.zeros(3), SMALLEST_VARIATION)
+    parameters = (volume.density, volume.sh, volume.temperature)
+    channels = [_channels(options, name, values) for name, values in zip(NAMES, parameters)]
+    blocks = Blocks(
+        np.zeros(3, np.int64), np.zeros(3, np.int64), np.zeros(3), np.array(channels, np.int64), SMALLEST_VARIATION
+    )
     for (name, (first, last)), push in zip(options.variation.items(), pushes):
         if push is not None:
             kind = NAMES.index(name)

@@ -52,6 +52,8 @@ class Blocks(NamedTuple):
     """One behind the last voxel; the first where there is no block."""
     push: Floats
     """Gradient of the block's total variation, (3,) float64."""
+    channels: Ints
+    """Channels of which it is the mean, (3,) int64: those without a column are 0."""
     smallest: float
     """Added under the root."""
 
@@ -336,7 +338,7 @@ def add_variation(
     first, last = blocks.first[kind], blocks.last[kind]
     one = values.dtype.type
     tiny = one(blocks.smallest)
-    scale = one(blocks.push[kind] / (channels * max(1, last - first)))
+    scale = one(blocks.push[kind] / (blocks.channels[kind] * max(1, last - first)))
     px, py, pz = np.empty(channels, values.dtype), np.empty(channels, values.dtype), np.empty(channels, values.dtype)
     begin, end = first_voxel(voxel_rows, 2, first_row), first_voxel(voxel_rows, 0, last_row)
     for number in range(max(begin, first), min(end, last)):

@@ -31,8 +31,11 @@ _Y00 = 0.28209479177387814
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def prefetch_colours(values: Floats, rows: Ints, number: int, active: int):
-    """Ask for the colours of a voxel's corners, whose rows are longer than a cache line."""
+    """Ask for the colours of a voxel's corners, whose rows are longer than a cache line unless there is one colour."""
     channels = values.shape[1]
+    if channels == 3:
+        prefetch_corners(values, rows, number)
+        return
     second = channels - channels // 3 + active - 1
     for corner in range(4):
         row = np.int64(rows[number, corner])

@@ -45,6 +45,9 @@ class RenderOptions:
     """Length that counts as 1 in the distortion of each ray, world units; None: not computed."""
     sh_degree: int | None = None
     """Degree up to which the stored colour harmonics take part; None: all. What lies behind gets no gradient."""
+    colour_channels: int | None = None
+    """Channels over which total variation of colour is averaged: those that are not stored yet are 0 and count. None:
+    the stored ones."""
     sparsity: bool = False
     """Sum the Cauchy sparsity of each ray, over the samples at hand."""
     variation: dict[str, tuple[int, int]] = field(default_factory=dict)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from thermoxels_ns.render import kernels_rows
 from thermoxels_ns.render.kernels_rows import Blocks, Order, RowGradients
+from thermoxels_ns.render.ordered_rows import remember_order
 from thermoxels_ns.scratch import SCRATCH
 from thermoxels_ns.threads import num_threads, run_tasks
 
@@ -62,6 +63,8 @@ def row_gradients(marched: Marched, blocks: Blocks) -> list[Tensor | None]:
 
     steps = zip(ranges, itertools.pairwise(places))
     run_tasks([lambda a=a, b=b, start=start, stop=stop: add(a, b, start, stop) for (a, b), (start, stop) in steps])
+    for touched in lists:
+        remember_order(touched)
     return [
         torch.sparse_coo_tensor(
             torch.from_numpy(touched)[None],

@@ -1,0 +1,133 @@
+"""Colour gets columns for further harmonics: colours, gradients and optimisers go on as if they had been there."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.reference.two_renderers import EVERYTHING, RENDERERS, random_grid, random_request, see
+from thermoxels_ns import losses
+from thermoxels_ns.errors import ThermoxelsError
+from thermoxels_ns.field.harmonics import num_coefficients
+from thermoxels_ns.field.voxel_grid import VoxelGrid
+from thermoxels_ns.field.widen import widen_colour
+from thermoxels_ns.optim import RowAdam, RowRMSprop
+
+STEPS = [(0, 1), (0, 2), (1, 2)]
+
+
+def places_of(low: int, high: int) -> torch.Tensor:
+    """Columns in which the harmonics of the lower degree stand among those of the higher one."""
+    few, many = num_coefficients(low), num_coefficients(high)
+    return torch.tensor([channel * many + k for channel in range(3) for k in range(few)])
+
+
+@pytest.mark.parametrize("low, high", STEPS)
+def test_colours_stay_and_new_columns_are_nil(low, high):
+    grid = random_grid(low, kept=0.5)
+    before, old = grid.sh.detach().clone(), grid.sh
+    points = torch.as_tensor(grid.lattice.cell_centres(), dtype=torch.float32)[grid.kept]
+    directions = torch.nn.functional.normalize(torch.randn(len(points), 3), dim=-1)
+    colours = grid.rgb_at(grid.locate(points), directions).detach()
+    change = widen_colour(grid, high)
+    assert grid.sh is not old and grid.sh_degree == high and grid.sh.shape[1] == 3 * num_coefficients(high)
+    places = places_of(low, high)
+    assert torch.equal(grid.sh[:, places], before)
+    assert int((grid.sh != 0).sum()) == int((before != 0).sum())
+    torch.testing.assert_close(grid.rgb_at(grid.locate(points), directions), colours, rtol=0, atol=1e-6)
+    assert torch.equal(change(before), grid.sh)
+
+
+def test_a_degree_that_is_stored_already_is_an_error():
+    with pytest.raises(AssertionError):
+        widen_colour(random_grid(2), 2)
+    with pytest.raises(ThermoxelsError, match="SH degree"):
+        widen_colour(random_grid(2), 3)
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
+@pytest.mark.parametrize("low, high", STEPS)
+def test_narrow_rows_render_and_differentiate_like_wide_ones_with_zeros(renderer, low, high):
+    """To the last bit: also total variation, whose mean counts the channels that are not stored."""
+    narrow = random_grid(low, kept=0.5)
+    wide, request = copy.deepcopy(narrow), random_request(narrow)
+    widen_colour(wide, high)
+    count = len(narrow.voxels)
+    blocks = {"density": (3, count), "sh": (count // 4, count // 2), "temperature": (0, 9)}
+    options = replace(EVERYTHING, variation=blocks, sh_degree=low, colour_channels=3 * num_coefficients(high))
+    few, many = see(renderer, narrow, request, options), see(renderer, wide, request, options)
+    for name, values in many.values.items():
+        if name == "variation of sh":  # a sum over other columns in another order
+            torch.testing.assert_close(few.values[name], values, rtol=1e-5, atol=0)
+        else:
+            assert torch.equal(few.values[name], values), name
+    for name, gradient in many.gradients.items():
+        if name == "sh":
+            assert float(gradient.abs().max()) > 0
+            assert int((gradient != 0).sum()) == int((gradient[:, places_of(low, high)] != 0).sum())
+            gradient = gradient[:, places_of(low, high)]
+        assert torch.equal(few.gradients[name], gradient), name
+
+
+def test_variation_of_columns_that_are_not_stored_is_that_of_zeros():
+    rows, corners = torch.randn(20, 3), torch.arange(16).view(2, 8)
+    padded = torch.cat((rows, torch.zeros(20, 24)), 1)
+    found = losses.total_variation(rows, corners, channels=27)
+    assert float(found) == pytest.approx(float(losses.total_variation(padded, corners)), rel=1e-6)
+    assert float(found) < 0.2 * float(losses.total_variation(rows, corners))
+
+
+@pytest.mark.parametrize("make", [RowAdam, RowRMSprop])
+@pytest.mark.parametrize("low, high", STEPS)
+def test_optimisers_go_on_as_if_the_columns_had_been_there(make, low, high):
+    """Rows with a gradient now, earlier, never: moments widen, the number of updates stays."""
+    narrow, places = random_grid(low, kept=0.5), places_of(low, high)
+    wide = copy.deepcopy(narrow)
+    widen_colour(wide, high)
+    pair = [(grid, make([grid.sh], lr=0.1)) for grid in (narrow, wide)]
+    generator = torch.Generator().manual_seed(0)
+    for turn in range(6):
+        if turn == 3:
+            old = narrow.sh
+            change = widen_colour(narrow, high)
+            pair[0][1].change_columns(old, narrow.sh, change)
+            assert pair[0][1].param_groups[0]["params"] == [narrow.sh] and list(pair[0][1].state) == [narrow.sh]
+        rows = (torch.rand(len(wide.sh), generator=generator) < 0.4).nonzero()[:, 0]
+        push = torch.randn(len(rows), wide.sh.shape[1], generator=generator)
+        if turn < 3:
+            push[:, ~torch.isin(torch.arange(push.shape[1]), places)] = 0.0
+        for grid, optimizer in pair:
+            values = push if grid.sh.shape == wide.sh.shape else push[:, places]
+            grid.sh.grad = torch.sparse_coo_tensor(rows[None], values.contiguous(), grid.sh.shape)
+            optimizer.step()
+    assert torch.equal(narrow.sh, wide.sh)
+    states = [optimizer.state[grid.sh] for grid, optimizer in pair]
+    assert states[0].keys() == states[1].keys()
+    assert all(torch.equal(values, states[1][name]) for name, values in states[0].items())
+
+
+def test_columns_may_change_before_the_first_step():
+    grid = random_grid(0)
+    old, optimizer = grid.sh, RowAdam([grid.sh])
+    change = widen_colour(grid, 2)
+    optimizer.change_columns(old, grid.sh, change)
+    assert optimizer.param_groups[0]["params"][0] is grid.sh and grid.sh is not old and not optimizer.state
+
+
+@pytest.mark.parametrize("saved, built", [(0, 2), (2, 0), (1, 2)])
+def test_a_checkpoint_brings_its_degree_and_leaves_parameters_the_same_objects(saved, built):
+    stored, grid = random_grid(saved, kept=0.5, seed=1), random_grid(built)
+    sh = grid.sh
+    grid.load_state_dict(stored.state_dict())
+    assert grid.sh is sh and grid.sh_degree == saved and torch.equal(grid.sh, stored.sh)
+
+
+@pytest.mark.parametrize("columns", [0, 4, 6, 48])
+def test_a_checkpoint_whose_columns_are_no_harmonics_is_refused(columns):
+    state = random_grid(2).state_dict()
+    state["sh"] = torch.zeros(len(state["sh"]), columns)
+    with pytest.raises(RuntimeError, match="size mismatch for sh"):
+        VoxelGrid(random_grid().lattice, 2).load_state_dict(state)
