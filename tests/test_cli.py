@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import warnings
 from typing import get_args
 
 import pytest
@@ -106,6 +107,21 @@ def test_unknown_scenes_and_options_are_refused():
         with pytest.raises(SystemExit) as stop:
             cli.main(words)
         assert stop.value.code == 2
+
+
+@pytest.mark.parametrize(("asked", "seen"), [([], ["another"]), (["default"], ["`torch.jit.script` is deprecated."])])
+def test_one_warning_for_programmers_is_not_shown_unless_warnings_are_asked_for(monkeypatch, asked, seen):
+    def warn() -> int:
+        for words in ("`torch.jit.script` is deprecated.", "another"):
+            warnings.warn(words, FutureWarning, stacklevel=1)
+        return 0
+
+    monkeypatch.setattr(cli, "main", warn)
+    monkeypatch.setattr(sys, "warnoptions", asked)
+    with warnings.catch_warnings(record=True) as caught, pytest.raises(SystemExit):
+        warnings.simplefilter("always")
+        cli.entrypoint()
+    assert [str(one.message) for one in caught][: len(seen)] == seen
 
 
 def test_the_entry_point_hands_the_status_to_the_shell(tmp_path):

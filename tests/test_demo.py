@@ -6,11 +6,13 @@ import io
 import json
 import math
 import os
+import shlex
 import stat
 import sys
 from pathlib import Path
 
 import pytest
+import tyro
 from rich.console import Console
 
 from thermoxels_ns import cli, demo
@@ -18,6 +20,8 @@ from thermoxels_ns.demo import Demo, run_demo
 from thermoxels_ns.demo_commands import command_line, run_command
 from thermoxels_ns.demo_results import Target, read_results
 from thermoxels_ns.errors import OutputError, ThermoxelsError
+from thermoxels_ns.export import ExportThermoxelsMesh
+from thermoxels_ns.heat_command import Heat
 
 PYTHON = sys.executable
 IMAGES = {
@@ -106,6 +110,21 @@ def test_commands_are_written_as_a_shell_reads_them():
     config = "--load-config 'my demo/outputs/demo/thermoxels/run/config.yml'"
     assert [config in command for command in commands] == [False, False, True, True, True]
     assert "--max-num-iterations" not in command_line(demo.demo_commands(Path("demo"), "sphere")[1])
+
+
+@pytest.mark.parametrize(("scene", "weather"), [("house-corner", "winter-night"), ("sphere", "original")])
+def test_the_next_steps_lead_to_a_heat_report_by_commands_that_exist(scene, weather):
+    """The mesh that heat is to flow in is that of the export before, or of the demo; options are as commands know."""
+    steps = [shlex.split(command) for command, _ in demo.heat_steps(Path("my demo"), scene)]
+    heat = tyro.cli(cli.Commands, args=steps[-1][1:])
+    assert isinstance(heat, Heat) and heat.scene == weather and heat.output_dir == Path("my demo/heat")
+    if scene == "sphere":
+        assert len(steps) == 1 and heat.mesh == Path("my demo/export/mesh.vtu")
+    else:
+        export = tyro.cli(ExportThermoxelsMesh, args=steps[0][2:])
+        assert (export.interior, export.wall_thickness) == ("hollow", 0.3)
+        assert export.output_dir == heat.mesh.parent == Path("my demo/walls")  # the demo's own export stays
+        assert ["--load-config", str(export.load_config)] == demo.demo_commands(Path("my demo"), scene)[2][1:3]
 
 
 def test_output_of_a_command_is_shown_and_kept(fake_commands, tmp_path, console):

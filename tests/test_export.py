@@ -363,6 +363,17 @@ def test_truth_that_cannot_be_used_does_not_cost_the_export(ball, tmp_path) -> N
     assert any("Not compared with the truth: transforms.json" in line for line in lines)
 
 
+@pytest.mark.parametrize(("interior", "told"), [("solid", False), ("hollow", True)])
+def test_a_hollow_mesh_says_why_it_agrees_less_with_a_filled_truth(ball, tmp_path, interior, told) -> None:
+    lines: list[str] = []
+    options = ExportOptions(pictures=False, interior=interior, **SCALED)
+    export_snapshot(ball, np.eye(4), options, tmp_path, lines.append, compare=lambda *_: {"precision": 0.5})
+    truth = read(tmp_path)["truth"]
+    assert truth["precision"] == 0.5
+    assert ("inner side of a hollow mesh counts as wrong surface" in truth.get("note", "")) == told
+    assert (truth.get("note") in lines) == told
+
+
 def test_too_many_steps_are_refused_before_anything_is_written(ball, tmp_path) -> None:
     options = ExportOptions(metres_per_unit=1.0, steps=3_000_000)
     with pytest.raises(HeatError, match=r"steps: .* 8 bytes = \d+ bytes\. Take at most \d+ steps"):

@@ -5,6 +5,7 @@ Only light imports at the top, so that ``thermoxels --help`` answers at once.
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -67,4 +68,4 @@ def _print_result(result: CaptureResult, folder: Path, console: Console) -> None
     if result.scale is None:
         say(f"The scale is unknown: {result.scale_missing}. Give a length when you export.", "bold yellow")
     say(f"What was found, with pictures to judge it by: {result.page}")
-    say(f"Train with: ns-train thermoxels thermal-data --data {folder}")
+    say(f"Train with: ns-train thermoxels --data {shlex.quote(str(folder))}")

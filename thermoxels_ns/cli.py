@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, Union
@@ -18,6 +19,9 @@ from thermoxels_ns.cost import Cost
 from thermoxels_ns.demo import Demo, SceneName
 from thermoxels_ns.errors import ThermoxelsError
 from thermoxels_ns.heat_command import Heat
+
+_NEWS_FOR_PROGRAMMERS = r"`torch\.jit\.script` is deprecated"
+"""How the warning begins that newer versions of torch give when nerfstudio 1.1.5 is imported."""
 
 
 @dataclass
@@ -119,6 +123,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 def entrypoint() -> None:
     """Entry point of the console script."""
+    if not sys.warnoptions:  # whoever sets filters wants to see what they let through
+        warnings.filterwarnings("ignore", _NEWS_FOR_PROGRAMMERS, FutureWarning)
     sys.exit(main())
 
 

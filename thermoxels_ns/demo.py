@@ -34,6 +34,7 @@ _WRITTEN = ("index.html", "scene", "outputs", "eval.json", "eval", "renders", "e
 _NUM_STEPS = 6
 _TRAIN_VIEWS, _HELD_OUT_VIEWS, _WIDTH, _HEIGHT = 42, 6, 320, 240
 _INPUTS_SHOWN = 6
+_BUILDINGS: tuple[SceneName, ...] = ("house-corner", "courtyard")
 _COLOUR_MAP = "inferno"
 _COLOUR_STOPS = 17
 
@@ -219,8 +220,8 @@ def assemble_page(
         ),
         at_a_glance=(
             Figure(pairs[0][0], f"In: {_TRAIN_VIEWS} photographs"),
-            Figure(pairs[0][1], "and their thermal images."),
-            Figure(_picture(export / "mesh.png"), "Out: a solid with temperatures, which heat can flow in."),
+            Figure(pairs[0][1], "In: their thermal images"),
+            Figure(_picture(export / "mesh.png"), "Out: a solid in which heat can flow"),
         ),
         checks=tuple(Check(t.name, t.measured_text, t.bound_text, t.met, t.meaning) for t in results.targets),
         more_figures=results.others,
@@ -243,6 +244,7 @@ def assemble_page(
                 command_line(["ns-viewer", "--load-config", folder / "outputs/demo/thermoxels/run/config.yml"]),
                 "Walk around the trained model in a browser:",
             ),
+            *heat_steps(folder, scene),
             (
                 command_line(["thermoxels", "capture", "PHOTOGRAPHS", "--output", "SCENE"]),
                 "Make a scene of your own from a folder of photographs and thermal images:",
@@ -263,6 +265,29 @@ def assemble_page(
             ("export/summary.json", "figures of mesh, heat and truth, and all options"),
             ("logs/", "what every command said"),
         ),
+    )
+
+
+def heat_steps(folder: Path, scene: str) -> Iterator[tuple[str, str]]:
+    """Commands that lead to a heat report: of a building with walls, of anything else as it was exported."""
+    from thermoxels_ns.demo_commands import command_line
+
+    config = folder / "outputs" / "demo" / "thermoxels" / "run" / "config.yml"
+    mesh, weather, said = folder / "export" / "mesh.vtu", "original", "ten windy, sunny minutes"
+    if scene in _BUILDINGS:
+        mesh, weather, said = folder / "walls" / "mesh.vtu", "winter-night", "a winter night"
+        yield (
+            command_line(
+                [
+                    *("ns-export", "thermoxels-mesh", "--load-config", config, "--output-dir", mesh.parent),
+                    *("--metres-per-unit", "1", "--interior", "hollow", "--wall-thickness", "0.3"),
+                ]
+            ),
+            "Export the building with rooms; photographs do not show how thick its walls are, so say it:",
+        )
+    yield (
+        command_line(["thermoxels", "heat", mesh, "--scene", weather, "--output-dir", folder / "heat"]),
+        f"Let {said} act on it; report.html says how much heat goes where:",
     )
 
 

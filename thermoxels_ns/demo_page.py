@@ -138,7 +138,8 @@ def _section(heading: str, content: str) -> str:
 def _checks(checks: Sequence[Check]) -> str:
     rows = "".join(map(_check, checks))
     head = "<tr><th></th><th class=num>measured</th><th class=num>target</th><th>met</th></tr>"
-    return f"<div class=result>{scrolling(f'<table><thead>{head}</thead><tbody>{rows}</tbody></table>')}</div>"
+    table = f"<table class=checks><thead>{head}</thead><tbody>{rows}</tbody></table>"
+    return f"<div class=result>{scrolling(table)}</div>"
 
 
 def _check(check: Check) -> str:
@@ -223,7 +224,7 @@ def _next_steps(steps: Sequence[tuple[str, str]]) -> str:
 
 _STYLE = """
 .result, .files, .cost { max-width: 50rem; }
-.glance { display: grid; grid-template-columns: repeat(3, 1fr); gap: .75rem; margin-top: 1.5rem; align-items: end; }
+.glance { display: grid; grid-template-columns: repeat(3, 1fr); gap: .75rem; margin-top: 1.5rem; }
 .total td { font-weight: 600; }
 .share { width: 40%; vertical-align: middle; }
 .share div { height: .6rem; background: var(--accent); border-radius: 2px; opacity: .75; }
@@ -239,5 +240,11 @@ _STYLE = """
   .inputs { grid-template-columns: repeat(3, 1fr); }
   .glance { grid-template-columns: repeat(2, 1fr); }
   .glance figure:last-child { grid-column: 1 / -1; }
+  .checks tr { display: grid; grid-template-columns: 5fr 5fr 2fr; border-bottom: 1px solid var(--line); }
+  .checks td, .checks th { border: 0; padding-right: 0; text-align: left; }
+  .checks td:first-child { grid-column: 1 / -1; padding-bottom: 0; }
+  .checks th:first-child { display: none; }
+  .result details td { width: 50%; }
+  .result details td.num { white-space: normal; }
 }
 """

@@ -10,6 +10,9 @@ from typing import Any
 
 from thermoxels_ns.errors import ThermoxelsError, explain
 
+_ENERGY_UNITS = ("J", "kJ", "MJ", "GJ", "TJ", "PJ")
+"""Each a thousand of the one before."""
+
 
 @dataclass(frozen=True)
 class Target:
@@ -114,10 +117,26 @@ def read_results(eval_json: Path, summary_json: Path) -> DemoResults:
         ("Tetrahedra", f"{mesh.number('tets'):,.0f}"),
         ("Nodes", f"{mesh.number('nodes'):,.0f}"),
         ("Nodes with a measured temperature", f"{100.0 * mesh.number('share_of_nodes_observed'):.0f} %"),
-        ("Heat content before", f"{heat.number('energy_before_j'):.6e} J"),
-        ("Heat content after", f"{heat.number('energy_after_j'):.6e} J"),
+        ("Heat content before", energy_text(heat.number("energy_before_j"))),
+        ("Heat content after", energy_text(heat.number("energy_after_j"))),
     )
     return DemoResults(targets, others)
+
+
+def energy_text(energy_j: float) -> str:
+    """Write an energy to four digits, in the unit in which it has one to three digits before the point.
+
+    Args:
+        energy_j: Energy [J], of either sign; NaN: it was not computed.
+
+    >>> energy_text(1.003777e11), energy_text(-2.5e6), energy_text(0.0), energy_text(999.99)
+    ('100.4 GJ', '-2.5 MJ', '0 J', '1 kJ')
+    """
+    if math.isnan(energy_j):
+        return "not computed"
+    value = float(f"{energy_j:.3e}")
+    power = max((number for number in range(len(_ENERGY_UNITS)) if abs(value) >= 1e3**number), default=0)
+    return f"{value / 1e3**power:.4g} {_ENERGY_UNITS[power]}"
 
 
 class _Section:

@@ -130,7 +130,7 @@ def export_snapshot(
         say(f"Heat: {time.steps} steps of {time.step_seconds:g} s through {preset.material.name}")
         solution = solve_heat(HeatProblem(mesh, preset.material), time)
         say(f"Heat: {solution.status} Energy conserved to {solution.energy_residual:.1e}.")
-        truth = None if compare is None else _compared(compare, built, metres, say)
+        truth = None if compare is None else _compared(compare, built, metres, options.interior, say)
     else:
         say(HEAT_SKIPPED)
 
@@ -229,17 +229,27 @@ def _tell(built: BuiltMesh, volume: float, unit: str, voxel_size: float | None, 
 
 
 def _compared(
-    compare: Callable[[SolidCells, TetMesh, float], dict[str, Any] | None], built: BuiltMesh, metres: float, say: Say
+    compare: Callable[[SolidCells, TetMesh, float], dict[str, Any] | None],
+    built: BuiltMesh,
+    metres: float,
+    interior: str,
+    say: Say,
 ) -> dict[str, Any] | None:
     """Compare with the truth; a truth that cannot be used costs the comparison, not the export."""
+    from thermoxels_ns.export_summary import INNER_SIDE
+
     try:
         truth = compare(built.solid, built.mesh, metres)
     except ThermoxelsError as problem:
         say(f"Not compared with the truth: {problem}")
         return {"error": str(problem)}
-    if truth is not None:
-        say("Against the truth: " + ", ".join(f"{name} {_short(value)}" for name, value in truth.items()))
-    return truth
+    if truth is None:
+        return None
+    say("Against the truth: " + ", ".join(f"{name} {_short(value)}" for name, value in truth.items()))
+    if interior != "hollow":
+        return truth
+    say(INNER_SIDE)
+    return {**truth, "note": INNER_SIDE}
 
 
 def _short(value: Any) -> str:

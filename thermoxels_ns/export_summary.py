@@ -34,6 +34,12 @@ ONLY_THE_SHELL = (
 )
 """What the heat balance of a reconstruction leaves out."""
 
+INNER_SIDE = (
+    "The exact scene is filled, so the inner side of a hollow mesh counts as wrong surface in precision, fscore and "
+    "mean distance; precision_seen and fscore_seen are those of the side that photographs show."
+)
+"""What to know of the figures of a hollow mesh beside the truth."""
+
 
 def mesh_summary(
     built: BuiltMesh, report: QualityReport, selection: SolidSelection, scale: SceneScale | None, voxel_size: float

@@ -31,6 +31,17 @@ def degrees(value_c: float) -> str:
     return f"{round(float(value_c), 2) + 0.0:.2f}"
 
 
+def coordinate(value_m: float) -> str:
+    """Write a coordinate to three digits, but not below the millimetre.
+
+    >>> coordinate(0.00625), coordinate(3.14159), coordinate(-12.04), coordinate(51234.5), coordinate(-0.0002)
+    ('0.006', '3.14', '-12', '51234', '0')
+    """
+    decimals = 3 if abs(value_m) < 1.0 else max(0, 2 - int(np.floor(np.log10(abs(value_m)))))
+    text = f"{round(float(value_m), decimals) + 0.0:.{decimals}f}"
+    return text.rstrip("0").rstrip(".") if decimals else text
+
+
 def unit_signs(unit: str) -> str:
     """Write the powers of a unit as signs, and keep it on one line.
 

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermoxels_ns.fem.answers import Spot
+from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.effects import Effect, FixedTemperature, InternalHeat
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import HeatSolution
-from thermoxels_ns.fem.system import effect_labels
 from thermoxels_ns.heat_accuracy_page import accuracy_card, accuracy_sections, how_time_was_followed
-from thermoxels_ns.heat_figures import Dust, degrees, dust_of, unit_signs
+from thermoxels_ns.heat_figures import Dust, coordinate, degrees, dust_of, unit_signs
 from thermoxels_ns.heat_figures import figure as _figure
 from thermoxels_ns.heat_pictures import in_words, plot_over_time
 from thermoxels_ns.heat_report import HeatReport, Section, Table
@@ -45,7 +45,6 @@ def heat_page(run: HeatRun, pictures: Mapping[str, bytes], command: str, files: 
         files: Names of the files beside the page.
     """
     sections = [
-        *_doubts(run),
         _answers(run),
         *_wall(run),
         *_probes(run),
@@ -68,6 +67,7 @@ def heat_page(run: HeatRun, pictures: Mapping[str, bytes], command: str, files: 
         summary=_summary(run),
         figures=_figures(run),
         sections=tuple(sections),
+        doubts=run.warnings,
     )
 
 
@@ -100,10 +100,6 @@ def _figures(run: HeatRun) -> tuple[tuple[str, str], ...]:
     )
     cards += accuracy_card(run.accuracy)
     return tuple(cards)
-
-
-def _doubts(run: HeatRun) -> list[Section]:
-    return [Section("Look at this first", words=run.warnings)] if run.warnings else []
 
 
 def _answers(run: HeatRun) -> Section:
@@ -347,7 +343,7 @@ def _probe_names(run: HeatRun) -> list[str]:
 
 
 def _place(spot: Spot) -> str:
-    where = f"at ({', '.join(f'{part:.3g}' for part in spot.point_m)}) m"
+    where = f"at ({', '.join(map(coordinate, spot.point_m))}) m"
     return where if spot.patches else f"{where}, inside"
 
 

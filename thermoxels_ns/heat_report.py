@@ -53,6 +53,8 @@ class HeatReport:
     """The figures that matter most: value with unit, and what it is."""
     sections: tuple[Section, ...]
     """The rest."""
+    doubts: tuple[str, ...] = ()
+    """What to know before any figure is believed; stands above the figures."""
 
 
 def build_report(report: HeatReport) -> str:
@@ -66,7 +68,8 @@ def build_report(report: HeatReport) -> str:
     )
     body = "".join(_section(section) for section in report.sections)
     header = f"<header><h1>{escape(report.title)}</h1><p>{escape(report.summary)}</p></header>"
-    return html_page(report.title, f"{header}\n<div class=cards>{cards}</div>\n{body}", _STYLE)
+    doubts = _section(Section("Look at this first", words=report.doubts)) if report.doubts else ""
+    return html_page(report.title, f"{header}\n{doubts}<div class=cards>{cards}</div>\n{body}", _STYLE)
 
 
 def _section(section: Section) -> str:

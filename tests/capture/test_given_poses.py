@@ -140,9 +140,10 @@ def test_one_pose_is_too_few_for_points(tmp_path):
         add_points(model, photographs(tmp_path, [(CAMERA.width, CAMERA.height)]), tmp_path)
 
 
-def test_what_colmap_refuses_is_an_error_with_a_remedy():
+def test_what_colmap_refuses_is_an_error_with_a_remedy(tmp_path):
     for problem in (ValueError("[sfm.cc:671] Check failed"), RuntimeError("disk")):
-        with pytest.raises(ThermoxelsError, match=r"COLMAP: expected to end.*--from-stage poses"), quiet_colmap():
+        refused = pytest.raises(ThermoxelsError, match=r"COLMAP: expected to end.*--from-stage poses")
+        with refused, quiet_colmap(tmp_path):
             raise problem
 
 

@@ -16,6 +16,7 @@ from thermoxels_ns.capture.gravity import Up
 from thermoxels_ns.capture.metric_scale import MetricScale
 from thermoxels_ns.capture.page import CapturePage, Overlay, build_page
 from thermoxels_ns.capture.pairs import Pair
+from thermoxels_ns.capture.rig_parameters import PARAMETERS
 from thermoxels_ns.data.radiometric_conditions import Conditions
 
 MODEL = ring_model(4)
@@ -68,6 +69,19 @@ def test_how_sure_the_rig_is(page):
     assert "Rig known" in words(replace(page, rig=replace(page.rig, projection_sigma_px=np.nan)))
     unsure = words(replace(page, rig=replace(page.rig, determined=False, explanation="Too flat.")))
     assert "not determined: the start value is kept" in unsure and "Too flat." in unsure
+
+
+def test_numbers_of_the_rig_have_their_errors_and_an_unsure_turn_its_reason(page):
+    errors = {"rx": 0.003, "ry": 0.004, "rz": 0.012, "log_focal": 0.01, "cx": 0.42, "cy": 0.57}
+    covariance = np.diag([errors.get(name, 0.0) ** 2 for name in PARAMETERS])
+    rig = replace(page.rig, parameters=PARAMETERS, covariance=covariance)
+    said = words(replace(page, rig=rig))
+    assert "principal point, pixels 320.0, 240.0 41.0, 29.0 41.0 ± 0.4, 29.0 ± 0.6 " in said
+    assert "focal length, pixels 500.0 70.0 70.0 ± 0.7 " in said
+    assert "turned by 0.00 ± 0.74 degrees" in said
+    assert "how sure the turn is The turn is sure to 0.74 degrees only" in said
+    given = words(replace(page, rig=replace(rig, parameters=(), covariance=np.zeros((0, 0)))))
+    assert "41.0, 29.0 41.0, 29.0 " in given and "how sure the turn is" not in given
 
 
 def test_what_the_correction_of_drift_changed(page):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.capture.colmap_log import quiet_colmap
+from thermoxels_ns.capture.colmap_process import run_apart
 from thermoxels_ns.capture.contract import CameraModel
+from thermoxels_ns.capture.disk_space import check_free_space
 from thermoxels_ns.checks import remove_file
-from thermoxels_ns.errors import OutputError, explain
 
 Matching = Literal["auto", "exhaustive", "sequential"]
 LensModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV"]
@@ -99,52 +99,78 @@ def fill_database(
         say: Told how far it is.
 
     Raises:
-        OutputError: There is too little free space for features and matches, which COLMAP would end the process at.
+        OutputError: There is too little free space for features and matches, or the disk becomes full.
         ThermoxelsError: COLMAP stopped.
     """
+    pairs = image_pairs(len(names), options.matching)
+    there = database.stat().st_size if database.is_file() else 0
+    needed = _LEAST_BYTES + options.max_features * (_BYTES_PER_FEATURE * len(names) + _BYTES_PER_MATCH * len(pairs))
+    remedy = "Make space, choose another --output, or lower --max-features"
+    check_free_space(database.parent, needed - there, "features and matches", remedy)
+    arguments = (database, images, list(names), camera, known_focal, masks, options, pairs)
+    run_apart(_find_and_match, arguments, database.parent, say)
+
+
+def _find_and_match(
+    database: Path,
+    images: Path,
+    names: Sequence[str],
+    camera: CameraModel,
+    known_focal: bool,
+    masks: Path | None,
+    options: FeatureOptions,
+    pairs: npt.NDArray[np.int64],
+    say: Callable[[str], None],
+) -> None:
+    """Do what `fill_database` promises for these pairs of photographs (p, 2), in this process."""
+    with quiet_colmap(database.parent):
+        _add_images(database, names, camera, options.lens, known_focal)
+        _find_features(database, images, names, masks, options, say)
+        _match(database, names, pairs, options, say)
+
+
+def _find_features(
+    database: Path,
+    images: Path,
+    names: Sequence[str],
+    masks: Path | None,
+    options: FeatureOptions,
+    say: Callable[[str], None],
+) -> None:
     import pycolmap
 
-    pairs = image_pairs(len(names), options.matching)
-    _check_free_space(database, options.max_features, len(names), len(pairs))
-    with quiet_colmap():
-        _add_images(database, names, camera, options.lens, known_focal)
-        reader = pycolmap.ImageReaderOptions(camera_model=options.lens, existing_camera_id=1)
-        if masks is not None:
-            reader.mask_path = str(masks)
-        extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=options.threads)
-        extraction.sift.max_num_features = options.max_features
-        todo = _without_features(database, names)
-        for start in range(0, len(todo), _CHUNK):
-            pycolmap.extract_features(
-                database, images, todo[start : start + _CHUNK], reader_options=reader, extraction_options=extraction
-            )
-            say(f"features: {len(names) - len(todo) + min(start + _CHUNK, len(todo))} of {len(names)} photographs")
-        matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=options.threads)
-        verification = pycolmap.TwoViewGeometryOptions()
-        verification.ransac.random_seed = options.seed
-        listed = database.with_name("pairs.txt")
-        for start in range(0, len(pairs), _PAIR_CHUNK):
-            some = pairs[start : start + _PAIR_CHUNK]
-            listed.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in some), encoding="utf-8")
-            pairing: Any = pycolmap.ImportedPairingOptions()
-            pairing.match_list_path = str(listed)
-            pycolmap.match_image_pairs(database, matching, pairing, verification)
-            say(f"matches: {start + len(some)} of {len(pairs)} pairs of photographs")
+    reader = pycolmap.ImageReaderOptions(camera_model=options.lens, existing_camera_id=1)
+    if masks is not None:
+        reader.mask_path = str(masks)
+    extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=options.threads)
+    extraction.sift.max_num_features = options.max_features
+    todo = _without_features(database, names)
+    for start in range(0, len(todo), _CHUNK):
+        some = todo[start : start + _CHUNK]
+        pycolmap.extract_features(database, images, some, reader_options=reader, extraction_options=extraction)
+        say(f"features: {len(names) - len(todo) + start + len(some)} of {len(names)} photographs")
 
 
-def _check_free_space(database: Path, max_features: int, images: int, pairs: int) -> None:
-    there = database.stat().st_size if database.is_file() else 0
-    needed = _LEAST_BYTES + max_features * (_BYTES_PER_FEATURE * images + _BYTES_PER_MATCH * pairs) - there
-    free = shutil.disk_usage(database.parent).free
-    if free < needed:
-        raise OutputError(
-            explain(
-                str(database.parent),
-                expected=f"up to {needed / 1e6:.0f} MB free for features and matches",
-                got=f"{free / 1e6:.0f} MB",
-                remedy="Make space, choose another --output, or lower --max-features; finished stages are kept.",
-            )
-        )
+def _match(
+    database: Path,
+    names: Sequence[str],
+    pairs: npt.NDArray[np.int64],
+    options: FeatureOptions,
+    say: Callable[[str], None],
+) -> None:
+    import pycolmap
+
+    matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=options.threads)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = options.seed
+    listed = database.with_name("pairs.txt")
+    for start in range(0, len(pairs), _PAIR_CHUNK):
+        some = pairs[start : start + _PAIR_CHUNK]
+        listed.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in some), encoding="utf-8")
+        pairing: Any = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = str(listed)
+        pycolmap.match_image_pairs(database, matching, pairing, verification)
+        say(f"matches: {start + len(some)} of {len(pairs)} pairs of photographs")
 
 
 def lens_parameters(camera: CameraModel, lens: LensModel) -> list[float]:

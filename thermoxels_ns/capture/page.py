@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -17,6 +18,7 @@ from thermoxels_ns.capture.gravity import Up
 from thermoxels_ns.capture.measurement import measurement_rows
 from thermoxels_ns.capture.metric_scale import MetricScale
 from thermoxels_ns.capture.pairs import Pair
+from thermoxels_ns.capture.rig_words import turn_deg, turn_error_deg, why_turn_is_unsure, with_error
 from thermoxels_ns.capture.sfm_model import SfmModel
 from thermoxels_ns.checks import replace_when_done
 from thermoxels_ns.data.dead_pixels import MIN_FRAMES
@@ -173,18 +175,22 @@ def _dropped(dropped: Mapping[str, str]) -> str:
 
 
 def _cameras(page: CapturePage) -> str:
-    errors = page.rig.standard_errors
-    focal_error = errors.get("log_focal", float("nan")) * page.rig.thermal_camera.fl_x
+    found = page.rig.standard_errors
+    focal_error = found.get("log_focal", float("nan")) * page.rig.thermal_camera.fl_x
+    errors = {"focal": focal_error, **{name: found[name] for name in ("cx", "cy") if name in found}}
     columns = (
-        ("photographs", page.model.camera, float("nan")),
-        ("thermal, start value", page.start.thermal_camera, float("nan")),
-        ("thermal, as written", page.rig.thermal_camera, focal_error),
+        ("photographs", page.model.camera, {}),
+        ("thermal, start value", page.start.thermal_camera, {}),
+        ("thermal, as written", page.rig.thermal_camera, errors),
     )
     lines = [
         ("size, pixels", [f"{camera.width} x {camera.height}" for _, camera, _ in columns]),
-        ("focal length, pixels", [_with_error(camera.fl_x, error) for _, camera, error in columns]),
+        (
+            "focal length, pixels",
+            [with_error(camera.fl_x, own.get("focal", math.nan), 1) for _, camera, own in columns],
+        ),
         ("angle of view, degrees", [f"{_angle(camera):.1f}" for _, camera, _ in columns]),
-        ("principal point, pixels", [f"{camera.cx:.1f}, {camera.cy:.1f}" for _, camera, _ in columns]),
+        ("principal point, pixels", [_principal_point(camera, own) for _, camera, own in columns]),
         ("distortion k1, k2", [f"{camera.k1:.4f}, {camera.k2:.4f}" for _, camera, _ in columns]),
     ]
     head = "".join(f"<th class=num>{escape(name)}</th>" for name, _, _ in columns)
@@ -192,26 +198,30 @@ def _cameras(page: CapturePage) -> str:
         f"<tr><td>{escape(name)}</td>{''.join(f'<td class=num>{escape(cell)}</td>' for cell in cells)}</tr>"
         for name, cells in lines
     )
-    transform = page.rig.visible_to_thermal
-    turn = np.degrees(np.arccos(np.clip((np.trace(transform[:3, :3]) - 1) / 2, -1, 1)))
-    shift = float(np.linalg.norm(transform[:3, 3]))
+    turn = with_error(turn_deg(page.rig), turn_error_deg(page.rig), 2)
+    shift = float(np.linalg.norm(page.rig.visible_to_thermal[:3, 3]))
     metres = f" = {100 * shift * page.scale.metres_per_unit:.1f} cm" if page.scale is not None else ""
     names = sorted({frame.camera for frame in page.frames if frame.camera})
     extra = [
         ("camera", ", ".join(names) or "the files do not say"),
-        ("between the two lenses", f"turned by {turn:.2f} degrees, {shift:.4g} units{metres} apart"),
+        ("between the two lenses", f"turned by {turn} degrees, {shift:.4g} units{metres} apart"),
         ("how the rig was found", page.rig.explanation),
     ]
+    unsure = why_turn_is_unsure(page.rig)
+    if unsure:
+        extra.append(("how sure the turn is", unsure))
     if np.isfinite(page.rig.score_after):
         extra.append(("agreement of edges", f"{page.rig.score_before:.3f} before, {page.rig.score_after:.3f} after"))
     if np.isfinite(page.rig.projection_sigma_px):
         extra.append(("standard error of a point's place", f"{page.rig.projection_sigma_px:.2f} thermal pixels"))
-    table = scrolling(f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{rows}</tbody></table>")
-    return table + _rows(extra)
+    table = f"<table class=cameras><thead><tr><th></th>{head}</tr></thead><tbody>{rows}</tbody></table>"
+    return scrolling(table) + _rows(extra)
 
 
-def _with_error(value: float, error: float) -> str:
-    return f"{value:.1f} ± {error:.1f}" if np.isfinite(error) else f"{value:.1f}"
+def _principal_point(camera: CameraModel, errors: Mapping[str, float]) -> str:
+    return ", ".join(
+        with_error(value, errors.get(name, math.nan), 1) for name, value in (("cx", camera.cx), ("cy", camera.cy))
+    )
 
 
 def _angle(camera: CameraModel) -> float:
@@ -302,10 +312,18 @@ _STYLE = """
 .rows { max-width: 56rem; }
 .rows td:first-child { width: 17rem; }
 td { overflow-wrap: anywhere; }
+td:first-child { min-width: 6rem; }
 .three { display: grid; grid-template-columns: repeat(3, 1fr); gap: .6rem; align-items: start; break-inside: avoid; }
 svg { max-width: 46rem; font-size: 11px; }
 svg rect { fill: var(--accent); opacity: .8; }
 svg line { stroke: var(--soft); }
 svg text { fill: var(--soft); }
-@media screen and (max-width: 640px) { .three { grid-template-columns: 1fr; } .rows td:first-child { width: 40%; } }
+@media screen and (max-width: 640px) {
+  .three { grid-template-columns: 1fr; }
+  .rows td:first-child { width: 40%; }
+  .cameras tr { display: grid; grid-template-columns: repeat(3, 1fr); border-bottom: 1px solid var(--line); }
+  .cameras td, .cameras th { border: 0; text-align: left; white-space: normal; }
+  .cameras td:first-child { grid-column: 1 / -1; padding-bottom: 0; color: var(--soft); }
+  .cameras th:first-child { display: none; }
+}
 """

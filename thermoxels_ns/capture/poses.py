@@ -182,7 +182,7 @@ def add_points(
     mapping.ba_refine_focal_length = mapping.ba_refine_extra_params = False
     mapping.constant_cameras = {1}
     mapping.fix_existing_frames = True
-    with quiet_colmap():
+    with quiet_colmap(folder):
         found = pycolmap.triangulate_points(
             posed, database, folder / "images", folder, clear_points=True, options=mapping, refine_intrinsics=False
         )
@@ -290,7 +290,7 @@ def _map(database: Path, folder: Path, options: PoseOptions, count: int, say: Ca
     pycolmap.set_random_seed(options.seed)
     mapping = _mapping_options(options)
     models: dict[int, Any] = {}
-    with quiet_colmap():
+    with quiet_colmap(folder):
         models = pycolmap.incremental_mapping(
             database, folder / "images", folder, mapping, next_image_callback=next_image
         )

@@ -27,6 +27,8 @@ JSON_NAME = "transforms.json"
 POINTS_NAME = "sparse_points.ply"
 TRACKS_NAME = "sparse_tracks.npz"
 _FOLDERS = ("images", "thermal", "masks")
+SCENE_CONTENT = (JSON_NAME, POINTS_NAME, TRACKS_NAME, *_FOLDERS)
+"""Files and folders of a scene in the output folder; masks only where there are any."""
 _COPIED = {"JPEG": ".jpg", "PNG": ".png"}
 _MOST_POINT_ERROR_PX = 2.0
 _LEAST_SIGHTINGS = 3
@@ -60,16 +62,13 @@ def scene_names(count: int) -> list[str]:
     ]
 
 
-def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = lambda _: None) -> Path:
+def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = lambda _: None) -> None:
     """Write a scene; until its last file, transforms.json, is in place the folder holds no scene.
 
     Args:
         scene: What is written.
         output: The capture's output folder; an earlier scene in it is replaced.
         say: Told how far it is.
-
-    Returns:
-        The path of transforms.json.
 
     Raises:
         OutputError: The folder cannot be written to.
@@ -94,7 +93,6 @@ def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = 
     for name in (POINTS_NAME, TRACKS_NAME, JSON_NAME):
         (new / name).replace(output / name)
     shutil.rmtree(new, ignore_errors=True)
-    return output / JSON_NAME
 
 
 def write_points(path: Path, points: FloatArray, colours: npt.NDArray[np.uint8]) -> None:

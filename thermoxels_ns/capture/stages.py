@@ -68,7 +68,7 @@ class StageCache:
         self._previous = key
         folder = self.folder / CACHE_FOLDER / name
         forced = self.from_stage is not None and STAGES.index(name) >= STAGES.index(self.from_stage)
-        title = f"{STAGES.index(name) + 1}/{len(STAGES)} {name}"
+        title = _title(name)
         stale = forced or _read_key(folder) != key
         done = None if stale else _read_done(folder, self.folder, writes)
         if done is not None:
@@ -90,6 +90,14 @@ class StageCache:
         write_json(folder / _DONE_FILE, {"seconds": took, "written": _sizes(self.folder, writes)})
         self.seconds.append((name, took))
         return folder
+
+    def leave_out(self, name: StageName, why: str) -> None:
+        """Say that a stage has nothing to do, so that the numbers of the others have no gap."""
+        self.say(f"{_title(name)}: left out, {why}")
+
+
+def _title(name: StageName) -> str:
+    return f"{STAGES.index(name) + 1}/{len(STAGES)} {name}"
 
 
 def fingerprint(paths: Sequence[Path], root: Path) -> list[tuple[str, int, int]]:

@@ -1,0 +1,168 @@
+"""What ends COLMAP from inside does not end the capture, and its error says what to do."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.capture.camera_card import counts, photograph
+from thermoxels_ns.capture import disk_space
+from thermoxels_ns.capture.colmap_process import run_apart
+from thermoxels_ns.capture.disk_space import check_free_space, disk_of
+from thermoxels_ns.capture.run import run_capture
+from thermoxels_ns.capture.settings import CaptureSettings
+from thermoxels_ns.errors import OutputError, SceneError, ThermoxelsError
+
+FULL = shutil.disk_usage(os.sep)._replace(free=4096)
+
+
+WORK = """
+import os, signal, time
+
+def count_to(last, folder, say):
+    for number in range(last):
+        say(f"{number} ä")
+    (folder / "counted").write_text(str(os.getpid()))
+
+
+def raise_one(problem, say):
+    say("before")
+    raise problem
+
+
+def abort_as_colmap(words, say):
+    os.write(2, words.encode())
+    os.abort()
+
+
+def killed(say):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def wait_for_ever(folder, say):
+    (folder / "pid").write_text(str(os.getpid()))
+    say("waiting")
+    time.sleep(600)
+"""
+"""A module that both processes can import."""
+
+
+@pytest.fixture
+def work(tmp_path, monkeypatch):
+    (tmp_path / "capture_apart.py").write_text(WORK, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "capture_apart", raising=False)
+    yield importlib.import_module("capture_apart")
+    sys.modules.pop("capture_apart", None)
+
+
+def test_it_is_another_process_and_says_how_far_it_is(tmp_path, work):
+    said = []
+    run_apart(work.count_to, (3, tmp_path), tmp_path, said.append)
+    assert said == ["0 ä", "1 ä", "2 ä"]
+    assert int((tmp_path / "counted").read_text()) != os.getpid()
+
+
+@pytest.mark.parametrize("problem", [SceneError("frame 3: no."), OSError(28, "No space left on device", "pairs.txt")])
+def test_errors_arrive_as_they_were_raised(tmp_path, work, problem):
+    said = []
+    with pytest.raises(type(problem)) as raised:
+        run_apart(work.raise_one, (problem,), tmp_path, said.append)
+    assert type(raised.value) is type(problem) and str(raised.value) == str(problem)
+    assert said == ["before"]
+
+
+def test_an_abort_is_an_error_with_its_reason(tmp_path, work):
+    words = "E1 thread.cc] SQLite error: disk I/O error\n*** Check failure stack trace: ***\n    @ 0x7f\n"
+    with pytest.raises(ThermoxelsError, match=r"COLMAP: expected to end.*SQLite error: disk I/O error.*--from-stage"):
+        run_apart(work.abort_as_colmap, (words,), tmp_path)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
+def test_a_lack_of_memory_is_named(tmp_path, work):
+    with pytest.raises(ThermoxelsError, match=r"killed.*memory runs out.*--max-features"):
+        run_apart(work.killed, (), tmp_path)
+
+
+def test_a_mistake_of_ours_is_not_silent(tmp_path, work):
+    with pytest.raises(ThermoxelsError, match=r"exit status 1 \(.*ZeroDivisionError"):
+        run_apart(work.raise_one, (ZeroDivisionError("zero"),), tmp_path)
+
+
+@pytest.mark.parametrize("says_so", [True, False])
+def test_a_full_disk_is_named_whatever_colmap_says(tmp_path, work, monkeypatch, says_so):
+    """The disk may have room again when it is looked at: then COLMAP's words tell."""
+    words = "[database_sqlite.cc:1262] SQLite error: database or disk is full\n" if says_so else "stack trace\n"
+    if not says_so:
+        monkeypatch.setattr(disk_space.shutil, "disk_usage", lambda _: FULL)
+    with pytest.raises(OutputError, match=r"free space for features, matches and poses.*finished stages are kept") as e:
+        run_apart(work.abort_as_colmap, (words,), tmp_path)
+    assert str(e.value).startswith(f"disk at {disk_of(tmp_path)}: ")
+
+
+def test_a_disk_that_fills_during_a_capture_is_named(tmp_path, monkeypatch):
+    """The space is there when features begin; the process that looks for them dies; then there is none."""
+    for name in "abc":
+        photograph(tmp_path / "card" / f"{name}-visible.jpg")
+        counts(tmp_path / "card" / f"{name}-radiometric.tiff")
+    usage = [shutil.disk_usage(tmp_path), FULL]
+    monkeypatch.setattr(disk_space.shutil, "disk_usage", lambda _: usage.pop(0) if len(usage) > 1 else usage[0])
+    monkeypatch.setattr("thermoxels_ns.capture.feature_matching._find_and_match", _abort_in_the_middle)
+    with pytest.raises(OutputError, match=rf"disk at {disk_of(tmp_path)}: .*got 0 MB.*\.capture"):
+        run_capture(tmp_path / "card", tmp_path / "scene", CaptureSettings())
+    monkeypatch.undo()
+    with pytest.raises(SceneError, match="photographs that fit together"):  # grey ones: it got past the features
+        run_capture(tmp_path / "card", tmp_path / "scene", CaptureSettings())
+
+
+def _abort_in_the_middle(*_):
+    os.abort()
+
+
+def test_the_disk_of_a_path_is_where_it_is_mounted(tmp_path):
+    disk = disk_of(tmp_path / "not" / "there")
+    assert os.path.ismount(disk) and tmp_path.resolve().is_relative_to(disk)
+    with pytest.raises(OutputError, match=r"up to 9000000000000 MB free for dreams, got \d+ MB\. Wait; finished"):
+        check_free_space(tmp_path, 9e18, "dreams", "Wait")
+
+
+PARENT = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+from capture_apart import wait_for_ever
+from thermoxels_ns.capture.colmap_process import run_apart
+run_apart(wait_for_ever, (Path(sys.argv[1]),), Path(sys.argv[1]), lambda line: print(line, flush=True))
+"""
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="processes are looked up in /proc")
+def test_it_ends_with_the_process_that_started_it(tmp_path, work):
+    arguments = [sys.executable, "-c", PARENT, str(tmp_path), str(Path(work.__file__).parent)]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        assert parent.stdout.readline() == "waiting\n"
+        parent.kill()
+    pid = int((tmp_path / "pid").read_text())
+    for _ in range(200):
+        if not _runs(pid):
+            break
+        time.sleep(0.05)
+    assert not _runs(pid)
+
+
+def _runs(pid: int) -> bool:
+    """Whether a process is there that has not ended; one that nobody asked after is a zombie."""
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
