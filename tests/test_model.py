@@ -273,6 +273,12 @@ def test_values_that_cannot_work_are_refused(option, value):
         make(**{option: value})
 
 
+@pytest.mark.parametrize("degree", [-1, 3])
+def test_a_degree_of_colour_that_there_is_not_is_refused_before_the_first_step(degree):
+    with pytest.raises(ThermoxelsError, match="sh_degree"):
+        make(sh_degree=degree, resolutions=(8, 16), refine_at=(4,))  # the first lattice stores one colour
+
+
 def test_masked_pixels_do_not_count_in_evaluation():
     model = make().eval()
     generator = torch.Generator().manual_seed(2)

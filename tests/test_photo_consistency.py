@@ -320,3 +320,16 @@ def test_a_training_without_colour_starts_plain(scene, capsys):
     plain = density(scene, 1, **options)
     assert torch.equal(density(scene, 1, start="photographs", **options), plain)
     assert "the same density everywhere, because no photographs train" in " ".join(capsys.readouterr().out.split())
+
+
+def test_the_edge_of_a_mask_is_no_texture():
+    """Two plain pictures, dark and bright, half of each hidden: nothing shows texture."""
+    size = np.array([[16, 12]] * 2)
+    picture = np.full((2, 12, 16, 3), 0.1, np.float32)
+    picture[1] = 0.7
+    picture[:, :, 8:] = np.nan
+    hidden = Photographs(np.zeros((2, 3, 4)), np.zeros((2, 3)), size, np.array([0, 192]), picture.reshape(-1, 3), 0.0)
+    assert not np.isfinite(_textured(hidden).colours).any()
+    picture[0, 5, 3] = 0.9
+    seen = np.isfinite(_textured(replace(hidden, colours=picture.reshape(-1, 3))).colours).all(1).reshape(2, 12, 16)
+    assert seen[0, 5, 3] and not seen[1].any()

@@ -10,7 +10,7 @@ from typing import Literal
 from nerfstudio.models.base_model import ModelConfig
 
 from thermoxels_ns.errors import ThermoxelsError, explain
-from thermoxels_ns.field.harmonics import num_coefficients
+from thermoxels_ns.field.harmonics import MAX_DEGREE, num_coefficients
 from thermoxels_ns.field.voxel_grid import DensityActivation
 from thermoxels_ns.ray_rendering import Backend
 from thermoxels_ns.schedule import QUALITIES, schedule_for
@@ -114,7 +114,7 @@ class ThermoxelsModelConfig(ModelConfig):
     tried for trial-steps, some photographs held back, and that which shows those better is taken; the log gives both
     figures. It costs the time of the trials. Needs 16 photographs and a run of at least three trials, else plain."""
     trial_steps: int = 250
-    """Steps of each trial of the start auto."""
+    """Steps of each trial of the start auto; half of them where one start leads clearly."""
     hold_density: int = 20
     """First steps in which the density stands after a start from photographs, while colours find their values."""
     carve: Literal["auto", "off"] = "auto"
@@ -203,6 +203,8 @@ class ThermoxelsModelConfig(ModelConfig):
             "tv_share": (1e-6, 1.0, "above 0, at most 1"),
         }
         values = {name: (float(getattr(self, name)), *limits) for name, limits in ranges.items()}
+        if self.sh_degree is not None:
+            values["sh_degree"] = (float(self.sh_degree), 0, MAX_DEGREE, "None, 0, 1 or 2")
         values |= {
             f"loss weight {name}": (float(weight), 0.0, 1e30, "a finite number, 0 or more")
             for name, weight in vars(self.loss_weights()).items()

@@ -185,9 +185,13 @@ def _textured(photographs: Photographs) -> Photographs:
     variations = []
     for (width, height), first in zip(photographs.sizes, photographs.firsts):
         picture = photographs.colours[first : first + width * height].reshape(height, width, 3)
-        brightness = np.nan_to_num(np.log(np.maximum(picture, _USABLE[0])).mean(-1))
+        brightness = np.log(np.maximum(picture, _USABLE[0])).mean(-1)
+        hidden = np.isnan(brightness)
+        brightness[hidden] = 0.0
         mean, square = (cv2.blur(v, (_TEXTURE_PIXELS, _TEXTURE_PIXELS)) for v in (brightness, brightness**2))
-        variations.append((square - mean * mean).reshape(-1))
+        # The edge of what a mask hides is no texture.
+        whole = cv2.blur(hidden.astype(np.float32), (_TEXTURE_PIXELS, _TEXTURE_PIXELS)) == 0.0
+        variations.append(np.where(whole, square - mean * mean, 0.0).reshape(-1))
     variation = np.concatenate(variations)
     plain = variation < max(np.quantile(variation, 1.0 - _TEXTURED_SHARE), _LEAST_TEXTURE**2)
     return replace(photographs, colours=np.where(plain[:, None], np.float32(np.nan), photographs.colours))

@@ -86,6 +86,8 @@ def _tracks(scene: SceneFile, folder: str) -> SparseTracks:
     if found is None:
         raise SceneError(f"{len(frames)} photographs in common, too few or all at one place: no common world")
     points, error_px, frame, point = _points(model, place)
+    if not all(camera.width for camera in model.cameras.values()):
+        raise SceneError("it has a camera whose photographs are 0 pixels wide")
     widths = [f.intrinsics.width / model.cameras[images[n].camera_id].width for n, f in zip(place, frames)]
     error_px = error_px * float(np.median(widths))
     moved = found.points(points)

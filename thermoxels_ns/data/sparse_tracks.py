@@ -104,7 +104,9 @@ def read_tracks(path: Path) -> SparseTracks:
     )
 
 
-def sightlines(tracks: SparseTracks, frames: Sequence[Frame], name: str = "tracks") -> Sightlines:
+def sightlines(
+    tracks: SparseTracks, frames: Sequence[Frame], name: str = "tracks", remedy: str = _REMEDY
+) -> Sightlines:
     """Lines from frames to the points that they see and that are well known.
 
     A point counts if at least `FEWEST_VIEWS` of the frames see it, more than `LEAST_PARALLAX_DEG` apart, with a mean
@@ -115,6 +117,7 @@ def sightlines(tracks: SparseTracks, frames: Sequence[Frame], name: str = "track
         tracks: Points and who sees them.
         frames: Frames whose sightings are used, in any order.
         name: What the tracks are called in messages.
+        remedy: What messages advise.
 
     Raises:
         SceneError: None of the frames is in the tracks, or the tracks belong to other poses.
@@ -127,7 +130,7 @@ def sightlines(tracks: SparseTracks, frames: Sequence[Frame], name: str = "track
                 name,
                 expected="photographs of this scene",
                 got=f"{len(tracks.frames)} others, such as {', '.join(tracks.frames[:2]) or 'none'}",
-                remedy=_REMEDY,
+                remedy=remedy,
             )
         )
     known = np.isfinite(tracks.points).all(axis=1) & (tracks.point_error_px <= MOST_ERROR_PX)
@@ -146,7 +149,7 @@ def sightlines(tracks: SparseTracks, frames: Sequence[Frame], name: str = "track
                 name,
                 expected="points in front of the photographs that see them",
                 got=f"{behind.mean():.0%} of the sightings behind: the poses are others",
-                remedy=_REMEDY,
+                remedy=remedy,
             )
         )
     frame, point, line = frame[~behind], point[~behind], line[~behind]

@@ -41,7 +41,9 @@ def find_sightlines(scene: SceneFile, training: Sequence[int], source: TrackSour
     if found is None:
         return None
     try:
-        return sightlines(found, frames, "its tracks")
+        return sightlines(
+            found, frames, "its tracks", "Give it the photographs and poses of the json, or move it away."
+        )
     except SceneError as problem:
         warn_unused("the scene's folder", str(problem))
         return None

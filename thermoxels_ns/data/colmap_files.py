@@ -1,0 +1,69 @@
+"""Whether the binary files of a COLMAP model are complete; its readers go on behind the end of one that is cut off."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+from thermoxels_ns.errors import SceneError
+
+_LEAST_CAMERA_BYTES = 48
+"""Of a camera with three parameters; others have more."""
+_FRAME_BYTES, _DATUM_BYTES = 64, 16
+"""Of a frame before the number of its images, and of each of them."""
+_POINT_BYTES, _SIGHTING_BYTES = 43, 8
+"""Of a point before the length of its track, and of each element of the track."""
+_IMAGE_BYTES, _FEATURE_BYTES = 64, 24
+"""Of an image before its name, and of each of its features."""
+_LENGTH = struct.Struct("<Q")
+
+
+def check_complete(folder: Path) -> None:
+    """Refuse a model whose files end before what they announce, as those of an interrupted copy do.
+
+    Args:
+        folder: Holds cameras, images, points3D and, of newer versions, frames; text is not looked at.
+
+    Raises:
+        SceneError: A file is too short; names it.
+    """
+    for name in ("cameras", "frames", "images", "points3D"):
+        path = folder / f"{name}.bin"
+        if path.is_file() and not _complete(name, path):
+            raise SceneError(f"it cannot be read, {path.name} ends before its last entry, as after an interrupted copy")
+
+
+def _complete(name: str, path: Path) -> bool:
+    try:
+        data = path.read_bytes()
+        (count,) = struct.unpack_from("<Q", data)
+        end = 8
+        if name == "cameras":
+            return len(data) >= end + count * _LEAST_CAMERA_BYTES
+        behind = {"frames": _behind_frame, "images": _behind_image, "points3D": _behind_point}[name]
+        for _ in range(count):
+            end = behind(data, end)
+    except OSError as problem:
+        raise SceneError(f"it cannot be read, {path.name}: {problem.strerror}") from problem
+    except (struct.error, ValueError):  # a number, or the end of a name, behind the end
+        return False
+    return end <= len(data)
+
+
+def _behind_frame(data: bytes, begin: int) -> int:
+    """Place of the byte behind the frame that begins at a byte."""
+    (images,) = struct.unpack_from("<I", data, begin + _FRAME_BYTES)
+    return begin + _FRAME_BYTES + 4 + images * _DATUM_BYTES
+
+
+def _behind_point(data: bytes, begin: int) -> int:
+    """Place of the byte behind the point that begins at a byte."""
+    (sightings,) = _LENGTH.unpack_from(data, begin + _POINT_BYTES)
+    return begin + _POINT_BYTES + 8 + sightings * _SIGHTING_BYTES
+
+
+def _behind_image(data: bytes, begin: int) -> int:
+    """Place of the byte behind the image that begins at a byte."""
+    features_at = data.index(b"\0", begin + _IMAGE_BYTES) + 1
+    (features,) = _LENGTH.unpack_from(data, features_at)
+    return features_at + 8 + features * _FEATURE_BYTES
