@@ -226,6 +226,7 @@ class HeatAccuracy:
 
         matplotlib.use("Agg")
         from matplotlib import pyplot
+        from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
         problems = list(dict.fromkeys(row.problem for row in rows))
         figure, panels = pyplot.subplots(1, len(problems), figsize=(4.6 * len(problems), 4.2), layout="constrained")
@@ -234,8 +235,8 @@ class HeatAccuracy:
             for method in dict.fromkeys(row.method for row in mine):
                 dots = sorted((row.seconds, row.error_k) for row in mine if row.method == method)
                 line = "" if method == "driver" or problem == "NAFEMS T3" else "-"
-                marker, size = ("*", 13) if method == "driver" else ("o", 5)
-                panel.plot(*zip(*dots), marker + line, markersize=size, label=method)
+                marker, size, colour = ("*", 13, "black") if method == "driver" else ("o", 5, None)
+                panel.plot(*zip(*dots), marker + line, markersize=size, color=colour, label=method)
             panel.set(
                 xscale="log",
                 yscale="log",
@@ -244,7 +245,11 @@ class HeatAccuracy:
                 ylabel="largest error of a node [K]",
             )
             panel.grid(True, which="both", alpha=0.25)
-            panel.legend(loc="lower left")
+            for axis in (panel.xaxis, panel.yaxis):
+                axis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+                axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+                axis.set_minor_formatter(NullFormatter())
+            panel.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=4, columnspacing=0.8, handletextpad=0.3)
         self.picture.parent.mkdir(parents=True, exist_ok=True)
         with replace_when_done(self.picture) as path:
             figure.savefig(path, dpi=110)
