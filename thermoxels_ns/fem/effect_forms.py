@@ -9,6 +9,7 @@ from thermoxels_ns.fem.account import Assembled
 from thermoxels_ns.fem.forms import FixedForm, FluxForm, Form, RadiationForm, RobinForm, SourceForm
 from thermoxels_ns.fem.linear_space import LinearSpace
 from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.terms import FluxTerm, RadiationTerm, RobinTerm, SourceTerm
 
 
@@ -32,7 +33,12 @@ class EffectForms:
 
 
 def effect_forms(
-    problem: HeatProblem, space: LinearSpace, reference_c: float, bill: Assembled | None = None
+    problem: HeatProblem,
+    space: LinearSpace,
+    reference_c: float,
+    bill: Assembled | None = None,
+    *,
+    where: Selection | None = None,
 ) -> EffectForms:
     """Turn effects into terms and terms into forms; what acts nowhere has none.
 
@@ -41,6 +47,7 @@ def effect_forms(
         space: The nodes.
         reference_c: What temperatures are relative to, [degrees Celsius].
         bill: Where fixed temperatures are counted, which are ready at once; None: nowhere.
+        where: Patches and regions that effects are looked for in, if others than those that `space` adds up heat by.
 
     Raises:
         HeatError: An effect names what the mesh does not have.
@@ -50,7 +57,7 @@ def effect_forms(
     radiation: list[RadiationForm] = []
     fixed: list[FixedForm] = []
     for label, effect in zip(effect_labels(problem), problem.effects):
-        for bare in effect.terms(space.selection):
+        for bare in effect.terms(space.selection if where is None else where):
             if not len(bare.tets if isinstance(bare, SourceTerm) else bare.facets):
                 continue
             term = replace(bare, effect=label)

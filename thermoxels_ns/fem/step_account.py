@@ -112,7 +112,8 @@ class StepAccount:
         unexplained = float(np.max(np.abs(relative_content - relative_content[0] - supplied)))
         exchanged = float(self._exchanged_j[:done].sum())
         mean = relative_content[0] / total_mass
-        spread = float(mass @ np.abs(states_k[0] - mean))
+        # Not by BLAS, whose sum depends on the number of its threads.
+        spread = float(np.sum(mass * np.abs(states_k[0] - mean)))
         scale, spread_scale = max(float(content[0]), exchanged), spread + exchanged
         if unexplained > _SUSPICIOUS * min(scale, spread_scale):
             terms = self._terms_j(states_k, times_s, unexplained / _ROUND_OFF)

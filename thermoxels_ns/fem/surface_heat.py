@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.checks import check_shape
 from thermoxels_ns.errors import HeatError
-from thermoxels_ns.fem.effect_forms import effect_labels
+from thermoxels_ns.fem.effect_forms import effect_forms, effect_labels
 from thermoxels_ns.fem.fixed_nodes import FixedNodes
-from thermoxels_ns.fem.forms import FixedForm, FluxForm, Form, RadiationForm, RobinForm
+from thermoxels_ns.fem.forms import SourceForm
 from thermoxels_ns.fem.linear_space import LinearSpace
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quadratic_space import QuadraticSpace
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import EffectHeat, heat_by_effect
 from thermoxels_ns.fem.system import HeatSystem
-from thermoxels_ns.fem.terms import FixedTerm, FluxTerm, RadiationTerm, RobinTerm
 
 Vector = npt.NDArray[np.float64]
 
@@ -63,29 +61,16 @@ def heat_by_part(
     check_shape("temperature_c", temperature_c, (space.num_nodes,), remedy, HeatError)
     reference_c = 0.5 * (float(temperature_c.min()) + float(temperature_c.max()))
     relative_k = temperature_c - reference_c
-    labels = effect_labels(problem)
-    forms: list[Form] = []
-    fixed: list[FixedForm] = []
-    for label, effect in zip(labels, problem.effects):
-        for term in effect.terms(selection):
-            if isinstance(term, (RobinTerm, FluxTerm, RadiationTerm, FixedTerm)) and len(term.facets):
-                term = replace(term, effect=label)
-                if isinstance(term, RobinTerm):
-                    forms.append(RobinForm(term, space, reference_c))
-                elif isinstance(term, FluxTerm):
-                    forms.append(FluxForm(term, space))
-                elif isinstance(term, RadiationTerm):
-                    forms.append(RadiationForm(term, space, reference_c))
-                else:
-                    fixed.append(FixedForm(term, space, reference_c))
+    acting = effect_forms(problem, space, reference_c, where=selection)
+    forms = [form for form in acting.exchanging if not isinstance(form, SourceForm)]
     groups = [(form.effect, group) for form in forms for group in form.groups]
     flows = [form.group_heat_w(relative_k, time_s) for form in forms]
-    if fixed:
-        held, system = FixedNodes(fixed, space.num_nodes), HeatSystem(problem, lumped=order == 1, order=order)
+    if acting.fixed:
+        held, system = FixedNodes(acting.fixed, space.num_nodes), HeatSystem(problem, lumped=order == 1, order=order)
         groups += held.groups
         kept_w = -system.net_heat_at_fixed(temperature_c - system.reference_c, time_s)
         flows.append(held.shares @ kept_w)
-    named = [label for label in labels if any(owner == label for owner, _ in groups)]
+    named = [label for label in effect_labels(problem) if any(owner == label for owner, _ in groups)]
     return heat_by_effect(named, groups, np.concatenate([np.zeros(0), *flows])[None])
 
 
