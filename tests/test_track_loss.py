@@ -50,6 +50,13 @@ def test_rays_end_before_and_behind_their_points_by_margin_and_uncertainty() -> 
     assert request.rgb_rays is not None and not bool(request.rgb_rays.any())
 
 
+def test_rays_to_points_nearer_than_the_margin_have_no_length_before_them() -> None:
+    request = track_rays(uncertainty=1.0)[0].request(25, 0.1, 0.05, torch.Generator().manual_seed(3), CPU)
+    assert request.far is not None
+    assert torch.equal(request.far[:25], torch.zeros(25))
+    assert bool((request.far[25:] > 1.1).all())
+
+
 @pytest.mark.parametrize("backend", ["reference", "fused"])
 def test_a_wall_in_place_costs_nothing_and_one_before_or_behind_it_everything(backend: str) -> None:
     assert wall(0.16, backend) < 1e-3
