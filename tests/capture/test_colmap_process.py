@@ -11,12 +11,15 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.capture.camera_card import counts, photograph
+from tests.capture.posed_model import ring_model
 from thermoxels_ns.capture import disk_space
 from thermoxels_ns.capture.colmap_process import run_apart
 from thermoxels_ns.capture.disk_space import check_free_space, disk_of
+from thermoxels_ns.capture.poses import add_points
 from thermoxels_ns.capture.run import run_capture
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.errors import OutputError, SceneError, ThermoxelsError
@@ -31,6 +34,15 @@ def count_to(last, folder, say):
     for number in range(last):
         say(f"{number} ä")
     (folder / "counted").write_text(str(os.getpid()))
+
+
+def threads_of_blas(say):
+    return os.environ["OPENBLAS_NUM_THREADS"], ["ä"] * 100_000
+
+
+def end_within_its_answer(say):
+    os.write(1, b"\\n\\x1egASVhA")
+    os._exit(3)
 
 
 def raise_one(problem, say):
@@ -69,6 +81,18 @@ def test_it_is_another_process_and_says_how_far_it_is(tmp_path, work):
     run_apart(work.count_to, (3, tmp_path), tmp_path, said.append)
     assert said == ["0 ä", "1 ä", "2 ä"]
     assert int((tmp_path / "counted").read_text()) != os.getpid()
+
+
+def test_what_it_returns_arrives_and_its_blas_has_one_thread(work, tmp_path, monkeypatch):
+    """Sums by COLMAP's own BLAS depend on its threads."""
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
+    assert run_apart(work.threads_of_blas, (), tmp_path) == ("1", ["ä"] * 100_000)
+    assert run_apart(work.count_to, (0, tmp_path), tmp_path) is None
+
+
+def test_a_part_of_an_answer_is_none(work, tmp_path):
+    with pytest.raises(ThermoxelsError, match="COLMAP: expected to end"):
+        run_apart(work.end_within_its_answer, (), tmp_path)
 
 
 @pytest.mark.parametrize("problem", [SceneError("frame 3: no."), OSError(28, "No space left on device", "pairs.txt")])
@@ -121,6 +145,31 @@ def test_a_disk_that_fills_during_a_capture_is_named(tmp_path, monkeypatch):
     monkeypatch.undo()
     with pytest.raises(SceneError, match="photographs that fit together"):  # grey ones: it got past the features
         run_capture(tmp_path / "card", tmp_path / "scene", CaptureSettings())
+
+
+def test_a_mapping_that_aborts_is_an_error_and_the_capture_goes_on_behind_its_features(tmp_path, monkeypatch):
+    for name in "abc":
+        photograph(tmp_path / "card" / f"{name}-visible.jpg")
+        counts(tmp_path / "card" / f"{name}-radiometric.tiff")
+    said: list[str] = []
+    monkeypatch.setattr("thermoxels_ns.capture.mapping._map", _abort_in_the_middle)
+    with pytest.raises(ThermoxelsError, match=r"COLMAP: expected to end, got exit status.*--from-stage poses"):
+        run_capture(tmp_path / "card", tmp_path / "scene", CaptureSettings(), said.append)
+    assert said[-1].startswith("matches: 3 of 3")
+    monkeypatch.undo()
+    with pytest.raises(SceneError, match="photographs that fit together"):  # grey ones: it got past the mapping
+        run_capture(tmp_path / "card", tmp_path / "scene", CaptureSettings())
+
+
+def test_points_for_given_poses_that_abort_are_an_error(tmp_path, monkeypatch):
+    model = ring_model(3)
+    size = model.camera.height, model.camera.width, 3
+    files = {name: photograph(tmp_path / f"{name}.jpg", np.full(size, 90, np.uint8)) for name in model.frames}
+    monkeypatch.setattr("thermoxels_ns.capture.mapping._triangulate", _abort_in_the_middle)
+    with pytest.raises(ThermoxelsError, match=r"COLMAP: expected to end, got exit status.*--from-stage poses"):
+        add_points(model, files, tmp_path)
+    monkeypatch.undo()
+    assert not len(add_points(model, files, tmp_path).points)
 
 
 def _abort_in_the_middle(*_):

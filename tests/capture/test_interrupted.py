@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import gc
 import shutil
 import sqlite3
+import sys
 
 import pytest
 
 from tests.capture.camera_card import counts, photograph
+from tests.capture.posed_model import ring_model
 from tests.capture.textured_room import VISIBLE
 from thermoxels_ns.capture.feature_matching import FeatureOptions, fill_database
+from thermoxels_ns.capture.results import load_model, save_model
 from thermoxels_ns.capture.run import run_capture
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.stages import STAGES, StageCache
@@ -108,6 +112,24 @@ def test_a_database_without_its_last_frame_is_begun_again(tmp_path):
     with sqlite3.connect(tmp_path / "features.db") as opened:
         opened.execute("delete from frames where frame_id = 2")
     assert fill() == [2, 2]
+
+
+def test_a_result_that_does_not_fit_on_the_disk_is_one_error(tmp_path, monkeypatch):
+    """Nothing else is printed, not even when what held the half-made file is cleared away."""
+    resource = pytest.importorskip("resource")
+    later = []
+    monkeypatch.setattr(sys, "unraisablehook", later.append)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))
+    try:
+        with pytest.raises(OutputError, match=r"model\.npz"):
+            save_model(tmp_path, ring_model(4))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    gc.collect()
+    assert later == [] and list(tmp_path.iterdir()) == []
+    save_model(tmp_path, ring_model(4))
+    assert load_model(tmp_path).frames == ring_model(4).frames
 
 
 def stages_that_ran(card, scene, **more):

@@ -75,30 +75,33 @@ def test_the_same_seed_gives_the_same_bits(card, found, tmp_path):
     assert again.camera == found[0].model.camera
 
 
-def test_an_interrupted_run_goes_on_with_its_features(card, found, tmp_path, monkeypatch):
-    work = tmp_path / "work"
+def test_an_interrupted_run_goes_on_with_its_features(card, found, tmp_path):
+    work, said = tmp_path / "work", []
     shutil.copytree(found[1], work)
-    import pycolmap
-
-    monkeypatch.setattr(pycolmap, "extract_features", lambda *_, **__: pytest.fail("features were looked for again"))
-    again = find_poses(card[0], work, 430.0, options=OPTIONS).model
+    again = find_poses(card[0], work, 430.0, options=OPTIONS, say=said.append).model
+    assert not [line for line in said if line.startswith("features:")]
     assert np.array_equal(again.camera_to_world, found[0].model.camera_to_world)
+    for file in work.glob("features.db*"):
+        file.unlink()
+    find_poses(card[0], work, 430.0, options=OPTIONS, say=said.append)
+    assert [line for line in said if line.startswith("features:")]
 
 
 def test_points_for_poses_that_are_given(card, tmp_path):
     photographs, truth = card
     none = np.zeros(0, dtype=np.int64)
-    names = tuple(f"shot{n}" for n in range(COUNT))
+    names = tuple(f"shot{n}" for n in range(COUNT))[::-1]  # in another order than that of their names
     given = SfmModel(
-        *(names, VISIBLE, truth, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), none, none),
+        *(names, VISIBLE, truth[::-1], np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), none, none),
         np.zeros((0, 2)),
     )
     model = add_points(given, photographs, tmp_path, options=OPTIONS)
-    assert np.array_equal(model.camera_to_world, truth)
+    assert np.array_equal(model.camera_to_world, truth[::-1])
     assert model.camera == VISIBLE
     assert len(model.points) > 200
     assert np.median(np.abs(model.points).min(axis=1)) < 0.01
     assert np.median(model.sighting_error_px()) < 0.7
+    assert (np.diff(model.sighting_frame) >= 0).all() and set(model.sighting_frame) == set(range(COUNT))
 
 
 def test_masked_parts_have_no_features(card, tmp_path):

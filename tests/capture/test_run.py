@@ -121,6 +121,7 @@ def test_the_page_shows_everything_and_fetches_nothing(capture):
     page = capture[2].page.read_text()
     for words in ("shot9-visible.jpg", "lonely.jpg", f"shot{COUNT}", "too few matches", "480 x 360", "160 x 128"):
         assert words in page, words
+    assert " °C" in page and "degrees C" not in page
     assert page.count("<img") == 3 * COUNT
     assert page.count("<svg") == 3  # reprojection, temperatures, drift
     assert not re.search(r"""(src|href)=["'](?!data:)""", page)
@@ -139,6 +140,19 @@ def test_a_second_run_takes_everything_from_the_first(capture):
     assert again.dropped == first.dropped
     assert np.array_equal(again.rig.visible_to_thermal, first.rig.visible_to_thermal)
     assert np.array_equal(again.drift.offsets_k, first.drift.offsets_k)
+
+
+def test_tracks_that_someone_deleted_are_written_again_and_nothing_else_is_done(capture, tmp_path):
+    card, earlier, _, _ = capture
+    scene, said = tmp_path / "scene", []
+    shutil.copytree(earlier, scene)
+    before = {path: path.read_bytes() for path in scene.rglob("*") if ".capture" not in path.parts and path.is_file()}
+    (scene / "sparse_tracks.npz").unlink()
+    run_capture(card, scene, settings(skip_bad=True), said.append)
+    ran = [line for line in said if re.match(r"\d/9", line) and not re.search("as before|left out", line)]
+    assert ran == ["8/9 scene"]
+    assert len(before[scene / "sparse_tracks.npz"]) > 1000
+    assert {path: path.read_bytes() for path in before} == before
 
 
 def test_another_scale_runs_only_what_depends_on_it_and_so_does_from_stage(capture, tmp_path):

@@ -14,7 +14,7 @@ from tests.capture.textured_room import write_card
 from tests.integration.commands import run
 
 COUNT = 5
-STOPS = ("features:", "4/9 scale", "rig: Comparing", "9/9 page")
+STOPS = ("features:", "matches:", "4/9 scale", "rig: Comparing", "9/9 page")
 """What the command says last before it is killed, one after the other."""
 
 

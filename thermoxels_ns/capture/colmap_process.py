@@ -12,22 +12,28 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from thermoxels_ns.capture.colmap_log import colmap_stopped
 from thermoxels_ns.errors import ThermoxelsError
 
 Say = Callable[[str], None]
+_Result = TypeVar("_Result")
 
 _MARK = b"\x1e"
 """Begins a line that is a message of ours; all other lines are COLMAP's."""
 _LINES_KEPT = 400
 """Of COLMAP's last words: it adds a stack of calls to the sentence that matters."""
 _KILLED = -int(getattr(signal, "SIGKILL", 9))
+_ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1"}
+"""COLMAP brings a BLAS of its own, whose sums depend on the number of its threads: one thread, same result."""
 
 
-def run_apart(work: Callable[..., None], arguments: tuple[Any, ...], folder: Path, say: Say = lambda _: None) -> None:
+def run_apart(
+    work: Callable[..., _Result], arguments: tuple[Any, ...], folder: Path, say: Say = lambda _: None
+) -> _Result:
     """Call ``work(*arguments, say)`` in a new process and wait for its end.
 
     The process ends with this one, also where this one is killed.
@@ -38,6 +44,9 @@ def run_apart(work: Callable[..., None], arguments: tuple[Any, ...], folder: Pat
         folder: Where it writes; looked at when it fails.
         say: Gets what the function tells its own `say`.
 
+    Returns:
+        What the function returned; pickle must be able to hold it.
+
     Raises:
         OutputError: It ended because the disk of `folder` is full.
         ThermoxelsError: It raised one, or ended without a word.
@@ -45,11 +54,15 @@ def run_apart(work: Callable[..., None], arguments: tuple[Any, ...], folder: Pat
     """
     start = f"import sys; sys.path[:] = {sys.path!r}; import {__name__} as there; there.serve()"
     child = subprocess.Popen(
-        [sys.executable, "-c", start], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        [sys.executable, "-c", start],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        env=os.environ | _ENVIRONMENT,
     )
     assert child.stdin is not None and child.stdout is not None
     words: deque[str] = deque(maxlen=_LINES_KEPT)
-    problem: Exception | None = None
+    ended: _Raised | _Returned | None = None
     try:
         with suppress(BrokenPipeError):  # it ended before it could listen; its words and status follow
             child.stdin.write(pickle.dumps((work, arguments)))
@@ -57,12 +70,12 @@ def run_apart(work: Callable[..., None], arguments: tuple[Any, ...], folder: Pat
         for line in child.stdout:
             if not line.startswith(_MARK):
                 words.append(line.decode("utf-8", "replace").rstrip())
-                continue
-            message = pickle.loads(base64.b64decode(line[len(_MARK) :]))
-            if isinstance(message, Exception):
-                problem = message
-            else:
-                say(message)
+            elif line.endswith(b"\n"):  # it may end in the middle of one
+                message = pickle.loads(base64.b64decode(line[len(_MARK) :]))
+                if isinstance(message, str):
+                    say(message)
+                else:
+                    ended = message
         status = child.wait()
     finally:
         if child.poll() is None:
@@ -71,10 +84,21 @@ def run_apart(work: Callable[..., None], arguments: tuple[Any, ...], folder: Pat
         with suppress(OSError):
             child.stdin.close()
         child.stdout.close()
-    if problem is not None:
-        raise problem
-    if status:
+    if isinstance(ended, _Raised):
+        raise ended.problem
+    if status or ended is None:
         raise colmap_stopped(_reason(status, words), folder)
+    return ended.result
+
+
+@dataclass(frozen=True)
+class _Raised:
+    problem: Exception
+
+
+@dataclass(frozen=True)
+class _Returned:
+    result: Any
 
 
 def serve() -> None:
@@ -82,9 +106,9 @@ def serve() -> None:
     work, arguments = pickle.load(sys.stdin.buffer)
     threading.Thread(target=_end_with_the_other, daemon=True).start()
     try:
-        work(*arguments, _send)
+        _send(_Returned(work(*arguments, _send)))
     except (ThermoxelsError, OSError) as problem:
-        _send(problem)
+        _send(_Raised(problem))
 
 
 def _end_with_the_other() -> None:
@@ -92,7 +116,7 @@ def _end_with_the_other() -> None:
     os._exit(1)
 
 
-def _send(message: str | Exception) -> None:
+def _send(message: str | _Raised | _Returned) -> None:
     sys.stdout.buffer.write(b"\n" + _MARK + base64.b64encode(pickle.dumps(message)) + b"\n")
     sys.stdout.buffer.flush()
 

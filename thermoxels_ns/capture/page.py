@@ -271,13 +271,13 @@ def _temperatures(page: CapturePage) -> str:
     low, high = (float(value) for value in np.percentile(values, _PERCENTILES))
     rows = [
         *measurement_rows(page.frames),
-        ("lowest, median, highest", f"{values.min():.1f}, {np.median(values):.1f}, {values.max():.1f} degrees C"),
+        ("lowest, median, highest", f"{values.min():.1f}, {np.median(values):.1f}, {values.max():.1f} °C"),
         ("pixels without a temperature", f"{100 * page.masked_share:.2f} %"),
         ("stuck pixels of the sensor", str(page.dead_pixels) if len(page.frames) >= MIN_FRAMES else _TOO_FEW),
     ]
     if page.overlay_share is not None:
         rows.append(("photographs masked", f"{100 * page.overlay_share:.1f} %"))
-    label = "temperature, degrees C; how many pixels of a sample, without the coldest and hottest 0.1 %"
+    label = "temperature, °C; how many pixels of a sample, without the coldest and hottest 0.1 %"
     return _rows(rows) + histogram(values, label, limits=(low, high))
 
 

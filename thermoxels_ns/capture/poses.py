@@ -6,15 +6,13 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from thermoxels_ns.capture.colmap_log import quiet_colmap
-from thermoxels_ns.capture.colmap_model import model_of_colmap
 from thermoxels_ns.capture.contract import CameraModel
-from thermoxels_ns.capture.feature_matching import FeatureOptions, LensModel, Matching, fill_database, lens_parameters
+from thermoxels_ns.capture.feature_matching import FeatureOptions, LensModel, Matching, fill_database
+from thermoxels_ns.capture.mapping import MIN_FRAMES, MatchedPhotographs, map_photographs, triangulate
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
 from thermoxels_ns.capture.sfm_model import SfmModel
@@ -23,8 +21,6 @@ from thermoxels_ns.errors import SceneError, explain
 _GUESSED_FOCAL = 1.0
 """Of the longest side, where the photograph does not say: a lens of 53 degrees."""
 _JPEG_QUALITY = 95
-MIN_FRAMES = 3
-"""Fewer photographs are no reconstruction."""
 _DATABASE = "features.db"
 
 
@@ -91,28 +87,21 @@ def find_poses(
     images = _reduced(photographs, names, folder / "images", size, options.image_size)
     mask_folder = _write_masks(masks, images, folder / "masks")
     start = start_camera(size, focal_px).resized(*images.camera_size)
-    database = folder / _DATABASE
     features = FeatureOptions(options.max_features, options.matching, options.lens, options.seed, options.threads)
+    matched = MatchedPhotographs(folder / _DATABASE, folder / "images", images.files, size)
     fill_database(
-        database, folder / "images", list(images.files), start, focal_px is not None, mask_folder, features, say
+        matched.database, matched.images, list(images.files), start, focal_px is not None, mask_folder, features, say
     )
-    models = _map(database, folder, options, len(names), say)
-    if not models:
-        raise _too_few(0, "photographs that fit together")
-    models.sort(key=lambda model: (-model.num_reg_images(), -len(model.points3D)))
-    model = model_of_colmap(models[0], images.files, size)
-    if len(model.frames) < MIN_FRAMES:
-        raise _too_few(len(model.frames), "photographs that fit together")
-    elsewhere = {
-        images.files[image.name]: f"fits only to {part.num_reg_images() - 1} others, in a part of its own"
-        for part in models[1:]
-        for image in part.images.values()
-        if image.has_pose
-    }
+    mapped = map_photographs(matched, options.seed, say)
+    found = 0 if mapped is None else len(mapped.model.frames)
+    if mapped is None or found < MIN_FRAMES:
+        raise _too_few(found, "photographs that fit together")
     for name in names:
-        if name not in model.frames:
-            dropped[name] = elsewhere.get(name, "too few matches with the other photographs")
-    return Poses(model, dropped)
+        if name in mapped.elsewhere:
+            dropped[name] = f"fits only to {mapped.elsewhere[name]} others, in a part of its own"
+        elif name not in mapped.model.frames:
+            dropped[name] = "too few matches with the other photographs"
+    return Poses(mapped.model, dropped)
 
 
 def add_points(
@@ -136,8 +125,6 @@ def add_points(
     Raises:
         SceneError: There are fewer than two photographs, or they are of another size than the camera's.
     """
-    import pycolmap
-
     options = options or PoseOptions()
     names = list(given.frames)
     if len(names) < 2:
@@ -162,42 +149,10 @@ def add_points(
     images = _reduced(photographs, names, folder / "images", size, options.image_size)
     mask_folder = _write_masks(masks, images, folder / "masks")
     camera = given.camera.resized(*images.camera_size)
-    database = folder / _DATABASE
     features = FeatureOptions(options.max_features, options.matching, "OPENCV", options.seed, options.threads)
-    fill_database(database, folder / "images", list(images.files), camera, True, mask_folder, features, say)
-    posed = pycolmap.Reconstruction()
-    opencv = pycolmap.Camera(
-        model="OPENCV", width=camera.width, height=camera.height, params=lens_parameters(camera, "OPENCV"), camera_id=1
-    )
-    posed.add_camera_with_trivial_rig(opencv)
-    with pycolmap.Database.open(database) as opened:
-        ids = {image.name: image.image_id for image in opened.read_all_images()}
-    for index, file in enumerate(images.files):
-        inverse = np.linalg.inv(given.camera_to_world[index] @ np.diag([1.0, -1.0, -1.0, 1.0]))
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(inverse[:3, :3]), inverse[:3, 3])
-        image = pycolmap.Image(name=file, camera_id=1, image_id=ids[file])
-        posed.add_image_with_trivial_frame(image, pose)
-    pycolmap.set_random_seed(options.seed)
-    mapping = _mapping_options(options)
-    mapping.ba_refine_focal_length = mapping.ba_refine_extra_params = False
-    mapping.constant_cameras = {1}
-    mapping.fix_existing_frames = True
-    with quiet_colmap(folder):
-        found = pycolmap.triangulate_points(
-            posed, database, folder / "images", folder, clear_points=True, options=mapping, refine_intrinsics=False
-        )
-    model = model_of_colmap(found, images.files, size)
-    return SfmModel(
-        given.frames,
-        given.camera,
-        given.camera_to_world,
-        model.points,
-        model.colours,
-        model.point_error_px,
-        np.array([given.frames.index(model.frames[i]) for i in range(len(model.frames))])[model.sighting_frame],
-        model.sighting_point,
-        model.sighting_pixel,
-    )
+    matched = MatchedPhotographs(folder / _DATABASE, folder / "images", images.files, size)
+    fill_database(matched.database, matched.images, list(images.files), camera, True, mask_folder, features, say)
+    return triangulate(matched, given, options.seed, say)
 
 
 def start_camera(size: tuple[int, int], focal_px: float | None) -> CameraModel:
@@ -261,40 +216,6 @@ def _write_masks(masks: PhotographMasks | None, images: _ReducedImages, folder: 
         use = Image.fromarray(np.where(masks.of(frame), np.uint8(255), np.uint8(0)))
         use.resize(images.camera_size, Image.Resampling.NEAREST).save(folder / f"{file}.png")
     return folder
-
-
-def _mapping_options(options: PoseOptions) -> Any:
-    import pycolmap
-
-    mapping = pycolmap.IncrementalPipelineOptions()
-    mapping.random_seed = options.seed
-    mapping.mapper.random_seed = options.seed
-    mapping.triangulation.random_seed = options.seed
-    # Sums over threads come in any order, and their last bits decide which point is kept: one thread, same result.
-    mapping.num_threads = 1
-    mapping.mapper.num_threads = 1
-    mapping.min_model_size = MIN_FRAMES
-    return mapping
-
-
-def _map(database: Path, folder: Path, options: PoseOptions, count: int, say: Callable[[str], None]) -> list[Any]:
-    import pycolmap
-
-    found = [2]  # the first pair comes without a call
-
-    def next_image() -> None:
-        found[0] += 1
-        if found[0] % 10 == 0:
-            say(f"poses: {min(found[0], count)} of {count} photographs")
-
-    pycolmap.set_random_seed(options.seed)
-    mapping = _mapping_options(options)
-    models: dict[int, Any] = {}
-    with quiet_colmap(folder):
-        models = pycolmap.incremental_mapping(
-            database, folder / "images", folder, mapping, next_image_callback=next_image
-        )
-    return list(models.values())
 
 
 def _too_few(got: int, what: str) -> SceneError:

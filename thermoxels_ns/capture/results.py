@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -47,8 +48,8 @@ def load_pairs(folder: Path, root: Path) -> tuple[tuple[Pair, ...], dict[str, st
 def save_model(folder: Path, model: SfmModel, name: str = "model") -> None:
     """Write a model as ``name.npz``."""
     arrays = {each.name: getattr(model, each.name) for each in fields(model) if each.name not in ("frames", "camera")}
-    with replace_when_done(folder / f"{name}.npz") as temporary:
-        np.savez(temporary, frames=np.array(model.frames), camera=np.array(_numbers(model.camera)), **arrays)
+    first = {"frames": np.array(model.frames), "camera": np.array(_numbers(model.camera))}
+    _write_arrays(folder / f"{name}.npz", first | arrays)
 
 
 def load_model(folder: Path, name: str = "model") -> SfmModel:
@@ -60,17 +61,16 @@ def load_model(folder: Path, name: str = "model") -> SfmModel:
 
 def save_rig(folder: Path, rig: RigEstimate, name: str = "rig") -> None:
     """Write a rig as ``name.npz``."""
-    with replace_when_done(folder / f"{name}.npz") as temporary:
-        np.savez(
-            temporary,
-            camera=np.array(_numbers(rig.thermal_camera)),
-            visible_to_thermal=rig.visible_to_thermal,
-            parameters=np.array(rig.parameters, dtype=np.str_),
-            covariance=rig.covariance,
-            determined=np.array(rig.determined),
-            explanation=np.array(rig.explanation),
-            scores=np.array([rig.score_before, rig.score_after, rig.projection_sigma_px], dtype=np.float64),
-        )
+    arrays = {
+        "camera": np.array(_numbers(rig.thermal_camera)),
+        "visible_to_thermal": rig.visible_to_thermal,
+        "parameters": np.array(rig.parameters, dtype=np.str_),
+        "covariance": rig.covariance,
+        "determined": np.array(rig.determined),
+        "explanation": np.array(rig.explanation),
+        "scores": np.array([rig.score_before, rig.score_after, rig.projection_sigma_px], dtype=np.float64),
+    }
+    _write_arrays(folder / f"{name}.npz", arrays)
 
 
 def load_rig(folder: Path, name: str = "rig") -> RigEstimate:
@@ -92,15 +92,14 @@ def load_rig(folder: Path, name: str = "rig") -> RigEstimate:
 
 def save_drift(folder: Path, drift: DriftEstimate) -> None:
     """Write a drift as ``drift.npz``."""
-    with replace_when_done(folder / "drift.npz") as temporary:
-        np.savez(
-            temporary,
-            offsets_k=drift.offsets_k,
-            radial=np.array(drift.radial, dtype=np.float64),
-            disagreement_k=np.array([drift.before_k, drift.after_k], dtype=np.float64),
-            used=np.array(drift.used),
-            explanation=np.array(drift.explanation),
-        )
+    arrays = {
+        "offsets_k": drift.offsets_k,
+        "radial": np.array(drift.radial, dtype=np.float64),
+        "disagreement_k": np.array([drift.before_k, drift.after_k], dtype=np.float64),
+        "used": np.array(drift.used),
+        "explanation": np.array(drift.explanation),
+    }
+    _write_arrays(folder / "drift.npz", arrays)
 
 
 def load_drift(folder: Path) -> DriftEstimate:
@@ -136,6 +135,14 @@ def load_scale(folder: Path) -> tuple[MetricScale | None, str, Up]:
         content["missing"],
         Up(np.array(up["direction"], dtype=np.float64), up["source"], up["spread_deg"]),
     )
+
+
+def _write_arrays(path: Path, arrays: dict[str, Any]) -> None:
+    """Write arrays, whole or not at all; put together in memory, because numpy's half-made files complain later."""
+    packed = io.BytesIO()
+    np.savez(packed, **arrays)
+    with replace_when_done(path) as temporary:
+        temporary.write_bytes(packed.getbuffer())
 
 
 def _arrays(path: Path) -> dict[str, Any]:

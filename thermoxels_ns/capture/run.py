@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from threadpoolctl import threadpool_limits
+
 from thermoxels_ns.capture.board_photos import board_of
 from thermoxels_ns.capture.camera_files import scan_folder
 from thermoxels_ns.capture.contract import DriftEstimate, RigEstimate
@@ -73,7 +75,8 @@ def run_capture(
         scan_folder(settings.board_photos)
     folder = prepare_output(output)
     try:
-        with only_capture(folder, say):
+        # Inverses and sums of BLAS depend on the number of its threads; one thread is no slower here.
+        with only_capture(folder, say), threadpool_limits(1, "blas"):
             remove_stale_temporaries(folder, [PAGE_NAME])
             cache = StageCache(folder, settings.from_stage, say)
             return _run_stages(CaptureJob(source, folder, settings, cache, say, board))
