@@ -1,9 +1,20 @@
+"""What the solver is given of a tolerance, and what is said while it works."""
+
 from __future__ import annotations
 
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
 import pytest
 
+from tests.heat_meshes import box_mesh, planes
 from thermoxels_ns import heat_solving
-from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
+from thermoxels_ns.fem.effects import Convection, HeatFlux
+from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.heat_command import Heat
 
 
 class Clock:
@@ -95,3 +106,79 @@ def test_steps_too_short_to_count_are_no_progress(clock) -> None:
         clock.now_s += 20.0
         progress(0.25, step)
     assert lines == ["25% of the time after 2 steps; about 60 s left."]
+
+
+def scene_of(time: TimeSteps | AdaptiveSteps | None) -> Any:
+    """What `solve_scene` asks of a heat scene."""
+    return SimpleNamespace(time=time)
+
+
+def feebly_warmed(depth_m: float = 0.3) -> HeatProblem:
+    """A wall between two airs, warmed by 0.05 W/m2, which 25 W/(m2 K) turn into at most 2 mK."""
+    mesh = box_mesh(planes(0.0, depth_m, step=depth_m / 6), [0.0, 0.1], [0.0, 0.1], temperature_c=20.0)
+    effects = Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, 0.0), HeatFlux(("x1",), 0.05)
+    return HeatProblem(mesh, Material("concrete", 1.7, 2200.0, 880.0), effects=effects)
+
+
+def solved(time: TimeSteps | None, problem: HeatProblem, **options: Any) -> heat_solving.SolvedScene:
+    chosen = Heat(mesh=Path("mesh.vtu"), scene="scene", **options)
+    return heat_solving.solve_scene(chosen, scene_of(time), problem, lambda _: None, lambda _: None)
+
+
+def test_what_is_left_out_counts_against_the_tolerance(monkeypatch) -> None:
+    """0.05 W/m2 take 2 mK of 50 mK: the solver may err by the other 48, and the estimate holds both."""
+    given: list[Any] = []
+    inner = heat_solving.solve_to_tolerance
+
+    def remember(problem, tolerance, **named):
+        given.append(tolerance)
+        return inner(problem, tolerance, **named)
+
+    monkeypatch.setattr(heat_solving, "solve_to_tolerance", remember)
+    found = solved(None, feebly_warmed(), tolerance=0.05).accuracy
+    assert found is not None and found.left_out_k == pytest.approx(0.002, rel=1e-6)
+    assert given[0].temperature_k == pytest.approx(0.048, rel=1e-6)
+    assert found.left_out_k < found.estimated_k <= 0.05 and found.met
+    everything = solved(None, feebly_warmed(), tolerance=0.05, leave_out_below_k=0.0).accuracy
+    assert everything is not None and everything.left_out_k == 0.0 and given[1].temperature_k == 0.05
+
+
+@pytest.mark.parametrize(("tolerance_k", "allowed_k"), [(0.05, 0.048), (None, 0.008)])
+def test_a_body_of_one_temperature_may_err_by_what_is_left(monkeypatch, tolerance_k, allowed_k) -> None:
+    asked: list[float] = []
+
+    def remember(problem, time, most_k):
+        asked.append(most_k)
+        return inner(problem, time, most_k)
+
+    inner = heat_solving.lumped_body
+    monkeypatch.setattr(heat_solving, "lumped_body", remember)
+    solved(TimeSteps(2, 1e9), feebly_warmed(), tolerance=tolerance_k, allow_unmet=True)
+    assert asked == [pytest.approx(allowed_k, rel=1e-3)]
+
+
+def test_the_error_of_a_body_of_one_temperature_holds_what_is_left_out() -> None:
+    """A copper cube in air."""
+    x = planes(0.0, 0.02, step=0.01)
+    effects = Convection(("*",), 5.0, 0.0), HeatFlux(("x0",), 0.01)
+    problem = HeatProblem(
+        box_mesh(x, x, x, temperature_c=20.0), Material("copper", 380.0, 8900.0, 380.0), effects=effects
+    )
+    found = solved(TimeSteps(4, 600.0), problem, tolerance=0.5)
+    assert found.lumped is not None and found.lumped.bound_k is not None and found.accuracy is not None
+    assert found.accuracy.order == 0 and found.accuracy.left_out_k > 0.0
+    assert found.accuracy.estimated_k == found.lumped.bound_k + found.accuracy.left_out_k
+
+
+@pytest.mark.parametrize(
+    ("tolerance_k", "share", "given", "expected"),
+    [
+        *((None, None, None, 0.01), (0.05, None, None, 0.01), (0.5, None, None, 0.1)),
+        *((None, 0.01, None, 0.0), (0.5, 0.01, None, 0.0), (0.5, 0.01, 0.2, 0.2), (None, None, 0.0, 0.0)),
+    ],
+)
+def test_what_may_be_left_out_unless_it_is_said(tolerance_k, share, given, expected) -> None:
+    options = Heat(
+        mesh=Path("mesh.vtu"), scene="s", tolerance=tolerance_k, flow_tolerance=share, leave_out_below_k=given
+    )
+    assert heat_solving.leave_out_below_k(options) == pytest.approx(expected) and np.isfinite(expected)

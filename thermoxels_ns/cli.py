@@ -19,6 +19,7 @@ from thermoxels_ns.cost import Cost
 from thermoxels_ns.demo import Demo, SceneName
 from thermoxels_ns.errors import ThermoxelsError
 from thermoxels_ns.heat_command import Heat
+from thermoxels_ns.option_help import join_help_lines
 
 _NEWS_FOR_PROGRAMMERS = r"`torch\.jit\.script` is deprecated"
 """How the warning begins that newer versions of torch give when nerfstudio 1.1.5 is imported."""
@@ -107,6 +108,7 @@ def main(arguments: list[str] | None = None) -> int:
     Returns:
         The exit status: 0, 1 for an error of the input (which is printed), 130 if the user interrupted it.
     """
+    join_help_lines(Capture, Demo, Synthetic, Cost, Heat)
     command = tyro.cli(
         Commands, prog="thermoxels", args=arguments, description="RGB and thermal photographs to a solid with heat."
     )

@@ -13,6 +13,7 @@ from thermoxels_ns.data.thermal_datamanager import ThermalDataManagerConfig
 from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
 from thermoxels_ns.model_config import ThermoxelsModelConfig
 from thermoxels_ns.optim import FusedAdamConfig, RowAdamConfig, RowRMSpropConfig
+from thermoxels_ns.option_help import join_help_lines
 from thermoxels_ns.pipeline import ThermoxelsPipelineConfig
 from thermoxels_ns.presets import read_preset, with_overrides
 from thermoxels_ns.schedule import QUALITIES
@@ -76,3 +77,5 @@ thermoxels = MethodSpecification(_trainer(), "RGB and thermal photographs to a v
 thermoxels_paper = _preset("thermoxels-paper", RowRMSpropConfig, RowRMSpropConfig)
 thermoxels_arco = _preset("thermoxels-arco")
 plenoxels_t = _preset("plenoxels-t")
+
+join_help_lines(*(method.config for method in (thermoxels, thermoxels_paper, thermoxels_arco, plenoxels_t)))

@@ -15,6 +15,7 @@ import torch
 import tyro
 
 from thermoxels_ns.errors import ThermoxelsError
+from thermoxels_ns.option_help import join_help_lines
 
 _EXPORTER = "nerfstudio.scripts.exporter"
 _SUBCOMMAND = "thermoxels-mesh"
@@ -106,6 +107,7 @@ def _with_mesh_export(commands: Any) -> Any:
     """Add our subcommand to ``Annotated[Union[...], markers]`` or ``Union[...]``, keeping members and markers."""
     from thermoxels_ns.export import ExportThermoxelsMesh
 
+    join_help_lines(ExportThermoxelsMesh)
     ours = Annotated[ExportThermoxelsMesh, tyro.conf.subcommand(name=_SUBCOMMAND)]
     markers = getattr(commands, "__metadata__", ())
     members = get_args(get_args(commands)[0] if markers else commands)

@@ -1,14 +1,18 @@
-"""nerfstudio's trainer, except that an interrupted save never harms an earlier checkpoint."""
+"""nerfstudio's trainer: checkpoints are complete or absent, and it says how a training goes on from one."""
 
 from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import torch
+import tyro
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils import writer
+from nerfstudio.utils.rich_utils import CONSOLE
 
+from thermoxels_ns.errors import CheckpointError, explain
 from thermoxels_ns.schedule import QUALITIES, Quality, Schedule, schedule_for
 
 
@@ -23,10 +27,15 @@ class ThermoxelsTrainerConfig(TrainerConfig):
     4000 steps: some minutes); `thermoxels cost` measures what they give. It replaces max-num-iterations, the lengths
     of the learning rate schedules, and the model's resolutions, refine-at, prune-at, thin-at, distortion-ramp and
     view-dependence-from."""
+    replaced: tyro.conf.Suppress[str] = ""
+    """What the quality replaced, for the log."""
 
     def __post_init__(self) -> None:
-        if self.quality is not None:
-            self.follow_schedule(schedule_for(*QUALITIES[self.quality]))
+        if self.quality is None:
+            return
+        model: Any = self.pipeline.model
+        self.replaced = f"{max(model.resolutions)} voxels and {self.max_num_iterations} steps"
+        self.follow_schedule(schedule_for(*QUALITIES[self.quality]))
 
     def follow_schedule(self, schedule: Schedule) -> None:
         """Set everything that depends on the resolution and the number of steps."""
@@ -41,6 +50,82 @@ class ThermoxelsTrainerConfig(TrainerConfig):
 
 class ThermoxelsTrainer(Trainer):
     """Trainer whose checkpoints are complete or absent."""
+
+    config: ThermoxelsTrainerConfig
+
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        """Build what trains, load the checkpoint, and say what a quality replaced: it may have been an option.
+
+        Raises:
+            CheckpointError: There is no checkpoint where one is to be, or the training cannot go on from it.
+        """
+        quality, replaced = self.config.quality, self.config.replaced
+        if quality is not None:
+            resolution, steps = QUALITIES[quality]
+            said = f"{resolution} voxels and {steps} steps"
+            CONSOLE.log(
+                f"quality {quality}: {said}" + (f", in place of {replaced}" if replaced not in ("", said) else "")
+            )
+        super().setup(test_mode)
+        # nerfstudio takes the shares and times that it shows from the number of steps without those before.
+        writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
+
+    def _load_checkpoint(self) -> None:
+        """Load a checkpoint if one is named, and say to which step the training goes on."""
+        self._check_that_there_is_one()
+        super()._load_checkpoint()
+        first, steps = self._start_step, self.config.max_num_iterations
+        if first == 0:
+            return
+        quality = self.config.quality
+        if quality is not None and first >= steps:
+            raise CheckpointError(
+                explain(
+                    "checkpoint",
+                    expected=f"one from before step {steps}, where quality {quality} ends",
+                    got=f"step {first}",
+                    remedy="Pass --max-num-iterations, how many more steps to take, in place of --quality.",
+                )
+            )
+        self._check_lattice(first)
+        if quality is not None:
+            CONSOLE.log(f"goes on from step {first} to step {steps}, where quality {quality} ends")
+            self.config.max_num_iterations = steps - first
+        else:
+            end = "" if first >= steps else f"; to end at step {steps} pass --max-num-iterations {steps - first}"
+            CONSOLE.log(f"goes on from step {first} for {steps} more{end}")
+
+    def _check_that_there_is_one(self) -> None:
+        folder, step, file = self.config.load_dir, self.config.load_step, self.config.load_checkpoint
+        if folder is not None:
+            pattern = "step-*.ckpt" if step is None else f"step-{step:09d}.ckpt"
+            missing = None if any(folder.glob(pattern)) else f"no {pattern} in {folder}"
+        else:
+            missing = None if file is None or file.is_file() else f"no file {file}"
+        if missing is not None:
+            raise CheckpointError(
+                explain(
+                    "checkpoint",
+                    expected="a folder with step-*.ckpt for --load-dir, or such a file for --load-checkpoint",
+                    got=missing,
+                    remedy="Pass the folder nerfstudio_models of a training.",
+                )
+            )
+
+    def _check_lattice(self, first: int) -> None:
+        """Refuse a lattice that is coarser than the options have it at a step: it would never be refined."""
+        model: Any = getattr(self.pipeline, "module", self.pipeline).model
+        refined = sum(step < first for step in model.config.refine_at)
+        expected, found = model.config.resolutions[refined], max(model.grid.lattice.cell_shape)
+        if found < expected:
+            raise CheckpointError(
+                explain(
+                    "checkpoint",
+                    expected=f"at least {expected} voxels at step {first}, which these options refine to before it",
+                    got=f"{found} voxels",
+                    remedy="Pass the quality, or the resolutions and refine-at, that the training began with.",
+                )
+            )
 
     def save_checkpoint(self, step: int) -> None:
         """Save model and optimisers under a temporary name, rename, and only then delete older checkpoints.

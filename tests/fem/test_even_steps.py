@@ -154,12 +154,26 @@ def test_what_jumps_over_the_range_is_taken_again_with_shorter_steps() -> None:
     assert solution.time_error_k == np.abs(even.errors_k()).max()
 
 
-def test_where_many_steps_jump_over_the_range_there_is_no_solution() -> None:
-    """Adaptive steps then take safe ones."""
+@pytest.mark.parametrize("duration_s", [700_000.0, 36_000_000.0])
+def test_where_many_steps_jump_over_the_range_there_is_no_solution(duration_s) -> None:
+    """Adaptive steps then take safe ones: of 32 steps in the first interval or of thousands none would jump."""
     problem = cube(Convection(("*",), 25.0, 0.0))
-    even = EvenSteps(HeatSystem(problem), AdaptiveSteps(36_000_000.0, 1e-3), ANY_K)
+    even = EvenSteps(HeatSystem(problem), AdaptiveSteps(duration_s, 1e-3), ANY_K)
     assert even.found and even.temperature_c.min() < -0.1
     assert even.solution() is None
+
+
+def test_iterations_of_all_steps_of_an_interval_are_counted() -> None:
+    """Where steps are equal from interval to interval, so is the work: half as many steps take about half of it."""
+    problem, time = two_pieces(), AdaptiveSteps(72_000.0, ANY_K)
+    few, many = (EvenSteps(HeatSystem(problem), time, 0.0, lambda *_: True, count).solution() for count in (1, 8))
+    assert few is not None and many is not None
+    assert few.steps == 10 and many.steps > 10
+    taken = np.array(many.iterations), np.array(few.iterations)
+    assert taken[1].min() >= 1 and taken[0].min() >= 1 and taken[0][0] > taken[1][0]
+    for solution in (few, many):
+        most = int(solution.status.split(" iterations at most")[0].split()[-1])
+        assert solution.iterations.max() >= most >= solution.iterations.sum() / solution.steps > 0.0
 
 
 @pytest.mark.parametrize("start_c", [10.0, 20.0])

@@ -78,6 +78,20 @@ def test_radiation_alone_cools_as_the_third_root_says() -> None:
     np.testing.assert_allclose(left_j, -capacity * np.diff(history.relative_k[:, 0]), rtol=1e-9)
 
 
+def test_a_black_piece_that_only_takes_radiation_in_is_warmed_by_it() -> None:
+    """10 W into 5 J / K for 3 s."""
+    equations = PieceEquations(*(np.array([part]) for part in (5.0, 0.0, 0.0, 10.0, 0.0)), 300.0)
+    history = follow_pieces(equations, np.zeros(1), np.array([0.0, 3.0]))
+    assert history.relative_k[1, 0] == pytest.approx(6.0, rel=1e-8) and history.mean_k[0, 0] == pytest.approx(3.0)
+
+
+def test_a_guess_below_absolute_zero_comes_back() -> None:
+    """Emission has the sign of the temperature there, or what a solver tries would run away from zero."""
+    equations = PieceEquations(*(np.array([part]) for part in (1.0, 0.0, 0.0, 0.0, 1e6)), 300.0)
+    history = follow_pieces(equations, np.array([-310.0]), np.array([0.0, 1.0, 10.0]))
+    assert -310.0 < history.relative_k[1, 0] < history.relative_k[2, 0] <= -300.0
+
+
 def test_pieces_with_and_without_radiation_do_not_disturb_each_other() -> None:
     rng = np.random.default_rng(0)
     parts = rng.uniform(1.0, 5.0, (4, 7))

@@ -68,6 +68,39 @@ def test_a_last_level_without_exchange_leaves_its_level_at_zero() -> None:
     np.testing.assert_allclose(matrix @ found, heat, atol=1e-12)
 
 
+def test_a_pivot_of_round_off_counts_as_none() -> None:
+    """What is left of 1 + 4e-16 after 1 is taken away is no number to divide by."""
+    matrix = sparse.csr_matrix(np.array([[1.0, 1.0], [1.0, 1.0 + 4e-16]]))
+    assert _DirectSolver()(matrix, np.array([1.0, 2.0])).tolist() == [1.0, 0.0]
+
+
+@pytest.mark.parametrize("heat", [1e-200, 1.0, 1e200])
+def test_the_size_of_the_heat_does_not_matter(cube, heat) -> None:
+    """Sums of squares neither vanish nor overflow."""
+    plain = MultigridConjugateGradients(cube[0]).solve(cube[1])
+    found = MultigridConjugateGradients(cube[0]).solve(heat * cube[1])
+    assert found.converged and found.iterations == plain.iterations
+    np.testing.assert_allclose(found.x, heat * plain.x, rtol=1e-9)
+
+
+def test_a_good_start_saves_iterations(cube) -> None:
+    solver = MultigridConjugateGradients(cube[0])
+    cold = solver.solve(cube[1])
+    assert solver.solve(cube[1], cold.x).iterations == 0 < cold.iterations
+    near = solver.solve(cube[1], cold.x * (1.0 + 1e-6))
+    assert near.iterations < cold.iterations
+    np.testing.assert_allclose(near.x, cold.x, rtol=1e-9)
+
+
+@pytest.mark.parametrize("spoiled", [-1.0, np.nan])
+def test_what_is_not_positive_definite_ends_at_once(cube, spoiled) -> None:
+    """Conjugate gradients know no way down there; iterations up to the limit would bring nothing."""
+    solver = MultigridConjugateGradients(cube[0])
+    solver._matrix = spoiled * cube[0]
+    found = solver.solve(cube[1])
+    assert not found.converged and found.iterations == 0
+
+
 def _line(count: int) -> sparse.lil_matrix:
     matrix = 2.0 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1)
     return sparse.lil_matrix(matrix)

@@ -10,6 +10,7 @@ import pytest
 
 from tests.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.errors import HeatError
+from thermoxels_ns.fem import screening as screening_module
 from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.effects import (
     AbsorbedSolar,
@@ -300,3 +301,39 @@ def test_an_effect_on_a_patch_without_triangles_does_nothing(tolerance_k: float,
     problem = HeatProblem(mesh, CONCRETE, effects=(Convection(SIDES, 10.0, 5.0), nowhere))
     screening = screen(problem, time, tolerance_k)
     assert [(left.effect, left.bound_k) for left in screening.left_out] == [("convection on interior-side", 0.0)]
+
+
+def test_what_is_left_out_holds_nothing_any_more() -> None:
+    """Convection alone would keep the flux's heat down; where both are left out, nothing does."""
+    flux_w_m2, seconds = 100.0, 3600.0
+    problem = HeatProblem(slab(), CONCRETE, effects=(HeatFlux(("*",), flux_w_m2), Convection(("*",), 2000.0, 20.0)))
+    time = TimeSteps(4, seconds / 4)
+    both = screen(problem, time, EVERYTHING)
+    assert [entry.effect for entry in both.left_out] == ["heat flux on *", "convection on *"]
+    alone = screen(problem, time, 0.1)
+    assert [entry.effect for entry in alone.left_out] == ["heat flux on *"]
+    assert alone.left_out[0].bound_k == pytest.approx(flux_w_m2 / 2000.0, rel=1e-3)
+    # Nodes on edges of the slab store least beside their area: they own a corner of a cell of 2 cm.
+    assert both.left_out[0].bound_k > 1.0 > 10.0 * alone.left_out[0].bound_k
+
+
+@pytest.mark.parametrize("flux_w_m2", [-1000.0, 1000.0])
+def test_what_a_flux_does_to_the_body_counts_for_the_exchange_beside_it(flux_w_m2) -> None:
+    """Body and air begin at 20 degrees: only what the flux does makes convection bring or take heat."""
+    problem = HeatProblem(slab(), CONCRETE, effects=(HeatFlux(("x0",), flux_w_m2), Convection(("x1",), 10.0, 20.0)))
+    screening = screen(problem, TimeSteps(4, 3600.0), 0.0)
+    assert screening.left_out == ()
+    assert [entry.bound_k is not None and entry.bound_k > 0.0 for entry in screening.kept] == [True, True]
+
+
+def test_bounds_on_obtuse_meshes_are_doubled_whatever_they_come_from(monkeypatch) -> None:
+    """Heat that warms a few nodes at an even rate, and heat that spreads from them into the depth."""
+    problem = HeatProblem(body(3, shaken=0.25), STEEL, effects=(HeatFlux(("x0",), 0.05),))
+    time, bounds_k = TimeSteps(4, 20000.0), []
+    for factor in (2.0, 4.0):
+        monkeypatch.setattr(screening_module, "_OBTUSE_FACTOR", factor)
+        (rise,) = screen(problem, time, EVERYTHING).left_out
+        (spread,) = screen(problem, time, 0.9 * rise.bound_k).left_out
+        assert "warms no node" in rise.reason and "spreads into the depth" in spread.reason
+        bounds_k.append([rise.bound_k, spread.bound_k])
+    np.testing.assert_allclose(bounds_k[1], 2.0 * np.array(bounds_k[0]), rtol=1e-12)

@@ -142,6 +142,13 @@ def test_a_sun_that_moves() -> None:
     assert np.asarray(given.function(walls, 0.0)).tolist() == [0.0, 0.0]
 
 
+def test_steps_follow_a_sun_that_moves_and_not_one_that_stands() -> None:
+    """In an hour it goes 15 degrees, which the cosine on a wall feels; in ten it would be night."""
+    moves = moving_sun(datetime(2025, 6, 21, tzinfo=UTC), 47.0, 0.0, NORTH)
+    assert 600.0 <= moves.resolution_s <= 3600.0
+    assert fixed_sun((3.0, 0.0, 4.0), Sunlight(1000.0, 0.0)).resolution_s == np.inf
+
+
 def test_a_sun_that_stands_still() -> None:
     effect = AbsorbedSolar(("*",), 0.5, fixed_sun((3.0, 0.0, 4.0), Sunlight(1000.0, 0.0)))
     irradiance = effect.bounded("irradiance_w_m2")

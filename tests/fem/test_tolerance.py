@@ -185,6 +185,10 @@ def test_too_little_memory_is_a_status() -> None:
         nafems_t3(), Tolerance(0.01), duration_s=32.0, memory_bytes=1e6, allow_unmet=True, log=silent
     )
     assert not transient.met and "P1 on the mesh size halved" in transient.status
+    # Heat flows are something to ask for instead only where they were not asked for, and without steps.
+    flows = solve_to_tolerance(problem, Tolerance(None, 1e-9), memory_bytes=room, allow_unmet=True, log=silent)
+    advised = ["--flow-tolerance 0.01" in each.status for each in (found, transient, flows)]
+    assert advised == [True, False, False]
 
 
 @pytest.mark.parametrize(

@@ -142,6 +142,8 @@ class Run:
                 f" {failure}. Allow more memory (--memory-gb) or a larger error, or take what there is (--allow-unmet "
                 "True); the worst temperature is often at a sharp edge."
             )
+            if last.step_tolerance_k is None and self.tolerance.heat_flow is None:
+                status += " Heat flows are met far sooner: ask for them instead (--flow-tolerance 0.01)."
         if failure and not allow_unmet:
             raise HeatError(status)
         self._log(status)

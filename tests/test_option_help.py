@@ -1,0 +1,126 @@
+"""Texts of options break at the width of the terminal, not where the source does."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import subprocess
+import sys
+import textwrap
+from dataclasses import dataclass, field
+from typing import Union
+
+import pytest
+import tyro
+
+from thermoxels_ns import cli, config, nerfstudio_bridge
+from thermoxels_ns.export import ExportThermoxelsMesh
+from thermoxels_ns.option_help import join_help_lines, joined_lines
+
+LONG = "Every option's text is one paragraph here, however many lines it takes in the source: 12 of them, or more."
+
+
+@dataclass
+class Below:
+    """What is inherited."""
+
+    low: int = 1
+    """Every option's text is one paragraph here,
+    however many lines it takes in the source:
+    12 of them, or more."""
+
+
+@dataclass
+class Options(Below):
+    """What is asked for."""
+
+    high: int = 2
+    """Every option's text is one paragraph here, however many lines
+    it takes in the source: 12 of them,
+
+    or more."""
+    bare: int = 3
+    metres: float = field(default=1.0, metadata={"unit": "m"})
+    """Length,
+    [m]."""
+
+
+def help_of(program: list[str], columns: int, monkeypatch, capsys) -> str:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    with pytest.raises(SystemExit):
+        cli.main([*program, "--help"])
+    return capsys.readouterr().out
+
+
+def words(text: str) -> str:
+    """A help text as the terminal broke it, in one line."""
+    return " ".join(re.sub(r"[│╭╮╰╯─]", " ", text).split())
+
+
+def test_only_empty_lines_break_a_text() -> None:
+    assert joined_lines("\n  One, \n  (2),\n\n  `three`\n    4.\n") == "One, (2),\n\n`three` 4."
+
+
+def test_tyro_is_told_what_stands_below_the_fields_of_a_class(monkeypatch, capsys) -> None:
+    join_help_lines(Options)
+    join_help_lines(Options)
+    assert {each.name: dict(each.metadata) for each in dataclasses.fields(Options)} == {
+        "low": {},  # of a class that was not named and is not of the package
+        "high": {"help": LONG.replace("or more", "\n\nor more").replace(" \n", "\n")},
+        "bare": {},
+        "metres": {"unit": "m", "help": "Length, [m]."},
+    }
+    monkeypatch.setenv("COLUMNS", "300")
+    with pytest.raises(SystemExit):
+        tyro.cli(Options, args=["--help"])
+    shown = capsys.readouterr().out
+    assert "however many lines it takes in the source: 12 of them," in shown
+    assert "however many lines it takes in the source: 12 of them, or more" in words(shown)
+
+
+def test_a_class_of_the_package_is_joined_with_what_it_inherits() -> None:
+    nerfstudio_bridge._with_mesh_export(Union[Options, Below])  # noqa: UP007 - as nerfstudio has it
+    texts = {each.name: each.metadata.get("help", "") for each in dataclasses.fields(ExportThermoxelsMesh)}
+    assert all(texts.values()) and "\n" not in "".join(texts.values())
+
+
+@pytest.mark.parametrize("method", ["thermoxels", "thermoxels_paper", "thermoxels_arco", "plenoxels_t"])
+def test_what_a_method_holds_is_joined(method) -> None:
+    trainer = getattr(config, method).config
+    for part, option in (
+        *((trainer, "quality"), (trainer.pipeline.model, "resolutions")),
+        *((trainer.pipeline.datamanager, "streams"), (trainer.pipeline.datamanager.dataparser, "missing_thermal")),
+    ):
+        (text,) = (each.metadata["help"] for each in dataclasses.fields(part) if each.name == option)
+        assert "\n" not in text and len(text) > 40
+
+
+@pytest.mark.parametrize("command", ["capture", "demo", "synthetic", "cost", "heat"])
+def test_a_wide_terminal_shows_each_text_in_one_line(command, monkeypatch, capsys) -> None:
+    shown = help_of([command], 1500, monkeypatch, capsys)
+    kinds = {"capture": cli.Capture, "demo": cli.Demo, "synthetic": cli.Synthetic, "cost": cli.Cost, "heat": cli.Heat}
+    texts = [each.metadata["help"] for each in dataclasses.fields(kinds[command]) if "help" in each.metadata]
+    lines = shown.splitlines()
+    assert texts and all(any(text in line for line in lines) for text in texts)
+
+
+def test_a_narrow_terminal_shows_all_words(monkeypatch, capsys) -> None:
+    text = next(each.metadata["help"] for each in dataclasses.fields(cli.Heat) if each.name == "tolerance")
+    shown = help_of(["heat"], 60, monkeypatch, capsys)
+    assert text in words(shown)
+    assert max(map(len, shown.split("options")[-1].splitlines())) <= 60
+
+
+def test_nerfstudios_own_texts_stay() -> None:
+    """Also those of fields that our classes inherit from it."""
+    code = """
+        import dataclasses
+        from nerfstudio.engine.trainer import TrainerConfig
+        before = {each.name: dict(each.metadata) for each in dataclasses.fields(TrainerConfig)}
+        import thermoxels_ns.config as ours
+        after = {each.name: dict(each.metadata) for each in dataclasses.fields(TrainerConfig)}
+        machine = {each.name: dict(each.metadata) for each in dataclasses.fields(ours.thermoxels.config.machine)}
+        print(before == after, any("help" in each for each in machine.values()))
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1:] == ["True False"], done.stderr

@@ -1,0 +1,142 @@
+"""How a training goes on from a checkpoint, and what a quality replaces."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tyro
+import yaml
+
+from thermoxels_ns.config import thermoxels
+from thermoxels_ns.data.synthetic import make_scene, write_scene
+from thermoxels_ns.errors import CheckpointError
+from thermoxels_ns.trainer import ThermoxelsTrainer, writer
+
+DRAFT = ("--quality", "draft")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("trainer") / "scene"
+    return write_scene(make_scene("sphere"), folder, 6, 1, width=40, height=30, progress=False)
+
+
+@pytest.fixture(autouse=True)
+def one_writer_at_a_time(monkeypatch) -> None:
+    for name in ("EVENT_WRITERS", "EVENT_STORAGE"):
+        monkeypatch.setattr(writer, name, [])
+    monkeypatch.setattr(writer, "GLOBAL_BUFFER", {})
+
+
+def trainer(scene: Path, folder: Path, *options: str) -> ThermoxelsTrainer:
+    """The trainer that ns-train would make."""
+    fixed = ["--vis", "tensorboard", "--pipeline.model.start", "plain", "--machine.device-type", "cpu"]
+    fixed += ["--output-dir", str(folder), "--experiment-name", "e", "--timestamp", "run", "--data", str(scene)]
+    before = deepcopy(thermoxels.config)
+    settings = (tyro.conf.FlagConversionOff,)
+    config = tyro.cli(type(before), default=before, args=[*fixed, *options], config=settings)
+    config.pipeline.datamanager.data = config.data
+    return config.setup(local_rank=0, world_size=1)
+
+
+@pytest.fixture(scope="module")
+def checkpoints(scene, tmp_path_factory) -> Path:
+    """Checkpoints on the first lattice of a draft, of 32 voxels, as if from different steps."""
+    folder = tmp_path_factory.mktemp("checkpoints")
+    made = trainer(scene, folder, *DRAFT, "--save-only-latest-checkpoint", "False")
+    made.setup()
+    for step in (99, 499, 799):
+        made.save_checkpoint(step)
+    return made.checkpoint_dir
+
+
+def words(capsys) -> str:
+    return " ".join(capsys.readouterr().out.split())
+
+
+def test_a_number_of_steps_that_a_quality_replaces_is_named(scene, tmp_path, capsys):
+    made = trainer(scene, tmp_path, *DRAFT, "--max-num-iterations", "2")
+    made.setup()
+    assert made.config.max_num_iterations == 800 and made._start_step == 0
+    said = words(capsys)
+    assert "quality draft: 64 voxels and 800 steps, in place of 128 voxels and 2 steps" in said
+    assert "goes on from" not in said and writer.GLOBAL_BUFFER["max_iter"] == 800
+
+
+def test_a_quality_that_replaces_nothing_says_so_little(scene, tmp_path, capsys):
+    trainer(scene, tmp_path, "--quality", "standard").setup()
+    said = words(capsys)
+    assert "quality standard: 128 voxels and 1500 steps" in said and "in place of" not in said
+
+
+def test_what_was_replaced_is_no_option_and_survives_the_config_file(scene, tmp_path, capsys):
+    config = trainer(scene, tmp_path, *DRAFT).config
+    assert yaml.load(yaml.dump(config), Loader=yaml.Loader).replaced == "128 voxels and 1500 steps"
+    with pytest.raises(SystemExit):
+        trainer(scene, tmp_path, "--replaced", "nothing")
+    with pytest.raises(SystemExit):
+        trainer(scene, tmp_path, "--help")
+    assert "--replaced" not in capsys.readouterr().out
+
+
+def test_a_quality_ends_where_it_ends_also_in_a_resumed_training(scene, checkpoints, tmp_path, capsys):
+    made = trainer(scene, tmp_path, *DRAFT, "--load-dir", str(checkpoints), "--load-step", "99")
+    made.setup()
+    assert (made._start_step, made.config.max_num_iterations) == (100, 700)
+    assert "goes on from step 100 to step 800, where quality draft ends" in words(capsys)
+    assert writer.GLOBAL_BUFFER["max_iter"] == 800
+
+
+def test_steps_are_counted_from_the_checkpoint_and_it_is_said(scene, checkpoints, tmp_path, capsys):
+    options = ["--pipeline.model.resolutions", "32", "--pipeline.model.refine-at"]
+    file = str(checkpoints / "step-000000099.ckpt")
+    made = trainer(scene, tmp_path, *options, "--load-checkpoint", file, "--max-num-iterations", "150")
+    made.setup()
+    assert (made._start_step, made.config.max_num_iterations) == (100, 150)
+    assert "goes on from step 100 for 150 more; to end at step 150 pass --max-num-iterations 50" in words(capsys)
+    assert writer.GLOBAL_BUFFER["max_iter"] == 250
+    trainer(scene, tmp_path, *options, "--load-checkpoint", file, "--max-num-iterations", "50").setup()
+    said = words(capsys)
+    assert "goes on from step 100 for 50 more" in said and "to end at" not in said
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ((*DRAFT, "--load-step", "799"), "expected one from before step 800, where quality draft ends, got step 800"),
+        ((*DRAFT, "--load-step", "499"), "expected at least 64 voxels at step 500, .* got 32 voxels"),
+        (("--quality", "standard", "--load-step", "499"), "expected at least 64 voxels at step 500"),
+        ((*DRAFT, "--load-step", "7"), "a folder with step-.*, got no step-000000007.ckpt in "),
+    ],
+)
+def test_checkpoints_that_a_training_cannot_go_on_from(scene, checkpoints, tmp_path, options, message):
+    with pytest.raises(CheckpointError, match=message):
+        trainer(scene, tmp_path, *options, "--load-dir", str(checkpoints)).setup()
+
+
+@pytest.mark.parametrize("where", ["run", "nowhere", "empty"])
+def test_folders_without_checkpoints(scene, checkpoints, tmp_path, where):
+    """The run's own folder, whose name stands in nerfstudio's log, holds them one level below."""
+    (tmp_path / "empty").mkdir()
+    folder = checkpoints.parent if where == "run" else tmp_path / where
+    with pytest.raises(CheckpointError, match=r"no step-\*.ckpt in .* Pass the folder nerfstudio_models"):
+        trainer(scene, tmp_path, "--load-dir", str(folder)).setup()
+
+
+def test_a_file_that_is_not_there(scene, tmp_path):
+    with pytest.raises(CheckpointError, match=r"got no file .*absent\.ckpt"):
+        trainer(scene, tmp_path, "--load-checkpoint", str(tmp_path / "absent.ckpt")).setup()
+
+
+def test_a_start_on_a_finer_lattice_is_no_hindrance(scene, tmp_path):
+    """A training from photographs begins on a lattice that the options have later."""
+    first: Any = trainer(scene, tmp_path, *DRAFT)
+    first.setup()
+    first.pipeline.model.split(2)
+    first.save_checkpoint(20)
+    again: Any = trainer(scene, tmp_path / "again", *DRAFT, "--load-dir", str(first.checkpoint_dir))
+    again.setup()
+    assert max(again.pipeline.model.grid.lattice.cell_shape) == 64 and again._start_step == 21
