@@ -12,7 +12,7 @@ import torch
 import thermoxels_ns.track_carving as track_carving
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.sightlines import Sightlines
+from thermoxels_ns.sightlines import Sightlines, agrees_with_neighbours
 from thermoxels_ns.track_carving import MARGIN_VOXELS, carve_air, empty_voxels
 
 BOX = Lattice.covering((-1, -1, -1), (1, 1, 1), 20)
@@ -54,6 +54,15 @@ def test_no_voxel_that_holds_a_point_is_carved(resolution: int) -> None:
     assert not empty[tuple(held.T)].any()
 
 
+def test_a_point_without_lines_keeps_its_voxel() -> None:
+    sight = lines([-0.95, 0.05, 0.05], [[0.87, 0.05, 0.05], [0.88, 0.05, 0.05]])
+    assert empty_voxels(BOX, sight)[8, 10, 10]
+    doubted = Sightlines(
+        sight.origins, sight.point, np.concatenate((sight.points, [[-0.15, 0.05, 0.05]])), sight.uncertainty
+    )
+    assert not empty_voxels(BOX, doubted)[8, 10, 10]
+
+
 def test_a_single_point_carves_nothing_however_many_see_it() -> None:
     origins = np.random.default_rng(1).uniform(-0.1, 0.1, (40, 3)) + np.array([-0.8, 0.03, 0.03])
     assert not empty_voxels(BOX, lines(origins, [0.8, 0.05, 0.05])).any()
@@ -68,6 +77,31 @@ def test_what_is_carved_ends_before_the_points_by_the_margin_and_the_uncertainty
     limit = 0.87 - MARGIN_VOXELS * BOX.voxel_size - 3.0 * uncertainty
     assert carved.tolist() == list(range(carved.max() + 1))
     assert limit - BOX.voxel_size < ends <= limit + 1e-9
+
+
+def ground(wrong: float, per_voxel: int = 4, seed: int = 0) -> tuple[Sightlines, np.ndarray, np.ndarray]:
+    """A floor at z = -0.48, a fifth of a voxel above faces of voxels, seen from above; some points lie below it.
+
+    Returns:
+        The lines, and which voxels hold the floor and which lie between it and the cameras.
+    """
+    random = np.random.default_rng(seed)
+    points = np.column_stack((random.uniform(-0.95, 0.95, (400 * per_voxel, 2)), np.full(400 * per_voxel, -0.48)))
+    cameras = np.column_stack((random.uniform(-1.5, 1.5, (6, 2)), np.full(6, 0.6)))
+    below = random.random(len(points)) < wrong
+    points[below] += random.uniform(0.2, 0.6, (below.sum(), 1)) * (points[below] - cameras[0])
+    height = BOX.cell_centres()[..., 2]
+    return lines(cameras, points), np.abs(height + 0.45) < 0.01, (height > -0.25) & (height < 0.2)
+
+
+def test_without_the_lines_that_neighbours_contradict_wrong_points_carve_little_of_the_ground() -> None:
+    sight, holds, above = ground(0.2)
+    below = BOX.cell_centres()[..., 2] < -0.55
+    believed = sight.with_lines_of(agrees_with_neighbours(sight))
+    eaten, after = empty_voxels(BOX, sight), empty_voxels(BOX, believed)
+    assert after[holds].mean() < 0.1 * eaten[holds].mean()
+    assert after[below].mean() < 0.1 * eaten[below].mean()
+    assert after[above].mean() > 0.5
 
 
 def test_lines_along_faces_and_from_outside_count_as_any() -> None:
@@ -116,6 +150,18 @@ def test_carved_voxels_are_no_longer_stored_and_rows_follow() -> None:
     rows = torch.arange(BOX.num_corners)[:, None]
     assert change is not None
     assert torch.equal(change(rows)[:, 0], torch.from_numpy(model.grid.voxels.corners))
+
+
+@pytest.mark.parametrize("doubted", [0, 7])
+def test_the_log_tells_points_with_lines_from_those_that_are_doubted(
+    doubted: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(track_carving.CONSOLE, "log", said.append)
+    sight, _ = room(300)
+    carved_model(sight.with_lines_of(np.arange(300) >= doubted))
+    assert f"to {300 - doubted} points" in said[0]
+    assert ("; 7 others do not" in said[0]) == (doubted == 7)
 
 
 def test_without_tracks_and_switched_off_nothing_changes() -> None:

@@ -10,6 +10,18 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
+NEIGHBOURS = 8
+"""Points nearest to a point in a photograph that its distance is compared with."""
+FEWEST_NEIGHBOURS = 4
+"""With fewer in a photograph it says nothing about the point."""
+STEEPEST = 3.0
+"""Slope of a surface against the photograph up to which neighbours on it agree: 72 degrees."""
+LEAST_TOLERANCE = 0.01
+"""Share of the distance by which neighbours may differ at any slope: surfaces are rough."""
+TOLERANCE_ERRORS = 3.0
+"""Standard errors of a line's length by which they may differ too."""
+_LINES_AT_ONCE = 1 << 18
+
 
 @dataclass(frozen=True, eq=False)
 class Sightlines:
@@ -28,3 +40,49 @@ class Sightlines:
         """The same lines in another world: scale (rotation p + translation)."""
         origins, points = (scale * (p @ rotation.T + translation) for p in (self.origins, self.points))
         return Sightlines(origins, self.point, points, scale * self.uncertainty)
+
+    def with_lines_of(self, chosen: npt.NDArray[np.bool_]) -> Sightlines:
+        """Only the lines to some points, one boolean per point; all points stay, with their numbers."""
+        kept = chosen[self.point]
+        return Sightlines(self.origins[kept], self.point[kept], self.points, self.uncertainty[kept])
+
+
+def agrees_with_neighbours(lines: Sightlines) -> npt.NDArray[np.bool_]:
+    """Which points lie where the points around them in the photographs do: wrong matches put theirs anywhere.
+
+    A photograph vouches for a point if at least half of the `NEIGHBOURS` points that it sees nearest to it are as far
+    away, give or take the largest of three lengths: `STEEPEST` times how far apart the two are across the line of
+    sight, the share `LEAST_TOLERANCE` of the distance, and `TOLERANCE_ERRORS` standard errors. So in plain regions,
+    where neighbours are few and far, much may differ, and among many little. Points agree that half of their
+    photographs vouch for. A point on something thin before other things may fail; it is then unknown, not wrong.
+
+    Args:
+        lines: Lines of sight; lines with one origin are one photograph's.
+
+    Returns:
+        One boolean per point; True for a point without lines, or which too few others are near to say.
+    """
+    from scipy.spatial import KDTree  # slow to import and only needed here
+
+    along = lines.points[lines.point] - lines.origins
+    length = np.linalg.norm(along, axis=1)
+    direction = along / np.maximum(length, 1e-300)[:, None]
+    photograph = np.unique(lines.origins, axis=0, return_inverse=True)[1].reshape(-1)
+    key = np.column_stack((direction, 10.0 * photograph))  # far from those of all other photographs
+    tree = KDTree(key) if len(key) else None
+    vouched = np.zeros(len(key), dtype=bool)
+    for first in range(0, len(key), _LINES_AT_ONCE):
+        assert tree is not None
+        some = slice(first, first + _LINES_AT_ONCE)
+        # Of each line the nearest is itself. A distance is the chord of an angle, or infinite where there is no other.
+        found = tree.query(key[some], NEIGHBOURS + 1, distance_upper_bound=3.0)
+        apart, other = (np.asarray(value)[:, 1:] for value in found)
+        known = np.isfinite(apart)
+        own = length[some, None]
+        least = np.maximum(LEAST_TOLERANCE * own, TOLERANCE_ERRORS * lines.uncertainty[some, None])
+        off = np.abs(length[np.where(known, other, 0)] - own)
+        agree = known & (off <= np.maximum(STEEPEST * own * np.where(known, apart, 0.0), least))
+        count = known.sum(axis=1)
+        vouched[some] = (2 * agree.sum(axis=1) >= count) | (count < FEWEST_NEIGHBOURS)
+    photographs, vouching = (np.bincount(lines.point, w, len(lines.points)) for w in (None, vouched))
+    return 2 * vouching >= photographs

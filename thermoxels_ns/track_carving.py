@@ -46,9 +46,11 @@ def carve_air(model: ThermoxelsModel) -> RowChange | None:
     carved = int(empty.sum())
     if carved in (0, len(empty)):
         return None
+    believed = len(np.unique(lines.point))
+    doubted = f"; {len(lines.points) - believed:,} others do not lie where their neighbours do"
     CONSOLE.log(
         f"tracks: {carved:,} of {len(empty):,} voxels are air ({carved / len(empty):.1%}), crossed by the "
-        f"{len(lines.origins):,} lines of sight to {len(lines.points):,} points"
+        f"{len(lines.origins):,} lines of sight to {believed:,} points{doubted if believed < len(lines.points) else ''}"
     )
     return prune(model.grid, ~empty)
 
@@ -57,7 +59,7 @@ def empty_voxels(lattice: Lattice, lines: Sightlines) -> npt.NDArray[np.bool_]:
     """Find the voxels that are air.
 
     A voxel is air if the lines to at least `FEWEST_POINTS` points cross it and leave it `MARGIN_VOXELS` voxels and
-    `MARGIN_ERRORS` standard errors before their points, and no point lies in it.
+    `MARGIN_ERRORS` standard errors before their points, and no point lies in it, with lines or without.
 
     Args:
         lattice: The voxels.

@@ -28,7 +28,7 @@ import numpy.typing as npt
 import torch
 import tyro
 from nerfstudio.utils.eval_utils import eval_setup
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from thermoxels_ns.checks import replace_when_done, writable_folder
 from thermoxels_ns.data.scene_file import read_scene_file
@@ -143,7 +143,8 @@ def measure(scene: Path, tracks: SparseTracks, judged: npt.NDArray[np.bool_], co
     lattice = model.grid.lattice
     views = np.bincount(tracks.sighting_point, minlength=len(tracks.points))
     judged = judged & (views >= _FEWEST_VIEWS) & (tracks.point_error_px < _MOST_ERROR_PX)
-    trained = cKDTree(outputs.metadata["sightlines"].points)
+    lines = outputs.metadata["sightlines"]
+    trained = KDTree(lines.points[np.unique(lines.point)])
     parts = []
     for frame in read_scene_file(scene).frames:
         if frame.image.name not in evaluating:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
 import pytest
 
 from thermoxels_ns.data.colmap_files import check_complete
-from thermoxels_ns.data.colmap_tracks import read_colmap_tracks
+from thermoxels_ns.data.colmap_tracks import COLMAP_FOLDERS, _matched, _points, read_colmap_tracks
+from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, write_tracks
 from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
@@ -24,9 +26,11 @@ OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3))
 
 
-def write_model(frames, names, folder: Path, *, text=False, points=POINTS, focal_factor=1.0, error=0.5) -> None:
-    """A model of cameras that all see all points, in a world that is turned, moved and scaled."""
-    turn = TURN.matrix()
+def write_model(
+    frames, names, folder: Path, *, text=False, points=POINTS, focal_factor=1.0, error=0.5, moved=True
+) -> None:
+    """A model of cameras that all see all points, in a world that is turned, moved and scaled if `moved`."""
+    turn, scale, shift = (TURN.matrix(), SCALE, SHIFT) if moved else (np.eye(3), 1.0, np.zeros(3))
     model = pycolmap.Reconstruction()
     first = frames[0].intrinsics
     model.add_camera_with_trivial_rig(
@@ -42,7 +46,7 @@ def write_model(frames, names, folder: Path, *, text=False, points=POINTS, focal
         pose = frame.pose @ OPENCV
         world = np.eye(4)[:3]
         world[:, :3] = (turn @ pose[:3, :3]).T
-        world[:, 3] = -world[:, :3] @ (SCALE * turn @ pose[:3, 3] + SHIFT)
+        world[:, 3] = -world[:, :3] @ (scale * turn @ pose[:3, 3] + shift)
         seen = (points - frame.pose[:3, 3]) @ frame.pose[:3, :3]
         pixels = np.column_stack((seen[:, 0] / -seen[:, 2], -seen[:, 1] / -seen[:, 2])) * first.fx * focal_factor
         image = pycolmap.Image(name=name, image_id=number, camera_id=1)
@@ -52,7 +56,7 @@ def write_model(frames, names, folder: Path, *, text=False, points=POINTS, focal
         track = pycolmap.Track()
         for image in range(1, len(frames) + 1):
             track.add_element(image, number)
-        model.add_point3D(SCALE * turn @ point + SHIFT, track, np.zeros(3, dtype=np.uint8))
+        model.add_point3D(scale * turn @ point + shift, track, np.zeros(3, dtype=np.uint8))
     for point in model.points3D.values():
         point.error = error
     folder.mkdir(parents=True, exist_ok=True)
@@ -78,7 +82,7 @@ def lines_of(folder, split="train", **options):
     return ThermalDataParserConfig(data=folder.path, **options).setup().get_dataparser_outputs(split)
 
 
-@pytest.mark.parametrize("where", ["colmap/sparse/0", "colmap", "sparse/0"])
+@pytest.mark.parametrize("where", COLMAP_FOLDERS)
 @pytest.mark.parametrize("text", [False, True])
 def test_points_come_in_the_worlds_of_the_json_and_of_training(scene, where, text):
     add_model(scene, where, text=text)
@@ -93,6 +97,28 @@ def test_points_come_in_the_worlds_of_the_json_and_of_training(scene, where, tex
     assert len(lines.points) == 30 and len(lines.origins) == 5 * 30  # the one that evaluates is left out
     assert nearest.min(axis=1).max() < 1e-5
     assert lines_of(scene, "val").metadata["sightlines"] is None
+
+
+@pytest.mark.parametrize("where", COLMAP_FOLDERS)
+def test_the_box_too_is_found_wherever_a_model_may_lie(scene_folder, where):
+    scene = scene_folder(frames=len(NAMES), names=NAMES)
+    del scene.meta["scene_box"]
+    scene.rewrite()
+    add_model(scene, where, moved=False)
+    file = read_scene_file(scene.path)
+    box, origin = find_scene_box(file, None, np.eye(3))
+    assert origin == f"the points of {where}"
+    assert (box[0] < POINTS.min(axis=0)).all() and (box[1] > POINTS.max(axis=0)).all()
+
+
+def test_a_cut_off_model_gives_no_box(scene):
+    add_model(scene)
+    path = scene.path / "colmap/sparse/0/points3D.bin"
+    path.write_bytes(path.read_bytes()[:-1])
+    file = read_scene_file(scene.path)
+    del file.meta["scene_box"]
+    with pytest.raises(SceneError, match=r"points3D\.bin ends before its last entry"):
+        find_scene_box(file, None, np.eye(3))
 
 
 def test_without_a_model_and_switched_off_there_are_no_lines(scene):
@@ -179,12 +205,23 @@ def test_errors_that_colmap_did_not_compute_are_computed(scene):
 
 
 def test_photographs_of_one_name_are_told_apart_by_their_folders():
-    from thermoxels_ns.data.colmap_tracks import _matched
-
     images = ["left/1.jpg", "right/1.jpg", "2.jpg"]
     assert _matched(images, ["images/right/1.jpg", "images/left/1.jpg", "images/2.jpg"]) == [(1, 0), (0, 1), (2, 2)]
     assert _matched(images, ["images/1.jpg", "2.jpg"]) == [(2, 1)]
     assert _matched(["1.jpg"], ["a/1.jpg", "b/1.jpg"]) == []
+    assert _matched(["1.jpg", "left/1.jpg"], ["images/left/1.jpg", "images/1.jpg"]) == [(1, 0), (0, 1)]
+
+
+def test_images_may_have_any_numbers():
+    def point(*images):
+        elements = [SimpleNamespace(image_id=image) for image in images]
+        return SimpleNamespace(xyz=(1.0, 2.0, 3.0), error=0.5, track=SimpleNamespace(elements=elements))
+
+    many = 2_000_000_000  # an array with one entry for each number up to it has 16 GB
+    model = SimpleNamespace(points3D={1: point(many, 7, 5, 7), 2: point(many + 1, 5)})
+    points, error_px, frame, point_of = _points(model, {many: 0, 5: 1, 7: 2})
+    assert points.tolist() == [[1.0, 2.0, 3.0]] * 2 and error_px.tolist() == [0.5, 0.5]
+    assert list(zip(point_of.tolist(), frame.tolist())) == [(0, 0), (0, 1), (0, 2), (1, 1)]
 
 
 def test_a_file_of_tracks_that_the_json_names_is_still_refused_when_wrong(scene):

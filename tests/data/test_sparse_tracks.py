@@ -75,6 +75,23 @@ def test_points_that_only_evaluation_sees_a_third_time_are_left_out(scene):
     assert len(lines_of(folder).metadata["sightlines"].points) == 27
 
 
+def test_a_point_that_its_neighbours_contradict_is_listed_without_lines(scene):
+    folder, tracks = scene
+    points = np.zeros((300, 3))  # a wall, seen by the three photographs on one side of it
+    points[:, 1:] = np.random.default_rng(3).uniform(-0.5, 0.5, (300, 2))
+    centres = np.array([np.array(entry["transform_matrix"])[:3, 3] for entry in folder.meta["frames"]])
+    frame, point = (a.reshape(-1) for a in np.meshgrid(np.flatnonzero(centres[:, 0] > 0), range(300), indexing="ij"))
+    tracks = SparseTracks(points, np.full(300, 0.5), tracks.frames, frame, point)
+    write_tracks(folder.path / "tracks.npz", tracks)
+    assert np.bincount(lines_of(folder).metadata["sightlines"].point).tolist() == [3] * 300
+    middle = int(np.argmin(np.abs(points).sum(axis=1)))
+    points[middle] += 0.1 * (centres[centres[:, 0] > 0].mean(axis=0) - points[middle])
+    write_tracks(folder.path / "tracks.npz", tracks)
+    lines = lines_of(folder).metadata["sightlines"]
+    assert len(lines.points) == 300
+    assert sorted(set(range(300)) - set(lines.point.tolist())) == [middle]
+
+
 def test_badly_known_points_are_left_out(scene):
     folder, tracks = scene
     error = tracks.point_error_px.copy()

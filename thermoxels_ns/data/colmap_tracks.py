@@ -138,7 +138,8 @@ def _pose(image: Any) -> FloatArray:
 def _matched(images: Sequence[str], frames: Sequence[str]) -> list[tuple[int, int]]:
     """Numbers of image and frame that are the same photograph.
 
-    Same name of the file; where several have it, the one whose folders too are those of the frame's name.
+    Same name of the file; where several have it, the one whose folders too are those of the frame's name, and of more
+    than one such that with most folders.
     """
     of_name: dict[str, list[int]] = {}
     for number, image in enumerate(images):
@@ -152,6 +153,8 @@ def _matched(images: Sequence[str], frames: Sequence[str]) -> list[tuple[int, in
         found = of_name.get(name, [])
         if len(found) > 1 or shared[name] > 1:
             found = [one for one in found if frame == images[one] or frame.endswith(f"/{images[one]}")]
+            longest = max((len(images[one]) for one in found), default=0)
+            found = [one for one in found if len(images[one]) == longest]
         if len(found) == 1:
             pairs.append((found[0], number))
     once = {image: 0 for image, _ in pairs}
@@ -168,10 +171,11 @@ def _points(model: Any, place: dict[int, int]) -> tuple[FloatArray, FloatArray, 
     images = [[element.image_id for element in point.track.elements] for point in found]
     point = np.repeat(np.arange(len(images)), [len(seen) for seen in images])
     image = np.array([number for seen in images for number in seen], dtype=np.int64)
-    of_image = np.full(max([*place, *image.tolist()], default=0) + 1, -1, dtype=np.int64)
-    of_image[list(place)] = list(place.values())
-    frame = of_image[image]
-    known = frame >= 0
+    numbers = np.array(sorted(place), dtype=np.int64)  # any numbers: some programs count from thousands of millions
+    frame_of = np.array([place[number] for number in numbers.tolist()], dtype=np.int64)
+    at = np.minimum(np.searchsorted(numbers, image), len(numbers) - 1)
+    known = numbers[at] == image
+    frame = frame_of[at]
     # A track may hold two features of one photograph.
     pairs = np.unique(point[known] * max(1, len(place)) + frame[known])
     return points, error, pairs % max(1, len(place)), pairs // max(1, len(place))

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.data.colmap_files import check_complete
+from thermoxels_ns.data.colmap_tracks import COLMAP_FOLDERS
 from thermoxels_ns.data.scene_file import Frame, SceneFile
 from thermoxels_ns.errors import SceneError, explain
 
@@ -21,7 +23,6 @@ _MARGIN = 0.05
 _FAR = 10.0
 """Points farther from the median point than this many median distances are strays."""
 _MOST_POINTS = 50_000
-_COLMAP_FOLDERS = ("colmap/sparse/0", "colmap", "sparse/0")
 # The axes that ns-process-data swapped in old versions, before it wrote applied_transform into the json.
 _LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
 
@@ -32,7 +33,7 @@ def find_scene_box(
     """Find the scene's box, axis-parallel after `rotation`.
 
     In order: the option, ``scene_box`` in the json (both in input coordinates), sparse points (``ply_file_path``, or a
-    COLMAP model in colmap/, colmap/sparse/0 or sparse/0), the cameras.
+    COLMAP model in one of `COLMAP_FOLDERS`), the cameras.
 
     Args:
         scene: The scene.
@@ -53,7 +54,7 @@ def find_scene_box(
     if "ply_file_path" in scene.meta:
         path = scene.folder / str(scene.meta["ply_file_path"])
         return box_of_points(_read_ply(path) @ rotation.T, scene.frames, rotation), f"the points of {path.name}"
-    for folder in _COLMAP_FOLDERS:
+    for folder in COLMAP_FOLDERS:
         if any((scene.folder / folder / f"points3D.{suffix}").is_file() for suffix in ("bin", "txt")):
             points = _read_colmap(scene.folder / folder, scene)
             return box_of_points(points @ rotation.T, scene.frames, rotation), f"the points of {folder}"
@@ -178,6 +179,7 @@ def _read_colmap(folder: Path, scene: SceneFile) -> npt.NDArray[np.float64]:
     import pycolmap  # slow to import and only needed here
 
     try:
+        check_complete(folder)
         model = pycolmap.Reconstruction(str(folder))
     except Exception as problem:  # pycolmap raises RuntimeError, ValueError, IndexError by version
         raise SceneError(

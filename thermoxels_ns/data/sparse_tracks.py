@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import numpy as np
 from thermoxels_ns.checks import replace_when_done
 from thermoxels_ns.data.scene_file import Frame
 from thermoxels_ns.errors import SceneError, explain
-from thermoxels_ns.sightlines import FloatArray, IntArray, Sightlines
+from thermoxels_ns.sightlines import FloatArray, IntArray, Sightlines, agrees_with_neighbours
 
 TRACKS_KEY = "tracks_file_path"
 """Name in transforms.json under which the file of tracks is given."""
@@ -46,20 +47,22 @@ class SparseTracks:
 
 
 def write_tracks(path: Path, tracks: SparseTracks) -> None:
-    """Write tracks as a compressed .npz.
+    """Write tracks as a compressed .npz, put together in memory, because numpy's half-made files complain later.
 
     Raises:
         OutputError: The file cannot be written.
     """
+    packed = io.BytesIO()
+    np.savez_compressed(
+        packed,
+        points=tracks.points,
+        point_error_px=tracks.point_error_px.astype(np.float32),
+        frames=np.array(tracks.frames, dtype=np.str_),
+        sighting_frame=tracks.sighting_frame.astype(np.int32),
+        sighting_point=tracks.sighting_point.astype(np.int32),
+    )
     with replace_when_done(path) as temporary:
-        np.savez_compressed(
-            temporary,
-            points=tracks.points,
-            point_error_px=tracks.point_error_px.astype(np.float32),
-            frames=np.array(tracks.frames, dtype=np.str_),
-            sighting_frame=tracks.sighting_frame.astype(np.int32),
-            sighting_point=tracks.sighting_point.astype(np.int32),
-        )
+        temporary.write_bytes(packed.getbuffer())
 
 
 def read_tracks(path: Path) -> SparseTracks:
@@ -110,8 +113,10 @@ def sightlines(
     """Lines from frames to the points that they see and that are well known.
 
     A point counts if at least `FEWEST_VIEWS` of the frames see it, more than `LEAST_PARALLAX_DEG` apart, with a mean
-    reprojection error of at most `MOST_ERROR_PX`. The standard error of a line's length is that of a triangulation: the
-    error in the image, over the focal length and the sine of that angle, times the length.
+    reprojection error of at most `MOST_ERROR_PX`. Of those, one that does not agree with its neighbours in the frames
+    (`agrees_with_neighbours`) is listed without lines: wrong lines would make air of walls. The standard error of a
+    line's length is that of a triangulation: the error in the image, over the focal length and the sine of that angle,
+    times the length.
 
     Args:
         tracks: Points and who sees them.
@@ -165,7 +170,8 @@ def sightlines(
         / focal[frame]
         / np.sin(np.minimum(angle[point], np.pi / 2))
     )
-    return Sightlines(poses[frame, :3, 3], renumbered[point], tracks.points[good], error * length)
+    found = Sightlines(poses[frame, :3, 3], renumbered[point], tracks.points[good], error * length)
+    return found.with_lines_of(agrees_with_neighbours(found))
 
 
 def _parallax(directions: FloatArray, point: IntArray, count: int) -> FloatArray:
