@@ -20,13 +20,14 @@ NAMES_THAT_SAY_NOTHING = {"utils", "util", "helpers", "helper", "common", "misc"
 
 GROUND = frozenset(
     {"errors", "checks", "units", "lattice", "snapshot", "streams", "schedule", "threads", "scratch", "configs_folder"}
-    | {"page_style", "sightlines"}
+    | {"page_style", "sightlines", "option_help"}
 )
 # One nerfstudio model, in files of one idea each.
 MODEL = frozenset(
     {"losses", "optim", "optim_kernels", "metrics", "model", "model_config", "coarse_to_fine"}
     | {"ray_rendering", "ray_statistics", "pipeline", "trainer", "warm_up"}
     | {"photo_consistency", "photo_kernels", "photo_start", "start_choice", "track_carving", "track_loss"}
+    | {"photo_air", "photo_reading", "plane_sweep", "depth_kernels"}
 )
 
 COST = frozenset({"cost", "cost_process", "cost_runs", "cost_report"})

@@ -24,7 +24,7 @@ from thermoxels_ns.photo_consistency import (
     exposures,
 )
 from thermoxels_ns.photo_kernels import _median
-from thermoxels_ns.photo_start import LONGEST_SIDE, read_photographs
+from thermoxels_ns.photo_reading import LONGEST_SIDE, read_photographs
 from thermoxels_ns.threads import set_num_threads
 
 LATTICE = Lattice((-0.5, -0.5, -0.5), 1.0 / 16, (17, 17, 17))

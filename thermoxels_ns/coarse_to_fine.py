@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -19,6 +20,7 @@ from thermoxels_ns.track_carving import carve_air
 
 if TYPE_CHECKING:
     from thermoxels_ns.model import ThermoxelsModel
+    from thermoxels_ns.photo_air import SeenThrough
 
 FEWEST_OPEN_RAYS = 0.002
 """Share of rays that must leave the box unsaturated for a background to be worth its cost."""
@@ -35,6 +37,7 @@ RAYS_PER_IMAGE = 4096
 def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
     """The callbacks of one training run, in the order in which they act at a step."""
     # They load compiled kernels, which importing the configuration must not.
+    from thermoxels_ns.photo_air import carve_seen_through, find_air
     from thermoxels_ns.photo_start import find_start, hold_density, set_density
     from thermoxels_ns.start_choice import decide_start
 
@@ -57,12 +60,20 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     def count(step: int) -> None:
         model.update_to_step(step)
 
+    @cache
+    def air() -> SeenThrough | None:
+        """What photographs look through; asked for when it is needed first, in a resumed training too."""
+        if verdict.found is not None and verdict.found.air is not None:
+            return verdict.found.air
+        return None if attributes.pipeline is None else find_air(model, attributes.pipeline.datamanager)
+
     def carve(step: int) -> None:
-        """Drop what lines of sight show to be air; at the first step of a training, not of a resumed one."""
-        old = model.grid.row_parameters()
-        change = carve_air(model)
-        if change is not None:
-            follow(old, change)
+        """Drop what lines of sight and depths show to be air; at the first step of a training, not of a resumed one."""
+        for drop in (lambda: carve_air(model), lambda: carve_seen_through(model, air())):
+            old = model.grid.row_parameters()
+            change = drop()
+            if change is not None:
+                follow(old, change)
 
     def start(step: int) -> None:
         """Set the density at the first step of a training, not at the first of a resumed one."""

@@ -121,6 +121,11 @@ class ThermoxelsModelConfig(ModelConfig):
     """Drop voxels that are air because structure from motion saw points through them. auto: where the scene has tracks
     (of thermoxels capture or of a COLMAP model, see the dataparser's tracks), at the start and after every
     refinement."""
+    photo_depth: Literal["off", "on"] = "off"
+    """Ask how far away is what photographs show, by comparing each with its neighbours (plane sweep). on: voxels that
+    many look through are dropped at the start and after every refinement, and a start from photographs begins dense
+    where they end. It finds walls of little texture before which fog closes, and takes some seconds; where photographs
+    are few and far apart it can open surfaces."""
     track_rays: int = 512
     """Lines of sight that each step looks at."""
     thermal_density_gradient: bool = False

@@ -28,6 +28,7 @@ from torch import Tensor
 from thermoxels_ns.errors import MemoryBudgetError
 from thermoxels_ns.field.refine import refine
 from thermoxels_ns.model_config import FINEST_START
+from thermoxels_ns.photo_air import SeenThrough, carve_seen_through
 from thermoxels_ns.photo_consistency import DensityStart
 from thermoxels_ns.photo_start import find_start, hold_density, set_density
 from thermoxels_ns.scratch import SCRATCH
@@ -147,7 +148,7 @@ def _choose(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> V
     if found.log_gain is None:
         return Verdict("plain", f"as {found.report}")
     CONSOLE.log(f"start: trying both for {steps} steps; naming one (--pipeline.model.start) saves the time")
-    trials = (_Trial(model, datamanager, optimizers.config, start) for start in (None, found))
+    trials = (_Trial(model, datamanager, optimizers.config, start, found.air) for start in (None, found))
     plain, photo, taken = _contest(next(trials), next(trials), judges, steps)
     SCRATCH.release()
     reason = (
@@ -226,9 +227,17 @@ class _Trial:
         datamanager: Gives the batches.
         settings: Optimisers by group, as nerfstudio's configuration has them.
         found: Where the density starts; None: plain.
+        air: What photographs look through, those that judge not asked; None: not known.
     """
 
-    def __init__(self, model: ThermoxelsModel, datamanager: Any, settings: dict[str, Any], found: DensityStart | None):
+    def __init__(
+        self,
+        model: ThermoxelsModel,
+        datamanager: Any,
+        settings: dict[str, Any],
+        found: DensityStart | None,
+        air: SeenThrough | None = None,
+    ):
         self.model, self.datamanager, self.found, self.step = deepcopy(model), datamanager, found, 0
         # A trial knows the geometry by its colours alone, which temperature does not move unless it is asked to.
         self.model.loss_weights = replace(model.loss_weights, thermal=0.0, tv_temperature=0.0)
@@ -236,6 +245,7 @@ class _Trial:
         if (factor := model.config.skipped_factor()) > 1:
             refine(self.model.grid, factor)
         carve_air(self.model)
+        carve_seen_through(self.model, air)
         if found is not None:
             set_density(self.model, found)
         self.optimizers = Optimizers(deepcopy(settings), self.model.get_param_groups())

@@ -1,0 +1,254 @@
+"""How far away is what photographs show: depths where neighbouring photographs agree about a plane's picture.
+
+For each photograph, its neighbours are drawn onto planes parallel to it, one behind the other, and compared with it
+patch by patch (plane sweep, Collins 1996; normalised cross-correlation). The nearest plane on which they agree best is
+the depth of a pixel. It counts where depths of other photographs, found on their own, lie in the same place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.depth_kernels import agreeing_views
+from thermoxels_ns.photo_consistency import Photographs
+from thermoxels_ns.threads import run_ranges
+
+FloatArray = npt.NDArray[np.float64]
+
+NEIGHBOURS = 4
+"""Photographs that one is compared with; of these the better half counts at each pixel, as others may be hidden."""
+ANGLES_DEG = (4.0, 60.0)
+"""Angles between directions to the same point at which two photographs are compared: a smaller one says nothing about
+depth, a larger one shows something else."""
+BEST_ANGLE_DEG = 15.0
+"""Neighbours at about this angle are preferred."""
+PATCH = 5
+"""Side of the square of pixels that is compared."""
+PLANES = (24, 128)
+"""Planes per photograph: such that the picture moves by about a pixel from one to the next, within these limits."""
+SMALLEST_CONTRAST = 1.5 / 255.0
+"""Standard deviation of brightness within a patch that is noise."""
+LEAST_CORRELATION = 0.5
+"""Correlation below which photographs do not agree."""
+FEWEST_VIEWS = 3
+"""Photographs whose own depths must lie where a sure one does; for a likely one, one of them."""
+_NEAREST = 0.02
+"""Distance of the nearest plane relative to the farthest."""
+_OUTSIDE = -100.0
+"""Brightness that stands for a pixel that a photograph does not show: one in a patch makes its mean negative."""
+_PROBES = (5, 4)
+"""Pixels along each side and depths at which neighbours are looked for."""
+_FEWEST_PROBES = 0.1
+"""Share of these that a neighbour must see."""
+
+
+@dataclass(frozen=True, eq=False)
+class Depths:
+    """Depths of the pixels of photographs."""
+
+    photographs: Photographs
+    """The photographs."""
+    depth: npt.NDArray[np.float32]
+    """Sure depth of each pixel, in the order of `photographs.colours`, shape (pixels,), [world units]; else NaN."""
+    likely: npt.NDArray[np.float32]
+    """The same, with what fewer photographs agree about."""
+    error: npt.NDArray[np.float32]
+    """Depth by which its planes are apart there, shape (pixels,), [world units]."""
+
+    @property
+    def share(self) -> float:
+        """Share of the pixels whose depth is known."""
+        return float(np.mean(np.isfinite(self.depth)))
+
+
+def depths_of(photographs: Photographs, lo: npt.ArrayLike, hi: npt.ArrayLike) -> Depths:
+    """Find the depths of photographs within a box.
+
+    Args:
+        photographs: Pinhole photographs, best some 160 pixels wide: cost grows with the third power of their size.
+        lo: Lower corner of the box, [world units].
+        hi: Upper corner.
+
+    Returns:
+        Depths; not known anywhere where no photograph has a neighbour.
+    """
+    low, high = np.asarray(lo, dtype=np.float64), np.asarray(hi, dtype=np.float64)
+    views = [_View.of(photographs, number) for number in range(len(photographs))]
+    total = len(photographs.colours)
+    depth, correlation, error = (np.full(total, value, np.float32) for value in (np.nan, -1.0, np.nan))
+
+    def work(begin: int, end: int) -> None:
+        for number in range(begin, end):
+            view = views[number]
+            span = _span(view, low, high, photographs.near)
+            near = [] if span is None else _neighbours(number, views, *span)
+            if span is not None and near:
+                first = int(photographs.firsts[number])
+                pixels = slice(first, first + view.brightness.size)
+                depth[pixels], correlation[pixels], error[pixels] = _sweep(view, near, *span)
+
+    run_ranges(work, len(views), 1)
+    depth[~(correlation >= LEAST_CORRELATION)] = np.nan
+    agreeing = np.zeros(total, dtype=np.int32)
+    matrices, inverses = photographs.matrices, np.stack([view.inverse for view in views])
+    sizes, firsts, centres = photographs.sizes, photographs.firsts, photographs.centres
+
+    def compare(begin: int, end: int) -> None:
+        agreeing_views(begin, end, matrices, inverses, centres, sizes, firsts, depth, error, agreeing)
+
+    run_ranges(compare, total, 4096)
+    sure, likely = (np.where(agreeing >= fewest, depth, np.float32(np.nan)) for fewest in (FEWEST_VIEWS, 1))
+    return Depths(photographs, sure, likely, error)
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """One photograph."""
+
+    brightness: npt.NDArray[np.float32]
+    """Shape (h, w); `_OUTSIDE` where masked."""
+    matrix: FloatArray
+    """World to homogeneous pixels, (3, 4)."""
+    inverse: FloatArray
+    """Homogeneous pixels to directions of depth 1 in the world, (3, 3)."""
+    centre: FloatArray
+
+    @classmethod
+    def of(cls, photographs: Photographs, number: int) -> _View:
+        width, height = photographs.sizes[number]
+        first = photographs.firsts[number]
+        colours = photographs.colours[first : first + width * height]
+        brightness = np.where(np.isnan(colours[:, 0]), np.float32(_OUTSIDE), colours.mean(1))
+        matrix = photographs.matrices[number]
+        picture = np.ascontiguousarray(brightness.reshape(height, width), dtype=np.float32)
+        return cls(picture, matrix, np.linalg.inv(matrix[:, :3]), photographs.centres[number])
+
+    def points(self, pixels: FloatArray, depth: FloatArray) -> FloatArray:
+        """World points of pixels (n, 2), whose centres lie at halves, at depths (n,)."""
+        homogeneous = np.column_stack((pixels, np.ones(len(pixels))))
+        return self.centre + depth[:, None] * (homogeneous @ self.inverse.T)
+
+    def pixels(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixels (n, 2) and depths (n,) of world points."""
+        seen = points @ self.matrix[:, :3].T + self.matrix[:, 3]
+        depth = seen[:, 2]
+        return seen[:, :2] / np.where(depth > 0.0, depth, np.nan)[:, None], depth
+
+    def shows(self, pixels: FloatArray, depth: FloatArray) -> npt.NDArray[np.bool_]:
+        height, width = self.brightness.shape
+        with np.errstate(invalid="ignore"):
+            return (depth > 0.0) & (pixels >= 0.0).all(1) & (pixels[:, 0] <= width) & (pixels[:, 1] <= height)
+
+
+def _span(view: _View, low: FloatArray, high: FloatArray, near: float) -> tuple[float, float] | None:
+    """Least and largest depth at which a photograph looks at the box; None if it does not."""
+    corners = np.stack(np.meshgrid(*zip(low, high)), -1).reshape(-1, 3)
+    depth = corners @ view.matrix[2, :3] + view.matrix[2, 3]
+    far = float(depth.max())
+    if far <= near or far <= 0.0:
+        return None
+    return max(float(depth.min()), near, _NEAREST * far), far
+
+
+def _neighbours(number: int, views: list[_View], near: float, far: float) -> list[_View]:
+    """Photographs that see most of what one sees, from directions that tell how far it is."""
+    view = views[number]
+    height, width = view.brightness.shape
+    columns, rows = ((np.arange(_PROBES[0]) + 0.5) * side / _PROBES[0] for side in (width, height))
+    pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
+    depths = 1.0 / np.linspace(1.0 / far, 1.0 / near, _PROBES[1] + 2)[1:-1]
+    points = np.concatenate([view.points(pixels, np.full(len(pixels), depth)) for depth in depths])
+    towards = view.centre - points
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    worth = np.zeros(len(views))
+    for other, seen in enumerate(views):
+        if other == number:
+            continue
+        away = seen.centre - points
+        cosine = np.einsum("ni,ni->n", away, towards) / np.maximum(np.linalg.norm(away, axis=1), 1e-12)
+        angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        useful = seen.shows(*seen.pixels(points)) & (angle > ANGLES_DEG[0]) & (angle < ANGLES_DEG[1])
+        if useful.mean() >= _FEWEST_PROBES:
+            worth[other] = np.sum(useful * np.exp(-0.5 * (np.log(np.maximum(angle, 1e-3) / BEST_ANGLE_DEG)) ** 2))
+    best = np.argsort(-worth, kind="stable")[:NEIGHBOURS]
+    return [views[other] for other in best if worth[other] > 0.0]
+
+
+def _sweep(view: _View, others: list[_View], near: float, far: float) -> tuple[npt.NDArray[np.float32], ...]:
+    """Depth, correlation and distance of planes for every pixel, each of shape (pixels,)."""
+    inverse_depths = np.linspace(1.0 / far, 1.0 / near, _num_planes(view, others, near, far))
+    here, mean, variance = _moments(view.brightness)
+    hidden = mean < 0.0
+    count = -(-len(others) // 2)
+    agreement = np.empty((len(inverse_depths), *here.shape), dtype=np.float32)
+    scores = np.empty((len(others), *here.shape), dtype=np.float32)
+    for plane, inverse_depth in enumerate(inverse_depths):
+        for number, other in enumerate(others):
+            moved = _drawn(other, view, 1.0 / inverse_depth)
+            there, other_mean, other_variance = _moments(moved)
+            covariance = _box(here * there) - mean * other_mean
+            score = covariance / np.sqrt(variance * other_variance)
+            score[hidden | (other_mean < 0.0)] = -1.0
+            scores[number] = score
+        agreement[plane] = np.sort(scores, axis=0)[-count:].mean(0)
+    best = agreement.argmax(0)
+    found = inverse_depths[0] + (best + _between(agreement, best)) * (inverse_depths[1] - inverse_depths[0])
+    depth = (1.0 / found).astype(np.float32).ravel()
+    error = (depth * depth * (inverse_depths[1] - inverse_depths[0])).astype(np.float32)
+    return depth, np.take_along_axis(agreement, best[None], 0).ravel(), error
+
+
+def _num_planes(view: _View, others: list[_View], near: float, far: float) -> int:
+    """Planes such that the middle of the picture moves by a pixel in the neighbour where it moves most."""
+    height, width = view.brightness.shape
+    middle = view.points(np.array([[0.5 * width, 0.5 * height]] * 2), np.array([near, far]))
+    most = 0.0
+    for other in others:
+        pixels, depth = other.pixels(middle)
+        if (depth > 0.0).all():
+            most = max(most, float(np.linalg.norm(pixels[1] - pixels[0])))
+    return int(np.clip(np.ceil(most) + 1, *PLANES))
+
+
+def _drawn(other: _View, view: _View, depth: float) -> npt.NDArray[np.float32]:
+    """What a photograph shows of the plane at a depth of another, drawn as the latter would see it."""
+    turn = depth * (other.matrix[:, :3] @ view.inverse)
+    turn[:, 2] += other.matrix[:, :3] @ view.centre + other.matrix[:, 3]
+    half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # pixel centres lie at halves, OpenCV's not
+    height, width = view.brightness.shape
+    drawn = cv2.warpPerspective(
+        other.brightness,
+        np.linalg.inv(half) @ turn @ half,
+        (width, height),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=(_OUTSIDE,),
+    )
+    return np.asarray(drawn, dtype=np.float32)
+
+
+def _box(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    box = cv2.boxFilter(values, -1, (PATCH, PATCH), borderType=cv2.BORDER_REFLECT)
+    return np.asarray(box, dtype=np.float32)
+
+
+def _moments(picture: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], ...]:
+    """The picture, and mean and variance (with that of noise) of the patch around every pixel."""
+    mean = _box(picture)
+    variance = np.maximum(_box(picture * picture) - mean * mean, 0.0) + np.float32(SMALLEST_CONTRAST**2)
+    return picture, mean, variance
+
+
+def _between(agreement: npt.NDArray[np.float32], best: npt.NDArray[np.int64]) -> FloatArray:
+    """Where between planes the agreement is best: the top of a parabola, in -1/2 to 1/2 planes."""
+    inner = np.clip(best, 1, len(agreement) - 2)
+    before, at, behind = (
+        np.take_along_axis(agreement, inner[None] + step, 0)[0].astype(np.float64) for step in (-1, 0, 1)
+    )
+    bend = before - 2.0 * at + behind
+    top = np.clip(0.5 * (before - behind) / np.where(bend < -1e-6, bend, -np.inf), -0.5, 0.5)
+    return np.where(best == inner, top, 0.0)
