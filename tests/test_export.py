@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,8 +17,15 @@ import torch
 import tyro
 from PIL import Image
 
+from tests.looking_cameras import looking_at
 from thermoxels_ns.errors import CheckpointError, HeatError, MeshError, OutputError, SceneError, ThermoxelsError
-from thermoxels_ns.export import ExportThermoxelsMesh, _check_config, input_from_world, viewpoint_of_cameras
+from thermoxels_ns.export import (
+    ExportThermoxelsMesh,
+    _check_config,
+    input_from_world,
+    scene_json,
+    viewpoint_of_cameras,
+)
 from thermoxels_ns.export_options import ExportOptions, Viewpoint, check_options
 from thermoxels_ns.export_snapshot import export_snapshot, volume_in_words
 from thermoxels_ns.lattice import Lattice
@@ -363,14 +371,22 @@ def test_truth_that_cannot_be_used_does_not_cost_the_export(ball, tmp_path) -> N
     assert any("Not compared with the truth: transforms.json" in line for line in lines)
 
 
-@pytest.mark.parametrize(("interior", "told"), [("solid", False), ("hollow", True)])
-def test_a_hollow_mesh_says_why_it_agrees_less_with_a_filled_truth(ball, tmp_path, interior, told) -> None:
+def test_the_scene_json_may_begin_with_the_mark_that_windows_editors_write(tmp_path) -> None:
+    (tmp_path / "transforms.json").write_text('{"metres_per_unit": 2.0}', encoding="utf-8-sig")
+    assert scene_json(tmp_path) == scene_json(tmp_path / "transforms.json") == {"metres_per_unit": 2.0}
+
+
+@pytest.mark.parametrize(
+    ("asked", "told"), [({"interior": "solid"}, False), ({"interior": "hollow"}, True), ({"wall_thickness": 0.2}, True)]
+)
+def test_a_mesh_with_an_inner_side_says_why_it_agrees_less_with_a_filled_truth(ball, tmp_path, asked, told) -> None:
     lines: list[str] = []
-    options = ExportOptions(pictures=False, interior=interior, **SCALED)
-    export_snapshot(ball, np.eye(4), options, tmp_path, lines.append, compare=lambda *_: {"precision": 0.5})
+    options = ExportOptions(pictures=False, **asked, **SCALED)
+    snapshot = replace(ball, views=looking_at((0.0, 0.0, 0.0), [(3.0, 0.0, 0.0), (3.0, 1.0, 0.0), (3.0, 0.0, 1.0)]))
+    export_snapshot(snapshot, np.eye(4), options, tmp_path, lines.append, compare=lambda *_: {"precision": 0.5})
     truth = read(tmp_path)["truth"]
     assert truth["precision"] == 0.5
-    assert ("inner side of a hollow mesh counts as wrong surface" in truth.get("note", "")) == told
+    assert ("inner side of a shell or a wall counts as wrong surface" in truth.get("note", "")) == told
     assert (truth.get("note") in lines) == told
 
 

@@ -114,7 +114,7 @@ def scene_json(scene_folder: Path) -> dict[str, Any]:
     names = [scene_folder] if scene_folder.is_file() else [folder / name for name in JSON_NAMES]
     for path in names:
         if path.is_file():
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = json.loads(path.read_text(encoding="utf-8-sig"))
             return content if isinstance(content, dict) else {}
     return {}
 

@@ -99,7 +99,7 @@ def export_snapshot(
     from thermoxels_ns.mesh.abaqus_file import HeatStep
     from thermoxels_ns.mesh.build import MeshOptions, build_mesh
     from thermoxels_ns.mesh.files import summary_text, write_summary
-    from thermoxels_ns.mesh.formats import MESH_FORMATS, write_mesh
+    from thermoxels_ns.mesh.formats import MESH_FORMATS, check_format, write_mesh
     from thermoxels_ns.mesh.quality import check_mesh
     from thermoxels_ns.mesh.quality_picture import picture_of_quality
     from thermoxels_ns.mesh.quality_report import quality_report
@@ -117,6 +117,9 @@ def export_snapshot(
         MeshOptions(options.boundary, options.coarsest_cell, up=up, rules=checked.rules),
     )
     mesh = built.mesh
+    suffixes = [f".{name}" for name in options.formats]
+    for suffix in suffixes:
+        check_format(f"{_MESH_STEM}{suffix}", mesh)
     voxel_size = snapshot.lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(to_mesh[:3, :3]))))
     check_mesh(mesh)
     unit = "input unit" if scale is None else "m"
@@ -130,11 +133,11 @@ def export_snapshot(
         say(f"Heat: {time.steps} steps of {time.step_seconds:g} s through {preset.material.name}")
         solution = solve_heat(HeatProblem(mesh, preset.material), time)
         say(f"Heat: {solution.status} Energy conserved to {solution.energy_residual:.1e}.")
-        truth = None if compare is None else _compared(compare, built, metres, options.interior, say)
+        inner_side = options.interior == "hollow" or options.wall_thickness is not None
+        truth = None if compare is None else _compared(compare, built, metres, inner_side, say)
     else:
         say(HEAT_SKIPPED)
 
-    suffixes = [f".{name}" for name in options.formats]
     files = [*_mesh_files(suffixes), _QUALITY]
     if solution is not None:
         files += [p.relative_to(folder).as_posix() for p in heat_series_paths(folder / _HEAT, len(solution.times_s))]
@@ -232,10 +235,13 @@ def _compared(
     compare: Callable[[SolidCells, TetMesh, float], dict[str, Any] | None],
     built: BuiltMesh,
     metres: float,
-    interior: str,
+    inner_side: bool,
     say: Say,
 ) -> dict[str, Any] | None:
-    """Compare with the truth; a truth that cannot be used costs the comparison, not the export."""
+    """Compare with the truth; a truth that cannot be used costs the comparison, not the export.
+
+    A mesh with an inner side, of a shell or of a wall, gets a note on what that does to the figures.
+    """
     from thermoxels_ns.export_summary import INNER_SIDE
 
     try:
@@ -246,7 +252,7 @@ def _compared(
     if truth is None:
         return None
     say("Against the truth: " + ", ".join(f"{name} {_short(value)}" for name, value in truth.items()))
-    if interior != "hollow":
+    if not inner_side:
         return truth
     say(INNER_SIDE)
     return {**truth, "note": INNER_SIDE}

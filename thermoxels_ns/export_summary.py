@@ -30,15 +30,15 @@ HEAT_SKIPPED = f"Heat step skipped: {NO_SCALE[0].lower()}{NO_SCALE[1:]}"
 
 ONLY_THE_SHELL = (
     "Space that no camera saw and that the mesh leaves empty, such as the inside of a building seen from outside with "
-    "--interior hollow. The heat content is that of the mesh."
+    "--interior hollow or --wall-thickness. The heat content is that of the mesh."
 )
 """What the heat balance of a reconstruction leaves out."""
 
 INNER_SIDE = (
-    "The exact scene is filled, so the inner side of a hollow mesh counts as wrong surface in precision, fscore and "
-    "mean distance; precision_seen and fscore_seen are those of the side that photographs show."
+    "The exact scene is filled, so the inner side of a shell or a wall counts as wrong surface in precision, fscore "
+    "and mean distance; precision_seen and fscore_seen are those of the side that photographs show."
 )
-"""What to know of the figures of a hollow mesh beside the truth."""
+"""What to know of the figures beside the truth if the mesh is not filled: hollow, or a wall of a given thickness."""
 
 
 def mesh_summary(

@@ -66,7 +66,7 @@ def load_known_truth(scene_folder: Path | str) -> KnownTruth | None:
     scene = load_truth(folder)
     if scene is None:
         return None
-    content = json.loads(path.read_text())
+    content = json.loads(path.read_text(encoding="utf-8-sig"))
     try:
         poses = [
             frame["transform_matrix"]

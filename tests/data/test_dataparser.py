@@ -16,6 +16,8 @@ from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.thermal_dataset import ThermalDataset
 from thermoxels_ns.errors import SceneError, ThermalFileError
+from thermoxels_ns.export import input_from_world
+from thermoxels_ns.mesh.build import apply_transform
 from thermoxels_ns.units import TemperatureRange
 
 
@@ -136,6 +138,48 @@ def test_transform_moves_poses_points_and_box_alike(scene_folder, orientation, c
     assert float(sides.max()) == pytest.approx(2.0, abs=1e-5)
     if centre == "box":
         torch.testing.assert_close(outputs.scene_box.get_center(), torch.zeros(3), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("centre", ["box", "poses"])
+@pytest.mark.parametrize("orientation", ["none", "up"])
+def test_far_from_the_origin_the_way_back_is_as_exact(scene_folder, centre, orientation):
+    """In national coordinates (easting, northing in metres) single precision is half a metre wide."""
+    shift = np.array([450_000.3, 5_200_000.4, 300.0])
+    scene = scene_folder(scene_box=[(shift - 4.0).tolist(), (shift + 4.0).tolist()])
+    for frame in scene.meta["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] += shift
+        frame["transform_matrix"] = pose.tolist()
+    scene.rewrite()
+    outputs = parse(scene.path, center_method=centre, orientation_method=orientation)
+    to_input = input_from_world(outputs.dataparser_transform.numpy(), outputs.dataparser_scale)
+    centres = apply_transform(to_input, outputs.cameras.camera_to_worlds.numpy()[:, :, 3].astype(np.float64))
+    given = {Path(f["file_path"]).stem: f["transform_matrix"] for f in scene.meta["frames"]}
+    expected = np.array([given[name] for name in names(outputs)])[:, :3, 3]
+    np.testing.assert_allclose(centres, expected, rtol=0, atol=1e-5)
+
+
+def test_near_the_origin_the_box_is_centred_to_the_last_digit(scene_folder):
+    outputs = parse(scene_folder(scene_box=[[0.1, -1.3, 0.7], [2.3, 0.4, 1.9]]).path)
+    low, high = outputs.scene_box.aabb
+    assert torch.equal(low, -high)
+
+
+@pytest.mark.parametrize(
+    ("method", "second"),
+    [
+        ("vertical", [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]),  # of two cameras at right angles
+        ("up", [[-1, 0, 0], [0, -1, 0], [0, 0, 1]]),  # one of them held upside down
+    ],
+)
+def test_two_cameras_that_do_not_tell_where_up_is_are_refused(scene_folder, method, second):
+    scene = scene_folder(frames=2, names=["frame_train_0", "frame_eval_0"])
+    for frame, rotation in zip(scene.meta["frames"], (np.eye(3), np.array(second))):
+        frame["transform_matrix"] = np.column_stack([rotation, 4.0 * rotation[:, 2]]).tolist()
+    scene.rewrite()
+    with pytest.raises(SceneError, match=f"2 cameras that do not, by {method}.*--orientation-method none"):
+        parse(scene.path, orientation_method=method)
+    assert len(parse(scene.path).image_filenames) == 1
 
 
 def test_train_and_eval_share_world_and_range(scene_folder):
@@ -388,6 +432,7 @@ def test_no_json_and_broken_json(scene_folder, tmp_path):
         (lambda f: f.update(fl_x=0.0), "frame 3.*positive focal"),
         (lambda f: f.update(camera_model="ORTHOPHOTO"), "frame 3.*ORTHOPHOTO"),
         (lambda f: f.update(thermal_camera={"w": 9, "h": 9}), "frame 3.*no fl_x"),
+        (lambda f: f.update(mask_path=None), "frame 3.*mask_path.*None"),
     ],
 )
 def test_bad_frames_are_named(scene_folder, change, message):

@@ -127,8 +127,9 @@ def test_counts_beyond_the_calibration_are_no_temperatures(tmp_path):
     assert np.isfinite(got.temperature_c).sum() == counts.size - 3
 
 
-def test_training_reads_the_same_degrees_whatever_the_unit(tmp_path):
-    path = write(tmp_path, FlirFile(smooth_counts()))
+@pytest.mark.parametrize("name", ["thermal.jpg", "thermal.tiff"])
+def test_training_reads_the_same_degrees_whatever_the_unit(tmp_path, name):
+    path = write(tmp_path, FlirFile(smooth_counts()), name)
     expected = read_thermogram(path).temperature_c
     for unit in (ThermalUnit.celsius(), ThermalUnit.bounds(0.0, 1.0), ThermalUnit.linear(0.1, 0.0)):
         np.testing.assert_array_equal(read_thermal_file(path, unit).temperature_c, expected)

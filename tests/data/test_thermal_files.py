@@ -11,6 +11,7 @@ from PIL import Image
 
 from thermoxels_ns.data.dead_pixels import find_dead_pixels
 from thermoxels_ns.data.thermal_files import ThermalUnit, read_temperature_c, read_thermal_file
+from thermoxels_ns.data.thermal_survey import survey_thermal_files
 from thermoxels_ns.errors import ThermalFileError
 
 BOUNDS = ThermalUnit.bounds(-10.0, 40.0)
@@ -45,10 +46,11 @@ def test_grey_jpg_reads_as_eight_bits(tmp_path):
 
 def test_equal_channels_count_as_grey_and_keep_sixteen_bits(tmp_path):
     counts = np.array([[0, 1, 65535], [40000, 40001, 3]], np.uint16)
-    assert cv2.imwrite(str(tmp_path / "deep.png"), np.repeat(counts[..., None], 3, axis=2))
-    np.testing.assert_allclose(
-        read_temperature_c(tmp_path / "deep.png", BOUNDS), -10 + counts / 65535.0 * 50, atol=4e-6
-    )
+    for name in ("deep.png", "deep.tiff"):
+        assert cv2.imwrite(str(tmp_path / name), np.repeat(counts[..., None], 3, axis=2))
+        np.testing.assert_allclose(read_temperature_c(tmp_path / name, BOUNDS), -10 + counts / 65535.0 * 50, atol=4e-6)
+        unsaturated = read_temperature_c(tmp_path / name, COUNTS)[1]
+        np.testing.assert_allclose(unsaturated, 0.025 * counts[1] - 100.0, atol=4e-5)
     eight = np.array([[1, 2], [3, 255]], np.uint8)
     path = save(tmp_path / "grey.png", np.repeat(eight[..., None], 3, axis=2))
     np.testing.assert_allclose(read_temperature_c(path, BOUNDS), -10 + eight / 255.0 * 50, atol=4e-6)
@@ -172,6 +174,19 @@ def test_dead_pixels_are_stuck_while_their_surroundings_change():
     expected[:, 7] = expected[0, 0] = True
     np.testing.assert_array_equal(dead, expected)
     assert not find_dead_pixels(stack[:4]).any()
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_dead_pixels_are_found_whichever_frames_of_a_long_scene_train(tmp_path, first):
+    random = np.random.default_rng(0)
+    paths = [tmp_path / f"{number:03d}.npy" for number in range(70)]
+    for path in paths:
+        frame = 20.0 + random.random((8, 9))
+        frame[3, 4] = 90.0
+        np.save(path, frame)
+    survey = survey_thermal_files(paths, CELSIUS, (-100.0, 2000.0), None, set(paths[first::2]))
+    assert np.argwhere(survey.dead_pixels[8, 9]).tolist() == [[3, 4]]
+    assert survey.temperature_range.max_c < 21.0
 
 
 def test_quiet_background_is_not_dead():

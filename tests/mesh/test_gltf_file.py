@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +90,22 @@ def test_any_direction_can_be_up(tmp_path, tagged_mesh, up):
     assert np.linalg.det(turn) == pytest.approx(1.0)
     assert x * x + y * y + z * z + w * w == pytest.approx(1.0, abs=1e-12)
     assert turn @ np.array(up) / np.linalg.norm(up) == pytest.approx(np.array([0.0, 1.0, 0.0]), abs=1e-6)
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0.3, -0.9, 0.4)])
+def test_far_from_the_origin_the_shape_stays_whole(tmp_path, tagged_mesh, up):
+    """In national coordinates single precision has steps of half a metre; a translation holds what is beyond it."""
+    shift = np.array([450_000.3, 5_200_000.4, 300.0])
+    moved = replace(tagged_mesh, points_m=tagged_mesh.points_m + shift)
+    write_glb(tmp_path / "far.glb", moved, up=up)
+    write_glb(tmp_path / "near.glb", tagged_mesh, up=up)
+    node, arrays = read_glb(tmp_path / "far.glb")[0]["nodes"][0], read_glb(tmp_path / "far.glb")[1]
+    x, y, z, w = node["rotation"]
+    turn = trimesh.transformations.quaternion_matrix([w, x, y, z])[:3, :3]
+    placed = arrays["POSITION"].astype(np.float64) @ turn.T + node["translation"]
+    surface = surface_of(moved.points_m, moved.facets)
+    assert placed == pytest.approx(surface.points_m @ turn.T, rel=0, abs=1e-6)
+    assert "translation" not in read_glb(tmp_path / "near.glb")[0]["nodes"][0]
 
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 0.0), (0.0, float("nan"), 1.0), (0.0, 1.0)])

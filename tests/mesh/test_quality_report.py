@@ -189,6 +189,19 @@ def test_right_angles_are_not_obtuse_wherever_the_mesh_lies(box_mesh):
     assert np.count_nonzero(report.dihedral_counts) == 3
 
 
+@pytest.mark.parametrize("size", [1.0, 1e-3])
+def test_a_voxel_mesh_keeps_its_promises_in_national_coordinates(box_mesh, size):
+    """Five million metres from the origin nodes have steps of a nanometre, which is no obtuse angle."""
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    points = size * 0.05 * box_mesh.points_m @ turn.T + [450_000.3, 5_200_000.4, 300.0]
+    report = quality_report(replace(box_mesh, points_m=points), "voxel")
+    assert report.broken == () and report.share_obtuse == 0.0 and report.share_positive_edges == 0.0
+    # A node that is off by a tenth of a voxel is no rounding.
+    points[len(points) // 2] += 0.1 * size * 0.05
+    assert "non_obtuse" in quality_report(replace(box_mesh, points_m=points), "voxel").broken
+
+
 def test_bodies_that_touch_are_counted_both_ways(mesh_of_cells):
     cells = np.zeros((4, 2, 2), dtype=bool)
     cells[0, 0, 0] = cells[1, 1, 1] = cells[3, 0, 0] = True

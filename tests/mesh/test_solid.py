@@ -164,6 +164,13 @@ def test_a_wall_thickness_is_in_metres_and_takes_the_place_of_filling(facade):
     assert wall.added == thick.cells.sum() - thin.cells.sum() and "0.4 m thick (4 voxels)" in wall.remark
 
 
+def test_a_wall_thinner_than_voxels_can_tell_is_not_said_to_be_made(facade):
+    thin = select_solid(facade, SolidSelection(close_gaps=0, density_threshold=15.0, wall_thickness=0.14), 0.2)
+    wall = step_of(thin, "wall")
+    assert wall.added == 0
+    assert wall.remark.startswith("A wall 0.14 m thick (1.4 voxels) is thinner than one and a half voxels; the seen")
+
+
 def test_a_wall_thickness_needs_a_scale_and_cameras(facade):
     selection = SolidSelection(wall_thickness=0.3)
     with pytest.raises(MeshError, match=r"wall_thickness.*scale is known.*--metres-per-unit"):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import meshio
 import numpy as np
 import pytest
 import trimesh
 
 from thermoxels_ns.errors import MeshError
+from thermoxels_ns.mesh.formats import check_format, write_mesh
 from thermoxels_ns.mesh.quality import facet_normals
 from thermoxels_ns.mesh.surface import surface_of
 from thermoxels_ns.mesh.surface_files import write_ply, write_stl
@@ -29,6 +32,19 @@ def test_stl_is_the_closed_surface(tmp_path, tagged_mesh):
     raw = np.frombuffer((tmp_path / "house.stl").read_bytes(), dtype=np.uint8)[84:].reshape(-1, 50)
     normals = raw[:, :12].copy().view("<f4")
     assert normals == pytest.approx(facet_normals(tagged_mesh.points_m, tagged_mesh.facets), abs=1e-6)
+
+
+def test_stl_far_from_the_origin_is_refused_and_ply_holds_it(tmp_path, tagged_mesh):
+    """At five million metres single precision has steps of half a metre, wider than the triangles."""
+    far = replace(tagged_mesh, points_m=tagged_mesh.points_m + np.array([450_000.3, 5_200_000.4, 300.0]))
+    with pytest.raises(MeshError, match=r"\.stl: expected coordinates near the origin.*5\.2e\+06.*Write \.ply"):
+        write_mesh(tmp_path / "far.stl", far)
+    with pytest.raises(MeshError, match="near the origin"):
+        check_format("far.stl", far)
+    check_format("near.stl", tagged_mesh)
+    assert not list(tmp_path.iterdir())
+    write_ply(tmp_path / "far.ply", far)
+    assert np.array_equal(meshio.read(tmp_path / "far.ply").points, surface_of(far.points_m, far.facets).points_m)
 
 
 def test_ply_holds_colours_of_the_photographs_and_temperatures(tmp_path, tagged_mesh):

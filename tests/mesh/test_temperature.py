@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.errors import MeshError
 from thermoxels_ns.mesh import temperature
@@ -137,11 +138,31 @@ def test_nan_measurement_and_wrong_shapes_are_refused():
 
 def test_a_solver_that_fails_is_reported(monkeypatch):
     monkeypatch.setattr(temperature, "_DIRECT_SOLVE_UNKNOWNS", 0)
-    monkeypatch.setattr(temperature, "cg", lambda matrix, load, **_: (np.zeros_like(load), 1))
+    monkeypatch.setattr(temperature, "_MOST_ROUNDS", 0)
     with pytest.raises(MeshError, match=r"relative residual of at most 1e-07, got 1 with 1 unobserved"):
         extend_harmonically(
             np.array([[0, 1], [1, 2], [1, 3]]), np.array([10.0, 0.0, 30.0, 40.0]), np.array([True, False, True, True])
         )
+
+
+def test_the_number_of_threads_changes_no_bit():
+    edges, weights = lattice_edges(np.ones((40, 40, 40), dtype=bool))
+    random = np.random.default_rng(0)
+    measured, observed = random.normal(20.0, 5.0, 41**3), random.random(41**3) < 0.02
+    found = []
+    for threads in (1, 2):
+        with threadpool_limits(threads, "blas"):
+            found.append(extend_harmonically(edges, measured, observed, weights))
+    np.testing.assert_array_equal(found[0], found[1])
+
+
+def test_both_solvers_agree(monkeypatch):
+    edges, weights = lattice_edges(np.ones((9, 9, 9), dtype=bool))
+    random = np.random.default_rng(1)
+    measured, observed = random.normal(20.0, 5.0, 1000), random.random(1000) < 0.1
+    direct = extend_harmonically(edges, measured, observed, weights)
+    monkeypatch.setattr(temperature, "_DIRECT_SOLVE_UNKNOWNS", 0)
+    np.testing.assert_allclose(extend_harmonically(edges, measured, observed, weights), direct, rtol=0, atol=1e-7)
 
 
 def test_linear_temperatures_are_extended_through_tetrahedra_of_any_size():

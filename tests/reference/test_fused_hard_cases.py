@@ -217,6 +217,21 @@ def test_miss_is_exactly_the_background_with_depth_infinite(renderer):
 
 
 @pytest.mark.parametrize("renderer", RENDERERS)
+@pytest.mark.parametrize("parallel", [False, True])
+@pytest.mark.parametrize("part", ["origins", "directions"])
+@pytest.mark.parametrize("axes", [[0], [1], [2], [1, 2], [0, 1, 2]])
+def test_a_ray_with_a_nan_misses_and_the_others_see_what_they_saw(renderer, part, axes, parallel):
+    towards = [1.0, 0.0, 0.0] if parallel else [3.0, -0.3, -0.2]
+    rays = request([[-3.0, 0.3, 0.2], [-3.0, 0.25, 0.1]], towards)
+    before = RENDERERS[renderer](filled(50.0), rays, RenderOptions())
+    getattr(rays, part)[0, axes] = float("nan")
+    seen = RENDERERS[renderer](filled(50.0), rays, RenderOptions())
+    assert before.accumulation.tolist() == [1.0, 1.0]
+    assert seen.accumulation.tolist() == [0.0, 1.0] and float(seen.depth[0]) == float("inf")
+    assert torch.equal(seen.thermal[1], before.thermal[1]) and torch.equal(seen.rgb[1], before.rgb[1])
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
 @pytest.mark.parametrize("activation, raw", [("relu", 0.0), ("relu", -3.0), ("exp", -1e30)])
 def test_rays_through_nothing_show_the_background_and_pull_at_no_temperature(renderer, activation, raw):
     grid = random_grid(1, 0, activation, 1.0, CUBE)

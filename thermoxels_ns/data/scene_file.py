@@ -255,7 +255,7 @@ def _frame(
                 remedy="Add it at the top of the json or in every frame.",
             )
         )
-    mask = _existing(folder / entry["mask_path"], where, "mask_path") if "mask_path" in entry else None
+    mask = _mask(folder, entry, where)
     if "transform_matrix" not in entry:
         raise SceneError(
             explain(
@@ -268,6 +268,22 @@ def _frame(
     pose = read_pose(entry["transform_matrix"], f"{where}: transform_matrix")
     intrinsics = read_intrinsics(meta, entry, image, where)
     return Frame(name, image, thermal, mask, pose, intrinsics, thermal_pose, thermal_intrinsics)
+
+
+def _mask(folder: Path, entry: dict[str, Any], where: str) -> Path | None:
+    if "mask_path" not in entry:
+        return None
+    name = entry["mask_path"]
+    if not isinstance(name, str):
+        raise SceneError(
+            explain(
+                f"{where}: mask_path",
+                expected="a file name",
+                got=repr(name),
+                remedy="Name the mask; or leave mask_path out of all frames if none has a mask.",
+            )
+        )
+    return _existing(folder / name, where, "mask_path")
 
 
 def _existing(path: Path, where: str, key: str) -> Path:

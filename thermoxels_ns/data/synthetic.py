@@ -308,7 +308,7 @@ def _intrinsics(camera: PinholeCamera) -> dict[str, Any]:
 
 def _read_transforms(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError) as problem:
         raise SceneError(
             explain(

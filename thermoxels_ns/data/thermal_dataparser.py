@@ -26,6 +26,9 @@ from thermoxels_ns.sightlines import Sightlines
 
 SCENE_SIZE = 2.0
 """Longest side of the scene box in nerfstudio's world; learning rates of the field rely on it."""
+_FAR_SIDES = 16.0
+"""Farther from the origin than this many times its longest side, as in national coordinates, a box is far: shifts in
+single precision are then off by more than a millionth of it."""
 
 
 @dataclass
@@ -198,19 +201,42 @@ class ThermalDataParser(DataParser):
             lines = lines.moved(world.rotation, world.translation, world.scale)
         return _Scene(file, split, survey, world, box, lines)
 
+    def _oriented(self, poses: npt.NDArray[np.float64]) -> torch.Tensor:
+        """nerfstudio's choice of rotation and shift for these poses (n, 4, 4), shape (3, 4) float32."""
+        method, centre = self.config.orientation_method, self.config.center_method
+        centering = "none" if centre == "box" else centre
+        try:
+            _, oriented = auto_orient_and_center_poses(torch.from_numpy(poses.astype(np.float32)), method, centering)
+        except (IndexError, RuntimeError):  # vertical needs three cameras; a decomposition may not converge
+            oriented = torch.full((3, 4), torch.nan)
+        if not bool(torch.isfinite(oriented).all()):
+            raise SceneError(
+                explain(
+                    "orientation_method, center_method",
+                    expected="cameras that tell where up and the middle are",
+                    got=f"{len(poses)} cameras that do not, by {method} and {centre}",
+                    remedy="Pass --orientation-method none --center-method box.",
+                )
+            )
+        return oriented
+
     def _place(self, file: SceneFile) -> tuple[_World, SceneBox, str]:
         """Choose orientation, origin and scale, and express the scene box in the new world."""
         config = self.config
-        poses = torch.from_numpy(np.stack([frame.pose for frame in file.frames]).astype(np.float32))
-        centering = "none" if config.center_method == "box" else config.center_method
-        _, oriented = auto_orient_and_center_poses(poses, config.orientation_method, centering)
+        oriented = self._oriented(np.stack([frame.pose for frame in file.frames]))
         rotation = _nearest_rotation(oriented[:, :3].numpy().astype(np.float64))
         box, source = find_scene_box(file, config.scene_box, rotation)
+        far = bool(np.abs(box).max() > _FAR_SIDES * (box[1] - box[0]).max())
+        if far:
+            rotation = _as_kept(rotation)
+            box, source = find_scene_box(file, config.scene_box, rotation)
         if config.center_method == "box":
             translation = -box.mean(axis=0)
         else:
             translation = oriented[:, 3].numpy().astype(np.float64)
         longest = float((box[1] - box[0]).max())
+        if far:
+            translation = _as_kept(translation)
         scale = (SCENE_SIZE / longest if config.auto_scale_poses else 1.0) * config.scale_factor
         if not (np.isfinite(scale) and scale > 0):
             raise SceneError(
@@ -227,6 +253,15 @@ class ThermalDataParser(DataParser):
             SceneBox(aabb=torch.from_numpy(placed.astype(np.float32))),
             source,
         )
+
+
+def _as_kept(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Round to single precision, in which nerfstudio keeps rotation and shift for the way back to input coordinates.
+
+    Five million metres from the origin that is half a metre. With the rounded numbers used for the way there too, the
+    world is off centre by as much, and what comes back is where it was.
+    """
+    return values.astype(np.float32).astype(np.float64)
 
 
 def _nearest_rotation(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

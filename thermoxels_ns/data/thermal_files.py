@@ -120,6 +120,8 @@ class _RawPixels:
 
     values: npt.NDArray[Any]
     no_data: npt.NDArray[np.bool_] | None = None
+    celsius: bool = False
+    """Whether they are degrees whatever the unit says."""
 
 
 def read_temperature_c(
@@ -178,9 +180,9 @@ def _to_celsius(
     path: Path, suffix: str, raw: _RawPixels, unit: ThermalUnit, valid_range_c: tuple[float, float]
 ) -> ThermalImage:
     values = raw.values
-    plain = values.dtype.kind == "f" or suffix in (".npy", ".csv")
+    plain = raw.celsius or values.dtype.kind == "f" or suffix in (".npy", ".csv")
     saturated = np.zeros(values.shape, dtype=bool)
-    if unit.kind == "linear" and (values.dtype.kind in "ui" or suffix in (".tif", ".tiff")):
+    if unit.kind == "linear" and not raw.celsius and (values.dtype.kind in "ui" or suffix in (".tif", ".tiff")):
         if values.dtype.kind in "ui":
             ends = np.iinfo(values.dtype)
             saturated = (values == ends.min) | (values == ends.max)
@@ -234,7 +236,7 @@ def _read_raw(path: Path, suffix: str) -> _RawPixels:
         return _RawPixels(_read_csv(path))
     if suffix in IMAGE_SUFFIXES:
         if is_flir_jpeg(path):
-            return _RawPixels(read_flir_jpeg(path).temperature_c())
+            return _RawPixels(read_flir_jpeg(path).temperature_c(), celsius=True)
         return _read_image(path)
     raise ThermalFileError(
         explain(
@@ -287,10 +289,10 @@ def _read_image(path: Path) -> _RawPixels:
         mode = image.mode
     if mode == "F":
         return _RawPixels(pixels)
-    if mode in ("L", "RGB", "RGBA", "LA") and bits == np.uint16 and path.suffix.lower() == ".png":
-        deep = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # Pillow cuts 16-bit colour PNG to 8 bits
-        if deep is None or deep.dtype != np.uint16:
-            raise _damaged(path, "a 16-bit PNG that cannot be decoded")
+    if mode in ("L", "RGB", "RGBA", "LA") and pixels.dtype.itemsize < np.dtype(bits).itemsize:
+        deep = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # Pillow cuts 16-bit colour PNG and TIFF to 8 bits
+        if deep is None or deep.dtype != bits:
+            raise _damaged(path, "a 16-bit colour image that cannot be decoded")
         pixels = deep
     if mode == "L" or mode.startswith("I"):
         return _RawPixels(pixels if pixels.dtype == bits else pixels.astype(bits))

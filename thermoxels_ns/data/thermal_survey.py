@@ -53,8 +53,10 @@ def survey_thermal_files(
     shapes: dict[Path, tuple[int, int]] = {}
     extremes: dict[Path, tuple[float, float]] = {}
     kept: dict[tuple[int, int], list[npt.NDArray[np.float32]]] = {}
-    step = -(-len(paths) // _MOST_FRAMES)
-    for number, path in enumerate(paths):
+    trains = [training is None or path in training for path in paths]
+    # Counted among the training files: every other file of all may be an evaluation's.
+    step = -(-sum(trains) // _MOST_FRAMES)
+    for path, is_training in zip(paths, trains):
         temperature_c = read_temperature_c(path, unit, valid_range_c)
         height, width = temperature_c.shape
         shapes[path] = (height, width)
@@ -67,11 +69,11 @@ def survey_thermal_files(
                     remedy="Check thermal_unit or temperature_bounds.json, or widen --valid-range-c.",
                 )
             )
-        if training is not None and path not in training:
+        if not is_training:
             continue
-        extremes[path] = (float(np.nanmin(temperature_c)), float(np.nanmax(temperature_c)))
-        if number % step == 0:
+        if len(extremes) % step == 0:
             kept.setdefault((height, width), []).append(temperature_c)
+        extremes[path] = (float(np.nanmin(temperature_c)), float(np.nanmax(temperature_c)))
     dead = {shape: find_dead_pixels(np.stack(frames)) for shape, frames in kept.items()}
     dead = {shape: mask for shape, mask in dead.items() if mask.any()}
     for path in extremes:

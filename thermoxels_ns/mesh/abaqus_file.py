@@ -172,7 +172,8 @@ def _surfaces(
 ) -> Iterator[str]:
     areas = np.linalg.norm(facet_area_vectors(content.points_m, content.facets), axis=1)
     for name, members in _parts(content.patch, patches):
-        mesh_m2, true_m2 = float(areas[members].sum()), float(areas[members] @ content.area_factor[members])
+        mesh_m2 = float(areas[members].sum())
+        true_m2 = float((areas[members] * content.area_factor[members]).sum())
         yield f"** PATCH-{name}: true area {true_m2:.9g} m2, area of its triangles {mesh_m2:.9g} m2\n"
         yield f"** Multiply film coefficients, emissivities and fluxes on PATCH-{name} by {true_m2 / mesh_m2:.9g}\n"
         yield f"*NSET, NSET=PATCH-{name}\n"

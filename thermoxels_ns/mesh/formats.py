@@ -16,7 +16,7 @@ from thermoxels_ns.mesh.files import write_vtu
 from thermoxels_ns.mesh.gltf_file import write_glb
 from thermoxels_ns.mesh.gmsh_file import write_msh
 from thermoxels_ns.mesh.surface import Colouring
-from thermoxels_ns.mesh.surface_files import write_ply, write_stl
+from thermoxels_ns.mesh.surface_files import check_stl, write_ply, write_stl
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.mesh.xdmf_file import heavy_data_path, write_xdmf
 
@@ -45,6 +45,8 @@ class MeshFormat:
     """Writes the files."""
     companion: Callable[[Path], Path] | None = None
     """Names the second file, if the format takes two."""
+    refuse: Callable[[TetMesh], None] | None = None
+    """Raises if the format cannot hold a mesh that others can; so an export knows before anything slow runs."""
 
 
 def _vtu(request: _Request) -> None:
@@ -90,6 +92,7 @@ MESH_FORMATS: dict[str, MeshFormat] = {
             ".stl",
             "surface, shape only: CAD and 3D printing",
             lambda request: write_stl(request.path, request.mesh),
+            refuse=check_stl,
         ),
         MeshFormat(
             ".ply",
@@ -148,6 +151,18 @@ def mesh_file_paths(path: Path | str) -> list[Path]:
     path = Path(path)
     companion = mesh_format(path).companion
     return [path] if companion is None else [path, companion(path)]
+
+
+def check_format(path: Path | str, mesh: TetMesh) -> None:
+    """Raise what `write_mesh` would because of the format, without writing.
+
+    Raises:
+        MeshError: The format cannot hold this mesh.
+        OutputError: No format has this ending.
+    """
+    refuse = mesh_format(path).refuse
+    if refuse is not None:
+        refuse(mesh)
 
 
 def write_mesh(

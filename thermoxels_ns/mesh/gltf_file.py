@@ -14,7 +14,7 @@ import numpy.typing as npt
 from thermoxels_ns.checks import replace_when_done, writable_folder
 from thermoxels_ns.errors import MeshError, explain
 from thermoxels_ns.mesh.file_content import check_suffix, file_content
-from thermoxels_ns.mesh.surface import Colouring, surface_colours, surface_of, surface_range_c
+from thermoxels_ns.mesh.surface import Colouring, far_origin, surface_colours, surface_of, surface_range_c
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _MAGIC, _VERSION, _JSON_CHUNK, _BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
@@ -34,8 +34,9 @@ def write_glb(
 
     glTF's up is +y: the file holds mesh coordinates and a rotation that turns `up` to it. Colours are stored as light
     intensities (linear), as glTF asks for, and shown as they are, without lamps (``KHR_materials_unlit``), so that a
-    colour stands for one temperature. The vertex attribute ``_TEMPERATURE_C`` holds the temperatures themselves, and
-    the ends of the colour map are in the mesh's ``extras``.
+    colour stands for one temperature. Positions are in single precision; those of a mesh far from the origin count from
+    its middle, and a translation brings it back. The vertex attribute ``_TEMPERATURE_C`` holds the temperatures
+    themselves, and the ends of the colour map are in the mesh's ``extras``.
 
     Layout: glTF 2.0 specification, Khronos Group (ISO/IEC 12113:2022).
 
@@ -62,7 +63,8 @@ def write_glb(
     light = _linear(surface_colours(mesh, surface, content.temperature_c, colouring))
     colours = np.full((len(light), 4), 65535, dtype="<u2")
     colours[:, :3] = np.floor(light * 65535.0 + 0.5)
-    positions = surface.points_m.astype("<f4")
+    origin = far_origin(surface.points_m)
+    positions = (surface.points_m if origin is None else surface.points_m - origin).astype("<f4")
     blocks = {
         "POSITION": (positions, _FLOAT, "VEC3"),
         "COLOR_0": (colours, _UNSIGNED_SHORT, "VEC4"),
@@ -86,7 +88,7 @@ def write_glb(
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "surface", "mesh": 0, "rotation": rotation}],
+        "nodes": [{"name": "surface", "mesh": 0, "rotation": rotation, **_moved_by(origin, rotation)}],
         "meshes": [
             {
                 "name": "surface",
@@ -122,6 +124,15 @@ def _write(path: Path, text: bytes, data: bytes) -> None:
 def _linear(colours: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Light intensity of screen colours (IEC 61966-2-1, sRGB), both in [0, 1]."""
     return np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+
+
+def _moved_by(origin: npt.NDArray[np.float64] | None, rotation: list[float]) -> dict[str, list[float]]:
+    """Translation of a node whose positions count from `origin`, which the quaternion (x, y, z, w) turns too."""
+    if origin is None:
+        return {}
+    axis, w = np.array(rotation[:3]), rotation[3]
+    turned = origin + 2.0 * np.cross(axis, np.cross(axis, origin) + w * origin)
+    return {"translation": turned.tolist()}
 
 
 def _turn_to_y(up: Sequence[float]) -> list[float]:

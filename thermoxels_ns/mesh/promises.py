@@ -57,6 +57,8 @@ class Evidence:
     """Share of tetrahedra with an obtuse angle between two faces, 0 to 1."""
     share_positive_edges: float
     """Share of edges whose entry of the stiffness matrix is positive, 0 to 1."""
+    angle_rounding_deg: float = 0.0
+    """How far rounding of nodes far from the origin may have turned angles, [degrees]."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,7 @@ def judge(evidence: Evidence, boundary_mode: BoundaryMode, length_unit: str = "m
         Promise(
             "dihedral_within_bounds",
             f"Angles between two faces of a tetrahedron lie within {low:g} to {high:g} degrees.",
-            inside >= -ANGLE_TOLERANCE_DEG,
+            inside >= -(ANGLE_TOLERANCE_DEG + evidence.angle_rounding_deg),
             inside,
             f"{smallest:.2f}° to {largest:.2f}°",
         ),

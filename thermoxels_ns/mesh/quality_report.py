@@ -12,7 +12,7 @@ from thermoxels_ns.errors import MeshError, explain
 from thermoxels_ns.mesh.face_count import IntArray, edges_of_rows, group_edges, group_faces
 from thermoxels_ns.mesh.promises import AngleBins, BoundaryMode, Evidence, Promise, angle_bins, judge
 from thermoxels_ns.mesh.quality import check_arrays, count_overlaps, count_twin_nodes, count_wrong_facets, facet_areas
-from thermoxels_ns.mesh.tet_shapes import shapes_in_chunks
+from thermoxels_ns.mesh.tet_shapes import angle_rounding, node_rounding, shapes_in_chunks
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 from thermoxels_ns.mesh.topology import (
     SurfaceComponent,
@@ -169,6 +169,7 @@ def quality_report(
         temperature_excess_k=float(max(low_c - temperature.min(), temperature.max() - high_c)),
         share_obtuse=shapes.share_obtuse,
         share_positive_edges=share_positive,
+        angle_rounding_deg=float(np.degrees(angle_rounding(node_rounding(mesh.points_m), float(lengths.min()) or 1.0))),
     )
     return QualityReport(
         boundary_mode=boundary_mode,
@@ -180,7 +181,7 @@ def quality_report(
         num_box_facets=int(np.count_nonzero(mesh.facet_tags == FACET_BOX)),
         volume_m3=shapes.volume_m3,
         area_m2=float(areas.sum()),
-        true_area_m2=None if mesh.boundary is None else float(areas @ mesh.boundary.area_factor),
+        true_area_m2=None if mesh.boundary is None else float((areas * mesh.boundary.area_factor).sum()),
         edge_length_m=(float(lengths.min()), float(lengths.mean()), float(lengths.max())),
         dihedral_range_deg=shapes.dihedral_range_deg,
         dihedral_counts=tuple(shapes.dihedral_counts.tolist()),

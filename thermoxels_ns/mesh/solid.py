@@ -21,7 +21,7 @@ from thermoxels_ns.mesh.threshold import (
     optical_depth_threshold,
     percentile_threshold,
 )
-from thermoxels_ns.mesh.wall_thickness import wall_behind
+from thermoxels_ns.mesh.wall_thickness import THINNEST_GROWN, wall_behind
 from thermoxels_ns.snapshot import GridSnapshot
 
 __all__ = [
@@ -218,9 +218,7 @@ def select_solid(
     if thickness is not None:
         assert snapshot.views is not None
         wall = cells | wall_behind(cells, snapshot.lattice, snapshot.views, thickness)
-        cells = step(
-            "wall", wall, f"The seen surface is made {selection.wall_thickness:g} m thick ({thickness:.3g} voxels)."
-        )
+        cells = step("wall", wall, _wall_remark(selection, thickness))
     elif selection.interior == "solid":
         cells = step("interior", *_filled(cells, snapshot, selection))
     return SolidCells(
@@ -272,6 +270,13 @@ def _filled(cells: BoolArray, snapshot: GridSnapshot, selection: SolidSelection)
     if inside.rooms:
         remark += f" {inside.rooms} cavities with a camera in them stay empty."
     return cells | inside.enclosed | inside.hidden, remark
+
+
+def _wall_remark(selection: SolidSelection, thickness: float) -> str:
+    asked = f"{selection.wall_thickness:g} m thick ({thickness:.3g} voxels)"
+    if thickness < THINNEST_GROWN:
+        return f"A wall {asked} is thinner than one and a half voxels; the seen surface stays as thick as it is."
+    return f"The seen surface is made {asked}."
 
 
 def _wall_voxels(

@@ -21,6 +21,10 @@ _DARKEST = 0.1
 """Share of the colour map left out at its dark end, where shading could not be told from cold."""
 
 
+_FAR_SIZES = 16.0
+"""Farther from the origin than this many times their own size, points lose in single precision what is seen of them."""
+
+
 @dataclass(frozen=True)
 class Surface:
     """Triangles that use every one of their nodes."""
@@ -44,6 +48,25 @@ def surface_of(points_m: npt.NDArray[np.float64], facets: npt.NDArray[np.int64])
     number = np.cumsum(used) - 1
     nodes = np.flatnonzero(used)
     return Surface(points_m[nodes], number[facets], nodes)
+
+
+def far_origin(points_m: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | None:
+    """Where to count positions from so that single precision can hold them.
+
+    Five million metres from the origin, as in national coordinates, single precision has steps of half a metre.
+
+    Args:
+        points_m: Nodes, shape (n, 3), n at least 1, [m].
+
+    Returns:
+        The middle of the nodes in whole units, shape (3,); None where the origin of the coordinates will do.
+
+    >>> far_origin(np.array([[4.0e6, 0.2, 0.0], [4.0e6 + 9.0, 2.6, 1.0]]))
+    array([4.000004e+06, 1.000000e+00, 0.000000e+00])
+    """
+    low, high = points_m.min(axis=0), points_m.max(axis=0)
+    far = float(np.abs(points_m).max()) > _FAR_SIZES * float((high - low).max())
+    return np.round(0.5 * (low + high)) if far else None
 
 
 def surface_colours(

@@ -8,12 +8,15 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.checks import replace_when_done, writable_folder
+from thermoxels_ns.errors import MeshError, explain
 from thermoxels_ns.mesh.file_content import check_suffix, colour_bytes, file_content
-from thermoxels_ns.mesh.quality import facet_area_vectors
+from thermoxels_ns.mesh.quality import facet_area_vectors, facet_areas
 from thermoxels_ns.mesh.surface import COLOUR_MAP, Colouring, surface_colours, surface_of, surface_range_c
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _STL_HEADER = b"Surface of a tetrahedral mesh, metres".ljust(80)
+_ROUNDING_NOTICED = 0.01
+"""Share of a triangle's side by which rounding may move its corners."""
 _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
@@ -25,17 +28,40 @@ def write_stl(path: Path | str, mesh: TetMesh) -> None:
         mesh: The mesh.
 
     Raises:
-        MeshError: An array does not fit the mesh or is not finite.
+        MeshError: An array does not fit the mesh or is not finite, or `check_stl` refuses the mesh.
         OutputError: The file cannot be written.
     """
     path = check_suffix(path, ".stl")
     content = file_content(mesh)
+    check_stl(mesh)
     vectors = facet_area_vectors(content.points_m, content.facets)
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
     triangles = np.zeros(len(content.facets), dtype=_STL_TRIANGLE)
     triangles["normal"] = vectors / np.where(lengths > 0.0, lengths, 1.0)
     triangles["corners"] = content.points_m[content.facets]
     _write(path, _STL_HEADER, np.uint32(len(triangles)).astype("<u4").tobytes(), triangles.tobytes())
+
+
+def check_stl(mesh: TetMesh) -> None:
+    """Refuse a mesh so far from the origin that STL, which has single precision, cannot hold its shape.
+
+    Raises:
+        MeshError: Rounding would move nodes by more than a hundredth of a triangle's side.
+    """
+    if not len(mesh.facets):
+        return
+    side = float(np.sqrt(2.0 * facet_areas(mesh.points_m, mesh.facets).mean()))
+    farthest = float(np.abs(mesh.points_m[mesh.facets]).max())
+    rounding = 0.5 * float(np.spacing(np.float32(farthest)))
+    if rounding > _ROUNDING_NOTICED * side:
+        raise MeshError(
+            explain(
+                "mesh for .stl",
+                expected="coordinates near the origin, because STL has single precision",
+                got=f"one at {farthest:.6g}, where single precision moves nodes by up to {rounding:.3g}",
+                remedy="Write .ply, which has double precision, or shift the poses towards the origin.",
+            )
+        )
 
 
 def write_ply(

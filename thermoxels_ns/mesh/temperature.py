@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import cg, spsolve
+from scipy.sparse.linalg import spsolve
 
 from thermoxels_ns.checks import check_finite, check_shape
 from thermoxels_ns.errors import MeshError, explain
@@ -19,6 +19,7 @@ Less is leakage through a surface or the tail of an interpolation, and its tempe
 
 _DIRECT_SOLVE_UNKNOWNS = 4000
 _RELATIVE_RESIDUAL = 1e-7
+_MOST_ROUNDS = 100_000
 _LEAST_CONDUCTANCE = 1e-6
 """Share of the mean conductance that every edge has at least: it keeps the matrix an M-matrix, and parts connected."""
 
@@ -134,12 +135,38 @@ def _parts_with_measurement(links: sparse.csr_array, observed: npt.NDArray[np.bo
     return parts.astype(np.int64)
 
 
+def _conjugate_gradients(
+    matrix: sparse.csr_array, load: npt.NDArray, degree: npt.NDArray, tolerance: float
+) -> npt.NDArray[np.float64]:
+    """Conjugate gradients with Jacobi, from 0 until the residual is at most `tolerance` of the load.
+
+    Sums are numpy's own: those of BLAS, which scipy's solver takes, depend in the last digits on how many threads it
+    has.
+    """
+    solution, residual = np.zeros(len(load)), np.array(load, dtype=np.float64)
+    enough = tolerance**2 * np.sum(residual * residual)
+    direction = residual / degree
+    fall = np.sum(residual * direction)
+    for _ in range(_MOST_ROUNDS):
+        if not np.sum(residual * residual) > enough:
+            break
+        image = matrix @ direction
+        step = fall / np.sum(direction * image)
+        solution += step * direction
+        residual -= step * image
+        scaled = residual / degree
+        fall, before = np.sum(residual * scaled), fall
+        direction *= fall / before
+        direction += scaled
+    return solution
+
+
 def _solve(matrix: sparse.csr_array, load: npt.NDArray, degree: npt.NDArray) -> npt.NDArray[np.float64]:
     """Solve the symmetric positive definite system: directly if small, else conjugate gradients with Jacobi."""
     if len(load) <= _DIRECT_SOLVE_UNKNOWNS:
         solution = np.asarray(spsolve(matrix.tocsc(), load)).reshape(-1)
     else:
-        solution, _ = cg(matrix, load, rtol=0.01 * _RELATIVE_RESIDUAL, atol=0.0, M=sparse.diags_array(1.0 / degree))
+        solution = _conjugate_gradients(matrix, load, degree, 0.01 * _RELATIVE_RESIDUAL)
     residual = float(np.linalg.norm(load - matrix @ solution))
     scale = float(np.linalg.norm(load)) or 1.0
     if not residual <= _RELATIVE_RESIDUAL * scale:

@@ -16,6 +16,10 @@ _FACE_PAIRS = ((2, 3), (1, 3), (1, 2), (0, 3), (0, 2), (0, 1))
 """Faces (by the node opposite) that meet in edge e of `face_count.TET_EDGES`."""
 _RIGHT_ANGLE = 1e-9
 """Cosines below this are those of a right angle, up to rounding."""
+_FAR_SIZES = 16.0
+"""Farther from the origin than this many times its own size, a mesh has nodes whose rounding counts."""
+_ANGLE_PER_ROUNDING = 4.0
+"""How far rounding turns an angle at most, [rad], over the share of a side that it moves nodes by."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,8 @@ class TetShapes:
     """Inward normal of the face opposite each node, twice the face's area long, each of shape (3, t), [m^2]."""
     six_volumes: FloatArray
     """Six times the signed volume, shape (t,), [m^3]."""
+    rounding: float = 0.0
+    """How far rounding may have moved nodes, see `node_rounding`, [m]."""
 
     @property
     def volumes(self) -> FloatArray:
@@ -37,7 +43,8 @@ class TetShapes:
     def dihedral_cosines(self) -> FloatArray:
         """Cosines of the inner angles between two faces, shape (6, t), at the edges of `face_count.TET_EDGES`.
 
-        The angle at a face without area counts as 0 degrees; those of right angles are exactly 0.
+        The angle at a face without area counts as 0 degrees; those of right angles, as far as rounding of the nodes
+        lets one tell, are exactly 0.
         """
         lengths = [np.sqrt(_dot(normal, normal)) for normal in self.normals]
         cosines = np.empty((6, len(self.six_volumes)))
@@ -45,8 +52,15 @@ class TetShapes:
             scale = lengths[i] * lengths[j]
             cosine = np.divide(-_dot(self.normals[i], self.normals[j]), scale, out=cosines[edge], where=scale > 0.0)
             cosine[scale == 0.0] = 1.0
-        cosines[np.abs(cosines) < _RIGHT_ANGLE] = 0.0
+        cosines[np.abs(cosines) < self._right_angle()] = 0.0
         return np.clip(cosines, -1.0, 1.0, out=cosines)
+
+    def _right_angle(self) -> float | FloatArray:
+        """Cosines below this are those of a right angle, one for all or shape (t,)."""
+        if self.rounding == 0.0:
+            return _RIGHT_ANGLE
+        shortest = np.sqrt(np.minimum.reduce([_dot(side, side) for side in self.sides]))
+        return np.maximum(angle_rounding(self.rounding, np.maximum(shortest, self.rounding)), _RIGHT_ANGLE)
 
     def radius_ratios(self) -> FloatArray:
         """Three times the radius of the inscribed over that of the circumscribed sphere, shape (t,).
@@ -81,6 +95,31 @@ class TetShapes:
         return entries
 
 
+def node_rounding(points: FloatArray) -> float:
+    """How far rounding may have moved nodes, [m]; 0 where a mesh is so near the origin that it does not count.
+
+    Nodes five million metres from the origin, as in national coordinates, have steps of a nanometre.
+
+    Args:
+        points: Nodes, shape (n, 3), [m].
+    """
+    if len(points) == 0:
+        return 0.0
+    low, high = points.min(axis=0), points.max(axis=0)
+    farthest = float(max(-low.min(), high.max()))
+    return float(np.spacing(farthest)) if farthest > _FAR_SIZES * float((high - low).max()) else 0.0
+
+
+def angle_rounding(rounding: float, side: float | FloatArray) -> float | FloatArray:
+    """How far rounding of the nodes may turn the angle between two faces at most, [rad].
+
+    Args:
+        rounding: What `node_rounding` returned, [m].
+        side: Shortest side of a tetrahedron, above 0, [m].
+    """
+    return _ANGLE_PER_ROUNDING * rounding / side
+
+
 def shapes_in_chunks(points: FloatArray, tets: npt.NDArray[np.int64]) -> Iterator[tuple[slice, TetShapes]]:
     """Go through tetrahedra a chunk at a time, so that memory does not grow with their number.
 
@@ -91,6 +130,7 @@ def shapes_in_chunks(points: FloatArray, tets: npt.NDArray[np.int64]) -> Iterato
     Yields:
         Which tetrahedra, and their shapes.
     """
+    rounding = node_rounding(points)
     columns = np.ascontiguousarray(np.asarray(points, dtype=np.float64).T)
     for start in range(0, len(tets), _CHUNK):
         which = slice(start, min(start + _CHUNK, len(tets)))
@@ -98,7 +138,7 @@ def shapes_in_chunks(points: FloatArray, tets: npt.NDArray[np.int64]) -> Iterato
         origin = columns.take(nodes[0], axis=1)
         a, b, c = (columns.take(nodes[n], axis=1) - origin for n in (1, 2, 3))
         one, two, three = _cross(b, c), _cross(c, a), _cross(a, b)
-        yield which, TetShapes((a, b, c), (-(one + two + three), one, two, three), _dot(a, one))
+        yield which, TetShapes((a, b, c), (-(one + two + three), one, two, three), _dot(a, one), rounding)
 
 
 def signed_volumes(points: FloatArray, tets: npt.NDArray[np.int64]) -> FloatArray:

@@ -14,6 +14,10 @@ from thermoxels_ns.snapshot import Views
 BoolArray = npt.NDArray[np.bool_]
 
 
+THINNEST_GROWN = 1.5
+"""A wall thinner than this has the middle of no voxel behind the seen one, so none is added, [voxels]."""
+
+
 def wall_behind(cells: BoolArray, lattice: Lattice, views: Views, thickness: float) -> BoolArray:
     """Find the voxels that make the seen surface as thick as a wall.
 
@@ -41,7 +45,7 @@ def _grown(cells: BoolArray, sight: Sight, thickness: float) -> BoolArray:
     reach = thickness - 0.5
     seen = sight.seen
     surface = np.argwhere(cells & seen & grow(seen & ~cells, 1))
-    if reach < 1.0 or len(surface) == 0:
+    if thickness < THINNEST_GROWN or len(surface) == 0:
         return added
     closed = ~seen | cells
     near = grow(_at(surface, cells.shape), int(reach)) & closed & ~cells

@@ -130,11 +130,13 @@ def chord(rays: Rays, r: int, volume: Volume):
         origin, direction = float(rays.origins[r, axis]), float(rays.directions[r, axis])
         lo, hi = volume.lo[axis], volume.hi[axis]
         if abs(direction) < 1e-20:
-            if origin < lo or origin > hi:
+            if not lo <= origin <= hi:
                 return 0.0, 0.0
             continue
         inverse = 1.0 / direction
         a, b = (lo - origin) * inverse, (hi - origin) * inverse
+        if not (a <= b or a >= b):  # a NaN of the ray, which the comparisons below would pass over
+            return 0.0, 0.0
         enter = max(enter, min(a, b))
         leave = min(leave, max(a, b))
     if not (leave > enter and leave < math.inf):
