@@ -155,11 +155,12 @@ def known_capture(
 
 
 def drawn_capture(
-    scene_name: str, ratio: int, thermal_width: int, baseline_m: float, seed: int
+    scene_name: str, ratio: int, thermal_width: int, baseline_m: float, seed: int, views: int | None = None
 ) -> tuple[KnownCapture, RigStart]:
     """A capture whose turn, lenses' direction, angle of view and principal point are drawn, and what is known of it.
 
-    That is an angle of view up to 5 % off, and nothing else: no ruler was held against the cameras.
+    That is an angle of view up to 5 % off, and nothing else: no ruler was held against the cameras. Six to eight views
+    if their number is not given.
     """
     draw = np.random.default_rng(1000 + seed)
     turn, zoom = draw.normal(0.0, 1.2, 3), 1.0 + draw.uniform(0.0, 0.1)
@@ -168,7 +169,7 @@ def drawn_capture(
     centre = draw.normal(0.0, 0.005 * thermal_width, 2)
     capture = known_capture(
         scene_name,
-        6 + seed % 3,
+        6 + seed % 3 if views is None else views,
         thermal_width * ratio,
         thermal_width,
         (between[0], between[1], between[2]),
