@@ -1,8 +1,8 @@
 """Rig and drift of a synthetic capture of as many frames as people take: nothing was measured, yet the turn is sure.
 
 Six frames leave the turn unsure by half a degree (`test_rig_without_ruler`), thirty-six less: they show the same walls
-at other places of the image. The error left is about a third of a thermal pixel, so images 80 pixels wide, which are
-not tried here, know the turn to some 0.4 degrees only.
+at other places of the image. Up to half a thermal pixel of the principal point stays unknown, so thermal images 80
+pixels wide leave some 0.4 degrees (`tests/benchmarks/rig_accuracy.py`).
 """
 
 from __future__ import annotations
