@@ -11,7 +11,7 @@ import torch
 
 from tests.short_training import train
 from tests.test_photo_consistency import LATTICE, PLANE, photographs
-from thermoxels_ns import photo_air
+from thermoxels_ns import photo_air, start_choice
 from thermoxels_ns.data.synthetic import make_scene, write_scene
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.lattice import Lattice
@@ -145,6 +145,14 @@ def test_air_is_dropped_at_the_start_and_after_a_refinement(scene, capsys, start
     assert len(air) > 0.01 * len(without.grid.voxels)
     assert said.count("voxels are air") >= 1 and said.count("photographs agree about") == 1  # asked once
     assert "depths:" not in capsys.readouterr().out
+
+
+def test_a_start_that_won_its_trial_asks_all_photographs_once(scene, capsys, monkeypatch):
+    won = start_choice.Verdict("photographs", "as it won")  # of what a trial found nothing is kept
+    monkeypatch.setattr(start_choice, "_decide", lambda model, attributes: won)
+    train(scene, 4, {"resolutions": [8, 16], "refine_at": [2], "photo_depth": "on"})
+    said = capsys.readouterr().out
+    assert said.count("voxels are air") >= 1 and said.count("photographs agree about") == 1
 
 
 def test_what_the_sphere_holds_is_never_air(scene):

@@ -60,25 +60,28 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     def count(step: int) -> None:
         model.update_to_step(step)
 
+    found = verdict.found
+
     @cache
     def air() -> SeenThrough | None:
         """What photographs look through; asked for when it is needed first, in a resumed training too."""
-        if verdict.found is not None and verdict.found.air is not None:
-            return verdict.found.air
+        if found is not None and found.air is not None:
+            return found.air
         return None if attributes.pipeline is None else find_air(model, attributes.pipeline.datamanager)
 
     def carve(step: int) -> None:
         """Drop what lines of sight and depths show to be air; at the first step of a training, not of a resumed one."""
-        for drop in (lambda: carve_air(model), lambda: carve_seen_through(model, air())):
+        for drop in (carve_air, lambda model: carve_seen_through(model, air())):
             old = model.grid.row_parameters()
-            change = drop()
+            change = drop(model)
             if change is not None:
                 follow(old, change)
 
     def start(step: int) -> None:
         """Set the density at the first step of a training, not at the first of a resumed one."""
+        nonlocal found
         assert attributes.pipeline is not None
-        found = verdict.found or find_start(model, attributes.pipeline.datamanager)
+        found = found or find_start(model, attributes.pipeline.datamanager)
         old = model.grid.row_parameters()
         change = model.split(model.config.skipped_factor())
         if change is not None:

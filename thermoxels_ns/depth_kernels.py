@@ -5,6 +5,22 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+FEWEST_DISTANCES = 3
+"""Photographs that must see a point for their distances to be averaged."""
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _pixel(x, y, z, matrix, width, height, first):
+    """Number of the pixel that shows a point, and the point's depth; -1 where the photograph does not show it."""
+    depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
+    if not depth > 0.0:
+        return -1, depth
+    column = np.floor((matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]) / depth)
+    row = np.floor((matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]) / depth)
+    if not (column >= 0.0 and column < width and row >= 0.0 and row < height):
+        return -1, depth
+    return first + int(row) * width + int(column), depth
+
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def agreeing_views(begin: int, end: int, matrices, inverses, centres, sizes, firsts, depth, error, result):
@@ -31,15 +47,9 @@ def agreeing_views(begin: int, end: int, matrices, inverses, centres, sizes, fir
         for k in range(len(firsts)):
             if k == number:
                 continue
-            p = matrices[k]
-            far = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
-            if not far > 0.0:
+            at, far = _pixel(x, y, z, matrices[k], sizes[k, 0], sizes[k, 1], firsts[k])
+            if at < 0:
                 continue
-            column = np.floor((p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]) / far)
-            row = np.floor((p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / far)
-            if not (column >= 0.0 and column < sizes[k, 0] and row >= 0.0 and row < sizes[k, 1]):
-                continue
-            at = firsts[k] + int(row) * sizes[k, 0] + int(column)
             if abs(depth[at] - far) <= error[at] + error[n]:  # False where it is NaN
                 result[n] += 1
 
@@ -59,15 +69,9 @@ def count_sights(
         z = lo[2] + step * (n % shape[2] + 0.5)
         through[n], ends[n] = 0, 0
         for k in range(len(firsts)):
-            p = matrices[k]
-            far = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
-            if not far > 0.0:
+            at, far = _pixel(x, y, z, matrices[k], sizes[k, 0], sizes[k, 1], firsts[k])
+            if at < 0:
                 continue
-            column = np.floor((p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]) / far)
-            row = np.floor((p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / far)
-            if not (column >= 0.0 and column < sizes[k, 0] and row >= 0.0 and row < sizes[k, 1]):
-                continue
-            at = firsts[k] + int(row) * sizes[k, 0] + int(column)
             if sure[at] - far > margin + error[at]:  # False where it is NaN
                 through[n] += 1
             elif abs(likely[at] - far) <= margin + error[at]:
@@ -79,22 +83,17 @@ def mean_distances(begin: int, end: int, points, matrices, sizes, firsts, depth,
     """Fill ``result[point]`` for points `begin` to `end` with the mean distance before the depths of photographs.
 
     Distances along the view direction, positive before a depth, at most `reach`; photographs whose depth is nearer than
-    the point by more than that do not see it. Fewer than three that do: NaN.
+    the point by more than that do not see it. Fewer than `FEWEST_DISTANCES` that do: NaN.
     """
     for n in range(begin, end):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         total, count = 0.0, 0
         for k in range(len(firsts)):
-            p = matrices[k]
-            far = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
-            if not far > 0.0:
+            at, far = _pixel(x, y, z, matrices[k], sizes[k, 0], sizes[k, 1], firsts[k])
+            if at < 0:
                 continue
-            column = np.floor((p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]) / far)
-            row = np.floor((p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / far)
-            if not (column >= 0.0 and column < sizes[k, 0] and row >= 0.0 and row < sizes[k, 1]):
-                continue
-            before = depth[firsts[k] + int(row) * sizes[k, 0] + int(column)] - far
+            before = depth[at] - far
             if before >= -reach:  # False where it is NaN
                 total += min(before, reach)
                 count += 1
-        result[n] = total / count if count >= 3 else np.nan
+        result[n] = total / count if count >= FEWEST_DISTANCES else np.nan
