@@ -16,7 +16,8 @@ import tyro
 
 from thermoxels_ns.capture_command import Capture
 from thermoxels_ns.cost import Cost
-from thermoxels_ns.demo import Demo, SceneName
+from thermoxels_ns.data.synthetic_scenes import SceneWord
+from thermoxels_ns.demo import Demo
 from thermoxels_ns.errors import ThermoxelsError
 from thermoxels_ns.heat_command import Heat
 from thermoxels_ns.option_help import join_help_lines
@@ -29,7 +30,7 @@ _NEWS_FOR_PROGRAMMERS = r"`torch\.jit\.script` is deprecated"
 class Synthetic:
     """Write a synthetic scene, whose shape and temperature are known exactly, as photographs and thermal images."""
 
-    scene: tyro.conf.Positional[SceneName]
+    scene: tyro.conf.Positional[SceneWord]
     """Which scene."""
     output_dir: Path
     """Folder for the scene, in the ThermoScenes layout; made if it does not exist. An earlier synthetic scene in it is

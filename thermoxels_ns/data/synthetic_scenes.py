@@ -1,11 +1,13 @@
-"""The synthetic scenes by name: an object on a table, a house corner, a sphere, a courtyard, pipes before a wall."""
+"""The synthetic scenes by name: an object on a table, a house corner, a sphere, a courtyard, pipes, or `random-N`."""
 
 from __future__ import annotations
 
 from functools import cache
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
+from tyro.constructors import PrimitiveConstructorSpec
 
 from thermoxels_ns.data.pinhole import CameraRing
 from thermoxels_ns.data.rectangles import distance_to_box
@@ -17,6 +19,7 @@ from thermoxels_ns.data.surroundings import room_rgb
 from thermoxels_ns.data.synthetic_courtyard import courtyard
 from thermoxels_ns.data.synthetic_house import house_corner
 from thermoxels_ns.data.synthetic_pipes import pipes
+from thermoxels_ns.data.synthetic_random import RANDOM_NAME, random_scene, random_seed
 from thermoxels_ns.errors import SceneError, explain
 
 FloatArray = npt.NDArray[np.float64]
@@ -106,12 +109,49 @@ _BUILDERS = {
 }
 
 SCENE_NAMES = tuple(_BUILDERS)
-"""Names that `make_scene` knows."""
+"""Names of the scenes that were built by hand; `make_scene` also knows `random-N`."""
+
+
+def check_scene_name(name: str) -> str:
+    """Return a name if `make_scene` knows it.
+
+    Raises:
+        SceneError: No scene has that name; the message lists those there are.
+
+    >>> check_scene_name("random-17")
+    'random-17'
+    """
+    if name not in _BUILDERS and random_seed(name) is None:
+        raise SceneError(
+            explain(
+                "synthetic scene",
+                expected=f"{RANDOM_NAME} with a whole number N from 0 on, or one of {', '.join(_BUILDERS)}",
+                got=repr(name),
+                remedy="Choose one of these names, or a seed as in random-17.",
+            )
+        )
+    return name
+
+
+SceneWord = Annotated[
+    str,
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=f"{{{','.join((*SCENE_NAMES, RANDOM_NAME))}}}",
+        instance_from_str=lambda words: check_scene_name(words[0]),
+        is_instance=lambda value: isinstance(value, str),
+        str_from_instance=lambda value: [value],
+    ),
+]
+"""A scene's name as an option of a command, checked while the command line is read."""
 
 
 @cache
 def make_scene(name: str) -> SyntheticScene:
-    """Make a synthetic scene by its name.
+    """Make a synthetic scene by its name, or by a seed in its name.
+
+    Args:
+        name: One of `SCENE_NAMES`, or ``random-`` and a seed without leading zeros.
 
     Raises:
         SceneError: No scene has that name; the message lists those there are.
@@ -119,13 +159,5 @@ def make_scene(name: str) -> SyntheticScene:
     >>> make_scene("sphere").temperature_bounds_c
     (10.0, 40.0)
     """
-    if name not in _BUILDERS:
-        raise SceneError(
-            explain(
-                "synthetic scene",
-                expected=f"one of {', '.join(_BUILDERS)}",
-                got=repr(name),
-                remedy="Choose one of these names.",
-            )
-        )
-    return _BUILDERS[name]()
+    seed = random_seed(check_scene_name(name))
+    return _BUILDERS[name]() if seed is None else random_scene(seed)

@@ -1,0 +1,147 @@
+"""The default training on scenes from seeds, on which nobody tuned anything: how many reach the quality promised.
+
+    python tests/benchmarks/unseen_scenes.py --output RUNS
+    python tests/benchmarks/unseen_scenes.py --output RUNS --seeds 3 17 --options --pipeline.model.start plain
+
+Each scene is written, trained and evaluated by the commands that a user types (`ns-train thermoxels`, `ns-eval`), with
+their defaults; what follows `--options`, which comes last, is handed to `ns-train`. Logs and results stay in the output
+folder. Seconds are those of the whole `ns-train`, which need an otherwise idle machine to mean anything.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from thermoxels_ns.data.scene_truth import SyntheticScene
+from thermoxels_ns.data.synthetic import make_scene, write_scene
+from thermoxels_ns.data.synthetic_random import FAMILIES
+from thermoxels_ns.demo_commands import run_command
+
+_TARGETS = {"psnr": (">=", 30.0), "thermal_mae_c": ("<=", 0.4), "fscore": (">=", 0.85)}
+_VIEWS = (42, 6)
+_STARTED = re.compile(r"\bstart: (plain|photographs)\b")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one scene."""
+
+    scene: SyntheticScene
+    """The exact scene."""
+    family: str
+    """Kind of arrangement."""
+    seconds: float
+    """Wall time of `ns-train`."""
+    start: str
+    """Start that the training chose, or was told."""
+    figures: dict[str, float]
+    """What `ns-eval` reports."""
+
+    def met(self, name: str) -> bool:
+        """Whether a figure is there and meets its target."""
+        value, (relation, bound) = self.figures.get(name, math.nan), _TARGETS[name]
+        return value >= bound if relation == ">=" else value <= bound
+
+    @property
+    def row(self) -> str:
+        """The line of the table."""
+        coldest, hottest = self.scene.temperature_bounds_c
+        shown = {name: f"{value:.2f}" for name, value in self.figures.items()}
+        bold = {name: f"**{shown[name]}**" for name in _TARGETS if name in shown and not self.met(name)}
+        cells = [
+            *(self.scene.name, self.family, f"{self.seconds:.0f}", f"{hottest - coldest:.0f} K"),
+            *((shown | bold).get(name, "none") for name in (*_TARGETS, "precision", "recall")),
+            f"{self.figures.get('half_transparent', math.nan):.1%}",
+            self.start,
+        ]
+        return f"| {' | '.join(cells)} |"
+
+
+@dataclass
+class UnseenScenes:
+    """Train on scenes from seeds. `--options ...`, last, goes to ns-train as it is."""
+
+    output: Path
+    """Folder for scenes, runs, logs and results. A scene that is there already is not written again."""
+    seeds: tuple[int, ...] = tuple(range(10))
+    """Seeds; ten in a row show each of the five families twice."""
+
+    def main(self, options: Sequence[str]) -> None:
+        """Print a line per scene as it is done, then how many meet the targets."""
+        print("| scene | shows | seconds | range | PSNR, dB | MAE, °C | F-score | precision | recall | half | start |")
+        print("|---|---|---|---|---|---|---|---|---|---|---|", flush=True)
+        outcomes = []
+        for seed in self.seeds:
+            outcomes.append(self.measure(seed, options))
+            print(outcomes[-1].row, flush=True)
+        for name, (relation, bound) in _TARGETS.items():
+            print(f"{name} {relation} {bound:g}: {sum(one.met(name) for one in outcomes)} of {len(outcomes)}")
+        print(f"all three: {sum(all(map(one.met, _TARGETS)) for one in outcomes)} of {len(outcomes)}")
+
+    def measure(self, seed: int, options: Sequence[str]) -> Outcome:
+        """Write, train and evaluate one scene."""
+        scene, folder = make_scene(f"random-{seed}"), self.output / f"random-{seed}"
+        if not _is_written(scene, folder / "scene"):
+            write_scene(scene, folder / "scene", *_VIEWS, progress=False)
+        run = folder / "outputs" / scene.name / "thermoxels" / "run"
+        quiet = Console(file=StringIO(), width=200)
+        began = time.perf_counter()
+        run_command(
+            [
+                *("ns-train", "thermoxels", "--output-dir", str(folder / "outputs"), "--experiment-name", scene.name),
+                *("--timestamp", "run", "--vis", "tensorboard", "--logging.steps-per-log", "100"),
+                *("--logging.local-writer.max-log-size", "0", *options),
+                *("thermal-data", "--data", str(folder / "scene")),
+            ],
+            folder / "train.log",
+            quiet,
+        )
+        seconds = time.perf_counter() - began
+        results = folder / "eval.json"
+        run_command(
+            ["ns-eval", "--load-config", str(run / "config.yml"), "--output-path", str(results)],
+            folder / "eval.log",
+            quiet,
+        )
+        starts = _STARTED.findall((folder / "train.log").read_text(encoding="utf-8", errors="replace"))
+        figures: dict[str, Any] = json.loads(results.read_text(encoding="utf-8"))["results"]
+        numbers = {name: float(value) for name, value in figures.items() if value is not None}
+        return Outcome(
+            scene, FAMILIES[seed % len(FAMILIES)].name, seconds, starts[-1] if starts else "as told", numbers
+        )
+
+
+def _is_written(scene: SyntheticScene, folder: Path) -> bool:
+    """Whether a folder holds this scene, with the cameras it has now; the json is written last."""
+    path = folder / "transforms.json"
+    if not path.is_file():
+        return False
+    content = json.loads(path.read_text(encoding="utf-8"))
+    poses = np.array([frame["transform_matrix"] for frame in content["frames"]])
+    wanted = np.concatenate(scene.poses(*_VIEWS))
+    return (
+        poses.shape == wanted.shape
+        and np.allclose(poses, wanted)
+        and np.allclose(content["scene_box"], scene.scene_box)
+    )
+
+
+if __name__ == "__main__":
+    words, passed_on = sys.argv[1:], []
+    if "--options" in words:
+        at = words.index("--options")
+        words, passed_on = words[:at], words[at + 1 :]
+    tyro.cli(UnseenScenes, args=words).main(passed_on)

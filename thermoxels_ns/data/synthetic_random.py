@@ -1,0 +1,176 @@
+"""Synthetic scenes from a seed, `random-17`: arrangements that nobody chose, to check settings that were not tuned on.
+
+The seed chooses one of five families in turn (a detached house, machinery, pipes and radiators, wings of a building, a
+facade strip) and draws everything in it: sizes and places, paints, light, temperatures, surroundings and cameras. Every
+answer is as exact as that of the scenes with names.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.data.scene_truth import RgbFunction, SyntheticScene
+from thermoxels_ns.data.solid_texture import SolidTexture, SunLight, painted
+from thermoxels_ns.data.solids import Box
+from thermoxels_ns.data.surroundings import room_rgb, sky_rgb, sky_temperature_c
+from thermoxels_ns.data.synthetic_random_buildings import detached_house, facade, wings
+from thermoxels_ns.data.synthetic_random_plan import Plan
+from thermoxels_ns.data.synthetic_random_plant import machinery, pipes_and_radiators
+from thermoxels_ns.data.synthetic_random_views import random_rings
+from thermoxels_ns.errors import SceneError, explain
+
+__all__ = ["FAMILIES", "RANDOM_NAME", "Family", "random_scene", "random_seed"]
+
+FloatArray = npt.NDArray[np.float64]
+
+RANDOM_NAME = "random-N"
+"""How the names of these scenes are written where all names are listed; N is the seed."""
+
+_NAME = re.compile(r"random-(0|[1-9][0-9]{0,17})")
+_STREAM = 7411
+_MARGIN_SHARE = 0.04
+_SURFACE_SAMPLES = 20_000
+_RANGE_K = (15.0, 60.0)
+
+
+@dataclass(frozen=True)
+class Family:
+    """A kind of arrangement."""
+
+    name: str
+    """What it shows."""
+    lay_out: Callable[[Plan], None]
+    """Puts its pieces into a plan."""
+    size_m: tuple[float, float]
+    """Longest side of the smallest and of the largest one [m]."""
+    outdoors: float
+    """Share of them that stand under the sky; the others stand in a room."""
+    arc_deg: tuple[float, float] | None = None
+    """Shortest and longest arc of cameras, in front of it (towards -y) [degrees]; None: all round."""
+
+
+FAMILIES = (
+    Family("detached house", detached_house, (11.0, 20.0), outdoors=1.0),
+    Family("machinery", machinery, (1.2, 5.0), outdoors=0.3),
+    Family("pipes and radiators", pipes_and_radiators, (1.8, 4.0), outdoors=0.15),
+    Family("wings", wings, (14.0, 26.0), outdoors=1.0),
+    Family("facade", facade, (8.0, 14.0), outdoors=1.0, arc_deg=(90.0, 130.0)),
+)
+"""The kinds; seed N has number N modulo their count."""
+
+
+def random_seed(name: str) -> int | None:
+    """Seed of a scene's name; None if it is not the name of a random scene.
+
+    >>> random_seed("random-17"), random_seed("random-017"), random_seed("house-corner")
+    (17, None, None)
+    """
+    found = _NAME.fullmatch(name)
+    return int(found[1]) if found else None
+
+
+def random_scene(seed: int) -> SyntheticScene:
+    """Make the scene of a seed; the same seed makes the same scene.
+
+    Args:
+        seed: At least 0.
+
+    Returns:
+        The scene, named ``random-`` and the seed.
+
+    Raises:
+        SceneError: The seed is below 0.
+
+    >>> random_scene(3).name
+    'random-3'
+    """
+    if seed < 0:
+        raise SceneError(
+            explain("seed", expected="a whole number from 0 on", got=seed, remedy="Pass a seed such as 17.")
+        )
+    draw = np.random.default_rng([_STREAM, seed])
+    family = FAMILIES[seed % len(FAMILIES)]
+    plan = Plan(draw)
+    family.lay_out(plan)
+    lo, hi = plan.solid().bounds
+    extent = float(np.subtract(hi, lo).max())
+    plan = plan.scaled(float(np.round(draw.uniform(*family.size_m), 2)) / extent)
+    solid = plan.solid()
+    box = _box_around(solid.bounds)
+    texture = SolidTexture(box, seed=int(draw.integers(2**31)))
+    light = _light(draw)
+    background_rgb, background_c, surface_c, bounds_c = _surroundings(draw, outdoors=draw.random() < family.outdoors)
+    sampled = plan.warmth(solid.surface_points(_SURFACE_SAMPLES, seed=1)[0])
+    coldest, hottest = round(float(sampled.min()), 6), round(float(sampled.max()), 6)
+
+    def temperature_c(points: npt.ArrayLike) -> FloatArray:
+        share = np.clip((plan.warmth(points) - coldest) / (hottest - coldest), 0.0, 1.0)
+        return (1.0 - share) * surface_c[0] + share * surface_c[1]
+
+    focal_share = round(float(draw.uniform(0.78, 1.05)), 3)
+    span = 360.0 if family.arc_deg is None else round(float(draw.uniform(*family.arc_deg)), 1)
+    start = round(float(draw.uniform(0.0, 360.0)), 1) if family.arc_deg is None else -90.0 - 0.5 * span
+    return SyntheticScene(
+        name=f"random-{seed}",
+        solid=solid,
+        scene_box=box,
+        temperature_bounds_c=bounds_c,
+        colour=lambda points, normals: painted(
+            points, normals, plan.part(points, normals), plan.paints, texture, light
+        ),
+        surface_temperature_c=temperature_c,
+        background_rgb=background_rgb,
+        background_temperature_c=background_c,
+        rings=random_rings(draw, plan.boxes_around(), focal_share, (start, span)),
+        focal_share=focal_share,
+    )
+
+
+def _box_around(bounds: Box) -> Box:
+    """The box to reconstruct: the solid and a margin of 4 % of the longest side all round."""
+    lo, hi = np.asarray(bounds[0]), np.asarray(bounds[1])
+    margin = float((hi - lo).max()) * _MARGIN_SHARE / (1.0 - 2.0 * _MARGIN_SHARE)
+    (x0, y0, z0), (x1, y1, z1) = np.round(lo - margin, 3).tolist(), np.round(hi + margin, 3).tolist()
+    return (x0, y0, z0), (x1, y1, z1)
+
+
+def _light(draw: np.random.Generator) -> SunLight:
+    azimuth, height = draw.uniform(0.0, 2.0 * np.pi), draw.uniform(0.35, 1.2)
+    return SunLight(
+        (float(np.cos(azimuth)), float(np.sin(azimuth)), float(height)), ambient=float(draw.uniform(0.5, 0.75))
+    )
+
+
+def _surroundings(
+    draw: np.random.Generator, outdoors: bool
+) -> tuple[RgbFunction, Callable[[npt.ArrayLike], FloatArray], tuple[float, float], tuple[float, float]]:
+    """Colour and temperature of what lies behind, the surface's coldest and hottest, and the bounds of it all [C]."""
+    brightness, spread = float(draw.uniform(0.75, 1.0)), _degrees(draw.uniform(*_RANGE_K))
+    if outdoors:
+        air, drop = _degrees(draw.uniform(-10.0, 18.0)), _degrees(draw.uniform(0.2, 0.45) * spread)
+        bounds = (air - drop, air - drop + spread)
+        surface = (air + float(draw.uniform(-0.5, 2.0)), bounds[1])
+        return _dimmed(sky_rgb, brightness), lambda d: sky_temperature_c(d, air, drop), surface, bounds
+    room = _degrees(draw.uniform(12.0, 25.0))
+    surface = (room + float(draw.uniform(0.0, 1.5)), room + spread)
+    return (
+        _dimmed(room_rgb, brightness),
+        lambda directions: np.full(len(np.asarray(directions)), room),
+        surface,
+        (room, room + spread),
+    )
+
+
+def _degrees(value: float) -> float:
+    """A multiple of a quarter, so that sums and differences of temperatures are exact."""
+    return 0.25 * round(4.0 * float(value))
+
+
+def _dimmed(colours: RgbFunction, brightness: float) -> RgbFunction:
+    factor = np.float32(brightness)
+    return lambda directions: np.asarray(colours(directions) * factor, dtype=np.float32)

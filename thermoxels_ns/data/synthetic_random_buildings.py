@@ -1,0 +1,246 @@
+"""Buildings that a seed lays out: a detached house, an L or U of wings, a facade strip. Lengths in plan voxels."""
+
+from __future__ import annotations
+
+from thermoxels_ns.data.solids import Box
+from thermoxels_ns.data.synthetic_random_plan import SMALLEST, WIDEST, Plan, Range
+
+Wall = tuple[int, int, float]
+
+_CORNER = 8.5
+_PIER = 3.6
+_OPENING = 6.0
+_LEDGE = 3.2
+_RIDGE = 13.0
+
+
+def detached_house(plan: Plan) -> None:
+    """A house on a plinth with a stepped roof, an annex on one side and windows on the other three."""
+    u = plan.u
+    ground, wall, roof, stone, glass = (plan.paint(m) for m in ("ground", "wall", "roof", "stone", "glass"))
+    size_x, size_y = u(104, WIDEST), u(94, 112)
+    plan.put(_slab(size_x, size_y, u(4, 7)), ground, u(0.0, 0.15))
+    width, depth, high = u(56, 68), u(40, 50), u(36, 48)
+    side, out = int(plan.draw.integers(4)), u(14, 20)
+    axis, sign = side // 2, 1 if side % 2 else -1
+    shift = [0.0, 0.0]
+    shift[axis] = -0.5 * sign * out
+    lo = (shift[0] - 0.5 * width, shift[1] - 0.5 * depth)
+    hi = (shift[0] + 0.5 * width, shift[1] + 0.5 * depth)
+    body: Box = ((*lo, 0.0), (*hi, high))
+    warm = u(0.25, 0.45)
+    plan.put(body, wall, warm)
+    plinth = u(6, 9)
+    plan.put(_grown((*lo, 0.0), (*hi, plinth), u(SMALLEST, 4.5)), stone, u(0.15, 0.5))
+    (ridge_x0, ridge_y0, _), (ridge_x1, ridge_y1, top) = _stepped_roof(plan, body, roof)
+    if plan.chance(0.6):
+        thick = u(4, min(7.0, ridge_y1 - ridge_y0 - 2.0 * _LEDGE))
+        x, y = u(ridge_x0 + _LEDGE, ridge_x1 - _LEDGE - thick), 0.5 * (ridge_y0 + ridge_y1 - thick)
+        plan.put(((x, y, high), (x + thick, y + thick, top + u(5, 12))), plan.paint("wall"), u(0.5, 0.9))
+
+    length = (depth, width)[axis]
+    along = u(16, length - 18)
+    middle = shift[1 - axis] + u(-1, 1) * max(0.5 * (length - along) - 9.5, 0.0)
+    plane = (lo, hi)[sign > 0][axis]
+    annex_wall: Wall = (axis, sign, plane + sign * out)
+    annex_high = u(0.45, 0.62) * high
+    annex = _against((axis, sign, plane), out, (middle - 0.5 * along, middle + 0.5 * along), (0.0, annex_high))
+    plan.put(annex, plan.paint("wall"), u(0.15, 0.6))
+    eaves = u(SMALLEST, 4.5)
+    cover = _against(
+        (axis, sign, plane),
+        out + eaves,
+        (middle - 0.5 * along - eaves, middle + 0.5 * along + eaves),
+        (annex_high, annex_high + u(3.4, 5)),
+    )
+    plan.put(cover, roof if plan.chance(0.5) else plan.paint("roof"), u(0.05, 0.3))
+    _windows(plan, annex_wall, (middle - 0.5 * along, middle + 0.5 * along), (4.0, annex_high - 4.0), glass)
+    for other in range(4):
+        if other != side:
+            a, s = other // 2, 1 if other % 2 else -1
+            face: Wall = (a, s, (lo, hi)[s > 0][a])
+            _windows(plan, face, (lo[1 - a], hi[1 - a]), (plinth + 4.0, high - 4.0), glass)
+    _spots(plan, (body, annex), high)
+
+
+def wings(plan: Plan) -> None:
+    """An L or a U of flat-roofed wings with parapets or eaves, a balcony, a jutting storey and a thin garden wall."""
+    u = plan.u
+    ground, wall, roof, stone, glass = (plan.paint(m) for m in ("ground", "wall", "roof", "stone", "glass"))
+    size_x, size_y = u(106, WIDEST), u(102, WIDEST)
+    plan.put(_slab(size_x, size_y, u(4, 6)), ground, u(0.0, 0.15))
+    width, depth, high = u(64, 78), u(20, 26), u(34, 46)
+    reach, wing = u(26, 38), u(19, 25)
+    left, right, back = -0.5 * width, 0.5 * width, 0.5 * (depth + reach)
+    inner, front = back - depth, back - depth - reach
+    low = high if plan.chance(0.4) else u(0.5, 0.7) * high
+    main: Box = ((left, inner, 0.0), (right, back, high))
+    blocks: list[tuple[Box, tuple[int, ...]]] = [(main, (0, 1, 2, 3))]
+    blocks.append((((left, front, 0.0), (left + wing, inner, low)), (0, 1, 2)))
+    yard = (left + wing, right)
+    if plan.chance(0.5):
+        other_wing, other_low = u(18, 24), u(0.5, 0.7) * high
+        blocks.append((((right - other_wing, inner - u(20, reach), 0.0), (right, inner, other_low)), (0, 1, 2)))
+        yard = (left + wing, right - other_wing)
+    eaves = 0.0 if plan.chance(0.5) else u(3.3, 5)
+    thick, rise = (u(SMALLEST, 4.0), u(4, 6)) if eaves == 0.0 else (0.0, u(3.4, 5))
+    for number, (block, sides) in enumerate(blocks):
+        plan.put(block, wall if number == 0 or plan.chance(0.5) else plan.paint("wall"), u(0.2, 0.45))
+        (x0, y0, _), (x1, y1, z) = block
+        if eaves > 0.0:
+            rear = y1 + eaves if number == 0 else y1
+            plan.put(((x0 - eaves, y0 - eaves, z), (x1 + eaves, rear, z + rise)), roof, u(0.05, 0.25))
+        else:
+            edges: tuple[Box, ...] = (
+                ((x0, y0, z), (x0 + thick, y1, z + rise)),
+                ((x1 - thick, y0, z), (x1, y1, z + rise)),
+                ((x0, y0, z), (x1, y0 + thick, z + rise)),
+                ((x0, y1 - thick, z), (x1, y1, z + rise)),
+            )
+            for edge in sides:
+                plan.put(edges[edge], roof, u(0.05, 0.25))
+
+    middle, half, out, floor = u(-0.2, 0.2) * width, 0.5 * u(20, 32), u(9, 13), u(0.45, 0.55) * high
+    thick, rise = u(SMALLEST, 4.2), u(4, 6)
+    paint, warm = stone, u(0.1, 0.4)
+    far = back + out
+    plan.put(((middle - half, back, floor), (middle + half, far, floor + thick)), paint, warm)
+    for x0, x1, y0 in (
+        (middle - half, middle + half, far - SMALLEST),
+        (middle - half, middle - half + SMALLEST, back),
+        (middle + half - SMALLEST, middle + half, back),
+    ):
+        plan.put(((x0, y0, floor), (x1, far, floor + thick + rise)), paint, warm)
+    behind: Wall = (1, 1, back)
+    door = u(4, 6)
+    plan.recess(behind, (middle - door, middle + door), (floor + thick, high - 5.0), u(SMALLEST, 4.2), glass, u(0.7, 1))
+    _windows(plan, behind, (left, right), (4.0, floor - 3.6), glass)
+
+    jut, from_z = u(8, 13), max(0.5 * low, 9.0)
+    outer: Wall = (0, -1, left)
+    span = (front + 5.0, front + 5.0 + u(16, reach - 6))
+    storey = _against(outer, jut, span, (from_z, low - 4.0))
+    plan.put(storey, plan.paint("wall"), u(0.25, 0.6))
+    if plan.chance(0.5):
+        post = u(3.3, 5)
+        for y in (span[0], span[1] - post):
+            plan.put(((left - jut, y, 0.0), (left - jut + post, y + post, from_z)), stone, u(0.1, 0.3))
+    _windows(plan, (1, -1, inner), (yard[0] - 3.0, yard[1] + 3.0), (4.0, high - 4.0), glass)
+    _windows(plan, (0, 1, left + wing), (front, inner + 3.0), (4.0, low - 4.0), glass)
+    _windows(plan, (1, -1, front), (left, left + wing), (4.0, low - 4.0), glass)
+
+    y = front - u(9, 13)
+    x = u(-0.42, -0.1) * size_x
+    garden: Box = ((x, y, 0.0), (x + u(34, 0.46 * size_x - x), y + u(SMALLEST, 4.0), u(12, 22)))
+    plan.put(garden, plan.paint("stone"), u(0.1, 0.5))
+    _spots(plan, (main, storey, garden), high)
+
+
+def facade(plan: Plan) -> None:
+    """A strip of facade with window recesses, sills, a cornice, entrance steps and a post that stands before it."""
+    u = plan.u
+    ground, wall, stone, glass = (plan.paint(m) for m in ("ground", "wall", "stone", "glass"))
+    half_x, ground_half = 0.5 * u(84, 104), 0.5 * u(108, WIDEST)
+    depth, before, high = u(14, 20), u(34, 46), u(60, 80)
+    plan.put(((-ground_half, -before, -u(4, 6)), (ground_half, depth, 0.0)), ground, u(0.0, 0.2))
+    body: Box = ((-half_x, 0.0, 0.0), (half_x, depth, high))
+    plan.put(body, wall, u(0.25, 0.45))
+    crown, plinth = u(4, 6), u(6, 9)
+    jut = u(3.4, 6)
+    plan.put(((-half_x, -jut, high - crown), (half_x, 0.0, high)), stone, u(0.05, 0.3))
+    if plan.chance(0.5):
+        plan.put(((-half_x, -u(SMALLEST, 4), 0.0), (half_x, 0.0, plinth)), stone, u(0.2, 0.5))
+    face: Wall = (1, -1, 0.0)
+    columns, rows = int(plan.draw.integers(3, 5)), int(plan.draw.integers(2, 4))
+    sill, tall = u(SMALLEST, 4.5), u(SMALLEST, 4.0)
+    stretch = (-half_x + 3.0, half_x - 3.0)
+    rise = (plinth + 6.0, high - crown - 1.0)
+    for (x0, x1), (z0, _) in _windows(plan, face, stretch, rise, glass, columns, rows, 5.2):
+        plan.put(((x0 - 3.2, -sill, z0 - tall), (x1 + 3.2, 0.0, z0)), stone, u(0.15, 0.5))
+    if plan.chance(0.5):
+        x, broad, tread, step = u(-0.6, 0.3) * half_x, u(14, 22), u(4, 5.5), u(SMALLEST, 3.9)
+        for number in range(2):
+            plan.put(((x, -(2 - number) * tread, 0.0), (x + broad, 0.0, (number + 1) * step)), stone, u(0.1, 0.3))
+    thick, tip = u(6, 10), u(0.4, 1.15) * high
+    x, y = u(-0.8, 0.6) * half_x, -u(24, before - 6)
+    post: Box = ((x, y, 0.0), (x + thick, y + thick, tip))
+    plan.put(post, plan.paint("wall"), u(0.3, 0.9))
+    if plan.chance(0.5):
+        plan.put(_grown((x, y, tip), (x + thick, y + thick, tip + u(3.4, 5)), u(3.2, 4)), stone, u(0.2, 0.9))
+    _spots(plan, (body, post), high)
+
+
+def _stepped_roof(plan: Plan, body: Box, paint: int) -> Box:
+    """Eaves and steps that shrink to a ridge along x; returns the last step."""
+    u = plan.u
+    (x0, y0, _), (x1, y1, z) = body
+    over, steps, warm = u(3.3, 5.5), int(plan.draw.integers(2, 5)), u(0.0, 0.25)
+    deep = y1 - y0 + 2.0 * over
+    along, across = u(3.3, 5), u(3.4, min(6.5, (deep - _RIDGE) / (2 * steps)))
+    step = body
+    for number in range(steps + 1):
+        dx, dy, rise = over - number * along, over - number * across, u(3.5, 5.5)
+        step = ((x0 - dx, y0 - dy, z), (x1 + dx, y1 + dy, z + rise))
+        plan.put(step, paint, warm)
+        z += rise
+    return step
+
+
+def _windows(
+    plan: Plan,
+    wall: Wall,
+    along: Range,
+    height: Range,
+    paint: int,
+    columns: int | None = None,
+    rows: int | None = None,
+    pier: float = _PIER,
+) -> list[tuple[Range, Range]]:
+    """Cut a grid of openings into a wall, each with its own size; some are left out. Returns those that were cut."""
+    a0, a1 = along[0] + _CORNER, along[1] - _CORNER
+    z0, z1 = height
+    room = 2.0 * pier + _OPENING
+    most_columns, most_rows = int((a1 - a0) / room), int((z1 - z0) / room)
+    if most_columns < 1 or most_rows < 1:
+        return []
+    columns = min(columns or 1 + int((a1 - a0) / 22.0), most_columns)
+    rows = min(rows or 1 + int((z1 - z0) / 26.0), most_rows)
+    cell, storey = (a1 - a0) / columns, (z1 - z0) / rows
+    share_wide, share_tall, depth = plan.u(0.75, 1.0), plan.u(0.75, 1.0), plan.u(SMALLEST, 4.6)
+    warm, cut = plan.u(0.5, 0.85), []
+    for row in range(rows):
+        for column in range(columns):
+            if plan.chance(0.15):
+                continue
+            half = 0.5 * max(share_wide * (cell - 2.0 * pier), _OPENING)
+            tall = max(share_tall * (storey - 2.0 * pier), _OPENING)
+            middle, bottom = a0 + (column + 0.5) * cell, z0 + row * storey + pier
+            opening = ((middle - half, middle + half), (bottom, bottom + tall))
+            plan.recess(wall, *opening, depth, paint, warm + plan.u(-0.15, 0.15))
+            cut.append(opening)
+    return cut
+
+
+def _spots(plan: Plan, boxes: tuple[Box, ...], high: float) -> None:
+    """Warm places, as vents and leaks make them, and a colder one."""
+    for _ in range(int(plan.draw.integers(1, 4))):
+        plan.spot(boxes[int(plan.draw.integers(len(boxes)))], plan.u(0.7, 1.1), plan.u(0.15, 0.4) * high)
+    plan.spot(boxes[0], plan.u(0.1, 0.2), plan.u(0.2, 0.5) * high)
+
+
+def _slab(size_x: float, size_y: float, thick: float) -> Box:
+    """Ground below z = 0."""
+    return (-0.5 * size_x, -0.5 * size_y, -thick), (0.5 * size_x, 0.5 * size_y, 0.0)
+
+
+def _grown(lo: tuple[float, float, float], hi: tuple[float, float, float], by: float) -> Box:
+    """A box widened in x and y."""
+    return (lo[0] - by, lo[1] - by, lo[2]), (hi[0] + by, hi[1] + by, hi[2])
+
+
+def _against(wall: Wall, out: float, along: Range, height: Range) -> Box:
+    """A box that stands out from a wall."""
+    axis, sign, plane = wall
+    through = (min(plane, plane + sign * out), max(plane, plane + sign * out))
+    (x0, x1), (y0, y1) = (through, along) if axis == 0 else (along, through)
+    return (x0, y0, height[0]), (x1, y1, height[1])

@@ -1,0 +1,221 @@
+"""The plan that a random scene is drawn on: pieces with paint and warmth, openings and warm spots, in voxels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.data.cylinder import Cylinder
+from thermoxels_ns.data.rectangles import distance_to_box
+from thermoxels_ns.data.solid_texture import Paint
+from thermoxels_ns.data.solid_union import SolidUnion
+from thermoxels_ns.data.solids import Box, BoxSolid, Sphere, Vector
+
+FloatArray = npt.NDArray[np.float64]
+Shape = Box | Sphere | Cylinder
+Range = tuple[float, float]
+
+SMALLEST = 3.1
+"""Lower bound of every thickness, gap and step of a plan [voxels of the plan]."""
+WIDEST = 116.0
+"""Upper bound of a plan's extent [voxels of the plan]: with the margins of the scene box it is below 127."""
+HAIR = 0.002
+"""How far a cylinder stays off what carries it [voxels of the plan], since exact solids side by side share no face."""
+
+_BLEND = 2.0
+_LIGHTEST, _STRONGEST = 0.08, 0.35
+_SHADE = 0.07
+_BASES: dict[str, tuple[Vector, ...]] = {
+    "ground": ((0.50, 0.49, 0.44), (0.36, 0.43, 0.28), (0.56, 0.50, 0.42), (0.44, 0.44, 0.46)),
+    "wall": ((0.76, 0.72, 0.62), (0.62, 0.40, 0.31), (0.70, 0.62, 0.45), (0.60, 0.61, 0.62), (0.72, 0.56, 0.50)),
+    "roof": ((0.46, 0.28, 0.24), (0.36, 0.36, 0.39), (0.52, 0.40, 0.34), (0.42, 0.46, 0.42)),
+    "stone": ((0.58, 0.57, 0.54), (0.68, 0.65, 0.60), (0.46, 0.44, 0.42)),
+    "glass": ((0.24, 0.31, 0.40), (0.30, 0.36, 0.38), (0.20, 0.24, 0.30)),
+    "metal": ((0.55, 0.58, 0.62), (0.38, 0.48, 0.58), (0.66, 0.36, 0.28), (0.70, 0.60, 0.32), (0.40, 0.52, 0.42)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """One solid thing with its paint and warmth."""
+
+    shape: Shape
+    """Where it is."""
+    paint: int
+    """Number of its paint."""
+    warmth: float
+    """Warmth at its middle, about 0 (coldest of the scene) to 1 (hottest)."""
+    slope: FloatArray
+    """Change of the warmth along x, y and z [per unit of length]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Glow:
+    """A box, or a point, of one warmth that fades into what is around it."""
+
+    core: Box
+    """Where the warmth is reached; a point if both corners agree."""
+    warmth: float
+    """Warmth of the core."""
+    reach: float
+    """How far from the core the surroundings are themselves again [units of length]."""
+
+
+@dataclass(eq=False)
+class Plan:
+    """What an arrangement consists of.
+
+    Later pieces lie over earlier ones where they share volume: a point has the paint of the last piece that holds it.
+    """
+
+    draw: np.random.Generator
+    """Source of every random choice."""
+    pieces: list[Piece] = field(default_factory=list)
+    """Boxes (which may overlap and touch) and round things (which share no volume and no face)."""
+    removed: list[Box] = field(default_factory=list)
+    """Boxes cut out of all others."""
+    glows: list[Glow] = field(default_factory=list)
+    """What is warmer, or colder, than the piece it lies on."""
+    paints: list[Paint] = field(default_factory=list)
+    """Paints by number."""
+    unit: float = 1.0
+    """Length of a voxel of the plan in the unit that the plan is in."""
+
+    def u(self, low: float, high: float) -> float:
+        """Draw a number between two, `low` if they are in the wrong order."""
+        return float(self.draw.uniform(low, max(low, high)))
+
+    def chance(self, share: float) -> bool:
+        """Draw whether something happens."""
+        return bool(self.draw.random() < share)
+
+    def paint(self, material: str) -> int:
+        """Mix a paint: one of a material's colours, a shade beside it, clearly textured to nearly plain."""
+        base = np.asarray(_BASES[material][int(self.draw.integers(len(_BASES[material])))])
+        mixed = np.clip(base + self.u(-_SHADE, _SHADE) + self.draw.uniform(-0.03, 0.03, 3), 0.12, 0.85)
+        red, green, blue = mixed.tolist()
+        contrast = _LIGHTEST * (_STRONGEST / _LIGHTEST) ** float(self.draw.random())
+        self.paints.append(Paint((red, green, blue), contrast))
+        return len(self.paints) - 1
+
+    def put(self, shape: Shape, paint: int, warmth: float) -> None:
+        """Add a piece, with a gentle slope of its warmth."""
+        lo, hi = _bounds(shape)
+        slope = self.draw.uniform(-0.12, 0.12, 3) / max(float(np.subtract(hi, lo).max()), 1.0)
+        self.pieces.append(Piece(shape, paint, warmth, slope))
+
+    def recess(
+        self, wall: tuple[int, int, float], along: Range, height: Range, depth: float, paint: int, warmth: float
+    ) -> None:
+        """Cut an opening into a wall and put a pane at its back.
+
+        Args:
+            wall: Axis that the wall's plane is at right angles to (0 or 1), its outward sign, its coordinate.
+            along: From where to where along the wall.
+            height: From where to where in z.
+            depth: How far the pane lies behind the wall's plane.
+            paint: Number of the pane's paint.
+            warmth: Warmth of the pane.
+        """
+        axis, sign, plane = wall
+        back = plane - sign * depth
+        self.removed.append(_beside(axis, (plane, back), along, height))
+        pane = _beside(axis, (back, back - sign), along, height)
+        self.pieces.append(Piece(pane, paint, warmth, np.zeros(3)))
+        self.glows.append(Glow(pane, warmth, depth))
+
+    def spot(self, box: Box, warmth: float, reach: float) -> None:
+        """Warm a place on one of the upright sides or on the top of a box."""
+        lo, hi = np.asarray(box[0]), np.asarray(box[1])
+        point = self.draw.uniform(lo, hi)
+        side = int(self.draw.integers(5))
+        axis, upper = (2, True) if side == 4 else (side // 2, bool(side % 2))
+        point[axis] = hi[axis] if upper else lo[axis]
+        x, y, z = point.tolist()
+        self.glows.append(Glow(((x, y, z), (x, y, z)), warmth, reach))
+
+    def scaled(self, factor: float) -> Plan:
+        """The same plan in another unit of length; it shares the source of choices."""
+
+        def box(corners: Box) -> Box:
+            (x0, y0, z0), (x1, y1, z1) = corners
+            return (x0 * factor, y0 * factor, z0 * factor), (x1 * factor, y1 * factor, z1 * factor)
+
+        def shape(old: Shape) -> Shape:
+            if isinstance(old, tuple):
+                return box(old)
+            x, y, z = (c * factor for c in old.centre)
+            if isinstance(old, Sphere):
+                return Sphere((x, y, z), old.radius * factor)
+            return Cylinder((x, y, z), old.radius * factor, old.length * factor, old.axis)
+
+        return Plan(
+            self.draw,
+            [Piece(shape(p.shape), p.paint, p.warmth, p.slope / factor) for p in self.pieces],
+            [box(cut) for cut in self.removed],
+            [Glow(box(glow.core), glow.warmth, glow.reach * factor) for glow in self.glows],
+            list(self.paints),
+            self.unit * factor,
+        )
+
+    def solid(self) -> BoxSolid | SolidUnion:
+        """The exact solid: all boxes joined, less what is cut out, beside the round things.
+
+        Panes are not joined: they lie within their walls, behind what is cut out.
+        """
+        boxes = [piece.shape for piece in self.pieces if isinstance(piece.shape, tuple)]
+        round_things = [piece.shape for piece in self.pieces if not isinstance(piece.shape, tuple)]
+        joined = BoxSolid(boxes, self.removed)
+        return SolidUnion((joined, *round_things)) if round_things else joined
+
+    def boxes_around(self) -> list[Box]:
+        """Boxes around all pieces."""
+        return [_bounds(piece.shape) for piece in self.pieces]
+
+    def part(self, points: npt.ArrayLike, normals: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """Paint of the last piece that holds a point just below the surface: points and normals (n, 3) to (n,)."""
+        inner = np.asarray(points, dtype=np.float64) - 0.01 * self.unit * np.asarray(normals, dtype=np.float64)
+        number = np.zeros(len(inner), dtype=np.int64)
+        for piece in self.pieces:
+            if isinstance(piece.shape, tuple):
+                lo, hi = piece.shape
+                held = np.all((inner > lo) & (inner < hi), axis=1)
+            else:
+                held = piece.shape.contains(inner)
+            number[held] = piece.paint
+        return number
+
+    def warmth(self, points: npt.ArrayLike) -> FloatArray:
+        """Warmth at points (n, 3), continuous in space, shape (n,).
+
+        Every piece has a share that falls with the distance from it, exp(-distance / 2 voxels), so that two that
+        touch pass into each other as heat makes them; glows lie over this.
+        """
+        points = np.asarray(points, dtype=np.float64)
+        far = np.array([_distance(points, piece.shape) for piece in self.pieces])
+        share = np.exp((far.min(axis=0) - far) / (_BLEND * self.unit))
+        own = np.array([p.warmth + (points - np.mean(_bounds(p.shape), axis=0)) @ p.slope for p in self.pieces])
+        warmth = np.einsum("pn,pn->n", share, own) / share.sum(axis=0)
+        for glow in self.glows:
+            near = np.maximum(1.0 - distance_to_box(points, *glow.core) / glow.reach, 0.0)
+            warmth += (glow.warmth - warmth) * near * near * (3.0 - 2.0 * near)
+        return warmth
+
+
+def _beside(axis: int, across: Range, along: Range, height: Range) -> Box:
+    """Box from its extents across a wall, along it and in z."""
+    through = (min(across), max(across))
+    (x0, x1), (y0, y1) = (through, along) if axis == 0 else (along, through)
+    return (x0, y0, height[0]), (x1, y1, height[1])
+
+
+def _bounds(shape: Shape) -> Box:
+    return shape if isinstance(shape, tuple) else shape.bounds
+
+
+def _distance(points: FloatArray, shape: Shape) -> FloatArray:
+    if isinstance(shape, tuple):
+        return distance_to_box(points, *shape)
+    return np.maximum(shape.signed_distance(points), 0.0)
