@@ -9,7 +9,7 @@ from tests.looking_cameras import looking_at
 from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.mesh import interior as interior_module
 from thermoxels_ns.mesh.interior import interior
-from thermoxels_ns.mesh.morphology import fill_enclosed
+from thermoxels_ns.mesh.morphology import convex_hull, fill_enclosed
 
 N = 24
 LATTICE = Lattice((0.0, 0.0, 0.0), 1.0, (N + 1, N + 1, N + 1))
@@ -171,3 +171,102 @@ def test_filling_does_not_bulge_a_round_body():
     ball = np.linalg.norm(np.indices((N, N, N)).transpose(1, 2, 3, 0) + 0.5 - 12.0, axis=-1) < 8.0
     found = interior(ball, LATTICE, looking_at(MIDDLE, [(70.0, 12.0, 12.0)]), 0)
     assert found.hidden.sum() < 0.02 * ball.sum()
+
+
+def half_around(count: int = 20, height: float = 14.0) -> np.ndarray:
+    """Cameras on the side of low x."""
+    angle = np.linspace(0.5 * np.pi + 0.1, 1.5 * np.pi - 0.1, count)
+    return np.column_stack((12 + 60 * np.cos(angle), 12 + 60 * np.sin(angle), np.full(count, height)))
+
+
+def with_holes_far_away() -> tuple[np.ndarray, np.ndarray]:
+    """A thin shell of a box whose side at high x is a chessboard with squares of four voxels; cameras, of which three
+    of 23 look through it."""
+    cells = box(5, 19) & ~box(6, 18)
+    y, z = np.indices((14, 14))
+    cells[18, 5:19, 5:19] = (y // 4 + z // 4) % 2 == 0
+    return cells, np.vstack((half_around(), [(70.0, 12.0, 12.0), (70.0, 2.0, 16.0), (70.0, 22.0, 8.0)]))
+
+
+def test_crevices_that_a_few_cameras_see_through_holes_of_the_shell_are_filled():
+    cells, eyes = with_holes_far_away()
+    found = interior(cells, LATTICE, looking_at(MIDDLE, eyes), 1)
+    assert not (found.hidden | found.enclosed)[~box(5, 19)].any()
+    assert (cells | found.hidden)[box(5, 19)].mean() > 0.88
+
+
+@pytest.mark.parametrize("rule", ["SHADOW_SURROUNDED", "CREVICE_SURROUNDED"])
+def test_both_looks_are_needed_for_crevices(monkeypatch, rule):
+    cells, eyes = with_holes_far_away()
+    views = looking_at(MIDDLE, eyes)
+    whole = interior(cells, LATTICE, views, 1).hidden
+    monkeypatch.setattr(interior_module, rule, 2.0)  # no place is surrounded twice
+    part = interior(cells, LATTICE, views, 1).hidden
+    assert not part[~whole].any() and part.sum() < 0.92 * whole.sum()
+
+
+def test_a_wide_hole_that_no_camera_sees_is_closed_flush_with_the_wall():
+    cells = box(5, 19) & ~box(6, 18)
+    cells[18, 7:17, 7:17] = False
+    found = interior(cells, LATTICE, looking_at(MIDDLE, half_around()), 2)
+    assert not found.enclosed.any()
+    assert np.array_equal(cells | found.hidden, box(5, 19))
+
+
+def test_of_a_box_seen_from_a_corner_the_hull_of_its_three_sides_is_filled():
+    cells = np.zeros((N, N, N), dtype=bool)
+    cells[5:19, 5:19, 18] = cells[18, 5:19, 5:19] = cells[5:19, 18, 5:19] = True
+    eyes = [(60.0, 60.0, 60.0), (70.0, 60.0, 50.0), (50.0, 70.0, 60.0), (60.0, 50.0, 70.0)]
+    found = interior(cells, LATTICE, looking_at(MIDDLE, eyes), 0)
+    assert found.hidden.sum() > 1500
+    assert np.array_equal(cells | found.hidden, convex_hull(cells, of_centres=True))
+
+
+def test_the_long_shadow_between_posts_on_a_plate_is_not_their_inside(monkeypatch):
+    """It is hidden and within the hull, but next to it there is more air than surface."""
+    lattice = Lattice((0.0, 0.0, 0.0), 1.0, (73, 25, 25))
+    cells = np.zeros(lattice.cell_shape, dtype=bool)
+    cells[2:70, 9:15, :2] = cells[2:5, 9:15, :10] = cells[67:70, 9:15, :10] = True
+    views = looking_at((36.0, 12.0, 5.0), [(500.0, y, 6.0) for y in np.linspace(9.0, 15.0, 7)])
+    between = (slice(16, 56), slice(9, 15), slice(6, 10))
+    found = interior(cells, lattice, views, 0)
+    assert found.hidden[between].mean() < 0.05
+    monkeypatch.setattr(interior_module, "SHADOW_SURROUNDED", -1.0)
+    assert interior(cells, lattice, views, 0).hidden[between].mean() > 0.8
+
+
+def test_under_a_table_on_legs_there_is_air_if_cameras_see_it():
+    table = np.zeros((N, N, N), dtype=bool)
+    table[5:19, 5:19, 16:18] = True
+    for x in (5, 16):
+        for y in (5, 16):
+            table[x : x + 3, y : y + 3, 4:16] = True
+    eyes = np.vstack((around(16, 8.0), around(8, 40.0)))
+    for seal in (0, 1, 2):
+        found = interior(table, LATTICE, looking_at(MIDDLE, eyes), seal)
+        assert not (found.hidden | found.enclosed).any()
+
+
+def test_a_courtyard_stays_open_and_the_building_around_it_is_filled():
+    building = np.zeros((N, N, N), dtype=bool)
+    building[3:21, 3:21, 3:12] = True
+    building[8:16, 8:16, 5:] = False
+    inside = np.zeros_like(building)
+    inside[1:-1, 1:-1, 1:-1] = building[1:-1, 1:-1, 1:-1]
+    for axis in range(3):
+        inside &= np.roll(building, 1, axis) & np.roll(building, -1, axis)
+    turn = np.linspace(0.0, 2.0 * np.pi, 20, endpoint=False)
+    eyes = np.column_stack((12 + 30 * np.cos(turn), 12 + 30 * np.sin(turn), np.full(20, 80.0)))
+    for seal in (0, 1):
+        found = interior(building & ~inside, LATTICE, looking_at(MIDDLE, eyes), seal)
+        assert inside.sum() > 500 and np.array_equal(found.hidden | found.enclosed, inside)
+
+
+def test_of_two_boxes_one_behind_the_other_each_is_filled_and_nothing_between_them():
+    boxes = np.zeros((N, N, N), dtype=bool)
+    boxes[2:9, 8:16, 5:15] = boxes[15:22, 8:16, 5:15] = True
+    shells = boxes.copy()
+    shells[3:9, 9:15, 6:14] = shells[15:21, 9:15, 6:14] = False  # of each, the side towards the other is missing
+    eyes = [(90.0, y, z) for y in np.linspace(2.0, 22.0, 6) for z in (6.0, 30.0)]
+    found = interior(shells, LATTICE, looking_at(MIDDLE, eyes), 1)
+    assert np.array_equal(shells | found.hidden | found.enclosed, boxes)

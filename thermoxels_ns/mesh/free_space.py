@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,7 +46,7 @@ def look(cells: BoolArray, lattice: Lattice, views: Views) -> Sight:
 
     Around each camera stand six pyramids, one per side of the lattice. In each of them, rays that lie one voxel apart
     at its far end go from layer to layer; a layer of voxels meets a regular grid of rays, so the ray of a voxel is a
-    product of two look-ups along the axes. The cost is that of a few passes over the lattice per camera.
+    product of two look-ups along the axes. The cost is that of two or three passes over the lattice per camera.
 
     Args:
         cells: True where a voxel blocks the view, shape `lattice.cell_shape`.
@@ -60,20 +59,22 @@ def look(cells: BoolArray, lattice: Lattice, views: Views) -> Sight:
     chosen = np.arange(len(views.focal))
     if len(chosen) > MOST_CAMERAS:
         chosen = np.linspace(0, len(chosen) - 1, MOST_CAMERAS).round().astype(np.int64)
-    in_image = np.zeros(cells.shape, dtype=np.uint8)
-    free = np.zeros(cells.shape, dtype=np.uint8)
+    cameras = [_Camera.of(views, int(number), lattice) for number in chosen]
+    both = np.zeros(cells.shape, dtype=np.uint16)
     for order in ((0, 1, 2), (1, 0, 2), (2, 0, 1)):
         # Layers across the first of these axes are contiguous.
-        layers = np.ascontiguousarray(cells.transpose(order))
-        counts = np.zeros((2, *layers.shape), dtype=np.uint8)
-        for number in chosen:
-            camera = _Camera.of(views, int(number), lattice)
+        passes = np.where(np.ascontiguousarray(cells.transpose(order)), _HELD, _HELD + _FREE)
+        blocks = cells.any(axis=order[1:])
+        counts = np.zeros(passes.shape, dtype=np.uint16)
+        for camera in cameras:
             for sign in (1, -1):
-                _look_along(layers, counts, camera, order, sign)
-        back = np.argsort(order)
-        in_image += counts[0].transpose(back)
-        free += counts[1].transpose(back)
-    return Sight(in_image, free)
+                _look_along(passes, blocks, counts, camera, order, sign)
+        both += counts.transpose(np.argsort(order))
+    return Sight((both % _FREE).astype(np.uint8), (both // _FREE).astype(np.uint8))
+
+
+_HELD, _FREE = np.uint16(1), np.uint16(256)
+"""Both counts of a voxel stand in one number, so that one look-up serves them: the image holds it, its line is free."""
 
 
 @dataclass(frozen=True)
@@ -104,17 +105,23 @@ class _Camera:
 
 
 def _look_along(
-    layers: BoolArray, counts: npt.NDArray[np.uint8], camera: _Camera, order: tuple[int, int, int], sign: int
+    passes: npt.NDArray[np.uint16],
+    blocks: BoolArray,
+    counts: npt.NDArray[np.uint16],
+    camera: _Camera,
+    order: tuple[int, int, int],
+    sign: int,
 ) -> None:
     """Add what one camera sees in the pyramid around one half of an axis, layer after layer away from it."""
     eye = camera.eye[list(order)]
-    distance = sign * (np.arange(len(layers)) + 0.5 - eye[0])
+    distance = sign * (np.arange(len(passes)) + 0.5 - eye[0])
     ahead = np.flatnonzero(distance > 0.0)[::sign]
     if len(ahead) == 0:
         return
-    near, far = distance[ahead[0]], distance[ahead[-1]]
+    away = distance[ahead]
+    near, far = away[0], away[-1]
     rays = []
-    for across, centre, voxels in zip(order[1:], eye[1:], layers.shape[1:]):
+    for across, centre, voxels in zip(order[1:], eye[1:], passes.shape[1:]):
         ends = np.array([-centre, voxels - centre])
         low, high = max(min(ends[0] / near, ends[0] / far), -1.0), min(max(ends[1] / near, ends[1] / far), 1.0)
         if low >= high:
@@ -129,18 +136,15 @@ def _look_along(
     held = camera.holds(direction)
     if not held.any():
         return
-    open_rays = held.copy()
-    for layer, away in _with_distance(ahead, distance):
-        (voxels_u, ray_u), (voxels_v, ray_v) = u.of_voxels(away), v.of_voxels(away)
-        counts[0, layer, voxels_u, voxels_v] += held[ray_u][:, ray_v]
-        counts[1, layer, voxels_u, voxels_v] += open_rays[ray_u][:, ray_v]
-        if away > CLEAR_OF_CAMERA and layers[layer].any():
-            (rays_u, voxel_u), (rays_v, voxel_v) = u.at_voxels(away), v.at_voxels(away)
-            open_rays[rays_u, rays_v] &= ~layers[layer][voxel_u][:, voxel_v]
-
-
-def _with_distance(ahead: npt.NDArray[np.int64], distance: npt.NDArray[np.float64]) -> Iterator[tuple[int, float]]:
-    return zip(ahead.tolist(), distance[ahead].tolist())
+    now = np.where(held, _HELD + _FREE, np.uint16(0))
+    ray_u, ray_v, voxel_u, voxel_v = u.of_voxels(away), v.of_voxels(away), u.at_voxels(away), v.at_voxels(away)
+    in_the_way = blocks[ahead] & (away > CLEAR_OF_CAMERA)
+    for step, layer in enumerate(ahead.tolist()):
+        (voxels_u, from_u), (voxels_v, from_v) = ray_u.at(step), ray_v.at(step)
+        counts[layer, voxels_u, voxels_v] += now.take(from_u, axis=0).take(from_v, axis=1)
+        if in_the_way[step]:
+            (rays_u, from_u), (rays_v, from_v) = voxel_u.at(step), voxel_v.at(step)
+            now[rays_u, rays_v] &= passes[layer].take(from_u, axis=0).take(from_v, axis=1)
 
 
 @dataclass(frozen=True)
@@ -159,22 +163,33 @@ class _Rays:
     def slopes(self) -> npt.NDArray[np.float64]:
         return self.low + (np.arange(self.count) + 0.5) * self.step
 
-    def of_voxels(self, away: float) -> tuple[slice, npt.NDArray[np.int64]]:
-        """The voxels of the layer that lie within the pyramid, and the ray nearest to each of them."""
-        slope = (np.arange(self.voxels) + 0.5 - self.eye) / away
+    def of_voxels(self, away: npt.NDArray[np.float64]) -> _Runs:
+        """For layers so far away: the voxels that lie within the pyramid, and the ray nearest to each of them."""
+        slope = (np.arange(self.voxels) + 0.5 - self.eye) / away[:, None]
         number = np.clip(np.floor((slope - self.low) / self.step), -1, self.count).astype(np.int64)
         if self.owns_diagonal:
             number[slope == 1.0] = self.count - 1
         else:
             number[slope == -1.0] = -1
-        return _inside(number, self.count)
+        return _Runs.inside(number, self.count)
 
-    def at_voxels(self, away: float) -> tuple[slice, npt.NDArray[np.int64]]:
-        """The rays that lie within the layer, and the voxel that each of them meets."""
-        return _inside(np.floor(self.eye + self.slopes * away).astype(np.int64), self.voxels)
+    def at_voxels(self, away: npt.NDArray[np.float64]) -> _Runs:
+        """For layers so far away: the rays that lie within the layer, and the voxel that each of them meets."""
+        return _Runs.inside(np.floor(self.eye + self.slopes * away[:, None]).astype(np.int64), self.voxels)
 
 
-def _inside(number: npt.NDArray[np.int64], count: int) -> tuple[slice, npt.NDArray[np.int64]]:
-    """The run of ascending numbers that lie in 0..count - 1."""
-    start, stop = np.searchsorted(number, [0, count])
-    return slice(int(start), int(stop)), number[start:stop]
+@dataclass(frozen=True)
+class _Runs:
+    """In each row of ascending numbers, the run of those that lie in 0..count - 1."""
+
+    number: npt.NDArray[np.int64]
+    start: list[int]
+    stop: list[int]
+
+    @classmethod
+    def inside(cls, number: npt.NDArray[np.int64], count: int) -> _Runs:
+        return cls(number, (number < 0).sum(axis=1).tolist(), (number < count).sum(axis=1).tolist())
+
+    def at(self, row: int) -> tuple[slice, npt.NDArray[np.int64]]:
+        run = slice(self.start[row], self.stop[row])
+        return run, self.number[row, run]

@@ -11,12 +11,18 @@ from scipy import ndimage
 from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.mesh.free_space import look
 from thermoxels_ns.mesh.morphology import close_gaps, connected, convex_hull, face_connected
+from thermoxels_ns.mesh.winding_number import winding_number
 from thermoxels_ns.snapshot import Views
 
 BoolArray = npt.NDArray[np.bool_]
 
 LARGEST_PASS = 4_000_000
 """Lattices with more voxels than this are looked at in blocks of 2^3, 4^3, ... voxels."""
+SHADOW_SURROUNDED = 0.1
+"""Space that the shell itself hides is inside only if seen surfaces surround it at least this far, as a winding number:
+behind a surface seen from one side only it is up to one half; in the shadow before a wall it is 0 or less."""
+CREVICE_SURROUNDED = 0.3
+"""The same for space that only the filled inside hides: holes of the shell let cameras see it, so it needs more."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +32,7 @@ class Interior:
     enclosed: BoolArray
     """Voxels of cavities: no way out through voxel faces, and no camera in them."""
     hidden: BoolArray
-    """Other voxels that cameras cannot look into, within the convex hull of a body."""
+    """Other voxels that cameras cannot look into, behind the surface and within the convex hull of a body."""
     rooms: int
     """Cavities left empty because a camera stands in them."""
 
@@ -36,7 +42,13 @@ def interior(cells: BoolArray, lattice: Lattice, views: Views | None, seal: int)
 
     A body is what touches once openings are sealed. Its inside are cavities of the sealed shell and, if the cameras
     are known, the space within its convex hull that they should see but do not, because the shell stands in front of
-    it (see `thermoxels_ns.mesh.free_space`). The hull bounds the shadow behind bodies seen from one side.
+    it (see `thermoxels_ns.mesh.free_space`), and that the backs of seen surfaces surround (see
+    `thermoxels_ns.mesh.winding_number`). The hull bounds the shadow behind bodies seen from one side; the winding
+    number tells the shadow of a body from its inside.
+
+    Through holes of the shell a few cameras look past it onto what others know to be inside. Such lines of sight end
+    where that begins, and the cameras are asked again: crevices between shell and inside are hidden now. They are
+    filled where surfaces surround them well.
 
     Args:
         cells: Solid voxels, shape `lattice.cell_shape`.
@@ -52,7 +64,7 @@ def interior(cells: BoolArray, lattice: Lattice, views: Views | None, seal: int)
     rooms = int(face_connected(room).max()) if room.any() else 0
     if views is None or len(views.focal) == 0:
         return Interior(enclosed, np.zeros_like(cells), rooms)
-    hidden = _hidden(sealed, lattice, views) & ~cells & ~enclosed
+    hidden = _hidden(sealed, lattice, views, seal) & ~cells & ~enclosed
     # What the filled space now encloses is as much inside as the rest.
     cavity, _ = _cavities(cells | enclosed | hidden, room | _camera_voxels(cells, lattice, views))
     return Interior(enclosed, hidden | cavity, rooms)
@@ -99,25 +111,35 @@ def _cavities(shell: BoolArray, cameras: BoolArray) -> tuple[BoolArray, BoolArra
     return (kept & ~rooms)[labels], rooms[labels]
 
 
-def _hidden(sealed: BoolArray, lattice: Lattice, views: Views) -> BoolArray:
-    """Voxels that are not seen, within the convex hull of a body."""
+def _hidden(sealed: BoolArray, lattice: Lattice, views: Views, seal: int) -> BoolArray:
+    """Voxels that are not seen, behind the surface and within the convex hull of a body."""
     block = 1
     while sealed.size > LARGEST_PASS * block**3:
         block *= 2
     if block > 1:
-        return _hidden_in_blocks(sealed, lattice, views, block)
+        return _hidden_in_blocks(sealed, lattice, views, seal, block)
     hull = _hulls(sealed)
-    return look(sealed, lattice, views).hidden & hull if hull.any() else hull
+    if not (hull & ~sealed).any():
+        return np.zeros_like(hull)
+    shadow = _behind(sealed, lattice, views, SHADOW_SURROUNDED) & hull
+    crevices = _behind(close_gaps(sealed | shadow, seal), lattice, views, CREVICE_SURROUNDED) & hull
+    return shadow | crevices
 
 
-def _hidden_in_blocks(sealed: BoolArray, lattice: Lattice, views: Views, block: int) -> BoolArray:
+def _behind(cells: BoolArray, lattice: Lattice, views: Views, surrounded: float) -> BoolArray:
+    """Voxels that are not seen and that seen surfaces surround at least so far."""
+    sight = look(cells, lattice, views)
+    return sight.hidden & (winding_number(cells, sight.seen & ~cells) >= surrounded)
+
+
+def _hidden_in_blocks(sealed: BoolArray, lattice: Lattice, views: Views, seal: int, block: int) -> BoolArray:
     """The same, where a block of voxels has one answer."""
     shape = sealed.shape
     padded = np.pad(sealed, [(0, -n % block) for n in shape])
     cx, cy, cz = (n // block for n in padded.shape)
     coarse = padded.reshape(cx, block, cy, block, cz, block).any(axis=(1, 3, 5))
     coarse_lattice = Lattice(lattice.lo, lattice.voxel_size * block, (cx + 1, cy + 1, cz + 1))
-    hidden = _hidden(coarse, coarse_lattice, views)
+    hidden = _hidden(coarse, coarse_lattice, views, seal // block)
 
     def fine(cells: BoolArray) -> BoolArray:
         for axis in range(3):

@@ -66,8 +66,9 @@ class SolidSelection:
     interior: InteriorKind = "solid"
     """What becomes of the inside of a body of which photographs only show the shell. solid: it is filled, namely
     cavities that the shell encloses, and space within the body's convex hull that the training cameras would see if
-    the shell did not stand in front of it (fewer than one in ten look into it). hollow: the shell alone is meshed, as
-    thick as the photographs happened to make it. A cavity with a camera in it is a room and is never filled."""
+    the shell did not stand in front of it (fewer than one in ten look into it), with the crevices that holes of the
+    shell leave between the two. hollow: the shell alone is meshed, as thick as the photographs happened to make it. A
+    cavity with a camera in it is a room and is never filled."""
     seal_openings: int = 2
     """While looking for the inside, openings in the shell up to twice this many voxels wide count as closed. It leaves
     the shell itself as it is."""

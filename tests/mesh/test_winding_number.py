@@ -1,0 +1,80 @@
+"""How far surfaces surround a place: against solid angles."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.mesh.winding_number import winding_number
+
+
+def box(shape: tuple[int, int, int], lo: tuple[int, int, int], hi: tuple[int, int, int]) -> np.ndarray:
+    cells = np.zeros(shape, dtype=bool)
+    cells[tuple(slice(a, b) for a, b in zip(lo, hi))] = True
+    return cells
+
+
+def rectangle(half_a: float, half_b: float, away: float) -> float:
+    """Winding number of a rectangle at a point above its middle: its solid angle over 4 pi."""
+    return np.arctan(half_a * half_b / (away * np.sqrt(half_a**2 + half_b**2 + away**2))) / np.pi
+
+
+@pytest.mark.parametrize("shape", [(24, 24, 24), (25, 18, 31)])
+@pytest.mark.parametrize("lo", [(6, 6, 6), (7, 5, 6)])
+def test_a_closed_surface_surrounds_its_inside_once_and_its_outside_not(shape, lo):
+    solid = box(shape, lo, (19, 12, 18))
+    found = winding_number(solid, ~solid)
+    assert found.shape == shape and found.dtype == np.float32
+    # A face in the middle of a block of two voxels is spread over both of its ends.
+    assert np.allclose(found[box(shape, (9, 8, 8), (16, 10, 16))], 1.0, atol=1e-4)
+    outside = ~box(shape, tuple(n - 2 for n in lo), (21, 14, 20))  # type: ignore[arg-type]
+    assert np.allclose(found[outside], 0.0, atol=1e-4)
+
+
+def test_a_cube_without_one_of_its_sides_surrounds_its_middle_five_sixths():
+    solid = box((48, 48, 48), (12, 12, 12), (36, 36, 36))
+    air = ~solid
+    air[12:36, 12:36, :12] = False  # nothing is known of what is below
+    found = winding_number(solid, air)
+    assert found[23:25, 23:25, 23:25].mean() == pytest.approx(5 / 6, abs=0.02)
+    # Below it the missing side is missed as well: with it, all would cancel.
+    below = found[23:25, 23:25, 5:7].mean()
+    assert below == pytest.approx(rectangle(12, 12, 6), abs=0.04)
+    # A film across the hole is where it is one half.
+    assert found[23:25, 23:25, 11:13].mean() == pytest.approx(0.5, abs=0.04)
+
+
+def test_a_plate_seen_from_one_side_subtends_its_solid_angle():
+    solid = box((48, 48, 48), (14, 14, 22), (34, 34, 24))
+    air = np.zeros_like(solid)
+    air[:, :, 24:] = True
+    found = winding_number(solid, air)
+    for away in (4, 8):
+        expected = rectangle(10, 10, away)
+        assert found[23:25, 23:25, 23 - away : 25 - away].mean() == pytest.approx(expected, abs=0.04)
+        assert found[23:25, 23:25, 23 + away : 25 + away].mean() == pytest.approx(-expected, abs=0.04)
+
+
+def test_a_leaf_seen_from_both_sides_surrounds_nothing():
+    leaf = box((32, 32, 32), (8, 8, 16), (24, 24, 17))
+    found = winding_number(leaf, ~leaf)
+    assert np.abs(np.delete(found, slice(12, 20), axis=2)).max() < 0.03
+
+
+def test_without_a_face_between_solid_and_air_there_is_no_surface():
+    solid = box((16, 16, 16), (4, 4, 4), (8, 12, 12))
+    air = box((16, 16, 16), (9, 4, 4), (13, 12, 12))  # one unknown voxel between them
+    for s, a in ((solid, air), (solid, solid & False), (solid & False, ~solid)):
+        assert not winding_number(s, a).any()
+
+
+def test_turning_space_turns_the_answer():
+    rng = np.random.default_rng(2)
+    solid = np.kron(rng.random((5, 6, 7)) < 0.4, np.ones((4, 4, 4), bool)).astype(bool)
+    air = ~solid & np.kron(rng.random((5, 6, 7)) < 0.7, np.ones((4, 4, 4), bool)).astype(bool)
+    found = winding_number(solid, air)
+    assert found.std() > 0.1
+    for order in ((2, 0, 1), (1, 0, 2)):
+        turned = winding_number(solid.transpose(order), air.transpose(order))
+        assert np.allclose(turned, found.transpose(order), atol=1e-4)
+    assert np.array_equal(winding_number(solid, air), found)
