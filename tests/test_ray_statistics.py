@@ -239,7 +239,8 @@ def test_evidence_lies_in_kept_voxels_in_their_order(backend):
 def test_without_rays_there_is_no_evidence():
     scene = slab()
     evidence = field_evidence(scene, ())
-    assert evidence.rays == 0 and len(evidence.half_depth_density) == 0 and float(evidence.voxel_weight.sum()) == 0.0
+    assert evidence.rays == 0 and len(evidence.half_depth_density) == 0
+    assert float(evidence.voxel_weight.sum()) == float(evidence.voxel_ends.sum()) == 0.0
     assert torch.equal(evidence.temperature.thermal, scene.grid.temperature.data[:, 0].clamp(0, 1))
 
 
@@ -267,8 +268,50 @@ def test_each_ray_that_ends_has_exactly_one_half_depth_however_sums_are_rounded(
         before=[0.0, 0.4999998, 0.4999999, 0.0, 0.0, 0.2999999],
         transmittance=[0.0, 0.5, 0.4],
     )
-    bundle = RayBundle(torch.zeros(3, 3), torch.eye(3), torch.ones(3, 1))
-    found = field_evidence(scene, [bundle]).half_depth_density
+    along_y = torch.tensor([0.0, 1.0, 0.0]).expand(3, 3)  # out of the layer, where there is no voxel to meet
+    bundle = RayBundle(torch.zeros(3, 3), along_y, torch.ones(3, 1))
+    evidence = field_evidence(scene, [bundle])
+    found = evidence.half_depth_density
     assert len(found) == 2 and found.tolist()[0] in (15.0, 25.0) and found.tolist()[1] in (45.0, 55.0)
     ends = voxel_weights(scene, [bundle]).ends
     assert ends.tolist() == [float(10 * number + 5) in found.tolist() for number in range(6)]
+    assert evidence.voxel_ends.tolist() == ends.double().tolist()
+
+
+def behind_plane(place: float, backend: Backend) -> Scene:
+    """Solid for x < `place`, as sharp as a density that is interpolated before its exponential can be."""
+    grid = VoxelGrid(Lattice.covering((-1, -1, -1), (1, 1, 1), 8), sh_degree=None, activation="exp")
+    corners = torch.as_tensor(grid.lattice.corner_positions(), dtype=torch.float32).reshape(-1, 3)
+    grid.density.data = 60.0 * (place - corners[:, :1]) / 0.25
+    return Scene(grid, backend)
+
+
+@pytest.mark.parametrize("place", [0.02, 0.06, 0.1, 0.16, 0.19, 0.23])
+def test_rays_meet_the_solid_wherever_in_a_voxel_a_sharp_surface_lies(backend, place):
+    """The voxel between x = 0 and 0.25 is empty at its centre if the surface lies before 0.125."""
+    scene = behind_plane(place, backend)
+    evidence = field_evidence(scene, rays_along_minus_x())
+    centre = scene.grid.voxel_density()
+    assert len(evidence.half_depth_density) == 1600
+    assert bool((centre[4] > 1e3).all()) == (place > 0.125)
+    assert float(evidence.half_depth_density.min()) > 1e3 and float(centre[5:].max()) < 1.0
+
+
+def test_no_ray_meets_what_stands_farther_than_half_a_voxel_behind_its_end(backend):
+    """A veil as thick as a voxel takes 90 %; a wall a thousand times as dense stands two voxels behind it."""
+    scene = slab(backend)
+    veil = -3 * math.log(0.1)
+    layers(scene, {4: veil, 1: 1e3 * veil, 0: 1e3 * veil})
+    evidence = field_evidence(scene, rays_along_minus_x())
+    torch.testing.assert_close(evidence.half_depth_density, torch.full((1600,), veil / 2))
+
+
+def test_rays_are_counted_in_the_voxel_they_end_in_and_not_where_they_leak(backend):
+    """A wall of optical depth 2.3 lets 10 % through to a second one, in which no ray ends."""
+    scene = slab(backend)
+    layers(scene, {4: -3 * math.log(0.1), 1: 500.0, 0: 500.0})
+    evidence = field_evidence(scene, rays_along_minus_x())
+    ends = evidence.voxel_ends.view(6, 6, 6).sum((1, 2))
+    weight = evidence.voxel_weight.view(6, 6, 6).sum((1, 2))
+    assert float(ends.sum()) == 1600 and float(ends[3:5].sum()) == 1600
+    assert float(weight[:3].sum()) == pytest.approx(160, rel=0.02)

@@ -26,7 +26,7 @@ def full() -> GridSnapshot:
         ones,
         np.ones((1, 2, 3), np.float32),
         np.ones((2, 3, 4, 3), np.float32),
-        RayEvidence(np.ones((1, 2, 3), np.float32), np.ones(7, np.float32)),
+        RayEvidence(np.ones((1, 2, 3), np.float32), np.ones(7, np.float32), np.ones((1, 2, 3), np.float32)),
         Views(np.zeros((5, 3, 4)), np.ones((5, 2)), np.zeros((5, 2)), np.ones((5, 2), np.int64)),
     )
 
@@ -74,6 +74,7 @@ def test_shapes_that_do_not_fit_are_refused_by_name(part):
     [
         ("evidence", "voxel_weight", -1e-3, "voxel_weight: expected 0 or more, got -0.001 to 1. The checkpoint"),
         ("evidence", "half_depth_density", -1.0, "half_depth_density: expected 0 or more, got -1 to 1. The checkpoint"),
+        ("evidence", "voxel_ends", -1.0, "voxel_ends: expected 0 or more, got -1 to 1. The checkpoint"),
         ("views", "focal", 0.0, "focal: expected 1e-06 or more, got 0 to 1. Correct the camera"),
         ("views", "size", 0, "size: expected 1 or more, got 0 to 1. Correct the camera"),
     ],

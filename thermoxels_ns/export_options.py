@@ -43,8 +43,8 @@ class ExportOptions:
     Thermoxels paper, and every boundary triangle says how much true surface it stands for."""
     voxel_optical_depth: float | None = None
     """Voxels in which density times edge length is at least this are solid: at 0.5, light that crosses one loses 39 %.
-    Lower it if walls have holes, raise it if empty space turns solid. Left out, the threshold is automatic: such that
-    85 % of the training rays that end on something end in a solid voxel."""
+    Lower it if walls have holes, raise it if empty space turns solid. Left out, the threshold is automatic: the
+    highest that 95 % of the training rays that end on something meet within half a voxel of where they end."""
     density_percentile: float | None = None
     """Voxels denser than this share of all voxels of the scene box are solid, [%], 0 to 100; the Thermoxels paper's
     way, where 90 keeps the densest tenth. Takes the place of the optical depth."""

@@ -384,9 +384,9 @@ class ThermoxelsModel(Model):
 
     def _ray_evidence(self, seen: FieldEvidence) -> RayEvidence:
         """What rays say about voxels, on the whole lattice."""
-        weight = np.zeros(self.grid.lattice.cell_shape, dtype=np.float32)
-        weight.reshape(-1)[self.grid.voxels.cells] = seen.voxel_weight.cpu().numpy()
-        return RayEvidence(weight, seen.half_depth_density.float().cpu().numpy())
+        lattice = np.zeros((2, *self.grid.lattice.cell_shape), dtype=np.float32)
+        lattice.reshape(2, -1)[:, self.grid.voxels.cells] = torch.stack((seen.voxel_weight, seen.voxel_ends)).cpu()
+        return RayEvidence(lattice[0], seen.half_depth_density.float().cpu().numpy(), lattice[1])
 
     def _corner_colour(self) -> Tensor | None:
         """Colour at the corners from the harmonic of degree 0, grey at corners of no kept voxel, (x, y, z, 3).

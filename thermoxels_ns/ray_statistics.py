@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int64
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from thermoxels_ns.field.interpolation import splat
+from thermoxels_ns.field.interpolation import TrilinearPoints, splat
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.ray_rendering import GridSamples
 from thermoxels_ns.streams import THERMAL_STREAM
@@ -88,6 +88,13 @@ def share_of_rays_opened(model: RaySampler, rays: Iterable[RayBundle], keep: Boo
     return opened / max(1, hit)
 
 
+END_WIDTH = 0.5
+"""A ray meets the voxels that it crosses this much before and after the point where half of its weight is spent,
+[voxels]. A sharp surface may lie anywhere in a voxel: if it lies behind the centre, that voxel is empty at its centre
+although rays end in it, and the solid begins with the next one, whose centre is at most half a voxel farther in."""
+_END_STEPS = 5
+
+
 @dataclass(frozen=True)
 class CornerTemperature:
     """What thermal rays say about the stored corners."""
@@ -108,9 +115,12 @@ class FieldEvidence:
     """What the thermal ones among them measured."""
     voxel_weight: Float[Tensor, " voxels"]
     """Sum of the weights that rays spent in each kept voxel, [rays]."""
+    voxel_ends: Float[Tensor, " voxels"]
+    """Number of rays that end on something (opacity above one half) and have spent half of their weight in each kept
+    voxel, [rays]."""
     half_depth_density: Float[Tensor, " ends"]
-    """Density at the centre of the voxel in which each ray that ends on something (opacity above one half) has spent
-    half of its weight, [1 / world unit], in the order of the rays."""
+    """Density that each ray that ends on something meets where it ends, [1 / world unit], in the order of the rays: the
+    highest at the centre of a voxel within `END_WIDTH` of where it has spent half of its weight."""
 
 
 @torch.no_grad()
@@ -129,17 +139,21 @@ def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidenc
     """
     grid = model.grid
     device = grid.density.device
-    centre_density = grid.voxel_density().view(-1)[grid.cells]
+    centre_density = grid.voxel_density()
     corners = torch.zeros(grid.voxels.num_rows, 2, device=device)
     voxels = torch.zeros(len(grid.voxels), dtype=torch.float64, device=device)
-    half_depth = [centre_density[:0]]
+    ends = torch.zeros_like(voxels)
+    half_depth = [centre_density.view(-1)[:0]]
     seen = 0
     for bundle in rays:
         directions = bundle.directions.to(device)
         samples = model.sample_rays(bundle.origins.to(device), directions)
         seen += len(directions)
         voxels.index_add_(0, samples.at.number, samples.weight.double())
-        half_depth.append(centre_density[samples.at.number[_half_way(samples)]])
+        half_way = _half_way(samples)
+        at_half, ray = samples.at.select(half_way), samples.ray[half_way]
+        ends += torch.bincount(at_half.number, minlength=len(ends))
+        half_depth.append(_density_met(grid, centre_density, at_half, directions[ray]))
         first_hit = (samples.before < 0.5) & (_is_thermal(bundle, device) & (samples.transmittance < 0.5))[samples.ray]
         at = samples.at.select(first_hit)
         weights = samples.weight[first_hit][:, None]
@@ -148,7 +162,22 @@ def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidenc
     weight = corners[:, 1]
     stored = grid.temperature[:, 0]
     thermal = torch.where(weight > 0, corners[:, 0] / weight.clamp(min=1e-30), stored)
-    return FieldEvidence(seen, CornerTemperature(thermal.clamp(0, 1), weight), voxels, torch.cat(half_depth))
+    return FieldEvidence(seen, CornerTemperature(thermal.clamp(0, 1), weight), voxels, ends, torch.cat(half_depth))
+
+
+def _density_met(
+    grid: VoxelGrid, centre_density: Float[Tensor, "x y z"], at: TrilinearPoints, directions: Float[Tensor, "n 3"]
+) -> Float[Tensor, " n"]:
+    """The highest density at the centre of a voxel within `END_WIDTH` of points along unit directions."""
+    shape = torch.tensor(grid.lattice.cell_shape, device=centre_density.device)
+    voxel = torch.stack(torch.unravel_index(grid.cells[at.number], grid.lattice.cell_shape), -1)
+    met = torch.zeros(len(voxel), dtype=centre_density.dtype, device=centre_density.device)
+    for offset in torch.linspace(-END_WIDTH, END_WIDTH, _END_STEPS).tolist():
+        there = voxel + torch.floor(at.fraction + offset * directions.to(at.fraction.dtype)).long()
+        inside = ((there >= 0) & (there < shape)).all(-1)
+        x, y, z = there.clamp(min=0).minimum(shape - 1).unbind(-1)
+        met = torch.where(inside, torch.maximum(met, centre_density[x, y, z]), met)
+    return met
 
 
 def _is_thermal(bundle: RayBundle, device: torch.device) -> Bool[Tensor, " rays"]:

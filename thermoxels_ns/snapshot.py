@@ -33,8 +33,11 @@ class RayEvidence:
     voxel_weight: npt.NDArray[np.float32]
     """Sum of the weights that rays spent in each voxel, shape `lattice.cell_shape`, [rays]."""
     half_depth_density: npt.NDArray[np.float32]
-    """Density, [1 / world unit], at the centre of the voxel in which each ray that ends on something (opacity above
-    one half) has spent half of its weight, shape (rays,)."""
+    """Density, [1 / world unit], that each ray that ends on something (opacity above one half) meets where it ends: the
+    highest at the centre of a voxel within half a voxel of where half of its weight is spent, shape (rays,)."""
+    voxel_ends: npt.NDArray[np.float32] | None = None
+    """Number of rays that end on something and have spent half of their weight in each voxel, shape
+    `lattice.cell_shape`, [rays]. None: not known."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,8 @@ class GridSnapshot:
         if self.evidence is not None:
             _check("voxel_weight", self.evidence.voxel_weight, lattice.cell_shape, least=0.0)
             _check("half_depth_density", self.evidence.half_depth_density, (None,), least=0.0)
+            if self.evidence.voxel_ends is not None:
+                _check("voxel_ends", self.evidence.voxel_ends, lattice.cell_shape, least=0.0)
         if self.views is not None:
             count = len(self.views.camera_to_world)
             _check("camera_to_world", self.views.camera_to_world, (count, 3, 4), remedy=_CAMERAS)

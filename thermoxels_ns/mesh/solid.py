@@ -48,8 +48,8 @@ class SolidSelection:
 
     voxel_optical_depth: float | None = None
     """Voxels in which density times edge length is at least this are solid: at 0.5, light that crosses one loses 39 %.
-    Lower it if walls have holes, raise it if empty space turns solid. Left out, the threshold is automatic: such that
-    85 % of the training rays that end on something end in a solid voxel."""
+    Lower it if walls have holes, raise it if empty space turns solid. Left out, the threshold is automatic: the
+    highest that 95 % of the training rays that end on something meet within half a voxel of where they end."""
     density_percentile: float | None = None
     """Percentile p of the density over all voxels of the box, 0 to 100: the (100 - p) % densest voxels are solid, as in
     the Thermoxels paper. Overrides the optical depth. Raise it if empty space turns solid, lower it if walls have

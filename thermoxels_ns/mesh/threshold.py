@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.errors import MeshError, explain
-from thermoxels_ns.snapshot import GridSnapshot
+from thermoxels_ns.snapshot import GridSnapshot, RayEvidence
 
 FALLBACK_OPTICAL_DEPTH = 0.5
 """Density times voxel edge from which on a voxel is solid where rays say nothing: it takes 39 % of the light."""
-SHARE_OF_RAYS = 0.85
-"""Share of the rays that end on something for which the voxel they end in is to be solid."""
-OPTICAL_DEPTH_BOUNDS = (0.02, 1.0)
+SHARE_OF_RAYS = 0.95
+"""Share of the rays that end on something that are to meet a solid voxel where they end."""
+OPTICAL_DEPTH_BOUNDS = (0.02, math.log(2.0))
 """The automatic threshold times the voxel edge stays within these. Below the first a ray needs 35 voxels to lose half
-of its light: fog, not a surface. From the second on a voxel stops 63 %: solid, whatever stands behind it."""
+of its light: fog, not a surface. From the second on a single voxel stops half of it: a surface, whatever stands behind
+it."""
+OPAQUE_OPTICAL_DEPTH = 2.0
+"""Density times voxel edge from which on a voxel is solid even though no ray ends in it: it stops 86 %."""
+SHARE_THAT_ENDS = 0.5
+"""Rays that end in a voxel, per weight that rays spent in it, above which it is part of what they end on. In a voxel
+that ends all rays that come it is 1; where light leaked past a surface, or was lost before it, it is 0."""
+LEAST_WEIGHT = 0.5
+"""Weight that rays spent in a voxel, [rays], below which it does not tell whether any end there: a ray that ends in a
+voxel spends about half of its weight there. Where rays are few, density alone decides."""
 FEWEST_RAYS = 100
 """With fewer rays than this that end on something, there is no evidence to choose by."""
 
@@ -26,20 +36,27 @@ class Threshold:
     """The voxels that are dense enough."""
 
     cells: npt.NDArray[np.bool_]
-    """True where a voxel is dense enough and not empty, shape `lattice.cell_shape`."""
+    """True where a voxel is dense enough, not empty and not ruled out by rays, shape `lattice.cell_shape`."""
     density: float
-    """Density at the voxel centre from which on that is so, [1 / world unit]."""
+    """Density at the voxel centre from which on it is dense enough, [1 / world unit]."""
     explanation: str
     """Which rule chose it, and why, in one or two sentences."""
 
 
 def automatic_threshold(snapshot: GridSnapshot, density: npt.NDArray[np.float64]) -> Threshold:
-    """Choose the threshold by where training rays end.
+    """Choose the threshold, and the voxels that reach it, by where training rays end.
 
-    Light that leaks through a surface, or is lost in fog before it, says little about where the surface is; the voxel
-    in which a ray has spent half of its weight is part of what it ends on. The threshold is the highest density that
-    `SHARE_OF_RAYS` of these voxels have, ray by ray, within `OPTICAL_DEPTH_BOUNDS`: so surfaces stay closed for nearly
-    all rays, and what rays merely pass through goes. Without evidence it is the rule of `optical_depth_threshold`.
+    A ray ends where half of its weight is spent. What it meets there is the densest voxel within half a voxel of that
+    point (`RayEvidence.half_depth_density`): in whichever part of a voxel a sharp surface lies, a solid one is among
+    them. The threshold is the highest density that `SHARE_OF_RAYS` of the rays meet, within `OPTICAL_DEPTH_BOUNDS`:
+    what nearly all rays end on is solid, and what they merely pass through goes.
+
+    Where rays spend weight but hardly any ends, density is what light left that leaked past a surface, or was lost
+    beside it. Such a voxel must be opaque by itself (`OPAQUE_OPTICAL_DEPTH`). A few of them behind a surface would
+    otherwise widen the body by a layer: the inside that no camera sees reaches as far as its farthest voxels.
+
+    Without evidence the rule is that of `optical_depth_threshold`; without `RayEvidence.voxel_ends` all voxels that
+    reach the threshold are solid.
 
     Args:
         snapshot: The trained field.
@@ -52,22 +69,37 @@ def automatic_threshold(snapshot: GridSnapshot, density: npt.NDArray[np.float64]
         reason = f"Automatic: {known} the training rays, so the rule is a fixed optical depth. {found.explanation}"
         return Threshold(found.cells, found.density, reason)
     voxel = snapshot.lattice.voxel_size
-    ends = float(np.quantile(evidence.half_depth_density, 1.0 - SHARE_OF_RAYS, method="lower"))
+    met = evidence.half_depth_density
     low, high = (depth / voxel for depth in OPTICAL_DEPTH_BOUNDS)
-    threshold = min(max(ends, low), high)
+    threshold = min(max(float(np.quantile(met, 1.0 - SHARE_OF_RAYS, method="lower")), low), high)
     # The densities of rays are float32; the threshold is one of them, and its own voxel must reach it.
-    cells = density >= np.float32(threshold)
+    dense = density >= np.float32(threshold)
+    cells = dense & ~_leaked_into(evidence, density * voxel)
     weight = evidence.voxel_weight
     held = float(weight[cells].sum(dtype=np.float64) / max(weight.sum(dtype=np.float64), 1e-300))
-    share = float(np.mean(evidence.half_depth_density >= np.float32(threshold)))
+    share = float(np.mean(met >= np.float32(threshold)))
     bound = {low: ", the least that is not fog", high: ", the most that is asked"}.get(threshold, "")
+    count = np.count_nonzero(dense) - np.count_nonzero(cells)
+    left_out = (
+        f"{count} voxels that dense are left out: hardly any ray ends in them and they are not opaque by themselves. "
+        if count
+        else ""
+    )
     return Threshold(
         cells,
         threshold,
-        f"Automatic: {share:.0%} of the {len(evidence.half_depth_density)} training rays that end on something end in "
-        f"a voxel of density {threshold:.4g} or more (optical depth {threshold * voxel:.2g} per voxel{bound}). Voxels "
-        f"that dense hold {held:.0%} of the weight that rays spent.",
+        f"Automatic: {share:.0%} of the {len(met)} training rays that end on something meet, within half a voxel of "
+        f"there, a voxel of density {threshold:.4g} or more (optical depth {threshold * voxel:.2g} per voxel{bound}). "
+        f"{left_out}Those that are solid hold {held:.0%} of the weight that rays spent.",
     )
+
+
+def _leaked_into(evidence: RayEvidence, optical_depth: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Voxels that rays pass through rather than end in, and that are not opaque by themselves; none if not known."""
+    if evidence.voxel_ends is None:
+        return np.zeros(optical_depth.shape, dtype=bool)
+    passed = evidence.voxel_ends <= SHARE_THAT_ENDS * evidence.voxel_weight
+    return passed & (evidence.voxel_weight >= LEAST_WEIGHT) & (optical_depth < OPAQUE_OPTICAL_DEPTH)
 
 
 def optical_depth_threshold(
