@@ -27,7 +27,7 @@ MODEL = frozenset(
     {"losses", "optim", "optim_kernels", "metrics", "model", "model_config", "coarse_to_fine"}
     | {"ray_rendering", "ray_statistics", "pipeline", "trainer", "warm_up"}
     | {"photo_consistency", "photo_kernels", "photo_start", "start_choice", "track_carving", "track_loss"}
-    | {"photo_air", "photo_reading", "plane_sweep", "depth_kernels"}
+    | {"photo_depth", "photo_reading", "plane_sweep", "depth_kernels"}
 )
 
 COST = frozenset({"cost", "cost_process", "cost_runs", "cost_report"})

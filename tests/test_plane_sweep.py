@@ -7,10 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.test_photo_consistency import EYES, PLANE, SIZE, photographs
-from thermoxels_ns.depth_kernels import agreeing_views
+from tests.test_photo_consistency import EYES, FOCAL, PLANE, SIZE, photographs
+from thermoxels_ns.depth_kernels import agreeing_views, correlate, weigh_patches
 from thermoxels_ns.photo_consistency import Photographs
-from thermoxels_ns.plane_sweep import ANGLES_DEG, FEWEST_VIEWS, NEIGHBOURS, Depths, _neighbours, _View, depths_of
+from thermoxels_ns.plane_sweep import (
+    ANGLES_DEG,
+    FEWEST_AROUND,
+    FEWEST_VIEWS,
+    NEIGHBOURS,
+    Depths,
+    _backed,
+    _neighbours,
+    _View,
+    depths_of,
+)
 from thermoxels_ns.threads import set_num_threads
 
 LO, HI = (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)
@@ -33,15 +43,14 @@ def test_a_plane_is_found_where_it_is():
     found = depths(photographs())
     known = np.isfinite(found.depth)
     off = np.abs(found.depth[known] - TRUE_DEPTH)
-    assert found.share > 0.5
+    assert found.share > 0.2
     assert np.median(off) < 0.004 and np.quantile(off, 0.95) < np.median(found.error[known])
-    assert np.all(np.isfinite(found.likely[known])) and np.isfinite(found.likely).sum() >= known.sum()
 
 
 def test_brightness_of_photographs_does_not_move_the_plane():
     gains = np.exp(np.random.default_rng(3).normal(0.0, 0.2, len(EYES)))
     found = depths(photographs(gains=gains))
-    assert found.share > 0.5
+    assert found.share > 0.2
     assert np.nanmedian(np.abs(found.depth - TRUE_DEPTH)) < 0.004
 
 
@@ -51,7 +60,7 @@ def test_threads_do_not_change_a_bit():
         set_num_threads(threads)
         found.append(depths(photographs()))
     set_num_threads(None)
-    for name in ("depth", "likely", "error"):
+    for name in ("depth", "error"):
         assert np.array_equal(getattr(found[0], name), getattr(found[1], name), equal_nan=True), name
 
 
@@ -62,7 +71,7 @@ def test_a_mask_hides_its_pixels_and_leaves_the_others_right():
 
     found = depths(changed(mask))
     assert not np.isfinite(found.depth.reshape(len(EYES), SIZE, SIZE)[:, 30:50, 20:60]).any()
-    assert found.share > 0.2
+    assert found.share > 0.1
     assert np.nanquantile(np.abs(found.depth - TRUE_DEPTH), 0.95) < 0.05
 
 
@@ -110,14 +119,106 @@ def test_neighbours_see_the_same_from_directions_that_differ():
     assert np.all((angles > ANGLES_DEG[0]) & (angles < ANGLES_DEG[1])), angles
 
 
-def test_a_depth_that_no_other_photograph_shares_is_not_sure():
-    seen = photographs()
+def agreement(seen: Photographs, depth: np.ndarray, tolerance: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
+    """Photographs that agree with each pixel's depth, and that look through it; planes are 0.01 apart."""
     total = len(seen.colours)
-    depth, error = np.full(total, TRUE_DEPTH, np.float32), np.full(total, 0.01, np.float32)
+    inverses, error = np.linalg.inv(seen.matrices[:, :, :3]), np.full(total, 0.01, np.float32)
+    agreeing, looking_through = (np.zeros(total, np.int32) for _ in range(2))
+    places = seen.matrices, inverses, seen.centres, seen.sizes, seen.firsts
+    agreeing_views(0, total, *places, depth, error, tolerance, agreeing, looking_through)
+    return agreeing, looking_through
+
+
+@pytest.mark.parametrize(("off", "agrees", "through"), [(0.0, True, False), (0.009, True, False), (0.03, False, False)])
+def test_depths_agree_within_the_tolerance_alone(off, agrees, through):
+    seen = photographs()
+    depth = np.full(len(seen.colours), TRUE_DEPTH, np.float32)
     middle = SIZE // 2 * SIZE + SIZE // 2
-    depth[middle] += 0.05
-    inverses = np.linalg.inv(seen.matrices[:, :, :3])
-    agreeing = np.zeros(total, np.int32)
-    agreeing_views(0, total, seen.matrices, inverses, seen.centres, seen.sizes, seen.firsts, depth, error, agreeing)
-    assert agreeing[middle] == 0
+    depth[middle] -= off
+    agreeing, looking_through = agreement(seen, depth)
+    assert (agreeing[middle] >= FEWEST_VIEWS) == agrees
+    assert (looking_through[middle] > 0) == through
     assert agreeing[middle + 1] >= FEWEST_VIEWS
+
+
+def test_photographs_look_through_a_point_before_what_they_see_and_not_through_one_behind():
+    seen = photographs()
+    depth = np.full(len(seen.colours), TRUE_DEPTH, np.float32)
+    before, behind = SIZE // 2 * SIZE + SIZE // 2, SIZE // 2 * SIZE + SIZE // 2 + 9
+    depth[before] -= 0.1
+    depth[behind] += 0.1
+    agreeing, looking_through = agreement(seen, depth)
+    assert agreeing[before] == agreeing[behind] == 0
+    assert looking_through[before] >= FEWEST_VIEWS and looking_through[behind] == 0
+
+
+def plate(noise: float) -> tuple[Photographs, np.ndarray]:
+    """Photographs of a part of the plane before a plain, far background, and which pixels show the plane."""
+    eyes = [(x, y, 1.6) for x in (-0.3, -0.1, 0.1, 0.3) for y in (-0.25, 0.0, 0.25)]
+    seen = photographs(eyes)
+    colours = seen.colours.reshape(len(eyes), SIZE, SIZE, 3).copy()
+    shown = np.zeros(colours.shape[:3], dtype=bool)
+    row, column = np.meshgrid(*[(np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL] * 2, indexing="ij")
+    for number, eye in enumerate(eyes):
+        x, y = eye[0] + column * TRUE_DEPTH, eye[1] - row * TRUE_DEPTH
+        shown[number] = (np.abs(x) < 0.4) & (np.abs(y) < 0.4)
+    colours = 0.35 + 0.15 * colours  # a weak texture, which differs clearly from what is behind
+    colours[~shown] = 0.9 + np.random.default_rng(0).normal(0.0, noise, (int((~shown).sum()), 3))
+    return replace(seen, colours=np.ascontiguousarray(colours.reshape(-1, 3), dtype=np.float32)), shown
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.002])
+def test_an_outline_gives_its_depth_to_nothing_beside_it(noise):
+    seen, shown = plate(noise)
+    found = depths(seen).depth.reshape(shown.shape)
+    known = np.isfinite(found)
+    assert known[shown].mean() > 0.02
+    assert np.median(np.abs(found[known & shown] - TRUE_DEPTH)) < 0.04
+    assert (known & ~shown).sum() <= 0.001 * known.sum()
+
+
+def test_weights_of_a_patch_are_those_of_its_own_colours_and_sum_to_one():
+    colours = np.full((9, 9, 3), 0.5, np.float32)
+    colours[:, 5:] = 0.9
+    colours[3, 3] += 0.02
+    weights, (means, variances) = np.zeros((9, 9, 25), np.float32), np.zeros((2, 9, 9), np.float32)
+    weigh_patches(colours, colours.mean(-1), 2, 0.025, 0.0, 0.05, np.float32(1e-9), weights, means, variances)
+    own = weights[4, 4].reshape(5, 5)
+    assert own.sum() == pytest.approx(1.0, abs=1e-6)
+    assert np.all(own[:, 3:] == 0.0) and own[1, 1] == pytest.approx(own[0, 0] * np.exp(-0.64), rel=1e-4)
+    inside = own.ravel() @ colours[2:7, 2:7].mean(-1).ravel()
+    assert means[4, 4] == pytest.approx(inside, abs=1e-6)
+    assert variances[4, 4] == pytest.approx(own.ravel() @ (colours[2:7, 2:7].mean(-1).ravel() - inside) ** 2, rel=1e-4)
+    assert variances[4, 6] == 0.0  # plain among what has its colour, however near the edge
+    assert np.all(variances[:2] == 0.0) and np.all(variances[:, -2:] == 0.0)  # patches beyond the photograph
+
+
+def test_correlation_is_that_of_the_weighted_patches_and_the_best_count():
+    draw = np.random.default_rng(1)
+    colours = (0.5 + 0.03 * draw.random((9, 9, 3))).astype(np.float32)
+    mine = colours.mean(-1)
+    weights, (means, variances) = np.zeros((9, 9, 25), np.float32), np.zeros((2, 9, 9), np.float32)
+    weigh_patches(colours, mine, 2, 0.025, 0.0, 0.05, np.float32(0.0), weights, means, variances)
+    others = np.stack((mine, draw.random((9, 9)).astype(np.float32), 1.3 * mine - 0.1, np.full_like(mine, -100.0)))
+    own, noise = weights[4, 4].astype(float), 1e-6
+    expected = []
+    for other in others[:3].astype(float):
+        a, b = (v[2:7, 2:7].ravel() - own @ v[2:7, 2:7].ravel() for v in (mine.astype(float), other))
+        expected.append(own @ (a * b) / np.sqrt((own @ (a * a) + noise) * (own @ (b * b) + noise)))
+    for count in (1, 2, 3, 4):
+        result = np.zeros((9, 9), np.float32)
+        correlate(mine, others, 2, weights, means, variances, np.float32(noise), count, result)
+        best = np.sort([*expected, -1.0])[-count:].mean()
+        assert result[4, 4] == pytest.approx(best, abs=2e-4)
+        assert result[0, 0] == -1.0
+
+
+def test_a_depth_needs_neighbours_of_its_own_kind():
+    depth, error = np.full((7, 7), np.nan, np.float32), np.full((7, 7), 0.1, np.float32)
+    depth[1:6, 1:6] = 2.0
+    depth[3, 5] = 2.5
+    backed = _backed(depth, error)
+    assert FEWEST_AROUND == 6
+    expected = np.zeros((7, 7), dtype=bool)
+    expected[2:5, 2:5] = True  # whole surroundings, or but for the one that differs
+    assert np.array_equal(backed, expected)

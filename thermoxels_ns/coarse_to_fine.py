@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -17,10 +16,10 @@ from thermoxels_ns.field.refine import RowChange, prune
 from thermoxels_ns.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
 from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.track_carving import carve_air
+from thermoxels_ns.track_loss import TrackRays
 
 if TYPE_CHECKING:
     from thermoxels_ns.model import ThermoxelsModel
-    from thermoxels_ns.photo_air import SeenThrough
 
 FEWEST_OPEN_RAYS = 0.002
 """Share of rays that must leave the box unsaturated for a background to be worth its cost."""
@@ -37,12 +36,16 @@ RAYS_PER_IMAGE = 4096
 def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
     """The callbacks of one training run, in the order in which they act at a step."""
     # They load compiled kernels, which importing the configuration must not.
-    from thermoxels_ns.photo_air import carve_seen_through, find_air
+    from thermoxels_ns.photo_depth import lines_for_training
     from thermoxels_ns.photo_start import find_start, hold_density, set_density
     from thermoxels_ns.start_choice import decide_start
 
     before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
-    verdict = decide_start(model, attributes)
+    depths = lines_for_training(model, attributes)
+    if depths is not None:
+        given = model.sightlines
+        model.track_rays = TrackRays(depths if given is None else given.and_those_of(depths))
+    verdict = decide_start(model, attributes, depths is not None)
     factors = model.config.refinements()
     steps = {*factors, *model.config.prune_at, *model.config.thin_at}
     from_photographs = verdict.start == "photographs"
@@ -62,20 +65,12 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
 
     found = verdict.found
 
-    @cache
-    def air() -> SeenThrough | None:
-        """What photographs look through; asked for when it is needed first, in a resumed training too."""
-        if found is not None and found.air is not None:
-            return found.air
-        return None if attributes.pipeline is None else find_air(model, attributes.pipeline.datamanager)
-
     def carve(step: int) -> None:
-        """Drop what lines of sight and depths show to be air; at the first step of a training, not of a resumed one."""
-        for drop in (carve_air, lambda model: carve_seen_through(model, air())):
-            old = model.grid.row_parameters()
-            change = drop(model)
-            if change is not None:
-                follow(old, change)
+        """Drop what lines of sight show to be air; at the first step of a training, not of a resumed one."""
+        old = model.grid.row_parameters()
+        change = carve_air(model)
+        if change is not None:
+            follow(old, change)
 
     def start(step: int) -> None:
         """Set the density at the first step of a training, not at the first of a resumed one."""

@@ -1,32 +1,124 @@
-"""Compiled loops over depths of photographs: where they agree, and which voxels lie before them."""
+"""Compiled loops over photographs that are compared with each other: patches, and where depths agree."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-FEWEST_DISTANCES = 3
-"""Photographs that must see a point for their distances to be averaged."""
+OUTSIDE = -1.0
+"""Correlation that stands for none."""
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _pixel(x, y, z, matrix, width, height, first):
-    """Number of the pixel that shows a point, and the point's depth; -1 where the photograph does not show it."""
-    depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
-    if not depth > 0.0:
-        return -1, depth
-    column = np.floor((matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]) / depth)
-    row = np.floor((matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]) / depth)
-    if not (column >= 0.0 and column < width and row >= 0.0 and row < height):
-        return -1, depth
-    return first + int(row) * width + int(column), depth
+def _difference(colours, row, column, i, j):
+    """Mean difference of the channels of two pixels."""
+    off = 0.0
+    for channel in range(3):
+        off += abs(colours[i, j, channel] - colours[row, column, channel])
+    return off / 3.0
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def agreeing_views(begin: int, end: int, matrices, inverses, centres, sizes, firsts, depth, error, result):
-    """Count in ``result[pixel]`` the other photographs whose own depth lies where that of a pixel does.
+def weigh_patches(
+    colours, brightness, radius, likeness, spread, least_weight, least_variance, weights, means, variances
+):
+    """Fill weights, mean and variance of the patch around each pixel: who has the pixel's colour belongs to it.
 
-    Depths agree if they differ by no more than the sum of both pixels' errors. Pixels `begin` to `end`; 0 where a depth
+    A neighbour's weight is exp(-(d / s)^2) with d the mean difference of its three channels from the pixel's, and
+    nothing below `least_weight` (adaptive support weights, Yoon and Kweon 2006, without distance). s is the fifth
+    smallest d of the eight pixels around, which an outline leaves small and a texture does not, times `spread`, but at
+    least `likeness`. The weights of a patch sum to 1. A pixel's variance is 0 where its patch reaches beyond the
+    photograph, holds a masked pixel (brightness below 0), or varies by less than `least_variance` among what belongs to
+    it.
+    """
+    height, width = brightness.shape
+    around = np.empty(9, np.float64)
+    for row in range(height):
+        for column in range(width):
+            variances[row, column] = 0.0
+            if row < radius or column < radius or row >= height - radius or column >= width - radius:
+                continue
+            k = 0
+            for i in range(row - 1, row + 2):
+                for j in range(column - 1, column + 2):
+                    around[k] = _difference(colours, row, column, i, j)
+                    k += 1
+            scale = max(likeness, spread * np.sort(around)[5])  # the first is the pixel itself
+            total, mean, hidden, k = 0.0, 0.0, False, 0
+            for i in range(row - radius, row + radius + 1):
+                for j in range(column - radius, column + radius + 1):
+                    hidden |= brightness[i, j] < 0.0
+                    weight = np.exp(-((_difference(colours, row, column, i, j) / scale) ** 2))
+                    if not weight >= least_weight:
+                        weight = 0.0
+                    weights[row, column, k] = weight
+                    total += weight
+                    mean += weight * brightness[i, j]
+                    k += 1
+            if hidden:
+                continue
+            mean /= total
+            variance, k = 0.0, 0
+            for i in range(row - radius, row + radius + 1):
+                for j in range(column - radius, column + radius + 1):
+                    weights[row, column, k] /= total
+                    variance += weights[row, column, k] * (brightness[i, j] - mean) ** 2
+                    k += 1
+            means[row, column] = mean
+            if variance >= least_variance:
+                variances[row, column] = variance
+
+
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+def correlate(brightness, others, radius, weights, means, variances, noise, count, result):
+    """Fill ``result[row, column]`` with how well the patch of a pixel is met by others drawn onto the same pixels.
+
+    Weighted, normalised cross-correlation; the mean of the best `count` of `others` (photographs, rows, columns), and
+    `OUTSIDE` where the pixel has no variance. `noise` [brightness^2] is added to both variances. A photograph whose
+    patch is masked (below 0) at a corner or in the middle counts as `OUTSIDE`.
+    """
+    height, width = brightness.shape
+    best = np.empty(count, np.float32)
+    for row in range(height):
+        for column in range(width):
+            result[row, column] = OUTSIDE
+            if variances[row, column] == 0.0:
+                continue
+            best[:] = OUTSIDE
+            middle, own = means[row, column], variances[row, column] + noise
+            up, down, left, right = row - radius, row + radius, column - radius, column + radius
+            for number in range(len(others)):
+                other = others[number]
+                if (
+                    min(other[up, left], other[up, right], other[down, left], other[down, right]) < 0.0
+                    or other[row, column] < 0.0
+                ):
+                    continue
+                first, second, both = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+                k = 0
+                for i in range(up, down + 1):
+                    for j in range(left, right + 1):
+                        weight = weights[row, column, k]
+                        value = other[i, j] - middle
+                        first += weight * value
+                        second += weight * value * value
+                        both += weight * value * (brightness[i, j] - middle)
+                        k += 1
+                score = both / np.sqrt(own * (max(second - first * first, np.float32(0.0)) + noise))
+                for place in range(count):
+                    if score > best[place]:
+                        best[place], score = score, best[place]
+            result[row, column] = best.sum() / count
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def agreeing_views(
+    begin: int, end: int, matrices, inverses, centres, sizes, firsts, depth, error, tolerance, agreeing, looking_through
+):
+    """Count the other photographs whose own depth lies where that of a pixel does, and those that look through it.
+
+    Depths agree if they differ by no more than `tolerance` times the sum of both pixels' errors; a photograph looks
+    through the point if its own depth is farther by more than twice that sum. Pixels `begin` to `end`; 0 where a depth
     is NaN.
     """
     number = len(firsts) - 1
@@ -35,7 +127,7 @@ def agreeing_views(begin: int, end: int, matrices, inverses, centres, sizes, fir
     for n in range(begin, end):
         while number + 1 < len(firsts) and firsts[number + 1] <= n:
             number += 1
-        result[n] = 0
+        agreeing[n], looking_through[n] = 0, 0
         if np.isnan(depth[n]):
             continue
         u = (n - firsts[number]) % sizes[number, 0] + 0.5
@@ -47,53 +139,17 @@ def agreeing_views(begin: int, end: int, matrices, inverses, centres, sizes, fir
         for k in range(len(firsts)):
             if k == number:
                 continue
-            at, far = _pixel(x, y, z, matrices[k], sizes[k, 0], sizes[k, 1], firsts[k])
-            if at < 0:
+            seen = matrices[k]
+            far = seen[2, 0] * x + seen[2, 1] * y + seen[2, 2] * z + seen[2, 3]
+            if not far > 0.0:
                 continue
-            if abs(depth[at] - far) <= error[at] + error[n]:  # False where it is NaN
-                result[n] += 1
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def count_sights(
-    begin: int, end: int, lo, step, shape, matrices, sizes, firsts, sure, likely, error, margin, through, ends
-):
-    """Count for voxels `begin` to `end` (flat numbers) the photographs that look through them, and that end there.
-
-    A photograph looks through a voxel whose middle lies more than `margin` and the pixel's error before its sure depth;
-    it ends there if its likely depth is no farther from the middle than that.
-    """
-    for n in range(begin, end):
-        x = lo[0] + step * (n // (shape[1] * shape[2]) + 0.5)
-        y = lo[1] + step * (n // shape[2] % shape[1] + 0.5)
-        z = lo[2] + step * (n % shape[2] + 0.5)
-        through[n], ends[n] = 0, 0
-        for k in range(len(firsts)):
-            at, far = _pixel(x, y, z, matrices[k], sizes[k, 0], sizes[k, 1], firsts[k])
-            if at < 0:
+            column = np.floor((seen[0, 0] * x + seen[0, 1] * y + seen[0, 2] * z + seen[0, 3]) / far)
+            row = np.floor((seen[1, 0] * x + seen[1, 1] * y + seen[1, 2] * z + seen[1, 3]) / far)
+            if not (column >= 0.0 and column < sizes[k, 0] and row >= 0.0 and row < sizes[k, 1]):
                 continue
-            if sure[at] - far > margin + error[at]:  # False where it is NaN
-                through[n] += 1
-            elif abs(likely[at] - far) <= margin + error[at]:
-                ends[n] += 1
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def mean_distances(begin: int, end: int, points, matrices, sizes, firsts, depth, reach, result):
-    """Fill ``result[point]`` for points `begin` to `end` with the mean distance before the depths of photographs.
-
-    Distances along the view direction, positive before a depth, at most `reach`; photographs whose depth is nearer than
-    the point by more than that do not see it. Fewer than `FEWEST_DISTANCES` that do: NaN.
-    """
-    for n in range(begin, end):
-        x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        total, count = 0.0, 0
-        for k in range(len(firsts)):
-            at, far = _pixel(x, y, z, matrices[k], sizes[k, 0], sizes[k, 1], firsts[k])
-            if at < 0:
-                continue
-            before = depth[at] - far
-            if before >= -reach:  # False where it is NaN
-                total += min(before, reach)
-                count += 1
-        result[n] = total / count if count >= FEWEST_DISTANCES else np.nan
+            at = firsts[k] + int(row) * sizes[k, 0] + int(column)
+            behind, planes = depth[at] - far, error[at] + error[n]  # neither is true where they are NaN
+            if abs(behind) <= tolerance * planes:
+                agreeing[n] += 1
+            elif behind > 2.0 * planes:
+                looking_through[n] += 1

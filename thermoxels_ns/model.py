@@ -293,12 +293,17 @@ class ThermoxelsModel(Model):
         return terms
 
     def _track_loss(self, rays: TrackRays) -> Tensor:
-        """How far this step's lines of sight are from ending at their points."""
-        config, near = self.config, self.config.near_plane * self.unit
+        """How far this step's lines of sight are from ending at their points.
+
+        That they end is asked for on the last lattice only: a coarse voxel that must be opaque reaches beyond what it
+        holds, and what of it lies before the surroundings stays, painted like these.
+        """
+        config, near, lattice = self.config, self.config.near_plane * self.unit, self.grid.lattice
         generator = torch.Generator().manual_seed((config.seed + 1) * 2_000_003 + self.step)
-        request = rays.request(config.track_rays, near, self.grid.lattice.voxel_size, generator, self.device)
+        last = max(lattice.cell_shape) >= config.resolutions[-1]
+        request = rays.request(config.track_rays, near, lattice.voxel_size, generator, self.device, through=last)
         seen = render_rays(self.grid, request, self._options(), config.backend)
-        return track_loss(seen.accumulation, seen.transmittance)
+        return track_loss(seen.accumulation, seen.transmittance, config.track_rays)
 
     def _distortion_weight(self) -> float:
         """Weight of the distortion term at this step: it grows over its ramp."""

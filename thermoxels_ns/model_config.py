@@ -121,11 +121,11 @@ class ThermoxelsModelConfig(ModelConfig):
     """Drop voxels that are air because structure from motion saw points through them. auto: where the scene has tracks
     (of thermoxels capture or of a COLMAP model, see the dataparser's tracks), at the start and after every
     refinement."""
-    photo_depth: Literal["off", "on"] = "off"
-    """Ask how far away is what photographs show, by comparing each with its neighbours (plane sweep). on: voxels that
-    many look through are dropped at the start and after every refinement, and a start from photographs begins dense
-    where they end. It finds walls of little texture before which fog closes, and takes some seconds; where photographs
-    are few and far apart it can open surfaces."""
+    photo_depth: Literal["auto", "off", "on"] = "auto"
+    """Ask how far away is what photographs show, by comparing each with its neighbours (plane sweep), and make lines of
+    sight end there, as those to points of structure from motion do. It keeps fog from closing before walls of little
+    texture. auto: where the scene has no tracks and the run at least 400 steps; on: always, beside tracks too. Where
+    photographs say something, the start auto is plain, without trials."""
     track_rays: int = 512
     """Lines of sight that each step looks at."""
     thermal_density_gradient: bool = False

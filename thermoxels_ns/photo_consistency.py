@@ -8,7 +8,6 @@ where a wall is seen at a grazing angle it ends in front of it.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -18,9 +17,6 @@ from scipy import ndimage
 from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.photo_kernels import colours_at, deviations_at_corners
 from thermoxels_ns.threads import run_ranges
-
-if TYPE_CHECKING:
-    from thermoxels_ns.photo_air import SeenThrough
 
 FINEST = 128
 """Voxels along the longest side of the lattice on which colours are compared."""
@@ -93,8 +89,6 @@ class DensityStart:
     """Logarithm of the factor on the start density at the corners, shape `lattice.shape`. None: they say nothing."""
     report: str
     """One line: what was found, or why nothing was."""
-    air: SeenThrough | None = None
-    """Voxels that photographs look through, where their depths were asked."""
 
 
 def density_from_photographs(lattice: Lattice, photographs: Photographs) -> DensityStart:

@@ -10,7 +10,6 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from thermoxels_ns.field.voxel_grid import DensityActivation
-from thermoxels_ns.photo_air import depths_said, start_from_depths
 from thermoxels_ns.photo_consistency import DensityStart, density_from_photographs
 from thermoxels_ns.photo_reading import read_photographs
 
@@ -79,8 +78,6 @@ def _find(model: ThermoxelsModel, datamanager: Any, left_out: Collection[int]) -
     if model.grid.sh is None or datamanager.config.streams == "thermal":
         return DensityStart(None, "no photographs train")
     lattice = model.grid.lattice.refined(model.config.skipped_factor())
-    if (depths := depths_said(model, datamanager, left_out)) is not None:
-        return start_from_depths(lattice, depths, model)
     photographs = read_photographs(datamanager.train_dataset, model.config.near_plane * model.unit, left_out)
     if photographs is None:
         return DensityStart(None, "no photograph is one of a perspective camera")

@@ -1,8 +1,11 @@
 """How far away is what photographs show: depths where neighbouring photographs agree about a plane's picture.
 
 For each photograph, its neighbours are drawn onto planes parallel to it, one behind the other, and compared with it
-patch by patch (plane sweep, Collins 1996; normalised cross-correlation). The nearest plane on which they agree best is
-the depth of a pixel. It counts where depths of other photographs, found on their own, lie in the same place.
+patch by patch (plane sweep, Collins 1996; normalised cross-correlation). The plane on which they agree best is the
+depth of a pixel. It counts where depths of other photographs, found on their own, lie in the same place.
+
+Within a patch only what has the pixel's own colour counts. Else an outline gives its depth to all that lies beside it:
+a rim of sky around every wall would seem as near as the wall, in all photographs alike.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.depth_kernels import agreeing_views
+from thermoxels_ns.depth_kernels import agreeing_views, correlate, weigh_patches
 from thermoxels_ns.photo_consistency import Photographs
 from thermoxels_ns.threads import run_ranges
 
@@ -26,20 +29,32 @@ ANGLES_DEG = (4.0, 60.0)
 depth, a larger one shows something else."""
 BEST_ANGLE_DEG = 15.0
 """Neighbours at about this angle are preferred."""
-PATCH = 5
-"""Side of the square of pixels that is compared."""
+RADIUS = 2
+"""Pixels from the middle of the square that is compared to its sides."""
+LIKENESS = 0.025
+"""Difference of a channel, of 1, at which a pixel of the square has 37 % of the weight of the middle one."""
+SPREAD = 1.0
+"""The same, relative to how much the pixels around the middle one differ from it, where that is more."""
+LEAST_WEIGHT = 0.05
+"""Weight below which it has none."""
 PLANES = (24, 128)
 """Planes per photograph: such that the picture moves by about a pixel from one to the next, within these limits."""
 SMALLEST_CONTRAST = 1.5 / 255.0
 """Standard deviation of brightness within a patch that is noise."""
-LEAST_CORRELATION = 0.5
+LEAST_CORRELATION = 0.6
 """Correlation below which photographs do not agree."""
+TOLERANCE = 0.3
+"""Share of the distance between planes, of both photographs together, by which depths that agree may differ."""
 FEWEST_VIEWS = 3
-"""Photographs whose own depths must lie where a sure one does; for a likely one, one of them."""
+"""Photographs whose own depths must lie where a sure one does."""
+VIEWS_PER_CONTRADICTION = 2
+"""As many must do so for each photograph that looks through the point."""
+FEWEST_AROUND = 6
+"""Of the eight pixels around a sure one, those whose depths agree with its own too: outlines and noise have fewer."""
 _NEAREST = 0.02
 """Distance of the nearest plane relative to the farthest."""
 _OUTSIDE = -100.0
-"""Brightness that stands for a pixel that a photograph does not show: one in a patch makes its mean negative."""
+"""Brightness that stands for a pixel that a photograph does not show: where it is mixed in, the rest is negative."""
 _PROBES = (5, 4)
 """Pixels along each side and depths at which neighbours are looked for."""
 _FEWEST_PROBES = 0.1
@@ -53,9 +68,7 @@ class Depths:
     photographs: Photographs
     """The photographs."""
     depth: npt.NDArray[np.float32]
-    """Sure depth of each pixel, in the order of `photographs.colours`, shape (pixels,), [world units]; else NaN."""
-    likely: npt.NDArray[np.float32]
-    """The same, with what fewer photographs agree about."""
+    """Depth of each pixel, in the order of `photographs.colours`, shape (pixels,), [world units]; NaN: not sure."""
     error: npt.NDArray[np.float32]
     """Depth by which its planes are apart there, shape (pixels,), [world units]."""
 
@@ -93,16 +106,23 @@ def depths_of(photographs: Photographs, lo: npt.ArrayLike, hi: npt.ArrayLike) ->
 
     run_ranges(work, len(views), 1)
     depth[~(correlation >= LEAST_CORRELATION)] = np.nan
-    agreeing = np.zeros(total, dtype=np.int32)
+    agreeing, looking_through = (np.zeros(total, dtype=np.int32) for _ in range(2))
     matrices, inverses = photographs.matrices, np.stack([view.inverse for view in views])
-    sizes, firsts, centres = photographs.sizes, photographs.firsts, photographs.centres
+    centres, sizes, firsts = photographs.centres, photographs.sizes, photographs.firsts
 
     def compare(begin: int, end: int) -> None:
-        agreeing_views(begin, end, matrices, inverses, centres, sizes, firsts, depth, error, agreeing)
+        agreeing_views(
+            begin, end, matrices, inverses, centres, sizes, firsts, depth, error, TOLERANCE, agreeing, looking_through
+        )
 
     run_ranges(compare, total, 4096)
-    sure, likely = (np.where(agreeing >= fewest, depth, np.float32(np.nan)) for fewest in (FEWEST_VIEWS, 1))
-    return Depths(photographs, sure, likely, error)
+    sure = (agreeing >= FEWEST_VIEWS) & (agreeing >= VIEWS_PER_CONTRADICTION * looking_through)
+    depth[~sure] = np.nan
+    for view, first in zip(views, firsts):
+        shape = view.brightness.shape
+        pixels = slice(first, first + view.brightness.size)
+        depth[pixels][~_backed(depth[pixels].reshape(shape), error[pixels].reshape(shape)).ravel()] = np.nan
+    return Depths(photographs, depth, error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +131,8 @@ class _View:
 
     brightness: npt.NDArray[np.float32]
     """Shape (h, w); `_OUTSIDE` where masked."""
+    colours: npt.NDArray[np.float32]
+    """Shape (h, w, 3)."""
     matrix: FloatArray
     """World to homogeneous pixels, (3, 4)."""
     inverse: FloatArray
@@ -121,11 +143,17 @@ class _View:
     def of(cls, photographs: Photographs, number: int) -> _View:
         width, height = photographs.sizes[number]
         first = photographs.firsts[number]
-        colours = photographs.colours[first : first + width * height]
+        colours = np.ascontiguousarray(photographs.colours[first : first + width * height], dtype=np.float32)
         brightness = np.where(np.isnan(colours[:, 0]), np.float32(_OUTSIDE), colours.mean(1))
         matrix = photographs.matrices[number]
         picture = np.ascontiguousarray(brightness.reshape(height, width), dtype=np.float32)
-        return cls(picture, matrix, np.linalg.inv(matrix[:, :3]), photographs.centres[number])
+        return cls(
+            picture,
+            colours.reshape(height, width, 3),
+            matrix,
+            np.linalg.inv(matrix[:, :3]),
+            photographs.centres[number],
+        )
 
     def points(self, pixels: FloatArray, depth: FloatArray) -> FloatArray:
         """World points of pixels (n, 2), whose centres lie at halves, at depths (n,)."""
@@ -181,25 +209,34 @@ def _neighbours(number: int, views: list[_View], near: float, far: float) -> lis
 def _sweep(view: _View, others: list[_View], near: float, far: float) -> tuple[npt.NDArray[np.float32], ...]:
     """Depth, correlation and distance of planes for every pixel, each of shape (pixels,)."""
     inverse_depths = np.linspace(1.0 / far, 1.0 / near, _num_planes(view, others, near, far))
-    here, mean, variance = _moments(view.brightness)
-    hidden = mean < 0.0
-    count = -(-len(others) // 2)
-    agreement = np.empty((len(inverse_depths), *here.shape), dtype=np.float32)
-    scores = np.empty((len(others), *here.shape), dtype=np.float32)
+    shape, noise = view.brightness.shape, np.float32(SMALLEST_CONTRAST**2)
+    weights = np.empty((*shape, (2 * RADIUS + 1) ** 2), dtype=np.float32)
+    means, variances = (np.empty(shape, dtype=np.float32) for _ in range(2))
+    weigh_patches(
+        view.colours, view.brightness, RADIUS, LIKENESS, SPREAD, LEAST_WEIGHT, noise, weights, means, variances
+    )
+    agreement = np.empty((len(inverse_depths), *shape), dtype=np.float32)
+    moved = np.empty((len(others), *shape), dtype=np.float32)
     for plane, inverse_depth in enumerate(inverse_depths):
         for number, other in enumerate(others):
-            moved = _drawn(other, view, 1.0 / inverse_depth)
-            there, other_mean, other_variance = _moments(moved)
-            covariance = _box(here * there) - mean * other_mean
-            score = covariance / np.sqrt(variance * other_variance)
-            score[hidden | (other_mean < 0.0)] = -1.0
-            scores[number] = score
-        agreement[plane] = np.sort(scores, axis=0)[-count:].mean(0)
+            moved[number] = _drawn(other, view, 1.0 / inverse_depth)
+        half = -(-len(others) // 2)
+        correlate(view.brightness, moved, RADIUS, weights, means, variances, noise, half, agreement[plane])
     best = agreement.argmax(0)
     found = inverse_depths[0] + (best + _between(agreement, best)) * (inverse_depths[1] - inverse_depths[0])
     depth = (1.0 / found).astype(np.float32).ravel()
     error = (depth * depth * (inverse_depths[1] - inverse_depths[0])).astype(np.float32)
     return depth, np.take_along_axis(agreement, best[None], 0).ravel(), error
+
+
+def _backed(depth: npt.NDArray[np.float32], error: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+    """Which pixels have `FEWEST_AROUND` neighbours whose depths are the same to one plane, shape (h, w)."""
+    height, width = depth.shape
+    framed, count = np.pad(depth, 1, constant_values=np.nan), np.zeros(depth.shape, dtype=np.int64)
+    for row in range(3):
+        for column in range(3):
+            count += np.abs(framed[row : row + height, column : column + width] - depth) <= error
+    return count > FEWEST_AROUND  # the pixel itself is one of them
 
 
 def _num_planes(view: _View, others: list[_View], near: float, far: float) -> int:
@@ -229,18 +266,6 @@ def _drawn(other: _View, view: _View, depth: float) -> npt.NDArray[np.float32]:
         borderValue=(_OUTSIDE,),
     )
     return np.asarray(drawn, dtype=np.float32)
-
-
-def _box(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    box = cv2.boxFilter(values, -1, (PATCH, PATCH), borderType=cv2.BORDER_REFLECT)
-    return np.asarray(box, dtype=np.float32)
-
-
-def _moments(picture: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], ...]:
-    """The picture, and mean and variance (with that of noise) of the patch around every pixel."""
-    mean = _box(picture)
-    variance = np.maximum(_box(picture * picture) - mean * mean, 0.0) + np.float32(SMALLEST_CONTRAST**2)
-    return picture, mean, variance
 
 
 def _between(agreement: npt.NDArray[np.float32], best: npt.NDArray[np.int64]) -> FloatArray:

@@ -41,6 +41,16 @@ class Sightlines:
         origins, points = (scale * (p @ rotation.T + translation) for p in (self.origins, self.points))
         return Sightlines(origins, self.point, points, scale * self.uncertainty)
 
+    def and_those_of(self, others: Sightlines) -> Sightlines:
+        """These lines, and others after them."""
+        point = np.concatenate((self.point, len(self.points) + others.point))
+        return Sightlines(
+            np.concatenate((self.origins, others.origins)),
+            point,
+            np.concatenate((self.points, others.points)),
+            np.concatenate((self.uncertainty, others.uncertainty)),
+        )
+
     def with_lines_of(self, chosen: npt.NDArray[np.bool_]) -> Sightlines:
         """Only the lines to some points, one boolean per point; all points stay, with their numbers."""
         kept = chosen[self.point]

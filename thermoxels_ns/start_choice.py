@@ -28,7 +28,6 @@ from torch import Tensor
 from thermoxels_ns.errors import MemoryBudgetError
 from thermoxels_ns.field.refine import refine
 from thermoxels_ns.model_config import FINEST_START
-from thermoxels_ns.photo_air import SeenThrough, carve_seen_through
 from thermoxels_ns.photo_consistency import DensityStart
 from thermoxels_ns.photo_start import find_start, hold_density, set_density
 from thermoxels_ns.scratch import SCRATCH
@@ -77,12 +76,13 @@ class Verdict:
     """What the photographs say, where they were asked."""
 
 
-def decide_start(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> Verdict:
+def decide_start(model: ThermoxelsModel, attributes: TrainingCallbackAttributes, depths: bool = False) -> Verdict:
     """Settle the start of a training, before its first step or after a checkpoint was loaded; the model remembers it.
 
     Args:
         model: The model.
         attributes: What nerfstudio gives callbacks.
+        depths: Whether the training follows depths that the photographs agree about.
     """
     remembered, wanted = STARTS[int(model.start_index)], model.config.start
     if remembered != "auto":
@@ -91,7 +91,7 @@ def decide_start(model: ThermoxelsModel, attributes: TrainingCallbackAttributes)
         return Verdict(_named(remembered), "as decided when the training began")
     if attributes.trainer is not None and attributes.trainer._start_step > 0:
         return Verdict(_named(model.config.start), "as for all trainings that began without a choice")
-    verdict = _decide(model, attributes)
+    verdict = _decide(model, attributes, depths)
     if model.config.start != "plain":
         CONSOLE.log(f"start: {verdict.start}, {verdict.reason}")
     model.start_index.fill_(STARTS.index(verdict.start))
@@ -102,8 +102,10 @@ def _named(start: str) -> Chosen:
     return "photographs" if start == "photographs" else "plain"
 
 
-def _decide(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> Verdict:
+def _decide(model: ThermoxelsModel, attributes: TrainingCallbackAttributes, depths: bool) -> Verdict:
     """Decide for a training that begins."""
+    if model.config.start == "auto" and depths:
+        return Verdict("plain", "as depths tell where surfaces are")
     if model.config.start == "auto":
         return _choose(model, attributes)
     if model.config.start == "plain":
@@ -148,7 +150,7 @@ def _choose(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> V
     if found.log_gain is None:
         return Verdict("plain", f"as {found.report}")
     CONSOLE.log(f"start: trying both for {steps} steps; naming one (--pipeline.model.start) saves the time")
-    trials = (_Trial(model, datamanager, optimizers.config, start, found.air) for start in (None, found))
+    trials = (_Trial(model, datamanager, optimizers.config, start) for start in (None, found))
     plain, photo, taken = _contest(next(trials), next(trials), judges, steps)
     SCRATCH.release()
     reason = (
@@ -227,7 +229,6 @@ class _Trial:
         datamanager: Gives the batches.
         settings: Optimisers by group, as nerfstudio's configuration has them.
         found: Where the density starts; None: plain.
-        air: What photographs look through, those that judge not asked; None: not known.
     """
 
     def __init__(
@@ -236,7 +237,6 @@ class _Trial:
         datamanager: Any,
         settings: dict[str, Any],
         found: DensityStart | None,
-        air: SeenThrough | None = None,
     ):
         self.model, self.datamanager, self.found, self.step = deepcopy(model), datamanager, found, 0
         # A trial knows the geometry by its colours alone, which temperature does not move unless it is asked to.
@@ -245,7 +245,6 @@ class _Trial:
         if (factor := model.config.skipped_factor()) > 1:
             refine(self.model.grid, factor)
         carve_air(self.model)
-        carve_seen_through(self.model, air)
         if found is not None:
             set_density(self.model, found)
         self.optimizers = Optimizers(deepcopy(settings), self.model.get_param_groups())

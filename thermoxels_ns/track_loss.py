@@ -29,7 +29,13 @@ class TrackRays:
         self._uncertainty = torch.from_numpy(lines.uncertainty)
 
     def request(
-        self, count: int, near: float, voxel_size: float, generator: torch.Generator, device: torch.device
+        self,
+        count: int,
+        near: float,
+        voxel_size: float,
+        generator: torch.Generator,
+        device: torch.device,
+        through: bool = True,
     ) -> RayRequest:
         """Choose lines at random and make two rays of each, that before the point and that through it.
 
@@ -39,28 +45,33 @@ class TrackRays:
             voxel_size: Of the lattice, [world units].
             generator: On the CPU.
             device: Where the rays are wanted.
+            through: Whether rays through the points are wanted.
 
         Returns:
-            2 `count` rays without colour and temperature: first those that end before their points.
+            2 `count` rays without colour and temperature: first those that end before their points. Without those
+            through the points: `count`.
         """
         chosen = torch.randint(len(self._length), (count,), generator=generator)
         margin = MARGIN_VOXELS * voxel_size + MARGIN_ERRORS * self._uncertainty[chosen]
         length = self._length[chosen]
-        far = torch.cat(((length - margin).clamp(min=0.0), length + margin)).float()
-        nothing = torch.zeros(2 * count, dtype=torch.bool, device=device)
-        origins, directions = (v[chosen].repeat(2, 1).to(device) for v in (self._origins, self._directions))
+        far = (length - margin).clamp(min=0.0)
+        if through:
+            far, chosen = torch.cat((far, length + margin)), chosen.repeat(2)
+        far, nothing = far.float(), torch.zeros(len(far), dtype=torch.bool, device=device)
+        origins, directions = (v[chosen].to(device) for v in (self._origins, self._directions))
         return RayRequest(origins, directions, near, far.to(device), nothing, nothing)
 
 
-def track_loss(accumulation: Tensor, transmittance: Tensor) -> Tensor:
+def track_loss(accumulation: Tensor, transmittance: Tensor, count: int) -> Tensor:
     """Mean share of light that a line loses before its point, and that passes it: both are 0 for a surface in place.
 
     Args:
-        accumulation: Of the rays of `TrackRays.request`, shape (2 n,).
-        transmittance: Of the same rays, shape (2 n,).
+        accumulation: Of the rays of `TrackRays.request`, shape (n,) or (2 n,).
+        transmittance: Of the same rays.
+        count: Number n of lines; rays after the first n are those through the points.
 
-    >>> float(track_loss(torch.tensor([0.25, 0.9]), torch.tensor([0.75, 0.1])))
+    >>> float(track_loss(torch.tensor([0.25, 0.9]), torch.tensor([0.75, 0.1]), 1))
     0.3499999940395355
     """
-    count = len(accumulation) // 2
-    return accumulation[:count].mean() + transmittance[count:].mean()
+    before = accumulation[:count].mean()
+    return before + transmittance[count:].mean() if len(transmittance) > count else before

@@ -1,0 +1,146 @@
+"""Lines of sight to where photographs agree that something is: exact for known depths, and within a training."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests.short_training import train
+from tests.test_photo_consistency import EYES, LATTICE, PLANE, SIZE, photographs
+from thermoxels_ns.data.synthetic import make_scene, write_scene
+from thermoxels_ns.photo_depth import ERROR_PLANES, SHORTEST_RUN, find_lines, lines_for_training, lines_to_depths
+from thermoxels_ns.plane_sweep import Depths, depths_of
+from thermoxels_ns.sightlines import Sightlines
+from thermoxels_ns.track_loss import TrackRays
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene") / "pipes"
+    write_scene(make_scene("pipes"), folder, 18, 2, 160, 120, progress=False)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def untrained(scene):
+    return train(scene, 0, {"start": "plain"})
+
+
+def test_lines_run_from_each_camera_to_what_its_sure_pixels_show():
+    seen = photographs()
+    depth = np.full(len(seen.colours), np.nan, np.float32)
+    sure = np.array([5, SIZE * SIZE - 1, 3 * SIZE * SIZE, len(depth) - 1])
+    depth[sure] = [1.5, 1.6, 1.7, 1.8]
+    lines = lines_to_depths(Depths(seen, depth, np.full(len(depth), 0.02, np.float32)))
+    number = [0, 0, 3, len(EYES) - 1]
+    assert np.array_equal(lines.origins, seen.centres[number]) and np.array_equal(lines.point, np.arange(4))
+    for pixel, camera, point, error in zip(sure, number, lines.points, lines.uncertainty):
+        across = seen.matrices[camera] @ np.append(point, 1.0)
+        place = pixel - camera * SIZE * SIZE
+        assert across[2] == pytest.approx(depth[pixel], abs=1e-6)
+        assert across[:2] / across[2] == pytest.approx([place % SIZE + 0.5, place // SIZE + 0.5], abs=1e-3)
+        slope = np.linalg.norm(point - seen.centres[camera]) / depth[pixel]
+        assert error == pytest.approx(ERROR_PLANES * 0.02 * slope, rel=1e-5)
+
+
+def test_lines_end_at_the_plane_that_the_photographs_show():
+    lines = lines_to_depths(depths_of(photographs(), LATTICE.lo, LATTICE.hi))
+    off = np.abs(lines.points[:, 2] - PLANE)
+    assert len(off) > 10_000 and np.quantile(off, 0.95) < 0.02
+
+
+def test_lines_of_two_kinds_stay_with_their_points():
+    def some(count: int, points: int, seed: int) -> Sightlines:
+        draw = np.random.default_rng(seed)
+        order = np.sort(draw.integers(0, points, count))
+        return Sightlines(draw.random((count, 3)), order, draw.random((points, 3)), draw.random(count))
+
+    one, two = some(7, 3, 0), some(5, 4, 1)
+    both = one.and_those_of(two)
+    assert np.array_equal(both.points[both.point], np.concatenate((one.points[one.point], two.points[two.point])))
+    assert np.array_equal(both.origins, np.concatenate((one.origins, two.origins)))
+    assert np.array_equal(both.uncertainty, np.concatenate((one.uncertainty, two.uncertainty)))
+    assert np.all(np.diff(both.point) >= 0) and len(both.points) == 7
+
+
+def test_most_lines_of_a_scene_end_at_its_surface(untrained):
+    lines = find_lines(untrained.model, untrained.datamanager)
+    assert lines is not None and len(lines.points) > 200
+    from thermoxels_ns.export import input_from_world
+
+    outputs: Any = untrained.datamanager.train_dataparser_outputs
+    to_input = input_from_world(outputs.dataparser_transform.numpy(), float(outputs.dataparser_scale))
+    points = lines.points @ to_input[:3, :3].T + to_input[:3, 3]
+    off = np.abs(make_scene("pipes").signed_distance(points))
+    assert np.median(off) < 0.02 and np.quantile(off, 0.9) < 0.06, np.quantile(off, [0.5, 0.9])
+
+
+@pytest.mark.parametrize("options", [{"sh_degree": None, "thermal_density_gradient": True}])
+def test_without_photographs_in_training_nothing_is_asked(scene, options):
+    pipeline = train(scene, 0, {"start": "plain", **options})
+    assert find_lines(pipeline.model, pipeline.datamanager) is None
+
+
+def test_photographs_that_agree_about_nothing_give_no_lines(untrained, monkeypatch, capsys):
+    from thermoxels_ns import photo_depth
+
+    def unsure(seen, lo, hi):
+        nothing = np.full(len(seen.colours), np.nan, np.float32)
+        return Depths(seen, nothing, nothing)
+
+    monkeypatch.setattr(photo_depth, "depths_of", unsure)
+    assert find_lines(untrained.model, untrained.datamanager) is None
+    assert "too few to tell anything" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("wanted", "steps", "tracks", "weight", "asked"),
+    [
+        ("auto", SHORTEST_RUN, False, 0.05, True),
+        ("auto", SHORTEST_RUN - 1, False, 0.05, False),
+        ("auto", SHORTEST_RUN, True, 0.05, False),
+        ("auto", SHORTEST_RUN, False, 0.0, False),
+        ("on", 1, True, 0.05, True),
+        ("off", SHORTEST_RUN, False, 0.05, False),
+    ],
+)
+def test_when_photographs_are_asked(monkeypatch, wanted, steps, tracks, weight, asked):
+    from thermoxels_ns import photo_depth
+
+    monkeypatch.setattr(photo_depth, "find_lines", lambda model, datamanager: "asked")
+    model: Any = SimpleNamespace(
+        config=SimpleNamespace(photo_depth=wanted),
+        loss_weights=SimpleNamespace(tracks=weight),
+        track_rays=object() if tracks else None,
+    )
+    first = steps // 2  # of a resumed training the steps before count too
+    trainer = SimpleNamespace(_start_step=first, config=SimpleNamespace(max_num_iterations=steps - first))
+    attributes: Any = SimpleNamespace(pipeline=SimpleNamespace(datamanager=None), trainer=trainer)
+    assert lines_for_training(model, attributes) == ("asked" if asked else None)
+
+
+def test_a_training_follows_depths_and_needs_no_trial(scene, capsys):
+    course = {"resolutions": [8, 16], "refine_at": [3], "start": "auto", "photo_depth": "on"}
+    followed = train(scene, 6, course).model
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.count("photographs agree about") == 1 and "start: plain, as depths tell where surfaces are" in said
+    alone = train(scene, 6, {**course, "photo_depth": "off"}).model
+    assert "depths:" not in capsys.readouterr().out
+    assert followed.track_rays is not None and alone.track_rays is None
+    assert not torch.equal(followed.grid.density, alone.grid.density)
+
+
+def test_depths_are_followed_beside_tracks_where_that_is_asked_for(scene, monkeypatch):
+    import thermoxels_ns.coarse_to_fine as course
+    import thermoxels_ns.photo_depth as photo_depth
+
+    mine = Sightlines(np.zeros((2, 3)), np.arange(2), np.ones((2, 3)), np.full(2, 0.1))
+    followed = []
+    monkeypatch.setattr(photo_depth, "find_lines", lambda model, datamanager: mine)
+    monkeypatch.setattr(course, "TrackRays", lambda lines: followed.append(lines) or TrackRays(lines))
+    train(scene, 1, {"start": "plain", "photo_depth": "on"})
+    assert len(followed) == 1 and len(followed[0].points) == 2
