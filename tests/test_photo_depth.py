@@ -144,3 +144,16 @@ def test_depths_are_followed_beside_tracks_where_that_is_asked_for(scene, monkey
     monkeypatch.setattr(course, "TrackRays", lambda lines: followed.append(lines) or TrackRays(lines))
     train(scene, 1, {"start": "plain", "photo_depth": "on"})
     assert len(followed) == 1 and len(followed[0].points) == 2
+
+
+def test_lines_are_asked_to_end_on_the_last_lattice_alone(scene, monkeypatch):
+    request, asked = TrackRays.request, []
+
+    def recorded(self, count, near, voxel_size, generator, device, through=True):
+        rays = request(self, count, near, voxel_size, generator, device, through)
+        asked.append((through, len(rays.directions) // count))
+        return rays
+
+    monkeypatch.setattr(TrackRays, "request", recorded)
+    train(scene, 6, {"resolutions": [8, 16], "refine_at": [4], "start": "plain", "photo_depth": "on"})
+    assert asked == [(False, 1)] * 4 + [(True, 2)] * 2

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.test_photo_consistency import EYES, FOCAL, PLANE, SIZE, photographs
+from tests.test_photo_consistency import EYES, FOCAL, PLANE, SIZE, photographs, texture
+from thermoxels_ns import plane_sweep
 from thermoxels_ns.depth_kernels import agreeing_views, correlate, weigh_patches
 from thermoxels_ns.photo_consistency import Photographs
 from thermoxels_ns.plane_sweep import (
@@ -156,13 +157,13 @@ def plate(noise: float) -> tuple[Photographs, np.ndarray]:
     """Photographs of a part of the plane before a plain, far background, and which pixels show the plane."""
     eyes = [(x, y, 1.6) for x in (-0.3, -0.1, 0.1, 0.3) for y in (-0.25, 0.0, 0.25)]
     seen = photographs(eyes)
-    colours = seen.colours.reshape(len(eyes), SIZE, SIZE, 3).copy()
+    colours = np.empty((len(eyes), SIZE, SIZE, 3))
     shown = np.zeros(colours.shape[:3], dtype=bool)
     row, column = np.meshgrid(*[(np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL] * 2, indexing="ij")
     for number, eye in enumerate(eyes):
         x, y = eye[0] + column * TRUE_DEPTH, eye[1] - row * TRUE_DEPTH
         shown[number] = (np.abs(x) < 0.4) & (np.abs(y) < 0.4)
-    colours = 0.35 + 0.15 * colours  # a weak texture, which differs clearly from what is behind
+        colours[number] = 0.35 + 0.1 * texture(3.0 * x, 3.0 * y)  # weak and fine, and clearly not what is behind
     colours[~shown] = 0.9 + np.random.default_rng(0).normal(0.0, noise, (int((~shown).sum()), 3))
     return replace(seen, colours=np.ascontiguousarray(colours.reshape(-1, 3), dtype=np.float32)), shown
 
@@ -172,7 +173,7 @@ def test_an_outline_gives_its_depth_to_nothing_beside_it(noise):
     seen, shown = plate(noise)
     found = depths(seen).depth.reshape(shown.shape)
     known = np.isfinite(found)
-    assert known[shown].mean() > 0.02
+    assert known[shown].mean() > 0.2
     assert np.median(np.abs(found[known & shown] - TRUE_DEPTH)) < 0.04
     assert (known & ~shown).sum() <= 0.001 * known.sum()
 
@@ -222,3 +223,41 @@ def test_a_depth_needs_neighbours_of_its_own_kind():
     expected = np.zeros((7, 7), dtype=bool)
     expected[2:5, 2:5] = True  # whole surroundings, or but for the one that differs
     assert np.array_equal(backed, expected)
+
+
+def test_a_texture_widens_what_belongs_to_a_pixel_and_an_outline_does_not():
+    draw = np.random.default_rng(2)
+    colours = (0.5 + 0.2 * draw.random((9, 9, 3))).astype(np.float32)
+    weights, (means, variances) = np.zeros((9, 9, 25), np.float32), np.zeros((2, 9, 9), np.float32)
+
+    def relative(at: tuple[int, int]) -> np.ndarray:
+        weigh_patches(colours, colours.mean(-1), 2, 0.025, 1.0, 0.0, np.float32(0.0), weights, means, variances)
+        own = weights[at].reshape(5, 5)
+        return own / own[2, 2]
+
+    off = np.abs(colours[2:7, 2:7].astype(float) - colours[4, 4]).mean(-1)
+    scale = np.sort(off[1:4, 1:4].ravel())[5]  # the first is the pixel itself
+    assert scale > 0.05
+    assert relative((4, 4)) == pytest.approx(np.exp(-((off / scale) ** 2)), abs=1e-5)
+    colours[:, :5], colours[:, 5:] = 0.5, 0.9  # of the eight pixels around one beside the outline five are its own
+    assert np.all(relative((4, 4))[:, 3:] == pytest.approx(0.0, abs=1e-9))
+    assert np.all(relative((4, 5))[:, :2] == pytest.approx(0.0, abs=1e-9))
+
+
+@pytest.mark.parametrize(("liars", "sure"), [(4, False), (9, True)])
+def test_what_many_look_through_is_not_sure_however_few_agree(monkeypatch, liars, sure):
+    """Some photographs agree about a plate before the plane, which all others look through."""
+    seen = photographs([(x, y, 1.6) for x in (-0.3, -0.1, 0.1, 0.3) for y in (-0.25, 0.0, 0.25)])
+    row, column = np.meshgrid(*[(np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL] * 2, indexing="ij")
+
+    def sweep(view, near, *span):
+        depth = np.full((SIZE, SIZE), TRUE_DEPTH, np.float32)
+        if np.flatnonzero((seen.centres == view.centre).all(1))[0] < liars:
+            x, y = (centre + sign * place * 1.4 for centre, sign, place in zip(view.centre, (1, -1), (column, row)))
+            depth[(np.abs(x) < 0.12) & (np.abs(y) < 0.12)] = 1.4
+        return depth.ravel(), np.ones(SIZE * SIZE, np.float32), np.full(SIZE * SIZE, 0.01, np.float32)
+
+    monkeypatch.setattr(plane_sweep, "_sweep", sweep)
+    found = depths(seen).depth
+    assert bool((found == np.float32(1.4)).any()) == sure
+    assert np.mean(found == np.float32(TRUE_DEPTH)) > 0.3
