@@ -15,7 +15,7 @@ from thermoxels_ns.data.synthetic import make_scene, write_scene
 from thermoxels_ns.photo_depth import ERROR_PLANES, SHORTEST_RUN, find_lines, lines_for_training, lines_to_depths
 from thermoxels_ns.plane_sweep import Depths, depths_of
 from thermoxels_ns.sightlines import Sightlines
-from thermoxels_ns.track_loss import TrackRays
+from thermoxels_ns.track_loss import COARSE_LIGHT, TrackRays, track_loss
 
 
 @pytest.fixture(scope="module")
@@ -146,14 +146,13 @@ def test_depths_are_followed_beside_tracks_where_that_is_asked_for(scene, monkey
     assert len(followed) == 1 and len(followed[0].points) == 2
 
 
-def test_lines_are_asked_to_end_on_the_last_lattice_alone(scene, monkeypatch):
-    request, asked = TrackRays.request, []
+def test_light_may_pass_points_while_the_lattice_is_coarse_and_no_longer_on_the_last(scene, monkeypatch):
+    asked = []
 
-    def recorded(self, count, near, voxel_size, generator, device, through=True):
-        rays = request(self, count, near, voxel_size, generator, device, through)
-        asked.append((through, len(rays.directions) // count))
-        return rays
+    def recorded(accumulation, transmittance, tolerated):
+        asked.append(tolerated)
+        return track_loss(accumulation, transmittance, tolerated)
 
-    monkeypatch.setattr(TrackRays, "request", recorded)
+    monkeypatch.setattr("thermoxels_ns.model.track_loss", recorded)
     train(scene, 6, {"resolutions": [8, 16], "refine_at": [4], "start": "plain", "photo_depth": "on"})
-    assert asked == [(False, 1)] * 4 + [(True, 2)] * 2
+    assert asked == [COARSE_LIGHT] * 4 + [0.0] * 2

@@ -34,7 +34,7 @@ def wall(at: float, backend: str) -> float:
         grid.density.copy_(torch.where(x > at, 1e3, 0.0))
     request = track_rays()[0].request(32, 0.0, LATTICE.voxel_size, torch.Generator().manual_seed(0), CPU)
     seen = render_rays(grid, request, RenderOptions(), backend)  # type: ignore[arg-type]
-    return float(track_loss(seen.accumulation, seen.transmittance, 32).detach())
+    return float(track_loss(seen.accumulation, seen.transmittance).detach())
 
 
 def test_rays_end_before_and_behind_their_points_by_margin_and_uncertainty() -> None:
@@ -68,7 +68,7 @@ def test_the_gradient_thins_what_is_before_the_points_and_thickens_what_is_at_th
     grid = VoxelGrid(LATTICE, sh_degree=0, activation="relu", start_density=0.5)
     request = track_rays()[0].request(32, 0.0, LATTICE.voxel_size, torch.Generator().manual_seed(0), CPU)
     seen = render_rays(grid, request, RenderOptions(), "reference")
-    track_loss(seen.accumulation, seen.transmittance, 32).backward()
+    track_loss(seen.accumulation, seen.transmittance).backward()
     gradient = grid.density.grad
     assert gradient is not None
     by_x = gradient.to_dense().view(LATTICE.shape).sum(dim=(1, 2))

@@ -33,7 +33,7 @@ from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
 from thermoxels_ns.sightlines import Sightlines
 from thermoxels_ns.snapshot import GridSnapshot, RayEvidence, Views
 from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
-from thermoxels_ns.track_loss import TrackRays, track_loss
+from thermoxels_ns.track_loss import COARSE_LIGHT, TrackRays, track_loss
 from thermoxels_ns.units import TemperatureRange
 
 
@@ -293,17 +293,13 @@ class ThermoxelsModel(Model):
         return terms
 
     def _track_loss(self, rays: TrackRays) -> Tensor:
-        """How far this step's lines of sight are from ending at their points.
-
-        That they end is asked for on the last lattice only: a coarse voxel that must be opaque reaches beyond what it
-        holds, and what of it lies before the surroundings stays, painted like these.
-        """
+        """How far this step's lines of sight are from ending at their points; coarse lattices may let light pass."""
         config, near, lattice = self.config, self.config.near_plane * self.unit, self.grid.lattice
         generator = torch.Generator().manual_seed((config.seed + 1) * 2_000_003 + self.step)
-        last = max(lattice.cell_shape) >= config.resolutions[-1]
-        request = rays.request(config.track_rays, near, lattice.voxel_size, generator, self.device, through=last)
+        request = rays.request(config.track_rays, near, lattice.voxel_size, generator, self.device)
         seen = render_rays(self.grid, request, self._options(), config.backend)
-        return track_loss(seen.accumulation, seen.transmittance, config.track_rays)
+        last = max(lattice.cell_shape) >= config.resolutions[-1]
+        return track_loss(seen.accumulation, seen.transmittance, 0.0 if last else COARSE_LIGHT)
 
     def _distortion_weight(self) -> float:
         """Weight of the distortion term at this step: it grows over its ramp."""

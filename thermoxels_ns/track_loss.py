@@ -13,6 +13,11 @@ MARGIN_VOXELS = 1.5
 MARGIN_ERRORS = 2.0
 """Standard errors of a line's length by which that is widened."""
 
+COARSE_LIGHT = 0.5
+"""Share of the light that may pass a point while the lattice is coarse. A coarse voxel that has to be opaque reaches
+beyond what it holds, and what of it lies before the surroundings stays, painted like these. One that takes half of the
+light yields to colours, and is there before the surroundings are painted to show the thing instead."""
+
 
 class TrackRays:
     """Rays along lines of sight.
@@ -29,13 +34,7 @@ class TrackRays:
         self._uncertainty = torch.from_numpy(lines.uncertainty)
 
     def request(
-        self,
-        count: int,
-        near: float,
-        voxel_size: float,
-        generator: torch.Generator,
-        device: torch.device,
-        through: bool = True,
+        self, count: int, near: float, voxel_size: float, generator: torch.Generator, device: torch.device
     ) -> RayRequest:
         """Choose lines at random and make two rays of each, that before the point and that through it.
 
@@ -45,33 +44,31 @@ class TrackRays:
             voxel_size: Of the lattice, [world units].
             generator: On the CPU.
             device: Where the rays are wanted.
-            through: Whether rays through the points are wanted.
 
         Returns:
-            2 `count` rays without colour and temperature: first those that end before their points. Without those
-            through the points: `count`.
+            2 `count` rays without colour and temperature: first those that end before their points.
         """
         chosen = torch.randint(len(self._length), (count,), generator=generator)
         margin = MARGIN_VOXELS * voxel_size + MARGIN_ERRORS * self._uncertainty[chosen]
         length = self._length[chosen]
-        far = (length - margin).clamp(min=0.0)
-        if through:
-            far, chosen = torch.cat((far, length + margin)), chosen.repeat(2)
-        far, nothing = far.float(), torch.zeros(len(far), dtype=torch.bool, device=device)
-        origins, directions = (v[chosen].to(device) for v in (self._origins, self._directions))
+        far = torch.cat(((length - margin).clamp(min=0.0), length + margin)).float()
+        nothing = torch.zeros(2 * count, dtype=torch.bool, device=device)
+        origins, directions = (v[chosen].repeat(2, 1).to(device) for v in (self._origins, self._directions))
         return RayRequest(origins, directions, near, far.to(device), nothing, nothing)
 
 
-def track_loss(accumulation: Tensor, transmittance: Tensor, count: int) -> Tensor:
+def track_loss(accumulation: Tensor, transmittance: Tensor, tolerated: float = 0.0) -> Tensor:
     """Mean share of light that a line loses before its point, and that passes it: both are 0 for a surface in place.
 
     Args:
-        accumulation: Of the rays of `TrackRays.request`, shape (n,) or (2 n,).
-        transmittance: Of the same rays.
-        count: Number n of lines; rays after the first n are those through the points.
+        accumulation: Of the rays of `TrackRays.request`, shape (2 n,).
+        transmittance: Of the same rays, shape (2 n,).
+        tolerated: Share of the light that may pass without counting.
 
-    >>> float(track_loss(torch.tensor([0.25, 0.9]), torch.tensor([0.75, 0.1]), 1))
+    >>> float(track_loss(torch.tensor([0.25, 0.9]), torch.tensor([0.75, 0.1])))
     0.3499999940395355
+    >>> float(track_loss(torch.tensor([0.25, 0.3]), torch.tensor([0.75, 0.7]), tolerated=0.5))
+    0.44999998807907104
     """
-    before = accumulation[:count].mean()
-    return before + transmittance[count:].mean() if len(transmittance) > count else before
+    count = len(accumulation) // 2
+    return accumulation[:count].mean() + (transmittance[count:] - tolerated).clamp(min=0.0).mean()
