@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +13,7 @@ import torch
 from tests.short_training import train
 from tests.test_photo_consistency import EYES, LATTICE, PLANE, SIZE, photographs
 from thermoxels_ns.data.synthetic import make_scene, write_scene
+from thermoxels_ns.field.refine import refine
 from thermoxels_ns.photo_depth import ERROR_PLANES, SHORTEST_RUN, find_lines, lines_for_training, lines_to_depths
 from thermoxels_ns.plane_sweep import Depths, depths_of
 from thermoxels_ns.sightlines import Sightlines
@@ -79,10 +81,28 @@ def test_most_lines_of_a_scene_end_at_its_surface(untrained):
     assert np.median(off) < 0.02 and np.quantile(off, 0.9) < 0.06, np.quantile(off, [0.5, 0.9])
 
 
-@pytest.mark.parametrize("options", [{"sh_degree": None, "thermal_density_gradient": True}])
-def test_without_photographs_in_training_nothing_is_asked(scene, options):
-    pipeline = train(scene, 0, {"start": "plain", **options})
+def test_without_photographs_in_training_nothing_is_asked(scene, untrained):
+    pipeline = train(scene, 0, {"start": "plain", "sh_degree": None, "thermal_density_gradient": True})
     assert find_lines(pipeline.model, pipeline.datamanager) is None
+    data = SimpleNamespace(config=SimpleNamespace(streams="thermal"), train_dataset=untrained.datamanager.train_dataset)
+    assert find_lines(untrained.model, data) is None
+
+
+def test_a_refined_model_asks_within_the_same_box(untrained, monkeypatch):
+    from thermoxels_ns import photo_depth
+
+    boxes = []
+
+    def recorded(seen, lo, hi):
+        boxes.append((tuple(lo), tuple(hi)))
+        return Depths(seen, np.full(len(seen.colours), np.nan, np.float32), np.zeros(len(seen.colours), np.float32))
+
+    monkeypatch.setattr(photo_depth, "depths_of", recorded)
+    model = deepcopy(untrained.model)
+    find_lines(model, untrained.datamanager)
+    refine(model.grid, 3)
+    find_lines(model, untrained.datamanager)
+    assert boxes[0] == boxes[1]
 
 
 def test_photographs_that_agree_about_nothing_give_no_lines(untrained, monkeypatch, capsys):
@@ -137,13 +157,23 @@ def test_a_training_follows_depths_and_needs_no_trial(scene, capsys):
 def test_depths_are_followed_beside_tracks_where_that_is_asked_for(scene, monkeypatch):
     import thermoxels_ns.coarse_to_fine as course
     import thermoxels_ns.photo_depth as photo_depth
+    from thermoxels_ns.model import ThermoxelsModel
 
-    mine = Sightlines(np.zeros((2, 3)), np.arange(2), np.ones((2, 3)), np.full(2, 0.1))
-    followed = []
-    monkeypatch.setattr(photo_depth, "find_lines", lambda model, datamanager: mine)
+    def some(count: int, at: float) -> Sightlines:
+        return Sightlines(np.zeros((count, 3)), np.arange(count), np.full((count, 3), at), np.full(count, 0.1))
+
+    populate, followed = ThermoxelsModel.populate_modules, []
+
+    def with_tracks(model):
+        populate(model)
+        model.sightlines = some(3, 0.2)
+        model.track_rays = TrackRays(model.sightlines)
+
+    monkeypatch.setattr(ThermoxelsModel, "populate_modules", with_tracks)
+    monkeypatch.setattr(photo_depth, "find_lines", lambda model, datamanager: some(2, 0.1))
     monkeypatch.setattr(course, "TrackRays", lambda lines: followed.append(lines) or TrackRays(lines))
-    train(scene, 1, {"start": "plain", "photo_depth": "on"})
-    assert len(followed) == 1 and len(followed[0].points) == 2
+    train(scene, 1, {"start": "plain", "carve": "off", "photo_depth": "on"})
+    assert len(followed) == 1 and followed[0].points[:, 0].tolist() == [0.2] * 3 + [0.1] * 2
 
 
 def test_light_may_pass_points_while_the_lattice_is_coarse_and_no_longer_on_the_last(scene, monkeypatch):

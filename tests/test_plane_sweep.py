@@ -11,6 +11,7 @@ from tests.test_photo_consistency import EYES, FOCAL, PLANE, SIZE, photographs, 
 from thermoxels_ns import plane_sweep
 from thermoxels_ns.depth_kernels import agreeing_views, correlate, weigh_patches
 from thermoxels_ns.photo_consistency import Photographs
+from thermoxels_ns.photo_depth import lines_to_depths
 from thermoxels_ns.plane_sweep import (
     ANGLES_DEG,
     FEWEST_AROUND,
@@ -18,6 +19,7 @@ from thermoxels_ns.plane_sweep import (
     NEIGHBOURS,
     Depths,
     _backed,
+    _drawn,
     _neighbours,
     _View,
     depths_of,
@@ -261,3 +263,57 @@ def test_what_many_look_through_is_not_sure_however_few_agree(monkeypatch, liars
     found = depths(seen).depth
     assert bool((found == np.float32(1.4)).any()) == sure
     assert np.mean(found == np.float32(TRUE_DEPTH)) > 0.3
+
+
+@pytest.mark.parametrize("beyond", [0.02, 0.2, 0.8])
+def test_what_lies_beyond_the_box_has_no_depth_at_its_far_side(beyond):
+    """Else all that stands behind a box would become a wall at its end."""
+    assert depths_of(photographs(), LO, (0.5, 0.5, 0.5)).share > 0.2
+    found = depths_of(photographs(), (-0.5, -0.5, PLANE + beyond), (0.5, 0.5, PLANE + beyond + 0.6))
+    assert found.share < 0.01
+
+
+def room() -> tuple[Photographs, float]:
+    """Photographs of a textured room from within, in a circle and all looking outwards, and the half of its width."""
+    size, focal, half = 64, 60.0, 0.5
+    column, row = np.meshgrid(*[(np.arange(size) + 0.5 - size / 2) / focal] * 2)
+    matrices, centres, pictures = [], [], []
+    for number in range(24):
+        angle = 2.0 * np.pi * number / 24
+        forward = np.array([np.cos(angle), np.sin(angle), 0.0])
+        turned = np.stack((np.cross(forward, (0.0, 0.0, 1.0)), (0.0, 0.0, -1.0), forward))
+        centre = -0.15 * forward + np.array([0.0, 0.0, 0.05 * (-1) ** number])
+        towards = np.stack((column, row, np.ones_like(row)), -1) @ turned
+        with np.errstate(divide="ignore"):
+            reach = ((np.where(towards > 0.0, half, -half) - centre) / towards).min(-1)
+        at = centre + reach[..., None] * towards
+        waves = [np.sin(41 * at @ way + phase) for way, phase in (((1, 2, 3), 0), ((3, -1, 2), 1), ((-2, 3, 1), 2))]
+        pictures.append(0.5 + 0.1 * np.stack(waves, -1))
+        intrinsics = np.array([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
+        matrices.append(intrinsics @ np.column_stack((turned, -turned @ centre)))
+        centres.append(centre)
+    colours = np.concatenate(pictures).reshape(-1, 3).astype(np.float32)
+    sizes = np.full((24, 2), size)
+    return Photographs(np.stack(matrices), np.stack(centres), sizes, np.arange(24) * size * size, colours), half
+
+
+def test_depths_of_a_room_from_within_lie_on_its_walls():
+    seen, half = room()
+    found = depths_of(seen, (-half, -half, -half), (half, half, half))
+    sure = np.flatnonzero(np.isfinite(found.depth))
+    lines = lines_to_depths(found)
+    off = np.abs(np.abs(lines.points).max(1) - half)
+    assert len(sure) > 500
+    assert np.quantile(off, 0.9) < 0.05, np.quantile(off, [0.5, 0.9])
+
+
+def test_nothing_is_drawn_of_what_lies_behind_a_photograph():
+    seen = photographs()
+    views = [_View.of(seen, number) for number in range(2)]
+    turned = replace(seen, matrices=seen.matrices.copy())
+    flip = np.diag([1.0, -1.0, -1.0])  # looks up, away from the plane
+    turned.matrices[1, :, :3] = turned.matrices[1, :, :3] @ flip
+    turned.matrices[1, :, 3] = -turned.matrices[1, :, :3] @ seen.centres[1]
+    away = _View.of(turned, 1)
+    assert (_drawn(views[1], views[0], TRUE_DEPTH) >= 0.0).any()
+    assert (_drawn(away, views[0], TRUE_DEPTH) < 0.0).all()

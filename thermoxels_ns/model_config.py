@@ -41,7 +41,8 @@ class LossWeights:
     distortion: float
     """Gather each ray's weight in one short interval."""
     tracks: float = 0.0
-    """Lines of sight to points of structure from motion end at these points; needs a scene with tracks."""
+    """Lines of sight end at the points that they were drawn to: tracks of structure from motion, depths on which
+    photographs agree."""
 
 
 LOSS_RECIPES: Mapping[str, LossWeights] = {
@@ -112,7 +113,8 @@ class ThermoxelsModelConfig(ModelConfig):
     """Density at the start. plain: the same everywhere; photographs: denser where the photographs that see a point
     agree about its colour, thinner where they do not, from the finest lattice of at most 64 voxels on. auto: both are
     tried for trial-steps, some photographs held back, and that which shows those better is taken; the log gives both
-    figures. It costs the time of the trials. Needs 16 photographs and a run of at least three trials, else plain."""
+    figures. It costs the time of the trials. Needs 16 photographs and a run of at least three trials, else plain; plain
+    too where photo-depth finds depths."""
     trial_steps: int = 250
     """Steps of each trial of the start auto; half of them where one start leads clearly."""
     hold_density: int = 20
@@ -124,8 +126,8 @@ class ThermoxelsModelConfig(ModelConfig):
     photo_depth: Literal["auto", "off", "on"] = "auto"
     """Ask how far away is what photographs show, by comparing each with its neighbours (plane sweep), and make lines of
     sight end there, as those to points of structure from motion do. It keeps fog from closing before walls of little
-    texture. auto: where the scene has no tracks and the run at least 400 steps; on: always, beside tracks too. Where
-    photographs say something, the start auto is plain, without trials."""
+    texture. auto: where the scene has no tracks and the run at least 400 steps; on: always, beside tracks too. It needs
+    a loss weight tracks above 0. Where photographs say something, the start auto is plain, without trials."""
     track_rays: int = 512
     """Lines of sight that each step looks at."""
     thermal_density_gradient: bool = False

@@ -1,4 +1,4 @@
-"""Lines of sight to where photographs agree that something is, for scenes without tracks of structure from motion.
+"""Lines of sight to where photographs agree that something is: for scenes without tracks of structure from motion.
 
 Before walls of little texture a training can close fog that no picture gives away: light that fog has stopped says
 nothing of what lies behind. Depths that photographs find by being compared with each other do (see `plane_sweep`): each
@@ -14,6 +14,7 @@ import numpy as np
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.photo_reading import read_photographs
 from thermoxels_ns.plane_sweep import Depths, depths_of
 from thermoxels_ns.sightlines import Sightlines
@@ -27,7 +28,7 @@ MOST_PHOTOGRAPHS = 64
 """Photographs compared; of more, that many are taken at equal distances in the list."""
 SHORTEST_RUN = 400
 """Steps that a run must have under auto: a shorter one would spend most of its time on depths."""
-LEAST_SHARE = 0.002
+LEAST_SHARE = 0.01
 """Share of the pixels whose depth must be sure; less is chance."""
 ERROR_PLANES = 0.25
 """Standard error of a depth, in planes of the sweep."""
@@ -80,19 +81,21 @@ def find_lines(model: ThermoxelsModel, datamanager: Any) -> Sightlines | None:
     """Ask the training photographs how far away is what they show, and say what was found.
 
     Args:
-        model: The model; its grid says where to look.
+        model: The model; its box says where to look.
         datamanager: Has the photographs.
 
     Returns:
         Lines of sight; None where the photographs say too little, or no photographs train.
     """
-    began, lattice = time.perf_counter(), model.grid.lattice
+    began = time.perf_counter()
     if model.grid.sh is None or datamanager.config.streams == "thermal":
         return None
     near = model.config.near_plane * model.unit
     photographs = read_photographs(datamanager.train_dataset, near, (), MOST_PHOTOGRAPHS, LONGEST_SIDE)
     if photographs is None:
         return None
+    box = model.scene_box.aabb.double().numpy()
+    lattice = Lattice.covering(box[0], box[1], model.config.resolutions[0])  # the same in a resumed training
     depths = depths_of(photographs, lattice.lo, lattice.hi)
     few = "" if depths.share >= LEAST_SHARE else ", too few to tell anything"
     CONSOLE.log(

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.depth_kernels import agreeing_views, correlate, weigh_patches
+from thermoxels_ns.depth_kernels import OUTSIDE, agreeing_views, correlate, weigh_patches
 from thermoxels_ns.photo_consistency import Photographs
 from thermoxels_ns.threads import run_ranges
 
@@ -51,7 +51,7 @@ VIEWS_PER_CONTRADICTION = 2
 """As many must do so for each photograph that looks through the point."""
 FEWEST_AROUND = 6
 """Of the eight pixels around a sure one, those whose depths agree with its own too: outlines and noise have fewer."""
-_NEAREST = 0.02
+_NEAREST = 0.1
 """Distance of the nearest plane relative to the farthest."""
 _OUTSIDE = -100.0
 """Brightness that stands for a pixel that a photograph does not show: where it is mixed in, the rest is negative."""
@@ -226,7 +226,10 @@ def _sweep(view: _View, others: list[_View], near: float, far: float) -> tuple[n
     found = inverse_depths[0] + (best + _between(agreement, best)) * (inverse_depths[1] - inverse_depths[0])
     depth = (1.0 / found).astype(np.float32).ravel()
     error = (depth * depth * (inverse_depths[1] - inverse_depths[0])).astype(np.float32)
-    return depth, np.take_along_axis(agreement, best[None], 0).ravel(), error
+    # What lies beyond the box agrees best on the last plane within it.
+    reached = np.take_along_axis(agreement, best[None], 0)[0]
+    reached[(best == 0) | (best == len(agreement) - 1)] = OUTSIDE
+    return depth, reached.ravel(), error
 
 
 def _backed(depth: npt.NDArray[np.float32], error: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
@@ -240,7 +243,10 @@ def _backed(depth: npt.NDArray[np.float32], error: npt.NDArray[np.float32]) -> n
 
 
 def _num_planes(view: _View, others: list[_View], near: float, far: float) -> int:
-    """Planes such that the middle of the picture moves by a pixel in the neighbour where it moves most."""
+    """Planes such that the middle of the picture moves by a pixel in the neighbour where it moves most.
+
+    Where no neighbour sees the middle both near and far, as many as there may be.
+    """
     height, width = view.brightness.shape
     middle = view.points(np.array([[0.5 * width, 0.5 * height]] * 2), np.array([near, far]))
     most = 0.0
@@ -248,7 +254,7 @@ def _num_planes(view: _View, others: list[_View], near: float, far: float) -> in
         pixels, depth = other.pixels(middle)
         if (depth > 0.0).all():
             most = max(most, float(np.linalg.norm(pixels[1] - pixels[0])))
-    return int(np.clip(np.ceil(most) + 1, *PLANES))
+    return int(np.clip(np.ceil(most) + 1, *PLANES)) if most > 0.0 else PLANES[1]
 
 
 def _drawn(other: _View, view: _View, depth: float) -> npt.NDArray[np.float32]:
@@ -265,6 +271,9 @@ def _drawn(other: _View, view: _View, depth: float) -> npt.NDArray[np.float32]:
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=(_OUTSIDE,),
     )
+    # What lies behind the other photograph would be drawn upside down.
+    columns, rows = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
+    drawn[turn[2, 0] * columns + turn[2, 1] * rows + turn[2, 2] <= 0.0] = _OUTSIDE
     return np.asarray(drawn, dtype=np.float32)
 
 

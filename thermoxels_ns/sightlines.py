@@ -1,4 +1,4 @@
-"""Lines of sight from cameras to points of structure from motion: what dataparser and model share."""
+"""Lines of sight from cameras to points that they see: what dataparser and model share."""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
 """Which start a training takes: both are tried for some steps, and photographs held back from both decide.
 
+Where depths on which photographs agree tell where surfaces are (see `photo_depth`), it is the plain one, untried.
+
 A plain start (the same density everywhere) and one from photo-consistency end in different geometry, and neither is
 better on all scenes: before walls of little texture a plain start closes fog, and where bodies hide each other
 photographs agree in wrong places. Which it was shows in photographs that did not train.

@@ -1,4 +1,7 @@
-"""Opacity along lines of sight: none before the point that a photograph sees, all up to just behind it."""
+"""Opacity along lines of sight: none before the point that a photograph sees, all up to just behind it.
+
+Points are those of structure from motion, or those on whose depth photographs agree (`photo_depth`).
+"""
 
 from __future__ import annotations
 

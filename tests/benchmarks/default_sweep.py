@@ -7,8 +7,8 @@ Run it on an otherwise idle machine; a row takes one to two minutes per scene:
     python tests/benchmarks/default_sweep.py --folders ../shared/data/arco --only default
 
 Each row differs from the default in what its name says. Times are training loops and relate to the default's in the
-same run; the trials by which the default chooses its start come before the loop and are not in them, the log of a real
-training has their seconds.
+same run; depths of photographs, and the trials by which a start is chosen without them, come before the loop and are not in
+them; the log of a real training has their seconds.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ def _losses(**weights: float) -> Candidate:
 CANDIDATES: Mapping[str, Candidate] = {
     "default": Candidate({}, {}),
     "recipe paper": Candidate({"recipe": "paper"}, {}),
+    "no depths of photographs": Candidate({"photo_depth": "off"}, {}),
     "plain start": Candidate({"start": "plain"}, {}),
     "start from photographs": Candidate({"start": "photographs"}, {}),
     "activation relu": Candidate({"density_activation": "relu"}, {"density": 15.0}),

@@ -55,7 +55,8 @@ class StepSpeed:
     reference_up_to: int = 128
     """Finest lattice on which the reference is timed too."""
     start: Literal["plain", "photographs", "auto"] = "plain"
-    """How the training begins, see --pipeline.model.start; only auto runs trials first."""
+    """How the training begins, see --pipeline.model.start; only auto runs trials first.
+    Lines of sight are left out: rays are those of photographs and thermal images alone."""
     threads: int | None = None
     """Threads of the compiled kernels; default: one per processor."""
     clock: Literal["wall", "processor"] = "wall"
@@ -99,7 +100,11 @@ class StepSpeed:
         """Train to the middle of the last stage and time."""
         schedule = schedule_for(resolution, self.steps)
         rays: Any = {"train_num_rays_per_batch": self.rays, "thermal_num_rays_per_batch": self.rays}
-        pipeline = {"datamanager": rays, "model": {"start": self.start}, "cpu_threads": self.threads}
+        pipeline = {
+            "datamanager": rays,
+            "model": {"start": self.start, "photo_depth": "off"},
+            "cpu_threads": self.threads,
+        }
         run = TrainingRun(scene, schedule, {"pipeline": pipeline})
         if self.threads is not None:
             torch.set_num_threads(max(1, self.threads // 2))
