@@ -7,8 +7,8 @@ Run it on an otherwise idle machine; a row takes one to two minutes per scene:
     python tests/benchmarks/default_sweep.py --folders ../shared/data/arco --only default
 
 Each row differs from the default in what its name says. Times are training loops and relate to the default's in the
-same run; depths of photographs, and the trials by which a start is chosen without them, come before the loop and are not in
-them; the log of a real training has their seconds.
+same run; depths of photographs, and the trials by which a start is chosen without them, come before the loop and are
+not in them; the log of a real training has their seconds.
 """
 
 from __future__ import annotations
