@@ -105,6 +105,30 @@ def test_what_the_shell_hides_from_all_cameras_is_inside_even_if_it_is_open_wher
     assert not interior(cells, LATTICE, None, 2).enclosed.any()
 
 
+def test_a_few_strays_below_an_open_underside_do_not_make_it_deeper():
+    cells, _ = cup()
+    clean = interior(cells, LATTICE, looking_at(MIDDLE, around()), 0).hidden
+    for corner in ((5, 5), (18, 18)):
+        cells[(*corner, slice(3, 5))] = True
+    strays = cells.copy()
+    found = interior(strays, LATTICE, looking_at(MIDDLE, around()), 0).hidden
+    assert clean[:, :, 5].any() and not clean[:, :, :5].any()
+    assert not found[:, :, :5].any() and np.array_equal(found, clean)
+    assert convex_hull(strays, of_centres=True)[:, :, 3:5].sum() > 10  # what would be filled
+
+
+def test_strays_are_the_outermost_layers_of_at_most_half_a_percent():
+    body = np.zeros((30, 20, 10), dtype=bool)
+    body[5:25, 5:15] = True  # 20 x 10 x 10
+    body[25, 5, 0:9] = body[26, 5, 0] = True  # 10 of 2010
+    body[5, 4, 0:8] = body[5, 15, 0:8] = True
+    kept = interior_module._without_strays(body)
+    assert not kept[25:].any() and not kept[:, 4].any() and not kept[:, 15].any()
+    assert np.array_equal(kept[5:25, 5:15], body[5:25, 5:15])
+    body[25, 6, 0:9] = True
+    assert np.array_equal(interior_module._without_strays(body)[25, 5:7], body[25, 5:7])  # too many: a part of the body
+
+
 def test_what_cameras_look_into_is_not_inside():
     cells, inside = cup()
     from_below = looking_at(MIDDLE, around(height=-60.0))

@@ -24,6 +24,10 @@ behind a surface seen from one side only it is up to one half; in the shadow bef
 CREVICE_SURROUNDED = 0.3
 """The same for space that only the filled inside hides: holes of the shell let cameras see it, so it needs more."""
 
+STRAY_SHARE = 0.005
+"""Share of a body's solid voxels that may lie beyond each side of the box that bounds its hull: a few strays below a
+slab would make the underside that no camera sees as deep as the deepest of them."""
+
 
 @dataclass(frozen=True)
 class Interior:
@@ -155,9 +159,19 @@ def _hidden_in_blocks(sealed: BoolArray, lattice: Lattice, views: Views, seal: i
 
 
 def _hulls(cells: BoolArray) -> BoolArray:
-    """Voxels within the convex hull of a body."""
+    """Voxels within the convex hull of a body, strays of which do not count."""
     labels = connected(cells)
     hull = np.zeros_like(cells)
     for number, box in enumerate(ndimage.find_objects(labels), start=1):
-        hull[box] |= convex_hull(labels[box] == number, of_centres=True)
+        hull[box] |= convex_hull(_without_strays(labels[box] == number), of_centres=True)
     return hull
+
+
+def _without_strays(body: BoolArray) -> BoolArray:
+    """A body without the outermost layers that hold at most `STRAY_SHARE` of its voxels, on each side."""
+    most, kept = STRAY_SHARE * np.count_nonzero(body), body
+    for axis in range(3):
+        layers = np.count_nonzero(body, axis=tuple(other for other in range(3) if other != axis))
+        inner = (np.cumsum(layers) > most) & (np.cumsum(layers[::-1])[::-1] > most)
+        kept = kept & np.expand_dims(inner, tuple(other for other in range(3) if other != axis))
+    return kept
