@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,7 +12,7 @@ import torch
 from tests.short_training import train
 from tests.test_photo_consistency import EYES, LATTICE, PLANE, SIZE, photographs
 from thermoxels_ns.data.synthetic import make_scene, write_scene
-from thermoxels_ns.field.refine import refine
+from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.photo_depth import ERROR_PLANES, SHORTEST_RUN, find_lines, lines_for_training, lines_to_depths
 from thermoxels_ns.plane_sweep import Depths, depths_of
 from thermoxels_ns.sightlines import Sightlines
@@ -88,21 +87,23 @@ def test_without_photographs_in_training_nothing_is_asked(scene, untrained):
     assert find_lines(untrained.model, data) is None
 
 
-def test_a_refined_model_asks_within_the_same_box(untrained, monkeypatch):
+def test_depths_are_looked_for_in_the_box_of_the_scene_however_the_lattice_was_refined(untrained, monkeypatch):
     from thermoxels_ns import photo_depth
 
     boxes = []
 
     def recorded(seen, lo, hi):
-        boxes.append((tuple(lo), tuple(hi)))
+        boxes.append((lo, hi))
         return Depths(seen, np.full(len(seen.colours), np.nan, np.float32), np.zeros(len(seen.colours), np.float32))
 
     monkeypatch.setattr(photo_depth, "depths_of", recorded)
-    model = deepcopy(untrained.model)
-    find_lines(model, untrained.datamanager)
-    refine(model.grid, 3)
-    find_lines(model, untrained.datamanager)
-    assert boxes[0] == boxes[1]
+    known = untrained.model
+    find_lines(known, untrained.datamanager)
+    # Refining moves a lattice's far corner, on some boxes, in the last bit; here by much.
+    moved = SimpleNamespace(sh=known.grid.sh, lattice=Lattice.covering((0, 0, 0), (9, 9, 9), 8))
+    refined: Any = SimpleNamespace(grid=moved, config=known.config, unit=known.unit, scene_box=known.scene_box)
+    find_lines(refined, untrained.datamanager)
+    assert boxes[0] == boxes[1] == (known.grid.lattice.lo, known.grid.lattice.hi)
 
 
 def test_photographs_that_agree_about_nothing_give_no_lines(untrained, monkeypatch, capsys):
@@ -171,18 +172,26 @@ def test_depths_are_followed_beside_tracks_where_that_is_asked_for(scene, monkey
 
     monkeypatch.setattr(ThermoxelsModel, "populate_modules", with_tracks)
     monkeypatch.setattr(photo_depth, "find_lines", lambda model, datamanager: some(2, 0.1))
-    monkeypatch.setattr(course, "TrackRays", lambda lines: followed.append(lines) or TrackRays(lines))
+    monkeypatch.setattr(course, "TrackRays", lambda lines, light: followed.append(lines) or TrackRays(lines, light))
     train(scene, 1, {"start": "plain", "carve": "off", "photo_depth": "on"})
     assert len(followed) == 1 and followed[0].points[:, 0].tolist() == [0.2] * 3 + [0.1] * 2
 
 
-def test_light_may_pass_points_while_the_lattice_is_coarse_and_no_longer_on_the_last(scene, monkeypatch):
-    asked = []
+@pytest.mark.parametrize(("depths", "light"), [("on", COARSE_LIGHT), ("off", 0.0)])
+def test_light_may_pass_depths_but_not_tracks_while_the_lattice_is_coarse(scene, monkeypatch, depths, light):
+    from thermoxels_ns.model import ThermoxelsModel
+
+    populate, asked = ThermoxelsModel.populate_modules, []
+
+    def with_tracks(model):
+        populate(model)
+        model.track_rays = TrackRays(Sightlines(np.zeros((1, 3)), np.zeros(1, int), np.ones((1, 3)), np.zeros(1)))
 
     def recorded(accumulation, transmittance, tolerated):
         asked.append(tolerated)
         return track_loss(accumulation, transmittance, tolerated)
 
+    monkeypatch.setattr(ThermoxelsModel, "populate_modules", with_tracks)
     monkeypatch.setattr("thermoxels_ns.model.track_loss", recorded)
-    train(scene, 6, {"resolutions": [8, 16], "refine_at": [4], "start": "plain", "photo_depth": "on"})
-    assert asked == [COARSE_LIGHT] * 4 + [0.0] * 2
+    train(scene, 6, {"resolutions": [8, 16], "refine_at": [4], "start": "plain", "photo_depth": depths})
+    assert asked == [light] * 4 + [0.0] * 2

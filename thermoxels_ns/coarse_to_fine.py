@@ -16,7 +16,7 @@ from thermoxels_ns.field.refine import RowChange, prune
 from thermoxels_ns.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
 from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.track_carving import carve_air
-from thermoxels_ns.track_loss import TrackRays
+from thermoxels_ns.track_loss import COARSE_LIGHT, TrackRays
 
 if TYPE_CHECKING:
     from thermoxels_ns.model import ThermoxelsModel
@@ -44,7 +44,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     depths = lines_for_training(model, attributes)
     if depths is not None:
         given = model.sightlines
-        model.track_rays = TrackRays(depths if given is None else given.and_those_of(depths))
+        model.track_rays = TrackRays(depths if given is None else given.and_those_of(depths), COARSE_LIGHT)
     verdict = decide_start(model, attributes, depths is not None)
     factors = model.config.refinements()
     steps = {*factors, *model.config.prune_at, *model.config.thin_at}
@@ -63,8 +63,6 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     def count(step: int) -> None:
         model.update_to_step(step)
 
-    found = verdict.found
-
     def carve(step: int) -> None:
         """Drop what lines of sight show to be air; at the first step of a training, not of a resumed one."""
         old = model.grid.row_parameters()
@@ -74,9 +72,8 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
 
     def start(step: int) -> None:
         """Set the density at the first step of a training, not at the first of a resumed one."""
-        nonlocal found
         assert attributes.pipeline is not None
-        found = found or find_start(model, attributes.pipeline.datamanager)
+        found = verdict.found or find_start(model, attributes.pipeline.datamanager)
         old = model.grid.row_parameters()
         change = model.split(model.config.skipped_factor())
         if change is not None:

@@ -33,7 +33,7 @@ from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
 from thermoxels_ns.sightlines import Sightlines
 from thermoxels_ns.snapshot import GridSnapshot, RayEvidence, Views
 from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
-from thermoxels_ns.track_loss import COARSE_LIGHT, TrackRays, track_loss
+from thermoxels_ns.track_loss import TrackRays, track_loss
 from thermoxels_ns.units import TemperatureRange
 
 
@@ -299,7 +299,7 @@ class ThermoxelsModel(Model):
         request = rays.request(config.track_rays, near, lattice.voxel_size, generator, self.device)
         seen = render_rays(self.grid, request, self._options(), config.backend)
         last = max(lattice.cell_shape) >= config.resolutions[-1]
-        return track_loss(seen.accumulation, seen.transmittance, 0.0 if last else COARSE_LIGHT)
+        return track_loss(seen.accumulation, seen.transmittance, 0.0 if last else rays.coarse_light)
 
     def _distortion_weight(self) -> float:
         """Weight of the distortion term at this step: it grows over its ramp."""

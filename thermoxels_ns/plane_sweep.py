@@ -271,9 +271,10 @@ def _drawn(other: _View, view: _View, depth: float) -> npt.NDArray[np.float32]:
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=(_OUTSIDE,),
     )
-    # What lies behind the other photograph would be drawn upside down.
-    columns, rows = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
-    drawn[turn[2, 0] * columns + turn[2, 1] * rows + turn[2, 2] <= 0.0] = _OUTSIDE
+    # What lies behind the other photograph would be drawn upside down. Depth in it is linear over the picture.
+    if min(turn[2] @ (column, row, 1.0) for column in (0, width) for row in (0, height)) <= 0.0:
+        columns, rows = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
+        drawn[turn[2, 0] * columns + turn[2, 1] * rows + turn[2, 2] <= 0.0] = _OUTSIDE
     return np.asarray(drawn, dtype=np.float32)
 
 

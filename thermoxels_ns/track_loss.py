@@ -17,9 +17,10 @@ MARGIN_ERRORS = 2.0
 """Standard errors of a line's length by which that is widened."""
 
 COARSE_LIGHT = 0.5
-"""Share of the light that may pass a point while the lattice is coarse. A coarse voxel that has to be opaque reaches
-beyond what it holds, and what of it lies before the surroundings stays, painted like these. One that takes half of the
-light yields to colours, and is there before the surroundings are painted to show the thing instead."""
+"""Share of the light that may pass a depth of photographs while the lattice is coarse. A coarse voxel that has to be
+opaque reaches beyond what it holds, and what of it lies before the surroundings stays, painted like these. One that
+takes half of the light yields to colours, and is there before the surroundings are painted to show the thing instead.
+Tracks of structure from motion are fewer, and let none pass: rooms would keep more fog."""
 
 
 class TrackRays:
@@ -27,9 +28,11 @@ class TrackRays:
 
     Args:
         lines: Lines of sight, world units; at least one.
+        coarse_light: Share of the light that may pass a point while the lattice is coarse.
     """
 
-    def __init__(self, lines: Sightlines) -> None:
+    def __init__(self, lines: Sightlines, coarse_light: float = 0.0) -> None:
+        self.coarse_light = coarse_light
         along = torch.from_numpy(lines.points[lines.point] - lines.origins)
         self._length = torch.linalg.norm(along, dim=-1)
         self._directions = (along / self._length[:, None].clamp(min=1e-12)).float()

@@ -15,11 +15,7 @@ def machinery(plan: Plan) -> None:
     """Tanks, drums, balls, blocks and frames on a floor slab, at least one of each."""
     u = plan.u
     size_x, size_y = u(102, WIDEST), u(84, 108)
-    plan.put(
-        ((-0.5 * size_x, -0.5 * size_y, -u(4, 6)), (0.5 * size_x, 0.5 * size_y, 0.0)),
-        plan.paint("ground"),
-        u(0.0, 0.2),
-    )
+    _floor(plan, size_x, size_y, 0.2)
     kinds: list[Callable[[Plan, Range, Range], None]] = [_tank, _drum, _ball, _block, _frame]
     kinds.append(kinds[int(plan.draw.integers(len(kinds)))])
     if plan.chance(0.3):
@@ -35,11 +31,7 @@ def pipes_and_radiators(plan: Plan) -> None:
     """A wall on a floor, radiators and standing pipes close to both of its sides, lying pipes on posts before them."""
     u = plan.u
     size_x, size_y = u(102, WIDEST), u(86, 100)
-    plan.put(
-        ((-0.5 * size_x, -0.5 * size_y, -u(4, 6)), (0.5 * size_x, 0.5 * size_y, 0.0)),
-        plan.paint("ground"),
-        u(0.0, 0.15),
-    )
+    _floor(plan, size_x, size_y, 0.15)
     half, thick, high = 0.5 * u(84, size_x - 8.0), u(4, 8), u(56, 76)
     wall: Box = ((-half, -0.5 * thick, 0.0), (half, 0.5 * thick, high))
     plan.put(wall, plan.paint("wall"), u(0.1, 0.35))
@@ -63,6 +55,12 @@ def pipes_and_radiators(plan: Plan) -> None:
             reach = max(reach, gap + 2.0 * radius)
         if crossed:
             _lying_pipe(plan, sign, plane + reach + 4.0, half, high)
+
+
+def _floor(plan: Plan, size_x: float, size_y: float, warmest: float) -> None:
+    """A slab whose top is at height 0."""
+    lo, hi = (-0.5 * size_x, -0.5 * size_y, -plan.u(4, 6)), (0.5 * size_x, 0.5 * size_y, 0.0)
+    plan.put((lo, hi), plan.paint("ground"), plan.u(0.0, warmest))
 
 
 def _radiator(plan: Plan, sign: int, plane: float, along: Range) -> float:
