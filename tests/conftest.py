@@ -10,6 +10,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 
+# Fixtures of all rooms: tiny scene folders, bodies for the heat solver, trained fields made by hand.
+pytest_plugins = ("tests.support.scene_folders", "tests.support.heat_bodies", "tests.support.small_fields")
+
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:

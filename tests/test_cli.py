@@ -11,9 +11,9 @@ from typing import get_args
 import pytest
 
 from thermoxels_ns import cli
-from thermoxels_ns.data.synthetic import SCENE_NAMES, load_truth
-from thermoxels_ns.demo import SceneName
-from thermoxels_ns.errors import SceneError
+from thermoxels_ns.commands.demo import SceneName
+from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.synthetic.scene_folder import SCENE_NAMES, load_truth
 
 SMALL = ["--num-train", "3", "--num-eval", "1", "--width", "16", "--height", "12"]
 

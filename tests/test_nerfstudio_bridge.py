@@ -17,7 +17,7 @@ import torch
 import tyro
 
 from thermoxels_ns import nerfstudio_bridge
-from thermoxels_ns.export import ExportThermoxelsMesh
+from thermoxels_ns.commands.export import ExportThermoxelsMesh
 
 STOCK = ("pointcloud", "tsdf", "poisson", "marching-cubes", "cameras", "gaussian-splat")
 HEAVY = ("pyvista", "skfem", "vtkmodules", "pycolmap", "open3d", "thermoxels_ns.mesh", "thermoxels_ns.fem")
@@ -136,7 +136,7 @@ def test_other_commands_load_nothing_heavy(tmp_path) -> None:
     assert result.returncode == 0, result.stderr
     loaded = result.stdout.split()
     assert "thermoxels_ns.nerfstudio_bridge" in loaded
-    assert not [name for name in loaded if name.startswith((*HEAVY, "thermoxels_ns.export"))]
+    assert not [name for name in loaded if name.startswith((*HEAVY, "thermoxels_ns.commands.export"))]
 
 
 def test_nothing_is_touched_without_the_exporter() -> None:

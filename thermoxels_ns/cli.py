@@ -14,13 +14,13 @@ from typing import Annotated, Literal, Union
 
 import tyro
 
-from thermoxels_ns.capture_command import Capture
-from thermoxels_ns.cost import Cost
-from thermoxels_ns.data.synthetic_scenes import SceneWord
-from thermoxels_ns.demo import Demo
-from thermoxels_ns.errors import ThermoxelsError
-from thermoxels_ns.heat_command import Heat
-from thermoxels_ns.option_help import join_help_lines
+from thermoxels_ns.commands.capture import Capture
+from thermoxels_ns.commands.cost import Cost
+from thermoxels_ns.commands.demo import Demo
+from thermoxels_ns.commands.heat import Heat
+from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.option_help import join_help_lines
+from thermoxels_ns.synthetic.catalogue import SceneWord
 
 _NEWS_FOR_PROGRAMMERS = r"`torch\.jit\.script` is deprecated"
 """How the warning begins that newer versions of torch give when nerfstudio 1.1.5 is imported."""
@@ -66,7 +66,7 @@ class Synthetic:
         """
         from rich.console import Console
 
-        from thermoxels_ns.data.synthetic import make_scene, write_scene
+        from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
         folder = write_scene(
             make_scene(self.scene),

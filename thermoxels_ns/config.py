@@ -9,15 +9,15 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from thermoxels_ns import nerfstudio_bridge
-from thermoxels_ns.data.thermal_datamanager import ThermalDataManagerConfig
-from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
-from thermoxels_ns.model_config import ThermoxelsModelConfig
-from thermoxels_ns.optim import FusedAdamConfig, RowAdamConfig, RowRMSpropConfig
-from thermoxels_ns.option_help import join_help_lines
-from thermoxels_ns.pipeline import ThermoxelsPipelineConfig
-from thermoxels_ns.presets import read_preset, with_overrides
-from thermoxels_ns.schedule import QUALITIES
-from thermoxels_ns.trainer import ThermoxelsTrainerConfig
+from thermoxels_ns.core.option_help import join_help_lines
+from thermoxels_ns.core.presets import read_preset, with_overrides
+from thermoxels_ns.data.datamanager import ThermalDataManagerConfig
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig
+from thermoxels_ns.training.model_config import ThermoxelsModelConfig
+from thermoxels_ns.training.optimizers import FusedAdamConfig, RowAdamConfig, RowRMSpropConfig
+from thermoxels_ns.training.pipeline import ThermoxelsPipelineConfig
+from thermoxels_ns.training.schedule import QUALITIES
+from thermoxels_ns.training.trainer import ThermoxelsTrainerConfig
 
 nerfstudio_bridge.install()
 

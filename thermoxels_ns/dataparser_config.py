@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
-from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 
 thermal_data = DataParserSpecification(
     config=ThermalDataParserConfig(), description="Paired RGB and thermal photographs (ThermoScenes layout)."

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 import tyro
 
-from thermoxels_ns.errors import ThermoxelsError
-from thermoxels_ns.option_help import join_help_lines
+from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.option_help import join_help_lines
 
 _EXPORTER = "nerfstudio.scripts.exporter"
 _SUBCOMMAND = "thermoxels-mesh"
@@ -105,7 +105,7 @@ class _ExporterTyro(ModuleType):
 
 def _with_mesh_export(commands: Any) -> Any:
     """Add our subcommand to ``Annotated[Union[...], markers]`` or ``Union[...]``, keeping members and markers."""
-    from thermoxels_ns.export import ExportThermoxelsMesh
+    from thermoxels_ns.commands.export import ExportThermoxelsMesh
 
     join_help_lines(ExportThermoxelsMesh)
     ours = Annotated[ExportThermoxelsMesh, tyro.conf.subcommand(name=_SUBCOMMAND)]

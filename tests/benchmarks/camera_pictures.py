@@ -18,10 +18,10 @@ import tyro
 from PIL import Image
 
 from thermoxels_ns.capture.photograph import open_photograph
-from thermoxels_ns.checks import replace_when_done
-from thermoxels_ns.data.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
-from thermoxels_ns.data.radiometry import RadiometryOptions, read_thermogram
-from thermoxels_ns.errors import ThermoxelsError
+from thermoxels_ns.core.checks import replace_when_done
+from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.radiometry.camera_file import RadiometryOptions, read_thermogram
+from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
 
 _WIDTH, _HEIGHT_IN, _DPI = 480, 2.7, 80
 _PERCENTILES = (3.0, 99.5)

@@ -23,8 +23,8 @@ import tyro
 from nerfstudio.utils.rich_utils import CONSOLE
 from training_run import TrainingRun
 
-from thermoxels_ns.data.synthetic import make_scene, write_scene
-from thermoxels_ns.schedule import QUALITIES, schedule_for
+from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.training.schedule import QUALITIES, schedule_for
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
+from thermoxels_ns.core.lattice import CORNER_OFFSETS
 from thermoxels_ns.field.harmonics import harmonics
 from thermoxels_ns.field.voxel_grid import VoxelGrid, activate_density
-from thermoxels_ns.lattice import CORNER_OFFSETS
 from thermoxels_ns.render.compositing import ray_weights
 from thermoxels_ns.render.sampling import sample_box
 

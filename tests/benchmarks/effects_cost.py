@@ -31,16 +31,16 @@ from thermoxels_ns.fem.linear_solver import ConjugateGradients
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.pieces import Pieces
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
-from thermoxels_ns.fem.scene_file import load_heat_scene
 from thermoxels_ns.fem.schemes import BACKWARD_EULER
-from thermoxels_ns.fem.screening import screen
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.solver_choice import LinearSolver
 from thermoxels_ns.fem.sparsity import product_and_bound
 from thermoxels_ns.fem.stepper import Stepper
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.system import HeatSystem
-from thermoxels_ns.mesh.patches import default_patches
+from thermoxels_ns.heat.scene_file import load_heat_scene
+from thermoxels_ns.heat.screening import screen
+from thermoxels_ns.mesh.boundary.patches import default_patches
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
 

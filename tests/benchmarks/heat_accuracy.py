@@ -40,10 +40,10 @@ if "tests" not in sys.modules:  # Another distribution may have installed a pack
     sys.modules["tests"] = types.ModuleType("tests")
     sys.modules["tests"].__path__ = [str(Path(__file__).parents[1])]
 
-from tests.building_corner import building_corner
-from tests.heat_meshes import box_mesh, planes
-from tests.shell_mesh import shell_mesh
-from thermoxels_ns.checks import replace_when_done
+from tests.support.building_corner import building_corner
+from tests.support.heat_meshes import box_mesh, planes
+from tests.support.shell_mesh import shell_mesh
+from thermoxels_ns.core.checks import replace_when_done
 from thermoxels_ns.fem.effects import Convection, FixedTemperature
 from thermoxels_ns.fem.error_budget import ErrorSize, Tolerance, difference_between
 from thermoxels_ns.fem.materials import Material

@@ -26,7 +26,7 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from PIL import Image
 
-from thermoxels_ns.checks import replace_when_done
+from thermoxels_ns.core.checks import replace_when_done
 
 Vector = npt.NDArray[np.float64]
 

@@ -15,8 +15,8 @@ import torch
 import tyro
 from training_run import TrainingRun
 
-from thermoxels_ns.data.synthetic import make_scene, write_scene
-from thermoxels_ns.schedule import schedule_for
+from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.training.schedule import schedule_for
 
 
 @dataclass

@@ -32,9 +32,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import replace_when_done
-from thermoxels_ns.lattice import CORNER_OFFSETS, Lattice
-from thermoxels_ns.snapshot import GridSnapshot, Views
+from thermoxels_ns.core.checks import replace_when_done
+from thermoxels_ns.core.lattice import CORNER_OFFSETS, Lattice
+from thermoxels_ns.core.snapshot import GridSnapshot, Views
 
 Vector = npt.NDArray[np.float64]
 MODES = ("conforming", "voxel")
@@ -83,7 +83,7 @@ def tilted_slab(degrees: float = 30.0, size: tuple[float, float, float] = (1.6, 
 
 def demo_scene(name: str) -> Body:
     """The exact solid of a synthetic scene."""
-    from thermoxels_ns.data.synthetic import make_scene
+    from thermoxels_ns.synthetic.scene_folder import make_scene
 
     scene = make_scene(name)  # type: ignore[arg-type]
     low, high = scene.scene_box
@@ -136,10 +136,10 @@ def ring_of_views(centre: Vector, reach: float, count: int) -> Views:
 
 def measure(name: str, voxels: int, mode: str, repeats: int) -> dict:
     """One case; runs in a process of its own."""
+    from thermoxels_ns.evaluation.surface_distance import sample_facets
     from thermoxels_ns.mesh.build import MeshOptions, build_mesh
-    from thermoxels_ns.mesh.quality import check_mesh, facet_areas, signed_volumes
-    from thermoxels_ns.mesh.solid import SolidSelection
-    from thermoxels_ns.mesh.surface_distance import sample_facets
+    from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas, signed_volumes
+    from thermoxels_ns.mesh.solid.voxels import SolidSelection
 
     body = BODIES[name]()
     snapshot = exact_snapshot(body, voxels)
@@ -223,7 +223,7 @@ def plain_loop(cells: npt.NDArray[np.bool_]) -> tuple[list, list]:
 def speed(repeats: int) -> None:
     """Seconds for 128^3 voxels with 5 % solid, and for 256^3 with as many solid voxels."""
     from thermoxels_ns.mesh.build import MeshOptions, build_mesh
-    from thermoxels_ns.mesh.solid import SolidSelection, select_solid
+    from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
 
     selection = SolidSelection(density_threshold=1.0, close_gaps=0, interior="hollow")
     for voxels, share in ((128, 0.05), (256, 0.05 / 8)):

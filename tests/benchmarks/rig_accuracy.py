@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "capture"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from known_rig import drawn_capture
 
-from thermoxels_ns.capture.drift import estimate_drift
-from thermoxels_ns.capture.rig import estimate_rig
+from thermoxels_ns.capture.rig.drift import estimate_drift
+from thermoxels_ns.capture.rig.search import estimate_rig
 
 CAPTURES = (
     *("house-corner:4:160:0.05:51", "courtyard:4:160:0.20:54", "house-corner:4:160:0.10:71"),

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from nerfstudio.utils import colormaps
 from nerfstudio.utils.eval_utils import eval_setup
 
-from thermoxels_ns.checks import replace_when_done
+from thermoxels_ns.core.checks import replace_when_done
 
 _INK = "#1d2430"
 _WIDTH_PX = 640

@@ -32,10 +32,10 @@ from dense_torch_step import dense_step_seconds
 from nerfstudio.utils.rich_utils import CONSOLE
 from training_run import TrainingRun
 
-from thermoxels_ns.data.synthetic import make_scene, write_scene
+from thermoxels_ns.core.threads import num_threads
 from thermoxels_ns.field.widen import widen_colour
-from thermoxels_ns.schedule import schedule_for
-from thermoxels_ns.threads import num_threads
+from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.training.schedule import schedule_for
 
 
 @dataclass
@@ -160,8 +160,8 @@ class StepSpeed:
 
     def median_of_kernels(self, run: TrainingRun) -> float:
         """Time per step that is spent in compiled kernels: renderer forward and backward, and row optimisers."""
-        from thermoxels_ns.optim import RowOptimizer
         from thermoxels_ns.render import fused
+        from thermoxels_ns.training.optimizers import RowOptimizer
 
         spent = [0.0]
 

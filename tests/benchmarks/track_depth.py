@@ -30,7 +30,7 @@ import tyro
 from nerfstudio.utils.eval_utils import eval_setup
 from scipy.spatial import KDTree
 
-from thermoxels_ns.checks import replace_when_done, writable_folder
+from thermoxels_ns.core.checks import replace_when_done, writable_folder
 from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, SparseTracks, read_tracks, write_tracks
 

@@ -25,10 +25,10 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from thermoxels_ns.data.scene_truth import SyntheticScene
-from thermoxels_ns.data.synthetic import make_scene, write_scene
-from thermoxels_ns.data.synthetic_random import FAMILIES
-from thermoxels_ns.demo_commands import run_command
+from thermoxels_ns.commands.demo_commands import run_command
+from thermoxels_ns.synthetic.random_scene import FAMILIES
+from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 _TARGETS = {"psnr": (">=", 30.0), "thermal_mae_c": ("<=", 0.4), "fscore": (">=", 0.85)}
 _VIEWS = (42, 6)

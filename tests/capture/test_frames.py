@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.capture.camera_card import counts, jpeg_bytes, photograph
-from tests.data.flir_file import FlirFile
+from tests.support.camera_card import counts, jpeg_bytes, photograph
+from tests.support.flir_file import FlirFile
 from thermoxels_ns.capture.frames import CaptureFrames, read_frames
 from thermoxels_ns.capture.pairs import Pair
-from thermoxels_ns.data.radiometry import RadiometryOptions
-from thermoxels_ns.errors import ThermalFileError, ThermoxelsError
+from thermoxels_ns.core.errors import ThermalFileError, ThermoxelsError
+from thermoxels_ns.radiometry.camera_file import RadiometryOptions
 
 RADIOMETRY = RadiometryOptions()
 

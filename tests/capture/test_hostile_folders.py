@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.capture.camera_card import counts, photograph
-from tests.data.flir_file import picture_bytes, segment
+from tests.support.camera_card import counts, photograph
+from tests.support.flir_file import picture_bytes, segment
 from thermoxels_ns.capture.camera_files import files_below, natural_key, scan_folder, shown_name
 from thermoxels_ns.capture.pairs import find_pairs
 from thermoxels_ns.capture.results import load_pairs, save_pairs
 from thermoxels_ns.capture.run import run_capture
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
 
 
 def dji_thermal(path: Path) -> Path:

@@ -9,15 +9,15 @@ import sys
 
 import pytest
 
-from tests.capture.camera_card import counts, photograph
-from tests.capture.posed_model import ring_model
-from tests.capture.textured_room import VISIBLE
-from thermoxels_ns.capture.feature_matching import FeatureOptions, fill_database
+from tests.support.camera_card import counts, photograph
+from tests.support.posed_model import ring_model
+from tests.support.textured_room import VISIBLE
 from thermoxels_ns.capture.results import load_model, save_model
 from thermoxels_ns.capture.run import run_capture
 from thermoxels_ns.capture.settings import CaptureSettings
+from thermoxels_ns.capture.sfm.feature_matching import FeatureOptions, fill_database
 from thermoxels_ns.capture.stages import STAGES, StageCache
-from thermoxels_ns.errors import OutputError, SceneError
+from thermoxels_ns.core.errors import OutputError, SceneError
 
 
 def run_stage(folder, from_stage=None, writes=()):

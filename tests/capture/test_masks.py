@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from thermoxels_ns.capture.masks import PhotographMasks, find_overlay, mask_files, read_mask
-from thermoxels_ns.errors import SceneError
+from thermoxels_ns.core.errors import SceneError
 
 
 def write(folder, number, pixels):

@@ -8,7 +8,7 @@ import pytest
 
 from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.measurement import conditions_text, measurement_rows
-from thermoxels_ns.data.radiometric_conditions import Conditions
+from thermoxels_ns.radiometry.conditions import Conditions
 
 
 def frame(**more) -> CaptureFrame:

@@ -14,7 +14,7 @@ from thermoxels_ns.capture.output_lock import LOCK_FILE, only_capture
 from thermoxels_ns.capture.run import run_capture
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.stages import CACHE_FOLDER, prepare_output
-from thermoxels_ns.errors import OutputError
+from thermoxels_ns.core.errors import OutputError
 
 needs_locks = pytest.mark.skipif(output_lock.fcntl is None, reason="this system has no flock")
 

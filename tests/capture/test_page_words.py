@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.capture.posed_model import ring_model
-from thermoxels_ns.capture.contract import CameraModel, DriftEstimate, RigEstimate
+from tests.support.posed_model import ring_model
 from thermoxels_ns.capture.frames import CaptureFrame
-from thermoxels_ns.capture.gravity import Up
-from thermoxels_ns.capture.metric_scale import MetricScale
-from thermoxels_ns.capture.page import CapturePage, Overlay, build_page
 from thermoxels_ns.capture.pairs import Pair
-from thermoxels_ns.capture.rig_parameters import PARAMETERS
-from thermoxels_ns.data.radiometric_conditions import Conditions
+from thermoxels_ns.capture.rig.parameters import PARAMETERS
+from thermoxels_ns.capture.sfm.gravity import Up
+from thermoxels_ns.capture.sfm.metric_scale import MetricScale
+from thermoxels_ns.capture.stage_types import CameraModel, DriftEstimate, RigEstimate
+from thermoxels_ns.radiometry.conditions import Conditions
+from thermoxels_ns.reports.capture_page import CapturePage, Overlay, build_page
 
 MODEL = ring_model(4)
 

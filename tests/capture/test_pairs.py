@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.capture.camera_card import counts, jpeg_bytes, photograph
-from tests.data.flir_file import FlirFile
+from tests.support.camera_card import counts, jpeg_bytes, photograph
+from tests.support.flir_file import FlirFile
 from thermoxels_ns.capture.camera_files import CameraFile, CameraFolder, scan_folder
 from thermoxels_ns.capture.pairs import PairOptions, PairSearch, find_pairs, read_pair_list
-from thermoxels_ns.errors import SceneError
+from thermoxels_ns.core.errors import SceneError
 
 ROOT = Path("/card")
 NOON = datetime(2024, 5, 1, 12)

@@ -8,9 +8,9 @@ import zlib
 import numpy as np
 import pytest
 
-from tests.capture.camera_card import photograph
+from tests.support.camera_card import photograph
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
-from thermoxels_ns.errors import SceneError
+from thermoxels_ns.core.errors import SceneError
 
 
 @pytest.mark.parametrize(("fraction", "microsecond"), [("25", 250000), ("782/1000", 782000), ("x", 0), (None, 0)])

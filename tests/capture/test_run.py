@@ -11,16 +11,16 @@ from typing import get_args, get_type_hints
 import numpy as np
 import pytest
 
-from tests.capture.board_pictures import BOARD, board_pairs, write_board_folder
-from tests.capture.camera_card import photograph
-from tests.capture.textured_room import RIG, THERMAL, VISIBLE, alignment, poses, write_card
+from tests.support.board_pictures import BOARD, board_pairs, write_board_folder
+from tests.support.camera_card import photograph
+from tests.support.textured_room import RIG, THERMAL, VISIBLE, alignment, poses, write_card
 from thermoxels_ns import cli
-from thermoxels_ns.capture.feature_matching import LensModel, Matching
 from thermoxels_ns.capture.run import run_capture
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.data.thermal_cameras import COUNT_SCALES
-from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
-from thermoxels_ns.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.capture.sfm.feature_matching import LensModel, Matching
+from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig
+from thermoxels_ns.radiometry.known_cameras import COUNT_SCALES
 
 COUNT = 6
 DRIFT_K = 0.6

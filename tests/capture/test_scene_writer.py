@@ -9,20 +9,20 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from tests.capture.camera_card import photograph
-from tests.capture.posed_model import CAMERA, ring_model
-from thermoxels_ns.capture.contract import CameraModel, DriftEstimate, RigEstimate
+from tests.support.camera_card import photograph
+from tests.support.posed_model import CAMERA, ring_model
 from thermoxels_ns.capture.frames import CaptureFrame
-from thermoxels_ns.capture.gravity import Up
 from thermoxels_ns.capture.masks import PhotographMasks
-from thermoxels_ns.capture.metric_scale import MetricScale
 from thermoxels_ns.capture.scene_writer import TRACKS_NAME, Scene, scene_names, write_scene_folder
+from thermoxels_ns.capture.sfm.gravity import Up
+from thermoxels_ns.capture.sfm.metric_scale import MetricScale
+from thermoxels_ns.capture.stage_types import CameraModel, DriftEstimate, RigEstimate
 from thermoxels_ns.capture.stages import prepare_output
+from thermoxels_ns.commands.scene_scale import scale_from_scene_file, up_from_scene_file
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.data.sparse_tracks import read_tracks
-from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
-from thermoxels_ns.data.thermal_files import read_temperature_c
-from thermoxels_ns.scene_scale import scale_from_scene_file, up_from_scene_file
+from thermoxels_ns.radiometry.thermal_files import read_temperature_c
 
 THERMAL = CameraModel(40, 30, 50.0, 50.0, 20.5, 14.5, k1=0.01)
 COUNT = 6

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from thermoxels_ns.capture.stages import CACHE_FOLDER, StageCache, fingerprint, prepare_output, read_json
-from thermoxels_ns.errors import OutputError, ThermoxelsError
+from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 
 
 def run_two(folder, first=1, second=1, from_stage=None):

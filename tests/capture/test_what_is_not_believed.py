@@ -11,17 +11,22 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from tests.capture.posed_model import CAMERA, ring_model
+from tests.support.posed_model import CAMERA, ring_model
 from thermoxels_ns.capture.camera_files import CameraFile, CameraFolder
-from thermoxels_ns.capture.drift import drift_of_samples
-from thermoxels_ns.capture.drift_samples import DriftSamples
-from thermoxels_ns.capture.gravity import find_up
 from thermoxels_ns.capture.masks import find_overlay
-from thermoxels_ns.capture.metric_scale import MeasuredDistance, scale_from_distance, scale_from_gps, scale_from_markers
 from thermoxels_ns.capture.pairs import PairSearch, find_pairs
 from thermoxels_ns.capture.photograph import GpsFix
-from thermoxels_ns.capture.sfm_model import SfmModel
-from thermoxels_ns.data.pinhole import look_at
+from thermoxels_ns.capture.rig.drift import drift_of_samples
+from thermoxels_ns.capture.rig.drift_samples import DriftSamples
+from thermoxels_ns.capture.sfm.gravity import find_up
+from thermoxels_ns.capture.sfm.metric_scale import (
+    MeasuredDistance,
+    scale_from_distance,
+    scale_from_gps,
+    scale_from_markers,
+)
+from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.synthetic.pinhole import look_at
 
 
 def readings(offsets_k: np.ndarray, points: int, seed: int) -> DriftSamples:

@@ -15,8 +15,8 @@ import pytest
 from rich.console import Console
 
 from thermoxels_ns import cli
-from thermoxels_ns.cost import Cost, planned_settings, run_cost
-from thermoxels_ns.cost_runs import (
+from thermoxels_ns.commands.cost import Cost, planned_settings, run_cost
+from thermoxels_ns.commands.cost_runs import (
     FIGURES,
     parse_setting,
     read_evaluation,
@@ -25,8 +25,8 @@ from thermoxels_ns.cost_runs import (
     training_options,
     training_seconds,
 )
-from thermoxels_ns.errors import SceneError, ThermoxelsError
-from thermoxels_ns.schedule import schedule_for
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError
+from thermoxels_ns.training.schedule import schedule_for
 
 PYTHON = sys.executable
 # A training takes `steps` / 100 seconds by its files' times; the evaluation improves with the steps.
@@ -63,7 +63,7 @@ def commands(tmp_path, monkeypatch):
     """Fake ns-train and ns-eval; gives a function that replaces one, and one that lists what was called."""
     folder = tmp_path / "bin"
     folder.mkdir()
-    monkeypatch.setattr("thermoxels_ns.cost_process.sys.executable", str(folder / "python"))
+    monkeypatch.setattr("thermoxels_ns.commands.cost_process.sys.executable", str(folder / "python"))
 
     def write(name: str, body: str) -> None:
         path = folder / name

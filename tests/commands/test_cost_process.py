@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from thermoxels_ns.cost_process import run_measured
-from thermoxels_ns.errors import ThermoxelsError
+from thermoxels_ns.commands.cost_process import run_measured
+from thermoxels_ns.core.errors import ThermoxelsError
 
 PYTHON = sys.executable
 
@@ -21,7 +21,7 @@ def command(tmp_path, monkeypatch):
     """Gives a function that writes a command beside a Python of its own and returns the words to run it."""
     folder = tmp_path / "bin"
     folder.mkdir()
-    monkeypatch.setattr("thermoxels_ns.cost_process.sys.executable", str(folder / "python"))
+    monkeypatch.setattr("thermoxels_ns.commands.cost_process.sys.executable", str(folder / "python"))
 
     def write(body: str) -> list[str]:
         path = folder / "work"
@@ -44,7 +44,7 @@ def test_memory_is_that_of_the_command(command, tmp_path):
     command("x = b'1' * int(sys.argv[1]); del x")
     script = (
         "import math, pathlib, sys\n"
-        "from thermoxels_ns.cost_process import run_measured\n"
+        "from thermoxels_ns.commands.cost_process import run_measured\n"
         f"sys.executable = {str(tmp_path / 'bin' / 'python')!r}\n"
         f"log = pathlib.Path({str(tmp_path / 'log')!r})\n"
         "peak = lambda size: run_measured(['work', str(size)], log).peak_memory_gb\n"

@@ -17,20 +17,20 @@ import torch
 import tyro
 from PIL import Image
 
-from tests.looking_cameras import looking_at
-from thermoxels_ns.errors import CheckpointError, HeatError, MeshError, OutputError, SceneError, ThermoxelsError
-from thermoxels_ns.export import (
+from tests.support.looking_cameras import looking_at
+from thermoxels_ns.commands.export import (
     ExportThermoxelsMesh,
     _check_config,
     input_from_world,
     scene_json,
     viewpoint_of_cameras,
 )
-from thermoxels_ns.export_options import ExportOptions, Viewpoint, check_options
-from thermoxels_ns.export_snapshot import export_snapshot, volume_in_words
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.mesh.solid import SolidSelection
-from thermoxels_ns.snapshot import GridSnapshot
+from thermoxels_ns.commands.export_options import ExportOptions, Viewpoint, check_options
+from thermoxels_ns.commands.export_snapshot import export_snapshot, volume_in_words
+from thermoxels_ns.core.errors import CheckpointError, HeatError, MeshError, OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import GridSnapshot
+from thermoxels_ns.mesh.solid.voxels import SolidSelection
 
 UNSEEN = 0.35
 
@@ -134,7 +134,7 @@ def test_small_changes_fill_their_own_symmetric_scale(ball, tmp_path, monkeypatc
         drawn.append((values, look))
         Image.new("RGB", (8, 6)).save(path)
 
-    monkeypatch.setattr("thermoxels_ns.mesh.pictures.picture_of_mesh", draw)
+    monkeypatch.setattr("thermoxels_ns.reports.mesh_pictures.picture_of_mesh", draw)
     export_snapshot(ball, np.eye(4), ExportOptions(metres_per_unit=1.0, steps=1, step_seconds=60.0), tmp_path)
     (before, first), (after, last), (change, look) = drawn[2:]
     assert first["clim"] == last["clim"]
@@ -148,10 +148,10 @@ def test_torch_s_compiler_still_loads_after_drawing() -> None:
     """Mesa's LLVM and triton's crash the process if pictures come first; the export sees to the order."""
     code = """
 import numpy as np
-from thermoxels_ns.export_options import ExportOptions
-from thermoxels_ns.export_snapshot import export_snapshot
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.snapshot import GridSnapshot
+from thermoxels_ns.commands.export_options import ExportOptions
+from thermoxels_ns.commands.export_snapshot import export_snapshot
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import GridSnapshot
 ones = np.ones((3, 3, 3), np.float32)
 ball = GridSnapshot(Lattice((0.0, 0.0, 0.0), 1.0, (3, 3, 3)), ones, 20 * ones, ones)
 export_snapshot(ball, np.eye(4), ExportOptions(density_threshold=0.5), "out")
@@ -254,7 +254,7 @@ def test_plain_command_line_takes_the_preset() -> None:
 
 def test_truth_and_viewpoint_reach_the_summary_and_the_pictures(ball, tmp_path, monkeypatch) -> None:
     looks = []
-    monkeypatch.setattr("thermoxels_ns.mesh.pictures.picture_of_mesh", lambda *_, **look: looks.append(look))
+    monkeypatch.setattr("thermoxels_ns.reports.mesh_pictures.picture_of_mesh", lambda *_, **look: looks.append(look))
     look = Viewpoint(up=(0.0, 1.0, 0.0), view_direction=(0.0, 0.0, -1.0))
     options = ExportOptions(density_threshold=4.0)
     asked = []
@@ -283,7 +283,8 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def plain_pictures(monkeypatch) -> None:
     monkeypatch.setattr(
-        "thermoxels_ns.mesh.pictures.picture_of_mesh", lambda path, *_, **__: Image.new("RGB", (8, 6)).save(path)
+        "thermoxels_ns.reports.mesh_pictures.picture_of_mesh",
+        lambda path, *_, **__: Image.new("RGB", (8, 6)).save(path),
     )
 
 

@@ -14,24 +14,25 @@ import pytest
 import pyvista as pv
 import tyro
 
-from tests.scene_bodies import room, tagged_body, wall
-from thermoxels_ns import cli, heat_run
-from thermoxels_ns.errors import HeatError, OutputError, ThermoxelsError
+from tests.support.scene_bodies import room, tagged_body, wall
+from thermoxels_ns import cli
+from thermoxels_ns.commands import heat_run
+from thermoxels_ns.commands.heat import Heat
+from thermoxels_ns.commands.heat_files import command_line
+from thermoxels_ns.commands.heat_run import compute_heat, run_heat
+from thermoxels_ns.core.errors import HeatError, OutputError, ThermoxelsError
 from thermoxels_ns.fem.probes import place_probes
 from thermoxels_ns.fem.problem import AdaptiveSteps
 from thermoxels_ns.fem.refine_mesh import refine_mesh
-from thermoxels_ns.fem.scene_file import load_heat_scene
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
-from thermoxels_ns.heat_command import Heat
-from thermoxels_ns.heat_files import command_line
-from thermoxels_ns.heat_page import heat_page
-from thermoxels_ns.heat_pictures import PICTURES, cut_open, plot_over_time
-from thermoxels_ns.heat_report import HeatReport, Section, Table, build_report
-from thermoxels_ns.heat_run import compute_heat, run_heat
-from thermoxels_ns.heat_solving import LEFT_OUT_SHARE
-from thermoxels_ns.mesh.formats import write_mesh
-from thermoxels_ns.mesh.read_mesh import read_mesh
+from thermoxels_ns.heat.scene_file import load_heat_scene
+from thermoxels_ns.heat.solving import LEFT_OUT_SHARE
+from thermoxels_ns.mesh.files.formats import write_mesh
+from thermoxels_ns.mesh.files.read import read_mesh
+from thermoxels_ns.reports.heat_page import heat_page
+from thermoxels_ns.reports.heat_pictures import PICTURES, cut_open, plot_over_time
+from thermoxels_ns.reports.heat_report import HeatReport, Section, Table, build_report
 
 TRANSIENT = """
 description: A <cold> & windy hour
@@ -333,7 +334,7 @@ def test_a_body_without_rooms_is_warned_about(folder, tmp_path, capsys) -> None:
 
 
 def test_long_solutions_say_how_far_they_are(folder, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("thermoxels_ns.heat_solving.SAY_EVERY_S", 0.0)
+    monkeypatch.setattr("thermoxels_ns.heat.solving.SAY_EVERY_S", 0.0)
     lines: list[str] = []
     options = Heat(folder / "room" / "mesh.vtu", str(folder / "hour.yaml"), tmp_path, leave_out_below_k=0.0)
     compute_heat(options, lines.append)

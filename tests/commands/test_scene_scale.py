@@ -8,9 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from thermoxels_ns.data.synthetic import make_scene, write_scene
-from thermoxels_ns.errors import SceneError, ThermoxelsError
-from thermoxels_ns.scene_scale import (
+from thermoxels_ns.commands.scene_scale import (
     UP_ASSUMED,
     SceneScale,
     choose_scale,
@@ -19,6 +17,8 @@ from thermoxels_ns.scene_scale import (
     scale_from_scene_file,
     up_from_scene_file,
 )
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError
+from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
 
 def test_option_is_taken_as_it_is_and_its_error_is_not_known():

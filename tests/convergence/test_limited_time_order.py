@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from tests.obtuse_bodies import AT_THE_BOUNDS, CONCRETE, body
+from tests.support.obtuse_bodies import AT_THE_BOUNDS, CONCRETE, body
 from thermoxels_ns.fem.effects import FixedTemperature
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying

@@ -7,12 +7,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, centres
-from thermoxels_ns.lattice import Lattice
+from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, centres
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.build import build_mesh
-from thermoxels_ns.mesh.quality import check_mesh
-from thermoxels_ns.mesh.solid import SolidSelection
-from thermoxels_ns.snapshot import GridSnapshot
+from thermoxels_ns.mesh.quality.checks import check_mesh
+from thermoxels_ns.mesh.solid.voxels import SolidSelection
 
 BODIES = ("sphere", "torus", "cylinder", "slab at 30 degrees", "slab at 45 degrees")
 OFFSETS = ((0.11, -0.27, 0.38), (0.5, 0.0, -0.25), (-0.42, 0.33, 0.06))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.heat_meshes import box_mesh
+from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.fem.edge_midpoints import TET_EDGES
 from thermoxels_ns.fem.effects import FixedTemperature, InternalHeat
 from thermoxels_ns.fem.materials import Material

@@ -9,10 +9,10 @@ import pytest
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
-from tests.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, stiffness, tet_mesh
-from thermoxels_ns.mesh.quality import MeshQuality, check_mesh, facet_areas, facet_normals
-from thermoxels_ns.mesh.stuffing import stuff
-from thermoxels_ns.mesh.tet_shapes import signed_volumes
+from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, stiffness, tet_mesh
+from thermoxels_ns.mesh.quality.checks import MeshQuality, check_mesh, facet_areas, facet_normals
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
+from thermoxels_ns.mesh.stuffing.isosurface import stuff
 
 SMOOTH = ("sphere", "torus")
 SHARP = tuple(name for name in SHAPES if SHAPES[name].sharp_edges)

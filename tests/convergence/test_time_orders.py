@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.heat_meshes import box_mesh
+from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.fem.effects import Convection, Effect, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from tests.reference.two_renderers import random_grid, random_request
-from thermoxels_ns import scratch
+from thermoxels_ns.core import buffer_pool as scratch
+from thermoxels_ns.core.buffer_pool import PATIENCE, SMALLEST, Scratch, rounded_size
 from thermoxels_ns.field.refine import refine
-from thermoxels_ns.ray_rendering import fused_render
 from thermoxels_ns.render.ray_render import RenderOptions
-from thermoxels_ns.scratch import PATIENCE, SMALLEST, Scratch, rounded_size
+from thermoxels_ns.render.renderers import fused_render
 
 LARGE = 4 * SMALLEST
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import thermoxels_ns.sightlines as module
-from thermoxels_ns.sightlines import FEWEST_NEIGHBOURS, Sightlines, agrees_with_neighbours
+import thermoxels_ns.core.feature_rays as module
+from thermoxels_ns.core.feature_rays import FEWEST_NEIGHBOURS, Sightlines, agrees_with_neighbours
 
 CAMERAS = np.random.default_rng(9).uniform(-0.6, 0.6, (6, 3)) + np.array([0.0, 0.0, 2.0])
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from thermoxels_ns.checks import (
+from thermoxels_ns.core.checks import (
     check_finite,
     check_positive,
     check_shape,
@@ -17,10 +17,10 @@ from thermoxels_ns.checks import (
     replace_when_done,
     writable_folder,
 )
-from thermoxels_ns.errors import MeshError, OutputError, ThermoxelsError
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.snapshot import GridSnapshot
-from thermoxels_ns.units import TemperatureRange, celsius_to_kelvin, kelvin_to_celsius
+from thermoxels_ns.core.errors import MeshError, OutputError, ThermoxelsError
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import GridSnapshot
+from thermoxels_ns.core.units import TemperatureRange, celsius_to_kelvin, kelvin_to_celsius
 
 
 def test_range_round_trip_for_floats_arrays_and_tensors():

@@ -1,6 +1,6 @@
 from pathlib import Path
 
-from thermoxels_ns.render.kernel_cache import forget_stale_kernels
+from thermoxels_ns.core.kernel_cache import forget_stale_kernels
 
 
 def test_what_was_compiled_from_other_sources_goes_and_nothing_else(tmp_path: Path):

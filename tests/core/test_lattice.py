@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from thermoxels_ns.errors import ThermoxelsError
-from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.lattice import Lattice
 
 LATTICE = Lattice((-1.0, 0.25, 3.0), 0.5, (4, 3, 5))
 

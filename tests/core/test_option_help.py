@@ -14,8 +14,8 @@ import pytest
 import tyro
 
 from thermoxels_ns import cli, config, nerfstudio_bridge
-from thermoxels_ns.export import ExportThermoxelsMesh
-from thermoxels_ns.option_help import join_help_lines, joined_lines
+from thermoxels_ns.commands.export import ExportThermoxelsMesh
+from thermoxels_ns.core.option_help import join_help_lines, joined_lines
 
 LONG = "Every option's text is one paragraph here, however many lines it takes in the source: 12 of them, or more."
 

@@ -16,19 +16,20 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.plugins.registry_dataparser import discover_dataparsers
 from nerfstudio.plugins.types import MethodSpecification
 
-from thermoxels_ns import config, presets
-from thermoxels_ns.errors import HeatError, ThermoxelsError
+from thermoxels_ns import config
+from thermoxels_ns.core import presets
+from thermoxels_ns.core.errors import HeatError, ThermoxelsError
+from thermoxels_ns.core.presets import read_preset, with_overrides
 from thermoxels_ns.fem.materials import Material
-from thermoxels_ns.fem.presets import HeatPreset, heat_preset_names, load_heat_preset
 from thermoxels_ns.fem.problem import TimeSteps
-from thermoxels_ns.presets import read_preset, with_overrides
+from thermoxels_ns.heat.presets import HeatPreset, heat_preset_names, load_heat_preset
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 METHODS: dict[str, str] = PROJECT["entry-points"]["nerfstudio.method_configs"]
 DATAPARSERS: dict[str, str] = PROJECT["entry-points"]["nerfstudio.dataparser_configs"]

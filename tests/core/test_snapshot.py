@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.short_training import train
-from thermoxels_ns.data.synthetic import make_scene, write_scene
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.snapshot import GridSnapshot, RayEvidence, Views
-from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
+from tests.support.short_training import train
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
+from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
+from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
 
 def full() -> GridSnapshot:

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermoxels_ns import threads
-from thermoxels_ns.threads import num_threads, run_ranges, run_tasks, set_num_threads
+from thermoxels_ns.core import threads
+from thermoxels_ns.core.threads import num_threads, run_ranges, run_tasks, set_num_threads
 
 
 @pytest.fixture(autouse=True)

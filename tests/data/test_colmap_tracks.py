@@ -10,13 +10,13 @@ import numpy as np
 import pycolmap
 import pytest
 
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.colmap_files import check_complete
 from thermoxels_ns.data.colmap_tracks import COLMAP_FOLDERS, _matched, _points, read_colmap_tracks
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, write_tracks
-from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
-from thermoxels_ns.errors import SceneError
 
 TAGS = ["train", "train", "eval", "train", "train", "train"]
 NAMES = [f"frame_{tag}_{number:05d}" for number, tag in enumerate(TAGS)]

@@ -12,10 +12,10 @@ from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConf
 from nerfstudio.scripts.render import _disable_datamanager_setup
 from PIL import Image
 
+from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.data.camera_rays import CameraRays
-from thermoxels_ns.data.thermal_datamanager import ThermalDataManager, ThermalDataManagerConfig
-from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
-from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
+from thermoxels_ns.data.datamanager import ThermalDataManager, ThermalDataManagerConfig
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 
 DISTORTION = {"k1": 0.08, "k2": -0.02, "p1": 0.003, "p2": -0.002}
 

@@ -11,14 +11,14 @@ import pytest
 import torch
 from PIL import Image
 
+from thermoxels_ns.commands.export import input_from_world
+from thermoxels_ns.core.errors import SceneError, ThermalFileError
+from thermoxels_ns.core.units import TemperatureRange
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig
+from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.data.scene_box import box_of_cameras, box_of_points
 from thermoxels_ns.data.scene_file import read_scene_file
-from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
-from thermoxels_ns.data.thermal_dataset import ThermalDataset
-from thermoxels_ns.errors import SceneError, ThermalFileError
-from thermoxels_ns.export import input_from_world
 from thermoxels_ns.mesh.build import apply_transform
-from thermoxels_ns.units import TemperatureRange
 
 
 def parse(data: Path, split: str = "train", **options):

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.data.sparse_tracks import (
     TRACKS_KEY,
@@ -16,8 +18,6 @@ from thermoxels_ns.data.sparse_tracks import (
     sightlines,
     write_tracks,
 )
-from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
-from thermoxels_ns.errors import SceneError
 
 TAGS = ["train", "train", "eval", "train", "train", "train"]
 NAMES = [f"frame_{tag}_{number:05d}" for number, tag in enumerate(TAGS)]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.splits import SplitMode, split_frames
-from thermoxels_ns.errors import SceneError
 
 NAMES = [f"images/{letter}.jpg" for letter in "abcdefghij"]
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from tests.short_training import train
-from thermoxels_ns.data.synthetic import make_scene, write_scene
-from thermoxels_ns.geometry_metrics import geometry_metrics, half_transparent_share
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.snapshot import GridSnapshot
-from thermoxels_ns.truth_comparison import KnownTruth, compare_with_truth
+from tests.support.short_training import train
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import GridSnapshot
+from thermoxels_ns.evaluation.geometry_metrics import geometry_metrics, half_transparent_share
+from thermoxels_ns.evaluation.truth_comparison import KnownTruth, compare_with_truth
+from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
 IDENTITY = np.eye(4)
 SCORES = ("fscore", "precision", "recall")
@@ -130,8 +130,8 @@ def test_evaluation_has_the_share_of_half_transparent_rays(pipeline):
 
 def test_ns_eval_compares_the_trained_density_with_the_scene(pipeline, monkeypatch):
     """A field that holds the exact scene, in the trained world's own coordinates, scores full."""
-    from thermoxels_ns.export import input_from_world
-    from thermoxels_ns.truth_comparison import load_known_truth
+    from thermoxels_ns.commands.export import input_from_world
+    from thermoxels_ns.evaluation.truth_comparison import load_known_truth
 
     outputs = pipeline.datamanager.train_dataparser_outputs
     world_to_input = input_from_world(outputs.dataparser_transform.numpy(), float(outputs.dataparser_scale))
@@ -154,7 +154,7 @@ def test_ns_eval_compares_the_trained_density_with_the_scene(pipeline, monkeypat
 
 def test_ns_eval_takes_the_density_that_the_model_has(pipeline, monkeypatch):
     said = []
-    monkeypatch.setattr("thermoxels_ns.pipeline.CONSOLE.print", said.append)
+    monkeypatch.setattr("thermoxels_ns.training.pipeline.CONSOLE.print", said.append)
     result = pipeline.geometry_metrics()
     assert result["fscore"] == 0.0  # nothing is solid at the start
     assert "The geometry scores 0" in said[0]

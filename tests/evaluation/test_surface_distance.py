@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.mesh.surface_distance import sample_facets, surface_distances
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.evaluation.surface_distance import sample_facets, surface_distances
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 
 

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermoxels_ns.data.synthetic import make_scene, visible_surface_points, write_scene
-from thermoxels_ns.errors import MeshError, SceneError
-from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.core.errors import MeshError, SceneError
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import GridSnapshot, Views
+from thermoxels_ns.evaluation.truth_comparison import KnownTruth, compare_with_truth, load_known_truth
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh
-from thermoxels_ns.mesh.quality import signed_volumes
-from thermoxels_ns.mesh.solid import SolidSelection, select_solid
-from thermoxels_ns.snapshot import GridSnapshot, Views
-from thermoxels_ns.truth_comparison import KnownTruth, compare_with_truth, load_known_truth
+from thermoxels_ns.mesh.quality.checks import signed_volumes
+from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
+from thermoxels_ns.synthetic.scene_folder import make_scene, visible_surface_points, write_scene
 
 IDENTITY = np.eye(4)
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.looking_cameras import looking_at
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.mesh.accuracy import SeenScore, boundary_samples, surface_fscore
-from thermoxels_ns.snapshot import Views
+from tests.support.looking_cameras import looking_at
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import Views
+from thermoxels_ns.evaluation.voxel_accuracy import SeenScore, boundary_samples, surface_fscore
 
 
 class Sphere:

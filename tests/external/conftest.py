@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.demo_mesh import demo_mesh
-from tests.house_mesh import house_mesh
+from tests.support.demo_mesh import demo_mesh
+from tests.support.house_mesh import house_mesh
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.mesh.tetrahedra import TetMesh

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.fem.stepping import solve_heat
-from thermoxels_ns.mesh.quality import facet_areas
-from thermoxels_ns.mesh.tet_shapes import signed_volumes
-from thermoxels_ns.mesh.xdmf_file import write_xdmf
+from thermoxels_ns.mesh.files.xdmf import write_xdmf
+from thermoxels_ns.mesh.quality.checks import facet_areas
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 
 pytestmark = pytest.mark.external
 

@@ -10,7 +10,7 @@ from scipy.spatial import Delaunay
 from skfem import Basis, BilinearForm, ElementTetP1, MeshTet
 from skfem.helpers import dot
 
-from thermoxels_ns.errors import HeatError
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.assembly import HeatMatrices, assemble, assemble_mass, assemble_stiffness
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.heat_meshes import SIDES, box_mesh
-from thermoxels_ns.errors import HeatError
+from tests.support.heat_meshes import SIDES, box_mesh
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effects import (
     STEFAN_BOLTZMANN_W_M2K4,
     AbsorbedSolar,

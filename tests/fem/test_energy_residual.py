@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.heat_meshes import SIDES, box_mesh
+from tests.support.heat_meshes import SIDES, box_mesh
 from thermoxels_ns.fem import steady
 from thermoxels_ns.fem.effects import Convection, Effect, FixedTemperature, Radiation
 from thermoxels_ns.fem.materials import Material

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.heat_meshes import box_mesh, planes
-from thermoxels_ns.errors import HeatError
-from thermoxels_ns.fem.edge_surplus import edge_surplus
+from tests.support.heat_meshes import box_mesh, planes
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effects import Convection, FixedTemperature, InternalHeat
 from thermoxels_ns.fem.error_estimate import RecoveredError, error_ratios, recovered_error, richardson
+from thermoxels_ns.fem.hierarchical_error_in_time import edge_surplus
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
 from thermoxels_ns.fem.quantities import Varying
@@ -151,7 +151,7 @@ def test_straight_temperatures_have_no_curvature_and_bent_ones_four_times_less_o
 @pytest.mark.parametrize("at_once", [1, 1000, 200_000])
 def test_the_surplus_of_all_times_together_is_that_of_one_after_the_other(at_once, monkeypatch) -> None:
     """A coefficient that may change with time, and does not, gives each time a matrix of its own."""
-    monkeypatch.setattr("thermoxels_ns.fem.edge_surplus._AT_ONCE", at_once)
+    monkeypatch.setattr("thermoxels_ns.fem.hierarchical_error_in_time._AT_ONCE", at_once)
     axis = np.linspace(0.0, 0.3, 4)
     warm = Varying(lambda places, time_s: 60.0 * np.cos(time_s / 1000.0))
     air = Varying(lambda places, time_s: 5.0 * np.sin(time_s / 500.0))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.heat_meshes import box_mesh
+from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.fem.effects import Convection, FixedTemperature, InternalHeat, Radiation
 from thermoxels_ns.fem.error_budget import mean_flows_w
 from thermoxels_ns.fem.even_steps import EvenSteps

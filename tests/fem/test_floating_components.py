@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.heat_meshes import box_mesh
-from thermoxels_ns.errors import HeatError
+from tests.support.heat_meshes import box_mesh
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effects import Convection, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps

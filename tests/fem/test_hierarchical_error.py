@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.building_corner import building_corner
-from tests.heat_meshes import box_mesh, planes
-from tests.shell_mesh import shell_mesh
-from thermoxels_ns.errors import HeatError
+from tests.support.building_corner import building_corner
+from tests.support.heat_meshes import box_mesh, planes
+from tests.support.shell_mesh import shell_mesh
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.edge_exchange import EdgeExchange, EdgeSpace
 from thermoxels_ns.fem.edge_operator import EdgeOperator
 from thermoxels_ns.fem.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
+from thermoxels_ns.fem.hierarchical_error import steady_surplus
 from thermoxels_ns.fem.linear_start import linear_start
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem
@@ -23,7 +24,6 @@ from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.sparsity import mesh_edges
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.steady_surplus import steady_surplus
 from thermoxels_ns.fem.system import HeatSystem
 
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)

@@ -5,7 +5,7 @@ import pytest
 from scipy import sparse
 from scipy.sparse.linalg import cg, spsolve
 
-from thermoxels_ns.errors import HeatError
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.linear_solver import ConjugateGradients
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy import sparse
 from threadpoolctl import threadpool_limits
 
-from tests.heat_meshes import box_mesh, planes
+from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns.fem.effects import Convection
 from thermoxels_ns.fem.linear_solver import ConjugateGradients
 from thermoxels_ns.fem.materials import Material

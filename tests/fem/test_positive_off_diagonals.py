@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from tests.heat_meshes import box_mesh
-from tests.obtuse_bodies import AT_THE_BOUNDS, CONCRETE, body
+from tests.support.heat_meshes import box_mesh
+from tests.support.obtuse_bodies import AT_THE_BOUNDS, CONCRETE, body
 from thermoxels_ns.fem.maximum_principle import holds_maximum_principle
+from thermoxels_ns.fem.positive_off_diagonals import WrongCouplings
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.system import HeatSystem
-from thermoxels_ns.fem.wrong_couplings import WrongCouplings
 
 
 def obtuse() -> HeatSystem:

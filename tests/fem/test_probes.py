@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.heat_meshes import box_mesh, planes
-from thermoxels_ns.errors import HeatError
+from tests.support.heat_meshes import box_mesh, planes
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.probes import place_probes
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 

@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.heat_meshes import box_mesh, planes
-from tests.shell_mesh import shell_mesh
-from thermoxels_ns.errors import HeatError
+from tests.support.heat_meshes import box_mesh, planes
+from tests.support.shell_mesh import shell_mesh
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.fem.linear_space import LinearSpace
 from thermoxels_ns.fem.materials import Material

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.heat_meshes import box_mesh
-from tests.shell_mesh import shell_mesh
+from tests.support.heat_meshes import box_mesh
+from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.fem.edge_midpoints import TET_EDGES, edge_numbers
 from thermoxels_ns.fem.elements import edge_couplings
 from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.sparse.linalg import spsolve
 
-from tests.heat_meshes import box_mesh
-from thermoxels_ns.errors import HeatError
+from tests.support.heat_meshes import box_mesh
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.assembly import assemble
 from thermoxels_ns.fem.effects import (
     AbsorbedSolar,

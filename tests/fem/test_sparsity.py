@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from thermoxels_ns.errors import HeatError
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.sparsity import MeshEdges, mesh_edges, product_and_bound, symmetric_matrix
 
 

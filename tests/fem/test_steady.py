@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from tests.heat_meshes import SIDES, box_mesh, planes
-from thermoxels_ns.errors import HeatError
+from tests.support.heat_meshes import SIDES, box_mesh, planes
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem import newton as newton_module
 from thermoxels_ns.fem import solver_choice, steady
 from thermoxels_ns.fem.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.heat_meshes import box_mesh
+from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.fem.effects import Convection, HeatFlux
 from thermoxels_ns.fem.marching import Taken
 from thermoxels_ns.fem.materials import Material

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.heat_meshes import SIDES, box_mesh
-from thermoxels_ns.errors import HeatError
+from tests.support.heat_meshes import SIDES, box_mesh
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.assembly import assemble
 from thermoxels_ns.fem.effects import (
     AbsorbedSolar,
@@ -193,7 +193,7 @@ def test_shares_of_fixed_nodes_add_up(box, concrete) -> None:
 
 def test_labels_differ_even_where_a_patch_is_named_like_a_number() -> None:
     """Two equal labels would count the heat of both effects twice."""
-    from tests.heat_meshes import box_mesh
+    from tests.support.heat_meshes import box_mesh
     from thermoxels_ns.fem.effect_forms import effect_labels
     from thermoxels_ns.fem.effects import Convection
     from thermoxels_ns.fem.materials import Material

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.building_corner import building_corner
-from tests.heat_meshes import box_mesh, graded
-from tests.shell_mesh import shell_mesh
-from thermoxels_ns.errors import HeatError
+from tests.support.building_corner import building_corner
+from tests.support.heat_meshes import box_mesh, graded
+from tests.support.shell_mesh import shell_mesh
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effects import Convection, FixedTemperature, Radiation
 from thermoxels_ns.fem.error_budget import ErrorSize, Tolerance, difference_between, mean_flows_w
 from thermoxels_ns.fem.materials import Material

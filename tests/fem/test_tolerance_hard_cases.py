@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.heat_meshes import box_mesh
-from thermoxels_ns.errors import HeatError
+from tests.support.heat_meshes import box_mesh
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effects import Convection, Effect, HeatFlux
 from thermoxels_ns.fem.error_budget import Tolerance
 from thermoxels_ns.fem.materials import Material

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from tests.heat_meshes import box_mesh
-from tests.shell_mesh import shell_mesh
-from thermoxels_ns.errors import HeatError
+from tests.support.heat_meshes import box_mesh
+from tests.support.shell_mesh import shell_mesh
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effects import Convection, FixedTemperature, InternalHeat, Radiation
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem

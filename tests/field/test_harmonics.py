@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from thermoxels_ns.errors import ThermoxelsError
+from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.field.background import SkyTemperature, SphereImage
 from thermoxels_ns.field.harmonics import harmonics, harmonics_with_unit_mean
 

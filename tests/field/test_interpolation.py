@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.interpolation import TrilinearPoints, interpolate, splat
 from thermoxels_ns.field.kept_voxels import KeptVoxels
-from thermoxels_ns.lattice import Lattice
 
 LATTICE = Lattice((-1.0, 0.5, 2.0), 0.25, (5, 4, 6))
 ALL = KeptVoxels(LATTICE)

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import binary_dilation
 
+from thermoxels_ns.core.lattice import CORNER_OFFSETS, Lattice
 from thermoxels_ns.field.kept_voxels import BLOCK, KeptVoxels
-from thermoxels_ns.lattice import CORNER_OFFSETS, Lattice
 from thermoxels_ns.render import kernels
 
 

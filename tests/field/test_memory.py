@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermoxels_ns.errors import MemoryBudgetError
+from thermoxels_ns.core.errors import MemoryBudgetError
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.field.memory import check_memory, memory_need
-from thermoxels_ns.lattice import Lattice
 
 TESTS = Path(__file__).parents[1]
 KERNELS = 0.3e9
@@ -31,7 +31,13 @@ def after_training(resolution: int, share: float, sh_degree: int) -> dict[str, f
     if not Path("/proc/self/status").exists():
         pytest.skip("this system does not tell the peak memory of a process in /proc")
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(TESTS.parent)}
-    command = [sys.executable, str(TESTS / "shell_training.py"), str(resolution), str(share), str(sh_degree)]
+    command = [
+        sys.executable,
+        str(TESTS / "support" / "shell_training.py"),
+        str(resolution),
+        str(share),
+        str(sh_degree),
+    ]
     result = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout.splitlines()[-1])

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.field.refine import prune, refine, split_voxels
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.lattice import Lattice
 
 
 def random_grid(activation="exp", kept: float = 1.0, temperature_degree: int = 0) -> VoxelGrid:

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from tests.reference.two_renderers import EVERYTHING, RENDERERS, random_grid, random_request, see
-from thermoxels_ns import losses
-from thermoxels_ns.errors import ThermoxelsError
+from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.field.harmonics import num_coefficients
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.field.widen import widen_colour
-from thermoxels_ns.optim import RowAdam, RowRMSprop
+from thermoxels_ns.training import losses
+from thermoxels_ns.training.optimizers import RowAdam, RowRMSprop
 
 STEPS = [(0, 1), (0, 2), (1, 2)]
 

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.heat_meshes import box_mesh, planes
+from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns.fem.effects import AbsorbedSolar, Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
-from thermoxels_ns.fem.lumped_body import lumped_body
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat.lumped_body import lumped_body
 
 COPPER = Material("copper", 380.0, 8900.0, 380.0)
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.heat_meshes import box_mesh, planes
-from thermoxels_ns.errors import HeatError
-from thermoxels_ns.fem import lumped_pieces
+from tests.support.heat_meshes import box_mesh, planes
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effects import Convection, HeatFlux, InternalHeat, Radiation
-from thermoxels_ns.fem.lumped_body import lumped_body
-from thermoxels_ns.fem.lumped_pieces import PieceEquations, TooHardError, follow_pieces
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat import lumped_pieces
+from thermoxels_ns.heat.lumped_body import lumped_body
+from thermoxels_ns.heat.lumped_pieces import PieceEquations, TooHardError, follow_pieces
 
 COPPER = Material("copper", 380.0, 8900.0, 380.0)
 NEXT_TO_NOTHING = Material("next to nothing", 380.0, 1e-6, 1e-6)

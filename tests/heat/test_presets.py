@@ -3,9 +3,9 @@ from __future__ import annotations
 import pytest
 import yaml
 
-from thermoxels_ns.configs_folder import configs_folder
-from thermoxels_ns.errors import HeatError
-from thermoxels_ns.fem.presets import heat_preset_names, load_heat_preset
+from thermoxels_ns.core.configs_folder import configs_folder
+from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.heat.presets import heat_preset_names, load_heat_preset
 
 
 @pytest.mark.parametrize("name", heat_preset_names())

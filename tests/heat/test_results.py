@@ -8,17 +8,17 @@ import json
 import numpy as np
 import pytest
 
-from tests.heat_meshes import box_mesh, planes
-from thermoxels_ns.errors import HeatError
-from thermoxels_ns.fem.answers import heat_answers
+from tests.support.heat_meshes import box_mesh, planes
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effects import AbsorbedSolar, Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.surface_heat import heat_by_part
-from thermoxels_ns.fem.wall_answers import wall_answer
-from thermoxels_ns.mesh.facet_owners import facet_owners
+from thermoxels_ns.heat.results import heat_answers
+from thermoxels_ns.heat.wall_results import wall_answer
+from thermoxels_ns.mesh.boundary.facet_owners import facet_owners
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 BRICK, WOOL = Material("brick", 0.7, 1600.0, 940.0), Material("wool", 0.04, 30.0, 1030.0)

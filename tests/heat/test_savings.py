@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from tests.heat_meshes import box_mesh
-from thermoxels_ns.fem import savings
+from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.fem.effects import Convection, Radiation
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.heat import savings
 
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
 

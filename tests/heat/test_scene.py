@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.scene_bodies import room, wall
-from thermoxels_ns.errors import HeatError
+from tests.support.scene_bodies import room, wall
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effects import (
     AbsorbedSolar,
     Convection,
@@ -19,14 +19,14 @@ from thermoxels_ns.fem.effects import (
     InternalHeat,
     Radiation,
 )
-from thermoxels_ns.fem.heat_scene import HeatScene
-from thermoxels_ns.fem.material_table import material
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.scene_fields import Ground, InsideAir, OutsideAir, Sky, Sun, Surface
 from thermoxels_ns.fem.selection import Selection
-from thermoxels_ns.fem.sky import swinbank_sky_c
 from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.heat.material_table import material
+from thermoxels_ns.heat.scene import HeatScene
+from thermoxels_ns.heat.scene_fields import Ground, InsideAir, OutsideAir, Sky, Sun, Surface
+from thermoxels_ns.heat.sky import swinbank_sky_c
 
 ALL = {"*": material("concrete")}
 INSIDE = InsideAir(20.0, "iso-6946-combined")

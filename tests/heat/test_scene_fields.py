@@ -5,8 +5,8 @@ from datetime import datetime, timezone
 
 import pytest
 
-from thermoxels_ns.errors import HeatError
-from thermoxels_ns.fem.scene_fields import Ground, InsideAir, OutsideAir, Section, Sky, Sun, Surface, field_bounds
+from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.heat.scene_fields import Ground, InsideAir, OutsideAir, Section, Sky, Sun, Surface, field_bounds
 
 SECTIONS = Section.__subclasses__()
 NOON = datetime(2025, 6, 21, 12, tzinfo=timezone.utc)

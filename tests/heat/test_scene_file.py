@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.scene_bodies import room
-from thermoxels_ns.configs_folder import configs_folder
-from thermoxels_ns.errors import HeatError
+from tests.support.scene_bodies import room
+from thermoxels_ns.core.configs_folder import configs_folder
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effects import (
     AbsorbedSolar,
     Convection,
@@ -19,14 +19,14 @@ from thermoxels_ns.fem.effects import (
     InternalHeat,
     Radiation,
 )
-from thermoxels_ns.fem.heat_scene import HeatScene
-from thermoxels_ns.fem.material_table import material
-from thermoxels_ns.fem.presets import load_heat_preset
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.scene_file import heat_scene_names, load_heat_scene
 from thermoxels_ns.fem.schemes import BACKWARD_EULER
 from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat.material_table import material
+from thermoxels_ns.heat.presets import load_heat_preset
+from thermoxels_ns.heat.scene import HeatScene
+from thermoxels_ns.heat.scene_file import heat_scene_names, load_heat_scene
 
 SMALL = 'materials: {"*": concrete}\nsteady: true\n'
 

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.scene_bodies import Z_UP, room, tagged_body, wall
-from thermoxels_ns.fem.heat_scene import HeatScene
+from tests.support.scene_bodies import Z_UP, room, tagged_body, wall
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import TimeSteps
-from thermoxels_ns.fem.scene_doubts import scene_doubts, unused_settings
-from thermoxels_ns.fem.scene_fields import InsideAir, OutsideAir
+from thermoxels_ns.heat.scene import HeatScene
+from thermoxels_ns.heat.scene_fields import InsideAir, OutsideAir
+from thermoxels_ns.heat.scene_warnings import scene_doubts, unused_settings
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 CONCRETE = {"*": Material("concrete", 1.7, 2200.0, 880.0)}

@@ -8,9 +8,8 @@ from datetime import datetime, timezone
 import numpy as np
 import pytest
 
-from tests.heat_meshes import SIDES, box_mesh, planes
-from thermoxels_ns.errors import HeatError
-from thermoxels_ns.fem import screening as screening_module
+from tests.support.heat_meshes import SIDES, box_mesh, planes
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.effects import (
     AbsorbedSolar,
@@ -23,13 +22,14 @@ from thermoxels_ns.fem.effects import (
     Radiation,
 )
 from thermoxels_ns.fem.materials import Material
-from thermoxels_ns.fem.nodal_heat import nodal_heats
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.screening import screen
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
-from thermoxels_ns.fem.sun import moving_sun
+from thermoxels_ns.heat import screening as screening_module
+from thermoxels_ns.heat.nodal_heat import nodal_heats
+from thermoxels_ns.heat.screening import screen
+from thermoxels_ns.heat.sun import moving_sun
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
@@ -219,7 +219,7 @@ def test_what_fixes_temperatures_stays() -> None:
 
 
 def test_screening_costs_nothing_where_nothing_acts(monkeypatch) -> None:
-    monkeypatch.setattr("thermoxels_ns.fem.screening._Screener", None)
+    monkeypatch.setattr("thermoxels_ns.heat.screening._Screener", None)
     problem = HeatProblem(slab(), CONCRETE)
     screening = screen(problem, TimeSteps(3, 60.0), 0.1)
     assert screening.problem is problem and screening.kept == screening.left_out == ()

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.heat_meshes import box_mesh, planes
-from thermoxels_ns import heat_solving
+from tests.support.heat_meshes import box_mesh, planes
+from thermoxels_ns.commands.heat import Heat
 from thermoxels_ns.fem.effects import Convection, HeatFlux
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.heat_command import Heat
+from thermoxels_ns.heat import solving as heat_solving
 
 
 class Clock:

@@ -5,10 +5,10 @@ from datetime import datetime, timedelta, timezone
 import numpy as np
 import pytest
 
-from thermoxels_ns.errors import HeatError
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effects import AbsorbedSolar
 from thermoxels_ns.fem.quantities import Places
-from thermoxels_ns.fem.sun import (
+from thermoxels_ns.heat.sun import (
     Sunlight,
     SunPosition,
     air_mass,

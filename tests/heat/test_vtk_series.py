@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import pyvista
 
-from thermoxels_ns.errors import OutputError
-from thermoxels_ns.fem.files import remove_heat_series, write_heat_series
+from thermoxels_ns.core.errors import OutputError
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat.vtk_series import remove_heat_series, write_heat_series
 
 
 @pytest.fixture

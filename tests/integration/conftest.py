@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.integration.commands import SHORT_TRAINING, Trained, run
-from thermoxels_ns.data.synthetic import make_scene, write_scene
+from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
 
 @pytest.fixture(scope="session")

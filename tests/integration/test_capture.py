@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.capture.camera_card import COUNTS_PER_K, ZERO_C, counts
-from tests.capture.textured_room import alignment
 from tests.integration.commands import run
-from thermoxels_ns.capture.contract import CameraModel
+from tests.support.camera_card import COUNTS_PER_K, ZERO_C, counts
+from tests.support.textured_room import alignment
+from thermoxels_ns.capture.stage_types import CameraModel
 
 FRAMES = slice(4, 14)
 HALF = 2

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.capture.textured_room import write_card
 from tests.integration.commands import run
+from tests.support.textured_room import write_card
 
 COUNT = 5
 STOPS = ("features:", "matches:", "4/9 scale", "rig: Comparing", "9/9 page")

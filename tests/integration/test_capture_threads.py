@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.capture.textured_room import write_card
+from tests.support.textured_room import write_card
 
 COUNT = 5
 OPTIONS = "--max-features 300 --image-size 320 --thermal-field-of-view-deg 56"

@@ -20,8 +20,8 @@ import torch
 from PIL import Image
 
 from tests.integration.commands import SHORT_TRAINING, Trained, run
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.kept_voxels import KeptVoxels
-from thermoxels_ns.lattice import Lattice
 
 STOCK_EXPORTS = ("pointcloud", "tsdf", "poisson", "marching-cubes", "cameras", "gaussian-splat")
 METRICS = (

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermoxels_ns.errors import MeshError
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.mesh.boundary.patch_rules import PatchRules, Rule
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh, check_similarity
-from thermoxels_ns.mesh.patch_rules import PatchRules, Rule
-from thermoxels_ns.mesh.quality import check_mesh, facet_areas
-from thermoxels_ns.mesh.solid import SolidSelection
+from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas
+from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX
 
 DENSE = SolidSelection(close_gaps=0, density_threshold=0.5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermoxels_ns.errors import MeshError
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.node_values import interpolate_corners
 
 SHAPE = (4, 5, 3)

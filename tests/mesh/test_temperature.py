@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from thermoxels_ns.errors import MeshError
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh import temperature
-from thermoxels_ns.mesh.stuffing import stuff
+from thermoxels_ns.mesh.stuffing.isosurface import stuff
 from thermoxels_ns.mesh.temperature import extend_harmonically
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets, lattice_edges
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.mesh.quality import check_mesh, facet_areas, signed_volumes
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas, signed_volumes
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
 from thermoxels_ns.mesh.voxel_tets import (
     boundary_facets,

@@ -9,14 +9,20 @@ import numpy as np
 import pytest
 import torch
 
-from tests.short_training import train
-from tests.test_photo_consistency import EYES, LATTICE, PLANE, SIZE, photographs
-from thermoxels_ns.data.synthetic import make_scene, write_scene
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.photo_depth import ERROR_PLANES, SHORTEST_RUN, find_lines, lines_for_training, lines_to_depths
-from thermoxels_ns.plane_sweep import Depths, depths_of
-from thermoxels_ns.sightlines import Sightlines
-from thermoxels_ns.track_loss import COARSE_LIGHT, TrackRays, track_loss
+from tests.multiview.test_photo_consistency import EYES, LATTICE, PLANE, SIZE, photographs
+from tests.support.short_training import train
+from thermoxels_ns.core.feature_rays import Sightlines
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.multiview.depth_supervision import (
+    ERROR_PLANES,
+    SHORTEST_RUN,
+    find_lines,
+    lines_for_training,
+    lines_to_depths,
+)
+from thermoxels_ns.multiview.stereo import Depths, depths_of
+from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.training.track_loss import COARSE_LIGHT, TrackRays, track_loss
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +77,7 @@ def test_lines_of_two_kinds_stay_with_their_points():
 def test_most_lines_of_a_scene_end_at_its_surface(untrained):
     lines = find_lines(untrained.model, untrained.datamanager)
     assert lines is not None and len(lines.points) > 200
-    from thermoxels_ns.export import input_from_world
+    from thermoxels_ns.commands.export import input_from_world
 
     outputs: Any = untrained.datamanager.train_dataparser_outputs
     to_input = input_from_world(outputs.dataparser_transform.numpy(), float(outputs.dataparser_scale))
@@ -88,7 +94,7 @@ def test_without_photographs_in_training_nothing_is_asked(scene, untrained):
 
 
 def test_depths_are_looked_for_in_the_box_of_the_scene_however_the_lattice_was_refined(untrained, monkeypatch):
-    from thermoxels_ns import photo_depth
+    from thermoxels_ns.multiview import depth_supervision as photo_depth
 
     boxes = []
 
@@ -107,7 +113,7 @@ def test_depths_are_looked_for_in_the_box_of_the_scene_however_the_lattice_was_r
 
 
 def test_photographs_that_agree_about_nothing_give_no_lines(untrained, monkeypatch, capsys):
-    from thermoxels_ns import photo_depth
+    from thermoxels_ns.multiview import depth_supervision as photo_depth
 
     def unsure(seen, lo, hi):
         nothing = np.full(len(seen.colours), np.nan, np.float32)
@@ -130,7 +136,7 @@ def test_photographs_that_agree_about_nothing_give_no_lines(untrained, monkeypat
     ],
 )
 def test_when_photographs_are_asked(monkeypatch, wanted, steps, tracks, weight, asked):
-    from thermoxels_ns import photo_depth
+    from thermoxels_ns.multiview import depth_supervision as photo_depth
 
     monkeypatch.setattr(photo_depth, "find_lines", lambda model, datamanager: "asked")
     model: Any = SimpleNamespace(
@@ -156,9 +162,9 @@ def test_a_training_follows_depths_and_needs_no_trial(scene, capsys):
 
 
 def test_depths_are_followed_beside_tracks_where_that_is_asked_for(scene, monkeypatch):
-    import thermoxels_ns.coarse_to_fine as course
-    import thermoxels_ns.photo_depth as photo_depth
-    from thermoxels_ns.model import ThermoxelsModel
+    import thermoxels_ns.multiview.depth_supervision as photo_depth
+    import thermoxels_ns.training.callbacks as course
+    from thermoxels_ns.training.model import ThermoxelsModel
 
     def some(count: int, at: float) -> Sightlines:
         return Sightlines(np.zeros((count, 3)), np.arange(count), np.full((count, 3), at), np.full(count, 0.1))
@@ -179,7 +185,7 @@ def test_depths_are_followed_beside_tracks_where_that_is_asked_for(scene, monkey
 
 @pytest.mark.parametrize(("depths", "light"), [("on", COARSE_LIGHT), ("off", 0.0)])
 def test_light_may_pass_depths_but_not_tracks_while_the_lattice_is_coarse(scene, monkeypatch, depths, light):
-    from thermoxels_ns.model import ThermoxelsModel
+    from thermoxels_ns.training.model import ThermoxelsModel
 
     populate, asked = ThermoxelsModel.populate_modules, []
 
@@ -192,6 +198,6 @@ def test_light_may_pass_depths_but_not_tracks_while_the_lattice_is_coarse(scene,
         return track_loss(accumulation, transmittance, tolerated)
 
     monkeypatch.setattr(ThermoxelsModel, "populate_modules", with_tracks)
-    monkeypatch.setattr("thermoxels_ns.model.track_loss", recorded)
+    monkeypatch.setattr("thermoxels_ns.training.model.track_loss", recorded)
     train(scene, 6, {"resolutions": [8, 16], "refine_at": [4], "start": "plain", "photo_depth": depths})
     assert asked == [light] * 4 + [0.0] * 2

@@ -11,10 +11,10 @@ import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
-from tests.short_training import train_with_optimizers
-from thermoxels_ns.data.synthetic import make_scene, write_scene
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.photo_consistency import (
+from tests.support.short_training import train_with_optimizers
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.threads import set_num_threads
+from thermoxels_ns.multiview.photo_consistency import (
     Photographs,
     _colours,
     _sample,
@@ -23,9 +23,9 @@ from thermoxels_ns.photo_consistency import (
     deviations,
     exposures,
 )
-from thermoxels_ns.photo_kernels import _median
-from thermoxels_ns.photo_reading import LONGEST_SIDE, read_photographs
-from thermoxels_ns.threads import set_num_threads
+from thermoxels_ns.multiview.photo_kernels import _median
+from thermoxels_ns.multiview.photographs import LONGEST_SIDE, read_photographs
+from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
 LATTICE = Lattice((-0.5, -0.5, -0.5), 1.0 / 16, (17, 17, 17))
 PLANE = -0.125

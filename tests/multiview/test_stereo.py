@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.test_photo_consistency import EYES, FOCAL, PLANE, SIZE, photographs, texture
-from thermoxels_ns import plane_sweep
-from thermoxels_ns.depth_kernels import agreeing_views, correlate, weigh_patches
-from thermoxels_ns.photo_consistency import Photographs
-from thermoxels_ns.photo_depth import lines_to_depths
-from thermoxels_ns.plane_sweep import (
+from tests.multiview.test_photo_consistency import EYES, FOCAL, PLANE, SIZE, photographs, texture
+from thermoxels_ns.core.threads import set_num_threads
+from thermoxels_ns.multiview import stereo as plane_sweep
+from thermoxels_ns.multiview.depth_supervision import lines_to_depths
+from thermoxels_ns.multiview.photo_consistency import Photographs
+from thermoxels_ns.multiview.stereo import (
     ANGLES_DEG,
     FEWEST_AROUND,
     FEWEST_VIEWS,
@@ -24,7 +24,7 @@ from thermoxels_ns.plane_sweep import (
     _View,
     depths_of,
 )
-from thermoxels_ns.threads import set_num_threads
+from thermoxels_ns.multiview.stereo_kernels import agreeing_views, correlate, weigh_patches
 
 LO, HI = (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)
 TRUE_DEPTH = 1.6 - PLANE

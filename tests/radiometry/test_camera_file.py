@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.data.flir_file import FlirFile, picture_bytes, smooth_counts
-from thermoxels_ns.data.radiometric_conditions import Conditions
-from thermoxels_ns.data.radiometric_model import corrected_temperature_c
-from thermoxels_ns.data.radiometry import RadiometryOptions, detect_format, read_thermogram
-from thermoxels_ns.data.thermal_cameras import COUNT_SCALES, recognised_camera
-from thermoxels_ns.errors import SceneError, ThermalFileError, ThermoxelsError
+from tests.support.flir_file import FlirFile, picture_bytes, smooth_counts
+from thermoxels_ns.core.errors import SceneError, ThermalFileError, ThermoxelsError
+from thermoxels_ns.radiometry.camera_file import RadiometryOptions, detect_format, read_thermogram
+from thermoxels_ns.radiometry.conditions import Conditions
+from thermoxels_ns.radiometry.known_cameras import COUNT_SCALES, recognised_camera
+from thermoxels_ns.radiometry.measurement_model import corrected_temperature_c
 
 WALL_C = np.array([[18.25, 19.5, 20.75], [21.0, 22.25, 23.5]])
 

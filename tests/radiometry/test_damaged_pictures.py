@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.capture.camera_card import counts, photograph
-from tests.data.flir_file import FlirFile, picture_bytes, segment, smooth_counts
+from tests.support.camera_card import counts, photograph
+from tests.support.flir_file import FlirFile, picture_bytes, segment, smooth_counts
 from thermoxels_ns.capture.camera_files import look_at
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
-from thermoxels_ns.data.decoders import naming
-from thermoxels_ns.data.flir_rjpeg import read_flir_jpeg
-from thermoxels_ns.data.jpeg_segments import DamagedJpegError, check_jpeg, jpeg_segments
-from thermoxels_ns.data.radiometry import RadiometryOptions, read_thermogram
-from thermoxels_ns.data.thermal_size import LARGEST_SIDE
-from thermoxels_ns.errors import SceneError, ThermalFileError, ThermoxelsError
+from thermoxels_ns.core.errors import SceneError, ThermalFileError, ThermoxelsError
+from thermoxels_ns.radiometry.camera_file import RadiometryOptions, read_thermogram
+from thermoxels_ns.radiometry.decoders import naming
+from thermoxels_ns.radiometry.flir_rjpeg import read_flir_jpeg
+from thermoxels_ns.radiometry.image_size import LARGEST_SIDE
+from thermoxels_ns.radiometry.jpeg_segments import DamagedJpegError, check_jpeg, jpeg_segments
 
 READERS: tuple[Callable[[Path], object], ...] = (
     lambda path: look_at(path, path.parent),

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.data.flir_file import picture_bytes, segment
-from thermoxels_ns.data.dji_rjpeg import is_dji_rjpeg
-from thermoxels_ns.data.radiometry import RadiometryOptions, read_thermogram
-from thermoxels_ns.errors import ThermalFileError
+from tests.support.flir_file import picture_bytes, segment
+from thermoxels_ns.core.errors import ThermalFileError
+from thermoxels_ns.radiometry.camera_file import RadiometryOptions, read_thermogram
+from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg
 
-STUB = Path(__file__).with_name("dirp_stub.c")
+STUB = Path(__file__).parents[1] / "support" / "dirp_stub.c"
 
 
 @pytest.fixture

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.data.flir_file import FlirFile, picture_bytes, smooth_counts
-from thermoxels_ns.data.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
-from thermoxels_ns.data.radiometry import RadiometryOptions, read_thermogram
-from thermoxels_ns.data.thermal_files import ThermalUnit, read_thermal_file
-from thermoxels_ns.errors import ThermalFileError
+from tests.support.flir_file import FlirFile, picture_bytes, smooth_counts
+from thermoxels_ns.core.errors import ThermalFileError
+from thermoxels_ns.radiometry.camera_file import RadiometryOptions, read_thermogram
+from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
+from thermoxels_ns.radiometry.thermal_files import ThermalUnit, read_thermal_file
 
 REAL_SHAPES = {
     "flir_b60_cc0.jpg": (180, 180),

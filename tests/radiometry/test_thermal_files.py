@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from thermoxels_ns.data.dead_pixels import find_dead_pixels
-from thermoxels_ns.data.thermal_files import ThermalUnit, read_temperature_c, read_thermal_file
+from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.data.thermal_survey import survey_thermal_files
-from thermoxels_ns.errors import ThermalFileError
+from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
+from thermoxels_ns.radiometry.thermal_files import ThermalUnit, read_temperature_c, read_thermal_file
 
 BOUNDS = ThermalUnit.bounds(-10.0, 40.0)
 COUNTS = ThermalUnit.linear(0.025, -100.0)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from thermoxels_ns import threads
+from thermoxels_ns.core import threads
 
 
 @pytest.fixture

@@ -20,11 +20,11 @@ from tests.reference.two_renderers import (
     random_request,
     see,
 )
-from thermoxels_ns.errors import ThermoxelsError
+from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.ray_rendering import fused_render, reference_render, sample_rays
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
+from thermoxels_ns.render.renderers import fused_render, reference_render, sample_rays
 
 CUBE = Lattice.covering((-1, -1, -1), (1, 1, 1), 16)
 TUBE = Lattice((0.0, 0.0, 0.0), 1.0, (257, 2, 2))

@@ -22,9 +22,9 @@ from tests.reference.two_renderers import (
     random_request,
     see,
 )
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.ray_rendering import fused_render, sample_rays
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
+from thermoxels_ns.render.renderers import fused_render, sample_rays
 
 ACTIVATIONS = ("relu", "softplus", "exp")
 

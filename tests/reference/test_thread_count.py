@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from tests.reference.two_renderers import random_grid, random_request
-from tests.short_training import train_with_optimizers
-from thermoxels_ns.data.synthetic import make_scene, write_scene
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.optim import RowAdam, RowRMSprop
-from thermoxels_ns.ray_rendering import fused_render, sample_rays
+from tests.support.short_training import train_with_optimizers
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.threads import num_threads, set_num_threads
 from thermoxels_ns.render.ray_render import RenderOptions
-from thermoxels_ns.threads import num_threads, set_num_threads
+from thermoxels_ns.render.renderers import fused_render, sample_rays
+from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.training.optimizers import RowAdam, RowRMSprop
 
 COUNTS = (1, 2, 5)
 

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.field.voxel_grid import DensityActivation, VoxelGrid
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.ray_rendering import fused_render, reference_render
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
+from thermoxels_ns.render.renderers import fused_render, reference_render
 
 Renderer = Callable[[VoxelGrid, RayRequest, RenderOptions], RayRender]
 RENDERERS: dict[str, Renderer] = {"reference": reference_render, "fused": fused_render}

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from tests.reference.two_renderers import random_grid, random_request
-from thermoxels_ns.optim import touched_rows
-from thermoxels_ns.ray_rendering import fused_render
 from thermoxels_ns.render import ordered_rows
 from thermoxels_ns.render.ordered_rows import in_order, remember_order
 from thermoxels_ns.render.ray_render import RenderOptions
+from thermoxels_ns.render.renderers import fused_render
+from thermoxels_ns.training.optimizers import touched_rows
 
 FLAT = RenderOptions(sh_degree=1)
 

@@ -17,11 +17,11 @@ from tests.reference.two_renderers import (
     random_request,
     see,
 )
-from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.threads import num_threads, set_num_threads
 from thermoxels_ns.render import fused, row_gradients
 from thermoxels_ns.render.kernels import AHEAD, Records
 from thermoxels_ns.render.kernels_rows import Order, first_voxel, order_records
-from thermoxels_ns.threads import num_threads, set_num_threads
 
 
 @pytest.fixture
@@ -99,7 +99,7 @@ def test_rows_of_total_variation_alone_have_a_gradient_and_no_others():
 
 
 def fused_render_variation(grid, options) -> torch.Tensor:
-    from thermoxels_ns.ray_rendering import fused_render
+    from thermoxels_ns.render.renderers import fused_render
 
     return fused_render(grid, random_request(grid, 10), options).variation["sh"]
 

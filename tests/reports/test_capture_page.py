@@ -7,10 +7,10 @@ import re
 import numpy as np
 import pytest
 
-from tests.capture.posed_model import ring_model
-from thermoxels_ns.capture.charts import bars, histogram
-from thermoxels_ns.capture.contract import CameraModel, RigEstimate, RigFrame
+from tests.support.posed_model import ring_model
 from thermoxels_ns.capture.overlays import colours, data_url, spread_out, thermal_in_photograph
+from thermoxels_ns.capture.stage_types import CameraModel, RigEstimate, RigFrame
+from thermoxels_ns.reports.svg_charts import bars, histogram
 
 THERMAL = CameraModel(80, 60, 70.0, 70.0, 41.0, 29.0)
 

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from thermoxels_ns.cost_report import (
+from thermoxels_ns.commands.cost_runs import FIGURES, CostRun, CostSetting
+from thermoxels_ns.reports.cost_report import (
     CostRow,
     Targets,
     cheapest,
@@ -21,7 +22,6 @@ from thermoxels_ns.cost_report import (
     verdict,
     write_csv,
 )
-from thermoxels_ns.cost_runs import FIGURES, CostRun, CostSetting
 
 NAN = math.nan
 NOTHING = dict.fromkeys(FIGURES, NAN)

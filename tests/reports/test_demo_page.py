@@ -11,8 +11,8 @@ from io import BytesIO
 import pytest
 from PIL import Image
 
-from thermoxels_ns.demo_page import Check, ColourBar, DemoPage, Figure, HeldOutView, build_page
-from thermoxels_ns.errors import ThermoxelsError
+from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.reports.demo_page import Check, ColourBar, DemoPage, Figure, HeldOutView, build_page
 
 
 def picture(colour: str, kind: str = "PNG") -> bytes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from thermoxels_ns.heat_report import HeatReport, Section, build_report
+from thermoxels_ns.reports.heat_report import HeatReport, Section, build_report
 
 
 def test_doubts_stand_above_the_figures() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from thermoxels_ns.heat_figures import Dust, degrees, dust_of, figure, unit_signs
+from thermoxels_ns.reports.heat_numbers import Dust, degrees, dust_of, figure, unit_signs
 
 
 @pytest.mark.parametrize(

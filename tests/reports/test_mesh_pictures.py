@@ -10,8 +10,8 @@ import pytest
 import pyvista
 from PIL import Image
 
-from thermoxels_ns.errors import MeshError, OutputError
-from thermoxels_ns.mesh.pictures import _view_axes, change_colours, picture_of_mesh
+from thermoxels_ns.core.errors import MeshError, OutputError
+from thermoxels_ns.reports.mesh_pictures import _view_axes, change_colours, picture_of_mesh
 
 SIZE = (400, 300)
 
@@ -134,7 +134,7 @@ def test_bad_input_is_refused(tmp_path, box_mesh):
 
 
 def test_a_few_hot_nodes_do_not_take_all_the_colours() -> None:
-    from thermoxels_ns.mesh.pictures import _colour_limits, _without_outliers
+    from thermoxels_ns.reports.mesh_pictures import _colour_limits, _without_outliers
 
     level = np.linspace(10.0, 12.0, 1000)
     with_lamp = np.append(level, [77.0, 78.0])

@@ -9,8 +9,8 @@ from io import BytesIO
 import pytest
 from PIL import Image
 
-from thermoxels_ns.errors import ThermoxelsError
-from thermoxels_ns.page_style import embedded_image, html_page, scrolling
+from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.reports.page_style import embedded_image, html_page, scrolling
 
 
 def luminance(colour: str) -> float:

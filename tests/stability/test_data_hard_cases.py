@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from thermoxels_ns.data.thermal_datamanager import ThermalDataManager, ThermalDataManagerConfig
-from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
-from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
+from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
+from thermoxels_ns.data.datamanager import ThermalDataManager, ThermalDataManagerConfig
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 
 DEAD_COLUMN = 5
 

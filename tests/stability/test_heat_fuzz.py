@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.heat_meshes import box_mesh
-from tests.obtuse_bodies import AT_THE_BOUNDS, H, body, dressed
-from thermoxels_ns.errors import HeatError
+from tests.support.heat_meshes import box_mesh
+from tests.support.obtuse_bodies import AT_THE_BOUNDS, H, body, dressed
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effects import Convection, Effect, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps

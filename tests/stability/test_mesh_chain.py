@@ -7,14 +7,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from tests.looking_cameras import looking_at
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.lattice import Lattice
+from tests.support.looking_cameras import looking_at
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
+from thermoxels_ns.mesh.boundary.facet_normals import LEAST_AREA_FACTOR, MOST_AREA_FACTOR
 from thermoxels_ns.mesh.build import BuiltMesh, MeshOptions, build_mesh
-from thermoxels_ns.mesh.facet_normals import LEAST_AREA_FACTOR, MOST_AREA_FACTOR
-from thermoxels_ns.mesh.quality import check_mesh, facet_areas, facet_normals
-from thermoxels_ns.mesh.solid import SolidSelection
-from thermoxels_ns.snapshot import GridSnapshot, RayEvidence
+from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas, facet_normals
+from thermoxels_ns.mesh.solid.voxels import SolidSelection
 
 MODES = ["conforming", "voxel"]
 AS_IT_IS = SolidSelection(density_threshold=0.5, close_gaps=0, smallest_body=0.0, interior="hollow")

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh
-from thermoxels_ns.mesh.quality import check_mesh
-from thermoxels_ns.mesh.solid import SolidSelection, select_solid
-from thermoxels_ns.snapshot import GridSnapshot
+from thermoxels_ns.mesh.quality.checks import check_mesh
+from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
 
 VOXEL = MeshOptions("voxel")
 

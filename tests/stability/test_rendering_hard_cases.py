@@ -7,10 +7,10 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from thermoxels_ns.errors import ThermoxelsError
+from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.refine import prune
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.lattice import Lattice
 from thermoxels_ns.render.compositing import composite, ray_weights
 from thermoxels_ns.render.march import march
 from thermoxels_ns.render.sampling import intersect_box, sample_box

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.heat_meshes import SIDES, box_mesh
-from tests.obtuse_bodies import AT_THE_BOUNDS, CONCRETE, body
+from tests.support.heat_meshes import SIDES, box_mesh
+from tests.support.obtuse_bodies import AT_THE_BOUNDS, CONCRETE, body
 from thermoxels_ns.fem import steady_range
 from thermoxels_ns.fem.effects import Convection, Effect, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.fem.problem import HeatProblem

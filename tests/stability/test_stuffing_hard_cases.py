@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.stuffed_shapes import (
+from tests.support.stuffed_shapes import (
     ANGLE_BOUNDS_DEG,
     box_distance,
     centres,
@@ -14,8 +14,8 @@ from tests.stuffed_shapes import (
     tet_mesh,
     turn,
 )
-from thermoxels_ns.mesh.quality import MeshQuality, check_mesh, facet_areas
-from thermoxels_ns.mesh.stuffing import StuffedSolid, stuff
+from thermoxels_ns.mesh.quality.checks import MeshQuality, check_mesh, facet_areas
+from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
 
 
 def sound(solid: StuffedSolid) -> MeshQuality:

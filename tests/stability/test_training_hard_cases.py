@@ -9,11 +9,11 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.short_training import train
-from thermoxels_ns.data.raycast import render_view
-from thermoxels_ns.data.synthetic import make_scene, write_scene
-from thermoxels_ns.errors import ThermoxelsError
-from thermoxels_ns.streams import RGB_STREAM
+from tests.support.short_training import train
+from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.ray_streams import RGB_STREAM
+from thermoxels_ns.synthetic.raycast import render_view
+from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
 
 def sphere(folder, views=12, **options):

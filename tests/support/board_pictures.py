@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.capture.camera_card import photograph
-from tests.capture.known_rig import turned
-from thermoxels_ns.capture.board_rig import CheckerBoard
-from thermoxels_ns.capture.contract import CameraModel
+from tests.support.camera_card import photograph
+from tests.support.known_rig import turned
+from thermoxels_ns.capture.rig.board_rig import CheckerBoard
+from thermoxels_ns.capture.stage_types import CameraModel
 
 BOARD = CheckerBoard(7, 5, 0.06)
 _PLACES = (

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from tests.heat_meshes import box_mesh
+from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.fem.effects import Convection
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from thermoxels_ns.data.synthetic import make_scene
-from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.build import BoundaryMode, MeshOptions, build_mesh
-from thermoxels_ns.mesh.solid import SolidSelection
+from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-from thermoxels_ns.snapshot import GridSnapshot
+from thermoxels_ns.synthetic.scene_folder import make_scene
 
 
 def demo_mesh(scene_name: str, voxels: int, boundary: BoundaryMode = "conforming") -> TetMesh:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.contract import (
+from thermoxels_ns.capture.stage_types import (
     OPENGL_FROM_OPENCV,
     CameraModel,
     RigEstimate,
@@ -16,9 +16,9 @@ from thermoxels_ns.capture.contract import (
     RigStart,
     radius_squared,
 )
-from thermoxels_ns.data.pinhole import PinholeCamera
-from thermoxels_ns.data.raycast import render_view
-from thermoxels_ns.data.synthetic import make_scene
+from thermoxels_ns.synthetic.pinhole import PinholeCamera
+from thermoxels_ns.synthetic.raycast import render_view
+from thermoxels_ns.synthetic.scene_folder import make_scene
 
 FloatArray = npt.NDArray[np.float64]
 

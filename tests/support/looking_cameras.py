@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.snapshot import Views
+from thermoxels_ns.core.snapshot import Views
 
 
 def looking_at(target: npt.ArrayLike, eyes: npt.ArrayLike, focal: float = 100.0, size: int = 200) -> Views:

@@ -7,11 +7,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from tests.heat_meshes import Nodal
-from tests.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, tet_mesh
+from tests.support.heat_meshes import Nodal
+from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, tet_mesh
 from thermoxels_ns.fem.materials import Material
-from thermoxels_ns.mesh.quality import dihedral_range_deg
-from thermoxels_ns.mesh.stuffing import stuff
+from thermoxels_ns.mesh.quality.checks import dihedral_range_deg
+from thermoxels_ns.mesh.stuffing.isosurface import stuff
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from thermoxels_ns.mesh.patches import default_patches
+from thermoxels_ns.mesh.boundary.patches import default_patches
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
 

@@ -14,8 +14,8 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.engine.optimizers import Optimizers
 
 from thermoxels_ns.config import thermoxels
-from thermoxels_ns.pipeline import ThermoxelsPipeline
-from thermoxels_ns.presets import with_overrides
+from thermoxels_ns.core.presets import with_overrides
+from thermoxels_ns.training.pipeline import ThermoxelsPipeline
 
 
 def train(scene: Path, steps: int, model: dict[str, Any] | None = None, rays: int = 512, rate: float = 1.0):

@@ -9,14 +9,14 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from tests.house_mesh import house_mesh
-from thermoxels_ns.lattice import CORNER_OFFSETS, Lattice
+from tests.support.house_mesh import house_mesh
+from thermoxels_ns.core.lattice import CORNER_OFFSETS, Lattice
+from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh
-from thermoxels_ns.mesh.quality import signed_volumes
-from thermoxels_ns.mesh.solid import SolidSelection
+from thermoxels_ns.mesh.quality.checks import signed_volumes
+from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_facets, boundary_tags, kuhn_tets
-from thermoxels_ns.snapshot import GridSnapshot
 
 
 @pytest.fixture

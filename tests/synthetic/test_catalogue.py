@@ -6,10 +6,10 @@ import itertools
 import numpy as np
 import pytest
 
-from thermoxels_ns.data.pinhole import CameraRing, PinholeCamera, look_at, ring_poses
-from thermoxels_ns.data.raycast import render_view, visible_surface_points
-from thermoxels_ns.data.synthetic_scenes import SCENE_NAMES, make_scene
-from thermoxels_ns.errors import SceneError
+from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.synthetic.catalogue import SCENE_NAMES, make_scene
+from thermoxels_ns.synthetic.pinhole import CameraRing, PinholeCamera, look_at, ring_poses
+from thermoxels_ns.synthetic.raycast import render_view, visible_surface_points
 
 
 @pytest.fixture(params=SCENE_NAMES)
@@ -237,8 +237,8 @@ def test_supersampling_is_the_mean_of_a_finer_image(scene) -> None:
 def test_images_do_not_depend_on_how_rays_are_chunked(scene, monkeypatch: pytest.MonkeyPatch) -> None:
     pose, camera = scene.poses(3, 0)[0][0], scene.camera(32, 24)
     whole = render_view(scene, pose, camera)
-    monkeypatch.setattr("thermoxels_ns.data.raycast._RAYS_PER_CHUNK", 101)
-    monkeypatch.setattr("thermoxels_ns.data.solids._RAYS_PER_CHUNK", 37)
+    monkeypatch.setattr("thermoxels_ns.synthetic.raycast._RAYS_PER_CHUNK", 101)
+    monkeypatch.setattr("thermoxels_ns.synthetic.solids._RAYS_PER_CHUNK", 37)
     parts = render_view(scene, pose, camera)
     np.testing.assert_allclose(parts.rgb, whole.rgb, atol=1e-6)
     np.testing.assert_array_equal(parts.depth_m, whole.depth_m)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from thermoxels_ns.data.raycast import render_view
-from thermoxels_ns.data.synthetic import SCENE_NAMES, load_truth, make_scene, write_scene
-from thermoxels_ns.errors import OutputError, SceneError
+from thermoxels_ns.core.errors import OutputError, SceneError
+from thermoxels_ns.synthetic.raycast import render_view
+from thermoxels_ns.synthetic.scene_folder import SCENE_NAMES, load_truth, make_scene, write_scene
 
 SMALL = {"num_train": 3, "num_eval": 2, "width": 40, "height": 30, "progress": False}
 

@@ -13,14 +13,14 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 
-from thermoxels_ns.coarse_to_fine import prune_by_rays
-from thermoxels_ns.errors import MemoryBudgetError, PruningError
-from thermoxels_ns.model import ThermoxelsModel
-from thermoxels_ns.model_config import ThermoxelsModelConfig
-from thermoxels_ns.optim import RowAdam
-from thermoxels_ns.sightlines import Sightlines
-from thermoxels_ns.track_carving import empty_voxels
-from thermoxels_ns.units import TemperatureRange
+from thermoxels_ns.core.errors import MemoryBudgetError, PruningError
+from thermoxels_ns.core.feature_rays import Sightlines
+from thermoxels_ns.core.units import TemperatureRange
+from thermoxels_ns.training.callbacks import prune_by_rays
+from thermoxels_ns.training.model import ThermoxelsModel
+from thermoxels_ns.training.model_config import ThermoxelsModelConfig
+from thermoxels_ns.training.optimizers import RowAdam
+from thermoxels_ns.training.track_carving import empty_voxels
 
 
 def model_of(**options) -> ThermoxelsModel:

@@ -7,7 +7,7 @@ import types
 import pytest
 import torch
 
-from thermoxels_ns import metrics
+from thermoxels_ns.training import image_metrics as metrics
 
 
 def images(h=48, w=64):

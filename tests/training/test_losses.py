@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from thermoxels_ns import losses
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.kept_voxels import KeptVoxels
-from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.training import losses
 
 
 def voxel_corners(lattice: Lattice, cells=None) -> torch.Tensor:

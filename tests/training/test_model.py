@@ -8,15 +8,15 @@ import torch
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
 
-from thermoxels_ns import pipeline
-from thermoxels_ns.errors import MemoryBudgetError, SceneError, ThermoxelsError
+from thermoxels_ns.core.errors import MemoryBudgetError, SceneError, ThermoxelsError
+from thermoxels_ns.core.feature_rays import Sightlines
+from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
+from thermoxels_ns.core.snapshot import Views
+from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.field.refine import prune
-from thermoxels_ns.model import ThermoxelsModel
-from thermoxels_ns.model_config import LOSS_RECIPES, ThermoxelsModelConfig
-from thermoxels_ns.sightlines import Sightlines
-from thermoxels_ns.snapshot import Views
-from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
-from thermoxels_ns.units import TemperatureRange
+from thermoxels_ns.training import pipeline
+from thermoxels_ns.training.model import ThermoxelsModel
+from thermoxels_ns.training.model_config import LOSS_RECIPES, ThermoxelsModelConfig
 
 BOX = SceneBox(aabb=torch.tensor([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]]))
 
@@ -344,7 +344,7 @@ def test_both_backends_train_alike():
 
 
 def test_a_lattice_beyond_the_budget_is_refused_before_it_is_built(monkeypatch):
-    monkeypatch.setattr("thermoxels_ns.model.VoxelField", lambda *_: pytest.fail("the field was built"))
+    monkeypatch.setattr("thermoxels_ns.training.model.VoxelField", lambda *_: pytest.fail("the field was built"))
     with pytest.raises(MemoryBudgetError, match=r"4096 x 4096 x 2048 voxels .*--pipeline.model.memory-budget-gb"):
         make(resolutions=(4096,), memory_budget_gb=64.0)
 

@@ -9,10 +9,17 @@ import numpy as np
 import pytest
 import torch
 
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.refine import prune, refine
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.optim import RowAdam, RowAdamConfig, RowOptimizer, RowRMSprop, RowRMSpropConfig, touched_rows
+from thermoxels_ns.training.optimizers import (
+    RowAdam,
+    RowAdamConfig,
+    RowOptimizer,
+    RowRMSprop,
+    RowRMSpropConfig,
+    touched_rows,
+)
 
 ROWS, CHANNELS = 50, 6
 KINDS = {"adam": RowAdam, "rmsprop": RowRMSprop}

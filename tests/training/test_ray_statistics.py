@@ -9,14 +9,14 @@ import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
 
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.field.interpolation import TrilinearPoints
 from thermoxels_ns.field.refine import prune
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.ray_rendering import Backend, GridSamples, sample_rays
-from thermoxels_ns.ray_statistics import backdrop_evidence, field_evidence, share_of_rays_opened, voxel_weights
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
-from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
+from thermoxels_ns.render.renderers import Backend, GridSamples, sample_rays
+from thermoxels_ns.training.ray_statistics import backdrop_evidence, field_evidence, share_of_rays_opened, voxel_weights
 
 
 @dataclass

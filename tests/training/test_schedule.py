@@ -6,8 +6,8 @@ import pytest
 import tyro
 
 from thermoxels_ns.config import thermoxels
-from thermoxels_ns.errors import ThermoxelsError
-from thermoxels_ns.schedule import QUALITIES, schedule_for
+from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.training.schedule import QUALITIES, schedule_for
 
 
 @pytest.mark.parametrize("steps", [10, 33, 400, 20_000])

@@ -14,14 +14,16 @@ import pytest
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 
-from tests.short_training import train_with_optimizers
-from thermoxels_ns import start_choice
-from thermoxels_ns.data.synthetic import make_scene, write_scene
-from thermoxels_ns.model_config import ThermoxelsModelConfig
-from thermoxels_ns.photo_start import SMALLEST_EPS, find_start
-from thermoxels_ns.pipeline import ThermoxelsPipeline
-from thermoxels_ns.sightlines import Sightlines
-from thermoxels_ns.start_choice import (
+from tests.support.short_training import train_with_optimizers
+from thermoxels_ns.core.feature_rays import Sightlines
+from thermoxels_ns.core.ray_streams import RGB_STREAM
+from thermoxels_ns.core.threads import set_num_threads
+from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.training import start_choice
+from thermoxels_ns.training.model_config import ThermoxelsModelConfig
+from thermoxels_ns.training.photo_start import SMALLEST_EPS, find_start
+from thermoxels_ns.training.pipeline import ThermoxelsPipeline
+from thermoxels_ns.training.start_choice import (
     HELD_BACK,
     RAYS_SHARE,
     STARTS,
@@ -32,9 +34,7 @@ from thermoxels_ns.start_choice import (
     held_back,
     lines_of_others,
 )
-from thermoxels_ns.streams import RGB_STREAM
-from thermoxels_ns.threads import set_num_threads
-from thermoxels_ns.track_loss import TrackRays
+from thermoxels_ns.training.track_loss import TrackRays
 
 TWO_LATTICES = {"resolutions": [8, 16], "refine_at": [3], "prune_threshold": 0.0, "hold_density": 2}
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-import thermoxels_ns.track_carving as track_carving
+import thermoxels_ns.training.track_carving as track_carving
+from thermoxels_ns.core.feature_rays import Sightlines, agrees_with_neighbours
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.sightlines import Sightlines, agrees_with_neighbours
-from thermoxels_ns.track_carving import MARGIN_VOXELS, carve_air, empty_voxels
+from thermoxels_ns.training.track_carving import MARGIN_VOXELS, carve_air, empty_voxels
 
 BOX = Lattice.covering((-1, -1, -1), (1, 1, 1), 20)
 

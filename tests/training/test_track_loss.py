@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from thermoxels_ns.core.feature_rays import Sightlines
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.ray_rendering import render_rays
 from thermoxels_ns.render.ray_render import RenderOptions
-from thermoxels_ns.sightlines import Sightlines
-from thermoxels_ns.track_loss import MARGIN_ERRORS, MARGIN_VOXELS, TrackRays, track_loss
+from thermoxels_ns.render.renderers import render_rays
+from thermoxels_ns.training.track_loss import MARGIN_ERRORS, MARGIN_VOXELS, TrackRays, track_loss
 
 CPU = torch.device("cpu")
 LATTICE = Lattice.covering((-1, -1, -1), (1, 1, 1), 20)

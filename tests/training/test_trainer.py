@@ -11,9 +11,9 @@ import tyro
 import yaml
 
 from thermoxels_ns.config import thermoxels
-from thermoxels_ns.data.synthetic import make_scene, write_scene
-from thermoxels_ns.errors import CheckpointError
-from thermoxels_ns.trainer import ThermoxelsTrainer, writer
+from thermoxels_ns.core.errors import CheckpointError
+from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.training.trainer import ThermoxelsTrainer, writer
 
 DRAFT = ("--quality", "draft")
 

@@ -14,12 +14,12 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.engine.optimizers import Optimizers
 
 from thermoxels_ns.config import thermoxels
-from thermoxels_ns.data.synthetic import make_scene, write_scene
-from thermoxels_ns.errors import CheckpointError
+from thermoxels_ns.core.errors import CheckpointError
+from thermoxels_ns.core.presets import with_overrides
 from thermoxels_ns.field.memory import memory_need
-from thermoxels_ns.model_config import ThermoxelsModelConfig
-from thermoxels_ns.pipeline import ThermoxelsPipeline
-from thermoxels_ns.presets import with_overrides
+from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.training.model_config import ThermoxelsModelConfig
+from thermoxels_ns.training.pipeline import ThermoxelsPipeline
 
 RISES = 9
 """Step from which colour depends on the direction."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.heat_meshes import box_mesh, graded, planes
+from tests.support.heat_meshes import box_mesh, graded, planes
 from thermoxels_ns.fem.effects import Convection, FixedTemperature
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem

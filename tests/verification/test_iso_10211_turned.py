@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.heat_meshes import box_mesh, graded, planes
+from tests.support.heat_meshes import box_mesh, graded, planes
 from tests.verification.test_iso_10211 import CASE_1, CASE_2, at, conductor
 from thermoxels_ns.fem.effects import Convection, FixedTemperature
 from thermoxels_ns.fem.problem import HeatProblem

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.building_corner import COLDEST_C, LISTED_W, building_corner
-from tests.heat_meshes import box_mesh, planes
-from tests.shell_mesh import shell_mesh
+from tests.support.building_corner import COLDEST_C, LISTED_W, building_corner
+from tests.support.heat_meshes import box_mesh, planes
+from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.fem.effects import Convection, FixedTemperature
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem

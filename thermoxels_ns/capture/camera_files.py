@@ -14,12 +14,12 @@ from typing import Literal
 from PIL import Image
 
 from thermoxels_ns.capture.photograph import read_photograph_facts
-from thermoxels_ns.data.decoders import naming
-from thermoxels_ns.data.dji_rjpeg import is_dji_rjpeg
-from thermoxels_ns.data.exif_facts import read_exif_facts
-from thermoxels_ns.data.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
-from thermoxels_ns.data.thermal_size import check_file_size, check_thermal_size
-from thermoxels_ns.errors import SceneError, ThermoxelsError, explain
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError, explain
+from thermoxels_ns.radiometry.decoders import naming
+from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg
+from thermoxels_ns.radiometry.exif import read_exif_facts
+from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
+from thermoxels_ns.radiometry.image_size import check_file_size, check_thermal_size
 
 Role = Literal["photograph", "thermal", "both", "thermal picture"]
 """thermal picture: its name says thermal, but it holds colours and no temperatures."""

@@ -11,7 +11,7 @@ from thermoxels_ns.capture.job import PAGE_NAME, CaptureJob
 from thermoxels_ns.capture.no_pairs import no_pairs
 from thermoxels_ns.capture.pairs import Pair, PairOptions, find_pairs, read_pair_list
 from thermoxels_ns.capture.stages import fingerprint, given_fingerprints, read_json, write_json
-from thermoxels_ns.errors import SceneError
+from thermoxels_ns.core.errors import SceneError
 
 _MOST_NAMED = 10
 """Files left out that are named while the command runs."""

@@ -10,7 +10,7 @@ import numpy as np
 from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.masks import PhotographMasks, find_overlay, mask_files
 from thermoxels_ns.capture.photograph import read_photograph_facts
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError, explain
 
 _LOOKED_AT = 40
 """Photographs that overlays are looked for in."""

@@ -15,12 +15,12 @@ from thermoxels_ns.capture.masks import read_mask
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.photograph import GpsFix, open_photograph, read_photograph_facts
 from thermoxels_ns.capture.stages import read_json, write_json
-from thermoxels_ns.data.dead_pixels import find_dead_pixels
-from thermoxels_ns.data.flir_records import PictureInPicture
-from thermoxels_ns.data.flir_rjpeg import read_flir_jpeg
-from thermoxels_ns.data.radiometric_conditions import Conditions
-from thermoxels_ns.data.radiometry import RadiometryOptions, read_thermogram
-from thermoxels_ns.errors import SceneError, ThermoxelsError, explain
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError, explain
+from thermoxels_ns.radiometry.camera_file import RadiometryOptions, read_thermogram
+from thermoxels_ns.radiometry.conditions import Conditions
+from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
+from thermoxels_ns.radiometry.flir_records import PictureInPicture
+from thermoxels_ns.radiometry.flir_rjpeg import read_flir_jpeg
 
 _LIST = "frames.json"
 _MOST_FOR_DEAD_PIXELS = 60

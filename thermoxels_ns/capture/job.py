@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from thermoxels_ns.capture.board_rig import CheckerBoard
+from thermoxels_ns.capture.rig.board_rig import CheckerBoard
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.stages import StageCache
-from thermoxels_ns.data.radiometry import RadiometryOptions
+from thermoxels_ns.radiometry.camera_file import RadiometryOptions
 
 PAGE_NAME = "capture.html"
 """Of the page, in the output folder."""

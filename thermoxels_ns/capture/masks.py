@@ -12,7 +12,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from thermoxels_ns.capture.photograph import open_photograph
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError, explain
 
 MIN_FRAMES = 8
 """Fewer photographs cannot tell what is drawn over them from what they all happen to show."""

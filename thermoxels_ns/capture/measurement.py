@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from thermoxels_ns.capture.frames import CaptureFrame
-from thermoxels_ns.data.radiometric_conditions import Conditions
+from thermoxels_ns.radiometry.conditions import Conditions
 
 _MOST_LISTED = 4
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from thermoxels_ns.capture.camera_files import CameraFile, CameraFolder, shown_name
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError, explain
 
 _DJI_LIBRARY = (
     "DJI's thermal images also need DJI's own library: download the DJI Thermal SDK and pass --dji-library with the "

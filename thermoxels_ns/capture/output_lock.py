@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from thermoxels_ns.capture.stages import CACHE_FOLDER
-from thermoxels_ns.errors import OutputError, explain
+from thermoxels_ns.core.errors import OutputError, explain
 
 try:
     import fcntl

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from thermoxels_ns.capture.contract import CameraModel, RigEstimate, RigFrame
 from thermoxels_ns.capture.photograph import open_photograph
-from thermoxels_ns.capture.sparse_depth import SparseDepth
+from thermoxels_ns.capture.sfm.sparse_depth import SparseDepth
+from thermoxels_ns.capture.stage_types import CameraModel, RigEstimate, RigFrame
 
 _WIDTH = 640
 _DEPTH_STEP = 4

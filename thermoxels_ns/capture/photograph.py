@@ -13,9 +13,9 @@ from typing import Any
 
 from PIL import Image
 
-from thermoxels_ns.data.decoders import naming
-from thermoxels_ns.data.exif_facts import ExifFacts, read_exif_facts
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.radiometry.decoders import naming
+from thermoxels_ns.radiometry.exif import ExifFacts, read_exif_facts
 
 LARGEST_SIDE = 30000
 """Pixels along a side of a photograph that is believed; a header that claims more is damaged."""

@@ -9,19 +9,19 @@ import numpy as np
 from thermoxels_ns.capture import results
 from thermoxels_ns.capture.frame_masks import find_masks, user_masks
 from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames
-from thermoxels_ns.capture.given_poses import fitted_to_photographs, in_order, read_given_poses
-from thermoxels_ns.capture.gravity import Up, find_up, level_rotation
 from thermoxels_ns.capture.job import CaptureJob
 from thermoxels_ns.capture.masks import PhotographMasks, mask_files
-from thermoxels_ns.capture.metric_scale import (
+from thermoxels_ns.capture.sfm.given_poses import fitted_to_photographs, in_order, read_given_poses
+from thermoxels_ns.capture.sfm.gravity import Up, find_up, level_rotation
+from thermoxels_ns.capture.sfm.metric_scale import (
     MeasuredDistance,
     MetricScale,
     scale_from_distance,
     scale_from_gps,
     scale_from_markers,
 )
-from thermoxels_ns.capture.poses import PoseOptions, add_points, find_poses
-from thermoxels_ns.capture.sfm_model import SfmModel
+from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.sfm.poses import PoseOptions, add_points, find_poses
 from thermoxels_ns.capture.stages import CACHE_FOLDER, files_of, given_fingerprints, read_json, write_json
 
 _OVERLAY_FILE = "overlay.npy"

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from thermoxels_ns.capture.camera_files import shown_name
-from thermoxels_ns.capture.contract import RigEstimate
 from thermoxels_ns.capture.frames import CaptureFrames
 from thermoxels_ns.capture.overlays import colours, data_url, overlay, spread_out
-from thermoxels_ns.capture.page import CapturePage, Overlay, write_page
 from thermoxels_ns.capture.pairs import Pair
-from thermoxels_ns.capture.rig_inputs import rig_frames
+from thermoxels_ns.capture.rig.inputs import rig_frames
 from thermoxels_ns.capture.scene_writer import Scene, scene_names
+from thermoxels_ns.capture.stage_types import RigEstimate
+from thermoxels_ns.reports.capture_page import CapturePage, Overlay, write_page
 
 _SHOWN = 6
 _SHOWN_PERCENTILES = (2.0, 98.0)

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from thermoxels_ns.capture.camera_files import shown_name
-from thermoxels_ns.capture.contract import CameraModel, DriftEstimate, RigEstimate
-from thermoxels_ns.capture.gravity import Up
-from thermoxels_ns.capture.metric_scale import MetricScale
 from thermoxels_ns.capture.pairs import Pair, PairSearch
-from thermoxels_ns.capture.sfm_model import SfmModel
+from thermoxels_ns.capture.sfm.gravity import Up
+from thermoxels_ns.capture.sfm.metric_scale import MetricScale
+from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.stage_types import CameraModel, DriftEstimate, RigEstimate
 from thermoxels_ns.capture.stages import read_json, write_json
-from thermoxels_ns.checks import replace_when_done
-from thermoxels_ns.errors import ThermoxelsError, explain
+from thermoxels_ns.core.checks import replace_when_done
+from thermoxels_ns.core.errors import ThermoxelsError, explain
 
 
 def save_pairs(folder: Path, search: PairSearch, root: Path) -> None:

@@ -8,21 +8,21 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
-from thermoxels_ns.capture.board_photos import board_of
 from thermoxels_ns.capture.camera_files import scan_folder
-from thermoxels_ns.capture.contract import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.file_stages import pair_stage, temperature_stage
 from thermoxels_ns.capture.job import PAGE_NAME, CaptureJob
-from thermoxels_ns.capture.metric_scale import MetricScale
 from thermoxels_ns.capture.output_lock import only_capture
 from thermoxels_ns.capture.pose_stages import photograph_masks, pose_stage, scale_stage
 from thermoxels_ns.capture.report import Findings, report_page
+from thermoxels_ns.capture.rig.board_photos import board_of
 from thermoxels_ns.capture.scene_writer import JSON_NAME, SCENE_CONTENT, Scene, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
+from thermoxels_ns.capture.sfm.metric_scale import MetricScale
+from thermoxels_ns.capture.stage_types import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.stages import StageCache, prepare_output
 from thermoxels_ns.capture.thermal_stages import board_stage, drift_stage, rig_stage
-from thermoxels_ns.checks import remove_stale_temporaries
-from thermoxels_ns.errors import OutputError, SceneError, ThermoxelsError, explain
+from thermoxels_ns.core.checks import remove_stale_temporaries
+from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError, explain
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,15 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from thermoxels_ns.capture.contract import CameraModel, DriftEstimate, FloatArray, RigEstimate
 from thermoxels_ns.capture.frames import CaptureFrame
-from thermoxels_ns.capture.gravity import Up
 from thermoxels_ns.capture.masks import PhotographMasks
-from thermoxels_ns.capture.metric_scale import MetricScale
 from thermoxels_ns.capture.photograph import open_photograph
-from thermoxels_ns.capture.sfm_model import SfmModel
+from thermoxels_ns.capture.sfm.gravity import Up
+from thermoxels_ns.capture.sfm.metric_scale import MetricScale
+from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.stage_types import CameraModel, DriftEstimate, FloatArray, RigEstimate
 from thermoxels_ns.capture.stages import CACHE_FOLDER, write_json
-from thermoxels_ns.checks import remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
 from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, SparseTracks, write_tracks
 
 JSON_NAME = "transforms.json"

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError, explain
 
 FloatArray = npt.NDArray[np.float64]
 

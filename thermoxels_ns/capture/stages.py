@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from thermoxels_ns import __version__
-from thermoxels_ns.checks import remove_file, replace_when_done, writable_folder
-from thermoxels_ns.errors import OutputError, SceneError, ThermoxelsError, explain
+from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError, explain
 
 StageName = Literal["pairs", "temperatures", "poses", "scale", "board", "rig", "drift", "scene", "page"]
 """The stages in order."""

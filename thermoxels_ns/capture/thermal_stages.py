@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from thermoxels_ns.capture import results
-from thermoxels_ns.capture.board_photos import in_scene_units, rig_from_board_photos
-from thermoxels_ns.capture.contract import DriftEstimate, RigEstimate
-from thermoxels_ns.capture.drift import estimate_drift
 from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames
 from thermoxels_ns.capture.job import CaptureJob
-from thermoxels_ns.capture.metric_scale import MetricScale
-from thermoxels_ns.capture.rig import estimate_rig
-from thermoxels_ns.capture.rig_inputs import kept_start, read_rig, rig_frames, rig_start
-from thermoxels_ns.capture.rig_words import rig_lines
-from thermoxels_ns.capture.sfm_model import SfmModel
+from thermoxels_ns.capture.rig.board_photos import in_scene_units, rig_from_board_photos
+from thermoxels_ns.capture.rig.drift import estimate_drift
+from thermoxels_ns.capture.rig.inputs import kept_start, read_rig, rig_frames, rig_start
+from thermoxels_ns.capture.rig.search import estimate_rig
+from thermoxels_ns.capture.rig.summary import rig_lines
+from thermoxels_ns.capture.sfm.metric_scale import MetricScale
+from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.stage_types import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.stages import files_of, fingerprint, given_fingerprints
 
 _LEAST_SIGHTINGS = 50

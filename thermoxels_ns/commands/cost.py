@@ -17,15 +17,15 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from thermoxels_ns.checks import check_positive, replace_when_done, writable_folder
-from thermoxels_ns.errors import ThermoxelsError, explain
+from thermoxels_ns.core.checks import check_positive, replace_when_done, writable_folder
+from thermoxels_ns.core.errors import ThermoxelsError, explain
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from thermoxels_ns.cost_process import Watch
-    from thermoxels_ns.cost_report import Targets
-    from thermoxels_ns.cost_runs import Bench, CostRun, CostSetting
+    from thermoxels_ns.commands.cost_process import Watch
+    from thermoxels_ns.commands.cost_runs import Bench, CostRun, CostSetting
+    from thermoxels_ns.reports.cost_report import Targets
 
 _RUNS, _TABLE, _PLOT, _PAGE = "runs.csv", "cost.csv", "cost.png", "cost.md"
 _QUIET_S = 60.0
@@ -86,7 +86,7 @@ class Cost:
 
 def run_cost(cost: Cost, console: Console) -> None:
     """Measure and report, see `Cost`."""
-    from thermoxels_ns.cost_runs import Bench, read_runs, write_runs
+    from thermoxels_ns.commands.cost_runs import Bench, read_runs, write_runs
 
     targets = _targets(cost)
     settings, baseline = planned_settings(cost)
@@ -141,7 +141,7 @@ def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
     Raises:
         ThermoxelsError: Nothing is to be trained, a setting is not one, or the baseline is none of them.
     """
-    from thermoxels_ns.cost_runs import CostSetting, parse_setting, training_options
+    from thermoxels_ns.commands.cost_runs import CostSetting, parse_setting, training_options
 
     for name in ("methods", "recipes"):
         if not getattr(cost, name):
@@ -186,7 +186,7 @@ def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
 
 
 def _targets(cost: Cost) -> Targets:
-    from thermoxels_ns.cost_report import Targets
+    from thermoxels_ns.reports.cost_report import Targets
 
     for name in ("target_mae", "target_psnr"):
         value = getattr(cost, name)
@@ -231,7 +231,7 @@ def _report(
     console: Console,
 ) -> None:
     """Write and print the table, the plot and which setting will do."""
-    from thermoxels_ns.cost_report import draw_plot, markdown_table, median_rows, verdict, write_csv
+    from thermoxels_ns.reports.cost_report import draw_plot, markdown_table, median_rows, verdict, write_csv
 
     rows = median_rows(settings, runs, baseline)
     counts = sorted({row.repeats for row in rows})

@@ -16,8 +16,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from thermoxels_ns.demo_commands import installed_command
-from thermoxels_ns.errors import ThermoxelsError, explain
+from thermoxels_ns.commands.demo_commands import installed_command
+from thermoxels_ns.core.errors import ThermoxelsError, explain
 
 _POLL_S = 0.05
 _TAIL_BYTES = 4096

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from thermoxels_ns import __version__
-from thermoxels_ns.checks import replace_when_done, writable_folder
-from thermoxels_ns.cost_process import ProcessCost, Watch, run_measured
-from thermoxels_ns.demo_commands import command_line
-from thermoxels_ns.errors import SceneError, ThermoxelsError, explain
+from thermoxels_ns.commands.cost_process import ProcessCost, Watch, run_measured
+from thermoxels_ns.commands.demo_commands import command_line
+from thermoxels_ns.core.checks import replace_when_done, writable_folder
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError, explain
 
 FIGURES: Mapping[str, str] = {
     "seconds": "wall time of the whole ns-train command, from its start to its end",
@@ -121,7 +121,7 @@ def training_options(resolution: int, steps: int) -> list[str]:
     Raises:
         ThermoxelsError: There is no schedule for them.
     """
-    from thermoxels_ns.schedule import schedule_for
+    from thermoxels_ns.training.schedule import schedule_for
 
     schedule = schedule_for(resolution, steps)
     words = ["--max-num-iterations", str(schedule.steps)]

@@ -15,16 +15,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from thermoxels_ns.checks import replace_when_done, writable_folder
-from thermoxels_ns.errors import OutputError, ThermoxelsError, explain
+from thermoxels_ns.core.checks import replace_when_done, writable_folder
+from thermoxels_ns.core.errors import OutputError, ThermoxelsError, explain
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
     from rich.console import Console
 
-    from thermoxels_ns.demo_page import ColourBar, DemoPage
-    from thermoxels_ns.demo_results import DemoResults
+    from thermoxels_ns.commands.demo_results import DemoResults
+    from thermoxels_ns.reports.demo_page import ColourBar, DemoPage
 
 SceneName = Literal["hot-object", "house-corner", "sphere", "courtyard", "pipes"]
 """The synthetic scenes."""
@@ -81,10 +81,10 @@ class _Steps:
 
 def run_demo(demo: Demo, console: Console) -> None:
     """Run all steps; see `Demo`."""
-    from thermoxels_ns.data.synthetic import make_scene, write_scene
-    from thermoxels_ns.demo_commands import command_line, run_command
-    from thermoxels_ns.demo_page import build_page
-    from thermoxels_ns.demo_results import read_results
+    from thermoxels_ns.commands.demo_commands import command_line, run_command
+    from thermoxels_ns.commands.demo_results import read_results
+    from thermoxels_ns.reports.demo_page import build_page
+    from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
     if demo.iterations is not None and demo.iterations < 1:
         raise ThermoxelsError(
@@ -202,8 +202,8 @@ def assemble_page(
     Raises:
         ThermoxelsError: A picture that a command should have written is missing.
     """
-    from thermoxels_ns.demo_commands import command_line
-    from thermoxels_ns.demo_page import Check, DemoPage, Figure, HeldOutView
+    from thermoxels_ns.commands.demo_commands import command_line
+    from thermoxels_ns.reports.demo_page import Check, DemoPage, Figure, HeldOutView
 
     bar = _colour_bar(folder / "scene")
     renders = folder / "renders" / "test"
@@ -270,7 +270,7 @@ def assemble_page(
 
 def heat_steps(folder: Path, scene: str) -> Iterator[tuple[str, str]]:
     """Commands that lead to a heat report: of a building with walls, of anything else as it was exported."""
-    from thermoxels_ns.demo_commands import command_line
+    from thermoxels_ns.commands.demo_commands import command_line
 
     config = folder / "outputs" / "demo" / "thermoxels" / "run" / "config.yml"
     mesh, weather, said = folder / "export" / "mesh.vtu", "original", "ten windy, sunny minutes"
@@ -326,7 +326,7 @@ def _colour_bar(scene: Path) -> ColourBar:
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
-    from thermoxels_ns.demo_page import ColourBar
+    from thermoxels_ns.reports.demo_page import ColourBar
 
     bounds = json.loads((scene / "temperature_bounds.json").read_text())
     stops = (n / (_COLOUR_STOPS - 1) for n in range(_COLOUR_STOPS))

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from thermoxels_ns.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError, explain
 
 _LAST_LINES = 12
 _QUIET_S = 20.0

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from thermoxels_ns.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError, explain
 
 _ENERGY_UNITS = ("J", "kJ", "MJ", "GJ", "TJ", "PJ")
 """Each a thousand of the one before."""

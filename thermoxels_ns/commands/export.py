@@ -16,17 +16,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_shape
-from thermoxels_ns.errors import CheckpointError, ThermoxelsError, explain
-from thermoxels_ns.export_options import ExportOptions, Viewpoint, check_options, scale_of
-from thermoxels_ns.export_snapshot import export_snapshot, prepare_folder
+from thermoxels_ns.commands.export_options import ExportOptions, Viewpoint, check_options, scale_of
+from thermoxels_ns.commands.export_snapshot import export_snapshot, prepare_folder
+from thermoxels_ns.core.checks import check_shape
+from thermoxels_ns.core.errors import CheckpointError, ThermoxelsError, explain
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
 
-    from thermoxels_ns.mesh.solid import SolidCells
+    from thermoxels_ns.core.snapshot import GridSnapshot
+    from thermoxels_ns.mesh.solid.voxels import SolidCells
     from thermoxels_ns.mesh.tetrahedra import TetMesh
-    from thermoxels_ns.snapshot import GridSnapshot
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class ExportThermoxelsMesh(ExportOptions):
         scene = load_trained_scene(self.load_config, check_scale)
 
         def compare(solid: SolidCells, mesh: TetMesh, scale: float) -> dict[str, Any] | None:
-            from thermoxels_ns.truth_comparison import compare_with_truth
+            from thermoxels_ns.evaluation.truth_comparison import compare_with_truth
 
             lattice = scene.snapshot.lattice
             return compare_with_truth(solid.cells, lattice, scene.world_to_input, scene.scene_folder, mesh, scale)

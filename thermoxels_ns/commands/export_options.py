@@ -10,24 +10,24 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
-from thermoxels_ns.errors import MeshError, explain
-from thermoxels_ns.scene_scale import (
+from thermoxels_ns.commands.scene_scale import (
     SceneScale,
     choose_scale,
     scale_from_known_distance,
     scale_from_option,
     up_from_scene_file,
 )
+from thermoxels_ns.core.errors import MeshError, explain
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from typing import Any
 
     from thermoxels_ns.fem.materials import Material
-    from thermoxels_ns.fem.presets import HeatPreset
     from thermoxels_ns.fem.problem import TimeSteps
-    from thermoxels_ns.mesh.patch_rules import PatchRules
-    from thermoxels_ns.mesh.solid import SolidSelection
+    from thermoxels_ns.heat.presets import HeatPreset
+    from thermoxels_ns.mesh.boundary.patch_rules import PatchRules
+    from thermoxels_ns.mesh.solid.voxels import SolidSelection
 
 Settings = TypeVar("Settings", "Material", "TimeSteps")
 Vector = tuple[float, float, float]
@@ -133,10 +133,10 @@ def check_options(options: ExportOptions) -> CheckedOptions:
     Raises:
         ThermoxelsError: An option is out of range, or a file cannot be read.
     """
-    from thermoxels_ns.fem.presets import load_heat_preset
+    from thermoxels_ns.heat.presets import load_heat_preset
+    from thermoxels_ns.mesh.boundary.patch_rules import PatchRules, load_patch_rules
     from thermoxels_ns.mesh.build import MeshOptions
-    from thermoxels_ns.mesh.patch_rules import PatchRules, load_patch_rules
-    from thermoxels_ns.mesh.solid import SolidSelection
+    from thermoxels_ns.mesh.solid.voxels import SolidSelection
 
     if options.metres_per_unit is not None:
         scale_from_option(options.metres_per_unit)

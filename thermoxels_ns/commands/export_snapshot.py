@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import refuse_what_is_in_the_way, remove_file, remove_stale_temporaries, writable_folder
-from thermoxels_ns.errors import ThermoxelsError
-from thermoxels_ns.export_options import ExportOptions, Viewpoint, check_options, scale_of, up_of
+from thermoxels_ns.commands.export_options import ExportOptions, Viewpoint, check_options, scale_of, up_of
+from thermoxels_ns.core.checks import refuse_what_is_in_the_way, remove_file, remove_stale_temporaries, writable_folder
+from thermoxels_ns.core.errors import ThermoxelsError
 
 if TYPE_CHECKING:
+    from thermoxels_ns.core.snapshot import GridSnapshot
     from thermoxels_ns.mesh.build import BuiltMesh
-    from thermoxels_ns.mesh.solid import SolidCells
+    from thermoxels_ns.mesh.solid.voxels import SolidCells
     from thermoxels_ns.mesh.tetrahedra import TetMesh
-    from thermoxels_ns.snapshot import GridSnapshot
 
 Say = Callable[[str], None]
 
@@ -44,8 +44,8 @@ def prepare_folder(output_dir: Path | str, *, heat: bool) -> Path:
     Raises:
         OutputError: The folder cannot be written to, or a folder has the name of a file of the export.
     """
-    from thermoxels_ns.fem.files import STEP_PATTERN
-    from thermoxels_ns.mesh.formats import MESH_FORMATS
+    from thermoxels_ns.heat.vtk_series import STEP_PATTERN
+    from thermoxels_ns.mesh.files.formats import MESH_FORMATS
 
     folder = writable_folder(output_dir)
     names = (*_mesh_files(MESH_FORMATS), *_MESH_PICTURES, _HEAT, _HEAT_PICTURE, _QUALITY, _SUMMARY)
@@ -91,18 +91,18 @@ def export_snapshot(
     Raises:
         ThermoxelsError: An option is out of range, nothing is solid, the folder cannot be written to, or heat fails.
     """
-    from thermoxels_ns.export_pictures import draw_heat, draw_mesh
-    from thermoxels_ns.export_summary import HEAT_SKIPPED, heat_summary, mesh_summary, versions
-    from thermoxels_ns.fem.files import heat_series_paths, remove_heat_series, write_heat_series
+    from thermoxels_ns.commands.export_summary import HEAT_SKIPPED, heat_summary, mesh_summary, versions
     from thermoxels_ns.fem.problem import HeatProblem
     from thermoxels_ns.fem.stepping import solve_heat
-    from thermoxels_ns.mesh.abaqus_file import HeatStep
+    from thermoxels_ns.heat.vtk_series import heat_series_paths, remove_heat_series, write_heat_series
     from thermoxels_ns.mesh.build import MeshOptions, build_mesh
-    from thermoxels_ns.mesh.files import summary_text, write_summary
-    from thermoxels_ns.mesh.formats import MESH_FORMATS, check_format, write_mesh
-    from thermoxels_ns.mesh.quality import check_mesh
-    from thermoxels_ns.mesh.quality_picture import picture_of_quality
-    from thermoxels_ns.mesh.quality_report import quality_report
+    from thermoxels_ns.mesh.files.abaqus import HeatStep
+    from thermoxels_ns.mesh.files.formats import MESH_FORMATS, check_format, write_mesh
+    from thermoxels_ns.mesh.files.vtu import summary_text, write_summary
+    from thermoxels_ns.mesh.quality.checks import check_mesh
+    from thermoxels_ns.mesh.quality.picture import picture_of_quality
+    from thermoxels_ns.mesh.quality.report import quality_report
+    from thermoxels_ns.reports.export_pictures import draw_heat, draw_mesh
 
     checked = check_options(options)
     scale = scale_of(options, checked, scene_file)
@@ -193,7 +193,7 @@ def _without_up(scale: Mapping[str, Any]) -> dict[str, Any]:
 
 def _mesh_files(suffixes: Iterable[str]) -> list[str]:
     """Names of the files that the mesh is written to in these formats."""
-    from thermoxels_ns.mesh.formats import mesh_file_paths
+    from thermoxels_ns.mesh.files.formats import mesh_file_paths
 
     return [path.name for suffix in suffixes for path in mesh_file_paths(f"{_MESH_STEM}{suffix}")]
 
@@ -242,7 +242,7 @@ def _compared(
 
     A mesh with an inner side, of a shell or of a wall, gets a note on what that does to the figures.
     """
-    from thermoxels_ns.export_summary import INNER_SIDE
+    from thermoxels_ns.commands.export_summary import INNER_SIDE
 
     try:
         truth = compare(built.solid, built.mesh, metres)

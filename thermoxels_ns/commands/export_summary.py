@@ -11,13 +11,13 @@ import numpy as np
 from thermoxels_ns import __version__
 
 if TYPE_CHECKING:
-    from thermoxels_ns.fem.presets import HeatPreset
+    from thermoxels_ns.commands.scene_scale import SceneScale
     from thermoxels_ns.fem.solution import HeatSolution
+    from thermoxels_ns.heat.presets import HeatPreset
     from thermoxels_ns.mesh.build import BuiltMesh
-    from thermoxels_ns.mesh.quality_report import QualityReport
-    from thermoxels_ns.mesh.solid import SolidCells, SolidSelection
+    from thermoxels_ns.mesh.quality.report import QualityReport
+    from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection
     from thermoxels_ns.mesh.tetrahedra import TetMesh
-    from thermoxels_ns.scene_scale import SceneScale
 
 NO_SCALE = (
     "The size of the scene is not known. Pass --metres-per-unit, the length in metres of one unit of the input poses "

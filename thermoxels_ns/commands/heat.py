@@ -56,7 +56,7 @@ class Heat:
         """
         from rich.console import Console
 
-        from thermoxels_ns.heat_run import run_heat
+        from thermoxels_ns.commands.heat_run import run_heat
 
         console = Console(highlight=False)
         run_heat(self, lambda line: console.print(line, markup=False, soft_wrap=True))

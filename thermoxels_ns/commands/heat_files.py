@@ -10,26 +10,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermoxels_ns.checks import (
+from thermoxels_ns.commands.heat import Heat
+from thermoxels_ns.core.checks import (
     refuse_what_is_in_the_way,
     remove_file,
     remove_stale_temporaries,
     replace_when_done,
     writable_folder,
 )
-from thermoxels_ns.fem.answers import plain_values
-from thermoxels_ns.fem.files import STEP_PATTERN, remove_heat_series, write_heat_series
-from thermoxels_ns.fem.lumped_body import LumpedBody
 from thermoxels_ns.fem.solution import SteadySolution
-from thermoxels_ns.heat_command import Heat
-from thermoxels_ns.heat_page import heat_page
-from thermoxels_ns.heat_pictures import PICTURES, draw_surface
-from thermoxels_ns.heat_report import build_report
-from thermoxels_ns.heat_solving import steps_taken, time_error_k
-from thermoxels_ns.mesh.files import summary_text, write_summary, write_vtu
+from thermoxels_ns.heat.lumped_body import LumpedBody
+from thermoxels_ns.heat.results import plain_values
+from thermoxels_ns.heat.solving import steps_taken, time_error_k
+from thermoxels_ns.heat.vtk_series import STEP_PATTERN, remove_heat_series, write_heat_series
+from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtu
+from thermoxels_ns.reports.heat_page import heat_page
+from thermoxels_ns.reports.heat_pictures import PICTURES, draw_surface
+from thermoxels_ns.reports.heat_report import build_report
 
 if TYPE_CHECKING:
-    from thermoxels_ns.heat_run import HeatRun
+    from thermoxels_ns.commands.heat_run import HeatRun
 
 ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY = "answers.json", "series.csv", "report.html", "heat.pvd", "heat.vtu"
 """Files of a run; pictures come on top."""

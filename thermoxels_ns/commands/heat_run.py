@@ -12,22 +12,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.errors import HeatError, MeshError, explain
-from thermoxels_ns.fem.answers import Answers, heat_answers
-from thermoxels_ns.fem.heat_scene import HeatScene
-from thermoxels_ns.fem.lumped_body import LumpedBody
+from thermoxels_ns.commands.heat import Heat
+from thermoxels_ns.commands.heat_files import prepared_folder, write_heat_files
+from thermoxels_ns.core.errors import HeatError, MeshError, explain
 from thermoxels_ns.fem.probes import Probes, place_probes
 from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.savings import seconds_saved
-from thermoxels_ns.fem.scene_doubts import scene_doubts, unused_settings
-from thermoxels_ns.fem.scene_file import load_heat_scene
-from thermoxels_ns.fem.screening import Screening
 from thermoxels_ns.fem.solution import SteadySolution
 from thermoxels_ns.fem.solution_nodes import Solution, SolutionNodes, solution_nodes
-from thermoxels_ns.fem.wall_answers import WallAnswer, faces_inside, not_only_airs, wall_answer
-from thermoxels_ns.heat_command import Heat
-from thermoxels_ns.heat_files import prepared_folder, write_heat_files
-from thermoxels_ns.heat_solving import (
+from thermoxels_ns.heat.lumped_body import LumpedBody
+from thermoxels_ns.heat.results import Answers, heat_answers
+from thermoxels_ns.heat.savings import seconds_saved
+from thermoxels_ns.heat.scene import HeatScene
+from thermoxels_ns.heat.scene_file import load_heat_scene
+from thermoxels_ns.heat.scene_warnings import scene_doubts, unused_settings
+from thermoxels_ns.heat.screening import Screening
+from thermoxels_ns.heat.solving import (
     Accuracy,
     Say,
     check_accuracy_options,
@@ -35,8 +34,9 @@ from thermoxels_ns.heat_solving import (
     solve_scene,
     steps_taken,
 )
-from thermoxels_ns.mesh.facet_owners import facet_owners
-from thermoxels_ns.mesh.read_mesh import read_mesh
+from thermoxels_ns.heat.wall_results import WallAnswer, faces_inside, not_only_airs, wall_answer
+from thermoxels_ns.mesh.boundary.facet_owners import facet_owners
+from thermoxels_ns.mesh.files.read import read_mesh
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Vector = npt.NDArray[np.float64]

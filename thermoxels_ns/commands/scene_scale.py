@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_finite, check_positive, check_shape
-from thermoxels_ns.errors import SceneError, ThermoxelsError, explain
+from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError, explain
 
 Vector = tuple[float, float, float]
 

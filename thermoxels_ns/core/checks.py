@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.errors import OutputError, ThermoxelsError, explain
+from thermoxels_ns.core.errors import OutputError, ThermoxelsError, explain
 
 
 def check_positive(name: str, value: float, remedy: str, error: type[ThermoxelsError] = ThermoxelsError) -> float:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from thermoxels_ns.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError, explain
 
-_PACKAGE = Path(__file__).resolve().parent
+_PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def configs_folder() -> Path:

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable
 from pathlib import Path
 
-from thermoxels_ns.checks import replace_when_done
+from thermoxels_ns.core.checks import replace_when_done
 
 _DIGEST = "thermoxels-kernels.sha256"
 

@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 
 import yaml
 
-from thermoxels_ns.configs_folder import configs_folder
-from thermoxels_ns.errors import ThermoxelsError, explain
+from thermoxels_ns.core.configs_folder import configs_folder
+from thermoxels_ns.core.errors import ThermoxelsError, explain
 
 Config = TypeVar("Config")
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from thermoxels_ns.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError, explain
 
 if TYPE_CHECKING:
     import torch

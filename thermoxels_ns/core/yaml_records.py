@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 import yaml
 
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError, explain
 
 Record = TypeVar("Record")
 

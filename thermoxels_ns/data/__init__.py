@@ -1,1 +1,1 @@
-"""From files to rays and temperatures: scenes, thermal files, synthetic scenes with known truth."""
+"""From scene folders to rays and temperatures."""

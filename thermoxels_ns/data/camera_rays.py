@@ -9,7 +9,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError, explain
 
 TABLE_LIMIT_BYTES = 2 * 1024**3
 """Above this the directions are computed per batch: scenes where every photograph has intrinsics of its own."""

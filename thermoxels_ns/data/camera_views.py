@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
-from thermoxels_ns.snapshot import Views
+from thermoxels_ns.core.snapshot import Views
 
 _WIDEST = np.deg2rad(80.0)
 """Angle from the optical axis up to which a pinhole stands for a fisheye lens."""

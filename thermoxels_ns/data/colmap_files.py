@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
-from thermoxels_ns.errors import SceneError
+from thermoxels_ns.core.errors import SceneError
 
 _LEAST_CAMERA_BYTES = 48
 """Of a camera with three parameters; others have more."""

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.core.feature_rays import FloatArray, IntArray
 from thermoxels_ns.data.colmap_files import check_complete
 from thermoxels_ns.data.folder_walls import path_inside
 from thermoxels_ns.data.pose_alignment import align_poses
 from thermoxels_ns.data.scene_file import Frame, SceneFile
 from thermoxels_ns.data.sparse_tracks import SparseTracks
-from thermoxels_ns.errors import SceneError
-from thermoxels_ns.sightlines import FloatArray, IntArray
 
 COLMAP_FOLDERS = ("colmap/sparse/0", "colmap/sparse", "colmap", "sparse/0", "sparse")
 """Where a model may lie in a scene's folder, the first that does counts."""

@@ -17,12 +17,12 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIn
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.data.camera_views import views_of_cameras
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig
+from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.data.photo_streams import PhotoStreams, draw_generator
-from thermoxels_ns.data.thermal_dataparser import ThermalDataParserConfig
-from thermoxels_ns.data.thermal_dataset import ThermalDataset
-from thermoxels_ns.errors import SceneError, explain
-from thermoxels_ns.snapshot import Views
 
 _TRAIN, _EVAL, _EVAL_IMAGE = 0, 1, 2
 
@@ -94,7 +94,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
         """Return the training batch of a step: rays, and ``image`` (n, 3) and ``thermal`` (n, 1) targets.
 
-        ``ray_bundle.metadata["stream"]`` says which targets a ray has (see `thermoxels_ns.streams`).
+        ``ray_bundle.metadata["stream"]`` says which targets a ray has (see `thermoxels_ns.core.ray_streams`).
         """
         number = step if self.test_mode == "val" else self.train_count
         self.train_count += 1
@@ -123,7 +123,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         Works in every test_mode; decodes no photographs.
 
         Args:
-            stream: Bits of `thermoxels_ns.streams`; thermal gives valid pixels only, both bits give every ray once. A
+            stream: Bits of `core.ray_streams`; thermal gives valid pixels only, both bits give every ray once. A
                 stream that does not train (see the option streams) gives nothing.
             max_rays_per_image: Widen the stride per photograph until no more rays than this remain.
             stride: Every n-th pixel in both directions.

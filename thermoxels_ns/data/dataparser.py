@@ -15,14 +15,14 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserCo
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.feature_rays import Sightlines
 from thermoxels_ns.data.pose_file_cameras import Intrinsics
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
 from thermoxels_ns.data.splits import Split, split_frames
 from thermoxels_ns.data.thermal_survey import ThermalSurvey, survey_thermal_files
 from thermoxels_ns.data.track_sources import TrackSource, find_sightlines
-from thermoxels_ns.errors import SceneError, explain
-from thermoxels_ns.sightlines import Sightlines
 
 SCENE_SIZE = 2.0
 """Longest side of the scene box in nerfstudio's world; learning rates of the field rely on it."""

@@ -15,9 +15,9 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 from torch import Tensor
 
-from thermoxels_ns.data.thermal_files import PixelReport, read_thermal_file
-from thermoxels_ns.errors import SceneError, explain
-from thermoxels_ns.units import TemperatureRange
+from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.units import TemperatureRange
+from thermoxels_ns.radiometry.thermal_files import PixelReport, read_thermal_file
 
 
 class ThermalDataset(InputDataset):

@@ -11,10 +11,10 @@ from jaxtyping import Bool, Int
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
+from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.data.camera_rays import CameraRays
-from thermoxels_ns.data.thermal_dataset import ThermalDataset
-from thermoxels_ns.errors import SceneError, explain
-from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
+from thermoxels_ns.data.dataset import ThermalDataset
 
 Streams = Literal["both", "rgb", "thermal"]
 _BITS = {"both": RGB_STREAM | THERMAL_STREAM, "rgb": RGB_STREAM, "thermal": THERMAL_STREAM}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermoxels_ns.sightlines import FloatArray
+from thermoxels_ns.core.feature_rays import FloatArray
 
 _ROUNDS = 20
 _FEWEST = 3

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 from PIL import Image
 
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError, explain
 
 # One centre per camera: the training rays store one direction per pixel and one origin per photograph.
 _CENTRAL = (CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.EQUIRECTANGULAR)

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.errors import SceneError, explain
 from thermoxels_ns.data.colmap_files import check_complete
 from thermoxels_ns.data.colmap_tracks import COLMAP_FOLDERS
 from thermoxels_ns.data.scene_file import Frame, SceneFile
-from thermoxels_ns.errors import SceneError, explain
 
 Box = npt.NDArray[np.float64]
 """Lowest and highest corner, shape (2, 3)."""

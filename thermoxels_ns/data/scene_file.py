@@ -11,9 +11,9 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.errors import SceneError, explain
 from thermoxels_ns.data.pose_file_cameras import Intrinsics, read_intrinsics, read_pose
-from thermoxels_ns.data.thermal_files import THERMAL_SUFFIXES, ThermalUnit
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.radiometry.thermal_files import THERMAL_SUFFIXES, ThermalUnit
 
 JSON_NAMES = ("transforms.json", "transforms_thermal.json")
 BOUNDS_NAME = "temperature_bounds.json"

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoxels_ns.checks import replace_when_done
+from thermoxels_ns.core.checks import replace_when_done
+from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.feature_rays import FloatArray, IntArray, Sightlines, agrees_with_neighbours
 from thermoxels_ns.data.scene_file import Frame
-from thermoxels_ns.errors import SceneError, explain
-from thermoxels_ns.sightlines import FloatArray, IntArray, Sightlines, agrees_with_neighbours
 
 TRACKS_KEY = "tracks_file_path"
 """Name in transforms.json under which the file of tracks is given."""

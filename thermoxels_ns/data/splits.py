@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError, explain
 
 SplitMode = Literal["auto", "filename", "lists", "interval"]
 _KEYS = {"train": "train_filenames", "val": "val_filenames", "test": "test_filenames"}

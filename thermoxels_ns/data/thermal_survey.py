@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.data.dead_pixels import find_dead_pixels
-from thermoxels_ns.data.thermal_files import ThermalUnit, read_temperature_c
-from thermoxels_ns.errors import ThermalFileError, explain
-from thermoxels_ns.units import TemperatureRange
+from thermoxels_ns.core.errors import ThermalFileError, explain
+from thermoxels_ns.core.units import TemperatureRange
+from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
+from thermoxels_ns.radiometry.thermal_files import ThermalUnit, read_temperature_c
 
 _MOST_FRAMES = 64
 """Frames per resolution that the search for dead pixels keeps in memory."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal
 
+from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.core.feature_rays import Sightlines
 from thermoxels_ns.data.colmap_tracks import read_colmap_tracks, warn_unused
 from thermoxels_ns.data.folder_walls import path_inside
 from thermoxels_ns.data.scene_file import SceneFile
 from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, read_tracks, sightlines
-from thermoxels_ns.errors import SceneError
-from thermoxels_ns.sightlines import Sightlines
 
 TrackSource = Literal["auto", "given", "off"]
 

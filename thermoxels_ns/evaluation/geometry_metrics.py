@@ -12,12 +12,12 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
-from thermoxels_ns.errors import MeshError, ThermoxelsError
-from thermoxels_ns.mesh.accuracy import surface_fscore
+from thermoxels_ns.core.errors import MeshError, ThermoxelsError
+from thermoxels_ns.core.snapshot import GridSnapshot
+from thermoxels_ns.evaluation.truth_comparison import TOLERANCE_VOXELS, KnownTruth, load_known_truth, points_seen
+from thermoxels_ns.evaluation.voxel_accuracy import surface_fscore
 from thermoxels_ns.mesh.build import check_similarity
-from thermoxels_ns.mesh.solid import SolidSelection, select_solid
-from thermoxels_ns.snapshot import GridSnapshot
-from thermoxels_ns.truth_comparison import TOLERANCE_VOXELS, KnownTruth, load_known_truth, points_seen
+from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
 
 HALF_TRANSPARENT = (0.1, 0.9)
 """A ray whose accumulation lies strictly between these is neither through nor stopped."""
@@ -53,7 +53,7 @@ def geometry_metrics(
     """Compare the surface that an export with default options has with the exact scene, if it is known.
 
     The surface is the boundary of the voxels that `SolidSelection` chooses by default; precision, recall and F-score
-    are defined by `thermoxels_ns.truth_comparison.compare_with_truth`.
+    are defined by `thermoxels_ns.evaluation.truth_comparison.compare_with_truth`.
 
     Args:
         snapshot: The trained field, with the evidence and the cameras that an export has.

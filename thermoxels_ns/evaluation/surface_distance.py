@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_positive, check_shape
-from thermoxels_ns.errors import MeshError, explain
-from thermoxels_ns.mesh.accuracy import TrueShape
-from thermoxels_ns.mesh.quality import facet_areas
+from thermoxels_ns.core.checks import check_positive, check_shape
+from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.evaluation.voxel_accuracy import TrueShape
+from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 
 

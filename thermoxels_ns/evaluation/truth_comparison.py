@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_positive
-from thermoxels_ns.data.pinhole import PinholeCamera
-from thermoxels_ns.data.scene_truth import SyntheticScene
-from thermoxels_ns.data.synthetic import load_truth, visible_surface_points
-from thermoxels_ns.errors import MeshError, SceneError, explain
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.mesh.accuracy import MIN_VIEWS, surface_fscore
+from thermoxels_ns.core.checks import check_positive
+from thermoxels_ns.core.errors import MeshError, SceneError, explain
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import Views
+from thermoxels_ns.evaluation.surface_distance import surface_distances
+from thermoxels_ns.evaluation.voxel_accuracy import MIN_VIEWS, surface_fscore
 from thermoxels_ns.mesh.build import check_similarity
-from thermoxels_ns.mesh.morphology import fill_enclosed
-from thermoxels_ns.mesh.quality import facet_areas, signed_volumes
-from thermoxels_ns.mesh.surface_distance import surface_distances
+from thermoxels_ns.mesh.quality.checks import facet_areas, signed_volumes
+from thermoxels_ns.mesh.solid.morphology import fill_enclosed
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-from thermoxels_ns.snapshot import Views
+from thermoxels_ns.synthetic.pinhole import PinholeCamera
+from thermoxels_ns.synthetic.scene_folder import load_truth, visible_surface_points
+from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 __all__ = ["MIN_VIEWS", "TOLERANCE_VOXELS", "KnownTruth", "compare_with_truth", "load_known_truth", "points_seen"]
 
@@ -124,7 +124,7 @@ def compare_with_truth(
 
         With a mesh also ``mesh_volume_m3`` and ``mesh_area_m2`` (of the true surface that its triangles stand for);
         ``chamfer_voxels``, ``chamfer_m`` and ``hausdorff_m`` between its surface and the part of the true one that is
-        seen (`thermoxels_ns.mesh.surface_distance`); ``temperature_seen_mae_c``, the mean absolute error [K] at the
+        seen (`surface_distance`); ``temperature_seen_mae_c``, the mean absolute error [K] at the
         surface points closest to those true points that lie within the tolerance, and ``share_of_seen_reached``, the
         share of them that do; and of the boundary nodes within the tolerance of the true surface:
         ``temperature_nodes``, the number that a thermal ray measured, and ``temperature_mae_c``, their mean absolute

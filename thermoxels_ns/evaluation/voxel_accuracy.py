@@ -9,13 +9,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from thermoxels_ns.checks import check_finite, check_positive, check_shape
-from thermoxels_ns.errors import MeshError, explain
-from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
+from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.build import apply_transform, check_similarity
-from thermoxels_ns.mesh.free_space import look
-from thermoxels_ns.mesh.morphology import fill_enclosed
-from thermoxels_ns.snapshot import Views
+from thermoxels_ns.mesh.solid.free_space import look
+from thermoxels_ns.mesh.solid.morphology import fill_enclosed
 
 MIN_VIEWS = 3
 """A point of a surface is seen if at least this many training cameras see it."""

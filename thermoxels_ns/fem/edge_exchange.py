@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.edge_midpoints import TET_EDGES, edge_numbers
 from thermoxels_ns.fem.effect_forms import effect_forms
 from thermoxels_ns.fem.fixed_nodes import FixedNodes
@@ -15,7 +16,6 @@ from thermoxels_ns.fem.quadratic_elements import edge_shapes
 from thermoxels_ns.fem.quadratic_space import QuadraticSpace
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.sparsity import MeshEdges
-from thermoxels_ns.units import ZERO_CELSIUS_K
 
 Vector = npt.NDArray[np.float64]
 

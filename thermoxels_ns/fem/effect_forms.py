@@ -5,11 +5,11 @@ from __future__ import annotations
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
-from thermoxels_ns.fem.account import Assembled
 from thermoxels_ns.fem.forms import FixedForm, FluxForm, Form, RadiationForm, RobinForm, SourceForm
 from thermoxels_ns.fem.linear_space import LinearSpace
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.solver_statistics import Assembled
 from thermoxels_ns.fem.terms import FluxTerm, RadiationTerm, RobinTerm, SourceTerm
 
 

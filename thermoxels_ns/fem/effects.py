@@ -10,11 +10,11 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.quantities import Bounded, Bounds, Quantity
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.terms import FixedTerm, FluxTerm, RadiationTerm, RobinTerm, SourceTerm, Term
-from thermoxels_ns.units import ZERO_CELSIUS_K
 
 STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8
 """Stefan-Boltzmann constant (CODATA 2018), [W / (m2 K4)]."""

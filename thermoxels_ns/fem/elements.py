@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from thermoxels_ns.checks import check_finite, check_shape
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.fem.sparsity import MeshEdges, checked_tets
 
 _REMEDY = "Build the mesh with thermoxels_ns.mesh."

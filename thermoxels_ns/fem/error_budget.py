@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermoxels_ns.checks import check_positive
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.checks import check_positive
+from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
-from thermoxels_ns.units import ZERO_CELSIUS_K
 
 _EQUAL = 1e-9
 """Temperatures that differ by less than this share of the absolute temperature are equal."""

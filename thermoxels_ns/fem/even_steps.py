@@ -20,10 +20,10 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.fem.effect_forms import effect_labels
+from thermoxels_ns.fem.limiter import RangeWatch
 from thermoxels_ns.fem.marching import RANGE_SHARE
 from thermoxels_ns.fem.matrix_parts import product_of_rows
 from thermoxels_ns.fem.problem import AdaptiveSteps
-from thermoxels_ns.fem.range_keeper import RangeWatch
 from thermoxels_ns.fem.schemes import SDIRK2
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.stage import Stage

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.fem.system import HeatSystem
 
 MOST_RISE_K = 1e6

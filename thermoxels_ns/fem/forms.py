@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.linear_space import LinearSpace, sums_by_number
 from thermoxels_ns.fem.quantities import Bounded
 from thermoxels_ns.fem.terms import FixedTerm, FluxTerm, RadiationTerm, RobinTerm, SourceTerm
-from thermoxels_ns.units import ZERO_CELSIUS_K
 
 Vector = npt.NDArray[np.float64]
 

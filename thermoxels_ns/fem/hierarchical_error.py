@@ -6,10 +6,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from thermoxels_ns.errors import HeatError
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.edge_exchange import EdgeExchange, EdgeSpace
 from thermoxels_ns.fem.edge_operator import EdgeOperator
-from thermoxels_ns.fem.edge_surplus import Surplus
+from thermoxels_ns.fem.hierarchical_error_in_time import Surplus
 from thermoxels_ns.fem.matrix_parts import block_of
 from thermoxels_ns.fem.solver_choice import LinearSolver
 from thermoxels_ns.fem.steady import heat_of_groups_w

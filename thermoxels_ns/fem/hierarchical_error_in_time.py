@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.errors import HeatError
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.stage import Stage

@@ -18,11 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
+from thermoxels_ns.fem.positive_off_diagonals import WrongCouplings
 from thermoxels_ns.fem.schemes import BACKWARD_EULER
 from thermoxels_ns.fem.stepper import Step, Stepper
 from thermoxels_ns.fem.system import HeatSystem
-from thermoxels_ns.fem.wrong_couplings import WrongCouplings
-from thermoxels_ns.units import ZERO_CELSIUS_K
 
 Vector = npt.NDArray[np.float64]
 

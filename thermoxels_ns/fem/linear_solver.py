@@ -10,7 +10,7 @@ import numpy.typing as npt
 from numba import njit
 from scipy import sparse
 
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.fem.sparsity import product_and_bound
 
 Vector = npt.NDArray[np.float64]

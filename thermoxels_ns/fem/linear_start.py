@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermoxels_ns.fem.error_budget import ErrorSize, flow_error
+from thermoxels_ns.fem.hierarchical_error import steady_surplus
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.solution import SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.steady_surplus import steady_surplus
 from thermoxels_ns.fem.system import HeatSystem
 
 

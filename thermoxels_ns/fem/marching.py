@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.fem.limiter import RangeKeeper, RangeWatch, is_in_range
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
-from thermoxels_ns.fem.range_keeper import RangeKeeper, RangeWatch, is_in_range
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, Scheme
 from thermoxels_ns.fem.stepper import Step, Stepper
 from thermoxels_ns.fem.system import HeatSystem

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from thermoxels_ns.checks import check_positive
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.checks import check_positive
+from thermoxels_ns.core.errors import HeatError, explain
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_finite, check_shape
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.fem.edge_midpoints import TET_EDGES, edge_numbers
 from thermoxels_ns.fem.quadratic_elements import edge_shapes
 from thermoxels_ns.fem.sparsity import mesh_edges

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_finite, check_positive, check_shape
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
+from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.effects import Effect
 from thermoxels_ns.fem.flat_tets import count_flat_tets
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-from thermoxels_ns.units import ZERO_CELSIUS_K
 
 
 @dataclass(frozen=True)

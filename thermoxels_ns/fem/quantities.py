@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError, explain
 
 
 @dataclass(frozen=True)

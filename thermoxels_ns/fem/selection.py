@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_finite, check_shape
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.fem.account import Assembled
+from thermoxels_ns.fem.solver_statistics import Assembled
 
 LEFT_OUT = {
     "convection": "Convection: not modelled, {}.",

@@ -8,7 +8,7 @@ from scipy import sparse
 
 from thermoxels_ns.fem.linear_solver import ConjugateGradients, LinearSolution
 from thermoxels_ns.fem.multigrid import MultigridConjugateGradients
-from thermoxels_ns.fem.swept_solver import SweptConjugateGradients, suits_sweeps
+from thermoxels_ns.fem.sweep_preconditioner import SweptConjugateGradients, suits_sweeps
 
 Vector = npt.NDArray[np.float64]
 

@@ -12,8 +12,8 @@ import numpy.typing as npt
 from numba import njit
 from scipy import sparse
 
-from thermoxels_ns.checks import check_shape
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.checks import check_shape
+from thermoxels_ns.core.errors import HeatError, explain
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.forms import COLDEST_SLOPE_K
 from thermoxels_ns.fem.linear_solver import LinearSolution
 from thermoxels_ns.fem.matrix_parts import block_of
@@ -19,7 +20,6 @@ from thermoxels_ns.fem.solver_choice import LinearSolver
 from thermoxels_ns.fem.starting_guess import StartingGuess
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.fem.two_level import SystemSolver
-from thermoxels_ns.units import ZERO_CELSIUS_K
 
 Vector = npt.NDArray[np.float64]
 

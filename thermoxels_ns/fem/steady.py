@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from thermoxels_ns.errors import HeatError
+from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.effect_forms import effect_labels
-from thermoxels_ns.fem.loose_pieces import check_held
+from thermoxels_ns.fem.floating_components import check_held
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.solution import SteadySolution, heat_by_effect
 from thermoxels_ns.fem.stage import StageSolution
 from thermoxels_ns.fem.steady_range import state_in_range
 from thermoxels_ns.fem.system import HeatSystem
-from thermoxels_ns.units import ZERO_CELSIUS_K
 
 _SUSPICIOUS = 1e-12
 """Residual from which on it is worth to look whether it is a share of nothing."""

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.fem.range_keeper import LEVEL_ROUND_OFF, MOST_SLACK, RANGE_ROUND_OFF
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
+from thermoxels_ns.fem.limiter import LEVEL_ROUND_OFF, MOST_SLACK, RANGE_ROUND_OFF
+from thermoxels_ns.fem.positive_off_diagonals import WrongCouplings
 from thermoxels_ns.fem.stage import Stage, StageSolution
 from thermoxels_ns.fem.system import HeatSystem
-from thermoxels_ns.fem.wrong_couplings import WrongCouplings
-from thermoxels_ns.units import ZERO_CELSIUS_K
 
 Vector = npt.NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.fem.effect_forms import effect_labels
-from thermoxels_ns.fem.loose_pieces import check_stored
+from thermoxels_ns.fem.floating_components import check_stored
 from thermoxels_ns.fem.marching import AdaptiveMarch, Taken, equal_steps
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, SDIRK2, Scheme

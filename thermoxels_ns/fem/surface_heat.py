@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_shape
-from thermoxels_ns.errors import HeatError
+from thermoxels_ns.core.checks import check_shape
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effect_forms import effect_forms, effect_labels
 from thermoxels_ns.fem.fixed_nodes import FixedNodes
 from thermoxels_ns.fem.forms import SourceForm

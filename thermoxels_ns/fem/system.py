@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from thermoxels_ns.errors import HeatError, explain
-from thermoxels_ns.fem.account import Assembled
+from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.fem.effect_forms import effect_forms
 from thermoxels_ns.fem.fixed_nodes import FixedNodes
 from thermoxels_ns.fem.forms import FluxForm, RobinForm, SourceForm
@@ -20,6 +19,7 @@ from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quadratic_space import QuadraticSpace
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solver_choice import LinearSolver
+from thermoxels_ns.fem.solver_statistics import Assembled
 from thermoxels_ns.fem.sparsity import product_and_bound
 from thermoxels_ns.fem.two_level import SystemSolver, TwoLevelConjugateGradients
 

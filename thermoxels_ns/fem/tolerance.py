@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from thermoxels_ns.checks import check_positive
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.checks import check_positive
+from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.fem.error_budget import ErrorSize, Tolerance, difference_between
 from thermoxels_ns.fem.error_estimate import ErrorRatios, error_ratios, recovered_error, richardson
 from thermoxels_ns.fem.linear_start import linear_start

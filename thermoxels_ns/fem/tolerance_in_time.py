@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.fem.edge_surplus import edge_surplus
 from thermoxels_ns.fem.error_budget import ErrorSize, flow_error, mean_flows_w
 from thermoxels_ns.fem.error_estimate import HALF_THE_SIZE, richardson
 from thermoxels_ns.fem.even_steps import EvenSteps
-from thermoxels_ns.fem.loose_pieces import check_stored
+from thermoxels_ns.fem.floating_components import check_stored
+from thermoxels_ns.fem.hierarchical_error_in_time import edge_surplus
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
 from thermoxels_ns.fem.recovered_gradient import curvature_k
 from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values

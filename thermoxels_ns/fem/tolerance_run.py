@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.fem.error_budget import ErrorSize, Tolerance
 from thermoxels_ns.fem.memory import describe_bytes, peak_bytes
 from thermoxels_ns.fem.problem import HeatProblem

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.fem.linear_solver import LinearSolution, is_solved
 from thermoxels_ns.fem.solver_choice import LinearSolver
 

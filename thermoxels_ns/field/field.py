@@ -8,8 +8,8 @@ from nerfstudio.field_components.field_heads import FieldHeadNames
 from nerfstudio.fields.base_field import Field
 from torch import Tensor
 
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.voxel_grid import DensityActivation, VoxelGrid
-from thermoxels_ns.lattice import Lattice
 
 
 class VoxelField(Field):

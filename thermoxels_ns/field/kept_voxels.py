@@ -15,7 +15,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from thermoxels_ns.lattice import CORNER_OFFSETS, Lattice
+from thermoxels_ns.core.lattice import CORNER_OFFSETS, Lattice
 
 BLOCK = 8
 """Voxels along the side of a block."""

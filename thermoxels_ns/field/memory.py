@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermoxels_ns.errors import MemoryBudgetError, explain
-from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.core.errors import MemoryBudgetError, explain
+from thermoxels_ns.core.lattice import Lattice
 
 _ROWS_PER_VOXEL = 1.5
 """Corners per kept voxel of a body a few voxels thick (1 in the bulk, 2 for a single layer)."""

@@ -13,10 +13,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from thermoxels_ns.core.buffer_pool import SCRATCH
 from thermoxels_ns.field.interpolation import TrilinearPoints, interpolate
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.scratch import SCRATCH
 
 RowChange = Callable[[Tensor], Tensor]
 """Maps values of the old rows, shape (old rows, channels), to values of the new ones."""

@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.harmonics import (
     MAX_DEGREE,
     degree_of,
@@ -18,7 +19,6 @@ from thermoxels_ns.field.harmonics import (
 )
 from thermoxels_ns.field.interpolation import TrilinearPoints, interpolate
 from thermoxels_ns.field.kept_voxels import KeptVoxels
-from thermoxels_ns.lattice import Lattice
 
 DensityActivation = Literal["relu", "softplus", "exp"]
 COLOUR_CHANNELS = tuple(3 * num_coefficients(degree) for degree in range(MAX_DEGREE + 1))

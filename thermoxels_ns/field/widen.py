@@ -11,9 +11,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from thermoxels_ns.core.buffer_pool import SCRATCH
 from thermoxels_ns.field.harmonics import num_coefficients
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.scratch import SCRATCH
 
 ColumnChange = Callable[[Tensor], Tensor]
 """Maps values with the old columns, shape (rows, old columns), to values with the new ones."""

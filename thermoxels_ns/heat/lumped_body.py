@@ -19,12 +19,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.effects import Effect, FixedTemperature
 from thermoxels_ns.fem.linear_space import LinearSpace
-from thermoxels_ns.fem.lumped_pieces import HOT_K, PieceEquations, PieceHistory, TooHardError, follow_pieces
 from thermoxels_ns.fem.maximum_principle import holds_maximum_principle
-from thermoxels_ns.fem.nodal_heat import nodal_heats
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.selection import Selection
@@ -32,7 +31,8 @@ from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect, left_out
 from thermoxels_ns.fem.solver_choice import LinearSolver
 from thermoxels_ns.fem.steady import is_still, is_too_cold
 from thermoxels_ns.fem.system import HeatSystem
-from thermoxels_ns.units import ZERO_CELSIUS_K
+from thermoxels_ns.heat.lumped_pieces import HOT_K, PieceEquations, PieceHistory, TooHardError, follow_pieces
+from thermoxels_ns.heat.nodal_heat import nodal_heats
 
 Vector = npt.NDArray[np.float64]
 

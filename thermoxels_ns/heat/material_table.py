@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from thermoxels_ns.configs_folder import configs_folder
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.configs_folder import configs_folder
+from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.yaml_records import as_record, read_yaml
 from thermoxels_ns.fem.materials import Material
-from thermoxels_ns.fem.yaml_records import as_record, read_yaml
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.linear_space import LinearSpace, sums_by_number
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Bounded, Places
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.terms import FixedTerm, FluxTerm, RobinTerm, SourceTerm, Term
-from thermoxels_ns.units import ZERO_CELSIUS_K
 
 Vector = npt.NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from typing import Any
 
 import yaml
 
-from thermoxels_ns.configs_folder import configs_folder
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.configs_folder import configs_folder
+from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import TimeSteps
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_shape
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.checks import check_shape
+from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.fem.effects import Effect, InternalHeat
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.fem.effects import (
     AbsorbedSolar,
     Convection,
@@ -23,7 +23,7 @@ from thermoxels_ns.fem.effects import (
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Quantity, Varying
-from thermoxels_ns.fem.scene_fields import (
+from thermoxels_ns.heat.scene_fields import (
     WITH_RADIATION,
     Ground,
     InsideAir,
@@ -34,10 +34,10 @@ from thermoxels_ns.fem.scene_fields import (
     check_direction,
     field_bounds,
 )
-from thermoxels_ns.fem.scene_patches import ScenePatches, check_disjoint
-from thermoxels_ns.fem.sky import Vector, outdoor_radiation, swinbank_sky_c
-from thermoxels_ns.fem.sun import Sunlight, fixed_sun, moving_sun
-from thermoxels_ns.fem.surface_coefficients import (
+from thermoxels_ns.heat.scene_patches import ScenePatches, check_disjoint
+from thermoxels_ns.heat.sky import Vector, outdoor_radiation, swinbank_sky_c
+from thermoxels_ns.heat.sun import Sunlight, fixed_sun, moving_sun
+from thermoxels_ns.heat.surface_coefficients import (
     inside_combined,
     inside_convection,
     inside_separate,

@@ -10,11 +10,11 @@ from dataclasses import dataclass, fields
 from datetime import datetime
 from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
 
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.quantities import Bounds
-from thermoxels_ns.fem.sky import Vector
-from thermoxels_ns.fem.surface_coefficients import HeatFlow
-from thermoxels_ns.units import ZERO_CELSIUS_K
+from thermoxels_ns.heat.sky import Vector
+from thermoxels_ns.heat.surface_coefficients import HeatFlow
 
 OUTSIDE = ("exterior-*",)
 """Patches that what is outside acts on, unless others are named."""

@@ -10,9 +10,9 @@ from itertools import combinations
 
 import numpy as np
 
-from thermoxels_ns.errors import HeatError, explain
-from thermoxels_ns.fem.scene_fields import Surface
+from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.heat.scene_fields import Surface
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _SIDES = ("exterior-", "interior-")

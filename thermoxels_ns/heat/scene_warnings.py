@@ -7,10 +7,10 @@ from fnmatch import fnmatchcase
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.fem.heat_scene import HeatScene
-from thermoxels_ns.fem.scene_fields import INSIDE, OUTSIDE
 from thermoxels_ns.fem.selection import Selection
-from thermoxels_ns.fem.sky import Vector
+from thermoxels_ns.heat.scene import HeatScene
+from thermoxels_ns.heat.scene_fields import INSIDE, OUTSIDE
+from thermoxels_ns.heat.sky import Vector
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _COS_45 = float(np.sqrt(0.5))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin, kelvin_to_celsius
 from thermoxels_ns.fem.quantities import Bounds, Places, Quantity, Varying
-from thermoxels_ns.units import ZERO_CELSIUS_K, celsius_to_kelvin, kelvin_to_celsius
 
 Vector = tuple[float, float, float]
 

@@ -9,21 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.checks import check_positive
-from thermoxels_ns.errors import HeatError, explain
-from thermoxels_ns.fem.answers import plain_values
+from thermoxels_ns.commands.heat import Heat
+from thermoxels_ns.core.checks import check_positive
+from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.fem.error_budget import Tolerance
-from thermoxels_ns.fem.heat_scene import HeatScene
-from thermoxels_ns.fem.lumped_body import LumpedBody, lumped_body
 from thermoxels_ns.fem.memory import check_memory, describe_bytes, peak_bytes
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.screening import Screening, screen
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 from thermoxels_ns.fem.solution_nodes import Solution
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.tolerance import ToleratedSolution, solve_to_tolerance
-from thermoxels_ns.heat_command import Heat
+from thermoxels_ns.heat.lumped_body import LumpedBody, lumped_body
+from thermoxels_ns.heat.results import plain_values
+from thermoxels_ns.heat.scene import HeatScene
+from thermoxels_ns.heat.screening import Screening, screen
 
 Say = Callable[[str], None]
 Lap = Callable[[str], None]

@@ -12,9 +12,9 @@ from datetime import datetime, timedelta, timezone
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.fem.quantities import Bounds, Places, Varying
-from thermoxels_ns.fem.sky import Vector, ground_view, sky_view
+from thermoxels_ns.heat.sky import Vector, ground_view, sky_view
 
 SOLAR_CONSTANT_W_M2 = 1353.0
 """Sunlight above the air at the mean distance of the sun, [W / m2]: the value that Meinel's fit was made with. (Today's

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree import ElementTree
 
-from thermoxels_ns.checks import remove_file, replace_when_done, writable_folder
-from thermoxels_ns.errors import OutputError, explain
+from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.errors import OutputError, explain
 from thermoxels_ns.fem.solution import HeatSolution
-from thermoxels_ns.mesh.files import write_vtu
+from thermoxels_ns.mesh.files.vtu import write_vtu
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 STEP_PATTERN = "step-*.vtu"

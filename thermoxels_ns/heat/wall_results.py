@@ -9,8 +9,7 @@ from fnmatch import fnmatchcase
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.errors import HeatError, explain
-from thermoxels_ns.fem.answers import Spot, describe_spot, end_state_c
+from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.effects import Convection
 from thermoxels_ns.fem.problem import HeatProblem
@@ -18,6 +17,7 @@ from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import SteadySolution
 from thermoxels_ns.fem.solution_nodes import SolutionNodes, solution_nodes
 from thermoxels_ns.fem.surface_heat import heat_by_part, heat_through_parts
+from thermoxels_ns.heat.results import Spot, describe_spot, end_state_c
 
 _LEAST_DIFFERENCE_K = 1e-6
 

@@ -7,22 +7,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_finite, check_shape
-from thermoxels_ns.errors import MeshError, explain
-from thermoxels_ns.lattice import CORNER_OFFSETS
-from thermoxels_ns.mesh.boundary import BoundaryMode, tag_boundary
+from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.lattice import CORNER_OFFSETS
+from thermoxels_ns.core.snapshot import GridSnapshot
+from thermoxels_ns.mesh.boundary.patch_rules import PatchRules
+from thermoxels_ns.mesh.boundary.patches import apply_regions
+from thermoxels_ns.mesh.boundary.tags import BoundaryMode, tag_boundary
 from thermoxels_ns.mesh.components import node_parts, renumbered
-from thermoxels_ns.mesh.morphology import bounding_box, connected, face_connected
 from thermoxels_ns.mesh.node_values import interpolate_corners
-from thermoxels_ns.mesh.patch_rules import PatchRules
-from thermoxels_ns.mesh.patches import apply_regions
-from thermoxels_ns.mesh.sharp_edges import sharpen
-from thermoxels_ns.mesh.solid import SolidCells, SolidSelection, select_solid
-from thermoxels_ns.mesh.stuffing import stuff
+from thermoxels_ns.mesh.solid.morphology import bounding_box, connected, face_connected
+from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, select_solid
+from thermoxels_ns.mesh.stuffing.isosurface import stuff
+from thermoxels_ns.mesh.stuffing.sharp_edges import sharpen
 from thermoxels_ns.mesh.temperature import MIN_OBSERVED_WEIGHT, extend_harmonically, tet_conductances
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, lattice_edges, voxel_facets
-from thermoxels_ns.snapshot import GridSnapshot
 
 
 @dataclass(frozen=True)

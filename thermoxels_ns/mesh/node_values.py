@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_shape
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.lattice import CORNER_OFFSETS
+from thermoxels_ns.core.checks import check_shape
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.core.lattice import CORNER_OFFSETS
 
 
 def interpolate_corners(

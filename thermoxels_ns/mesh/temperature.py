@@ -8,10 +8,10 @@ from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
-from thermoxels_ns.checks import check_finite, check_shape
-from thermoxels_ns.errors import MeshError, explain
-from thermoxels_ns.mesh.face_count import TET_EDGES
-from thermoxels_ns.mesh.tet_shapes import shapes_in_chunks
+from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.mesh.quality.face_count import TET_EDGES
+from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
 
 MIN_OBSERVED_WEIGHT = 0.5
 """A node counts as measured if thermal rays, all together, gave it at least half of one fully absorbed ray.

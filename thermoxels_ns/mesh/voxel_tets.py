@@ -7,8 +7,8 @@ from itertools import permutations
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.errors import MeshError, explain
-from thermoxels_ns.lattice import CORNER_OFFSETS
+from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.lattice import CORNER_OFFSETS
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
 
 OUTWARD_FACES: npt.NDArray[np.int64] = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)

@@ -14,13 +14,13 @@ import numpy as np
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.photo_reading import read_photographs
-from thermoxels_ns.plane_sweep import Depths, depths_of
-from thermoxels_ns.sightlines import Sightlines
+from thermoxels_ns.core.feature_rays import Sightlines
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.multiview.photographs import read_photographs
+from thermoxels_ns.multiview.stereo import Depths, depths_of
 
 if TYPE_CHECKING:
-    from thermoxels_ns.model import ThermoxelsModel
+    from thermoxels_ns.training.model import ThermoxelsModel
 
 LONGEST_SIDE = 160
 """Pixels along the longer side of the photographs that are compared."""

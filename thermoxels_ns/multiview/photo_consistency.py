@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.photo_kernels import colours_at, deviations_at_corners
-from thermoxels_ns.threads import run_ranges
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.threads import run_ranges
+from thermoxels_ns.multiview.photo_kernels import colours_at, deviations_at_corners
 
 FINEST = 128
 """Voxels along the longest side of the lattice on which colours are compared."""

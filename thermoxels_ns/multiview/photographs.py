@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
-from thermoxels_ns.photo_consistency import Photographs
+from thermoxels_ns.multiview.photo_consistency import Photographs
 
 MOST_PHOTOGRAPHS = 32
 """Photographs compared; of more, that many are taken at equal distances in the list."""

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.depth_kernels import OUTSIDE, agreeing_views, correlate, weigh_patches
-from thermoxels_ns.photo_consistency import Photographs
-from thermoxels_ns.threads import run_ranges
+from thermoxels_ns.core.threads import run_ranges
+from thermoxels_ns.multiview.photo_consistency import Photographs
+from thermoxels_ns.multiview.stereo_kernels import OUTSIDE, agreeing_views, correlate, weigh_patches
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -15,18 +15,18 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from thermoxels_ns.data.dji_rjpeg import is_dji_rjpeg, read_dji_rjpeg
-from thermoxels_ns.data.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
-from thermoxels_ns.data.jpeg_segments import JPEG_START, DamagedJpegError, check_jpeg
-from thermoxels_ns.data.radiometric_conditions import ConditionOverrides, Conditions
-from thermoxels_ns.data.radiometric_model import corrected_temperature_c
-from thermoxels_ns.data.radiometric_tiff import read_count_image
-from thermoxels_ns.data.thermal_cameras import COUNT_SCALES, CameraName
-from thermoxels_ns.data.thermal_files import ThermalImage, ThermalUnit
-from thermoxels_ns.data.thermal_size import check_file_size
-from thermoxels_ns.data.thermal_tables import NPY_START, looks_like_csv, read_csv, read_npy
-from thermoxels_ns.data.thermogram import Thermogram, ThermogramFormat, ThermogramMetadata, masked_image
-from thermoxels_ns.errors import ThermalFileError, explain
+from thermoxels_ns.core.errors import ThermalFileError, explain
+from thermoxels_ns.radiometry.conditions import ConditionOverrides, Conditions
+from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg, read_dji_rjpeg
+from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
+from thermoxels_ns.radiometry.image_size import check_file_size
+from thermoxels_ns.radiometry.jpeg_segments import JPEG_START, DamagedJpegError, check_jpeg
+from thermoxels_ns.radiometry.known_cameras import COUNT_SCALES, CameraName
+from thermoxels_ns.radiometry.measurement_model import corrected_temperature_c
+from thermoxels_ns.radiometry.radiometric_tiff import read_count_image
+from thermoxels_ns.radiometry.tables import NPY_START, looks_like_csv, read_csv, read_npy
+from thermoxels_ns.radiometry.thermal_files import ThermalImage, ThermalUnit
+from thermoxels_ns.radiometry.thermogram import Thermogram, ThermogramFormat, ThermogramMetadata, masked_image
 
 _HEAD_BYTES = 4096
 _PNG_START = b"\x89PNG\r\n\x1a\n"

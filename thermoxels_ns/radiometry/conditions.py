@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from thermoxels_ns.errors import ThermoxelsError, explain
-from thermoxels_ns.units import ZERO_CELSIUS_K
+from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
 
 DEFAULT_RELATIVE_HUMIDITY = 0.5
 """Where neither file nor user says: what cameras assume; over a room's distances it changes less than their noise."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from thermoxels_ns.errors import SceneError, ThermoxelsError, explain
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError, explain
 
 
 @contextmanager

@@ -17,12 +17,12 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from thermoxels_ns.data.decoders import naming
-from thermoxels_ns.data.exif_facts import ExifFacts, read_exif_facts
-from thermoxels_ns.data.jpeg_segments import APP1, APP3, JPEG_START, DamagedJpegError, check_jpeg, jpeg_segments
-from thermoxels_ns.data.radiometric_conditions import ConditionOverrides, Conditions
-from thermoxels_ns.data.thermal_size import check_thermal_size
-from thermoxels_ns.errors import ThermalFileError, ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermalFileError, ThermoxelsError, explain
+from thermoxels_ns.radiometry.conditions import ConditionOverrides, Conditions
+from thermoxels_ns.radiometry.decoders import naming
+from thermoxels_ns.radiometry.exif import ExifFacts, read_exif_facts
+from thermoxels_ns.radiometry.image_size import check_thermal_size
+from thermoxels_ns.radiometry.jpeg_segments import APP1, APP3, JPEG_START, DamagedJpegError, check_jpeg, jpeg_segments
 
 _SDK = "the DJI Thermal SDK (www.dji.com/downloads/softwares/dji-thermal-sdk)"
 _STATUS = {

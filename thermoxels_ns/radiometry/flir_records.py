@@ -17,11 +17,11 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from thermoxels_ns.data.radiometric_conditions import Conditions
-from thermoxels_ns.data.radiometric_model import AirConstants, PlanckConstants
-from thermoxels_ns.data.thermal_size import check_thermal_size
-from thermoxels_ns.errors import ThermoxelsError
-from thermoxels_ns.units import kelvin_to_celsius
+from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.units import kelvin_to_celsius
+from thermoxels_ns.radiometry.conditions import Conditions
+from thermoxels_ns.radiometry.image_size import check_thermal_size
+from thermoxels_ns.radiometry.measurement_model import AirConstants, PlanckConstants
 
 RAW_DATA, EMBEDDED_PICTURE, CAMERA_INFO, PICTURE_IN_PICTURE = 0x01, 0x0E, 0x20, 0x2A
 """Record types that are read; palettes, measuring tools and voice notes are not."""

@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.data.flir_records import (
+from thermoxels_ns.core.errors import ThermalFileError, explain
+from thermoxels_ns.radiometry.conditions import Conditions
+from thermoxels_ns.radiometry.flir_records import (
     CAMERA_INFO,
     EMBEDDED_PICTURE,
     PICTURE_IN_PICTURE,
@@ -27,10 +29,8 @@ from thermoxels_ns.data.flir_records import (
     read_embedded_picture,
     read_picture_in_picture,
 )
-from thermoxels_ns.data.jpeg_segments import APP1, JPEG_START, DamagedJpegError, jpeg_segments
-from thermoxels_ns.data.radiometric_conditions import Conditions
-from thermoxels_ns.data.radiometric_model import RadiometricModel
-from thermoxels_ns.errors import ThermalFileError, explain
+from thermoxels_ns.radiometry.jpeg_segments import APP1, JPEG_START, DamagedJpegError, jpeg_segments
+from thermoxels_ns.radiometry.measurement_model import RadiometricModel
 
 _WANTED = (RAW_DATA, CAMERA_INFO, PICTURE_IN_PICTURE, EMBEDDED_PICTURE)
 _FLIR_MARK = b"FLIR\0"

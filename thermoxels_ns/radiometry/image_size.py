@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from thermoxels_ns.errors import ThermalFileError, explain
+from thermoxels_ns.core.errors import ThermalFileError, explain
 
 LARGEST_SIDE = 8192
 """Pixels along a side: four times the largest thermal sensors and super-resolution modes (about 2048)."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from thermoxels_ns.data.thermal_files import ThermalUnit
+from thermoxels_ns.radiometry.thermal_files import ThermalUnit
 
 CameraName = Literal["workswell", "flir-high-gain", "flir-low-gain", "flir-duo", "sensefly"]
 

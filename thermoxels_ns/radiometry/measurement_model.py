@@ -19,11 +19,11 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_positive
-from thermoxels_ns.data.planck_band import LONG_WAVE
-from thermoxels_ns.data.radiometric_conditions import Conditions, check_between
-from thermoxels_ns.errors import ThermoxelsError, explain
-from thermoxels_ns.units import celsius_to_kelvin, kelvin_to_celsius
+from thermoxels_ns.core.checks import check_positive
+from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.units import celsius_to_kelvin, kelvin_to_celsius
+from thermoxels_ns.radiometry.conditions import Conditions, check_between
+from thermoxels_ns.radiometry.planck_band import LONG_WAVE
 
 _LARGEST_ATTENUATION, _LARGEST_WEIGHT = 1.0, 10.0
 _LARGEST_EXPONENT = 700.0

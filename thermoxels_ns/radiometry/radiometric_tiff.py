@@ -8,12 +8,12 @@ from typing import Any
 
 from PIL import Image
 
-from thermoxels_ns.data.decoders import naming
-from thermoxels_ns.data.exif_facts import ExifFacts, read_exif_facts
-from thermoxels_ns.data.thermal_cameras import COUNT_SCALES, CameraName, known_cameras, recognised_camera
-from thermoxels_ns.data.thermal_files import ThermalImage, ThermalUnit, read_thermal_file
-from thermoxels_ns.data.thermal_size import check_thermal_size
-from thermoxels_ns.errors import ThermalFileError, explain
+from thermoxels_ns.core.errors import ThermalFileError, explain
+from thermoxels_ns.radiometry.decoders import naming
+from thermoxels_ns.radiometry.exif import ExifFacts, read_exif_facts
+from thermoxels_ns.radiometry.image_size import check_thermal_size
+from thermoxels_ns.radiometry.known_cameras import COUNT_SCALES, CameraName, known_cameras, recognised_camera
+from thermoxels_ns.radiometry.thermal_files import ThermalImage, ThermalUnit, read_thermal_file
 
 _SAMPLE_BITS = 258
 _COUNT_MODES = ("I", "I;16", "I;16B", "I;16L")

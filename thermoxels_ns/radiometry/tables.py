@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoxels_ns.data.thermal_files import ThermalImage, ThermalUnit, read_thermal_file
-from thermoxels_ns.data.thermal_size import check_thermal_size
-from thermoxels_ns.errors import ThermalFileError, explain
+from thermoxels_ns.core.errors import ThermalFileError, explain
+from thermoxels_ns.radiometry.image_size import check_thermal_size
+from thermoxels_ns.radiometry.thermal_files import ThermalImage, ThermalUnit, read_thermal_file
 
 NPY_START = b"\x93NUMPY"
 _LONGEST_LINE = 2**20

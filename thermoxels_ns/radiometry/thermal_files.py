@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from thermoxels_ns.data.decoders import quiet_decoders
-from thermoxels_ns.data.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
-from thermoxels_ns.data.thermal_size import check_thermal_size
-from thermoxels_ns.errors import ThermalFileError, explain
-from thermoxels_ns.units import ZERO_CELSIUS_K
+from thermoxels_ns.core.errors import ThermalFileError, explain
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
+from thermoxels_ns.radiometry.decoders import quiet_decoders
+from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
+from thermoxels_ns.radiometry.image_size import check_thermal_size
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 THERMAL_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".csv")

@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.data.flir_records import PictureInPicture
-from thermoxels_ns.data.radiometric_conditions import Conditions
-from thermoxels_ns.data.thermal_files import PixelReport, ThermalImage
+from thermoxels_ns.radiometry.conditions import Conditions
+from thermoxels_ns.radiometry.flir_records import PictureInPicture
+from thermoxels_ns.radiometry.thermal_files import PixelReport, ThermalImage
 
 ThermogramFormat = Literal["FLIR R-JPEG", "DJI R-JPEG", "TIFF", "PNG", "NPY", "CSV"]
 

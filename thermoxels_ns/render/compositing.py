@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from thermoxels_ns.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError, explain
 from thermoxels_ns.render.sampling import RaySteps
 
 OPAQUE_OPTICAL_DEPTH = 100.0

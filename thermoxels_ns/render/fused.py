@@ -17,17 +17,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from thermoxels_ns.errors import ThermoxelsError, explain
-from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.core.buffer_pool import SCRATCH
+from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.kernel_cache import forget_stale_kernels
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.threads import run_ranges, run_tasks
 from thermoxels_ns.render import kernels, kernels_backward, kernels_rows, kernels_shading, prefetch
-from thermoxels_ns.render.kernel_cache import forget_stale_kernels
 from thermoxels_ns.render.kernels import Rays, Records, Settings, Sums, Volume
 from thermoxels_ns.render.kernels_backward import RayGradients
 from thermoxels_ns.render.kernels_rows import Blocks
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions, near_and_far
 from thermoxels_ns.render.row_gradients import row_gradients
-from thermoxels_ns.scratch import SCRATCH
-from thermoxels_ns.threads import run_ranges, run_tasks
 
 # Before the first call, which loads what was compiled earlier.
 forget_stale_kernels(

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from thermoxels_ns.lattice import Lattice
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.render.compositing import RayWeights, ray_weights
 from thermoxels_ns.render.sampling import RaySteps, sample_box
 

@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from thermoxels_ns import losses
-from thermoxels_ns.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError, explain
 from thermoxels_ns.field.interpolation import TrilinearPoints
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.compositing import composite
 from thermoxels_ns.render.march import March, march
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
+from thermoxels_ns.training import losses
 
 Backend = Literal["auto", "reference", "fused"]
 

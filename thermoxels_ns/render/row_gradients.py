@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from thermoxels_ns.core.buffer_pool import SCRATCH
+from thermoxels_ns.core.threads import num_threads, run_tasks
 from thermoxels_ns.render import kernels_rows
 from thermoxels_ns.render.kernels_rows import Blocks, Order, RowGradients
 from thermoxels_ns.render.ordered_rows import remember_order
-from thermoxels_ns.scratch import SCRATCH
-from thermoxels_ns.threads import num_threads, run_tasks
 
 if TYPE_CHECKING:
     from thermoxels_ns.render.fused import Marched

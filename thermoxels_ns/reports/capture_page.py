@@ -11,18 +11,18 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.charts import bars, histogram
-from thermoxels_ns.capture.contract import CameraModel, DriftEstimate, RigEstimate
 from thermoxels_ns.capture.frames import CaptureFrame
-from thermoxels_ns.capture.gravity import Up
 from thermoxels_ns.capture.measurement import measurement_rows
-from thermoxels_ns.capture.metric_scale import MetricScale
 from thermoxels_ns.capture.pairs import Pair
-from thermoxels_ns.capture.rig_words import turn_deg, turn_error_deg, why_turn_is_unsure, with_error
-from thermoxels_ns.capture.sfm_model import SfmModel
-from thermoxels_ns.checks import replace_when_done
-from thermoxels_ns.data.dead_pixels import MIN_FRAMES
-from thermoxels_ns.page_style import html_page, scrolling
+from thermoxels_ns.capture.rig.summary import turn_deg, turn_error_deg, why_turn_is_unsure, with_error
+from thermoxels_ns.capture.sfm.gravity import Up
+from thermoxels_ns.capture.sfm.metric_scale import MetricScale
+from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.stage_types import CameraModel, DriftEstimate, RigEstimate
+from thermoxels_ns.core.checks import replace_when_done
+from thermoxels_ns.radiometry.dead_pixels import MIN_FRAMES
+from thermoxels_ns.reports.page_style import html_page, scrolling
+from thermoxels_ns.reports.svg_charts import bars, histogram
 
 _PERCENTILES = (0.1, 99.9)
 _TOO_FEW = f"not looked for in fewer than {MIN_FRAMES} frames"

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from thermoxels_ns.checks import replace_when_done
-from thermoxels_ns.cost_runs import FIGURES, CostRun, CostSetting
+from thermoxels_ns.commands.cost_runs import FIGURES, CostRun, CostSetting
+from thermoxels_ns.core.checks import replace_when_done
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-from thermoxels_ns.errors import ThermoxelsError, explain
-from thermoxels_ns.page_style import embedded_image, html_page, scrolling
+from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.reports.page_style import embedded_image, html_page, scrolling
 
 
 @dataclass(frozen=True)

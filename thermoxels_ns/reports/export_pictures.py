@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from thermoxels_ns.checks import replace_when_done
+from thermoxels_ns.core.checks import replace_when_done
 
 if TYPE_CHECKING:
     from thermoxels_ns.fem.solution import HeatSolution
@@ -26,7 +26,7 @@ def draw_mesh(paths: Sequence[Path], mesh: TetMesh, look: Look, length_unit: str
         look: Arguments `up` and `view_direction` of `picture_of_mesh`.
         length_unit: Name of the unit of the node positions.
     """
-    from thermoxels_ns.mesh.pictures import picture_of_mesh
+    from thermoxels_ns.reports.mesh_pictures import picture_of_mesh
 
     every, measured = paths
     picture_of_mesh(every, mesh, title="Surface temperature", length_unit=length_unit, **look)
@@ -47,7 +47,7 @@ def draw_heat(path: Path, mesh: TetMesh, solution: HeatSolution, look: Look) -> 
 
     from PIL import Image
 
-    from thermoxels_ns.mesh.pictures import change_colours, picture_of_mesh
+    from thermoxels_ns.reports.mesh_pictures import change_colours, picture_of_mesh
 
     shown = np.unique(mesh.facets)
     before, after = solution.temperature_c[0], solution.temperature_c[-1]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
-from thermoxels_ns.heat_pictures import in_words
-from thermoxels_ns.heat_report import Section, Table
-from thermoxels_ns.heat_solving import Accuracy
+from thermoxels_ns.heat.solving import Accuracy
+from thermoxels_ns.reports.heat_pictures import in_words
+from thermoxels_ns.reports.heat_report import Section, Table
 
 
 def accuracy_sections(accuracy: Accuracy | None) -> list[Section]:

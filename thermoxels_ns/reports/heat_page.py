@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermoxels_ns.fem.answers import Spot
 from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.effects import Effect, FixedTemperature, InternalHeat
 from thermoxels_ns.fem.materials import Material
@@ -16,14 +15,15 @@ from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import HeatSolution
-from thermoxels_ns.heat_accuracy_page import accuracy_card, accuracy_sections, how_time_was_followed
-from thermoxels_ns.heat_figures import Dust, coordinate, degrees, dust_of, unit_signs
-from thermoxels_ns.heat_figures import figure as _figure
-from thermoxels_ns.heat_pictures import in_words, plot_over_time
-from thermoxels_ns.heat_report import HeatReport, Section, Table
+from thermoxels_ns.heat.results import Spot
+from thermoxels_ns.reports.heat_accuracy import accuracy_card, accuracy_sections, how_time_was_followed
+from thermoxels_ns.reports.heat_numbers import Dust, coordinate, degrees, dust_of, unit_signs
+from thermoxels_ns.reports.heat_numbers import figure as _figure
+from thermoxels_ns.reports.heat_pictures import in_words, plot_over_time
+from thermoxels_ns.reports.heat_report import HeatReport, Section, Table
 
 if TYPE_CHECKING:
-    from thermoxels_ns.heat_run import HeatRun
+    from thermoxels_ns.commands.heat_run import HeatRun
 
 _CAPTIONS = {
     "surface-start.png": "The surface at the start.",

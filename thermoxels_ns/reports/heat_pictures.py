@@ -39,7 +39,7 @@ def draw_surface(
     Returns:
         Names of the files.
     """
-    from thermoxels_ns.mesh.pictures import change_colours, picture_of_mesh
+    from thermoxels_ns.reports.mesh_pictures import change_colours, picture_of_mesh
 
     start, end, change, cut = PICTURES
     seen = mesh.facet_tags != FACET_BOX

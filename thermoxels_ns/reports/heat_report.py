@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-from thermoxels_ns.page_style import embedded_image, html_page, scrolling
+from thermoxels_ns.reports.page_style import embedded_image, html_page, scrolling
 
 
 @dataclass(frozen=True)

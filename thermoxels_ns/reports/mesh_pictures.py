@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_finite, check_shape, replace_when_done, writable_folder
-from thermoxels_ns.errors import MeshError, OutputError, explain
+from thermoxels_ns.core.checks import check_finite, check_shape, replace_when_done, writable_folder
+from thermoxels_ns.core.errors import MeshError, OutputError, explain
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 if TYPE_CHECKING:

@@ -9,18 +9,18 @@ import numpy as np
 import numpy.typing as npt
 from tyro.constructors import PrimitiveConstructorSpec
 
-from thermoxels_ns.data.pinhole import CameraRing
-from thermoxels_ns.data.rectangles import distance_to_box
-from thermoxels_ns.data.scene_truth import SyntheticScene
-from thermoxels_ns.data.solid_texture import Paint, SolidTexture, SunLight, painted
-from thermoxels_ns.data.solid_union import SolidUnion
-from thermoxels_ns.data.solids import Box, BoxSolid, Sphere
-from thermoxels_ns.data.surroundings import room_rgb
-from thermoxels_ns.data.synthetic_courtyard import courtyard
-from thermoxels_ns.data.synthetic_house import house_corner
-from thermoxels_ns.data.synthetic_pipes import pipes
-from thermoxels_ns.data.synthetic_random import RANDOM_NAME, random_scene, random_seed
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.synthetic.courtyard import courtyard
+from thermoxels_ns.synthetic.house_corner import house_corner
+from thermoxels_ns.synthetic.pinhole import CameraRing
+from thermoxels_ns.synthetic.pipes import pipes
+from thermoxels_ns.synthetic.random_scene import RANDOM_NAME, random_scene, random_seed
+from thermoxels_ns.synthetic.rectangles import distance_to_box
+from thermoxels_ns.synthetic.scene_truth import SyntheticScene
+from thermoxels_ns.synthetic.solid_union import SolidUnion
+from thermoxels_ns.synthetic.solids import Box, BoxSolid, Sphere
+from thermoxels_ns.synthetic.surroundings import room_rgb
+from thermoxels_ns.synthetic.texture import Paint, SolidTexture, SunLight, painted
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.data.solids import Box, Hits, Vector
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.synthetic.solids import Box, Hits, Vector
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.data.cylinder import Cylinder
-from thermoxels_ns.data.pinhole import CameraRing
-from thermoxels_ns.data.scene_truth import SyntheticScene
-from thermoxels_ns.data.solid_texture import Paint, SolidTexture, SunLight, painted
-from thermoxels_ns.data.solid_union import SolidUnion
-from thermoxels_ns.data.solids import Box, BoxSolid
-from thermoxels_ns.data.surroundings import room_rgb
+from thermoxels_ns.synthetic.cylinder import Cylinder
+from thermoxels_ns.synthetic.pinhole import CameraRing
+from thermoxels_ns.synthetic.scene_truth import SyntheticScene
+from thermoxels_ns.synthetic.solid_union import SolidUnion
+from thermoxels_ns.synthetic.solids import Box, BoxSolid
+from thermoxels_ns.synthetic.surroundings import room_rgb
+from thermoxels_ns.synthetic.texture import Paint, SolidTexture, SunLight, painted
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from thermoxels_ns.data.solids import Box
-from thermoxels_ns.data.synthetic_random_plan import SMALLEST, WIDEST, Plan, Range
+from thermoxels_ns.synthetic.random_plan import SMALLEST, WIDEST, Plan, Range
+from thermoxels_ns.synthetic.solids import Box
 
 Wall = tuple[int, int, float]
 

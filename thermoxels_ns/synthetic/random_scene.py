@@ -14,15 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.data.scene_truth import RgbFunction, SyntheticScene
-from thermoxels_ns.data.solid_texture import SolidTexture, SunLight, painted
-from thermoxels_ns.data.solids import Box
-from thermoxels_ns.data.surroundings import room_rgb, sky_rgb, sky_temperature_c
-from thermoxels_ns.data.synthetic_random_buildings import detached_house, facade, wings
-from thermoxels_ns.data.synthetic_random_plan import Plan
-from thermoxels_ns.data.synthetic_random_plant import machinery, pipes_and_radiators
-from thermoxels_ns.data.synthetic_random_views import random_rings
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.synthetic.random_buildings import detached_house, facade, wings
+from thermoxels_ns.synthetic.random_plan import Plan
+from thermoxels_ns.synthetic.random_plant import machinery, pipes_and_radiators
+from thermoxels_ns.synthetic.random_views import random_rings
+from thermoxels_ns.synthetic.scene_truth import RgbFunction, SyntheticScene
+from thermoxels_ns.synthetic.solids import Box
+from thermoxels_ns.synthetic.surroundings import room_rgb, sky_rgb, sky_temperature_c
+from thermoxels_ns.synthetic.texture import SolidTexture, SunLight, painted
 
 __all__ = ["FAMILIES", "RANDOM_NAME", "Family", "random_scene", "random_seed"]
 

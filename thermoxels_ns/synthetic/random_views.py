@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.data.pinhole import CameraRing
-from thermoxels_ns.data.solids import Box
+from thermoxels_ns.synthetic.pinhole import CameraRing
+from thermoxels_ns.synthetic.solids import Box
 
 _PICTURE_ASPECT = 0.75
 _RIM = 0.95

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.data.pinhole import PinholeCamera
-from thermoxels_ns.data.scene_truth import SyntheticScene
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.synthetic.pinhole import PinholeCamera
+from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -16,12 +16,12 @@ import numpy.typing as npt
 from PIL import Image
 from rich.progress import track
 
-from thermoxels_ns.checks import remove_file, replace_when_done, writable_folder
-from thermoxels_ns.data.pinhole import PinholeCamera
-from thermoxels_ns.data.raycast import RenderedView, render_view, visible_surface_points
-from thermoxels_ns.data.scene_truth import SyntheticScene
-from thermoxels_ns.data.synthetic_scenes import SCENE_NAMES, make_scene
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.synthetic.catalogue import SCENE_NAMES, make_scene
+from thermoxels_ns.synthetic.pinhole import PinholeCamera
+from thermoxels_ns.synthetic.raycast import RenderedView, render_view, visible_surface_points
+from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 __all__ = [
     "SCENE_NAMES",

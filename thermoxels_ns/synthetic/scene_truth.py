@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.data.pinhole import CameraRing, PinholeCamera, ring_poses
-from thermoxels_ns.data.solids import Box, Solid
+from thermoxels_ns.synthetic.pinhole import CameraRing, PinholeCamera, ring_poses
+from thermoxels_ns.synthetic.solids import Box, Solid
 
 FloatArray = npt.NDArray[np.float64]
 RgbFunction = Callable[..., npt.NDArray[np.float32]]

@@ -8,9 +8,9 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.data.cylinder import Cylinder
-from thermoxels_ns.data.solids import Box, BoxSolid, Hits, Sphere
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.synthetic.cylinder import Cylinder
+from thermoxels_ns.synthetic.solids import Box, BoxSolid, Hits, Sphere
 
 FloatArray = npt.NDArray[np.float64]
 Part = BoxSolid | Sphere | Cylinder

@@ -15,8 +15,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.data.rectangles import Rectangles, exposed_rectangles
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.synthetic.rectangles import Rectangles, exposed_rectangles
 
 Vector = tuple[float, float, float]
 Box = tuple[Vector, Vector]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.data.solids import Box
+from thermoxels_ns.synthetic.solids import Box
 
 _SPACINGS_VOXELS = (2.0, 4.0, 10.0)
 _AMPLITUDES = (0.45, 0.55, 0.5)

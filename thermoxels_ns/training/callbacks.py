@@ -11,15 +11,15 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch.nn import Parameter
 
-from thermoxels_ns.errors import PruningError, explain
+from thermoxels_ns.core.errors import PruningError, explain
+from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.field.refine import RowChange, prune
-from thermoxels_ns.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
-from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
-from thermoxels_ns.track_carving import carve_air
-from thermoxels_ns.track_loss import COARSE_LIGHT, TrackRays
+from thermoxels_ns.training.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
+from thermoxels_ns.training.track_carving import carve_air
+from thermoxels_ns.training.track_loss import COARSE_LIGHT, TrackRays
 
 if TYPE_CHECKING:
-    from thermoxels_ns.model import ThermoxelsModel
+    from thermoxels_ns.training.model import ThermoxelsModel
 
 FEWEST_OPEN_RAYS = 0.002
 """Share of rays that must leave the box unsaturated for a background to be worth its cost."""
@@ -36,9 +36,9 @@ RAYS_PER_IMAGE = 4096
 def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
     """The callbacks of one training run, in the order in which they act at a step."""
     # They load compiled kernels, which importing the configuration must not.
-    from thermoxels_ns.photo_depth import lines_for_training
-    from thermoxels_ns.photo_start import find_start, hold_density, set_density
-    from thermoxels_ns.start_choice import decide_start
+    from thermoxels_ns.multiview.depth_supervision import lines_for_training
+    from thermoxels_ns.training.photo_start import find_start, hold_density, set_density
+    from thermoxels_ns.training.start_choice import decide_start
 
     before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
     depths = lines_for_training(model, attributes)

@@ -15,26 +15,26 @@ from nerfstudio.utils import colormaps
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
-from thermoxels_ns import losses
-from thermoxels_ns.coarse_to_fine import coarse_to_fine_callbacks
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.feature_rays import Sightlines
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
+from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
+from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.field.background import SkyTemperature, SphereImage, seen_behind
 from thermoxels_ns.field.field import VoxelField
 from thermoxels_ns.field.harmonics import harmonics, num_coefficients
 from thermoxels_ns.field.memory import check_memory
 from thermoxels_ns.field.refine import RowChange, refine
 from thermoxels_ns.field.widen import ColumnChange, widen_colour
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.metrics import lpips, lpips_available, psnr, ssim, thermal_metrics
-from thermoxels_ns.model_config import ThermoxelsModelConfig
-from thermoxels_ns.ray_rendering import GridSamples, render_rays, sample_rays
-from thermoxels_ns.ray_statistics import FieldEvidence, field_evidence
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
-from thermoxels_ns.sightlines import Sightlines
-from thermoxels_ns.snapshot import GridSnapshot, RayEvidence, Views
-from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
-from thermoxels_ns.track_loss import TrackRays, track_loss
-from thermoxels_ns.units import TemperatureRange
+from thermoxels_ns.render.renderers import GridSamples, render_rays, sample_rays
+from thermoxels_ns.training import losses
+from thermoxels_ns.training.callbacks import coarse_to_fine_callbacks
+from thermoxels_ns.training.image_metrics import lpips, lpips_available, psnr, ssim, thermal_metrics
+from thermoxels_ns.training.model_config import ThermoxelsModelConfig
+from thermoxels_ns.training.ray_statistics import FieldEvidence, field_evidence
+from thermoxels_ns.training.track_loss import TrackRays, track_loss
 
 
 class ThermoxelsModel(Model):

@@ -9,11 +9,11 @@ from typing import Literal
 
 from nerfstudio.models.base_model import ModelConfig
 
-from thermoxels_ns.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError, explain
 from thermoxels_ns.field.harmonics import MAX_DEGREE, num_coefficients
 from thermoxels_ns.field.voxel_grid import DensityActivation
-from thermoxels_ns.ray_rendering import Backend
-from thermoxels_ns.schedule import QUALITIES, schedule_for
+from thermoxels_ns.render.renderers import Backend
+from thermoxels_ns.training.schedule import QUALITIES, schedule_for
 
 _STANDARD = schedule_for(*QUALITIES["standard"])
 FINEST_START = 64
@@ -290,6 +290,6 @@ class ThermoxelsModelConfig(ModelConfig):
 
 
 def _model_class() -> type:
-    from thermoxels_ns.model import ThermoxelsModel
+    from thermoxels_ns.training.model import ThermoxelsModel
 
     return ThermoxelsModel

@@ -16,10 +16,10 @@ import torch
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, OptimizerConfig
 from torch import Tensor
 
+from thermoxels_ns.core.threads import run_ranges
 from thermoxels_ns.field.refine import RowChange
 from thermoxels_ns.field.widen import ColumnChange
 from thermoxels_ns.render.ordered_rows import in_order
-from thermoxels_ns.threads import run_ranges
 
 
 class RowOptimizer(torch.optim.Optimizer):
@@ -127,7 +127,7 @@ class RowAdam(RowOptimizer):
         (beta1, beta2), lr, eps = group["betas"], group["lr"], group["eps"]
         first, second = (state[name].view(len(parameter), -1) for name in ("exp_avg", "exp_avg_sq"))
         if parameter.device.type == "cpu":
-            from thermoxels_ns import optim_kernels
+            from thermoxels_ns.training import optimizer_kernels as optim_kernels
 
             adam_rows: Any = optim_kernels.adam_rows
 
@@ -167,7 +167,7 @@ class RowRMSprop(RowOptimizer):
         lr, alpha, eps = group["lr"], group["alpha"], group["eps"]
         square = state["square_avg"].view(len(parameter), -1)
         if parameter.device.type == "cpu":
-            from thermoxels_ns import optim_kernels
+            from thermoxels_ns.training import optimizer_kernels as optim_kernels
 
             rmsprop_rows: Any = optim_kernels.rmsprop_rows
 

@@ -10,11 +10,11 @@ import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from thermoxels_ns.field.voxel_grid import DensityActivation
-from thermoxels_ns.photo_consistency import DensityStart, density_from_photographs
-from thermoxels_ns.photo_reading import read_photographs
+from thermoxels_ns.multiview.photo_consistency import DensityStart, density_from_photographs
+from thermoxels_ns.multiview.photographs import read_photographs
 
 if TYPE_CHECKING:
-    from thermoxels_ns.model import ThermoxelsModel
+    from thermoxels_ns.training.model import ThermoxelsModel
 
 SMALLEST_EPS = 1e-8
 """Least eps of the density's optimiser: what photographs say must not be undone by rows with next to no gradient,

@@ -12,13 +12,13 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
-from thermoxels_ns.errors import CheckpointError, SceneError, explain
-from thermoxels_ns.model import ThermoxelsModel
-from thermoxels_ns.ray_rendering import choose_backend
-from thermoxels_ns.snapshot import GridSnapshot
-from thermoxels_ns.streams import RGB_STREAM, THERMAL_STREAM
-from thermoxels_ns.threads import set_num_threads
-from thermoxels_ns.warm_up import compile_kernels
+from thermoxels_ns.core.errors import CheckpointError, SceneError, explain
+from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
+from thermoxels_ns.core.snapshot import GridSnapshot
+from thermoxels_ns.core.threads import set_num_threads
+from thermoxels_ns.render.renderers import choose_backend
+from thermoxels_ns.training.model import ThermoxelsModel
+from thermoxels_ns.training.warm_up import compile_kernels
 
 _GRID = "_model.field.grid."
 _ACTIVATION = "_model.field.grid.activation_index"
@@ -162,9 +162,9 @@ class ThermoxelsPipeline(VanillaPipeline):
         return averages
 
     def geometry_metrics(self) -> dict[str, float]:
-        """How well the surface agrees with the exact scene, see `thermoxels_ns.geometry_metrics`; empty if unknown."""
-        from thermoxels_ns.export import input_from_world
-        from thermoxels_ns.geometry_metrics import geometry_metrics, has_truth
+        """How well the surface agrees with the exact scene, see `evaluation.geometry_metrics`; empty if unknown."""
+        from thermoxels_ns.commands.export import input_from_world
+        from thermoxels_ns.evaluation.geometry_metrics import geometry_metrics, has_truth
 
         datamanager: Any = self.datamanager
         if not has_truth(datamanager.get_datapath(), _say):
@@ -179,7 +179,7 @@ class ThermoxelsPipeline(VanillaPipeline):
 
         ``half_transparent``, the share of rays that are neither through nor stopped, joins the metrics of the model.
         """
-        from thermoxels_ns.geometry_metrics import half_transparent_share
+        from thermoxels_ns.evaluation.geometry_metrics import half_transparent_share
 
         rows: list[dict[str, float]] = []
         one_image = self.model.get_image_metrics_and_images

@@ -11,10 +11,10 @@ from jaxtyping import Bool, Float, Int64
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
+from thermoxels_ns.core.ray_streams import THERMAL_STREAM
 from thermoxels_ns.field.interpolation import TrilinearPoints, splat
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.ray_rendering import GridSamples
-from thermoxels_ns.streams import THERMAL_STREAM
+from thermoxels_ns.render.renderers import GridSamples
 
 
 class RaySampler(Protocol):
@@ -135,7 +135,7 @@ def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidenc
 
     Args:
         model: The field.
-        rays: Rays of either stream. One that says of no stream (see `thermoxels_ns.streams`) counts as thermal too.
+        rays: Rays of either stream. One that says of no stream (see `core.ray_streams`) counts as thermal too.
     """
     grid = model.grid
     device = grid.density.device

@@ -27,19 +27,19 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from thermoxels_ns.errors import MemoryBudgetError
+from thermoxels_ns.core.buffer_pool import SCRATCH
+from thermoxels_ns.core.errors import MemoryBudgetError
+from thermoxels_ns.core.feature_rays import FloatArray, Sightlines
+from thermoxels_ns.core.ray_streams import RGB_STREAM
 from thermoxels_ns.field.refine import refine
-from thermoxels_ns.model_config import FINEST_START
-from thermoxels_ns.photo_consistency import DensityStart
-from thermoxels_ns.photo_start import find_start, hold_density, set_density
-from thermoxels_ns.scratch import SCRATCH
-from thermoxels_ns.sightlines import FloatArray, Sightlines
-from thermoxels_ns.streams import RGB_STREAM
-from thermoxels_ns.track_carving import carve_air
-from thermoxels_ns.track_loss import TrackRays
+from thermoxels_ns.multiview.photo_consistency import DensityStart
+from thermoxels_ns.training.model_config import FINEST_START
+from thermoxels_ns.training.photo_start import find_start, hold_density, set_density
+from thermoxels_ns.training.track_carving import carve_air
+from thermoxels_ns.training.track_loss import TrackRays
 
 if TYPE_CHECKING:
-    from thermoxels_ns.model import ThermoxelsModel
+    from thermoxels_ns.training.model import ThermoxelsModel
 
 Chosen = Literal["plain", "photographs"]
 STARTS = ("auto", "plain", "photographs")

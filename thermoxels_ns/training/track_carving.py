@@ -13,12 +13,12 @@ import numpy as np
 import numpy.typing as npt
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from thermoxels_ns.core.feature_rays import FloatArray, IntArray, Sightlines
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.refine import RowChange, prune
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.sightlines import FloatArray, IntArray, Sightlines
 
 if TYPE_CHECKING:
-    from thermoxels_ns.model import ThermoxelsModel
+    from thermoxels_ns.training.model import ThermoxelsModel
 
 FEWEST_POINTS = 2
 """Different points whose lines must cross a voxel: a single one may be wrong."""

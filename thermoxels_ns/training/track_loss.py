@@ -8,8 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from thermoxels_ns.core.feature_rays import Sightlines
 from thermoxels_ns.render.ray_render import RayRequest
-from thermoxels_ns.sightlines import Sightlines
 
 MARGIN_VOXELS = 1.5
 """Voxels before and behind a point between which the surface may lie."""

@@ -12,8 +12,8 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from thermoxels_ns.errors import CheckpointError, explain
-from thermoxels_ns.schedule import QUALITIES, Quality, Schedule, schedule_for
+from thermoxels_ns.core.errors import CheckpointError, explain
+from thermoxels_ns.training.schedule import QUALITIES, Quality, Schedule, schedule_for
 
 
 @dataclass

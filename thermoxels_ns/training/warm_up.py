@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 import torch
 
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.optim import RowAdam
-from thermoxels_ns.ray_rendering import fused_render
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
+from thermoxels_ns.render.renderers import fused_render
+from thermoxels_ns.training.optimizers import RowAdam
 
 SILENT_SECONDS = 1.0
 """Loading kernels that were compiled before takes less."""

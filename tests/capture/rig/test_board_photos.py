@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.capture.board_pictures import BOARD, board_pairs, write_board_folder
-from tests.capture.textured_room import RIG, THERMAL, VISIBLE
-from thermoxels_ns.capture.board_photos import board_of, in_scene_units, rig_from_board_photos
-from thermoxels_ns.capture.contract import CameraModel, RigEstimate
-from thermoxels_ns.capture.metric_scale import MetricScale
+from tests.support.board_pictures import BOARD, board_pairs, write_board_folder
+from tests.support.textured_room import RIG, THERMAL, VISIBLE
+from thermoxels_ns.capture.rig.board_photos import board_of, in_scene_units, rig_from_board_photos
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.data.radiometry import RadiometryOptions
-from thermoxels_ns.errors import SceneError
+from thermoxels_ns.capture.sfm.metric_scale import MetricScale
+from thermoxels_ns.capture.stage_types import CameraModel, RigEstimate
+from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.radiometry.camera_file import RadiometryOptions
 
 SIZE = (THERMAL.width, THERMAL.height)
 SETTINGS = CaptureSettings(thermal_field_of_view_deg=55.0)

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.capture.board_pictures import BOARD, board_pairs, picture
-from tests.capture.known_rig import turned
-from thermoxels_ns.capture.board_rig import find_board, rig_from_boards
-from thermoxels_ns.capture.contract import CameraModel, RigStart
-from thermoxels_ns.errors import SceneError
+from tests.support.board_pictures import BOARD, board_pairs, picture
+from tests.support.known_rig import turned
+from thermoxels_ns.capture.rig.board_rig import find_board, rig_from_boards
+from thermoxels_ns.capture.stage_types import CameraModel, RigStart
+from thermoxels_ns.core.errors import SceneError
 
 VISIBLE = CameraModel(640, 480, 600.0, 600.0, 322.0, 238.0, k1=-0.05)
 THERMAL = CameraModel(160, 128, 150.0, 150.0, 81.0, 63.0)

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.capture.known_rig import known_capture
-from thermoxels_ns.capture.contract import DriftEstimate, radius_squared
-from thermoxels_ns.capture.drift import drift_of_samples, estimate_drift
-from thermoxels_ns.capture.drift_samples import DriftSamples
-from thermoxels_ns.errors import SceneError
+from tests.support.known_rig import known_capture
+from thermoxels_ns.capture.rig.drift import drift_of_samples, estimate_drift
+from thermoxels_ns.capture.rig.drift_samples import DriftSamples
+from thermoxels_ns.capture.stage_types import DriftEstimate, radius_squared
+from thermoxels_ns.core.errors import SceneError
 
 FRAMES = 12
 

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from thermoxels_ns.capture.edge_structure import edge_field, local_contrast, without_fixed_pattern
-from thermoxels_ns.capture.rig_levels import even_trust
+from thermoxels_ns.capture.rig.edge_structure import edge_field, local_contrast, without_fixed_pattern
+from thermoxels_ns.capture.rig.image_pyramid import even_trust
 
 
 def step(angle_deg: float, size: int = 64) -> np.ndarray:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.capture.known_rig import drawn_capture
-from thermoxels_ns.capture.drift import estimate_drift
-from thermoxels_ns.capture.rig import estimate_rig
+from tests.support.known_rig import drawn_capture
+from thermoxels_ns.capture.rig.drift import estimate_drift
+from thermoxels_ns.capture.rig.search import estimate_rig
 
 FRAMES = 36
 

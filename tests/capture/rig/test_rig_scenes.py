@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.capture.known_rig import known_capture, projection_difference_px
-from thermoxels_ns.capture.contract import CameraModel, RigFrame, RigStart
-from thermoxels_ns.capture.drift import estimate_drift
-from thermoxels_ns.capture.rig import estimate_rig
+from tests.support.known_rig import known_capture, projection_difference_px
+from thermoxels_ns.capture.rig.drift import estimate_drift
+from thermoxels_ns.capture.rig.search import estimate_rig
+from thermoxels_ns.capture.stage_types import CameraModel, RigFrame, RigStart
 
 
 @pytest.mark.parametrize(

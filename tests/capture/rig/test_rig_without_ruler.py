@@ -15,11 +15,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.capture.known_rig import changes_between, drawn_capture
-from thermoxels_ns.capture.drift import estimate_drift
-from thermoxels_ns.capture.rig import estimate_rig
-from thermoxels_ns.capture.rig_certainty import turn_errors_deg
-from thermoxels_ns.capture.rig_parameters import PARAMETERS
+from tests.support.known_rig import changes_between, drawn_capture
+from thermoxels_ns.capture.rig.drift import estimate_drift
+from thermoxels_ns.capture.rig.parameters import PARAMETERS
+from thermoxels_ns.capture.rig.search import estimate_rig
+from thermoxels_ns.capture.rig.uncertainty import turn_errors_deg
 
 FOCAL_KNOWN, FOCAL_UNSURE = 0.01, 0.02
 LARGEST_TURN_DEG = 0.75

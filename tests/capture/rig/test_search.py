@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.capture.known_rig import KnownCapture, known_capture, painted_sky
-from thermoxels_ns.capture.contract import CameraModel, RigFrame, RigStart
-from thermoxels_ns.capture.rig import estimate_rig
-from thermoxels_ns.capture.rig_levels import prepare_frames
-from thermoxels_ns.capture.rig_parameters import RigModel, prior_sigmas
-from thermoxels_ns.errors import SceneError
+from tests.support.known_rig import KnownCapture, known_capture, painted_sky
+from thermoxels_ns.capture.rig.image_pyramid import prepare_frames
+from thermoxels_ns.capture.rig.parameters import RigModel, prior_sigmas
+from thermoxels_ns.capture.rig.search import estimate_rig
+from thermoxels_ns.capture.stage_types import CameraModel, RigFrame, RigStart
+from thermoxels_ns.core.errors import SceneError
 
 
 @pytest.fixture(scope="module")

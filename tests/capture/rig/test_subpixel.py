@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.capture.known_rig import KnownCapture, painted_sky
-from thermoxels_ns.capture.contract import RigStart
-from thermoxels_ns.capture.rig_certainty import turn_errors_deg
-from thermoxels_ns.capture.rig_levels import prepare_frames
-from thermoxels_ns.capture.rig_parameters import RigModel, prior_sigmas
-from thermoxels_ns.capture.rig_patches import THERMAL_BLUR_PX, PatchScore, SmoothThermal, patch_design
-from thermoxels_ns.capture.rig_polish import Polished, centre_doubted, polish
+from tests.support.known_rig import KnownCapture, painted_sky
+from thermoxels_ns.capture.rig.image_pyramid import prepare_frames
+from thermoxels_ns.capture.rig.parameters import RigModel, prior_sigmas
+from thermoxels_ns.capture.rig.patches import THERMAL_BLUR_PX, PatchScore, SmoothThermal, patch_design
+from thermoxels_ns.capture.rig.subpixel import Polished, centre_doubted, polish
+from thermoxels_ns.capture.rig.uncertainty import turn_errors_deg
+from thermoxels_ns.capture.stage_types import RigStart
 
 NEAR = np.array([0.003, -0.004, 0.002, 0.0, 0.0, 0.0, 0.004, 0.0, 0.0, 0.0])
 """About half a pixel off."""

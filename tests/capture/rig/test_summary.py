@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermoxels_ns.capture.contract import CameraModel, RigEstimate
-from thermoxels_ns.capture.rig_parameters import PARAMETERS
-from thermoxels_ns.capture.rig_words import rig_lines, turn_error_deg, why_turn_is_unsure
+from thermoxels_ns.capture.rig.parameters import PARAMETERS
+from thermoxels_ns.capture.rig.summary import rig_lines, turn_error_deg, why_turn_is_unsure
+from thermoxels_ns.capture.stage_types import CameraModel, RigEstimate
 
 ERRORS = {"rx": 0.003, "ry": 0.004, "rz": 0.012, "log_focal": 0.01, "cx": 0.42, "cy": 0.57}
 """Their squares add up to 0.013 rad squared, 0.745 degrees."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermoxels_ns.capture.rig_certainty import certainty_text, turn_errors_deg
-from thermoxels_ns.capture.rig_parameters import PARAMETERS
+from thermoxels_ns.capture.rig.parameters import PARAMETERS
+from thermoxels_ns.capture.rig.uncertainty import certainty_text, turn_errors_deg
 
 RX, TY, FOCAL, CY = (PARAMETERS.index(name) for name in ("rx", "ty", "log_focal", "cy"))
 

@@ -14,15 +14,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.capture.camera_card import counts, photograph
-from tests.capture.posed_model import ring_model
-from thermoxels_ns.capture import disk_space
-from thermoxels_ns.capture.colmap_process import run_apart
-from thermoxels_ns.capture.disk_space import check_free_space, disk_of
-from thermoxels_ns.capture.poses import add_points
+from tests.support.camera_card import counts, photograph
+from tests.support.posed_model import ring_model
 from thermoxels_ns.capture.run import run_capture
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.capture.sfm import disk_space
+from thermoxels_ns.capture.sfm.colmap_process import run_apart
+from thermoxels_ns.capture.sfm.disk_space import check_free_space, disk_of
+from thermoxels_ns.capture.sfm.poses import add_points
+from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
 
 FULL = shutil.disk_usage(os.sep)._replace(free=4096)
 
@@ -139,7 +139,7 @@ def test_a_disk_that_fills_during_a_capture_is_named(tmp_path, monkeypatch):
         counts(tmp_path / "card" / f"{name}-radiometric.tiff")
     usage = [shutil.disk_usage(tmp_path), FULL]
     monkeypatch.setattr(disk_space.shutil, "disk_usage", lambda _: usage.pop(0) if len(usage) > 1 else usage[0])
-    monkeypatch.setattr("thermoxels_ns.capture.feature_matching._find_and_match", _abort_in_the_middle)
+    monkeypatch.setattr("thermoxels_ns.capture.sfm.feature_matching._find_and_match", _abort_in_the_middle)
     with pytest.raises(OutputError, match=rf"disk at {disk_of(tmp_path)}: .*got 0 MB.*\.capture"):
         run_capture(tmp_path / "card", tmp_path / "scene", CaptureSettings())
     monkeypatch.undo()
@@ -152,7 +152,7 @@ def test_a_mapping_that_aborts_is_an_error_and_the_capture_goes_on_behind_its_fe
         photograph(tmp_path / "card" / f"{name}-visible.jpg")
         counts(tmp_path / "card" / f"{name}-radiometric.tiff")
     said: list[str] = []
-    monkeypatch.setattr("thermoxels_ns.capture.mapping._map", _abort_in_the_middle)
+    monkeypatch.setattr("thermoxels_ns.capture.sfm.mapping._map", _abort_in_the_middle)
     with pytest.raises(ThermoxelsError, match=r"COLMAP: expected to end, got exit status.*--from-stage poses"):
         run_capture(tmp_path / "card", tmp_path / "scene", CaptureSettings(), said.append)
     assert said[-1].startswith("matches: 3 of 3")
@@ -165,7 +165,7 @@ def test_points_for_given_poses_that_abort_are_an_error(tmp_path, monkeypatch):
     model = ring_model(3)
     size = model.camera.height, model.camera.width, 3
     files = {name: photograph(tmp_path / f"{name}.jpg", np.full(size, 90, np.uint8)) for name in model.frames}
-    monkeypatch.setattr("thermoxels_ns.capture.mapping._triangulate", _abort_in_the_middle)
+    monkeypatch.setattr("thermoxels_ns.capture.sfm.mapping._triangulate", _abort_in_the_middle)
     with pytest.raises(ThermoxelsError, match=r"COLMAP: expected to end, got exit status.*--from-stage poses"):
         add_points(model, files, tmp_path)
     monkeypatch.undo()
@@ -188,7 +188,7 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from capture_apart import wait_for_ever
-from thermoxels_ns.capture.colmap_process import run_apart
+from thermoxels_ns.capture.sfm.colmap_process import run_apart
 run_apart(wait_for_ever, (Path(sys.argv[1]),), Path(sys.argv[1]), lambda line: print(line, flush=True))
 """
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.capture.posed_model import CAMERA, ring_model
-from thermoxels_ns.capture.colmap_log import quiet_colmap
-from thermoxels_ns.capture.colmap_model import camera_of_colmap, model_of_colmap, read_colmap
-from thermoxels_ns.capture.given_poses import fitted_to_photographs, in_order, read_given_poses
-from thermoxels_ns.capture.poses import Poses, add_points
-from thermoxels_ns.errors import SceneError, ThermoxelsError
+from tests.support.posed_model import CAMERA, ring_model
+from thermoxels_ns.capture.sfm.colmap_log import quiet_colmap
+from thermoxels_ns.capture.sfm.colmap_model import camera_of_colmap, model_of_colmap, read_colmap
+from thermoxels_ns.capture.sfm.given_poses import fitted_to_photographs, in_order, read_given_poses
+from thermoxels_ns.capture.sfm.poses import Poses, add_points
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 
 MODEL = ring_model(5, points=60)
 SOURCES = {name: f"visible/{name}-visible.jpg" for name in MODEL.frames}

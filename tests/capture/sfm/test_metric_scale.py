@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.capture.posed_model import CAMERA, ring_model
-from thermoxels_ns.capture.metric_scale import (
+from tests.support.posed_model import CAMERA, ring_model
+from thermoxels_ns.capture.photograph import GpsFix
+from thermoxels_ns.capture.sfm.metric_scale import (
     MeasuredDistance,
     local_metres,
     scale_from_distance,
     scale_from_gps,
     scale_from_markers,
 )
-from thermoxels_ns.capture.photograph import GpsFix
-from thermoxels_ns.errors import ThermoxelsError
+from thermoxels_ns.core.errors import ThermoxelsError
 
 UNIT_M = 0.37
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.capture.textured_room import VISIBLE, alignment, write_card
-from thermoxels_ns.capture.feature_matching import image_pairs
+from tests.support.textured_room import VISIBLE, alignment, write_card
 from thermoxels_ns.capture.masks import PhotographMasks
-from thermoxels_ns.capture.poses import PoseOptions, add_points, find_poses
-from thermoxels_ns.capture.sfm_model import SfmModel
-from thermoxels_ns.errors import SceneError
+from thermoxels_ns.capture.sfm.feature_matching import image_pairs
+from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.sfm.poses import PoseOptions, add_points, find_poses
+from thermoxels_ns.core.errors import SceneError
 
 OPTIONS = PoseOptions(max_features=500)
 COUNT = 6

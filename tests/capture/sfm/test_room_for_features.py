@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from thermoxels_ns.capture import disk_space, feature_matching
-from thermoxels_ns.capture.contract import CameraModel
-from thermoxels_ns.capture.feature_matching import FeatureOptions, fill_database, image_pairs
-from thermoxels_ns.errors import OutputError
+from thermoxels_ns.capture.sfm import disk_space, feature_matching
+from thermoxels_ns.capture.sfm.feature_matching import FeatureOptions, fill_database, image_pairs
+from thermoxels_ns.capture.stage_types import CameraModel
+from thermoxels_ns.core.errors import OutputError
 
 CAMERA = CameraModel(width=640, height=480, fl_x=500.0, fl_y=500.0, cx=320.0, cy=240.0)
 FEATURES = 1000

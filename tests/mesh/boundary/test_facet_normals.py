@@ -8,10 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.mesh.facet_normals import LEAST_AREA_FACTOR, MOST_AREA_FACTOR, true_surface
-from thermoxels_ns.mesh.level_set import level_of
-from thermoxels_ns.mesh.quality import facet_areas, facet_normals
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.mesh.boundary.facet_normals import LEAST_AREA_FACTOR, MOST_AREA_FACTOR, true_surface
+from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
+from thermoxels_ns.mesh.solid.level_set import level_of
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX
 from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, voxel_facets
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.mesh.facet_owners import facet_owners
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.mesh.boundary.facet_owners import facet_owners
 from thermoxels_ns.mesh.voxel_tets import OUTWARD_FACES
 
 

@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.mesh.patch_rules import DEFAULT_PATCHES, PatchRules, Rule, load_patch_rules
-from thermoxels_ns.mesh.patches import (
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.mesh.boundary.patch_rules import DEFAULT_PATCHES, PatchRules, Rule, load_patch_rules
+from thermoxels_ns.mesh.boundary.patches import (
     apply_patches,
     apply_regions,
     default_patches,
     facing,
 )
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "configs" / "patches-example.yaml"
+EXAMPLE = Path(__file__).resolve().parents[3] / "configs" / "patches-example.yaml"
 UP = (0.0, 0.0, 1.0)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermoxels_ns.mesh.surface_net import SurfaceNet, surface_net, voxel_faces
+from thermoxels_ns.mesh.boundary.surface_net import SurfaceNet, surface_net, voxel_faces
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets, voxel_facets
 
 

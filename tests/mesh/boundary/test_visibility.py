@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.mesh.facet_normals import true_surface
-from thermoxels_ns.mesh.quality import facet_normals
-from thermoxels_ns.mesh.visibility import _EmptySpace, seen_facets
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import Views
+from thermoxels_ns.mesh.boundary.facet_normals import true_surface
+from thermoxels_ns.mesh.boundary.visibility import _EmptySpace, seen_facets
+from thermoxels_ns.mesh.quality.checks import facet_normals
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets, voxel_facets
-from thermoxels_ns.snapshot import Views
 
 LATTICE = Lattice((2.0, -1.0, 0.5), 0.25, (33, 33, 33))
 H = LATTICE.voxel_size

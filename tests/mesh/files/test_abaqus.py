@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermoxels_ns.errors import HeatError, MeshError
-from thermoxels_ns.mesh.abaqus_file import HeatStep, write_inp
-from thermoxels_ns.mesh.quality import facet_areas
+from thermoxels_ns.core.errors import HeatError, MeshError
+from thermoxels_ns.mesh.files.abaqus import HeatStep, write_inp
+from thermoxels_ns.mesh.quality.checks import facet_areas
 
 STEP = HeatStep(1.7, 2200.0, 880.0, steps=10, step_seconds=60.0)
 # Nodes of the faces S1 to S4 of a linear tetrahedron, as the manuals of Abaqus and CalculiX list them.

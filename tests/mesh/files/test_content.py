@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from thermoxels_ns.errors import MeshError, OutputError
-from thermoxels_ns.mesh.abaqus_file import HeatStep
-from thermoxels_ns.mesh.file_content import UNTAGGED_PATCH, file_content
-from thermoxels_ns.mesh.formats import MESH_FORMATS, mesh_file_paths, mesh_format, write_mesh
+from thermoxels_ns.core.errors import MeshError, OutputError
+from thermoxels_ns.mesh.files.abaqus import HeatStep
+from thermoxels_ns.mesh.files.content import UNTAGGED_PATCH, file_content
+from thermoxels_ns.mesh.files.formats import MESH_FORMATS, mesh_file_paths, mesh_format, write_mesh
 
 STEP = HeatStep(1.7, 2200.0, 880.0, steps=10, step_seconds=60.0)
 SUFFIXES = sorted(MESH_FORMATS)

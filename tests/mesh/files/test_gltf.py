@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.mesh.gltf_file import write_glb
-from thermoxels_ns.mesh.surface import surface_of
-from thermoxels_ns.mesh.tet_shapes import signed_volumes
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.mesh.boundary.surface import surface_of
+from thermoxels_ns.mesh.files.gltf import write_glb
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 
 TYPES = {5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}

@@ -8,10 +8,10 @@ import shutil
 import numpy as np
 import pytest
 
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.mesh.file_content import colour_bytes
-from thermoxels_ns.mesh.formats import write_mesh
-from thermoxels_ns.mesh.read_mesh import read_mesh
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.mesh.files.content import colour_bytes
+from thermoxels_ns.mesh.files.formats import write_mesh
+from thermoxels_ns.mesh.files.read import read_mesh
 from thermoxels_ns.mesh.tetrahedra import Boundary
 
 

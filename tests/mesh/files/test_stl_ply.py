@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.mesh.formats import check_format, write_mesh
-from thermoxels_ns.mesh.quality import facet_normals
-from thermoxels_ns.mesh.surface import surface_of
-from thermoxels_ns.mesh.surface_files import write_ply, write_stl
-from thermoxels_ns.mesh.tet_shapes import signed_volumes
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.mesh.boundary.surface import surface_of
+from thermoxels_ns.mesh.files.formats import check_format, write_mesh
+from thermoxels_ns.mesh.files.stl_ply import write_ply, write_stl
+from thermoxels_ns.mesh.quality.checks import facet_normals
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 
 
 def colours(read: meshio.Mesh) -> np.ndarray:

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-from thermoxels_ns.errors import MeshError, OutputError
-from thermoxels_ns.mesh.files import write_summary, write_vtu
+from thermoxels_ns.core.errors import MeshError, OutputError
+from thermoxels_ns.mesh.files.vtu import write_summary, write_vtu
 
 
 def test_mesh_round_trips_through_pyvista(tmp_path, box_mesh):

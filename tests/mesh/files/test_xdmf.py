@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-from thermoxels_ns.errors import OutputError
-from thermoxels_ns.mesh import xdmf_file
-from thermoxels_ns.mesh.xdmf_file import BODY_GRID, FACET_GRID, heavy_data_path, write_xdmf
+from thermoxels_ns.core.errors import OutputError
+from thermoxels_ns.mesh.files import xdmf as xdmf_file
+from thermoxels_ns.mesh.files.xdmf import BODY_GRID, FACET_GRID, heavy_data_path, write_xdmf
 
 
 def read_grids(path) -> dict[str, pv.UnstructuredGrid]:

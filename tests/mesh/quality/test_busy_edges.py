@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 import pytest
 
-from thermoxels_ns.mesh.quality import count_overlaps
-from thermoxels_ns.mesh.topology import group_sides
+from thermoxels_ns.mesh.quality.checks import count_overlaps
+from thermoxels_ns.mesh.quality.topology import group_sides
 
 POINTS = np.array(
     [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.3, 0.7, 0.0], [0.5, -1.0, 1.0], [0.5, -1.0, -1.0]]

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.mesh.face_count import group_faces
-from thermoxels_ns.mesh.quality import (
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.mesh.quality.checks import (
     check_mesh,
     count_twin_nodes,
     count_wrong_facets,
@@ -18,6 +17,7 @@ from thermoxels_ns.mesh.quality import (
     facet_normals,
     signed_volumes,
 )
+from thermoxels_ns.mesh.quality.face_count import group_faces
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
 

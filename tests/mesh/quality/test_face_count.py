@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermoxels_ns.mesh.face_count import (
+from thermoxels_ns.mesh.quality.face_count import (
     OUTWARD_FACES,
     count_faces,
     edges_of_rows,

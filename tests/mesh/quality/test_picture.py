@@ -10,9 +10,9 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from thermoxels_ns.errors import OutputError
-from thermoxels_ns.mesh.quality_picture import picture_of_quality
-from thermoxels_ns.mesh.quality_report import QualityReport, quality_report
+from thermoxels_ns.core.errors import OutputError
+from thermoxels_ns.mesh.quality.picture import picture_of_quality
+from thermoxels_ns.mesh.quality.report import QualityReport, quality_report
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
 

@@ -10,10 +10,10 @@ import pytest
 import skfem
 from skfem.models.poisson import laplace
 
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.mesh.promises import DIHEDRAL_BOUNDS_DEG, BoundaryMode, Evidence, angle_bins, judge
-from thermoxels_ns.mesh.quality import check_mesh
-from thermoxels_ns.mesh.quality_report import QualityReport, quality_report
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.mesh.quality.checks import check_mesh
+from thermoxels_ns.mesh.quality.criteria import DIHEDRAL_BOUNDS_DEG, BoundaryMode, Evidence, angle_bins, judge
+from thermoxels_ns.mesh.quality.report import QualityReport, quality_report
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
 

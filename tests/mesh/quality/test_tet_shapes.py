@@ -7,8 +7,8 @@ import pytest
 import skfem
 from skfem.models.poisson import laplace
 
-from thermoxels_ns.mesh.face_count import TET_EDGES
-from thermoxels_ns.mesh.tet_shapes import TetShapes, shapes_in_chunks, signed_volumes
+from thermoxels_ns.mesh.quality.face_count import TET_EDGES
+from thermoxels_ns.mesh.quality.tet_shapes import TetShapes, shapes_in_chunks, signed_volumes
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 REGULAR = np.array([[1.0, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1]])
@@ -95,7 +95,7 @@ def test_degenerate_tetrahedra_have_figures_not_nan():
 def test_chunks_cover_every_tetrahedron_once(monkeypatch):
     corners, tets = kuhn_tets(np.ones((2, 2, 3), dtype=bool))
     whole = signed_volumes(corners.astype(float), tets)
-    monkeypatch.setattr("thermoxels_ns.mesh.tet_shapes._CHUNK", 7)
+    monkeypatch.setattr("thermoxels_ns.mesh.quality.tet_shapes._CHUNK", 7)
     np.testing.assert_array_equal(signed_volumes(corners.astype(float), tets), whole)
     assert whole.sum() == pytest.approx(12.0)
     assert sum(len(shapes.volumes) for _, shapes in shapes_in_chunks(corners.astype(float), tets)) == len(tets)

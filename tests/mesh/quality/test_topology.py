@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermoxels_ns.mesh.face_count import group_faces
-from thermoxels_ns.mesh.topology import SurfaceComponent, count_bodies, surface_topology, tets_across_faces
+from thermoxels_ns.mesh.quality.face_count import group_faces
+from thermoxels_ns.mesh.quality.topology import SurfaceComponent, count_bodies, surface_topology, tets_across_faces
 from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
 
 

@@ -10,13 +10,13 @@ import pytest
 import torch
 from nerfstudio.cameras.rays import RayBundle
 
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.mesh.threshold import automatic_threshold
-from thermoxels_ns.ray_rendering import GridSamples, sample_rays
-from thermoxels_ns.ray_statistics import field_evidence
+from thermoxels_ns.mesh.solid.threshold import automatic_threshold
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
-from thermoxels_ns.snapshot import GridSnapshot, RayEvidence
+from thermoxels_ns.render.renderers import GridSamples, sample_rays
+from thermoxels_ns.training.ray_statistics import field_evidence
 
 LATTICE = Lattice((0.0, 0.0, 0.0), 0.125, (17, 9, 9))
 VOXEL = LATTICE.voxel_size

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.looking_cameras import looking_at
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.mesh.free_space import MOST_CAMERAS, Sight, look
-from thermoxels_ns.snapshot import Views
+from tests.support.looking_cameras import looking_at
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import Views
+from thermoxels_ns.mesh.solid.free_space import MOST_CAMERAS, Sight, look
 
 LATTICE = Lattice((-1.0, -1.0, -1.0), 0.125, (17, 17, 17))
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thermoxels_ns.mesh.level_set import DEEP_RATIOS, level_of
+from thermoxels_ns.mesh.solid.level_set import DEEP_RATIOS, level_of
 
 
 def crossings(level: np.ndarray) -> np.ndarray:

@@ -7,8 +7,8 @@ import pytest
 from scipy import ndimage
 from scipy.spatial import Delaunay
 
-from thermoxels_ns.lattice import CORNER_OFFSETS
-from thermoxels_ns.mesh.morphology import close_gaps, connected, convex_hull, face_connected, fill_enclosed, grow
+from thermoxels_ns.core.lattice import CORNER_OFFSETS
+from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected, fill_enclosed, grow
 
 
 @pytest.mark.parametrize("by", [1, 2, 3, 5])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermoxels_ns.mesh.surface_ramp import REACH, SurfaceRamp, near_surface, surface_ramp
+from thermoxels_ns.mesh.solid.surface_ramp import REACH, SurfaceRamp, near_surface, surface_ramp
 
 
 def depth(*, radius: float = 8.0, voxels: int = 24) -> np.ndarray:

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.mesh.solid import SolidSelection, select_solid
-from thermoxels_ns.mesh.threshold import (
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
+from thermoxels_ns.mesh.solid.threshold import (
     FEWEST_RAYS,
     LEAST_WEIGHT,
     OPAQUE_OPTICAL_DEPTH,
@@ -20,7 +20,7 @@ from thermoxels_ns.mesh.threshold import (
     optical_depth_threshold,
     percentile_threshold,
 )
-from thermoxels_ns.snapshot import GridSnapshot, RayEvidence
+from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
 
 VOXEL = 0.25
 MET = np.repeat(np.arange(1.0, 11.0), [30, 130, *[105] * 8])

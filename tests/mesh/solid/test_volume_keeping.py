@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermoxels_ns.mesh.level_set import level_of
-from thermoxels_ns.mesh.quality import dihedral_range_deg
-from thermoxels_ns.mesh.sharp_edges import sharpen
-from thermoxels_ns.mesh.stuffing import StuffedSolid, stuff
-from thermoxels_ns.mesh.tet_shapes import signed_volumes
-from thermoxels_ns.mesh.volume_keeping import keep_volume
+from thermoxels_ns.mesh.quality.checks import dihedral_range_deg
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
+from thermoxels_ns.mesh.solid.level_set import level_of
+from thermoxels_ns.mesh.solid.volume_keeping import keep_volume
+from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
+from thermoxels_ns.mesh.stuffing.sharp_edges import sharpen
 
 
 def meshed(cells: np.ndarray) -> StuffedSolid:

@@ -7,11 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.looking_cameras import looking_at
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.mesh.solid import SolidCells, SolidSelection, SolidStep, close_gaps, fill_enclosed, select_solid
-from thermoxels_ns.snapshot import GridSnapshot
+from tests.support.looking_cameras import looking_at
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import GridSnapshot
+from thermoxels_ns.mesh.solid.voxels import (
+    SolidCells,
+    SolidSelection,
+    SolidStep,
+    close_gaps,
+    fill_enclosed,
+    select_solid,
+)
 
 
 def step_of(solid: SolidCells, name: str) -> SolidStep:

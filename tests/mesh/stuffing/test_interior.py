@@ -9,13 +9,13 @@ import pytest
 from scipy import ndimage
 from scipy.sparse.linalg import spsolve
 
-from tests.stuffed_shapes import ANGLE_BOUNDS_DEG, box_distance, centres, stiffness, tet_mesh, turn
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.mesh.bcc_lattice import bcc_lattice
-from thermoxels_ns.mesh.quality import check_mesh, dihedral_range_deg
-from thermoxels_ns.mesh.stuffing import StuffedSolid, stuff
-from thermoxels_ns.mesh.stuffing_interior import coarse_interior
-from thermoxels_ns.mesh.tet_shapes import signed_volumes
+from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, box_distance, centres, stiffness, tet_mesh, turn
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.mesh.quality.checks import check_mesh, dihedral_range_deg
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
+from thermoxels_ns.mesh.stuffing.bcc_lattice import bcc_lattice
+from thermoxels_ns.mesh.stuffing.interior import coarse_interior
+from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
 
 
 def ball(cells: int, radius: float, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:

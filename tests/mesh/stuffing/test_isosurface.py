@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from tests.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, centres, euler_characteristic, num_bodies, tet_mesh
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.mesh.bcc_lattice import DIRECTIONS, LENGTHS, OPPOSITE, bcc_lattice
-from thermoxels_ns.mesh.quality import check_mesh, dihedral_range_deg
-from thermoxels_ns.mesh.stuffing import stuff
-from thermoxels_ns.mesh.stuffing_stencils import BUNDLE_EDGES, BUNDLE_POINTS, CODE_WEIGHTS, stencil_table
-from thermoxels_ns.mesh.stuffing_warp import ALPHA_INSIDE, ALPHA_OUTSIDE, warp
+from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, centres, euler_characteristic, num_bodies, tet_mesh
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.mesh.quality.checks import check_mesh, dihedral_range_deg
+from thermoxels_ns.mesh.stuffing.bcc_lattice import DIRECTIONS, LENGTHS, OPPOSITE, bcc_lattice
+from thermoxels_ns.mesh.stuffing.isosurface import stuff
+from thermoxels_ns.mesh.stuffing.stencils import BUNDLE_EDGES, BUNDLE_POINTS, CODE_WEIGHTS, stencil_table
+from thermoxels_ns.mesh.stuffing.warp import ALPHA_INSIDE, ALPHA_OUTSIDE, warp
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (3, 2, 1), (1, 4, 5), (4, 3, 5)])

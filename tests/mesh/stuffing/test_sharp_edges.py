@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from tests.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, Shape, box_distance, centres, tet_mesh, turn
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.mesh.edge_planes import Surface, edge_planes
-from thermoxels_ns.mesh.quality import check_mesh, dihedral_range_deg, facet_areas, facet_normals
-from thermoxels_ns.mesh.sharp_edges import ANGLES_DEG, LONGEST_MOVE, sharpen
-from thermoxels_ns.mesh.stuffing import StuffedSolid, stuff
-from thermoxels_ns.mesh.tet_shapes import signed_volumes
+from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, Shape, box_distance, centres, tet_mesh, turn
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.mesh.quality.checks import check_mesh, dihedral_range_deg, facet_areas, facet_normals
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
+from thermoxels_ns.mesh.stuffing.edge_planes import Surface, edge_planes
+from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
+from thermoxels_ns.mesh.stuffing.sharp_edges import ANGLES_DEG, LONGEST_MOVE, sharpen
 
 CELLS = 48
 VOXEL = 2.0 / CELLS

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoxels_ns.capture.board_rig import CheckerBoard, rig_from_boards
 from thermoxels_ns.capture.camera_files import scan_folder
-from thermoxels_ns.capture.contract import CameraModel, RigEstimate
 from thermoxels_ns.capture.frames import read_frames
-from thermoxels_ns.capture.metric_scale import MetricScale
 from thermoxels_ns.capture.pairs import PairOptions, find_pairs
 from thermoxels_ns.capture.photograph import open_photograph
-from thermoxels_ns.capture.rig_inputs import BASELINE_SIGMA_M, rig_start
+from thermoxels_ns.capture.rig.board_rig import CheckerBoard, rig_from_boards
+from thermoxels_ns.capture.rig.inputs import BASELINE_SIGMA_M, rig_start
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.data.radiometry import RadiometryOptions
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.capture.sfm.metric_scale import MetricScale
+from thermoxels_ns.capture.stage_types import CameraModel, RigEstimate
+from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.radiometry.camera_file import RadiometryOptions
 
 _SIZE = re.compile(r"(\d{1,3})\s*[xX]\s*(\d{1,3})")
 _SHIFTS = slice(3, 6)

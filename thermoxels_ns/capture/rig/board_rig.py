@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
-from thermoxels_ns.capture.contract import CameraModel, RigEstimate, RigStart
-from thermoxels_ns.capture.rig_parameters import PARAMETERS, RigModel, prior_sigmas
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel, prior_sigmas
+from thermoxels_ns.capture.stage_types import CameraModel, RigEstimate, RigStart
+from thermoxels_ns.core.errors import SceneError, explain
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import fft
 
-from thermoxels_ns.capture.rig_score import EdgePoints, RigScore
+from thermoxels_ns.capture.rig.score import EdgePoints, RigScore
 
 FloatArray = npt.NDArray[np.float64]
 _Spectra = tuple[npt.NDArray, ...]

@@ -14,8 +14,8 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from thermoxels_ns.capture.contract import CameraModel, DriftEstimate, RigFrame
-from thermoxels_ns.capture.drift_samples import DriftSamples, sample_shared_points
+from thermoxels_ns.capture.rig.drift_samples import DriftSamples, sample_shared_points
+from thermoxels_ns.capture.stage_types import CameraModel, DriftEstimate, RigFrame
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.contract import CameraModel, RigFrame, radius_squared
-from thermoxels_ns.capture.rig_levels import read_temperatures
-from thermoxels_ns.capture.sparse_depth import SparseDepth
+from thermoxels_ns.capture.rig.image_pyramid import read_temperatures
+from thermoxels_ns.capture.sfm.sparse_depth import SparseDepth
+from thermoxels_ns.capture.stage_types import CameraModel, RigFrame, radius_squared
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]

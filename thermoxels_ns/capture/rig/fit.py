@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
 
-from thermoxels_ns.capture.rig_parameters import RigModel
+from thermoxels_ns.capture.rig.parameters import RigModel
 
 FloatArray = npt.NDArray[np.float64]
 

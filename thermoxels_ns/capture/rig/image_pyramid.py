@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.contract import CameraModel, RigFrame
-from thermoxels_ns.capture.edge_structure import edge_field, without_fixed_pattern
-from thermoxels_ns.capture.rig_parameters import RigModel
-from thermoxels_ns.capture.rig_score import EdgePoints, RigScore, ThermalEdges
-from thermoxels_ns.capture.sparse_depth import SparseDepth
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.capture.rig.edge_structure import edge_field, without_fixed_pattern
+from thermoxels_ns.capture.rig.parameters import RigModel
+from thermoxels_ns.capture.rig.score import EdgePoints, RigScore, ThermalEdges
+from thermoxels_ns.capture.sfm.sparse_depth import SparseDepth
+from thermoxels_ns.capture.stage_types import CameraModel, RigFrame
+from thermoxels_ns.core.errors import SceneError, explain
 
 FloatImage = npt.NDArray[np.float32]
 

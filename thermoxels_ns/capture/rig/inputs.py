@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.capture.contract import CameraModel, RigEstimate, RigFrame, RigStart
 from thermoxels_ns.capture.frames import CaptureFrame
-from thermoxels_ns.capture.sfm_model import SfmModel
+from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.stage_types import CameraModel, RigEstimate, RigFrame, RigStart
 from thermoxels_ns.capture.stages import read_json
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError, explain
 
 _MOST_ERROR_PX = 4.0
 """Points that project farther than this from where they were seen are not used, [pixels of the photographs]."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.contract import CameraModel, RigStart
+from thermoxels_ns.capture.stage_types import CameraModel, RigStart
 
 FloatArray = npt.NDArray[np.float64]
 

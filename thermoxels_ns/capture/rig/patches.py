@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from thermoxels_ns.capture.rig_parameters import RigModel
+from thermoxels_ns.capture.rig.parameters import RigModel
 
 FloatArray = npt.NDArray[np.float64]
 FloatImage = npt.NDArray[np.float32]

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.rig_parameters import RigModel
+from thermoxels_ns.capture.rig.parameters import RigModel
 
 FloatArray = npt.NDArray[np.float64]
 

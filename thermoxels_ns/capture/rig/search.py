@@ -12,15 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.contract import CameraModel, RigEstimate, RigFrame, RigStart
-from thermoxels_ns.capture.rig_certainty import certainty_text
-from thermoxels_ns.capture.rig_fit import RigClimber
-from thermoxels_ns.capture.rig_levels import PreparedFrames, prepare_frames
-from thermoxels_ns.capture.rig_parameters import PARAMETERS, RigModel, prior_sigmas
-from thermoxels_ns.capture.rig_polish import polish
-from thermoxels_ns.capture.rig_score import RigScore
-from thermoxels_ns.capture.rig_start import RoughRig, RoughSearch
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.capture.rig.coarse_search import RoughRig, RoughSearch
+from thermoxels_ns.capture.rig.fit import RigClimber
+from thermoxels_ns.capture.rig.image_pyramid import PreparedFrames, prepare_frames
+from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel, prior_sigmas
+from thermoxels_ns.capture.rig.score import RigScore
+from thermoxels_ns.capture.rig.subpixel import polish
+from thermoxels_ns.capture.rig.uncertainty import certainty_text
+from thermoxels_ns.capture.stage_types import CameraModel, RigEstimate, RigFrame, RigStart
+from thermoxels_ns.core.errors import SceneError, explain
 
 FloatArray = npt.NDArray[np.float64]
 

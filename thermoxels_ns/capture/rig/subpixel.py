@@ -17,15 +17,15 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.rig_fit import RigClimber
-from thermoxels_ns.capture.rig_levels import (
+from thermoxels_ns.capture.rig.fit import RigClimber
+from thermoxels_ns.capture.rig.image_pyramid import (
     FARTHEST_FROM_POINT,
     SURE_DISTANCE,
     PreparedFrame,
     PreparedFrames,
 )
-from thermoxels_ns.capture.rig_parameters import PARAMETERS, RigModel
-from thermoxels_ns.capture.rig_patches import THERMAL_BLUR_PX, PatchDesign, PatchScore, SmoothThermal, patch_design
+from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel
+from thermoxels_ns.capture.rig.patches import THERMAL_BLUR_PX, PatchDesign, PatchScore, SmoothThermal, patch_design
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from thermoxels_ns.capture.contract import RigEstimate
+from thermoxels_ns.capture.stage_types import RigEstimate
 
 _FAR_LESS_SURE = 2.0
 """Times the standard error of a point's place that the turn alone would move it, from which on that is explained."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.rig_parameters import PARAMETERS
+from thermoxels_ns.capture.rig.parameters import PARAMETERS
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from thermoxels_ns.capture.disk_space import filled, is_full
-from thermoxels_ns.errors import ThermoxelsError, explain
+from thermoxels_ns.capture.sfm.disk_space import filled, is_full
+from thermoxels_ns.core.errors import ThermoxelsError, explain
 
 _FATAL_ONLY = 3
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.capture.contract import OPENGL_FROM_OPENCV, CameraModel
-from thermoxels_ns.capture.sfm_model import SfmModel
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.stage_types import OPENGL_FROM_OPENCV, CameraModel
+from thermoxels_ns.core.errors import SceneError, explain
 
 _FIELDS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from thermoxels_ns.capture.colmap_log import colmap_stopped
-from thermoxels_ns.errors import ThermoxelsError
+from thermoxels_ns.capture.sfm.colmap_log import colmap_stopped
+from thermoxels_ns.core.errors import ThermoxelsError
 
 Say = Callable[[str], None]
 _Result = TypeVar("_Result")

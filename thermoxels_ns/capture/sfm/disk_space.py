@@ -6,7 +6,7 @@ import os
 import shutil
 from pathlib import Path
 
-from thermoxels_ns.errors import OutputError, explain
+from thermoxels_ns.core.errors import OutputError, explain
 
 _FULL_BYTES = 1_000_000
 """Free space up to which a disk is taken for the reason why a program ended: programs write whole pages."""

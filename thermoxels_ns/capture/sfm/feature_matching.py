@@ -10,11 +10,11 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.colmap_log import quiet_colmap
-from thermoxels_ns.capture.colmap_process import run_apart
-from thermoxels_ns.capture.contract import CameraModel
-from thermoxels_ns.capture.disk_space import check_free_space
-from thermoxels_ns.checks import remove_file
+from thermoxels_ns.capture.sfm.colmap_log import quiet_colmap
+from thermoxels_ns.capture.sfm.colmap_process import run_apart
+from thermoxels_ns.capture.sfm.disk_space import check_free_space
+from thermoxels_ns.capture.stage_types import CameraModel
+from thermoxels_ns.core.checks import remove_file
 
 Matching = Literal["auto", "exhaustive", "sequential"]
 LensModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV"]

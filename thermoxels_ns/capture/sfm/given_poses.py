@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.capture.colmap_model import model_of_colmap, read_colmap
-from thermoxels_ns.capture.contract import CameraModel
-from thermoxels_ns.capture.poses import Poses, common_size
-from thermoxels_ns.capture.sfm_model import SfmModel
+from thermoxels_ns.capture.sfm.colmap_model import model_of_colmap, read_colmap
+from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.sfm.poses import Poses, common_size
+from thermoxels_ns.capture.stage_types import CameraModel
 from thermoxels_ns.capture.stages import read_json
+from thermoxels_ns.core.errors import SceneError, explain
 from thermoxels_ns.data.folder_walls import path_inside
-from thermoxels_ns.errors import SceneError, explain
 
 
 def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:

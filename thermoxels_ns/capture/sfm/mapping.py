@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.capture.colmap_log import quiet_colmap
-from thermoxels_ns.capture.colmap_model import model_of_colmap
-from thermoxels_ns.capture.colmap_process import run_apart
-from thermoxels_ns.capture.contract import OPENGL_FROM_OPENCV
-from thermoxels_ns.capture.feature_matching import lens_parameters
-from thermoxels_ns.capture.sfm_model import SfmModel
+from thermoxels_ns.capture.sfm.colmap_log import quiet_colmap
+from thermoxels_ns.capture.sfm.colmap_model import model_of_colmap
+from thermoxels_ns.capture.sfm.colmap_process import run_apart
+from thermoxels_ns.capture.sfm.feature_matching import lens_parameters
+from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.stage_types import OPENGL_FROM_OPENCV
 
 MIN_FRAMES = 3
 """Fewer photographs are no reconstruction."""

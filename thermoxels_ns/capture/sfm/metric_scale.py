@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.contract import FloatArray
 from thermoxels_ns.capture.photograph import GpsFix, open_photograph
-from thermoxels_ns.capture.sfm_model import SfmModel
-from thermoxels_ns.checks import check_positive
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.stage_types import FloatArray
+from thermoxels_ns.core.checks import check_positive
+from thermoxels_ns.core.errors import SceneError, explain
 
 _EARTH_RADIUS_M, _FLATTENING = 6378137.0, 1.0 / 298.257223563
 _WORST_GPS = 0.3

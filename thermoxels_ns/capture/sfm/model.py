@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.contract import OPENGL_FROM_OPENCV, CameraModel, FloatArray
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.capture.stage_types import OPENGL_FROM_OPENCV, CameraModel, FloatArray
+from thermoxels_ns.core.errors import SceneError, explain
 
 
 @dataclass(frozen=True)

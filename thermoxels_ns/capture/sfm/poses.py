@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from thermoxels_ns.capture.contract import CameraModel
-from thermoxels_ns.capture.feature_matching import FeatureOptions, LensModel, Matching, fill_database
-from thermoxels_ns.capture.mapping import MIN_FRAMES, MatchedPhotographs, map_photographs, triangulate
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
-from thermoxels_ns.capture.sfm_model import SfmModel
-from thermoxels_ns.errors import SceneError, explain
+from thermoxels_ns.capture.sfm.feature_matching import FeatureOptions, LensModel, Matching, fill_database
+from thermoxels_ns.capture.sfm.mapping import MIN_FRAMES, MatchedPhotographs, map_photographs, triangulate
+from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.stage_types import CameraModel
+from thermoxels_ns.core.errors import SceneError, explain
 
 _GUESSED_FOCAL = 1.0
 """Of the longest side, where the photograph does not say: a lens of 53 degrees."""

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from thermoxels_ns.checks import check_finite
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.mesh.net_planes import evened_normals, net_planes, net_vertices
-from thermoxels_ns.mesh.surface_net import surface_net, voxel_faces
+from thermoxels_ns.core.checks import check_finite
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.mesh.boundary.net_planes import evened_normals, net_planes, net_vertices
+from thermoxels_ns.mesh.boundary.surface_net import surface_net, voxel_faces
 
 LEAST_AREA_FACTOR = 0.05
 """Lower bound of a face's area factor: no face that convection or radiation acts on is without area."""

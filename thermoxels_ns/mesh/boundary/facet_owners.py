@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError, explain
 from thermoxels_ns.mesh.voxel_tets import OUTWARD_FACES
 
 

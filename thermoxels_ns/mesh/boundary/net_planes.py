@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from thermoxels_ns.mesh.surface_net import SurfaceNet, VoxelFaces
+from thermoxels_ns.mesh.boundary.surface_net import SurfaceNet, VoxelFaces
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from thermoxels_ns.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError, explain
 
 FACINGS = ("up", "side", "down")
 """Where a surface may face."""

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_finite, check_shape
-from thermoxels_ns.errors import MeshError, explain
-from thermoxels_ns.mesh.patch_rules import DEFAULT_PATCHES, DEFAULT_REGION, FACINGS, PatchRules, Rule
+from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.mesh.boundary.patch_rules import DEFAULT_PATCHES, DEFAULT_REGION, FACINGS, PatchRules, Rule
 
 _COS_45 = math.sqrt(0.5) + 1e-9
 """A little above the cosine of 45 degrees, so that a roof of exactly 45 degrees is a side whatever its rounding."""

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError, explain
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Colouring = Literal["temperature", "photographs"]

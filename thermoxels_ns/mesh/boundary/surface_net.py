@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from thermoxels_ns.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError, explain
 
 IntArray = npt.NDArray[np.int64]
 

@@ -7,15 +7,15 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.mesh.facet_normals import true_surface
-from thermoxels_ns.mesh.patch_rules import PatchRules
-from thermoxels_ns.mesh.patches import apply_patches
-from thermoxels_ns.mesh.quality import facet_normals
-from thermoxels_ns.mesh.solid import SolidCells
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import Views
+from thermoxels_ns.mesh.boundary.facet_normals import true_surface
+from thermoxels_ns.mesh.boundary.patch_rules import PatchRules
+from thermoxels_ns.mesh.boundary.patches import apply_patches
+from thermoxels_ns.mesh.boundary.visibility import seen_facets
+from thermoxels_ns.mesh.quality.checks import facet_normals
+from thermoxels_ns.mesh.solid.voxels import SolidCells
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary, TetMesh
-from thermoxels_ns.mesh.visibility import seen_facets
-from thermoxels_ns.snapshot import Views
 
 BoundaryMode = Literal["conforming", "voxel"]
 """How the boundary of a mesh runs: along the level set of the density, or along voxel faces."""

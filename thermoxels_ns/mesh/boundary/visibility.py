@@ -10,10 +10,10 @@ import numpy.typing as npt
 from numba import njit
 from scipy import ndimage
 
-from thermoxels_ns.checks import check_finite, check_shape
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.snapshot import Views
+from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import Views
 
 START_ABOVE_SURFACE = (1.0, 0.5)
 """A line of sight starts this far out along the normal, [voxels]: past the steps of a staircase, or, if something solid

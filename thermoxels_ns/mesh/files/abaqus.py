@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_positive, replace_when_done, writable_folder
-from thermoxels_ns.errors import HeatError, MeshError, explain
-from thermoxels_ns.mesh.facet_owners import facet_owners
-from thermoxels_ns.mesh.file_content import FileContent, check_suffix, file_content
-from thermoxels_ns.mesh.quality import facet_area_vectors
+from thermoxels_ns.core.checks import check_positive, replace_when_done, writable_folder
+from thermoxels_ns.core.errors import HeatError, MeshError, explain
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
+from thermoxels_ns.mesh.boundary.facet_owners import facet_owners
+from thermoxels_ns.mesh.files.content import FileContent, check_suffix, file_content
+from thermoxels_ns.mesh.quality.checks import facet_area_vectors
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-from thermoxels_ns.units import ZERO_CELSIUS_K
 
 STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8
 """Stefan-Boltzmann constant (CODATA 2018, exact to the digits given), [W / (m2 K4)]."""

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_finite, check_shape
-from thermoxels_ns.errors import MeshError, OutputError, explain
-from thermoxels_ns.mesh.quality import facet_area_vectors
+from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.errors import MeshError, OutputError, explain
+from thermoxels_ns.mesh.quality.checks import facet_area_vectors
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 UNTAGGED_PATCH = "boundary"

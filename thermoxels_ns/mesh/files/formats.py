@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.errors import MeshError, OutputError, explain
-from thermoxels_ns.mesh.abaqus_file import HeatStep, write_inp
-from thermoxels_ns.mesh.boundary_file import boundary_path, write_boundary_vtp
-from thermoxels_ns.mesh.files import write_vtu
-from thermoxels_ns.mesh.gltf_file import write_glb
-from thermoxels_ns.mesh.gmsh_file import write_msh
-from thermoxels_ns.mesh.surface import Colouring
-from thermoxels_ns.mesh.surface_files import check_stl, write_ply, write_stl
+from thermoxels_ns.core.errors import MeshError, OutputError, explain
+from thermoxels_ns.mesh.boundary.surface import Colouring
+from thermoxels_ns.mesh.files.abaqus import HeatStep, write_inp
+from thermoxels_ns.mesh.files.gltf import write_glb
+from thermoxels_ns.mesh.files.gmsh import write_msh
+from thermoxels_ns.mesh.files.stl_ply import check_stl, write_ply, write_stl
+from thermoxels_ns.mesh.files.vtp import boundary_path, write_boundary_vtp
+from thermoxels_ns.mesh.files.vtu import write_vtu
+from thermoxels_ns.mesh.files.xdmf import heavy_data_path, write_xdmf
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-from thermoxels_ns.mesh.xdmf_file import heavy_data_path, write_xdmf
 
 
 @dataclass(frozen=True)

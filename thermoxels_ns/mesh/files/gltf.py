@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import replace_when_done, writable_folder
-from thermoxels_ns.errors import MeshError, explain
-from thermoxels_ns.mesh.file_content import check_suffix, file_content
-from thermoxels_ns.mesh.surface import Colouring, far_origin, surface_colours, surface_of, surface_range_c
+from thermoxels_ns.core.checks import replace_when_done, writable_folder
+from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.mesh.boundary.surface import Colouring, far_origin, surface_colours, surface_of, surface_range_c
+from thermoxels_ns.mesh.files.content import check_suffix, file_content
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _MAGIC, _VERSION, _JSON_CHUNK, _BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942

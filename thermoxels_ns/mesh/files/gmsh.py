@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import replace_when_done, writable_folder
-from thermoxels_ns.errors import MeshError, explain
-from thermoxels_ns.mesh.facet_owners import facet_owners
-from thermoxels_ns.mesh.file_content import FileContent, check_suffix, file_content
+from thermoxels_ns.core.checks import replace_when_done, writable_folder
+from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.mesh.boundary.facet_owners import facet_owners
+from thermoxels_ns.mesh.files.content import FileContent, check_suffix, file_content
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 TEMPERATURE_VIEW = "temperature_c"

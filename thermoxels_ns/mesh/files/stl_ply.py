@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import replace_when_done, writable_folder
-from thermoxels_ns.errors import MeshError, explain
-from thermoxels_ns.mesh.file_content import check_suffix, colour_bytes, file_content
-from thermoxels_ns.mesh.quality import facet_area_vectors, facet_areas
-from thermoxels_ns.mesh.surface import COLOUR_MAP, Colouring, surface_colours, surface_of, surface_range_c
+from thermoxels_ns.core.checks import replace_when_done, writable_folder
+from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.mesh.boundary.surface import COLOUR_MAP, Colouring, surface_colours, surface_of, surface_range_c
+from thermoxels_ns.mesh.files.content import check_suffix, colour_bytes, file_content
+from thermoxels_ns.mesh.quality.checks import facet_area_vectors, facet_areas
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _STL_HEADER = b"Surface of a tetrahedral mesh, metres".ljust(80)

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_finite, check_shape
-from thermoxels_ns.errors import MeshError
-from thermoxels_ns.mesh.file_content import check_suffix, colour_bytes, file_content
-from thermoxels_ns.mesh.files import write_vtk
-from thermoxels_ns.mesh.quality import facet_area_vectors
-from thermoxels_ns.mesh.surface import surface_of
+from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.mesh.boundary.surface import surface_of
+from thermoxels_ns.mesh.files.content import check_suffix, colour_bytes, file_content
+from thermoxels_ns.mesh.files.vtu import write_vtk
+from thermoxels_ns.mesh.quality.checks import facet_area_vectors
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 
 

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_finite, check_shape, replace_when_done, writable_folder
-from thermoxels_ns.errors import MeshError, OutputError, explain
-from thermoxels_ns.mesh.file_content import check_suffix, colour_bytes, file_content
+from thermoxels_ns.core.checks import check_finite, check_shape, replace_when_done, writable_folder
+from thermoxels_ns.core.errors import MeshError, OutputError, explain
+from thermoxels_ns.core.units import celsius_to_kelvin
+from thermoxels_ns.mesh.files.content import check_suffix, colour_bytes, file_content
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-from thermoxels_ns.units import celsius_to_kelvin
 
 _OWN_ARRAYS = ("temperature_c", "temperature_k", "observed", "colour")
 

@@ -9,10 +9,10 @@ from xml.etree import ElementTree
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import remove_file, replace_when_done, writable_folder
-from thermoxels_ns.mesh.file_content import FileContent, check_suffix, colour_bytes, file_content
+from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.units import celsius_to_kelvin
+from thermoxels_ns.mesh.files.content import FileContent, check_suffix, colour_bytes, file_content
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-from thermoxels_ns.units import celsius_to_kelvin
 
 BODY_GRID = "mesh"
 """Name of the grid of tetrahedra: what `read_mesh` of FEniCSx asks for unless told otherwise."""

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_finite, check_shape
-from thermoxels_ns.errors import MeshError, explain
-from thermoxels_ns.mesh.face_count import Groups, IntArray, faces_of_rows, group_faces, group_pairs
-from thermoxels_ns.mesh.tet_shapes import shapes_in_chunks, signed_volumes
+from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.mesh.quality.face_count import Groups, IntArray, faces_of_rows, group_faces, group_pairs
+from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks, signed_volumes
+from thermoxels_ns.mesh.quality.topology import group_sides
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
-from thermoxels_ns.mesh.topology import group_sides
 
 __all__ = [
     "MeshQuality",

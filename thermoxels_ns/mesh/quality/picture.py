@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermoxels_ns.checks import replace_when_done, writable_folder
-from thermoxels_ns.errors import OutputError, explain
-from thermoxels_ns.mesh.promises import DIHEDRAL_BOUNDS_DEG, angle_bins, in_percent
-from thermoxels_ns.mesh.quality_report import RATIO_BIN, QualityReport
+from thermoxels_ns.core.checks import replace_when_done, writable_folder
+from thermoxels_ns.core.errors import OutputError, explain
+from thermoxels_ns.mesh.quality.criteria import DIHEDRAL_BOUNDS_DEG, angle_bins, in_percent
+from thermoxels_ns.mesh.quality.report import RATIO_BIN, QualityReport
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

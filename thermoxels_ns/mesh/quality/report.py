@@ -8,19 +8,25 @@ from typing import Any, get_args
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.errors import MeshError, explain
-from thermoxels_ns.mesh.face_count import IntArray, edges_of_rows, group_edges, group_faces
-from thermoxels_ns.mesh.promises import AngleBins, BoundaryMode, Evidence, Promise, angle_bins, judge
-from thermoxels_ns.mesh.quality import check_arrays, count_overlaps, count_twin_nodes, count_wrong_facets, facet_areas
-from thermoxels_ns.mesh.tet_shapes import angle_rounding, node_rounding, shapes_in_chunks
-from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
-from thermoxels_ns.mesh.topology import (
+from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.mesh.quality.checks import (
+    check_arrays,
+    count_overlaps,
+    count_twin_nodes,
+    count_wrong_facets,
+    facet_areas,
+)
+from thermoxels_ns.mesh.quality.criteria import AngleBins, BoundaryMode, Evidence, Promise, angle_bins, judge
+from thermoxels_ns.mesh.quality.face_count import IntArray, edges_of_rows, group_edges, group_faces
+from thermoxels_ns.mesh.quality.tet_shapes import angle_rounding, node_rounding, shapes_in_chunks
+from thermoxels_ns.mesh.quality.topology import (
     SurfaceComponent,
     count_bodies,
     group_sides,
     surface_topology,
     tets_across_faces,
 )
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 
 RATIO_BIN = 0.05
 """Width of the bins of the radius ratio; 20 of them from 0 to 1, the last includes 1."""

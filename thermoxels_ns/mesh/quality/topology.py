@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from thermoxels_ns.mesh.face_count import Groups, IntArray, group_pairs
+from thermoxels_ns.mesh.quality.face_count import Groups, IntArray, group_pairs
 
 
 @dataclass(frozen=True)

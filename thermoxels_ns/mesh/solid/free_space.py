@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.snapshot import Views
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import Views
 
 BoolArray = npt.NDArray[np.bool_]
 

@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.mesh.free_space import look
-from thermoxels_ns.mesh.morphology import close_gaps, connected, convex_hull, face_connected
-from thermoxels_ns.mesh.winding_number import winding_number
-from thermoxels_ns.snapshot import Views
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import Views
+from thermoxels_ns.mesh.solid.free_space import look
+from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected
+from thermoxels_ns.mesh.solid.winding_number import winding_number
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -46,8 +46,8 @@ def interior(cells: BoolArray, lattice: Lattice, views: Views | None, seal: int)
 
     A body is what touches once openings are sealed. Its inside are cavities of the sealed shell and, if the cameras
     are known, the space within its convex hull that they should see but do not, because the shell stands in front of
-    it (see `thermoxels_ns.mesh.free_space`), and that the backs of seen surfaces surround (see
-    `thermoxels_ns.mesh.winding_number`). The hull bounds the shadow behind bodies seen from one side; the winding
+    it (see `thermoxels_ns.mesh.solid.free_space`), and that the backs of seen surfaces surround (see
+    `thermoxels_ns.mesh.solid.winding_number`). The hull bounds the shadow behind bodies seen from one side; the winding
     number tells the shadow of a body from its inside.
 
     Through holes of the shell a few cameras look past it onto what others know to be inside. Such lines of sight end

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from thermoxels_ns.mesh.morphology import bounding_box
-from thermoxels_ns.mesh.surface_ramp import surface_ramp
-from thermoxels_ns.mesh.volume_keeping import keep_volume
+from thermoxels_ns.mesh.solid.morphology import bounding_box
+from thermoxels_ns.mesh.solid.surface_ramp import surface_ramp
+from thermoxels_ns.mesh.solid.volume_keeping import keep_volume
 
 BoolArray = npt.NDArray[np.bool_]
 FloatArray = npt.NDArray[np.float32]

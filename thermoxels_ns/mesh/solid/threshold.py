@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.errors import MeshError, explain
-from thermoxels_ns.snapshot import GridSnapshot, RayEvidence
+from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
 
 FALLBACK_OPTICAL_DEPTH = 0.5
 """Density times voxel edge from which on a voxel is solid where rays say nothing: it takes 39 % of the light."""

@@ -9,20 +9,20 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_positive
-from thermoxels_ns.errors import MeshError, explain
-from thermoxels_ns.mesh.interior import interior
-from thermoxels_ns.mesh.level_set import level_of
-from thermoxels_ns.mesh.morphology import close_gaps, connected, face_connected, fill_enclosed
-from thermoxels_ns.mesh.threshold import (
+from thermoxels_ns.core.checks import check_positive
+from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.snapshot import GridSnapshot
+from thermoxels_ns.mesh.solid.interior import interior
+from thermoxels_ns.mesh.solid.level_set import level_of
+from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, face_connected, fill_enclosed
+from thermoxels_ns.mesh.solid.threshold import (
     Threshold,
     automatic_threshold,
     density_threshold,
     optical_depth_threshold,
     percentile_threshold,
 )
-from thermoxels_ns.mesh.wall_thickness import THINNEST_GROWN, wall_behind
-from thermoxels_ns.snapshot import GridSnapshot
+from thermoxels_ns.mesh.solid.wall_thickness import THINNEST_GROWN, wall_behind
 
 __all__ = [
     "InteriorKind",

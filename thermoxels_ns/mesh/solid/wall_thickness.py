@@ -6,10 +6,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from thermoxels_ns.lattice import Lattice
-from thermoxels_ns.mesh.free_space import Sight, look
-from thermoxels_ns.mesh.morphology import grow
-from thermoxels_ns.snapshot import Views
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.snapshot import Views
+from thermoxels_ns.mesh.solid.free_space import Sight, look
+from thermoxels_ns.mesh.solid.morphology import grow
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -21,7 +21,7 @@ THINNEST_GROWN = 1.5
 def wall_behind(cells: BoolArray, lattice: Lattice, views: Views, thickness: float) -> BoolArray:
     """Find the voxels that make the seen surface as thick as a wall.
 
-    Seen surface are the solid voxels that enough cameras have a free line to (see `thermoxels_ns.mesh.free_space`). An
+    Seen surface are the solid voxels that enough cameras have a free line to (see `free_space`). An
     empty voxel joins if it lies within the thickness of them, counted from their outer faces, on the straight way
     through space that is solid or not seen. Voxels that cameras look through never join, so a plate that is seen from
     both sides does not grow.

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from scipy.ndimage import binary_dilation
 from scipy.spatial import KDTree
 
-from thermoxels_ns.mesh.quality import facet_area_vectors
-from thermoxels_ns.mesh.stuffing import StuffedSolid
+from thermoxels_ns.mesh.quality.checks import facet_area_vectors
+from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]

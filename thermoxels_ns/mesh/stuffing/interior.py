@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.mesh.bcc_lattice import BccLattice, index_box
-from thermoxels_ns.mesh.octree import BoolArray, balanced_octree, eroded, split_in_eight
+from thermoxels_ns.mesh.stuffing.bcc_lattice import BccLattice, index_box
+from thermoxels_ns.mesh.stuffing.octree import BoolArray, balanced_octree, eroded, split_in_eight
 
 # The sides of a face lie between its corners 0-1, 1-2, 2-3 and 3-0, counter-clockwise seen from where its axis points.
 _CORNERS = np.array([[0, 0, 0], [0, 1, 0], [0, 1, 1], [0, 0, 1]])

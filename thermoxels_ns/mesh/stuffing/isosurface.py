@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.checks import check_finite, check_shape
-from thermoxels_ns.errors import MeshError, explain
-from thermoxels_ns.mesh.bcc_lattice import DIRECTIONS, BccLattice, bcc_lattice
-from thermoxels_ns.mesh.stuffing_interior import CoarseInterior, coarse_interior
-from thermoxels_ns.mesh.stuffing_stencils import (
+from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.mesh.stuffing.bcc_lattice import DIRECTIONS, BccLattice, bcc_lattice
+from thermoxels_ns.mesh.stuffing.interior import CoarseInterior, coarse_interior
+from thermoxels_ns.mesh.stuffing.stencils import (
     BUNDLE_EDGES,
     BUNDLE_POINTS,
     CODE_WEIGHTS,
@@ -20,7 +20,7 @@ from thermoxels_ns.mesh.stuffing_stencils import (
     SIDES_OUTWARD,
     stencil_table,
 )
-from thermoxels_ns.mesh.stuffing_warp import WarpedLattice, warp
+from thermoxels_ns.mesh.stuffing.warp import WarpedLattice, warp
 
 _CHUNK = 1 << 16
 

@@ -15,10 +15,18 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from thermoxels_ns.errors import MeshError, explain
-from thermoxels_ns.mesh.edge_planes import BoolArray, FloatArray, IntArray, Planes, Surface, edge_planes, is_near
-from thermoxels_ns.mesh.stuffing import StuffedSolid
-from thermoxels_ns.mesh.tet_shapes import shapes_in_chunks
+from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
+from thermoxels_ns.mesh.stuffing.edge_planes import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Planes,
+    Surface,
+    edge_planes,
+    is_near,
+)
+from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid
 
 ANGLES_DEG = (13.0, 160.0)
 """No move is made that leaves a dihedral angle outside this range. It is narrower than what stuffing itself promises,

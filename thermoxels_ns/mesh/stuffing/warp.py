@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.mesh.bcc_lattice import DIRECTIONS, LENGTHS, NUM_DIRECTIONS, OPPOSITE, BccLattice
+from thermoxels_ns.mesh.stuffing.bcc_lattice import DIRECTIONS, LENGTHS, NUM_DIRECTIONS, OPPOSITE, BccLattice
 
 ALPHA_INSIDE = np.where(LENGTHS == 1.0, 0.272, 0.397)
 """Share of each of the 14 edges within which a cut pulls a point inside the solid onto the surface."""

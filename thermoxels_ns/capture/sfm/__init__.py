@@ -1,0 +1,1 @@
+"""Camera poses from photographs by structure from motion, and their scale."""

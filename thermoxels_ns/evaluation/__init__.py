@@ -1,0 +1,1 @@
+"""Comparison of a reconstruction with the truth."""

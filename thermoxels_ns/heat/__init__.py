@@ -1,0 +1,1 @@
+"""Heat scenes: materials, effects, weather, screening and results in watts."""

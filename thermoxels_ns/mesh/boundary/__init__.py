@@ -1,0 +1,1 @@
+"""The boundary of a mesh: tags, patches, normals, areas and visibility."""

@@ -1,0 +1,1 @@
+"""Whether a mesh is fit for a finite-element solver."""

@@ -1,0 +1,1 @@
+"""Which part of space is solid."""

@@ -1,0 +1,1 @@
+"""Isosurface stuffing: tetrahedra that follow the surface."""

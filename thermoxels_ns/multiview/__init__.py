@@ -1,0 +1,1 @@
+"""What photographs say without a model: depths by multi-view stereo."""

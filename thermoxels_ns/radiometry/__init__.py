@@ -1,0 +1,1 @@
+"""From thermal camera files to degrees Celsius."""

@@ -1,0 +1,1 @@
+"""Scenes drawn by formula, whose shape and temperature are known exactly."""

@@ -1,0 +1,1 @@
+"""The nerfstudio model, its losses, optimisers and the course of a training."""
