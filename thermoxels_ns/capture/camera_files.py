@@ -14,7 +14,7 @@ from typing import Literal
 from PIL import Image
 
 from thermoxels_ns.capture.photograph import read_photograph_facts
-from thermoxels_ns.core.errors import SceneError, ThermoxelsError, explain
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 from thermoxels_ns.radiometry.decoders import naming
 from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg
 from thermoxels_ns.radiometry.exif import read_exif_facts
@@ -102,12 +102,10 @@ def scan_folder(
     """
     if not folder.is_dir():
         raise SceneError(
-            explain(
-                "input",
-                expected="a folder with camera files",
-                got=f"{'a file' if folder.exists() else 'nothing'} at {folder}",
-                remedy="Pass the folder that the memory card was copied to.",
-            )
+            "input",
+            expected="a folder with camera files",
+            got=f"{'a file' if folder.exists() else 'nothing'} at {folder}",
+            remedy="Pass the folder that the memory card was copied to.",
         )
     files, unreadable, others = [], dict[Path, str](), 0
     found, passed_over = files_below(folder, without)
@@ -177,12 +175,10 @@ def shown_name(path: Path) -> str:
 def _check_name(name: Path) -> None:
     if any(unicodedata.category(each) in _UNPRINTED for each in str(name)):
         raise SceneError(
-            explain(
-                "/".join(shown_name(Path(part)) for part in name.parts),
-                expected="a name that can be printed",
-                got="one with line breaks, control characters or bytes of no encoding",
-                remedy="Rename the file.",
-            )
+            "/".join(shown_name(Path(part)) for part in name.parts),
+            expected="a name that can be printed",
+            got="one with line breaks, control characters or bytes of no encoding",
+            remedy="Rename the file.",
         )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.masks import PhotographMasks, find_overlay, mask_files
 from thermoxels_ns.capture.photograph import read_photograph_facts
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 
 _LOOKED_AT = 40
 """Photographs that overlays are looked for in."""
@@ -57,11 +57,9 @@ def user_masks(frames: Sequence[CaptureFrame], folder: Path | None) -> dict[str,
             found[frame.name] = own
     if not found:
         raise SceneError(
-            explain(
-                "masks",
-                expected="masks named like photographs",
-                got=f"{len(files)} pictures in {folder}, none of them named so",
-                remedy=f"Name them like {Path(frames[0].photograph_source).stem}.png.",
-            )
+            "masks",
+            expected="masks named like photographs",
+            got=f"{len(files)} pictures in {folder}, none of them named so",
+            remedy=f"Name them like {Path(frames[0].photograph_source).stem}.png.",
         )
     return found

@@ -15,7 +15,7 @@ from thermoxels_ns.capture.masks import read_mask
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.photograph import GpsFix, open_photograph, read_photograph_facts
 from thermoxels_ns.capture.stages import read_json, write_json
-from thermoxels_ns.core.errors import SceneError, ThermoxelsError, explain
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 from thermoxels_ns.radiometry.camera_file import RadiometryOptions, read_thermogram
 from thermoxels_ns.radiometry.conditions import Conditions
 from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
@@ -145,12 +145,10 @@ def read_frames(
             say(f"read: {number} of {len(pairs)} pairs")
     if not frames:
         raise SceneError(
-            explain(
-                "pairs",
-                expected="at least one pair whose files can be read",
-                got=f"none of {len(pairs)}: " + (next(iter(dropped.values())) if dropped else "there are no pairs"),
-                remedy="Look at the files, or at the pairs that were found in capture.html.",
-            )
+            "pairs",
+            expected="at least one pair whose files can be read",
+            got=f"none of {len(pairs)}: " + (next(iter(dropped.values())) if dropped else "there are no pairs"),
+            remedy="Look at the files, or at the pairs that were found in capture.html.",
         )
     height, width = Counter(sizes).most_common(1)[0][0]
     for frame, shape in zip(frames, sizes):
@@ -173,12 +171,10 @@ def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -
         content = read_flir_jpeg(pair.photograph).visible
         if content is None:
             raise SceneError(
-                explain(
-                    str(pair.photograph),
-                    expected="a photograph inside the file",
-                    got="none in a form that is known",
-                    remedy="Export the photograph with the camera's program and put it beside the file.",
-                )
+                str(pair.photograph),
+                expected="a photograph inside the file",
+                got="none in a form that is known",
+                remedy="Export the photograph with the camera's program and put it beside the file.",
             )
         photograph = folder / "photographs" / (pair.name + (".jpg" if content.startswith(b"\xff\xd8") else ".png"))
         photograph.write_bytes(content)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from thermoxels_ns.capture.photograph import open_photograph
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 
 MIN_FRAMES = 8
 """Fewer photographs cannot tell what is drawn over them from what they all happen to show."""
@@ -103,12 +103,10 @@ def read_mask(path: Path, width: int, height: int) -> npt.NDArray[np.bool_]:
     mask = np.asarray(open_photograph(path).convert("L")) >= 128
     if mask.shape != (height, width):
         raise SceneError(
-            explain(
-                str(path),
-                expected=f"a mask of {width} x {height} pixels, as the images have",
-                got=f"{mask.shape[1]} x {mask.shape[0]}",
-                remedy="Draw it on one of the images: white where they may be used, black elsewhere.",
-            )
+            str(path),
+            expected=f"a mask of {width} x {height} pixels, as the images have",
+            got=f"{mask.shape[1]} x {mask.shape[0]}",
+            remedy="Draw it on one of the images: white where they may be used, black elsewhere.",
         )
     return mask
 
@@ -120,9 +118,7 @@ def mask_files(folder: Path) -> dict[str, Path]:
         SceneError: There is no such folder.
     """
     if not folder.is_dir():
-        raise SceneError(
-            explain("masks", expected="a folder of masks", got=f"no folder at {folder}", remedy="Check the path.")
-        )
+        raise SceneError("masks", expected="a folder of masks", got=f"no folder at {folder}", remedy="Check the path.")
     return {
         path.stem.lower(): path for path in sorted(folder.iterdir()) if path.suffix.lower() in (".png", ".jpg", ".jpeg")
     }

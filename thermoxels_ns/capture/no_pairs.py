@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from thermoxels_ns.capture.camera_files import CameraFile, CameraFolder, shown_name
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 
 _DJI_LIBRARY = (
     "DJI's thermal images also need DJI's own library: download the DJI Thermal SDK and pass --dji-library with the "
@@ -38,9 +38,7 @@ def no_pairs(found: CameraFolder, unpaired: Mapping[Path, str], has_dji_library:
         remedies.append(f"Not looked at: {shown_name(path)}: {why}.")
     if any(file.dji for file in thermal) and not has_dji_library:
         remedies.append(_DJI_LIBRARY)
-    return SceneError(
-        explain(str(found.folder), expected="photographs with thermal images", got=got, remedy=" ".join(remedies))
-    )
+    return SceneError(str(found.folder), expected="photographs with thermal images", got=got, remedy=" ".join(remedies))
 
 
 def _counted(found: CameraFolder, photographs: int, thermal: int, pictures: int) -> str:

@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from thermoxels_ns.capture.stages import CACHE_FOLDER
-from thermoxels_ns.core.errors import OutputError, explain
+from thermoxels_ns.core.errors import OutputError
 
 try:
     import fcntl
@@ -42,14 +42,10 @@ def only_capture(output: Path, say: Callable[[str], None] = lambda _: None) -> I
         if not _lock(file, say):
             number = os.read(file, _MOST_DIGITS).decode("ascii", "replace")
             raise OutputError(
-                explain(
-                    "output",
-                    expected="a folder that no other capture is working in",
-                    got=f"{output}, where process {number} is at work"
-                    if number.isdigit()
-                    else f"{output}, where one is",
-                    remedy="Wait until it ends, or pass another folder with --output.",
-                )
+                "output",
+                expected="a folder that no other capture is working in",
+                got=f"{output}, where process {number} is at work" if number.isdigit() else f"{output}, where one is",
+                remedy="Wait until it ends, or pass another folder with --output.",
             )
         with suppress(OSError):  # the number is for that message alone; what needs a full disk will name it
             os.ftruncate(file, 0)

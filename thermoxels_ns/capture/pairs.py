@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from thermoxels_ns.capture.camera_files import ROLE_WORDS, CameraFile, CameraFolder, natural_key, words_of
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.folder_walls import path_inside
 
 _DJI = re.compile(r"^(?P<head>.*?dji)_(?:(?P<time>\d{14})_)?(?P<number>\d{3,})_(?P<role>[a-z])(?P<tail>.*)$")
@@ -114,33 +114,29 @@ def read_pair_list(file: Path, folder: Path) -> PairSearch:
         rows = [row for row in csv.reader(file.read_text(encoding="utf-8-sig").splitlines()) if any(row)]
     except (OSError, UnicodeDecodeError, csv.Error) as problem:
         raise SceneError(
-            explain(str(file), expected="a CSV file of pairs", got=str(problem), remedy="Write it again.")
+            str(file), expected="a CSV file of pairs", got=str(problem), remedy="Write it again."
         ) from problem
     pairs = []
     for number, row in enumerate(rows, start=1):
         where = f"{file.name}: line {number}"
         if len(row) != 2:
             raise SceneError(
-                explain(where, expected="photograph,thermal", got=",".join(row), remedy="Write two names per line.")
+                where, expected="photograph,thermal", got=",".join(row), remedy="Write two names per line."
             )
         photograph, thermal = (path_inside(folder, name.strip(), where) for name in row)
         missing = [path for path in (photograph, thermal) if not path.is_file()]
         if missing and number == 1 and len(missing) == 2:
             continue
         if missing:
-            raise SceneError(
-                explain(where, expected=f"a file {missing[0]}", got="none", remedy="Correct the name in the list.")
-            )
+            raise SceneError(where, expected=f"a file {missing[0]}", got="none", remedy="Correct the name in the list.")
         pairs.append((photograph, thermal))
     twice = [path.name for side in zip(*pairs) for path, count in Counter(side).items() if count > 1]
     if twice or not pairs:
         raise SceneError(
-            explain(
-                str(file),
-                expected="at least one pair, and every file in one pair only",
-                got=f"{twice[0]} twice" if twice else "no pair",
-                remedy="Correct the list.",
-            )
+            str(file),
+            expected="at least one pair, and every file in one pair only",
+            got=f"{twice[0]} twice" if twice else "no pair",
+            remedy="Correct the list.",
         )
     root = folder.resolve()
     names = _names([photograph for photograph, _ in pairs], root)

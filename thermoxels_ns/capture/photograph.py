@@ -13,7 +13,7 @@ from typing import Any
 
 from PIL import Image
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.decoders import naming
 from thermoxels_ns.radiometry.exif import ExifFacts, read_exif_facts
 
@@ -95,12 +95,10 @@ def check_photograph_size(path: Path, width: int, height: int) -> None:
     """Raise a `SceneError` if a photograph's header claims more pixels than cameras have."""
     if not (0 < width < LARGEST_SIDE and 0 < height < LARGEST_SIDE and width * height <= _LARGEST_PIXELS):
         raise SceneError(
-            explain(
-                str(path),
-                expected=f"a photograph below {LARGEST_SIDE} pixels a side and {_LARGEST_PIXELS} in all",
-                got=f"a header that says {width} x {height}",
-                remedy="The header is damaged; copy the file from the camera again.",
-            )
+            str(path),
+            expected=f"a photograph below {LARGEST_SIDE} pixels a side and {_LARGEST_PIXELS} in all",
+            got=f"a header that says {width} x {height}",
+            remedy="The header is damaged; copy the file from the camera again.",
         )
 
 

@@ -17,7 +17,7 @@ from thermoxels_ns.capture.sfm.model import SfmModel
 from thermoxels_ns.capture.stage_types import CameraModel, DriftEstimate, RigEstimate
 from thermoxels_ns.capture.stages import read_json, write_json
 from thermoxels_ns.core.checks import replace_when_done
-from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError
 
 
 def save_pairs(folder: Path, search: PairSearch, root: Path) -> None:
@@ -151,12 +151,10 @@ def _arrays(path: Path) -> dict[str, Any]:
             return {name: opened[name] for name in opened.files}
     except (OSError, ValueError, KeyError) as problem:
         raise ThermoxelsError(
-            explain(
-                str(path),
-                expected="what an earlier stage of the capture wrote",
-                got=str(problem) or type(problem).__name__,
-                remedy="Run it again with --from-stage pairs.",
-            )
+            str(path),
+            expected="what an earlier stage of the capture wrote",
+            got=str(problem) or type(problem).__name__,
+            remedy="Run it again with --from-stage pairs.",
         ) from problem
 
 

@@ -22,7 +22,7 @@ from thermoxels_ns.capture.stage_types import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.stages import StageCache, prepare_output
 from thermoxels_ns.capture.thermal_stages import board_stage, drift_stage, rig_stage
 from thermoxels_ns.core.checks import remove_stale_temporaries
-from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError, explain
+from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,10 @@ def run_capture(
         scan_folder(source)  # says what is wrong
     if source.resolve().is_relative_to(output.resolve()):
         raise SceneError(
-            explain(
-                "output",
-                expected="another folder than the input, which does not hold it either",
-                got=output,
-                remedy="Pass a new folder with --output; the camera's files stay as they are.",
-            )
+            "output",
+            expected="another folder than the input, which does not hold it either",
+            got=output,
+            remedy="Pass a new folder with --output; the camera's files stay as they are.",
         )
     board = board_of(settings)
     if settings.board_photos is not None and not settings.board_photos.is_dir():
@@ -84,12 +82,10 @@ def run_capture(
         raise
     except OSError as problem:
         raise OutputError(
-            explain(
-                str(problem.filename2 or problem.filename or folder),
-                expected="a file that can be read or written",
-                got=problem.strerror or str(problem),
-                remedy="Check free space and permissions, and run the command again: finished stages are kept.",
-            )
+            str(problem.filename2 or problem.filename or folder),
+            expected="a file that can be read or written",
+            got=problem.strerror or str(problem),
+            remedy="Check free space and permissions, and run the command again: finished stages are kept.",
         ) from problem
 
 

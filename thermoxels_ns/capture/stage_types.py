@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -54,12 +54,10 @@ class CameraModel:
         good = all(map(math.isfinite, numbers)) and min(self.fl_x, self.fl_y) > 0 and min(self.width, self.height) > 0
         if not good:
             raise SceneError(
-                explain(
-                    "camera",
-                    expected="at least one pixel, focal lengths above 0 and finite numbers",
-                    got=f"{self.width} x {self.height} pixels, {numbers}",
-                    remedy="Correct the intrinsics.",
-                )
+                "camera",
+                expected="at least one pixel, focal lengths above 0 and finite numbers",
+                got=f"{self.width} x {self.height} pixels, {numbers}",
+                remedy="Correct the intrinsics.",
             )
 
     @classmethod
@@ -71,12 +69,10 @@ class CameraModel:
         """
         if not 0.0 < horizontal_deg < 179.0:
             raise SceneError(
-                explain(
-                    "field of view",
-                    expected="an angle above 0 and below 179 degrees",
-                    got=horizontal_deg,
-                    remedy="Pass the horizontal angle of view from the lens's data sheet.",
-                )
+                "field of view",
+                expected="an angle above 0 and below 179 degrees",
+                got=horizontal_deg,
+                remedy="Pass the horizontal angle of view from the lens's data sheet.",
             )
         focal = 0.5 * width / math.tan(math.radians(0.5 * horizontal_deg))
         return cls(width, height, focal, focal, 0.5 * width, 0.5 * height)

@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args
 
 from thermoxels_ns import __version__
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError, explain
+from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
 
 StageName = Literal["pairs", "temperatures", "poses", "scale", "board", "rig", "drift", "scene", "page"]
 """The stages in order."""
@@ -120,7 +120,7 @@ def given_fingerprints(paths: Sequence[Path | None]) -> list[tuple[str, int, int
     for path in there:
         if not path.is_file():
             raise SceneError(
-                explain(str(path), expected="a file", got="nothing there", remedy="Check the path, or leave it out.")
+                str(path), expected="a file", got="nothing there", remedy="Check the path, or leave it out."
             )
     return fingerprint(there, Path("/")) if there else []
 
@@ -139,12 +139,10 @@ def prepare_output(folder: Path) -> Path:
     folder = writable_folder(folder)
     if not (folder / CACHE_FOLDER).is_dir() and any(folder.iterdir()):
         raise OutputError(
-            explain(
-                "output",
-                expected="an empty folder or one of an earlier capture",
-                got=f"{folder}, which holds other files",
-                remedy="Pass another folder with --output.",
-            )
+            "output",
+            expected="an empty folder or one of an earlier capture",
+            got=f"{folder}, which holds other files",
+            remedy="Pass another folder with --output.",
         )
     writable_folder(folder / CACHE_FOLDER)
     return folder
@@ -167,12 +165,10 @@ def read_json(path: Path) -> Any:
     except (OSError, ValueError, RecursionError) as problem:
         own = CACHE_FOLDER in path.parts
         raise ThermoxelsError(
-            explain(
-                str(path),
-                expected="what an earlier stage of the capture wrote" if own else "a file of json",
-                got=str(problem),
-                remedy="Run it again with --from-stage pairs." if own else "Write it again, or pass another file.",
-            )
+            str(path),
+            expected="what an earlier stage of the capture wrote" if own else "a file of json",
+            got=str(problem),
+            remedy="Run it again with --from-stage pairs." if own else "Write it again, or pass another file.",
         ) from problem
 
 
@@ -206,10 +202,8 @@ def _remove_folder(folder: Path) -> None:
         pass
     except OSError as problem:
         raise OutputError(
-            explain(
-                str(folder),
-                expected="an earlier result of the capture, which can be removed",
-                got=problem.strerror or str(problem),
-                remedy="Remove the folder by hand, or choose another one with --output.",
-            )
+            str(folder),
+            expected="an earlier result of the capture, which can be removed",
+            got=problem.strerror or str(problem),
+            remedy="Remove the folder by hand, or choose another one with --output.",
         ) from problem

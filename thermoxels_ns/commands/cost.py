@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from thermoxels_ns.core.checks import check_positive, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -91,7 +91,7 @@ def run_cost(cost: Cost, console: Console) -> None:
     targets = _targets(cost)
     settings, baseline = planned_settings(cost)
     if cost.repeats < 1:
-        raise ThermoxelsError(explain("repeats", expected="1 or more", got=cost.repeats, remedy="Pass --repeats 3."))
+        raise ThermoxelsError("repeats", expected="1 or more", got=cost.repeats, remedy="Pass --repeats 3.")
     folder = writable_folder(cost.output_dir)
     bench = Bench(cost.scene, folder, cost.keep_models)
 
@@ -126,12 +126,10 @@ def run_cost(cost: Cost, console: Console) -> None:
         _report(cost, folder, settings, counted, baseline, targets, console)
     if failed:
         raise ThermoxelsError(
-            explain(
-                "cost",
-                expected="every run to finish",
-                got=f"{len(failed)} that did not",
-                remedy="Start the command again to repeat them. " + "\n".join(failed),
-            )
+            "cost",
+            expected="every run to finish",
+            got=f"{len(failed)} that did not",
+            remedy="Start the command again to repeat them. " + "\n".join(failed),
         )
 
 
@@ -146,13 +144,13 @@ def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
     for name in ("methods", "recipes"):
         if not getattr(cost, name):
             raise ThermoxelsError(
-                explain(name, expected="at least one", got="none", remedy=f"Leave out --{name} for the default.")
+                name, expected="at least one", got="none", remedy=f"Leave out --{name} for the default."
             )
     try:
         further = tuple(shlex.split(cost.train_options))
     except ValueError as problem:
         raise ThermoxelsError(
-            explain("train_options", expected="words as in a shell", got=str(problem), remedy="Close the quotes.")
+            "train_options", expected="words as in a shell", got=str(problem), remedy="Close the quotes."
         ) from problem
 
     words: dict[str, tuple[str, ...]] = {}
@@ -164,12 +162,12 @@ def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
     words |= {quality: ("--quality", quality) for quality in cost.qualities}
     if not words:
         raise ThermoxelsError(
-            explain("settings", expected="a setting or a quality", got="none", remedy="Pass --settings 64:800.")
+            "settings", expected="a setting or a quality", got="none", remedy="Pass --settings 64:800."
         )
     baseline = cost.baseline or ("standard" if "standard" in words else [*words][-1])
     if baseline not in words:
         raise ThermoxelsError(
-            explain("baseline", expected=f"one of {', '.join(words)}", got=baseline, remedy="Name one of them.")
+            "baseline", expected=f"one of {', '.join(words)}", got=baseline, remedy="Name one of them."
         )
 
     def row(of: str, method: str, recipe: str, kind: str = "") -> CostSetting:

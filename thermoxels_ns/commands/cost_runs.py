@@ -16,7 +16,7 @@ from thermoxels_ns import __version__
 from thermoxels_ns.commands.cost_process import ProcessCost, Watch, run_measured
 from thermoxels_ns.commands.demo_commands import command_line
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
-from thermoxels_ns.core.errors import SceneError, ThermoxelsError, explain
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 
 FIGURES: Mapping[str, str] = {
     "seconds": "wall time of the whole ns-train command, from its start to its end",
@@ -105,12 +105,10 @@ def parse_setting(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"([1-9]\d*):([1-9]\d*)", text)
     if match is None:
         raise ThermoxelsError(
-            explain(
-                "settings",
-                expected="voxels and steps, such as 64:800",
-                got=repr(text),
-                remedy="Pass --settings 64:800 128:1500.",
-            )
+            "settings",
+            expected="voxels and steps, such as 64:800",
+            got=repr(text),
+            remedy="Pass --settings 64:800 128:1500.",
         )
     return int(match[1]), int(match[2])
 
@@ -167,12 +165,10 @@ def read_runs(path: Path) -> list[CostRun]:
         ]
     except (OSError, KeyError, TypeError, ValueError, csv.Error) as problem:
         raise ThermoxelsError(
-            explain(
-                str(path),
-                expected="the finished runs of an earlier start",
-                got=f"{type(problem).__name__}: {problem}",
-                remedy="Remove the file to measure again, or choose another --output-dir.",
-            )
+            str(path),
+            expected="the finished runs of an earlier start",
+            got=f"{type(problem).__name__}: {problem}",
+            remedy="Remove the file to measure again, or choose another --output-dir.",
         ) from problem
 
 
@@ -201,9 +197,7 @@ class Bench:
             SceneError: There is no such scene folder.
         """
         if not scene.is_dir():
-            raise SceneError(
-                explain("scene", expected="a scene folder", got=f"none at {scene}", remedy="Correct the path.")
-            )
+            raise SceneError("scene", expected="a scene folder", got=f"none at {scene}", remedy="Correct the path.")
         self.scene = scene
         self.fingerprint = scene_fingerprint(scene)
         self._folder = folder
@@ -278,12 +272,10 @@ def training_seconds(run_folder: Path) -> float:
     checkpoints = sorted((run_folder / "nerfstudio_models").glob("step-*.ckpt"))
     if not (start.is_file() and checkpoints):
         raise ThermoxelsError(
-            explain(
-                str(run_folder),
-                expected="dataparser_transforms.json and a checkpoint of a finished run",
-                got="a folder without them",
-                remedy="Look into the run's log.",
-            )
+            str(run_folder),
+            expected="dataparser_transforms.json and a checkpoint of a finished run",
+            got="a folder without them",
+            remedy="Look into the run's log.",
         )
     return checkpoints[-1].stat().st_mtime - start.stat().st_mtime
 
@@ -299,10 +291,8 @@ def read_evaluation(path: Path) -> dict[str, float]:
         return {name: float(results.get(name, math.nan)) for name in _EVALUATED}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as problem:
         raise ThermoxelsError(
-            explain(
-                str(path),
-                expected="the results of ns-eval",
-                got=f"{type(problem).__name__}: {problem}",
-                remedy="Start the command again; finished runs are kept.",
-            )
+            str(path),
+            expected="the results of ns-eval",
+            got=f"{type(problem).__name__}: {problem}",
+            remedy="Start the command again; finished runs are kept.",
         ) from problem

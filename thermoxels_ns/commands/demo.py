@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
-from thermoxels_ns.core.errors import OutputError, ThermoxelsError, explain
+from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -88,7 +88,7 @@ def run_demo(demo: Demo, console: Console) -> None:
 
     if demo.iterations is not None and demo.iterations < 1:
         raise ThermoxelsError(
-            explain("iterations", expected="1 or more", got=demo.iterations, remedy="Leave it out for the default.")
+            "iterations", expected="1 or more", got=demo.iterations, remedy="Leave it out for the default."
         )
     folder = prepare_folder(demo.output_dir)
     logs = writable_folder(folder / "logs")
@@ -116,7 +116,7 @@ def run_demo(demo: Demo, console: Console) -> None:
     missed = [f"{t.name} {t.measured_text} (target {t.bound_text})" for t in results.targets if not t.met]
     if missed:
         raise ThermoxelsError(
-            explain("demo", expected="every target met", got="; ".join(missed), remedy=f"See {index} for pictures.")
+            "demo", expected="every target met", got="; ".join(missed), remedy=f"See {index} for pictures."
         )
 
 
@@ -132,12 +132,10 @@ def prepare_folder(path: Path) -> Path:
     marker = folder / _MARKER
     if not marker.is_file() and any(folder.iterdir()):
         raise OutputError(
-            explain(
-                "output_dir",
-                expected="an empty folder or one of an earlier demo",
-                got=f"{folder}, which holds other files",
-                remedy="Pass another folder with --output-dir.",
-            )
+            "output_dir",
+            expected="an empty folder or one of an earlier demo",
+            got=f"{folder}, which holds other files",
+            remedy="Pass another folder with --output-dir.",
         )
     marker.write_text("Made by `thermoxels demo`, which replaces: " + ", ".join(_WRITTEN) + "\n")
     for name in _WRITTEN:
@@ -296,12 +294,10 @@ def _picture(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as problem:
         raise ThermoxelsError(
-            explain(
-                str(path),
-                expected="a picture that the demo's commands write",
-                got=problem.strerror or str(problem),
-                remedy="Run the demo again.",
-            )
+            str(path),
+            expected="a picture that the demo's commands write",
+            got=problem.strerror or str(problem),
+            remedy="Run the demo again.",
         ) from problem
 
 

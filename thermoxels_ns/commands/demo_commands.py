@@ -51,12 +51,10 @@ def installed_command(name: str) -> str:
     program = shutil.which(name, path=str(folder))
     if program is None:
         raise ThermoxelsError(
-            explain(
-                name,
-                expected=f"a command in {folder}",
-                got="none",
-                remedy="Install this package and nerfstudio into the environment of this Python.",
-            )
+            name,
+            expected=f"a command in {folder}",
+            got="none",
+            remedy="Install this package and nerfstudio into the environment of this Python.",
         )
     return program
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError
 
 _ENERGY_UNITS = ("J", "kJ", "MJ", "GJ", "TJ", "PJ")
 """Each a thousand of the one before."""
@@ -148,7 +148,7 @@ class _Section:
             content = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError) as problem:
             raise ThermoxelsError(
-                explain(str(path), expected="a readable json file", got=str(problem), remedy="Run the demo again.")
+                str(path), expected="a readable json file", got=str(problem), remedy="Run the demo again."
             ) from problem
         self._content: dict[str, Any] = content.get(name) if isinstance(content, dict) else None  # type: ignore[assignment]
         if not isinstance(self._content, dict):
@@ -165,5 +165,5 @@ class _Section:
 
     def _error(self, expected: str, got: object) -> ThermoxelsError:
         return ThermoxelsError(
-            explain(f"{self._path}: {self._name}", expected=expected, got=repr(got), remedy="Run the demo again.")
+            f"{self._path}: {self._name}", expected=expected, got=repr(got), remedy="Run the demo again."
         )

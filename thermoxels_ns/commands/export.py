@@ -19,7 +19,7 @@ import numpy.typing as npt
 from thermoxels_ns.commands.export_options import ExportOptions, Viewpoint, check_options, scale_of
 from thermoxels_ns.commands.export_snapshot import export_snapshot, prepare_folder
 from thermoxels_ns.core.checks import check_shape
-from thermoxels_ns.core.errors import CheckpointError, ThermoxelsError, explain
+from thermoxels_ns.core.errors import CheckpointError, ThermoxelsError
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
@@ -135,12 +135,10 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
     """
     if not load_config.is_file():
         raise CheckpointError(
-            explain(
-                "load_config",
-                expected="the config.yml of a training run",
-                got=f"no file at {load_config}",
-                remedy="Pass --load-config outputs/<scene>/thermoxels/<time>/config.yml.",
-            )
+            "load_config",
+            expected="the config.yml of a training run",
+            got=f"no file at {load_config}",
+            remedy="Pass --load-config outputs/<scene>/thermoxels/<time>/config.yml.",
         )
     import yaml
     from nerfstudio.utils.eval_utils import eval_setup
@@ -156,21 +154,17 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
         raise
     except (yaml.YAMLError, AssertionError, KeyError, UnicodeDecodeError) as problem:
         raise CheckpointError(
-            explain(
-                "load_config",
-                expected="a config.yml that ns-train of this installation wrote",
-                got=f"{load_config}, which cannot be read ({_reason(load_config, problem)})",
-                remedy="Pass the config.yml of the training run.",
-            )
+            "load_config",
+            expected="a config.yml that ns-train of this installation wrote",
+            got=f"{load_config}, which cannot be read ({_reason(load_config, problem)})",
+            remedy="Pass the config.yml of the training run.",
         ) from problem
     except (RuntimeError, pickle.UnpicklingError, EOFError) as problem:
         raise CheckpointError(
-            explain(
-                "checkpoint",
-                expected="the parameters of the model that config.yml describes",
-                got=f"{type(problem).__name__}: {problem}",
-                remedy="Use the config.yml and the checkpoint of one and the same training run.",
-            )
+            "checkpoint",
+            expected="the parameters of the model that config.yml describes",
+            got=f"{type(problem).__name__}: {problem}",
+            remedy="Use the config.yml and the checkpoint of one and the same training run.",
         ) from problem
     pipeline_of_ours: Any = pipeline
     outputs = pipeline_of_ours.datamanager.train_dataparser_outputs
@@ -247,12 +241,10 @@ def input_from_world(transform: npt.ArrayLike, scale: float) -> npt.NDArray[np.f
     orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
     if not (orthonormal and np.all(np.isfinite(shift)) and np.isfinite(scale) and scale > 0):
         raise CheckpointError(
-            explain(
-                "dataparser_transform",
-                expected="a rotation, a finite shift and a scale above 0",
-                got=f"{matrix.tolist()}, scale {scale}",
-                remedy=remedy,
-            )
+            "dataparser_transform",
+            expected="a rotation, a finite shift and a scale above 0",
+            got=f"{matrix.tolist()}, scale {scale}",
+            remedy=remedy,
         )
     inverse = np.eye(4)
     inverse[:3, :3] = np.linalg.inv(rotation) / scale
@@ -271,21 +263,17 @@ def _check_config(config: TrainerConfig) -> TrainerConfig:
     pipeline: Any = config.pipeline
     if not callable(getattr(pipeline._target, "grid_snapshot", None)):
         raise CheckpointError(
-            explain(
-                "load_config",
-                expected="a model trained with a Thermoxels method",
-                got=f"the checkpoint of another method ({config.method_name})",
-                remedy="Train with ns-train thermoxels, or choose another subcommand of ns-export.",
-            )
+            "load_config",
+            expected="a model trained with a Thermoxels method",
+            got=f"the checkpoint of another method ({config.method_name})",
+            remedy="Train with ns-train thermoxels, or choose another subcommand of ns-export.",
         )
     folder = config.get_checkpoint_dir()
     if not any(folder.glob("step-*.ckpt")):
         raise CheckpointError(
-            explain(
-                "checkpoint",
-                expected=f"a file step-*.ckpt in {folder}",
-                got="none",
-                remedy="Run the command in the folder where ns-train ran, or train to the first checkpoint.",
-            )
+            "checkpoint",
+            expected=f"a file step-*.ckpt in {folder}",
+            got="none",
+            remedy="Run the command in the folder where ns-train ran, or train to the first checkpoint.",
         )
     return config

@@ -17,7 +17,7 @@ from thermoxels_ns.commands.scene_scale import (
     scale_from_option,
     up_from_scene_file,
 )
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -146,22 +146,18 @@ def check_options(options: ExportOptions) -> CheckedOptions:
         distance = scale_from_known_distance(first, second, length, options.known_distance_error)
     elif options.known_distance_error is not None:
         raise MeshError(
-            explain(
-                "known_distance_error",
-                expected="--known-distance beside it",
-                got="none",
-                remedy="Pass --known-distance x y z x y z metres, or leave the error out.",
-            )
+            "known_distance_error",
+            expected="--known-distance beside it",
+            got="none",
+            remedy="Pass --known-distance x y z x y z metres, or leave the error out.",
         )
     choose_scale(options.metres_per_unit, distance)
     if not options.formats or len(set(options.formats)) < len(options.formats):
         raise MeshError(
-            explain(
-                "formats",
-                expected="at least one format, each once",
-                got=options.formats,
-                remedy="Pass --formats vtu glb, for example.",
-            )
+            "formats",
+            expected="at least one format, each once",
+            got=options.formats,
+            remedy="Pass --formats vtu glb, for example.",
         )
     MeshOptions(options.boundary, options.coarsest_cell)  # refuses what is out of range
     selection = SolidSelection(**{field.name: getattr(options, field.name) for field in fields(SolidSelection)})
@@ -191,12 +187,10 @@ def scale_of(
     needs += ["--patches"] if options.patches is not None else []
     if scale is None and needs:
         raise MeshError(
-            explain(
-                "scale",
-                expected=f"a scene whose scale is known, for {needs[0]}",
-                got="none in the options or in the scene's json",
-                remedy="Pass --metres-per-unit, or --known-distance.",
-            )
+            "scale",
+            expected=f"a scene whose scale is known, for {needs[0]}",
+            got="none in the options or in the scene's json",
+            remedy="Pass --metres-per-unit, or --known-distance.",
         )
     return scale
 
@@ -210,9 +204,7 @@ def up_of(options: ExportOptions, scene_file: Mapping[str, Any] | None, viewpoin
     if options.up is not None:
         length = math.sqrt(sum(value * value for value in options.up))
         if not (math.isfinite(length) and length > 0.0):
-            raise MeshError(
-                explain("up", expected="a direction", got=options.up, remedy="Pass --up 0 0 1, for example.")
-            )
+            raise MeshError("up", expected="a direction", got=options.up, remedy="Pass --up 0 0 1, for example.")
         x, y, z = (value / length for value in options.up)
         return (x, y, z), "Given with --up."
     in_file = up_from_scene_file(scene_file or {})

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.commands.heat import Heat
 from thermoxels_ns.commands.heat_files import prepared_folder, write_heat_files
-from thermoxels_ns.core.errors import HeatError, MeshError, explain
+from thermoxels_ns.core.errors import HeatError, MeshError
 from thermoxels_ns.fem.probes import Probes, place_probes
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.solution import SteadySolution
@@ -201,20 +201,16 @@ def _export_summary(mesh: Path, say: Say) -> dict[str, Any]:
         summary = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as problem:
         remedy = "Export the mesh again, or move the file away."
-        raise MeshError(
-            explain(str(path), expected="the summary of an export", got=problem, remedy=remedy)
-        ) from problem
+        raise MeshError(str(path), expected="the summary of an export", got=problem, remedy=remedy) from problem
     if not isinstance(summary, dict):
         remedy = "Export the mesh again, or move the file away."
-        raise MeshError(explain(str(path), expected="the summary of an export", got=repr(summary)[:40], remedy=remedy))
+        raise MeshError(str(path), expected="the summary of an export", got=repr(summary)[:40], remedy=remedy)
     if summary.get("length_unit", "m") != "m":
         raise HeatError(
-            explain(
-                "scale of the mesh",
-                expected="an export in metres",
-                got=f"one in {summary['length_unit']}s",
-                remedy="Export again with --metres-per-unit or --known-distance.",
-            )
+            "scale of the mesh",
+            expected="an export in metres",
+            got=f"one in {summary['length_unit']}s",
+            remedy="Export again with --metres-per-unit or --known-distance.",
         )
     return summary
 
@@ -227,12 +223,10 @@ def _direction(up: Any, mesh: Path) -> Direction | None:
         x, y, z = (float(part) for part in up)
     except (TypeError, ValueError) as problem:
         raise MeshError(
-            explain(
-                f"{mesh.with_name('summary.json')}: up",
-                expected="three numbers",
-                got=repr(up),
-                remedy="Pass --up 0 0 1, or export the mesh again.",
-            )
+            f"{mesh.with_name('summary.json')}: up",
+            expected="three numbers",
+            got=repr(up),
+            remedy="Pass --up 0 0 1, or export the mesh again.",
         ) from problem
     return (x, y, z)
 

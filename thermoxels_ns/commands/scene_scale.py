@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
-from thermoxels_ns.core.errors import SceneError, ThermoxelsError, explain
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 
 Vector = tuple[float, float, float]
 
@@ -112,12 +112,10 @@ def scale_from_known_distance(
     apart = float(np.linalg.norm(b - a))
     if not apart > 1e-12 * max(float(np.abs(a).max()), float(np.abs(b).max())):
         raise ThermoxelsError(
-            explain(
-                "known distance",
-                expected="two different points",
-                got=f"{_in_words(a)} and {_in_words(b)}",
-                remedy="Pass two points far from each other, in the coordinates of transforms.json.",
-            )
+            "known distance",
+            expected="two different points",
+            got=f"{_in_words(a)} and {_in_words(b)}",
+            remedy="Pass two points far from each other, in the coordinates of transforms.json.",
         )
     error = None if standard_error_m is None else standard_error_m / apart
     source = f"From {distance_m:g} m measured between {_in_words(a)} and {_in_words(b)}, {apart:.6g} units apart."
@@ -142,12 +140,10 @@ def scale_from_scene_file(meta: Mapping[str, Any], name: str = "transforms.json"
     if value is None:
         if error is not None:
             raise SceneError(
-                explain(
-                    f"{name}: {_ERROR_KEY}",
-                    expected=f"'{_KEY}' beside it",
-                    got="none",
-                    remedy=f"Add '{_KEY}' or remove '{_ERROR_KEY}'.",
-                )
+                f"{name}: {_ERROR_KEY}",
+                expected=f"'{_KEY}' beside it",
+                got="none",
+                remedy=f"Add '{_KEY}' or remove '{_ERROR_KEY}'.",
             )
         return None
     check_positive(f"{name}: {_KEY}", value, "Correct the json, or remove the key.", SceneError)
@@ -173,12 +169,10 @@ def up_from_scene_file(meta: Mapping[str, Any], name: str = "transforms.json") -
     length = math.hypot(*value) if numbers else 0.0
     if not numbers or len(value) != 3 or not 0.0 < length < math.inf:
         raise SceneError(
-            explain(
-                f"{name}: {_UP_KEY}",
-                expected="three finite numbers, not all 0",
-                got=repr(value),
-                remedy="Correct the json, for instance to [0, 0, 1], or remove the key.",
-            )
+            f"{name}: {_UP_KEY}",
+            expected="three finite numbers, not all 0",
+            got=repr(value),
+            remedy="Correct the json, for instance to [0, 0, 1], or remove the key.",
         )
     x, y, z = (float(v) / length for v in value)
     return (x, y, z)
@@ -208,12 +202,10 @@ def choose_scale(
     """
     if option is not None and known_distance is not None:
         raise ThermoxelsError(
-            explain(
-                "scale",
-                expected="metres per unit or a known distance",
-                got=f"both: {option} m per unit, and {known_distance.metres_per_unit:g} from the distance",
-                remedy="Leave one of them out.",
-            )
+            "scale",
+            expected="metres per unit or a known distance",
+            got=f"both: {option} m per unit, and {known_distance.metres_per_unit:g} from the distance",
+            remedy="Leave one of them out.",
         )
     meta = {} if scene_file is None else scene_file
     in_file = scale_from_scene_file(meta, name)
@@ -236,7 +228,7 @@ def _point(name: str, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
     try:
         point = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as problem:
-        raise ThermoxelsError(explain(name, expected="three numbers", got=repr(value), remedy=remedy)) from problem
+        raise ThermoxelsError(name, expected="three numbers", got=repr(value), remedy=remedy) from problem
     return check_finite(name, check_shape(name, point, (3,), remedy), remedy)
 
 
@@ -246,7 +238,7 @@ def _is_number(value: object) -> bool:
 
 def _check_not_negative(name: str, value: object, remedy: str, error: type[ThermoxelsError]) -> None:
     if not (isinstance(value, int | float) and _is_number(value) and math.isfinite(value) and value >= 0.0):
-        raise error(explain(name, expected="a finite number of at least 0", got=repr(value), remedy=remedy))
+        raise error(name, expected="a finite number of at least 0", got=repr(value), remedy=remedy)
 
 
 def _in_words(point: npt.NDArray[np.float64]) -> str:

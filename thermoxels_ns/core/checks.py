@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import OutputError, ThermoxelsError, explain
+from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 
 
 def check_positive(name: str, value: float, remedy: str, error: type[ThermoxelsError] = ThermoxelsError) -> float:
     """Return `value` if it is a finite number above zero (True is no number), else raise `error`."""
     number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
     if not (number and math.isfinite(value) and value > 0):
-        raise error(explain(name, expected="a finite number above 0", got=repr(value), remedy=remedy))
+        raise error(name, expected="a finite number above 0", got=repr(value), remedy=remedy)
     return float(value)
 
 
@@ -30,9 +30,7 @@ def check_finite(
     """Return `array` if every entry is finite, else raise `error` with the count of bad entries."""
     bad = int(np.size(array) - np.count_nonzero(np.isfinite(array)))
     if bad:
-        raise error(
-            explain(name, expected="finite numbers only", got=f"{bad} of {array.size} NaN or infinite", remedy=remedy)
-        )
+        raise error(name, expected="finite numbers only", got=f"{bad} of {array.size} NaN or infinite", remedy=remedy)
     return array
 
 
@@ -47,7 +45,7 @@ def check_shape(
     fits = len(array.shape) == len(shape) and all(want in (None, got) for want, got in zip(shape, array.shape))
     if not fits:
         wanted = "(" + ", ".join("n" if s is None else str(s) for s in shape) + ")"
-        raise error(explain(name, expected=f"shape {wanted}", got=tuple(array.shape), remedy=remedy))
+        raise error(name, expected=f"shape {wanted}", got=tuple(array.shape), remedy=remedy)
     return array
 
 
@@ -63,12 +61,10 @@ def writable_folder(path: Path | str) -> Path:
             pass
     except OSError as problem:
         raise OutputError(
-            explain(
-                "output folder",
-                expected=f"a folder that can be written to at {folder}",
-                got=problem.strerror or str(problem),
-                remedy="Choose another folder or change its permissions.",
-            )
+            "output folder",
+            expected=f"a folder that can be written to at {folder}",
+            got=problem.strerror or str(problem),
+            remedy="Choose another folder or change its permissions.",
         ) from problem
     return folder
 
@@ -132,21 +128,17 @@ def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Itera
     blocked += [name for name in folders if (folder / name).exists() and not (folder / name).is_dir()]
     if blocked:
         raise OutputError(
-            explain(
-                "output folder",
-                expected=f"no folder in the place of a file, and no file in the place of a folder, in {folder}",
-                got=", ".join(blocked),
-                remedy="Move it away, or choose another folder.",
-            )
+            "output folder",
+            expected=f"no folder in the place of a file, and no file in the place of a folder, in {folder}",
+            got=", ".join(blocked),
+            remedy="Move it away, or choose another folder.",
         )
 
 
 def _output_error(path: Path, expected: str, problem: OSError) -> OutputError:
     return OutputError(
-        explain(
-            path.name,
-            expected=f"{expected} at {path}",
-            got=problem.strerror or str(problem),
-            remedy="Move away what is there, check free space and permissions, or choose another folder.",
-        )
+        path.name,
+        expected=f"{expected} at {path}",
+        got=problem.strerror or str(problem),
+        remedy="Move away what is there, check free space and permissions, or choose another folder.",
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -19,10 +19,8 @@ def configs_folder() -> Path:
         if folder.is_dir():
             return folder
     raise ThermoxelsError(
-        explain(
-            "configuration files",
-            expected=f"a folder configs in or beside {_PACKAGE}",
-            got="none",
-            remedy="Install the package again.",
-        )
+        "configuration files",
+        expected=f"a folder configs in or beside {_PACKAGE}",
+        got="none",
+        remedy="Install the package again.",
     )

@@ -1,38 +1,71 @@
-"""Throw away compiled kernels of earlier versions: numba watches one source file each, but kernels inline others."""
+"""Compiled kernels: one decorator, and a cache that knows which files kernels inline each other from."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 from thermoxels_ns.core.checks import replace_when_done
 
+_PACKAGE = Path(__file__).resolve().parents[1]
 _DIGEST = "thermoxels-kernels.sha256"
 
 
-def forget_stale_kernels(cache: Path, sources: Iterable[Path]) -> bool:
-    """Remove what numba keeps of `sources` if any of them differs from when it was kept.
+def kernel(function: Callable | None = None, **options: Any) -> Any:
+    """Compile a function with numba when it is first called, without the interpreter's lock, and keep the result.
+
+    A kernel may call kernels of its own room and of ``core``: numba watches only the file that a kernel stands in,
+    so what was compiled in a room is thrown away when any file of the room that has kernels changed.
 
     Args:
-        cache: Folder in which numba keeps compiled functions.
-        sources: Python files with compiled functions; they may call each other's.
+        function: A function in numba's subset of Python; plain use as ``@kernel``.
+        options: For `numba.njit`, such as ``fastmath={"contract"}``. Division by zero gives inf or NaN, as in numpy.
+    """
+    from numba import njit
+
+    def compiled(function: Callable) -> Any:
+        dispatcher = njit(**{"nogil": True, "cache": True, "error_model": "numpy", **options})(function)
+        source, cached = Path(function.__code__.co_filename), dispatcher.stats.cache_path
+        if cached and _PACKAGE in source.parents:
+            # Before the first call, which loads what was compiled earlier.
+            _forget_once(source.relative_to(_PACKAGE).parts[0], Path(cached))
+        return dispatcher
+
+    return compiled if function is None else compiled(function)
+
+
+@cache
+def _forget_once(room: str, cached: Path) -> None:
+    folders = (_PACKAGE / room, _PACKAGE / "core")
+    forget_stale_kernels(
+        cached,
+        {path for folder in folders for path in folder.rglob("*.py") if b"kernel_cache" in path.read_bytes()},
+    )
+
+
+def forget_stale_kernels(cached: Path, sources: Iterable[Path]) -> bool:
+    """Remove what numba keeps in a folder if any of the sources differs from when it was kept.
+
+    Args:
+        cached: Folder in which numba keeps compiled functions.
+        sources: Python files with compiled functions that may inline each other's.
 
     Returns:
         Whether anything was out of date. A folder that cannot be written is left alone.
     """
-    sources = sorted(sources)
-    digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
-    mark = cache / _DIGEST
-    try:
+    digest = hashlib.sha256(b"".join(source.read_bytes() for source in sorted(sources))).hexdigest()
+    mark = cached / _DIGEST
+    with suppress(OSError):
         if mark.is_file() and mark.read_text() == digest:
             return False
-        for source in sources:
-            for kept in (*cache.glob(f"{source.stem}.*.nbi"), *cache.glob(f"{source.stem}.*.nbc")):
-                kept.unlink(missing_ok=True)
-        cache.mkdir(parents=True, exist_ok=True)
+        for kept in (*cached.glob("*.nbi"), *cached.glob("*.nbc")):
+            kept.unlink(missing_ok=True)
+        cached.mkdir(parents=True, exist_ok=True)
         with replace_when_done(mark) as unfinished:
             unfinished.write_text(digest)
-    except OSError:
-        return False
-    return True
+        return True
+    return False

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError
 
 CORNER_OFFSETS: npt.NDArray[np.int64] = np.array(
     [[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1], [1, 0, 0], [1, 0, 1], [1, 1, 0], [1, 1, 1]], dtype=np.int64
@@ -34,21 +34,17 @@ class Lattice:
     def __post_init__(self) -> None:
         if not (all(math.isfinite(v) for v in self.lo) and math.isfinite(self.voxel_size) and self.voxel_size > 0):
             raise ThermoxelsError(
-                explain(
-                    "lattice",
-                    expected="a finite origin and a voxel size above 0",
-                    got=f"lo {self.lo}, voxel size {self.voxel_size}",
-                    remedy="Check the scene box: its sides must be longer than 0.",
-                )
+                "lattice",
+                expected="a finite origin and a voxel size above 0",
+                got=f"lo {self.lo}, voxel size {self.voxel_size}",
+                remedy="Check the scene box: its sides must be longer than 0.",
             )
         if len(self.shape) != 3 or min(self.shape) < 2:
             raise ThermoxelsError(
-                explain(
-                    "lattice shape",
-                    expected="at least 2 corners along each axis",
-                    got=self.shape,
-                    remedy="Raise the resolution or check the scene box.",
-                )
+                "lattice shape",
+                expected="at least 2 corners along each axis",
+                got=self.shape,
+                remedy="Raise the resolution or check the scene box.",
             )
 
     @classmethod
@@ -64,12 +60,10 @@ class Lattice:
         size = hi - lo
         if resolution < 1 or not np.all(np.isfinite(size)) or not np.all(size > 0):
             raise ThermoxelsError(
-                explain(
-                    "scene box",
-                    expected="three finite sides longer than 0 and a resolution of at least 1",
-                    got=f"sides {size.tolist()}, resolution {resolution}",
-                    remedy="Correct the scene box or the camera poses it comes from.",
-                )
+                "scene box",
+                expected="three finite sides longer than 0 and a resolution of at least 1",
+                got=f"sides {size.tolist()}, resolution {resolution}",
+                remedy="Correct the scene box or the camera poses it comes from.",
             )
         h = float(size.max()) / resolution
         cells = np.maximum(np.ceil(size / h - 1e-6).astype(int), 1)

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import yaml
 
 from thermoxels_ns.core.configs_folder import configs_folder
-from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError
 
 Config = TypeVar("Config")
 
@@ -26,11 +26,11 @@ def read_preset(name: str) -> dict[str, Any]:
     path = configs_folder() / f"{name}.yaml"
     if not path.is_file():
         known = ", ".join(sorted(p.stem for pattern in _PATTERNS for p in configs_folder().glob(pattern))) or "none"
-        raise ThermoxelsError(explain("preset", expected=f"one of {known}", got=name, remedy="Correct the name."))
+        raise ThermoxelsError("preset", expected=f"one of {known}", got=name, remedy="Correct the name.")
     content = yaml.safe_load(path.read_text(encoding="utf-8"))
     if not isinstance(content, dict):
         raise ThermoxelsError(
-            explain(str(path.name), expected="a mapping", got=type(content).__name__, remedy="Write key: value lines.")
+            str(path.name), expected="a mapping", got=type(content).__name__, remedy="Write key: value lines."
         )
     return content
 
@@ -51,14 +51,12 @@ def with_overrides(config: Config, overrides: Mapping[str, Any], name: str = "pr
     elif dataclasses.is_dataclass(config) and not isinstance(config, type):
         fields = {f.name: getattr(config, f.name) for f in dataclasses.fields(config)}
     else:
-        raise ThermoxelsError(
-            explain(name, expected="a single value", got="a mapping", remedy="Remove the nested keys.")
-        )
+        raise ThermoxelsError(name, expected="a single value", got="a mapping", remedy="Remove the nested keys.")
     changed = {}
     for key, value in overrides.items():
         if key not in fields:
             raise ThermoxelsError(
-                explain(f"{name}.{key}", expected=f"one of {', '.join(sorted(fields))}", got=key, remedy="Correct it.")
+                f"{name}.{key}", expected=f"one of {', '.join(sorted(fields))}", got=key, remedy="Correct it."
             )
         old = fields[key]
         if isinstance(value, Mapping) and (dataclasses.is_dataclass(old) or (isinstance(old, Mapping) and old)):

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_finite, check_shape
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 
 
@@ -110,4 +110,4 @@ def _check(
     if array.size and not least <= array.min() <= array.max() <= most:
         expected = f"{least:g} or more" if most == np.inf else f"values from {least:g} to {most:g}"
         got = f"{array.min():g} to {array.max():g}"
-        raise MeshError(explain(name, expected=expected, got=got, remedy=remedy))
+        raise MeshError(name, expected=expected, got=got, remedy=remedy)

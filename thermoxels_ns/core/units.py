@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError
 
 if TYPE_CHECKING:
     import torch
@@ -46,12 +46,10 @@ class TemperatureRange:
         finite = np.isfinite(self.min_c) and np.isfinite(self.max_c)
         if not finite or self.max_c - self.min_c < _SMALLEST_SPAN_K:
             raise ThermoxelsError(
-                explain(
-                    "temperature range",
-                    expected=f"finite bounds at least {_SMALLEST_SPAN_K} K apart",
-                    got=f"{self.min_c} to {self.max_c} C",
-                    remedy="Use TemperatureRange.spanning, which widens the range of a constant image.",
-                )
+                "temperature range",
+                expected=f"finite bounds at least {_SMALLEST_SPAN_K} K apart",
+                got=f"{self.min_c} to {self.max_c} C",
+                remedy="Use TemperatureRange.spanning, which widens the range of a constant image.",
             )
 
     @classmethod

@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 import yaml
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 
 Record = TypeVar("Record")
 
@@ -122,7 +122,7 @@ def shown(content: object) -> str:
 
 def wrong(name: str, expected: str, got: object, remedy: str = "Correct the file.") -> HeatError:
     """Make the error for something in a file."""
-    return HeatError(explain(name, expected=expected, got=got, remedy=remedy))
+    return HeatError(name, expected=expected, got=got, remedy=remedy)
 
 
 def _plain(name: str, content: object, kind: type) -> Any:

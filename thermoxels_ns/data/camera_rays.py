@@ -9,7 +9,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 
 TABLE_LIMIT_BYTES = 2 * 1024**3
 """Above this the directions are computed per batch: scenes where every photograph has intrinsics of its own."""
@@ -151,12 +151,10 @@ def _mend_optical_axis(
     on_axis = ((coords - axis).abs().amax(dim=1) < 1e-3) & (cameras.camera_type.view(-1)[image] == _FISHEYE)
     if bool((lost & ~on_axis).any()):
         raise SceneError(
-            explain(
-                f"camera of photograph {int(image[lost & ~on_axis][0])}",
-                expected="a lens distortion that can be undone in every pixel",
-                got=f"{int((lost & ~on_axis).sum())} pixels without a finite ray",
-                remedy="Check k1 to p2, or undistort the photographs.",
-            )
+            f"camera of photograph {int(image[lost & ~on_axis][0])}",
+            expected="a lens distortion that can be undone in every pixel",
+            got=f"{int((lost & ~on_axis).sum())} pixels without a finite ray",
+            remedy="Check k1 to p2, or undistort the photographs.",
         )
     rays.directions[lost] = -cameras.camera_to_worlds[image[lost], :, 2]
     area = 1.0 / (cameras.fx * cameras.fy)[image]

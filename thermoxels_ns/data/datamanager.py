@@ -17,7 +17,7 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIn
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.data.camera_views import views_of_cameras
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
@@ -158,9 +158,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
     def _streams(self, dataset: ThermalDataset) -> PhotoStreams:
         if self.config.seed < 0:
             raise SceneError(
-                explain(
-                    "seed", expected="0 or more", got=self.config.seed, remedy="Pass --pipeline.datamanager.seed 42."
-                )
+                "seed", expected="0 or more", got=self.config.seed, remedy="Pass --pipeline.datamanager.seed 42."
             )
         storage = self.device if self.config.images_on_gpu else "cpu"
         return PhotoStreams(dataset, self.config.streams, storage, self.device)

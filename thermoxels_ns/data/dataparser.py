@@ -15,7 +15,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserCo
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.feature_rays import Sightlines
 from thermoxels_ns.data.pose_file_cameras import Intrinsics
 from thermoxels_ns.data.scene_box import find_scene_box
@@ -131,7 +131,7 @@ class ThermalDataParser(DataParser):
         scene = self._scene
         chosen = {"train": scene.split.train, "val": scene.split.val, "test": scene.split.test}.get(split)
         if chosen is None:
-            raise SceneError(explain("split", expected="train, val or test", got=split, remedy="Choose one of them."))
+            raise SceneError("split", expected="train, val or test", got=split, remedy="Choose one of them.")
         frames = [scene.file.frames[index] for index in chosen]
         shapes = [scene.survey.shapes[frame.thermal] for frame in frames]
         factor = 1.0 / self._downscale()
@@ -169,7 +169,7 @@ class ThermalDataParser(DataParser):
             return 1.0
         if not factor >= 1:
             raise SceneError(
-                explain("downscale_factor", expected="a number of at least 1", got=factor, remedy="Pass 2, 4 or 8.")
+                "downscale_factor", expected="a number of at least 1", got=factor, remedy="Pass 2, 4 or 8."
             )
         return float(factor)
 
@@ -211,12 +211,10 @@ class ThermalDataParser(DataParser):
             oriented = torch.full((3, 4), torch.nan)
         if not bool(torch.isfinite(oriented).all()):
             raise SceneError(
-                explain(
-                    "orientation_method, center_method",
-                    expected="cameras that tell where up and the middle are",
-                    got=f"{len(poses)} cameras that do not, by {method} and {centre}",
-                    remedy="Pass --orientation-method none --center-method box.",
-                )
+                "orientation_method, center_method",
+                expected="cameras that tell where up and the middle are",
+                got=f"{len(poses)} cameras that do not, by {method} and {centre}",
+                remedy="Pass --orientation-method none --center-method box.",
             )
         return oriented
 
@@ -240,12 +238,10 @@ class ThermalDataParser(DataParser):
         scale = (SCENE_SIZE / longest if config.auto_scale_poses else 1.0) * config.scale_factor
         if not (np.isfinite(scale) and scale > 0):
             raise SceneError(
-                explain(
-                    "scale_factor",
-                    expected="a finite number above 0",
-                    got=config.scale_factor,
-                    remedy="Pass --scale-factor 1.",
-                )
+                "scale_factor",
+                expected="a finite number above 0",
+                got=config.scale_factor,
+                remedy="Pass --scale-factor 1.",
             )
         placed = scale * (box + translation)
         return (
@@ -277,24 +273,20 @@ def _thermal_intrinsics(frame: Frame, shape: tuple[int, int]) -> Intrinsics:
     if own is not None:
         if (own.height, own.width) != shape:
             raise SceneError(
-                explain(
-                    frame.thermal.name,
-                    expected=f"{own.width} x {own.height} pixels as thermal_camera says",
-                    got=f"{width} x {height}",
-                    remedy="Correct w and h of thermal_camera, or use the thermal images it was calibrated with.",
-                )
+                frame.thermal.name,
+                expected=f"{own.width} x {own.height} pixels as thermal_camera says",
+                got=f"{width} x {height}",
+                remedy="Correct w and h of thermal_camera, or use the thermal images it was calibrated with.",
             )
         return own
     colour = frame.intrinsics
     fitting = colour.height * width / colour.width
     if abs(height - fitting) > max(1.0, 0.03 * fitting):
         raise SceneError(
-            explain(
-                frame.thermal.name,
-                expected=f"the photograph's aspect ratio {colour.width} x {colour.height}",
-                got=f"{width} x {height}",
-                remedy="Give the thermal camera its own intrinsics as 'thermal_camera' in the json.",
-            )
+            frame.thermal.name,
+            expected=f"the photograph's aspect ratio {colour.width} x {colour.height}",
+            got=f"{width} x {height}",
+            remedy="Give the thermal camera its own intrinsics as 'thermal_camera' in the json.",
         )
     return colour.resized(width, height)
 

@@ -15,7 +15,7 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 from torch import Tensor
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.radiometry.thermal_files import PixelReport, read_thermal_file
 
@@ -32,12 +32,10 @@ class ThermalDataset(InputDataset):
         super().__init__(dataparser_outputs, scale_factor)
         if "temperature_range" not in self.metadata:
             raise SceneError(
-                explain(
-                    "dataparser",
-                    expected="thermal-data, which finds the thermal images",
-                    got="one that gives photographs only",
-                    remedy="Write: ns-train thermoxels thermal-data --data SCENE.",
-                )
+                "dataparser",
+                expected="thermal-data, which finds the thermal images",
+                got="one that gives photographs only",
+                remedy="Write: ns-train thermoxels thermal-data --data SCENE.",
             )
         self.temperature_range: TemperatureRange = self.metadata["temperature_range"]
         self.thermal_cameras: Cameras | None = self.metadata["thermal_cameras"]
@@ -60,32 +58,26 @@ class ThermalDataset(InputDataset):
                 picture = opened.convert("RGBA") if opened.mode in ("P", "PA", "LA") else opened.copy()
         except Exception as problem:  # Pillow's plugins raise many types on damaged data
             raise SceneError(
-                explain(
-                    str(path),
-                    expected="a readable photograph",
-                    got=problem,
-                    remedy="The file is damaged; copy it again or remove the frame.",
-                )
+                str(path),
+                expected="a readable photograph",
+                got=problem,
+                remedy="The file is damaged; copy it again or remove the frame.",
             ) from problem
         if picture.mode == "RGBA":
             if picture.getchannel("A").getextrema()[0] != 255:
                 raise SceneError(
-                    explain(
-                        str(path),
-                        expected="an opaque photograph",
-                        got="transparent pixels",
-                        remedy="Flatten it onto a colour, or give the transparent part as mask_path.",
-                    )
+                    str(path),
+                    expected="an opaque photograph",
+                    got="transparent pixels",
+                    remedy="Flatten it onto a colour, or give the transparent part as mask_path.",
                 )
             picture = picture.convert("RGB")
         elif picture.mode not in ("RGB", "L", "CMYK", "YCbCr"):
             raise SceneError(
-                explain(
-                    str(path),
-                    expected="a photograph with 8 bits per channel",
-                    got=f"image mode {picture.mode}",
-                    remedy="Convert it to 8-bit RGB.",
-                )
+                str(path),
+                expected="a photograph with 8 bits per channel",
+                got=f"image mode {picture.mode}",
+                remedy="Convert it to 8-bit RGB.",
             )
         return np.array(self._resized(picture.convert("RGB"), image_idx, Image.Resampling.BOX))
 
@@ -113,18 +105,16 @@ class ThermalDataset(InputDataset):
                 picture = opened.convert("L")
         except Exception as problem:
             raise SceneError(
-                explain(str(path), expected="a readable mask", got=problem, remedy="Write the mask again.")
+                str(path), expected="a readable mask", got=problem, remedy="Write the mask again."
             ) from problem
         with Image.open(self._dataparser_outputs.image_filenames[image_idx]) as photograph:
             size = photograph.size
         if picture.size != size:
             raise SceneError(
-                explain(
-                    str(path),
-                    expected=f"a mask of {size[0]} x {size[1]} pixels like its photograph",
-                    got=f"{picture.size[0]} x {picture.size[1]}",
-                    remedy="Write the mask at the photograph's resolution.",
-                )
+                str(path),
+                expected=f"a mask of {size[0]} x {size[1]} pixels like its photograph",
+                got=f"{picture.size[0]} x {picture.size[1]}",
+                remedy="Write the mask at the photograph's resolution.",
             )
         resized = np.array(self._resized(picture, image_idx, Image.Resampling.NEAREST))
         return torch.from_numpy(resized > 0)[..., None]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path, PureWindowsPath
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 
 _SHOWN = 200
 """Letters of a name that a message repeats."""
@@ -44,10 +44,8 @@ def path_inside(folder: Path, name: str, where: str) -> Path:
                 return path
             got = f"{name!r}, a link to {path}"
     raise SceneError(
-        explain(
-            where,
-            expected=f"a file inside {folder}",
-            got=got,
-            remedy="Copy the file into the folder and name it relative to it.",
-        )
+        where,
+        expected=f"a file inside {folder}",
+        got=got,
+        remedy="Copy the file into the folder and name it relative to it.",
     )

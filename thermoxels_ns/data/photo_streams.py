@@ -11,7 +11,7 @@ from jaxtyping import Bool, Int
 from nerfstudio.cameras.rays import RayBundle
 from torch import Tensor
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.data.camera_rays import CameraRays
 from thermoxels_ns.data.dataset import ThermalDataset
@@ -203,5 +203,5 @@ def _numbers(usable: Bool[Tensor, " pixels"] | None, name: str, remedy: str) -> 
         return None
     numbers = usable.nonzero()[:, 0]
     if len(numbers) == 0:
-        raise SceneError(explain(name, expected="at least one that is not masked", got="none", remedy=remedy))
+        raise SceneError(name, expected="at least one that is not masked", got="none", remedy=remedy)
     return numbers.to(torch.int32) if len(usable) < 2**31 else numbers

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 from PIL import Image
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 
 # One centre per camera: the training rays store one direction per pixel and one origin per photograph.
 _CENTRAL = (CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.EQUIRECTANGULAR)
@@ -52,19 +52,15 @@ def read_pose(values: Any, where: str) -> npt.NDArray[np.float64]:
     except (TypeError, ValueError):
         matrix = np.zeros(0)
     if matrix.shape not in ((3, 4), (4, 4)):
-        raise SceneError(
-            explain(where, expected="4 x 4 numbers", got=f"shape {matrix.shape}", remedy="Correct the json.")
-        )
+        raise SceneError(where, expected="4 x 4 numbers", got=f"shape {matrix.shape}", remedy="Correct the json.")
     pose = np.eye(4)
     pose[:3] = matrix[:3]
     remedy = "Remove the frame or run structure from motion again."
     if not np.isfinite(pose).all():
-        raise SceneError(explain(where, expected="finite numbers", got="NaN or infinity", remedy=remedy))
+        raise SceneError(where, expected="finite numbers", got="NaN or infinity", remedy=remedy)
     rotation = pose[:3, :3]
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-2 or np.linalg.det(rotation) < 0:
-        raise SceneError(
-            explain(where, expected="a rotation in the upper left 3 x 3", got=rotation.tolist(), remedy=remedy)
-        )
+        raise SceneError(where, expected="a rotation in the upper left 3 x 3", got=rotation.tolist(), remedy=remedy)
     return pose
 
 
@@ -76,12 +72,10 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
     camera_type = CAMERA_MODEL_TO_TYPE.get(model) if isinstance(model, str) else None
     if camera_type not in _CENTRAL:
         raise SceneError(
-            explain(
-                f"{where}: camera_model",
-                expected="PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, OPENCV_FISHEYE or EQUIRECTANGULAR",
-                got=model,
-                remedy="Undistort the photographs to a pinhole camera.",
-            )
+            f"{where}: camera_model",
+            expected="PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, OPENCV_FISHEYE or EQUIRECTANGULAR",
+            got=model,
+            remedy="Undistort the photographs to a pinhole camera.",
         )
     size = _image_size(image, where) if image is not None else None
     try:
@@ -95,28 +89,24 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
             distortion = tuple(float(values.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     except KeyError as problem:
         raise SceneError(
-            explain(where, expected="intrinsics fl_x, fl_y, cx, cy, w, h", got=f"no {problem.args[0]}", remedy=remedy)
+            where, expected="intrinsics fl_x, fl_y, cx, cy, w, h", got=f"no {problem.args[0]}", remedy=remedy
         ) from problem
     except (TypeError, ValueError, OverflowError) as problem:
-        raise SceneError(explain(where, expected="numbers as intrinsics", got=problem, remedy=remedy)) from problem
+        raise SceneError(where, expected="numbers as intrinsics", got=problem, remedy=remedy) from problem
     good = np.isfinite((*focal, *distortion)).all() and len(distortion) == 6 and min(width, height) > 0
     if not good or min(focal[:2]) <= 0:
         raise SceneError(
-            explain(
-                where,
-                expected="finite intrinsics, positive focal lengths and size, six distortion parameters",
-                got={"w": width, "h": height, "fl_x, fl_y, cx, cy": focal, "distortion": distortion},
-                remedy=remedy,
-            )
+            where,
+            expected="finite intrinsics, positive focal lengths and size, six distortion parameters",
+            got={"w": width, "h": height, "fl_x, fl_y, cx, cy": focal, "distortion": distortion},
+            remedy=remedy,
         )
     if size is not None and (width, height) != size:
         raise SceneError(
-            explain(
-                where,
-                expected=f"a photograph of {width} x {height} pixels as the intrinsics say",
-                got=f"{size[0]} x {size[1]}",
-                remedy="Use the photographs that the poses were computed from, or scale the intrinsics.",
-            )
+            where,
+            expected=f"a photograph of {width} x {height} pixels as the intrinsics say",
+            got=f"{size[0]} x {size[1]}",
+            remedy="Use the photographs that the poses were computed from, or scale the intrinsics.",
         )
     return Intrinsics(width, height, *focal, distortion, camera_type.value)  # type: ignore[arg-type]
 
@@ -128,10 +118,8 @@ def _image_size(path: Path, where: str) -> tuple[int, int]:
             return image.size
     except Exception as problem:  # Pillow's plugins raise many types on damaged headers
         raise SceneError(
-            explain(
-                f"{where}: {path.name}",
-                expected="a readable photograph",
-                got=problem,
-                remedy="The file is damaged; copy it again or remove the frame.",
-            )
+            f"{where}: {path.name}",
+            expected="a readable photograph",
+            got=problem,
+            remedy="The file is damaged; copy it again or remove the frame.",
         ) from problem

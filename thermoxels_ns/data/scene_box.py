@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.colmap_files import check_complete
 from thermoxels_ns.data.colmap_tracks import COLMAP_FOLDERS
 from thermoxels_ns.data.scene_file import Frame, SceneFile
@@ -85,12 +85,10 @@ def box_of_points(points: npt.NDArray[np.float64], frames: Sequence[Frame], rota
         points = points[distance <= _FAR * max(np.median(distance), 1e-12)]
     if len(points) < 10:
         raise SceneError(
-            explain(
-                "sparse points",
-                expected="at least 10 points in front of the cameras to find the scene box",
-                got=len(points),
-                remedy=_REMEDY,
-            )
+            "sparse points",
+            expected="at least 10 points in front of the cameras to find the scene box",
+            got=len(points),
+            remedy=_REMEDY,
         )
     low, high = np.percentile(points, _PERCENTILES, axis=0)
     extent = high - low
@@ -113,19 +111,15 @@ def box_of_cameras(frames: Sequence[Frame], rotation: npt.NDArray[np.float64]) -
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     normal = across.mean(axis=0)
     if np.linalg.eigvalsh(normal)[0] < 1e-3:  # mean squared sine of the angle to a common direction
-        raise SceneError(
-            explain("scene box", expected="cameras that look at one place", got="parallel views", remedy=_REMEDY)
-        )
+        raise SceneError("scene box", expected="cameras that look at one place", got="parallel views", remedy=_REMEDY)
     centre = np.linalg.solve(normal, np.einsum("nij,nj->i", across, origins) / len(frames))
     depth = ((centre - origins) * axes).sum(axis=1)
     if np.median(depth) <= 0:
         raise SceneError(
-            explain(
-                "scene box",
-                expected="cameras that look at one place",
-                got="cameras that look away from each other",
-                remedy=_REMEDY,
-            )
+            "scene box",
+            expected="cameras that look at one place",
+            got="cameras that look away from each other",
+            remedy=_REMEDY,
         )
     half_view = np.array(
         [max(f.intrinsics.width / f.intrinsics.fx, f.intrinsics.height / f.intrinsics.fy) / 2 for f in frames]
@@ -145,7 +139,7 @@ def _checked(corners: Any, name: str) -> Box:
         sides = box[1] - box[0]
         good = bool((sides > 1e-6 * np.abs(sides).max()).all())
     if not good:
-        raise SceneError(explain(name, expected=expected, got=np.asarray(corners).tolist(), remedy=_REMEDY))
+        raise SceneError(name, expected=expected, got=np.asarray(corners).tolist(), remedy=_REMEDY)
     return box
 
 
@@ -161,12 +155,12 @@ def _read_ply(path: Path) -> npt.NDArray[np.float64]:
     import trimesh  # slow to import and only needed here
 
     if not path.is_file():
-        raise SceneError(explain("ply_file_path", expected=f"a file at {path}", got="nothing there", remedy=_REMEDY))
+        raise SceneError("ply_file_path", expected=f"a file at {path}", got="nothing there", remedy=_REMEDY)
     try:
         loaded: Any = trimesh.load(path)
         points = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
     except Exception as problem:  # trimesh raises whatever its parsers meet
-        raise SceneError(explain(str(path), expected="a readable .ply", got=problem, remedy=_REMEDY)) from problem
+        raise SceneError(str(path), expected="a readable .ply", got=problem, remedy=_REMEDY) from problem
     return points
 
 
@@ -182,9 +176,7 @@ def _read_colmap(folder: Path, scene: SceneFile) -> npt.NDArray[np.float64]:
         check_complete(folder)
         model = pycolmap.Reconstruction(str(folder))
     except Exception as problem:  # pycolmap raises RuntimeError, ValueError, IndexError by version
-        raise SceneError(
-            explain(str(folder), expected="a readable COLMAP model", got=problem, remedy=_REMEDY)
-        ) from problem
+        raise SceneError(str(folder), expected="a readable COLMAP model", got=problem, remedy=_REMEDY) from problem
     centres = {Path(image.name).name: np.asarray(image.projection_center()) for image in model.images.values()}
     known = [(centres[frame.image.name], frame.pose[:3, 3]) for frame in scene.frames if frame.image.name in centres]
     in_colmap, in_json = (np.array(side).reshape(-1, 3) for side in (zip(*known) if known else ([], [])))
@@ -199,10 +191,8 @@ def _read_colmap(folder: Path, scene: SceneFile) -> npt.NDArray[np.float64]:
             points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
             return points @ transform[:, :3].T + transform[:, 3]
     raise SceneError(
-        explain(
-            str(folder),
-            expected="a COLMAP model with the camera centres of the json",
-            got=f"{len(known)} photographs in common, at other places" if known else "no photograph in common",
-            remedy=_REMEDY,
-        )
+        str(folder),
+        expected="a COLMAP model with the camera centres of the json",
+        got=f"{len(known)} photographs in common, at other places" if known else "no photograph in common",
+        remedy=_REMEDY,
     )

@@ -69,21 +69,17 @@ def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "err
     entries = meta.get("frames")
     if not isinstance(entries, list) or not entries:
         raise SceneError(
-            explain(
-                json_path.name,
-                expected="a list 'frames' with one posed photograph per entry",
-                got="no frames: the scene has no poses",
-                remedy="Run structure from motion (ns-process-data) on the photographs first.",
-            )
+            json_path.name,
+            expected="a list 'frames' with one posed photograph per entry",
+            got="no frames: the scene has no poses",
+            remedy="Run structure from motion (ns-process-data) on the photographs first.",
         )
     partners = _ThermalPartners(folder)
     frames, left_out = [], []
     for index, entry in enumerate(entries):
         where = f"{json_path.name}: frame {index}"
         if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
-            raise SceneError(
-                explain(where, expected="an object with 'file_path'", got=entry, remedy="Correct the json.")
-            )
+            raise SceneError(where, expected="an object with 'file_path'", got=entry, remedy="Correct the json.")
         name = Path(entry["file_path"]).as_posix()
         where = f"{where} ({name})"
         image = _existing(folder / name, where, "file_path")
@@ -97,21 +93,17 @@ def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "err
     orphans = partners.orphans(folder, [frame.image for frame in frames])
     if missing_thermal == "error" and orphans:
         raise SceneError(
-            explain(
-                f"{folder.name}/thermal",
-                expected="one photograph in images/ for every thermal image",
-                got=f"{partners.count} thermal images, {len(orphans)} of them without a photograph: {_some(orphans)}",
-                remedy="Restore the photographs, remove these files, or pass --missing-thermal skip.",
-            )
+            f"{folder.name}/thermal",
+            expected="one photograph in images/ for every thermal image",
+            got=f"{partners.count} thermal images, {len(orphans)} of them without a photograph: {_some(orphans)}",
+            remedy="Restore the photographs, remove these files, or pass --missing-thermal skip.",
         )
     if not frames:
         raise SceneError(
-            explain(
-                json_path.name,
-                expected="at least one frame with a thermal partner",
-                got=f"{len(entries)} frames, none with one",
-                remedy="Put the thermal images in thermal/ or name them with 'thermal_file_path'.",
-            )
+            json_path.name,
+            expected="at least one frame with a thermal partner",
+            got=f"{len(entries)} frames, none with one",
+            remedy="Put the thermal images in thermal/ or name them with 'thermal_file_path'.",
         )
     _refuse_duplicates(json_path, frames)
     _refuse_half_masks(json_path, frames)
@@ -144,12 +136,10 @@ class _ThermalPartners:
         found = self.by_stem.get(image.stem, [])
         if len(found) > 1:
             raise SceneError(
-                explain(
-                    f"thermal partner of {image.name}",
-                    expected="one file",
-                    got=", ".join(path.name for path in found),
-                    remedy="Keep one of them, or name it with 'thermal_file_path' in the frame.",
-                )
+                f"thermal partner of {image.name}",
+                expected="one file",
+                got=", ".join(path.name for path in found),
+                remedy="Keep one of them, or name it with 'thermal_file_path' in the frame.",
             )
         return found[0] if found else None
 
@@ -170,12 +160,10 @@ def _find_json(data: Path) -> Path:
         if (data / name).is_file():
             return data / name
     raise SceneError(
-        explain(
-            f"scene folder {data}",
-            expected=" or ".join(JSON_NAMES),
-            got="neither" if data.is_dir() else "no such folder",
-            remedy="Pass --data the folder that holds it (ns-process-data writes it).",
-        )
+        f"scene folder {data}",
+        expected=" or ".join(JSON_NAMES),
+        got="neither" if data.is_dir() else "no such folder",
+        remedy="Pass --data the folder that holds it (ns-process-data writes it).",
     )
 
 
@@ -184,11 +172,11 @@ def _load_json(path: Path) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError) as problem:
         raise SceneError(
-            explain(str(path), expected="valid json", got=str(problem), remedy="Write the file again.")
+            str(path), expected="valid json", got=str(problem), remedy="Write the file again."
         ) from problem
     if not isinstance(content, dict):
         raise SceneError(
-            explain(str(path), expected="a json object", got=type(content).__name__, remedy="Write the file again.")
+            str(path), expected="a json object", got=type(content).__name__, remedy="Write the file again."
         )
     return content
 
@@ -206,12 +194,10 @@ def _read_bounds(folder: Path) -> tuple[float, float] | None:
         del problem
     if not (np.isfinite(first) and np.isfinite(second)):
         raise SceneError(
-            explain(
-                str(path),
-                expected=f"finite numbers {keys[0]} and {keys[1]} in degrees Celsius",
-                got={key: content.get(key) for key in keys},
-                remedy="Correct the file, or remove it if the thermal files hold degrees Celsius.",
-            )
+            str(path),
+            expected=f"finite numbers {keys[0]} and {keys[1]} in degrees Celsius",
+            got={key: content.get(key) for key in keys},
+            remedy="Correct the file, or remove it if the thermal files hold degrees Celsius.",
         )
     return min(first, second), max(first, second)  # published scenes exist with the two names swapped
 
@@ -223,12 +209,10 @@ def _unit(meta: dict[str, Any], json_path: Path, bounds: tuple[float, float] | N
             return ThermalUnit.linear(float(unit["celsius_per_count"]), float(unit["celsius_offset"]))
         except (KeyError, TypeError, ValueError) as problem:
             raise SceneError(
-                explain(
-                    f"{json_path.name}: thermal_unit",
-                    expected="numbers celsius_per_count (not 0) and celsius_offset",
-                    got=unit,
-                    remedy="Correct the json.",
-                )
+                f"{json_path.name}: thermal_unit",
+                expected="numbers celsius_per_count (not 0) and celsius_offset",
+                got=unit,
+                remedy="Correct the json.",
             ) from problem
     return ThermalUnit.bounds(*bounds) if bounds else ThermalUnit.celsius()
 
@@ -242,28 +226,22 @@ def _frame(
     camera = entry.get("thermal_camera", meta.get("thermal_camera"))
     if camera is not None:
         if not isinstance(camera, dict):
-            raise SceneError(
-                explain(where, expected="'thermal_camera' as an object", got=camera, remedy="Correct the json.")
-            )
+            raise SceneError(where, expected="'thermal_camera' as an object", got=camera, remedy="Correct the json.")
         thermal_intrinsics = read_intrinsics({}, camera, None, f"{where}: thermal_camera")
     elif thermal_pose is not None:
         raise SceneError(
-            explain(
-                where,
-                expected="'thermal_camera' (w, h, fl_x, fl_y, cx, cy) beside 'thermal_transform_matrix'",
-                got="no thermal_camera",
-                remedy="Add it at the top of the json or in every frame.",
-            )
+            where,
+            expected="'thermal_camera' (w, h, fl_x, fl_y, cx, cy) beside 'thermal_transform_matrix'",
+            got="no thermal_camera",
+            remedy="Add it at the top of the json or in every frame.",
         )
     mask = _mask(folder, entry, where)
     if "transform_matrix" not in entry:
         raise SceneError(
-            explain(
-                where,
-                expected="'transform_matrix', the camera's pose",
-                got="none",
-                remedy="Remove the frame or run structure from motion again.",
-            )
+            where,
+            expected="'transform_matrix', the camera's pose",
+            got="none",
+            remedy="Remove the frame or run structure from motion again.",
         )
     pose = read_pose(entry["transform_matrix"], f"{where}: transform_matrix")
     intrinsics = read_intrinsics(meta, entry, image, where)
@@ -276,12 +254,10 @@ def _mask(folder: Path, entry: dict[str, Any], where: str) -> Path | None:
     name = entry["mask_path"]
     if not isinstance(name, str):
         raise SceneError(
-            explain(
-                f"{where}: mask_path",
-                expected="a file name",
-                got=repr(name),
-                remedy="Name the mask; or leave mask_path out of all frames if none has a mask.",
-            )
+            f"{where}: mask_path",
+            expected="a file name",
+            got=repr(name),
+            remedy="Name the mask; or leave mask_path out of all frames if none has a mask.",
         )
     return _existing(folder / name, where, "mask_path")
 
@@ -290,9 +266,7 @@ def _existing(path: Path, where: str, key: str) -> Path:
     if path.is_file():
         return path
     raise SceneError(
-        explain(
-            where, expected=f"the file of '{key}'", got=f"nothing at {path}", remedy="Restore it or remove the frame."
-        )
+        where, expected=f"the file of '{key}'", got=f"nothing at {path}", remedy="Restore it or remove the frame."
     )
 
 
@@ -301,12 +275,10 @@ def _refuse_duplicates(json_path: Path, frames: list[Frame]) -> None:
         twice = [path.name for path, count in Counter(path.resolve() for path in paths).items() if count > 1]
         if twice:
             raise SceneError(
-                explain(
-                    json_path.name,
-                    expected=f"every {kind} in one frame only",
-                    got=f"{_some(twice)} more than once",
-                    remedy="Remove the duplicate frames: one of them could leak from training to evaluation.",
-                )
+                json_path.name,
+                expected=f"every {kind} in one frame only",
+                got=f"{_some(twice)} more than once",
+                remedy="Remove the duplicate frames: one of them could leak from training to evaluation.",
             )
 
 
@@ -314,12 +286,10 @@ def _refuse_half_masks(json_path: Path, frames: list[Frame]) -> None:
     masks = sum(frame.mask is not None for frame in frames)
     if masks not in (0, len(frames)):
         raise SceneError(
-            explain(
-                f"{json_path.name}: mask_path",
-                expected="a mask for every frame or for none",
-                got=f"{masks} masks for {len(frames)} frames",
-                remedy="Add the missing ones (white: use the pixel).",
-            )
+            f"{json_path.name}: mask_path",
+            expected="a mask for every frame or for none",
+            got=f"{masks} masks for {len(frames)} frames",
+            remedy="Add the missing ones (white: use the pixel).",
         )
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from thermoxels_ns.core.checks import replace_when_done
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.feature_rays import FloatArray, IntArray, Sightlines, agrees_with_neighbours
 from thermoxels_ns.data.scene_file import Frame
 
@@ -77,7 +77,7 @@ def read_tracks(path: Path) -> SparseTracks:
             points, error, frames, frame, point = (file[name] for name in names)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, AttributeError, TypeError) as problem:
         raise SceneError(
-            explain(path.name, expected=f"an .npz with {', '.join(names)}", got=problem, remedy=_REMEDY)
+            path.name, expected=f"an .npz with {', '.join(names)}", got=problem, remedy=_REMEDY
         ) from problem
     good = (
         points.ndim == 2
@@ -95,9 +95,7 @@ def read_tracks(path: Path) -> SparseTracks:
     if not good:
         arrays = (points, error, frames, frame, point)
         shapes = ", ".join(f"{name} {array.dtype}{array.shape}" for name, array in zip(names, arrays))
-        raise SceneError(
-            explain(path.name, expected="points, frames and pairs of their numbers", got=shapes, remedy=_REMEDY)
-        )
+        raise SceneError(path.name, expected="points, frames and pairs of their numbers", got=shapes, remedy=_REMEDY)
     return SparseTracks(
         points.astype(np.float64),
         error.astype(np.float64),
@@ -131,12 +129,10 @@ def sightlines(
     number = np.array([place.get(known, -1) for known in tracks.frames], dtype=np.int64)
     if len(frames) and not (number >= 0).any():
         raise SceneError(
-            explain(
-                name,
-                expected="photographs of this scene",
-                got=f"{len(tracks.frames)} others, such as {', '.join(tracks.frames[:2]) or 'none'}",
-                remedy=remedy,
-            )
+            name,
+            expected="photographs of this scene",
+            got=f"{len(tracks.frames)} others, such as {', '.join(tracks.frames[:2]) or 'none'}",
+            remedy=remedy,
         )
     known = np.isfinite(tracks.points).all(axis=1) & (tracks.point_error_px <= MOST_ERROR_PX)
     known &= tracks.point_error_px >= 0.0  # COLMAP writes -1 for an error that it did not compute
@@ -150,12 +146,10 @@ def sightlines(
     behind = (line * -poses[frame, :3, 2]).sum(axis=1) <= 0.0
     if behind.sum() > MOST_BEHIND * len(behind):
         raise SceneError(
-            explain(
-                name,
-                expected="points in front of the photographs that see them",
-                got=f"{behind.mean():.0%} of the sightings behind: the poses are others",
-                remedy=remedy,
-            )
+            name,
+            expected="points in front of the photographs that see them",
+            got=f"{behind.mean():.0%} of the sightings behind: the poses are others",
+            remedy=remedy,
         )
     frame, point, line = frame[~behind], point[~behind], line[~behind]
     length = np.linalg.norm(line, axis=1)

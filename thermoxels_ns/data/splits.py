@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 
 SplitMode = Literal["auto", "filename", "lists", "interval"]
 _KEYS = {"train": "train_filenames", "val": "val_filenames", "test": "test_filenames"}
@@ -57,22 +57,18 @@ def split_frames(
     for side, chosen in (("training", split.train), ("evaluation", split.val), ("evaluation", split.test)):
         if not chosen:
             raise SceneError(
-                explain(
-                    f"{side} frames",
-                    expected=f"at least one of the {len(names)} frames ({split.how})",
-                    got="none",
-                    remedy="Add frames or choose another split, e.g. --eval-mode interval --eval-interval 2.",
-                )
+                f"{side} frames",
+                expected=f"at least one of the {len(names)} frames ({split.how})",
+                got="none",
+                remedy="Add frames or choose another split, e.g. --eval-mode interval --eval-interval 2.",
             )
     both = set(split.train) & (set(split.val) | set(split.test))
     if both:
         raise SceneError(
-            explain(
-                "split lists",
-                expected="no frame on both sides",
-                got=", ".join(names[i] for i in sorted(both)) + " in training and in evaluation",
-                remedy="Remove them from one list: evaluation frames must never train.",
-            )
+            "split lists",
+            expected="no frame on both sides",
+            got=", ".join(names[i] for i in sorted(both)) + " in training and in evaluation",
+            remedy="Remove them from one list: evaluation frames must never train.",
         )
     return split
 
@@ -81,12 +77,10 @@ def _by_name(names: Sequence[str], tagged: list[tuple[bool, bool]]) -> Split:
     unclear = [name for name, (train, evaluate) in zip(names, tagged) if train == evaluate]
     if unclear:
         raise SceneError(
-            explain(
-                "split by file name",
-                expected="frame_train_ or frame_eval_ in every name",
-                got=f"{unclear[0]} ({len(unclear)} such)",
-                remedy="Rename them or pass --eval-mode interval.",
-            )
+            "split by file name",
+            expected="frame_train_ or frame_eval_ in every name",
+            got=f"{unclear[0]} ({len(unclear)} such)",
+            remedy="Rename them or pass --eval-mode interval.",
         )
     evaluate = [i for i, (_, test) in enumerate(tagged) if test]
     return Split([i for i, (train, _) in enumerate(tagged) if train], evaluate, evaluate, "by file name")
@@ -101,12 +95,10 @@ def _by_lists(names: Sequence[str], meta: Mapping[str, Any], left_out: Sequence[
         unknown = [name for name in listed or [] if name not in position]
         if unknown:
             raise SceneError(
-                explain(
-                    key,
-                    expected="names that are in 'frames'",
-                    got=f"{unknown[0]} ({len(unknown)} unknown)",
-                    remedy="Correct the list; it must write names as 'file_path' does.",
-                )
+                key,
+                expected="names that are in 'frames'",
+                got=f"{unknown[0]} ({len(unknown)} unknown)",
+                remedy="Correct the list; it must write names as 'file_path' does.",
             )
         found[side] = None if listed is None else sorted({position[name] for name in listed})
     val = found["val"] or found["test"]
@@ -124,12 +116,10 @@ def _by_interval(names: Sequence[str], interval: int, offset: int | None) -> Spl
     start = interval // 2 if offset is None else offset
     if interval < 2 or not 0 <= start < interval:
         raise SceneError(
-            explain(
-                "eval_interval, eval_offset",
-                expected="an interval of at least 2 and an offset from 0 to interval - 1",
-                got=f"{interval}, {start}",
-                remedy="Pass --eval-interval 8.",
-            )
+            "eval_interval, eval_offset",
+            expected="an interval of at least 2 and an offset from 0 to interval - 1",
+            got=f"{interval}, {start}",
+            remedy="Pass --eval-interval 8.",
         )
     evaluate = list(range(start, len(names), interval))
     train = [i for i in range(len(names)) if i % interval != start]

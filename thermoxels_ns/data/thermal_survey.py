@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import ThermalFileError, explain
+from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
 from thermoxels_ns.radiometry.thermal_files import ThermalUnit, read_temperature_c
@@ -62,12 +62,10 @@ def survey_thermal_files(
         shapes[path] = (height, width)
         if not np.isfinite(temperature_c).any():
             raise ThermalFileError(
-                explain(
-                    str(path),
-                    expected=f"temperatures from {valid_range_c[0]} to {valid_range_c[1]} C",
-                    got="no valid pixel",
-                    remedy="Check thermal_unit or temperature_bounds.json, or widen --valid-range-c.",
-                )
+                str(path),
+                expected=f"temperatures from {valid_range_c[0]} to {valid_range_c[1]} C",
+                got="no valid pixel",
+                remedy="Check thermal_unit or temperature_bounds.json, or widen --valid-range-c.",
             )
         if not is_training:
             continue

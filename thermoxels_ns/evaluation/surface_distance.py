@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_positive, check_shape
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.evaluation.voxel_accuracy import TrueShape
 from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
@@ -47,9 +47,7 @@ def sample_facets(
     total = np.concatenate([[0.0], np.cumsum(area)])
     if not total[-1] > 0.0:
         raise MeshError(
-            explain(
-                "boundary", expected="triangles with an area above 0", got=len(facets), remedy="Build the mesh again."
-            )
+            "boundary", expected="triangles with an area above 0", got=len(facets), remedy="Build the mesh again."
         )
     number = np.arange(count)
     which = np.searchsorted(total, (number + 0.5) / count * total[-1], side="right") - 1

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_positive
-from thermoxels_ns.core.errors import MeshError, SceneError, explain
+from thermoxels_ns.core.errors import MeshError, SceneError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.evaluation.surface_distance import surface_distances
@@ -184,12 +184,10 @@ def points_seen(known: KnownTruth) -> npt.NDArray[np.float64]:
     seen = visible_surface_points(known.scene, known.training_poses, known.camera, points, normals, MIN_VIEWS)
     if not seen.any():
         raise SceneError(
-            explain(
-                "training cameras",
-                expected=f"a part of the surface that at least {MIN_VIEWS} of them see",
-                got=f"none, with {len(known.training_poses)} training cameras",
-                remedy="Write the scene with more training views.",
-            )
+            "training cameras",
+            expected=f"a part of the surface that at least {MIN_VIEWS} of them see",
+            got=f"none, with {len(known.training_poses)} training cameras",
+            remedy="Write the scene with more training views.",
         )
     return points[seen]
 
@@ -267,4 +265,4 @@ def _temperature_errors(
 
 
 def _unusable(path: Path, expected: str, got: str) -> SceneError:
-    return SceneError(explain(str(path), expected=expected, got=got, remedy="Write the synthetic scene again."))
+    return SceneError(str(path), expected=expected, got=got, remedy="Write the synthetic scene again.")

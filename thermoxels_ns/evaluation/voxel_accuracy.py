@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.build import apply_transform, check_similarity
@@ -109,7 +109,7 @@ def surface_fscore(
     seen = check_shape("true_points_seen", np.asarray(true_points_seen, np.float64), (None, 3), remedy, MeshError)
     check_finite("true_points_seen", seen, remedy, MeshError)
     if len(seen) == 0:
-        raise MeshError(explain("true_points_seen", expected="at least one point", got="none", remedy=remedy))
+        raise MeshError("true_points_seen", expected="at least one point", got="none", remedy=remedy)
     check_positive("tolerance", tolerance, "Pass 1.5 voxels in truth units.", MeshError)
     transform = check_similarity("world_to_truth", np.eye(4) if world_to_truth is None else world_to_truth)
 

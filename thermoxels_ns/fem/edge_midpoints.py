@@ -1,14 +1,11 @@
-"""Edges of tetrahedra and triangles by number, for nodes that sit in their middles.
-
-Kernels are kept compiled by numba, which watches a kernel's own file: none may call one of another file.
-"""
+"""Edges of tetrahedra and triangles by number, for nodes that sit in their middles."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.fem.sparsity import MeshEdges
 
 TET_EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
@@ -45,7 +42,7 @@ def midpoints(edges: MeshEdges, nodal: npt.NDArray[np.float64]) -> npt.NDArray[n
     return 0.5 * (nodal[edges.smaller_nodes()] + nodal[edges.other])
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _find(first, other, elements, ends, numbers):
     num_nodes = len(first) - 1
     for k in range(len(elements)):

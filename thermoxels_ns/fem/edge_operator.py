@@ -3,15 +3,14 @@
 Linear functions l_i and bubbles b_ij = 4 l_i l_j together span what quadratic tetrahedra do (a hierarchical basis). So
 the nodes' coefficients are those of linear tetrahedra, and what edges add is an estimate of what those lack.
 
-Kernels are kept compiled by numba, which watches a kernel's own file: none may call one of another file.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.fem.edge_midpoints import TET_EDGES
 from thermoxels_ns.fem.problem import HeatProblem
 
@@ -57,7 +56,7 @@ class EdgeOperator:
         return diagonal
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _prepare(points, tets, conductivity, coupling):
     side, normal = np.empty((3, 3)), np.empty((4, 3))
     for t in range(len(tets)):
@@ -83,7 +82,7 @@ def _prepare(points, tets, conductivity, coupling):
                 edge += 1
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _conducted(tets, edge_of, coupling, nodal, edge, at_nodes, at_edges):
     # grad T = sum over a of p_a grad l_a with p_a = c_a + 4 sum over j of e_aj l_j. Means over a tetrahedron: 1/4 of
     # l_i, 1/10 of l_i l_i and 1/20 of l_i l_j. With t_a = sum over j of e_aj, q_i = sum over a of g_ai t_a and n_i the
@@ -123,7 +122,7 @@ def _conducted(tets, edge_of, coupling, nodal, edge, at_nodes, at_edges):
         at_edges[edge_of[t, 5]] += 0.8 * (q2 + q3 + s23) + n2 + n3
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _to_edges(tets, edge_of, coupling, nodal, ends, at_edges):
     flow = np.empty(4)
     for t in range(len(tets)):
@@ -138,7 +137,7 @@ def _to_edges(tets, edge_of, coupling, nodal, ends, at_edges):
             at_edges[edge_of[t, k]] += flow[ends[k, 0]] + flow[ends[k, 1]]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _diagonal(edge_of, coupling, ends, diagonal):
     own = np.empty(4)
     for t in range(len(edge_of)):

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.quantities import Bounded, Bounds, Quantity
 from thermoxels_ns.fem.selection import Selection
@@ -213,5 +213,5 @@ def _checked_names(field: str, names: object) -> tuple[str, ...]:
     listed = tuple(names) if isinstance(names, (tuple, list)) else ()
     if not listed or not all(isinstance(name, str) and name.strip() for name in listed):
         remedy = f'Write {field}=("name",), for example.'
-        raise HeatError(explain(field, expected="a tuple of names", got=repr(names), remedy=remedy))
+        raise HeatError(field, expected="a tuple of names", got=repr(names), remedy=remedy)
     return listed

@@ -3,17 +3,16 @@
 The geometry of each tetrahedron is computed where it is needed and never stored. On a lattice, tetrahedra are alike
 and could share their matrices, but to recognise one takes longer than to compute it.
 
-Kernels are kept compiled by numba, which watches a kernel's own file: none may call one of another file.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from thermoxels_ns.core.checks import check_finite, check_shape
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.fem.sparsity import MeshEdges, checked_tets
 
 _REMEDY = "Build the mesh with thermoxels_ns.mesh."
@@ -108,12 +107,10 @@ def _per_tet(name: str, value: float | npt.NDArray[np.float64], num_tets: int) -
     bad = int(np.count_nonzero(~(np.isfinite(values) & (values > 0.0))))
     if bad or values.shape not in ((), (num_tets,)):
         raise HeatError(
-            explain(
-                name,
-                expected=f"finite numbers above 0, one for all or shape ({num_tets},)",
-                got=f"shape {values.shape} with {bad} that are not",
-                remedy="Give one number per tetrahedron of the mesh.",
-            )
+            name,
+            expected=f"finite numbers above 0, one for all or shape ({num_tets},)",
+            got=f"shape {values.shape} with {bad} that are not",
+            remedy="Give one number per tetrahedron of the mesh.",
         )
     return np.ascontiguousarray(values.reshape(-1))
 
@@ -121,10 +118,10 @@ def _per_tet(name: str, value: float | npt.NDArray[np.float64], num_tets: int) -
 def _refuse_flat(num_flat: int, num_tets: int) -> None:
     if num_flat:
         got = f"{num_flat} of {num_tets} flat or inverted"
-        raise HeatError(explain("mesh tets", expected="volumes above 0", got=got, remedy=_REMEDY))
+        raise HeatError("mesh tets", expected="volumes above 0", got=got, remedy=_REMEDY)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _sides(points, tet, scale):
     # Unsigned, here and below: no test for negative numbers.
     o, a, b, c = (
@@ -140,22 +137,22 @@ def _sides(points, tet, scale):
     )
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _cross(u, v):
     return (u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0])
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _dot(u, v):
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _size(a, b, c):
     return max(abs(a[0]), abs(a[1]), abs(a[2]), abs(b[0]), abs(b[1]), abs(b[2]), abs(c[0]), abs(c[1]), abs(c[2]))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _place(first, other, node, neighbour):
     """Number of the edge between two nodes, by bisection."""
     low, high = np.uint64(min(node, neighbour)), max(node, neighbour)
@@ -169,7 +166,7 @@ def _place(first, other, node, neighbour):
     return begin
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _add_couplings(points, tets, conductivity, scale, first, other, coupling):
     """Returns the number of tetrahedra that are flat or inverted."""
     each = 0 if len(conductivity) == 1 else 1
@@ -196,7 +193,7 @@ def _add_couplings(points, tets, conductivity, scale, first, other, coupling):
     return flat
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _add_capacities(points, tets, capacity, scale, nodal, first, other, edge):
     """Returns the number of tetrahedra that are flat or inverted."""
     each = 0 if len(capacity) == 1 else 1

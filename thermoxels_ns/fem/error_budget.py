@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermoxels_ns.core.checks import check_positive
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 
@@ -34,7 +34,7 @@ class Tolerance:
     def __post_init__(self) -> None:
         if self.temperature_k is None and self.heat_flow is None:
             remedy = "Give a tolerance in kelvin, or one for heat flows such as 0.01."
-            raise HeatError(explain("tolerance", expected="temperature_k or heat_flow", got="neither", remedy=remedy))
+            raise HeatError("tolerance", expected="temperature_k or heat_flow", got="neither", remedy=remedy)
         for name, remedy in (("temperature_k", "Give it in kelvin."), ("heat_flow", "Give a share, such as 0.01.")):
             value = getattr(self, name)
             if value is not None:

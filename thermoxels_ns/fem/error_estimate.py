@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quadratic_space import QuadraticSpace
 from thermoxels_ns.fem.recovered_gradient import gradient_defect
@@ -119,10 +119,10 @@ def richardson(difference: float, ratio: float) -> float:
     """
     if not 0.0 < ratio < 1.0:
         remedy = "Use 1/4 for two meshes of linear tetrahedra, one with half the size of the other."
-        raise HeatError(explain("ratio", expected="a number above 0 and below 1", got=repr(ratio), remedy=remedy))
+        raise HeatError("ratio", expected="a number above 0 and below 1", got=repr(ratio), remedy=remedy)
     return abs(difference) * ratio / (1.0 - ratio)
 
 
 def _of_another_mesh(expected: int, got: int) -> HeatError:
     remedy = "Give the problem that was solved."
-    return HeatError(explain("solution", expected=f"{expected} temperatures", got=got, remedy=remedy))
+    return HeatError("solution", expected=f"{expected} temperatures", got=got, remedy=remedy)

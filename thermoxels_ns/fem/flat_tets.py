@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from thermoxels_ns.core.kernel_cache import kernel
 
 
 def count_flat_tets(points_m: npt.NDArray[np.float64], tets: npt.NDArray[np.int64], share: float = 1e-12) -> int:
@@ -21,7 +22,7 @@ def count_flat_tets(points_m: npt.NDArray[np.float64], tets: npt.NDArray[np.int6
     return int(_count(np.ascontiguousarray(points_m, np.float64), np.ascontiguousarray(tets, np.int64), share))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _count(points, tets, share):
     flat = 0
     for t in range(len(tets)):

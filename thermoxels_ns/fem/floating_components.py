@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.system import HeatSystem
 
 MOST_RISE_K = 1e6
@@ -29,7 +29,7 @@ def check_held(system: HeatSystem, time_s: float) -> None:
         remedy = "Remove the piece, give its boundary an effect, or follow it through time instead."
         got = f"none on {len(loose)} of {system.pieces.count} pieces; {_largest(system, loose)}"
         expected = "convection, radiation, ground contact or a fixed temperature on every connected piece of a body"
-        raise HeatError(explain("steady heat problem", expected=expected, got=got, remedy=remedy))
+        raise HeatError("steady heat problem", expected=expected, got=got, remedy=remedy)
 
 
 def check_stored(system: HeatSystem, duration_s: float) -> None:
@@ -57,7 +57,7 @@ def check_stored(system: HeatSystem, duration_s: float) -> None:
         got += f" in {duration_s:g} s; {_largest(system, runaway)}"
         expected = "heat capacity, or exchange of heat, that takes up given fluxes and sources in every connected piece"
         remedy = "Remove the piece, correct its material, or give it convection, radiation or a fixed temperature."
-        raise HeatError(explain("heat problem", expected=expected, got=got, remedy=remedy))
+        raise HeatError("heat problem", expected=expected, got=got, remedy=remedy)
 
 
 def _largest_capacity(system: HeatSystem) -> npt.NDArray[np.float64]:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy import sparse
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.fem.sparsity import product_and_bound
 
 Vector = npt.NDArray[np.float64]
@@ -86,13 +86,11 @@ class ConjugateGradients:
         diagonal = matrix.diagonal()
         if not (np.all(np.isfinite(matrix.data)) and np.all(diagonal > 0)):
             raise HeatError(
-                explain(
-                    "matrix of the heat problem",
-                    expected="finite entries and a diagonal above 0",
-                    got=f"smallest diagonal entry {np.min(diagonal, initial=np.inf):.3g}, "
-                    f"{np.count_nonzero(~np.isfinite(matrix.data))} entries not finite",
-                    remedy="Check the units of the mesh, the material and the time step.",
-                )
+                "matrix of the heat problem",
+                expected="finite entries and a diagonal above 0",
+                got=f"smallest diagonal entry {np.min(diagonal, initial=np.inf):.3g}, "
+                f"{np.count_nonzero(~np.isfinite(matrix.data))} entries not finite",
+                remedy="Check the units of the mesh, the material and the time step.",
             )
         self._matrix = matrix
         self._norm = float(np.max(product_and_bound(matrix, np.ones(len(diagonal)))[1], initial=0.0))
@@ -166,7 +164,7 @@ def _scaled_upper_triangle(
     return first, other, values
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _largest(vector):
     largest = 0.0
     for value in vector:
@@ -177,7 +175,7 @@ def _largest(vector):
     return largest
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+@kernel(fastmath={"reassoc", "contract"})
 def _residual(indptr, indices, data, b, scale, x, r, moved):
     """Sets r = b / scale - A x, of x = 0 unless it was moved; returns the norms of r and x."""
     rr = xx = 0.0
@@ -192,7 +190,7 @@ def _residual(indptr, indices, data, b, scale, x, r, moved):
     return math.sqrt(rr), math.sqrt(xx)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _count_above(indptr, indices, first):
     for row in range(len(indptr) - 1):
         count = 0
@@ -201,7 +199,7 @@ def _count_above(indptr, indices, first):
         first[row + 1] = first[row] + count
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _take_above(indptr, indices, data, scale, first, other, values):
     for row in range(len(indptr) - 1):
         place = first[row]
@@ -214,7 +212,7 @@ def _take_above(indptr, indices, data, scale, first, other, values):
 
 # Sums may be regrouped: four at a time, they need not wait for each other. Arrays are made outside, which takes a third
 # off the time to compile.
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+@kernel(fastmath={"reassoc", "contract"})
 def _iterate(first, other, values, size, x, r, direction, image, tolerance, max_iterations):
     """Conjugate gradients for a matrix with ones on its diagonal, which need no preconditioner.
 

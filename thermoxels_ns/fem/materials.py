@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from thermoxels_ns.core.checks import check_positive
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,7 @@ class Material:
 
     def __post_init__(self) -> None:
         if not (isinstance(self.name, str) and self.name.strip()):
-            raise HeatError(
-                explain("material name", expected="a name", got=repr(self.name), remedy="Give the material a name.")
-            )
+            raise HeatError("material name", expected="a name", got=repr(self.name), remedy="Give the material a name.")
         for field, unit in (
             ("conductivity_w_mk", "W/(m K)"),
             ("density_kg_m3", "kg/m3"),

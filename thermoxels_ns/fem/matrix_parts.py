@@ -1,14 +1,12 @@
-"""Parts of sparse matrices, changes of their diagonal and products of rows, in one pass instead of several of scipy's.
-
-Kernels are kept compiled by numba, which watches a kernel's own file: none may call one of another file.
-"""
+"""Parts of sparse matrices, changes of their diagonal and products of rows, in one pass."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy import sparse
+
+from thermoxels_ns.core.kernel_cache import kernel
 
 
 def with_more_on_diagonal(matrix: sparse.csr_matrix, more: npt.NDArray[np.float64]) -> sparse.csr_matrix:
@@ -68,7 +66,7 @@ def product_of_rows(
     return product
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _multiply_rows(indptr, indices, data, rows, vector, product):
     for place in range(len(rows)):
         total = 0.0
@@ -77,7 +75,7 @@ def _multiply_rows(indptr, indices, data, rows, vector, product):
         product[place] = total
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _add_to_diagonal(indptr, indices, more, data):
     """Returns whether each row has an entry on the diagonal to add to."""
     for row in range(len(indptr) - 1):
@@ -92,7 +90,7 @@ def _add_to_diagonal(indptr, indices, more, data):
     return True
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _count_kept(indptr, indices, kept, number, first):
     for place in range(len(kept)):
         count = 0
@@ -101,7 +99,7 @@ def _count_kept(indptr, indices, kept, number, first):
         first[place + 1] = first[place] + count
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _take_kept(indptr, indices, data, kept, number, columns, values):
     place = 0
     for row in kept:

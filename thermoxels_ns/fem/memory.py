@@ -5,15 +5,14 @@ by the number of nodes. Couplings are counted on a sample, because lattices have
 Measured on lattices and on conforming meshes; interpreter and libraries, which need about 150 MB, come on top, and so
 does multigrid, which takes over where conjugate gradients are slow and needs about as much as the matrices.
 
-The kernel is kept compiled by numba, which watches a kernel's own file: it calls none of another file.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -51,9 +50,9 @@ def peak_bytes(
         HeatError: The order or the number of times makes no sense.
     """
     if order not in (1, 2):
-        raise HeatError(explain("order", expected="1 or 2", got=repr(order), remedy="Use 1 or 2."))
+        raise HeatError("order", expected="1 or 2", got=repr(order), remedy="Use 1 or 2.")
     if times < 1:
-        raise HeatError(explain("times", expected="at least 1", got=repr(times), remedy="Count the start as one."))
+        raise HeatError("times", expected="at least 1", got=repr(times), remedy="Count the start as one.")
     mesh, finer = problem.mesh, 8.0**refinements
     nodes, edges = float(len(mesh.points_m)), _count_edges(mesh)
     states = 8.0 * times * nodes
@@ -90,7 +89,7 @@ def check_memory(needed: float, allowed: float, remedy: str) -> None:
     """
     if needed > allowed:
         expected, got = f"at most {describe_bytes(allowed)}", f"about {describe_bytes(needed)}"
-        raise HeatError(explain("memory of the heat problem", expected=expected, got=got, remedy=remedy))
+        raise HeatError("memory of the heat problem", expected=expected, got=got, remedy=remedy)
 
 
 def _count_edges(mesh: TetMesh) -> float:
@@ -114,7 +113,7 @@ def _coupled_share(mesh: TetMesh) -> float:
     return float(np.mean(keys[last] & 1))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _edges_and_angles(points, tets, right, keys):
     """Number every edge of every tetrahedron by its ends, times two, plus one if it lies at an angle that couples them.
 

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy import sparse
 
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.fem.linear_solver import LinearSolution, is_solved
 
 Vector = npt.NDArray[np.float64]
@@ -115,7 +115,7 @@ class _DirectSolver:
         return x.reshape(np.shape(right_hand_side))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _factorise(matrix):
     """Turn the lower triangle into that of its Cholesky factor; a row whose pivot vanishes has an infinite one."""
     for i in range(len(matrix)):
@@ -130,7 +130,7 @@ def _factorise(matrix):
                 matrix[i, i] = math.sqrt(rest) if rest > smallest else np.inf
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _solve(factor, x):
     """Forward and backward substitution in place."""
     for i in range(len(x)):

@@ -1,15 +1,14 @@
 """Loops over nodes that keep what each connected piece stores and exchanges exact.
 
-Kernels are kept compiled by numba, which watches a kernel's own file: none may call one of another file. Plain sums
-over many nodes lose digits; these are sums of sums over blocks.
+Plain sums over many nodes lose digits; these are sums of sums over blocks.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.fem.pieces import Pieces
 
 Vector = npt.NDArray[np.float64]
@@ -53,7 +52,7 @@ def weighted_sums(pieces: Pieces, weights: Vector, nodal: Vector) -> Vector:
     return pieces.sums(weights * nodal)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _is_within(values, bounds, slack, sizes):
     i, count = 0, len(values)
     while i < count and abs(values[i]) <= bounds[i] + slack * abs(sizes[i]):
@@ -61,7 +60,7 @@ def _is_within(values, bounds, slack, sizes):
     return i == count
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+@kernel(fastmath={"reassoc", "contract"})
 def _sum(values):
     total = 0.0
     for begin in range(0, len(values), _BLOCK):
@@ -72,7 +71,7 @@ def _sum(values):
     return total
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+@kernel(fastmath={"reassoc", "contract"})
 def _sum_of_products(first, second):
     total = 0.0
     for begin in range(0, len(first), _BLOCK):
@@ -83,13 +82,13 @@ def _sum_of_products(first, second):
     return total
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _subtract(values, held, share):
     for i in range(len(values)):
         values[i] -= share * held[i]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _subtract_by_piece(values, held, number, shares):
     for i in range(len(values)):
         values[i] -= shares[number[i]] * held[i]

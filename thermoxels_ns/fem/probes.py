@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_finite, check_shape
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.edge_midpoints import TET_EDGES, edge_numbers
 from thermoxels_ns.fem.quadratic_elements import edge_shapes
 from thermoxels_ns.fem.sparsity import mesh_edges
@@ -94,10 +94,8 @@ def _outside(mesh: TetMesh, number: int, point: npt.NDArray[np.float64]) -> Heat
     x, y, z = mesh.points_m[nearest]
     low, high = (", ".join(f"{v:.4g}" for v in end) for end in (mesh.points_m.min(axis=0), mesh.points_m.max(axis=0)))
     return HeatError(
-        explain(
-            f"probe {number + 1}",
-            expected=f"a point inside the body, which lies between ({low}) and ({high}) m",
-            got=f"({', '.join(f'{v:.6g}' for v in point)}), which is outside",
-            remedy=f"Move it; the nearest node is ({x:.6g}, {y:.6g}, {z:.6g}), {distance[nearest]:.3g} m away.",
-        )
+        f"probe {number + 1}",
+        expected=f"a point inside the body, which lies between ({low}) and ({high}) m",
+        got=f"({', '.join(f'{v:.6g}' for v in point)}), which is outside",
+        remedy=f"Move it; the nearest node is ({x:.6g}, {y:.6g}, {z:.6g}), {distance[nearest]:.3g} m away.",
     )

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.effects import Effect
 from thermoxels_ns.fem.flat_tets import count_flat_tets
@@ -37,24 +37,20 @@ class TimeSteps:
         whole = isinstance(self.steps, numbers.Integral) and not isinstance(self.steps, bool)
         if not whole or self.steps < 1:
             raise HeatError(
-                explain(
-                    "steps",
-                    expected="a whole number of at least 1",
-                    got=repr(self.steps),
-                    remedy="Give 10, for example: steps in a scene, --steps in an export.",
-                )
+                "steps",
+                expected="a whole number of at least 1",
+                got=repr(self.steps),
+                remedy="Give 10, for example: steps in a scene, --steps in an export.",
             )
         remedy = "Give 60, for example: step_seconds in a scene, --step-seconds in an export."
         seconds = check_positive("step_seconds", self.step_seconds, remedy, HeatError)
         object.__setattr__(self, "step_seconds", seconds)
         if self.steps * (seconds / sys.float_info.max) > 1.0:
             raise HeatError(
-                explain(
-                    "steps and step_seconds",
-                    expected=f"a last time that is a number, at most {sys.float_info.max:.3g} s",
-                    got=f"{self.steps} steps of {seconds:g} s",
-                    remedy="Give a shorter one.",
-                )
+                "steps and step_seconds",
+                expected=f"a last time that is a number, at most {sys.float_info.max:.3g} s",
+                got=f"{self.steps} steps of {seconds:g} s",
+                remedy="Give a shorter one.",
             )
 
     @property
@@ -95,7 +91,7 @@ class AdaptiveSteps:
         whole = isinstance(self.outputs, numbers.Integral) and not isinstance(self.outputs, bool)
         if not whole or self.outputs < 1:
             expected, remedy = "a whole number of at least 1", "Give the number of intervals, such as 10."
-            raise HeatError(explain("outputs", expected=expected, got=repr(self.outputs), remedy=remedy))
+            raise HeatError("outputs", expected=expected, got=repr(self.outputs), remedy=remedy)
 
     @property
     def num_times(self) -> int:
@@ -136,23 +132,19 @@ class HeatProblem:
         check_shape("mesh tets", tets, (None, 4), remedy, HeatError)
         if len(tets) == 0 or tets.min() < 0 or tets.max() >= len(points):
             raise HeatError(
-                explain(
-                    "mesh tets",
-                    expected=f"at least one tetrahedron with node numbers from 0 to {len(points) - 1}",
-                    got=f"{len(tets)} tetrahedra"
-                    + (f" with node numbers from {tets.min()} to {tets.max()}" if len(tets) else ""),
-                    remedy=remedy,
-                )
+                "mesh tets",
+                expected=f"at least one tetrahedron with node numbers from 0 to {len(points) - 1}",
+                got=f"{len(tets)} tetrahedra"
+                + (f" with node numbers from {tets.min()} to {tets.max()}" if len(tets) else ""),
+                remedy=remedy,
             )
         unused = len(points) - np.count_nonzero(np.bincount(tets.ravel(), minlength=len(points)))
         if unused:
             raise HeatError(
-                explain(
-                    "mesh points",
-                    expected="every node in at least one tetrahedron",
-                    got=f"{unused} of {len(points)} in none",
-                    remedy="Remove the unused nodes; they have no heat capacity.",
-                )
+                "mesh points",
+                expected="every node in at least one tetrahedron",
+                got=f"{unused} of {len(points)} in none",
+                remedy="Remove the unused nodes; they have no heat capacity.",
             )
         self._check_volumes(remedy)
         self._check_temperatures()
@@ -193,14 +185,14 @@ class HeatProblem:
         remedy, names = "Give one Material, or one per region: {name of region: Material}.", self.mesh.region_names
         if not isinstance(self.material, Mapping):
             got = repr(self.material)
-            raise HeatError(explain("material", expected="a Material or a mapping", got=got, remedy=remedy))
+            raise HeatError("material", expected="a Material or a mapping", got=got, remedy=remedy)
         shape = (len(self.mesh.tets),)
         region = check_shape(
             "mesh region", self.mesh.region, shape, "Build the mesh with thermoxels_ns.mesh.", HeatError
         )
         if region.min() < 0 or region.max() >= len(names):
             expected, got = f"numbers from 0 to {len(names) - 1}", f"{region.min()} to {region.max()}"
-            raise HeatError(explain("mesh region", expected=expected, got=got, remedy="Name every region of the mesh."))
+            raise HeatError("mesh region", expected=expected, got=got, remedy="Name every region of the mesh.")
         used = {names[number] for number in np.unique(region)}
         missing, unknown = used - set(self.material), set(self.material) - set(names)
         wrong = [name for name, material in self.material.items() if not isinstance(material, Material)]
@@ -211,30 +203,28 @@ class HeatProblem:
                 if names
             )
             expected = f"a Material for each of the regions {', '.join(sorted(used))}"
-            raise HeatError(explain("material", expected=expected, got=got, remedy=remedy))
+            raise HeatError("material", expected=expected, got=got, remedy=remedy)
 
     def _check_effects(self) -> None:
         wrong = [type(effect).__name__ for effect in self.effects if not isinstance(effect, Effect)]
         if wrong or not isinstance(self.effects, tuple):
             got = ", ".join(wrong) or type(self.effects).__name__
             remedy = "Use the effects of thermoxels_ns.fem.effects."
-            raise HeatError(explain("effects", expected="a tuple of effects", got=got, remedy=remedy))
+            raise HeatError("effects", expected="a tuple of effects", got=got, remedy=remedy)
         length = math.hypot(*self.up) if len(self.up) == 3 else math.nan
         if not (math.isfinite(length) and length > 0.0):
             expected, remedy = "a direction", "Give three numbers, such as (0, 0, 1)."
-            raise HeatError(explain("up", expected=expected, got=repr(self.up), remedy=remedy))
+            raise HeatError("up", expected=expected, got=repr(self.up), remedy=remedy)
         object.__setattr__(self, "up", tuple(float(part) / length for part in self.up))
 
     def _check_volumes(self, remedy: str) -> None:
         bad = count_flat_tets(self.mesh.points_m, self.mesh.tets)
         if bad:
             raise HeatError(
-                explain(
-                    "mesh tets",
-                    expected="volumes above 0",
-                    got=f"{bad} of {len(self.mesh.tets)} flat or inverted",
-                    remedy=remedy,
-                )
+                "mesh tets",
+                expected="volumes above 0",
+                got=f"{bad} of {len(self.mesh.tets)} flat or inverted",
+                remedy=remedy,
             )
 
     def _check_temperatures(self) -> None:
@@ -244,10 +234,8 @@ class HeatProblem:
         check_finite(name, start, remedy, HeatError)
         if start.min() < -ZERO_CELSIUS_K:
             raise HeatError(
-                explain(
-                    name,
-                    expected=f"temperatures above absolute zero ({-ZERO_CELSIUS_K} C)",
-                    got=f"{start.min():.6g} C",
-                    remedy=remedy,
-                )
+                name,
+                expected=f"temperatures above absolute zero ({-ZERO_CELSIUS_K} C)",
+                got=f"{start.min():.6g} C",
+                remedy=remedy,
             )

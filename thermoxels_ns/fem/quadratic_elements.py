@@ -4,7 +4,6 @@ Local nodes 0 to 3 are the corners with phi_i = l_i (2 l_i - 1), 4 to 9 the midd
 phi_ij = 4 l_i l_j, l being the four linear shape functions. Edges are straight, so that the gradients of l are constant
 and every entry of an element's matrix is a fixed combination of the six couplings of P1.
 
-Kernels are kept compiled by numba, which watches a kernel's own file: none may call one of another file.
 """
 
 from __future__ import annotations
@@ -14,9 +13,9 @@ from math import factorial
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy import sparse
 
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.fem.edge_midpoints import FACET_EDGES, TET_EDGES
 
 _ANGLE_ROUND_OFF = 16.0 * np.finfo(np.float64).eps
@@ -147,7 +146,7 @@ def _rows(
     return matrix
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _couplings(points, tets, conductivity, right, coupling):
     """k V grad l_a . grad l_b for the six edges of each tetrahedron."""
     side, normal = np.empty((3, 3)), np.empty((4, 3))
@@ -183,7 +182,7 @@ def _couplings(points, tets, conductivity, right, coupling):
                 edge += 1
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _members(nodes, first, member):
     """Elements that have each node, as 10 t + local number."""
     width = nodes.shape[1]
@@ -201,7 +200,7 @@ def _members(nodes, first, member):
             member[filled[node]] = width * t + i
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _count(nodes, first, member, place, start):
     width = nodes.shape[1]
     for node in range(len(first) - 1):
@@ -215,7 +214,7 @@ def _count(nodes, first, member, place, start):
         start[node + 1] = start[node] + count
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _fill(nodes, first, member, place, start, values, table, columns, entries):
     width = nodes.shape[1]
     for node in range(len(first) - 1):

@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def tabulated(times_s: npt.ArrayLike, values: npt.ArrayLike) -> Varying:
     if not (fits and np.isfinite(times).all() and np.isfinite(entries).all() and np.all(np.diff(times) > 0.0)):
         expected = "at least two times, ascending, and as many values, all finite"
         got = f"times of shape {times.shape} and values of shape {entries.shape}"
-        raise HeatError(explain("table", expected=expected, got=got, remedy="Sort it by time and remove repetitions."))
+        raise HeatError("table", expected=expected, got=got, remedy="Sort it by time and remove repetitions.")
     return Varying(
         lambda _, time_s: float(np.interp(time_s, times, entries)), resolution_s=float(np.min(np.diff(times)))
     )
@@ -108,7 +108,7 @@ class Bounds:
         fits &= (values > self.low) if self.above_low else (values >= self.low)
         if np.asarray(value).dtype == np.bool_ or not np.all(fits):
             got = repr(value) if np.ndim(value) == 0 else f"{np.count_nonzero(~fits)} of {values.size} that are not"
-            raise HeatError(explain(self.name, expected=self._expected(), got=got, remedy=self._remedy()))
+            raise HeatError(self.name, expected=self._expected(), got=got, remedy=self._remedy())
         return values
 
     def check_quantity(self, quantity: Quantity) -> Quantity:
@@ -120,7 +120,7 @@ class Bounds:
             if self.varies:
                 expected = "a number or a Varying"
                 remedy = "Wrap a function: Varying(function, in_time=True), or in_time=False if time does not matter."
-            raise HeatError(explain(self.name, expected=expected, got=repr(quantity), remedy=remedy))
+            raise HeatError(self.name, expected=expected, got=repr(quantity), remedy=remedy)
         return float(self.check(quantity))
 
     def _remedy(self) -> str:
@@ -173,11 +173,9 @@ class Bounded:
         values = self.bounds.check(value)
         if values.shape not in ((), (len(places),)):
             raise HeatError(
-                explain(
-                    f"function of {self.bounds.name}",
-                    expected=f"one number, or one per place, shape ({len(places)},)",
-                    got=values.shape,
-                    remedy="Correct the function given to Varying.",
-                )
+                f"function of {self.bounds.name}",
+                expected=f"one number, or one per place, shape ({len(places)},)",
+                got=values.shape,
+                remedy="Correct the function given to Varying.",
             )
         return np.broadcast_to(values, (len(places),)).copy()

@@ -1,7 +1,4 @@
-"""How far the gradient of a temperature is from its own mean around each node, tetrahedron by tetrahedron.
-
-Kernels are kept compiled by numba, which watches a kernel's own file: none may call one of another file.
-"""
+"""How far the gradient of a temperature is from its own mean around each node, tetrahedron by tetrahedron."""
 
 from __future__ import annotations
 
@@ -9,8 +6,8 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.fem.edge_midpoints import TET_EDGES
 from thermoxels_ns.fem.quadratic_elements import mass_table
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -77,7 +74,7 @@ def _groups(group: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.ND
     return np.argsort(group, kind="stable"), np.concatenate([[0], np.cumsum(np.bincount(group))])
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _gradients(points, tet, nodes, nodal, ends, slope, gradient):
     """Gradient at each node of a tetrahedron into `gradient`; returns the volume."""
     side = np.empty((3, 3))
@@ -117,7 +114,7 @@ def _gradients(points, tet, nodes, nodal, ends, slope, gradient):
     return six_volumes / 6.0
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _defect(points, tets, nodes, nodal, by_group, group_ends, ends, means, defect):
     width = nodes.shape[1]
     total, weight = np.zeros((len(nodal), 3)), np.zeros(len(nodal))
@@ -147,7 +144,7 @@ def _defect(points, tets, nodes, nodal, by_group, group_ends, ends, means, defec
             defect[t] = volume * square
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _largest_curvature(points, tets, states, by_group, group_ends):
     """`curvature_k`; in a tetrahedron where temperatures are linear, the integral of `_defect` is a short sum."""
     total, weight = np.zeros((len(points), 3)), np.zeros(len(points))

@@ -1,7 +1,4 @@
-"""Finer meshes of the same body: every tetrahedron is cut into eight.
-
-The kernel is kept compiled by numba, which watches a kernel's own file: it calls none of another file.
-"""
+"""Finer meshes of the same body: every tetrahedron is cut into eight."""
 
 from __future__ import annotations
 
@@ -9,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.fem.edge_midpoints import FACET_EDGES, TET_EDGES, edge_numbers, midpoints
 from thermoxels_ns.fem.sparsity import mesh_edges
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -94,7 +91,7 @@ _TIE = 1e-9
 """Cosines that differ by less are the same."""
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _choose_diagonals(points, local, children, chosen):
     """Finds the diagonal whose four children have the largest smallest cosine of an angle between faces."""
     normal = np.empty((4, 3))

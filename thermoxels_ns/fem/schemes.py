@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def theta_scheme(theta: float) -> Scheme:
     """
     if not 0.5 <= theta <= 1.0:
         remedy = "Use 1 for backward Euler or 0.5 for Crank-Nicolson."
-        raise HeatError(explain("theta", expected="a number from 0.5 to 1", got=repr(theta), remedy=remedy))
+        raise HeatError("theta", expected="a number from 0.5 to 1", got=repr(theta), remedy=remedy)
     if theta == 1.0:
         return BACKWARD_EULER
     order = 2 if theta == 0.5 else 1

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_finite, check_shape
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -106,7 +106,7 @@ class Selection:
         check_finite("boundary area_factor", tags.area_factor, remedy, HeatError)
         if num_facets and tags.area_factor.min() <= 0.0:
             got = f"{tags.area_factor.min():g}"
-            raise HeatError(explain("boundary area_factor", expected="numbers above 0", got=got, remedy=remedy))
+            raise HeatError("boundary area_factor", expected="numbers above 0", got=got, remedy=remedy)
         check_shape("boundary patch", tags.patch, (num_facets,), remedy, HeatError)
         _check_indices("boundary patch", tags.patch, len(tags.patch_names), remedy)
 
@@ -114,7 +114,7 @@ class Selection:
 def _check_indices(name: str, indices: npt.NDArray[np.int64], count: int, remedy: str) -> None:
     if indices.size and (indices.min() < 0 or indices.max() >= count):
         got = f"{indices.min()} to {indices.max()}"
-        raise HeatError(explain(name, expected=f"numbers from 0 to {count - 1}", got=got, remedy=remedy))
+        raise HeatError(name, expected=f"numbers from 0 to {count - 1}", got=got, remedy=remedy)
 
 
 def _matching(field: str, patterns: tuple[str, ...], names: tuple[str, ...]) -> npt.NDArray[np.bool_]:
@@ -124,12 +124,10 @@ def _matching(field: str, patterns: tuple[str, ...], names: tuple[str, ...]) -> 
         matches = np.array([fnmatchcase(name, pattern) for name in names], dtype=bool)
         if not matches.any():
             raise HeatError(
-                explain(
-                    field,
-                    expected=f"names or patterns of {', '.join(names)}",
-                    got=repr(pattern),
-                    remedy="Correct the name, or tag the mesh so that it has such a part.",
-                )
+                field,
+                expected=f"names or patterns of {', '.join(names)}",
+                got=repr(pattern),
+                remedy="Correct the name, or tag the mesh so that it has such a part.",
             )
         chosen |= matches
     return chosen

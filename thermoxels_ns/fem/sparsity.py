@@ -1,7 +1,4 @@
-"""Symmetric matrices on the nodes of a mesh: one value per edge, one per node, and products with them.
-
-Kernels are kept compiled by numba, which watches a kernel's own file: none may call one of another file.
-"""
+"""Symmetric matrices on the nodes of a mesh: one value per edge, one per node, and products with them."""
 
 from __future__ import annotations
 
@@ -9,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy import sparse
 
 from thermoxels_ns.core.checks import check_shape
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.core.kernel_cache import kernel
 
 
 @dataclass(frozen=True)
@@ -68,12 +65,10 @@ def checked_tets(tets: npt.NDArray[np.int64], num_nodes: int) -> npt.NDArray[np.
     check_shape("mesh tets", tets, (None, 4), remedy, HeatError)
     if len(tets) and (tets.min() < 0 or tets.max() >= num_nodes):
         raise HeatError(
-            explain(
-                "mesh tets",
-                expected=f"node numbers from 0 to {num_nodes - 1}",
-                got=f"{tets.min()} to {tets.max()}",
-                remedy=remedy,
-            )
+            "mesh tets",
+            expected=f"node numbers from 0 to {num_nodes - 1}",
+            got=f"{tets.min()} to {tets.max()}",
+            remedy=remedy,
         )
     return np.ascontiguousarray(tets, dtype=np.int64)
 
@@ -111,7 +106,7 @@ def product_and_bound(
     return product, bound
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _unique_edges(tets, end, other, first, mark):
     """Returns the number of edges; `first` and the beginning of `other` are those of `MeshEdges`."""
     num_nodes = len(mark)
@@ -147,7 +142,7 @@ def _unique_edges(tets, end, other, first, mark):
     return kept
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _product_and_bound(indptr, indices, data, vector, product, bound):
     for row in range(len(vector)):
         total = size = 0.0

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from thermoxels_ns.core.kernel_cache import kernel
 
 Vector = npt.NDArray[np.float64]
 
@@ -78,7 +79,7 @@ class StartingGuess:
 
 
 # Loops instead of BLAS, whose sums depend on the number of its threads.
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
+@kernel(fastmath={"reassoc", "contract"})
 def _products(vectors, other):
     products = np.zeros(len(vectors))
     for k in range(len(vectors)):
@@ -89,7 +90,7 @@ def _products(vectors, other):
     return products
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _combined(vectors, shares):
     total = np.empty(vectors.shape[1])
     for i in range(len(total)):

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.floating_components import check_stored
 from thermoxels_ns.fem.marching import AdaptiveMarch, Taken, equal_steps
@@ -116,7 +116,7 @@ def _check_estimate(scheme: Scheme | None) -> None:
     if scheme is not None and scheme.estimate is None:
         remedy = "Use SDIRK2, or equal steps."
         raise HeatError(
-            explain("scheme", expected="one with an error estimate for adaptive steps", got=scheme.name, remedy=remedy)
+            "scheme", expected="one with an error estimate for adaptive steps", got=scheme.name, remedy=remedy
         )
 
 
@@ -130,10 +130,8 @@ def _room_for_states(num_times: int, num_nodes: int) -> Vector:
     except MemoryError:
         got = "less memory free than"
     raise HeatError(
-        explain(
-            "steps",
-            expected=f"temperatures of all times that fit into memory, at most {MAX_STATE_BYTES} bytes",
-            got=f"{got} that: {num_times} times x {num_nodes} nodes x 8 bytes = {needed} bytes",
-            remedy=f"Take at most {max(MAX_STATE_BYTES // (8 * num_nodes) - 1, 1)} steps, or a coarser mesh.",
-        )
+        "steps",
+        expected=f"temperatures of all times that fit into memory, at most {MAX_STATE_BYTES} bytes",
+        got=f"{got} that: {num_times} times x {num_nodes} nodes x 8 bytes = {needed} bytes",
+        remedy=f"Take at most {max(MAX_STATE_BYTES // (8 * num_nodes) - 1, 1)} steps, or a coarser mesh.",
     )

@@ -23,9 +23,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from scipy import sparse
 
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.fem.linear_solver import ConjugateGradients, Vector
 
 _BESIDE = 0.5
@@ -90,7 +90,7 @@ class SweptConjugateGradients(ConjugateGradients):
         )
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _pivot_roots(first, other, values, root):
     """Square roots of D of a matrix with ones on its diagonal; they come as ones."""
     for i in range(len(root)):
@@ -101,7 +101,7 @@ def _pivot_roots(first, other, values, root):
         root[i] = math.sqrt(root[i])
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _divide_and_part(first, other, values, root, surplus, beside):
     """Divide rows and columns by the roots, so that D is 1, and part couplings to the next node from the others.
 
@@ -125,7 +125,7 @@ def _divide_and_part(first, other, values, root, surplus, beside):
 
 # The share of the node before is added last and comes from a register, because a sweep waits for it. Arrays are made
 # outside, and indices are unsigned, as in `linear_solver`.
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def _iterate(first, other, values, beside, surplus, size, x, r, direction, step, image, tolerance, max_iterations):
     """Conjugate gradients for (1 + L)^-1 A (1 + L^T)^-1, where A = L + (2 - surplus) + L^T.
 
@@ -212,7 +212,7 @@ def _iterate(first, other, values, beside, surplus, size, x, r, direction, step,
         count += 1
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _norm_below(first, other, values, beside, size, r, work):
     """Norm of size * (1 + L) r; `work` is overwritten."""
     work[:] = 0.0

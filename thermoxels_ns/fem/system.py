@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effect_forms import effect_forms
 from thermoxels_ns.fem.fixed_nodes import FixedNodes
 from thermoxels_ns.fem.forms import FluxForm, RobinForm, SourceForm
@@ -331,11 +331,11 @@ def _space(selection: Selection, lumped: bool, lumped_boundary: bool | None, ord
         return LinearSpace(selection, lumped=lumped, lumped_boundary=lumped_boundary is not False)
     if order != 2:
         remedy = "Use 1 for linear tetrahedra or 2 for quadratic ones."
-        raise HeatError(explain("order", expected="1 or 2", got=repr(order), remedy=remedy))
+        raise HeatError("order", expected="1 or 2", got=repr(order), remedy=remedy)
     if lumped or lumped_boundary:
         got = "lumped=True" if lumped else "lumped_boundary=True"
         remedy = "Leave it out: lumped, a quadratic tetrahedron would have negative masses at its corners."
-        raise HeatError(explain("order 2", expected="integrals that are not lumped", got=got, remedy=remedy))
+        raise HeatError("order 2", expected="integrals that are not lumped", got=got, remedy=remedy)
     return QuadraticSpace(selection)
 
 

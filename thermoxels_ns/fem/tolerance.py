@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from thermoxels_ns.core.checks import check_positive
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.error_budget import ErrorSize, Tolerance, difference_between
 from thermoxels_ns.fem.error_estimate import ErrorRatios, error_ratios, recovered_error, richardson
 from thermoxels_ns.fem.linear_start import linear_start
@@ -123,5 +123,5 @@ def _richardson(coarse: SteadySolution, fine: SteadySolution, num_nodes: int, ra
 def _needs_kelvin(tolerance: Tolerance) -> float:
     if tolerance.temperature_k is None:
         remedy = "Give temperature_k too: steps in time are chosen by it."
-        raise HeatError(explain("tolerance", expected="one in kelvin", got="heat_flow only", remedy=remedy))
+        raise HeatError("tolerance", expected="one in kelvin", got="heat_flow only", remedy=remedy)
     return tolerance.temperature_k

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.error_budget import ErrorSize, Tolerance
 from thermoxels_ns.fem.memory import describe_bytes, peak_bytes
 from thermoxels_ns.fem.problem import HeatProblem
@@ -133,7 +133,7 @@ class Run:
         """
         if self.solution is None:
             remedy = "Allow more memory, or use a coarser mesh."
-            raise HeatError(explain("memory_bytes", expected="room for a first estimate", got=failure, remedy=remedy))
+            raise HeatError("memory_bytes", expected="room for a first estimate", got=failure, remedy=remedy)
         last, seconds = self.levels[-1], time.perf_counter() - self._begin_s
         allowed = self.tolerance.describe()
         status = f"{'Not within' if failure else 'Within'} {allowed}: {last.describe()}, {seconds:.2f} s in all."

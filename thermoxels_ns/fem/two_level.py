@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.linear_solver import LinearSolution, is_solved
 from thermoxels_ns.fem.solver_choice import LinearSolver
 
@@ -53,13 +53,11 @@ class TwoLevelConjugateGradients:
         self._diagonal = matrix.diagonal()
         if not (np.all(np.isfinite(matrix.data)) and np.all(self._diagonal > 0.0)):
             raise HeatError(
-                explain(
-                    "matrix of the heat problem",
-                    expected="finite entries and a diagonal above 0",
-                    got=f"smallest diagonal entry {np.min(self._diagonal, initial=np.inf):.3g}, "
-                    f"{np.count_nonzero(~np.isfinite(matrix.data))} entries not finite",
-                    remedy="Check the units of the mesh and the material.",
-                )
+                "matrix of the heat problem",
+                expected="finite entries and a diagonal above 0",
+                got=f"smallest diagonal entry {np.min(self._diagonal, initial=np.inf):.3g}, "
+                f"{np.count_nonzero(~np.isfinite(matrix.data))} entries not finite",
+                remedy="Check the units of the mesh and the material.",
             )
         self._matrix, self._prolongation = matrix, prolongation
         self._restriction = sparse.csr_matrix(prolongation.T)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError
 
 MAX_DEGREE = 2
 
@@ -26,9 +26,7 @@ def num_coefficients(degree: int) -> int:
     9
     """
     if not 0 <= degree <= MAX_DEGREE:
-        raise ThermoxelsError(
-            explain("SH degree", expected=f"0 to {MAX_DEGREE}", got=degree, remedy="Lower the degree.")
-        )
+        raise ThermoxelsError("SH degree", expected=f"0 to {MAX_DEGREE}", got=degree, remedy="Lower the degree.")
     return (degree + 1) ** 2
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermoxels_ns.core.errors import MemoryBudgetError, explain
+from thermoxels_ns.core.errors import MemoryBudgetError
 from thermoxels_ns.core.lattice import Lattice
 
 _ROWS_PER_VOXEL = 1.5
@@ -53,12 +53,10 @@ def check_memory(lattice: Lattice, voxels: int, channels: int, budget_gb: float)
     need = memory_need(lattice, voxels, channels)
     if need.gigabytes > budget_gb:
         raise MemoryBudgetError(
-            explain(
-                "memory",
-                expected=f"at most the budget of {budget_gb:g} GB",
-                got=f"a lattice of {' x '.join(map(str, lattice.cell_shape))} voxels that needs {need}",
-                remedy="Lower the last of --pipeline.model.resolutions, prune more "
-                "(--pipeline.model.prune-threshold 0.05), or raise --pipeline.model.memory-budget-gb.",
-            )
+            "memory",
+            expected=f"at most the budget of {budget_gb:g} GB",
+            got=f"a lattice of {' x '.join(map(str, lattice.cell_shape))} voxels that needs {need}",
+            remedy="Lower the last of --pipeline.model.resolutions, prune more "
+            "(--pipeline.model.prune-threshold 0.05), or raise --pipeline.model.memory-budget-gb.",
         )
     return need

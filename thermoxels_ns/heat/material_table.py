@@ -9,7 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from thermoxels_ns.core.configs_folder import configs_folder
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.yaml_records import as_record, read_yaml
 from thermoxels_ns.fem.materials import Material
 
@@ -31,7 +31,7 @@ class MaterialRow:
         self.named("row")
         if not self.source.strip():
             remedy = "Write where the figures come from."
-            raise HeatError(explain("source", expected="a text", got=repr(self.source), remedy=remedy))
+            raise HeatError("source", expected="a text", got=repr(self.source), remedy=remedy)
 
     def named(self, name: str) -> Material:
         """Make the material.
@@ -76,7 +76,7 @@ def material(name: str, table: Mapping[str, MaterialRow] | None = None) -> Mater
         close = difflib.get_close_matches(str(name), list(rows), n=1, cutoff=0.75)
         remedy = f"Did you mean {close[0]}?" if close else "Correct the name, or give the three figures themselves."
         expected = f"one of {', '.join(rows)}"
-        raise HeatError(explain("material", expected=expected, got=repr(name), remedy=remedy))
+        raise HeatError("material", expected=expected, got=repr(name), remedy=remedy)
     return rows[name].named(name)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 
 from thermoxels_ns.core.configs_folder import configs_folder
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import TimeSteps
 
@@ -53,19 +53,15 @@ def load_heat_preset(name: str) -> HeatPreset:
     path = Path(name) if Path(name).suffix in (".yaml", ".yml") else configs_folder() / f"heat-{name}.yaml"
     if not path.is_file():
         raise HeatError(
-            explain(
-                "heat preset",
-                expected=f"one of {', '.join(heat_preset_names())}, or the path of a yaml file",
-                got=repr(name),
-                remedy="Correct --heat-preset.",
-            )
+            "heat preset",
+            expected=f"one of {', '.join(heat_preset_names())}, or the path of a yaml file",
+            got=repr(name),
+            remedy="Correct --heat-preset.",
         )
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as problem:
-        raise HeatError(
-            explain(path.name, expected="a yaml file", got=str(problem), remedy="Correct the file.")
-        ) from problem
+        raise HeatError(path.name, expected="a yaml file", got=str(problem), remedy="Correct the file.") from problem
     content = _keys(path.name, content, HeatPreset)
     material = _keys(f"{path.name}: material", content["material"], Material)
     time = _keys(f"{path.name}: time", content["time"], TimeSteps)
@@ -89,12 +85,10 @@ def _check_not_text(name: str, value: object, *, is_name: bool) -> None:
     if exponent:
         written = f"{mantissa if '.' in mantissa else mantissa + '.0'}e{exponent}"
     raise HeatError(
-        explain(
-            name,
-            expected="a number",
-            got=f"the text {value!r}",
-            remedy=f"Write {written}, without quotes; a power of ten needs a point and a sign in yaml, as in 1.0e+0.",
-        )
+        name,
+        expected="a number",
+        got=f"the text {value!r}",
+        remedy=f"Write {written}, without quotes; a power of ten needs a point and a sign in yaml, as in 1.0e+0.",
     )
 
 
@@ -103,7 +97,5 @@ def _keys(name: str, content: object, target: type) -> dict[str, Any]:
     wanted = [field.name for field in fields(target)]
     if not isinstance(content, dict) or set(content) != set(wanted):
         got = ", ".join(map(str, content)) if isinstance(content, dict) else repr(content)
-        raise HeatError(
-            explain(name, expected=f"the keys {', '.join(wanted)}", got=got or "none", remedy="Correct the file.")
-        )
+        raise HeatError(name, expected=f"the keys {', '.join(wanted)}", got=got or "none", remedy="Correct the file.")
     return content

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_shape
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effects import Effect, InternalHeat
 from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem
@@ -344,5 +344,5 @@ def _checked_regions(mesh: TetMesh, facet_region: npt.NDArray[np.int64] | None) 
     remedy = "Give the region of the tetrahedron behind each boundary triangle."
     if facet_region is None:
         got = f"none for {len(used)} regions"
-        raise HeatError(explain("facet_region", expected="one number per triangle", got=got, remedy=remedy))
+        raise HeatError("facet_region", expected="one number per triangle", got=got, remedy=remedy)
     return check_shape("facet_region", np.asarray(facet_region), (len(mesh.facets),), remedy, HeatError)

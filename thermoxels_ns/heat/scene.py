@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effects import (
     AbsorbedSolar,
     Convection,
@@ -283,4 +283,4 @@ def _given(value: Value | None) -> Value:
 
 
 def _wrong(name: str, expected: str, got: object, remedy: str) -> HeatError:
-    return HeatError(explain(name, expected=expected, got=got, remedy=remedy))
+    return HeatError(name, expected=expected, got=got, remedy=remedy)

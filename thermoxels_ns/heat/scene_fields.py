@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from datetime import datetime
 from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.quantities import Bounds
 from thermoxels_ns.heat.sky import Vector
@@ -255,4 +255,4 @@ def _check_only_if(name: str, value: float | None, needed: bool, coefficient: st
 
 
 def _unclear(name: str, expected: str, got: object, remedy: str) -> HeatError:
-    return HeatError(explain(name, expected=expected, got=got, remedy=remedy))
+    return HeatError(name, expected=expected, got=got, remedy=remedy)

@@ -10,7 +10,7 @@ from itertools import combinations
 
 import numpy as np
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.heat.scene_fields import Surface
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -51,7 +51,7 @@ class ScenePatches:
             if not matches:
                 expected = f"names or patterns of the patches {', '.join(self.area_m2)}"
                 remedy = "Correct the name, or tag the mesh so that it has such a patch."
-                raise HeatError(explain(f"{name}: patches", expected=expected, got=repr(pattern), remedy=remedy))
+                raise HeatError(f"{name}: patches", expected=expected, got=repr(pattern), remedy=remedy)
             found |= matches
         return found
 
@@ -104,13 +104,11 @@ class ScenePatches:
         if forgotten:
             shares = (f"{patch} ({100.0 * self.area_m2[patch] / whole:.3g} % of the surface)" for patch in forgotten)
             raise HeatError(
-                explain(
-                    "heat scene",
-                    expected="something that acts on every patch, or the patch named adiabatic",
-                    got=f"nothing on {', '.join(shares)}",
-                    remedy=f"{_what_may_act(acting, forgotten)}, or write "
-                    f"adiabatic: {_yaml_list((*adiabatic, *forgotten))}.",
-                )
+                "heat scene",
+                expected="something that acts on every patch, or the patch named adiabatic",
+                got=f"nothing on {', '.join(shares)}",
+                remedy=f"{_what_may_act(acting, forgotten)}, or write "
+                f"adiabatic: {_yaml_list((*adiabatic, *forgotten))}.",
             )
 
 
@@ -129,7 +127,7 @@ def check_disjoint(what: str, entries: Sequence[tuple[str, set[str]]], remedy: s
         both = sorted(where & elsewhere)
         if both:
             got = f"{second} on {', '.join(both)} as well"
-            raise HeatError(explain(first, expected=f"{what} once on each patch", got=got, remedy=remedy))
+            raise HeatError(first, expected=f"{what} once on each patch", got=got, remedy=remedy)
 
 
 def _what_may_act(acting: set[str], forgotten: Sequence[str]) -> str:

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.elements import capacities
 from thermoxels_ns.fem.linear_solver import ConjugateGradients
@@ -116,7 +116,7 @@ def screen(problem: HeatProblem, time: TimeSteps | AdaptiveSteps | None, toleran
     """
     if not tolerance_k >= 0.0:
         remedy = "Give a tolerance in kelvin, or 0 to keep everything."
-        raise HeatError(explain("tolerance_k", expected="a number of at least 0", got=tolerance_k, remedy=remedy))
+        raise HeatError("tolerance_k", expected="a number of at least 0", got=tolerance_k, remedy=remedy)
     begin = clock.perf_counter()
     if not problem.effects:
         return Screening(problem, (), (), tolerance_k, "No effect acts.", clock.perf_counter() - begin)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin, kelvin_to_celsius
 from thermoxels_ns.fem.quantities import Bounds, Places, Quantity, Varying
 
@@ -94,6 +94,4 @@ def outdoor_radiation(
         return Varying(lambda places, _: emissivity * sky_view(places.normals, places.up), in_time=False), sky_c
     if ground_c is not None:
         return Varying(lambda places, _: emissivity * ground_view(places.normals, places.up), in_time=False), ground_c
-    raise HeatError(
-        explain("outdoor radiation", expected="sky_c, ground_c or both", got="neither", remedy="Give one of them.")
-    )
+    raise HeatError("outdoor radiation", expected="sky_c, ground_c or both", got="neither", remedy="Give one of them.")

@@ -11,7 +11,7 @@ import numpy as np
 
 from thermoxels_ns.commands.heat import Heat
 from thermoxels_ns.core.checks import check_positive
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.error_budget import Tolerance
 from thermoxels_ns.fem.memory import check_memory, describe_bytes, peak_bytes
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
@@ -97,10 +97,10 @@ def leave_out_below_k(options: Heat) -> float:
         return LEAVE_OUT_BELOW_K if tolerance_k is None else LEFT_OUT_SHARE * tolerance_k
     if not 0.0 <= given < np.inf:
         expected, remedy = "a finite number of at least 0", "Pass 0 to build everything."
-        raise HeatError(explain("leave-out-below-k", expected=expected, got=given, remedy=remedy))
+        raise HeatError("leave-out-below-k", expected=expected, got=given, remedy=remedy)
     if tolerance_k is not None and given >= tolerance_k:
         expected, remedy = f"less than the tolerance of {tolerance_k:g} K", "Leave it out for a fifth of the tolerance."
-        raise HeatError(explain("leave-out-below-k", expected=expected, got=f"{given:g} K", remedy=remedy))
+        raise HeatError("leave-out-below-k", expected=expected, got=f"{given:g} K", remedy=remedy)
     return given
 
 
@@ -118,16 +118,11 @@ def check_accuracy_options(options: Heat, scene: HeatScene) -> None:
         check_positive("flow-tolerance", options.flow_tolerance, remedy, HeatError)
         if options.flow_tolerance >= 1.0:
             got = f"{options.flow_tolerance:g}, which is {100.0 * options.flow_tolerance:g} %"
-            raise HeatError(explain("flow-tolerance", expected="less than 1", got=got, remedy=remedy))
+            raise HeatError("flow-tolerance", expected="less than 1", got=got, remedy=remedy)
     if scene.time is not None and options.flow_tolerance is not None and options.tolerance is None:
         remedy = "Pass --tolerance too: steps in time are chosen by it."
         raise HeatError(
-            explain(
-                "flow-tolerance",
-                expected="--tolerance beside it if the scene has a duration",
-                got="none",
-                remedy=remedy,
-            )
+            "flow-tolerance", expected="--tolerance beside it if the scene has a duration", got="none", remedy=remedy
         )
     leave_out_below_k(options)
 

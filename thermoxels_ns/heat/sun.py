@@ -12,7 +12,7 @@ from datetime import datetime, timedelta, timezone
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.quantities import Bounds, Places, Varying
 from thermoxels_ns.heat.sky import Vector, ground_view, sky_view
 
@@ -136,9 +136,7 @@ def towards_sun(position: SunPosition, up: Vector, north: Vector) -> Vector:
     level = northward - (northward @ upward) * upward
     if float(np.linalg.norm(level)) < 1e-6:
         raise HeatError(
-            explain(
-                "north", expected="a direction other than up", got=list(north), remedy="Give north along the ground."
-            )
+            "north", expected="a direction other than up", got=list(north), remedy="Give north along the ground."
         )
     level /= np.linalg.norm(level)
     azimuth, elevation = math.radians(position.azimuth_deg), math.radians(position.elevation_deg)
@@ -266,12 +264,10 @@ def _later(start: datetime, time_s: float) -> datetime:
         return start + timedelta(seconds=time_s)
     except OverflowError as problem:
         raise HeatError(
-            explain(
-                "time of the sun",
-                expected="a date of the years 1 to 9999",
-                got=f"{time_s:.3g} s after {start.isoformat()}",
-                remedy="Follow the body for a shorter time.",
-            )
+            "time of the sun",
+            expected="a date of the years 1 to 9999",
+            got=f"{time_s:.3g} s after {start.isoformat()}",
+            remedy="Follow the body for a shorter time.",
         ) from problem
 
 
@@ -279,12 +275,10 @@ def _days(moment: datetime) -> float:
     """Days since noon of 1 January 2000."""
     if moment.tzinfo is None or moment.utcoffset() is None:
         raise HeatError(
-            explain(
-                "date and time",
-                expected="one with a time zone",
-                got=moment.isoformat(),
-                remedy=f"Write {moment.isoformat()}+01:00, for example, or Z at its end for universal time.",
-            )
+            "date and time",
+            expected="one with a time zone",
+            got=moment.isoformat(),
+            remedy=f"Write {moment.isoformat()}+01:00, for example, or Z at its end for universal time.",
         )
     return (moment - _EPOCH).total_seconds() / 86400.0
 
@@ -294,5 +288,5 @@ def _unit(name: str, direction: Vector) -> npt.NDArray[np.float64]:
     length = float(np.linalg.norm(vector))
     if vector.shape != (3,) or not (math.isfinite(length) and length > 0.0):
         remedy = "Give three numbers, such as [0, 1, 0]."
-        raise HeatError(explain(name, expected="a direction", got=vector.tolist(), remedy=remedy))
+        raise HeatError(name, expected="a direction", got=vector.tolist(), remedy=remedy)
     return vector / length

@@ -6,7 +6,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import OutputError, explain
+from thermoxels_ns.core.errors import OutputError
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.mesh.files.vtu import write_vtu
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -73,10 +73,8 @@ def remove_heat_series(pvd: Path | str) -> None:
             folder.rmdir()
     except OSError as problem:
         raise OutputError(
-            explain(
-                "heat series",
-                expected=f"a folder that can be removed at {folder}",
-                got=problem.strerror or str(problem),
-                remedy="Change its permissions, or choose another folder.",
-            )
+            "heat series",
+            expected=f"a folder that can be removed at {folder}",
+            got=problem.strerror or str(problem),
+            remedy="Change its permissions, or choose another folder.",
         ) from problem

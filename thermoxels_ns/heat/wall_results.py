@@ -9,7 +9,7 @@ from fnmatch import fnmatchcase
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import HeatError, explain
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.effects import Convection
 from thermoxels_ns.fem.problem import HeatProblem
@@ -111,14 +111,14 @@ def wall_answer(
     if not abs(difference_k) >= _LEAST_DIFFERENCE_K:
         remedy = "A U-value needs two different temperatures."
         got = f"{inside_c:g} and {outside_c:g} C"
-        raise HeatError(explain("airs of a wall", expected="two temperatures", got=got, remedy=remedy))
+        raise HeatError("airs of a wall", expected="two temperatures", got=got, remedy=remedy)
     selection, mesh = Selection(problem.mesh, problem.up), problem.mesh
     every_c = end_state_c(solution)
     inner = faces_inside(problem, inside)
     if not inner.any():
         expected = f"some of the patches {', '.join(selection.patch_names)}"
         remedy = "Name patches that have some surface."
-        raise HeatError(explain("inside of a wall", expected=expected, got=", ".join(inside), remedy=remedy))
+        raise HeatError("inside of a wall", expected=expected, got=", ".join(inside), remedy=remedy)
 
     def parts(numbers: npt.NDArray[np.int64], names: tuple[str, ...]) -> tuple[WallPart, ...]:
         number = np.where(inner, numbers, len(names))

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_finite, check_shape
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.boundary.patch_rules import PatchRules
@@ -45,27 +45,21 @@ class MeshOptions:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.min_observed_weight) and self.min_observed_weight >= 0.0):
             raise MeshError(
-                explain(
-                    "min_observed_weight",
-                    expected="a finite number of at least 0",
-                    got=self.min_observed_weight,
-                    remedy=f"Leave it out to use {MIN_OBSERVED_WEIGHT}.",
-                )
+                "min_observed_weight",
+                expected="a finite number of at least 0",
+                got=self.min_observed_weight,
+                remedy=f"Leave it out to use {MIN_OBSERVED_WEIGHT}.",
             )
         coarsest = self.coarsest_cell
         if not (isinstance(coarsest, int) and coarsest > 0 and coarsest & (coarsest - 1) == 0):
             raise MeshError(
-                explain(
-                    "coarsest_cell",
-                    expected="1, 2, 4, 8 or another power of two, [voxels]",
-                    got=repr(coarsest),
-                    remedy="Pass --coarsest-cell 4.",
-                )
+                "coarsest_cell",
+                expected="1, 2, 4, 8 or another power of two, [voxels]",
+                got=repr(coarsest),
+                remedy="Pass --coarsest-cell 4.",
             )
         if self.boundary not in ("conforming", "voxel"):
-            raise MeshError(
-                explain("boundary", expected="conforming or voxel", got=self.boundary, remedy="Pass one of them.")
-            )
+            raise MeshError("boundary", expected="conforming or voxel", got=self.boundary, remedy="Pass one of them.")
 
 
 @dataclass(frozen=True)
@@ -286,7 +280,7 @@ def check_similarity(name: str, matrix: npt.ArrayLike) -> npt.NDArray[np.float64
     scale = np.trace(squared) / 3.0
     similar = scale > 0.0 and np.allclose(squared, scale * np.eye(3), rtol=0.0, atol=1e-5 * scale)
     if not similar or not np.array_equal(transform[3], [0.0, 0.0, 0.0, 1.0]):
-        raise MeshError(explain(name, expected="a similarity", got=transform.tolist(), remedy=remedy))
+        raise MeshError(name, expected="a similarity", got=transform.tolist(), remedy=remedy)
     return transform
 
 

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
 from thermoxels_ns.core.checks import check_finite, check_shape
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.face_count import TET_EDGES
 from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
 
@@ -125,12 +125,10 @@ def _parts_with_measurement(links: sparse.csr_array, observed: npt.NDArray[np.bo
             f"part {p} ({sizes[p]} nodes, the first is node {int(np.argmax(parts == p))})" for p in blind[:3]
         )
         raise MeshError(
-            explain(
-                "observed temperatures",
-                expected="at least one node seen by a thermal ray in each connected part of the mesh",
-                got=f"none in {len(blind)} of {count} parts: {shown}{', ...' if len(blind) > 3 else ''}",
-                remedy="Train with thermal images that show this part.",
-            )
+            "observed temperatures",
+            expected="at least one node seen by a thermal ray in each connected part of the mesh",
+            got=f"none in {len(blind)} of {count} parts: {shown}{', ...' if len(blind) > 3 else ''}",
+            remedy="Train with thermal images that show this part.",
         )
     return parts.astype(np.int64)
 
@@ -171,11 +169,9 @@ def _solve(matrix: sparse.csr_array, load: npt.NDArray, degree: npt.NDArray) -> 
     scale = float(np.linalg.norm(load)) or 1.0
     if not residual <= _RELATIVE_RESIDUAL * scale:
         raise MeshError(
-            explain(
-                "harmonic extension of the temperature",
-                expected=f"a relative residual of at most {_RELATIVE_RESIDUAL:g}",
-                got=f"{residual / scale:.3g} with {len(load)} unobserved nodes",
-                remedy="Train at a lower resolution, or with thermal images that show more of the scene.",
-            )
+            "harmonic extension of the temperature",
+            expected=f"a relative residual of at most {_RELATIVE_RESIDUAL:g}",
+            got=f"{residual / scale:.3g} with {len(load)} unobserved nodes",
+            remedy="Train at a lower resolution, or with thermal images that show more of the scene.",
         )
     return solution

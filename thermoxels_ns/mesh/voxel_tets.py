@@ -7,7 +7,7 @@ from itertools import permutations
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
 
@@ -173,12 +173,10 @@ def _as_cells(cells: npt.NDArray) -> npt.NDArray[np.bool_]:
     cells = np.asarray(cells)
     if cells.ndim != 3 or cells.dtype != np.bool_ or not cells.any():
         raise MeshError(
-            explain(
-                "solid voxels",
-                expected="a three-dimensional boolean array with at least one True",
-                got=f"{cells.dtype} array of shape {cells.shape} with {np.count_nonzero(cells)} solid voxels",
-                remedy="Lower the density threshold or percentile so that some voxels are solid.",
-            )
+            "solid voxels",
+            expected="a three-dimensional boolean array with at least one True",
+            got=f"{cells.dtype} array of shape {cells.shape} with {np.count_nonzero(cells)} solid voxels",
+            remedy="Lower the density threshold or percentile so that some voxels are solid.",
         )
     return cells
 

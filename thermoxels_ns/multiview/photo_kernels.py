@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from thermoxels_ns.core.kernel_cache import kernel
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _look(across, down, depth, width, height, first, near, colours, seen, place):
     """Write the colour at homogeneous pixels of a photograph to ``seen[place]``; False where it shows none."""
     if not depth > near:
@@ -27,7 +28,7 @@ def _look(across, down, depth, width, height, first, near, colours, seen, place)
     return not np.isnan(seen[place, 0])  # masked pixels are NaN
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _median(values, count):
     """Median of the first `count` values, float32.
 
@@ -50,7 +51,7 @@ def _median(values, count):
     return 0.5 * (lower + upper)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def colours_at(begin: int, end: int, points, matrices, sizes, firsts, near, colours, result):
     """Fill ``result[point, photograph]`` for points `begin` to `end`; NaN where a photograph does not show a point."""
     for n in range(begin, end):
@@ -64,7 +65,7 @@ def colours_at(begin: int, end: int, points, matrices, sizes, firsts, near, colo
                 result[n, k, :] = np.nan
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def deviations_at_corners(
     begin: int, end: int, lo, step, shape, matrices, sizes, firsts, near, colours, fewest, result
 ):

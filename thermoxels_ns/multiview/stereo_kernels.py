@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from thermoxels_ns.core.kernel_cache import kernel
 
 OUTSIDE = -1.0
 """Correlation that stands for none."""
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _difference(colours, row, column, i, j):
     """Mean difference of the channels of two pixels."""
     off = 0.0
@@ -18,7 +19,7 @@ def _difference(colours, row, column, i, j):
     return off / 3.0
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def weigh_patches(
     colours, brightness, radius, likeness, spread, least_weight, least_variance, weights, means, variances
 ):
@@ -69,7 +70,7 @@ def weigh_patches(
                 variances[row, column] = variance
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@kernel(fastmath=True)
 def correlate(brightness, others, radius, weights, means, variances, noise, count, result):
     """Fill ``result[row, column]`` with how well the patch of a pixel is met by others drawn onto the same pixels.
 
@@ -111,7 +112,7 @@ def correlate(brightness, others, radius, weights, means, variances, noise, coun
             result[row, column] = best.sum() / count
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def agreeing_views(
     begin: int, end: int, matrices, inverses, centres, sizes, firsts, depth, error, tolerance, agreeing, looking_through
 ):

@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from thermoxels_ns.core.errors import ThermalFileError, explain
+from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.radiometry.conditions import ConditionOverrides, Conditions
 from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg, read_dji_rjpeg
 from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
@@ -54,21 +54,17 @@ class RadiometryOptions(ConditionOverrides):
         super().__post_init__()
         if (self.celsius_per_count is None) != (self.celsius_offset is None):
             raise ThermalFileError(
-                explain(
-                    "celsius_per_count and celsius_offset",
-                    expected="both or neither",
-                    got=f"{self.celsius_per_count} and {self.celsius_offset}",
-                    remedy="Pass --celsius-per-count 0.04 --celsius-offset -273.15, for example.",
-                )
+                "celsius_per_count and celsius_offset",
+                expected="both or neither",
+                got=f"{self.celsius_per_count} and {self.celsius_offset}",
+                remedy="Pass --celsius-per-count 0.04 --celsius-offset -273.15, for example.",
             )
         if self.celsius_per_count is not None and self.camera is not None:
             raise ThermalFileError(
-                explain(
-                    "camera",
-                    expected="a preset or a scale of your own",
-                    got=f"the preset {self.camera} and {self.celsius_per_count} K per count",
-                    remedy="Leave --camera or --celsius-per-count and --celsius-offset out.",
-                )
+                "camera",
+                expected="a preset or a scale of your own",
+                got=f"the preset {self.camera} and {self.celsius_per_count} K per count",
+                remedy="Leave --camera or --celsius-per-count and --celsius-offset out.",
             )
         _ = self.given_unit  # a scale of 0 raises here and not at the first file
 
@@ -105,12 +101,10 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
         return _read_stored(path, found, options)
     except OSError as problem:
         raise ThermalFileError(
-            explain(
-                str(path),
-                expected="a file that can be read",
-                got=problem.strerror or str(problem),
-                remedy="Check its permissions, or copy it again.",
-            )
+            str(path),
+            expected="a file that can be read",
+            got=problem.strerror or str(problem),
+            remedy="Check its permissions, or copy it again.",
         ) from problem
 
 
@@ -122,7 +116,7 @@ def detect_format(path: Path) -> ThermogramFormat:
     """
     if not path.is_file():
         raise ThermalFileError(
-            explain("thermal file", expected=f"a file at {path}", got="nothing there", remedy="Check the path.")
+            "thermal file", expected=f"a file at {path}", got="nothing there", remedy="Check the path."
         )
     check_file_size(path)
     with path.open("rb") as stream:
@@ -138,12 +132,10 @@ def detect_format(path: Path) -> ThermogramFormat:
     if looks_like_csv(head):
         return "CSV"
     raise ThermalFileError(
-        explain(
-            str(path),
-            expected="a FLIR or DJI R-JPEG, a TIFF, a 16-bit PNG, or a table of degrees C (.npy, .csv)",
-            got=f"none of them: it starts with {head[:8]!r}",
-            remedy="Export it from the camera's program in one of these formats.",
-        )
+        str(path),
+        expected="a FLIR or DJI R-JPEG, a TIFF, a 16-bit PNG, or a table of degrees C (.npy, .csv)",
+        got=f"none of them: it starts with {head[:8]!r}",
+        remedy="Export it from the camera's program in one of these formats.",
     )
 
 
@@ -157,20 +149,16 @@ def _jpeg_format(path: Path) -> ThermogramFormat:
         check_jpeg(content)
     except DamagedJpegError as problem:
         raise ThermalFileError(
-            explain(
-                str(path),
-                expected="a whole radiometric JPEG",
-                got=str(problem),
-                remedy="Copy the file from the camera again.",
-            )
+            str(path),
+            expected="a whole radiometric JPEG",
+            got=str(problem),
+            remedy="Copy the file from the camera again.",
         ) from problem
     raise ThermalFileError(
-        explain(
-            str(path),
-            expected="a radiometric JPEG: counts and calibration beside the picture",
-            got="a plain JPEG: a photograph, or a false-colour picture, whose palette cannot be turned back",
-            remedy="Use the file as the camera wrote it; editing, messengers and cloud albums drop the thermal part.",
-        )
+        str(path),
+        expected="a radiometric JPEG: counts and calibration beside the picture",
+        got="a plain JPEG: a photograph, or a false-colour picture, whose palette cannot be turned back",
+        remedy="Use the file as the camera wrote it; editing, messengers and cloud albums drop the thermal part.",
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 
 DEFAULT_RELATIVE_HUMIDITY = 0.5
@@ -49,12 +49,10 @@ class Conditions:
                 check_between(name, value, low, high, f"from {low:g} to {high:g} degrees C")
             elif needed:
                 raise ThermoxelsError(
-                    explain(
-                        name,
-                        expected=f"a temperature, because {why} needs one",
-                        got="none",
-                        remedy=f"Pass --{name.replace('_', '-')} in degrees C; indoors the room's is a good guess.",
-                    )
+                    name,
+                    expected=f"a temperature, because {why} needs one",
+                    got="none",
+                    remedy=f"Pass --{name.replace('_', '-')} in degrees C; indoors the room's is a good guess.",
                 )
 
 
@@ -96,5 +94,5 @@ def check_between(name: str, value: float, low: float, high: float, expected: st
     number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
     if not (number and low <= value <= high and (zero or value > 0)):
         raise ThermoxelsError(
-            explain(name, expected=expected, got=repr(value), remedy=f"Pass a right --{name.replace('_', '-')}.")
+            name, expected=expected, got=repr(value), remedy=f"Pass a right --{name.replace('_', '-')}."
         )

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from thermoxels_ns.core.errors import SceneError, ThermoxelsError, explain
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 
 
 @contextmanager
@@ -49,23 +49,19 @@ def naming(
     except Image.DecompressionBombError as problem:
         limit = 2 * (Image.MAX_IMAGE_PIXELS or 0)
         raise error(
-            explain(
-                str(path),
-                expected=f"a picture of at most {limit} pixels",
-                got=f"a header that says more ({problem})",
-                remedy="Reduce the picture; or copy the file again, if it is not so large: its header is damaged.",
-            )
+            str(path),
+            expected=f"a picture of at most {limit} pixels",
+            got=f"a header that says more ({problem})",
+            remedy="Reduce the picture; or copy the file again, if it is not so large: its header is damaged.",
         ) from problem
     except Exception as problem:  # decoders raise OSError, SyntaxError, KeyError, TypeError, struct.error and others
         # The operating system's errors have a number, those of decoders have none.
         refused = isinstance(problem, OSError) and problem.errno is not None
         raise error(
-            explain(
-                str(path),
-                expected="a file that can be read" if refused else expected,
-                got=(problem.strerror if isinstance(problem, OSError) else None) or str(problem) or _kind(problem),
-                remedy="Check its permissions and the disk, or copy it again." if refused else remedy,
-            )
+            str(path),
+            expected="a file that can be read" if refused else expected,
+            got=(problem.strerror if isinstance(problem, OSError) else None) or str(problem) or _kind(problem),
+            remedy="Check its permissions and the disk, or copy it again." if refused else remedy,
         ) from problem
 
 

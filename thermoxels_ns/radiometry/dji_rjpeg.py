@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from thermoxels_ns.core.errors import ThermalFileError, ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermalFileError, ThermoxelsError
 from thermoxels_ns.radiometry.conditions import ConditionOverrides, Conditions
 from thermoxels_ns.radiometry.decoders import naming
 from thermoxels_ns.radiometry.exif import ExifFacts, read_exif_facts
@@ -99,21 +99,17 @@ def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrid
         check_jpeg(content)  # before a library in another language takes it
     except DamagedJpegError as problem:
         raise ThermalFileError(
-            explain(
-                str(path),
-                expected="a whole DJI R-JPEG, as the drone wrote it",
-                got=str(problem),
-                remedy="Copy the file from the drone again.",
-            )
+            str(path),
+            expected="a whole DJI R-JPEG, as the drone wrote it",
+            got=str(problem),
+            remedy="Copy the file from the drone again.",
         ) from problem
     if library is None:
         raise ThermalFileError(
-            explain(
-                str(path),
-                expected="DJI's library libdirp, the only one that turns the counts of a DJI R-JPEG into degrees",
-                got="no library",
-                remedy=f"Download {_SDK} and pass --dji-library with the path of libdirp.so (libdirp.dll on Windows).",
-            )
+            str(path),
+            expected="DJI's library libdirp, the only one that turns the counts of a DJI R-JPEG into degrees",
+            got="no library",
+            remedy=f"Download {_SDK} and pass --dji-library with the path of libdirp.so (libdirp.dll on Windows).",
         )
     dirp = _load(library)
     data = (ctypes.c_uint8 * len(content)).from_buffer_copy(content)
@@ -123,12 +119,10 @@ def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrid
         status = getattr(dirp, function)(*arguments)
         if status != 0:
             raise ThermalFileError(
-                explain(
-                    str(path),
-                    expected=f"{function} of {library.name} to take the file",
-                    got=f"status {status} ({_STATUS.get(status, 'unknown')})",
-                    remedy=f"Copy the file from the drone again, unedited; use a newer library. {_LIMITS}",
-                )
+                str(path),
+                expected=f"{function} of {library.name} to take the file",
+                got=f"status {status} ({_STATUS.get(status, 'unknown')})",
+                remedy=f"Copy the file from the drone again, unedited; use a newer library. {_LIMITS}",
             )
 
     call("dirp_create_from_rjpeg", data, ctypes.c_int32(len(content)), ctypes.byref(handle))
@@ -156,23 +150,19 @@ def _measure(path: Path, call: Callable[..., None], handle: ctypes.c_void_p, ove
         )
     except ThermoxelsError as problem:
         raise ThermalFileError(
-            explain(
-                str(path),
-                expected="possible measurement parameters",
-                got=str(problem),
-                remedy="Copy the file from the drone again, unedited.",
-            )
+            str(path),
+            expected="possible measurement parameters",
+            got=str(problem),
+            remedy="Copy the file from the drone again, unedited.",
         ) from problem
     after = before
     if overrides.given():
         if overrides.air_c is not None and not knows_air:
             raise ThermalFileError(
-                explain(
-                    "air_c",
-                    expected="a libdirp that knows the air temperature",
-                    got="one that takes the reflected temperature for it",
-                    remedy="Use a newer DJI Thermal SDK, or leave --air-c out.",
-                )
+                "air_c",
+                expected="a libdirp that knows the air temperature",
+                got="one that takes the reflected temperature for it",
+                remedy="Use a newer DJI Thermal SDK, or leave --air-c out.",
             )
         after = overrides.applied_to(before)
         if not knows_air:
@@ -214,11 +204,9 @@ def _load(library: Path) -> ctypes.CDLL:
             wrong = f"another library ({problem})"
     if dirp is None or wrong is not None:
         raise ThermalFileError(
-            explain(
-                "dji_library",
-                expected=f"DJI's libdirp for this computer at {library}",
-                got=wrong,
-                remedy=f"Pass --dji-library with the path of the file in {_SDK}, and leave the libraries beside it.",
-            )
+            "dji_library",
+            expected=f"DJI's libdirp for this computer at {library}",
+            got=wrong,
+            remedy=f"Pass --dji-library with the path of the file in {_SDK}, and leave the libraries beside it.",
         )
     return dirp

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import ThermalFileError, explain
+from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.radiometry.conditions import Conditions
 from thermoxels_ns.radiometry.flir_records import (
     CAMERA_INFO,
@@ -103,12 +103,10 @@ def read_flir_jpeg(path: Path) -> FlirImage:
         )
     except (DamagedJpegError, DamagedRecordError) as problem:
         raise ThermalFileError(
-            explain(
-                str(path),
-                expected="a whole FLIR R-JPEG, as the camera wrote it",
-                got=str(problem),
-                remedy="Copy the file from the camera again; programs that edit pictures drop its thermal part.",
-            )
+            str(path),
+            expected="a whole FLIR R-JPEG, as the camera wrote it",
+            got=str(problem),
+            remedy="Copy the file from the camera again; programs that edit pictures drop its thermal part.",
         ) from problem
 
 

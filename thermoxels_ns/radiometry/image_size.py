@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from thermoxels_ns.core.errors import ThermalFileError, explain
+from thermoxels_ns.core.errors import ThermalFileError
 
 LARGEST_SIDE = 8192
 """Pixels along a side: four times the largest thermal sensors and super-resolution modes (about 2048)."""
@@ -20,12 +20,10 @@ def check_thermal_size(path: Path | str, width: int, height: int) -> None:
     """
     if not (0 < width <= LARGEST_SIDE and 0 < height <= LARGEST_SIDE):
         raise ThermalFileError(
-            explain(
-                str(path),
-                expected=f"a thermal image of 1 to {LARGEST_SIDE} pixels a side",
-                got=f"a header that says {width} x {height}",
-                remedy="The header is damaged or this is no camera file; copy it again, or cut a mosaic into parts.",
-            )
+            str(path),
+            expected=f"a thermal image of 1 to {LARGEST_SIDE} pixels a side",
+            got=f"a header that says {width} x {height}",
+            remedy="The header is damaged or this is no camera file; copy it again, or cut a mosaic into parts.",
         )
 
 
@@ -38,19 +36,15 @@ def check_file_size(path: Path) -> None:
     size = path.stat().st_size
     if size == 0:
         raise ThermalFileError(
-            explain(
-                str(path),
-                expected="a camera file",
-                got="a file of zero bytes",
-                remedy="Copy it from the camera again, or remove it.",
-            )
+            str(path),
+            expected="a camera file",
+            got="a file of zero bytes",
+            remedy="Copy it from the camera again, or remove it.",
         )
     if size > LARGEST_FILE_BYTES:
         raise ThermalFileError(
-            explain(
-                str(path),
-                expected=f"a thermal image of at most {LARGEST_FILE_BYTES} bytes",
-                got=f"{size} bytes",
-                remedy="Write one file per image; read videos frame by frame.",
-            )
+            str(path),
+            expected=f"a thermal image of at most {LARGEST_FILE_BYTES} bytes",
+            got=f"{size} bytes",
+            remedy="Write one file per image; read videos frame by frame.",
         )

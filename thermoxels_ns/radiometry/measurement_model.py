@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_positive
-from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.units import celsius_to_kelvin, kelvin_to_celsius
 from thermoxels_ns.radiometry.conditions import Conditions, check_between
 from thermoxels_ns.radiometry.planck_band import LONG_WAVE
@@ -65,12 +65,10 @@ class PlanckConstants:
             )
         if not math.isfinite(self.o):
             raise ThermoxelsError(
-                explain(
-                    "Planck constant O",
-                    expected="a finite number",
-                    got=self.o,
-                    remedy="Use the constants of the camera file.",
-                )
+                "Planck constant O",
+                expected="a finite number",
+                got=self.o,
+                remedy="Use the constants of the camera file.",
             )
 
     def signal(self, temperature_k: npt.ArrayLike) -> Floats:
@@ -195,12 +193,10 @@ class RadiometricModel:
         weight = given.emissivity * tau * optics
         if not weight > 0:
             raise ThermoxelsError(
-                explain(
-                    "distance_m",
-                    expected="a distance that some radiation passes",
-                    got=f"{given.distance_m:g} m in air of {given.air_c} C and humidity {given.relative_humidity:g}",
-                    remedy="Check --distance-m, --air-c and --relative-humidity.",
-                )
+                "distance_m",
+                expected="a distance that some radiation passes",
+                got=f"{given.distance_m:g} m in air of {given.air_c} C and humidity {given.relative_humidity:g}",
+                remedy="Check --distance-m, --air-c and --relative-humidity.",
             )
         return weight, background
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from PIL import Image
 
-from thermoxels_ns.core.errors import ThermalFileError, explain
+from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.radiometry.decoders import naming
 from thermoxels_ns.radiometry.exif import ExifFacts, read_exif_facts
 from thermoxels_ns.radiometry.image_size import check_thermal_size
@@ -56,12 +56,10 @@ def read_count_image(
         mode, depth, exif = image.mode, _depth(image), read_exif_facts(image)
     if mode != "F" and mode not in _COUNT_MODES:
         raise ThermalFileError(
-            explain(
-                str(path),
-                expected="one channel of 16-bit counts or of floats, [degrees C]",
-                got=f"{depth}: a picture for the eye, whose shades are no temperatures",
-                remedy="Export the radiometric TIFF from the camera or its program.",
-            )
+            str(path),
+            expected="one channel of 16-bit counts or of floats, [degrees C]",
+            got=f"{depth}: a picture for the eye, whose shades are no temperatures",
+            remedy="Export the radiometric TIFF from the camera or its program.",
         )
     if mode == "F" and unit is None and camera is None:
         unit = ThermalUnit.celsius()
@@ -69,12 +67,10 @@ def read_count_image(
         camera = camera or recognised_camera(exif.make, exif.model)
         if camera is None:
             raise ThermalFileError(
-                explain(
-                    str(path),
-                    expected="counts with a known unit",
-                    got=f"counts of {exif.camera or 'an unnamed camera'}, which may mean several things",
-                    remedy=f"Pass --camera with one of {known_cameras()}; or --celsius-per-count and --celsius-offset.",
-                )
+                str(path),
+                expected="counts with a known unit",
+                got=f"counts of {exif.camera or 'an unnamed camera'}, which may mean several things",
+                remedy=f"Pass --camera with one of {known_cameras()}; or --celsius-per-count and --celsius-offset.",
             )
         unit = COUNT_SCALES[camera].unit
     return CountImage(

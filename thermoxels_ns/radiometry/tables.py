@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoxels_ns.core.errors import ThermalFileError, explain
+from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.radiometry.image_size import check_thermal_size
 from thermoxels_ns.radiometry.thermal_files import ThermalImage, ThermalUnit, read_thermal_file
 
@@ -39,12 +39,10 @@ def read_csv(path: Path, valid_range_c: tuple[float, float]) -> ThermalImage:
             width, height = max(width, 1 + max(line.count(","), line.count(";"))), height + 1
             if len(line) == _LONGEST_LINE:
                 raise ThermalFileError(
-                    explain(
-                        str(path),
-                        expected=f"a table with lines below {_LONGEST_LINE} characters",
-                        got=f"a longer one, line {height}",
-                        remedy="The file is damaged or no table; write one row of the image per line.",
-                    )
+                    str(path),
+                    expected=f"a table with lines below {_LONGEST_LINE} characters",
+                    got=f"a longer one, line {height}",
+                    remedy="The file is damaged or no table; write one row of the image per line.",
                 )
             check_thermal_size(path, width, height)
     return read_thermal_file(path, ThermalUnit.celsius(), valid_range_c, suffix=".csv")
@@ -67,11 +65,9 @@ def read_npy(path: Path, unit: ThermalUnit | None, valid_range_c: tuple[float, f
         kind = "f"
     if kind in "ui" and unit is None:
         raise ThermalFileError(
-            explain(
-                str(path),
-                expected="an array of degrees C (float32 or float64), or whole numbers with a known unit",
-                got="whole numbers and no unit",
-                remedy="Pass --camera, or --celsius-per-count and --celsius-offset.",
-            )
+            str(path),
+            expected="an array of degrees C (float32 or float64), or whole numbers with a known unit",
+            got="whole numbers and no unit",
+            remedy="Pass --camera, or --celsius-per-count and --celsius-offset.",
         )
     return read_thermal_file(path, unit or ThermalUnit.celsius(), valid_range_c, suffix=".npy")

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from thermoxels_ns.core.errors import ThermalFileError, explain
+from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.radiometry.decoders import quiet_decoders
 from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
@@ -44,12 +44,10 @@ class ThermalUnit:
         wrong_scale = not np.isfinite(self.scale) or (self.kind == "linear" and self.scale == 0)
         if wrong_scale or not np.isfinite(self.offset_c):
             raise ThermalFileError(
-                explain(
-                    "thermal unit",
-                    expected="a finite offset and a finite scale (not zero for counts)",
-                    got=f"scale {self.scale}, offset {self.offset_c} C",
-                    remedy=_UNIT_REMEDY,
-                )
+                "thermal unit",
+                expected="a finite offset and a finite scale (not zero for counts)",
+                got=f"scale {self.scale}, offset {self.offset_c} C",
+                remedy=_UNIT_REMEDY,
             )
 
     @classmethod
@@ -166,12 +164,10 @@ def read_thermal_file(
         raise _damaged(path, problem) from problem
     if raw.values.ndim != 2 or 0 in raw.values.shape:
         raise ThermalFileError(
-            explain(
-                str(path),
-                expected="one temperature per pixel, shape (height, width)",
-                got=f"shape {raw.values.shape}",
-                remedy="Export a single-channel thermal image.",
-            )
+            str(path),
+            expected="one temperature per pixel, shape (height, width)",
+            got=f"shape {raw.values.shape}",
+            remedy="Export a single-channel thermal image.",
         )
     return _to_celsius(path, suffix, raw, unit, valid_range_c)
 
@@ -193,12 +189,10 @@ def _to_celsius(
         celsius = values.astype(np.float64) / np.iinfo(values.dtype).max * unit.scale + unit.offset_c
     else:
         raise ThermalFileError(
-            explain(
-                str(path),
-                expected="counts with a known unit (bounds need unsigned 8 or 16 bit)",
-                got=f"{values.dtype} counts and the unit '{unit.kind}'",
-                remedy=_UNIT_REMEDY,
-            )
+            str(path),
+            expected="counts with a known unit (bounds need unsigned 8 or 16 bit)",
+            got=f"{values.dtype} counts and the unit '{unit.kind}'",
+            remedy=_UNIT_REMEDY,
         )
     nan = ~np.isfinite(celsius)
     if raw.no_data is not None:
@@ -215,12 +209,10 @@ def _to_celsius(
 def _read_raw(path: Path, suffix: str) -> _RawPixels:
     if not path.is_file():
         raise ThermalFileError(
-            explain(
-                "thermal file",
-                expected=f"a file at {path}",
-                got="nothing there",
-                remedy="Restore the file, or remove the frame or pass --missing-thermal skip.",
-            )
+            "thermal file",
+            expected=f"a file at {path}",
+            got="nothing there",
+            remedy="Restore the file, or remove the frame or pass --missing-thermal skip.",
         )
     if path.stat().st_size == 0:
         raise _damaged(path, "a file of zero bytes")
@@ -239,12 +231,10 @@ def _read_raw(path: Path, suffix: str) -> _RawPixels:
             return _RawPixels(read_flir_jpeg(path).temperature_c(), celsius=True)
         return _read_image(path)
     raise ThermalFileError(
-        explain(
-            str(path),
-            expected="a thermal file of type " + ", ".join(THERMAL_SUFFIXES),
-            got=f"suffix '{suffix}'",
-            remedy="Convert the file to one of these.",
-        )
+        str(path),
+        expected="a thermal file of type " + ", ".join(THERMAL_SUFFIXES),
+        got=f"suffix '{suffix}'",
+        remedy="Convert the file to one of these.",
     )
 
 
@@ -274,12 +264,10 @@ def _read_image(path: Path) -> _RawPixels:
         check_thermal_size(path, *image.size)
         if getattr(image, "n_frames", 1) != 1:
             raise ThermalFileError(
-                explain(
-                    str(path),
-                    expected="one image",
-                    got=f"{getattr(image, 'n_frames', 1)} pages",
-                    remedy="Save the page that holds the temperatures as a file of its own.",
-                )
+                str(path),
+                expected="one image",
+                got=f"{getattr(image, 'n_frames', 1)} pages",
+                remedy="Save the page that holds the temperatures as a file of its own.",
             )
         image.load()  # raises on truncated data
         bits = _integer_type(path, image)
@@ -299,12 +287,10 @@ def _read_image(path: Path) -> _RawPixels:
     if mode in ("RGB", "RGBA", "LA"):
         return _one_channel(path, pixels, has_alpha=pixels.ndim == 3 and pixels.shape[-1] in (2, 4))
     raise ThermalFileError(
-        explain(
-            str(path),
-            expected="a grey or floating-point image",
-            got=f"image mode {mode}",
-            remedy="Export the thermal image as 16-bit grey PNG or TIFF.",
-        )
+        str(path),
+        expected="a grey or floating-point image",
+        got=f"image mode {mode}",
+        remedy="Export the thermal image as 16-bit grey PNG or TIFF.",
     )
 
 
@@ -331,12 +317,10 @@ def _one_channel(path: Path, pixels: npt.NDArray[Any], has_alpha: bool) -> _RawP
     colours = pixels[..., :-1] if has_alpha else pixels
     if not (colours == colours[..., :1]).all():
         raise ThermalFileError(
-            explain(
-                str(path),
-                expected="a grey image (all channels equal)",
-                got="a false-colour picture: its palette cannot be turned back into temperatures",
-                remedy="Export the radiometric data (16-bit PNG or TIFF, .npy, .csv) or a grey palette.",
-            )
+            str(path),
+            expected="a grey image (all channels equal)",
+            got="a false-colour picture: its palette cannot be turned back into temperatures",
+            remedy="Export the radiometric data (16-bit PNG or TIFF, .npy, .csv) or a grey palette.",
         )
     no_data = pixels[..., -1] == 0 if has_alpha else None
     return _RawPixels(np.ascontiguousarray(colours[..., 0]), no_data)
@@ -344,10 +328,8 @@ def _one_channel(path: Path, pixels: npt.NDArray[Any], has_alpha: bool) -> _RawP
 
 def _damaged(path: Path, problem: object) -> ThermalFileError:
     return ThermalFileError(
-        explain(
-            str(path),
-            expected="a readable thermal file",
-            got=str(problem) or type(problem).__name__,
-            remedy="The file is damaged or not what its suffix says; copy it again or remove its frame.",
-        )
+        str(path),
+        expected="a readable thermal file",
+        got=str(problem) or type(problem).__name__,
+        remedy="The file is damaged or not what its suffix says; copy it again or remove its frame.",
     )

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.render.sampling import RaySteps
 
 OPAQUE_OPTICAL_DEPTH = 100.0
@@ -63,12 +63,10 @@ def ray_weights(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "ray
     """
     if torch.isnan(density).any():
         raise ThermoxelsError(
-            explain(
-                "density",
-                expected="numbers >= 0",
-                got=f"{int(torch.isnan(density).sum())} NaN",
-                remedy="Lower the density learning rate and resume from the last checkpoint.",
-            )
+            "density",
+            expected="numbers >= 0",
+            got=f"{int(torch.isnan(density).sum())} NaN",
+            remedy="Lower the density learning rate and resume from the last checkpoint.",
         )
     optical_depth = torch.where(
         deltas > 0, (density * deltas).clamp(min=0.0, max=OPAQUE_OPTICAL_DEPTH), torch.zeros_like(deltas)

@@ -10,7 +10,6 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,22 +17,15 @@ import torch
 from torch import Tensor
 
 from thermoxels_ns.core.buffer_pool import SCRATCH
-from thermoxels_ns.core.errors import ThermoxelsError, explain
-from thermoxels_ns.core.kernel_cache import forget_stale_kernels
+from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.threads import run_ranges, run_tasks
-from thermoxels_ns.render import kernels, kernels_backward, kernels_rows, kernels_shading, prefetch
+from thermoxels_ns.render import kernels, kernels_backward, kernels_rows, kernels_shading
 from thermoxels_ns.render.kernels import Rays, Records, Settings, Sums, Volume
 from thermoxels_ns.render.kernels_backward import RayGradients
 from thermoxels_ns.render.kernels_rows import Blocks
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions, near_and_far
 from thermoxels_ns.render.row_gradients import row_gradients
-
-# Before the first call, which loads what was compiled earlier.
-forget_stale_kernels(
-    Path(str(kernels.march_forward.stats.cache_path)),
-    (Path(str(module.__file__)) for module in (kernels, kernels_backward, kernels_rows, kernels_shading, prefetch)),
-)
 
 ACTIVATIONS = {"relu": kernels.RELU, "softplus": kernels.SOFTPLUS, "exp": kernels.EXP}
 SMALLEST_VARIATION = 1e-10
@@ -181,12 +173,10 @@ def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple
         SCRATCH.release()
     if sum(wrong):
         raise ThermoxelsError(
-            explain(
-                "density",
-                expected="numbers >= 0",
-                got=f"NaN in {sum(wrong)} places",
-                remedy="Lower the density learning rate and resume from the last checkpoint.",
-            )
+            "density",
+            expected="numbers >= 0",
+            got=f"NaN in {sum(wrong)} places",
+            remedy="Lower the density learning rate and resume from the last checkpoint.",
         )
     return records, [(begin, end) for begin, _, end in found]
 

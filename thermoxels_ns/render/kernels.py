@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.render.prefetch import prefetch
 
 Floats = npt.NDArray[np.floating]
@@ -122,7 +122,7 @@ class Sums(NamedTuple):
     sparsity: Floats
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def chord(rays: Rays, r: int, volume: Volume):
     """Entry and exit distance of a ray, both 0 for a miss; each axis guarded as in `sampling.intersect_box`."""
     enter, leave = float(rays.near[r]), float(rays.far[r])
@@ -144,7 +144,7 @@ def chord(rays: Rays, r: int, volume: Volume):
     return enter, leave
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def path_of(rays: Rays, r: int, volume: Volume):
     """Where a ray begins, its direction, and the distance it takes per world unit along each axis.
 
@@ -164,7 +164,7 @@ def path_of(rays: Rays, r: int, volume: Volume):
     )
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def next_sample(i: int, enter: float, length: float, step: float, path, volume: Volume):
     """The first sample from step `i` on that lies in a kept voxel.
 
@@ -211,7 +211,7 @@ def next_sample(i: int, enter: float, length: float, step: float, path, volume: 
         i = max(i + 1, int(ahead) + 1 if ahead >= 0.0 else 0)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def basis_of(directions: Floats, r: int, count: int, scale: float, basis: Floats):
     """Spherical harmonics of a ray's direction, the first `count` of `harmonics.harmonics`, times `scale`."""
     basis[0] = 0.28209479177387814 * scale
@@ -226,7 +226,7 @@ def basis_of(directions: Floats, r: int, count: int, scale: float, basis: Floats
             basis[8] = 0.5462742152960396 * scale * (x * x - y * y)
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def gather(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: float, into: Floats):
     """Interpolate one row of `values` at a place in a voxel."""
     gx, gy, gz = 1.0 - fx, 1.0 - fy, 1.0 - fz
@@ -242,7 +242,7 @@ def gather(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: fl
         )
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def gather_some(
     values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: float, count: int, active: int, into: Floats
 ):
@@ -259,7 +259,7 @@ def gather_some(
             )
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def gather_one(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz: float, k: int):
     """Interpolate channel `k` at a place in a voxel."""
     gx, gy, gz = 1.0 - fx, 1.0 - fy, 1.0 - fz
@@ -275,7 +275,7 @@ def gather_one(values: Floats, rows: Ints, number: int, fx: float, fy: float, fz
     )
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def prefetch_corners(values: Floats, rows: Ints, number: int):
     """Ask for the first channel of a voxel's corners."""
     for corner in range(4):
@@ -283,13 +283,13 @@ def prefetch_corners(values: Floats, rows: Ints, number: int):
         prefetch(values, row, 0)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def place_of(records: Records, n: int):
     """Place of a sample in its voxel."""
     return float(records.fraction[n, 0]), float(records.fraction[n, 1]), float(records.fraction[n, 2])
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def activate(raw: float, kind: int):
     """Density of an interpolated raw value; a NaN stays one."""
     if kind == RELU:
@@ -299,7 +299,7 @@ def activate(raw: float, kind: int):
     return math.exp(raw if not raw > EXP_LIMIT else EXP_LIMIT)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def march_forward(
     first: int,
     last: int,

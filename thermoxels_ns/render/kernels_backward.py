@@ -8,8 +8,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from numba import njit
-
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.render.kernels import (
     COLOUR,
     DENSITY,
@@ -41,7 +40,7 @@ class RayGradients(NamedTuple):
     sparsity: Floats
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def march_backward(
     first: int, last: int, rays: Rays, volume: Volume, settings: Settings, records: Records, grads: RayGradients
 ):

@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.render.kernels import (
     COLOUR,
     DENSITY,
@@ -75,7 +75,7 @@ class RowGradients(NamedTuple):
     temperature: Floats
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def order_records(records: Records, order: Order):
     """Fill `order` by counting; `order.group` holds zeros before."""
     group = order.group
@@ -96,7 +96,7 @@ def order_records(records: Records, order: Order):
     group[0] = 0
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def first_voxel(voxel_rows: Ints, corner: int, row: int):
     """The first voxel whose row of a corner is at least `row`; such rows ascend."""
     low, high = 0, len(voxel_rows)
@@ -109,7 +109,7 @@ def first_voxel(voxel_rows: Ints, corner: int, row: int):
     return low
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def use_rows(first_row: int, last_row: int, volume: Volume, records: Records, order: Order, blocks: Blocks, uses: Ints):
     """Mark which parameters rows `first_row` to `last_row` have a gradient for.
 
@@ -154,13 +154,13 @@ def use_rows(first_row: int, last_row: int, volume: Volume, records: Records, or
     return density, colour, temperature
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _groups_before(number: int, order: Order):
     """Number of groups that reach the voxels before `number`."""
     return (number + (1 << order.shift) - 1) >> order.shift
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def list_rows(first_row: int, last_row: int, density: int, colour: int, temperature: int, rows: RowGradients):
     """List the rows of a range that have a gradient, from the given places on, and set their sums to 0."""
     for row in range(first_row, last_row):
@@ -181,7 +181,7 @@ def list_rows(first_row: int, last_row: int, density: int, colour: int, temperat
             temperature += 1
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def prefetch_record(records: Records, n: int):
     """Ask for what is needed of a record."""
     prefetch(records.number, n, 0)
@@ -191,7 +191,7 @@ def prefetch_record(records: Records, n: int):
     prefetch(records.rgb, n, 0)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def prefetch_sums(rows: RowGradients, voxel_rows: Ints, number: int):
     """Ask for the sums of a voxel's corners, as far as they are in the range whose places are known."""
     for corner in range(4):
@@ -201,7 +201,7 @@ def prefetch_sums(rows: RowGradients, voxel_rows: Ints, number: int):
         prefetch(rows.temperature, rows.place[row, 2], 0)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def corner_shares(records: Records, n: int, shares: Floats):
     """Trilinear weights of a sample's corners, in the order of `lattice.CORNER_OFFSETS`."""
     one = shares.dtype.type(1.0)
@@ -212,7 +212,7 @@ def corner_shares(records: Records, n: int, shares: Floats):
     shares[4], shares[5], shares[6], shares[7] = c * gz, c * fz, d * gz, d * fz
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def add_samples(
     first_row: int,
     last_row: int,
@@ -281,7 +281,7 @@ def add_samples(
                         rows.temperature[place, k] += share * heat * thermal_basis[k]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def spread_harmonics(first: int, last: int, rows: RowGradients):
     """Put the sums of places `first` to `last` where their harmonics stand among all; the others get 0."""
     count, active = rows.sh.shape[1] // 3, rows.sh_sums.shape[1] // 3
@@ -292,7 +292,7 @@ def spread_harmonics(first: int, last: int, rows: RowGradients):
                 rows.sh[place, c * count + k] = rows.sh_sums[place, c * active + k]
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def total_variation(values: Floats, voxel_rows: Ints, first: int, last: int, smallest: float):
     """Sum over voxels `first` to `last` and channels of sqrt(dx^2 + dy^2 + dz^2) (Plenoxels, eq. 4)."""
     channels = values.shape[1]
@@ -311,7 +311,7 @@ def total_variation(values: Floats, voxel_rows: Ints, first: int, last: int, sma
     return total
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def add_variation(
     first_row: int,
     last_row: int,

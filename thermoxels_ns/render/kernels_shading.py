@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.render.kernels import (
     Floats,
     Ints,
@@ -29,7 +29,7 @@ NEAR, FAR = 8, 24
 _Y00 = 0.28209479177387814
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def prefetch_colours(values: Floats, rows: Ints, number: int, active: int):
     """Ask for the colours of a voxel's corners, whose rows are longer than a cache line unless there is one colour."""
     channels = values.shape[1]
@@ -46,7 +46,7 @@ def prefetch_colours(values: Floats, rows: Ints, number: int, active: int):
         prefetch(values, row + 1, second)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def shade(first: int, last: int, rays: Rays, volume: Volume, settings: Settings, records: Records, sums: Sums):
     """Read and sum colour and temperature of rays `first` to `last` (paper, eq. 1 and 2).
 

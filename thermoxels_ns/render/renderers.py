@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.field.interpolation import TrilinearPoints
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.compositing import composite
@@ -29,12 +29,10 @@ def choose_backend(backend: Backend, device: torch.device) -> Literal["reference
     assert backend in get_args(Backend)
     if backend == "fused" and device.type != "cpu":
         raise ThermoxelsError(
-            explain(
-                "backend",
-                expected=f"auto or reference on {device.type}",
-                got="fused, whose kernels run on the CPU",
-                remedy="Pass --pipeline.model.backend auto, or --machine.device-type cpu.",
-            )
+            "backend",
+            expected=f"auto or reference on {device.type}",
+            got="fused, whose kernels run on the CPU",
+            remedy="Pass --pipeline.model.backend auto, or --machine.device-type cpu.",
         )
     if backend == "auto":
         return "fused" if device.type == "cpu" else "reference"

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.reports.page_style import embedded_image, html_page, scrolling
 
 
@@ -179,12 +179,10 @@ def _bar(bar: ColourBar) -> str:
     """A strip of colours with five temperatures below it."""
     if len(bar.colours) < 2:
         raise ThermoxelsError(
-            explain(
-                "colour bar",
-                expected="at least two colours",
-                got=len(bar.colours),
-                remedy="Sample the colour map more often.",
-            )
+            "colour bar",
+            expected="at least two colours",
+            got=len(bar.colours),
+            remedy="Sample the colour map more often.",
         )
     ticks = "".join(f"<span>{bar.min_c + share * (bar.max_c - bar.min_c):.1f}</span>" for share in (0, 0.25, 0.5, 0.75))
     ticks += f"<span>{bar.max_c:.1f}&nbsp;°C</span>"

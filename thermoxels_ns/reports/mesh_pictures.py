@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_finite, check_shape, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import MeshError, OutputError, explain
+from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 if TYPE_CHECKING:
@@ -86,9 +86,7 @@ def picture_of_mesh(
 
     path = Path(path)
     if path.suffix != ".png":
-        raise OutputError(
-            explain("picture", expected="a name that ends in .png", got=path.name, remedy="Rename the file.")
-        )
+        raise OutputError("picture", expected="a name that ends in .png", got=path.name, remedy="Rename the file.")
     values = np.asarray(mesh.temperature_c if temperature_c is None else temperature_c, dtype=np.float64)
     remedy = "Pass one finite temperature per mesh node."
     check_shape("temperature_c", values, (len(mesh.points_m),), remedy, MeshError)
@@ -177,7 +175,7 @@ def _unit(name: str, vector: npt.ArrayLike) -> npt.NDArray[np.float64]:
     length = float(np.linalg.norm(array))
     if array.shape != (3,) or not np.isfinite(length) or length == 0.0:
         raise MeshError(
-            explain(name, expected="three finite numbers, not all 0", got=vector, remedy="Pass for instance (0, 0, 1).")
+            name, expected="three finite numbers, not all 0", got=vector, remedy="Pass for instance (0, 0, 1)."
         )
     return array / length
 
@@ -193,7 +191,7 @@ def _colour_limits(values: npt.NDArray[np.float64]) -> tuple[float, float]:
     """Ends of the colour bar; a constant temperature gets 1 K around it."""
     low, high = float(values.min()), float(values.max())
     if not (np.isfinite(low) and np.isfinite(high)):
-        raise MeshError(explain("clim", expected="finite temperatures", got=(low, high), remedy="Leave clim out."))
+        raise MeshError("clim", expected="finite temperatures", got=(low, high), remedy="Leave clim out.")
     return (low, high) if high - low > 1e-3 else (low - 0.5, high + 0.5)
 
 

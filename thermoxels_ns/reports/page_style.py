@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 from html import escape
 
-from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError
 
 _SIGNATURES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 
@@ -48,12 +48,10 @@ def embedded_image(image: bytes, words: str) -> str:
     kind = next((kind for signature, kind in _SIGNATURES.items() if image.startswith(signature)), None)
     if kind is None:
         raise ThermoxelsError(
-            explain(
-                words,
-                expected="the content of a PNG or JPEG file",
-                got=f"{len(image)} bytes that begin with {image[:8]!r}",
-                remedy="Draw the picture again.",
-            )
+            words,
+            expected="the content of a PNG or JPEG file",
+            got=f"{len(image)} bytes that begin with {image[:8]!r}",
+            remedy="Draw the picture again.",
         )
     return f'<img src="data:{kind};base64,{base64.b64encode(image).decode()}" alt="{escape(words, quote=True)}">'
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from tyro.constructors import PrimitiveConstructorSpec
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.courtyard import courtyard
 from thermoxels_ns.synthetic.house_corner import house_corner
 from thermoxels_ns.synthetic.pinhole import CameraRing
@@ -123,12 +123,10 @@ def check_scene_name(name: str) -> str:
     """
     if name not in _BUILDERS and random_seed(name) is None:
         raise SceneError(
-            explain(
-                "synthetic scene",
-                expected=f"{RANDOM_NAME} with a whole number N from 0 on, or one of {', '.join(_BUILDERS)}",
-                got=repr(name),
-                remedy="Choose one of these names, or a seed as in random-17.",
-            )
+            "synthetic scene",
+            expected=f"{RANDOM_NAME} with a whole number N from 0 on, or one of {', '.join(_BUILDERS)}",
+            got=repr(name),
+            remedy="Choose one of these names, or a seed as in random-17.",
         )
     return name
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.solids import Box, Hits, Vector
 
 FloatArray = npt.NDArray[np.float64]
@@ -38,12 +38,10 @@ class Cylinder:
         finite = np.isfinite(self.centre).all() and np.isfinite(sizes).all()
         if not (finite and min(sizes) > 0 and self.axis in (0, 1, 2)):
             raise SceneError(
-                explain(
-                    "cylinder",
-                    expected="a finite centre, a radius and a length above 0, and an axis of 0, 1 or 2",
-                    got=f"centre {self.centre}, radius {self.radius}, length {self.length}, axis {self.axis}",
-                    remedy="Correct these.",
-                )
+                "cylinder",
+                expected="a finite centre, a radius and a length above 0, and an axis of 0, 1 or 2",
+                got=f"centre {self.centre}, radius {self.radius}, length {self.length}, axis {self.axis}",
+                remedy="Correct these.",
             )
 
     @property

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -35,12 +35,10 @@ class PinholeCamera:
         lengths = (self.fl_x, self.fl_y)
         if min(self.width, self.height) < 1 or not all(math.isfinite(f) and f > 0 for f in lengths):
             raise SceneError(
-                explain(
-                    "camera",
-                    expected="at least one pixel and focal lengths above 0",
-                    got=f"{self.width} x {self.height} pixels, focal lengths {lengths}",
-                    remedy="Correct the intrinsics.",
-                )
+                "camera",
+                expected="at least one pixel and focal lengths above 0",
+                got=f"{self.width} x {self.height} pixels, focal lengths {lengths}",
+                remedy="Correct the intrinsics.",
             )
 
     def directions(self, pose: npt.ArrayLike, samples_per_axis: int = 1) -> FloatArray:
@@ -88,12 +86,10 @@ def look_at(position: npt.ArrayLike, target: npt.ArrayLike) -> FloatArray:
     right = np.cross((0.0, 0.0, 1.0), back)
     if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(back):
         raise SceneError(
-            explain(
-                "camera",
-                expected="a view direction that is not vertical",
-                got=f"position {position.tolist()}, target {np.asarray(target).tolist()}",
-                remedy="Move the camera to the side.",
-            )
+            "camera",
+            expected="a view direction that is not vertical",
+            got=f"position {position.tolist()}, target {np.asarray(target).tolist()}",
+            remedy="Move the camera to the side.",
         )
     right /= np.linalg.norm(right)
     back /= np.linalg.norm(back)
@@ -141,12 +137,10 @@ def ring_poses(rings: Sequence[CameraRing], num_train: int, num_eval: int) -> tu
     """
     if num_train < 1 or num_eval < 0:
         raise SceneError(
-            explain(
-                "number of views",
-                expected="at least 1 for training and at least 0 for evaluation",
-                got=f"{num_train} and {num_eval}",
-                remedy="Raise num_train or num_eval.",
-            )
+            "number of views",
+            expected="at least 1 for training and at least 0 for evaluation",
+            got=f"{num_train} and {num_eval}",
+            remedy="Raise num_train or num_eval.",
         )
     used = rings[: min(len(rings), num_train)]
     train, held_out = [np.eye(4)] * num_train, [np.eye(4)] * num_eval

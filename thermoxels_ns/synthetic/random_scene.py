@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.random_buildings import detached_house, facade, wings
 from thermoxels_ns.synthetic.random_plan import Plan
 from thermoxels_ns.synthetic.random_plant import machinery, pipes_and_radiators
@@ -90,9 +90,7 @@ def random_scene(seed: int) -> SyntheticScene:
     'random-3'
     """
     if seed < 0:
-        raise SceneError(
-            explain("seed", expected="a whole number from 0 on", got=seed, remedy="Pass a seed such as 17.")
-        )
+        raise SceneError("seed", expected="a whole number from 0 on", got=seed, remedy="Pass a seed such as 17.")
     draw = np.random.default_rng([_STREAM, seed])
     family = FAMILIES[seed % len(FAMILIES)]
     plan = Plan(draw)

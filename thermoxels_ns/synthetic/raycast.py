@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.pinhole import PinholeCamera
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
@@ -127,11 +127,9 @@ def _position_outside(scene: SyntheticScene, pose: FloatArray) -> FloatArray:
     origin = pose[:3, 3]
     if float(scene.signed_distance(origin[None])[0]) < 0.0:
         raise SceneError(
-            explain(
-                "camera position",
-                expected=f"a point outside the solid of scene {scene.name}",
-                got=f"{origin.tolist()}, which is inside it",
-                remedy="Move the camera out of the solid.",
-            )
+            "camera position",
+            expected=f"a point outside the solid of scene {scene.name}",
+            got=f"{origin.tolist()}, which is inside it",
+            remedy="Move the camera out of the solid.",
         )
     return origin

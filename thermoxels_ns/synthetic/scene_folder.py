@@ -17,7 +17,7 @@ from PIL import Image
 from rich.progress import track
 
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.catalogue import SCENE_NAMES, make_scene
 from thermoxels_ns.synthetic.pinhole import PinholeCamera
 from thermoxels_ns.synthetic.raycast import RenderedView, render_view, visible_surface_points
@@ -160,12 +160,10 @@ def load_truth(scene_folder: Path | str) -> SyntheticScene | None:
         return None
     if not (isinstance(truth, dict) and isinstance(truth.get("synthetic_scene"), str)):
         raise SceneError(
-            explain(
-                "transforms.json: truth",
-                expected='an object with the text "synthetic_scene"',
-                got=json.dumps(truth),
-                remedy="Write the scene again, or remove the key for real photographs.",
-            )
+            "transforms.json: truth",
+            expected='an object with the text "synthetic_scene"',
+            got=json.dumps(truth),
+            remedy="Write the scene again, or remove the key for real photographs.",
         )
     return make_scene(truth["synthetic_scene"])
 
@@ -174,19 +172,17 @@ def _thermal_size(width: int, height: int, thermal_width: int | None, own_camera
     """Width and height of the thermal images; one camera for both bands needs the same aspect exactly."""
     for name, value in (("width", width), ("height", height), ("thermal_width", thermal_width)):
         if value is not None and value < 1:
-            raise SceneError(explain(name, expected="at least 1 pixel", got=value, remedy=f"Raise {name}."))
+            raise SceneError(name, expected="at least 1 pixel", got=value, remedy=f"Raise {name}.")
     if own_camera:
         chosen = thermal_width or max(width // 2, 1)
         return chosen, max(round(chosen * _THERMAL_ASPECT), 1)
     chosen = thermal_width or width
     if height * chosen % width:
         raise SceneError(
-            explain(
-                "thermal_width",
-                expected=f"a width that keeps the aspect {width}:{height} in whole pixels",
-                got=f"{chosen}, for a height of {height * chosen / width:.2f}",
-                remedy=f"Pass a divisor of {width} such as {width // 2}, or give the thermal images their own camera.",
-            )
+            "thermal_width",
+            expected=f"a width that keeps the aspect {width}:{height} in whole pixels",
+            got=f"{chosen}, for a height of {height * chosen / width:.2f}",
+            remedy=f"Pass a divisor of {width} such as {width // 2}, or give the thermal images their own camera.",
         )
     return chosen, height * chosen // width
 
@@ -194,16 +190,14 @@ def _thermal_size(width: int, height: int, thermal_width: int | None, own_camera
 def _check_options(thermal_format: str, noise_k: float, drift_k: float) -> None:
     if thermal_format not in get_args(ThermalFormat):
         raise SceneError(
-            explain(
-                "thermal_format",
-                expected=f"one of {', '.join(get_args(ThermalFormat))}",
-                got=repr(thermal_format),
-                remedy="Choose one of these formats.",
-            )
+            "thermal_format",
+            expected=f"one of {', '.join(get_args(ThermalFormat))}",
+            got=repr(thermal_format),
+            remedy="Choose one of these formats.",
         )
     for name, value in (("noise_k", noise_k), ("drift_k", drift_k)):
         if not (np.isfinite(value) and value >= 0.0):
-            raise SceneError(explain(name, expected="a finite number of at least 0", got=value, remedy="Pass 0."))
+            raise SceneError(name, expected="a finite number of at least 0", got=value, remedy="Pass 0.")
 
 
 def _prepared_folder(folder: Path | str) -> Path:
@@ -217,12 +211,10 @@ def _prepared_folder(folder: Path | str) -> Path:
         content = _read_transforms(old)
         if content.get("truth") is None:
             raise SceneError(
-                explain(
-                    "output folder",
-                    expected="an empty folder or one with an earlier synthetic scene",
-                    got=f"{target}, whose transforms.json describes other photographs",
-                    remedy="Choose another folder.",
-                )
+                "output folder",
+                expected="an empty folder or one with an earlier synthetic scene",
+                got=f"{target}, whose transforms.json describes other photographs",
+                remedy="Choose another folder.",
             )
         for path in _listed_files(target, content):
             remove_file(path)
@@ -311,21 +303,17 @@ def _read_transforms(path: Path) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError) as problem:
         raise SceneError(
-            explain(
-                "transforms.json",
-                expected=f"a readable json file at {path}",
-                got=str(problem),
-                remedy="Check the scene folder, or write the scene again.",
-            )
+            "transforms.json",
+            expected=f"a readable json file at {path}",
+            got=str(problem),
+            remedy="Check the scene folder, or write the scene again.",
         ) from problem
     if not isinstance(content, dict):
         raise SceneError(
-            explain(
-                "transforms.json",
-                expected="a json object",
-                got=type(content).__name__,
-                remedy="Check the scene folder, or write the scene again.",
-            )
+            "transforms.json",
+            expected="a json object",
+            got=type(content).__name__,
+            remedy="Check the scene folder, or write the scene again.",
         )
     return content
 

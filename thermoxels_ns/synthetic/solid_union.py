@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.cylinder import Cylinder
 from thermoxels_ns.synthetic.solids import Box, BoxSolid, Hits, Sphere
 
@@ -30,12 +30,10 @@ class SolidUnion:
         for (i, first), (j, second) in combinations(enumerate(self.parts), 2):
             if _overlap(first, second):
                 raise SceneError(
-                    explain(
-                        f"parts {i} and {j}",
-                        expected="solids that do not overlap and share no face",
-                        got=f"{type(first).__name__} {first.bounds} and {type(second).__name__} {second.bounds}",
-                        remedy="Move one of them, or join boxes in one BoxSolid.",
-                    )
+                    f"parts {i} and {j}",
+                    expected="solids that do not overlap and share no face",
+                    got=f"{type(first).__name__} {first.bounds} and {type(second).__name__} {second.bounds}",
+                    remedy="Move one of them, or join boxes in one BoxSolid.",
                 )
 
     @property

@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.rectangles import Rectangles, exposed_rectangles
 
 Vector = tuple[float, float, float]
@@ -104,21 +104,17 @@ class BoxSolid:
             for number, (lo, hi) in enumerate(boxes):
                 if not (np.isfinite([lo, hi]).all() and np.all(np.less(lo, hi))):
                     raise SceneError(
-                        explain(
-                            f"{name}[{number}]",
-                            expected="finite corners with lo below hi along every axis",
-                            got=f"{lo} to {hi}",
-                            remedy="Swap or correct the corners.",
-                        )
+                        f"{name}[{number}]",
+                        expected="finite corners with lo below hi along every axis",
+                        got=f"{lo} to {hi}",
+                        remedy="Swap or correct the corners.",
                     )
         if not (self.boxes and self._cells.any()):
             raise SceneError(
-                explain(
-                    "boxes",
-                    expected="a solid with a volume above 0",
-                    got=f"{len(self.boxes)} boxes of which the {len(self.removed)} removed ones leave nothing",
-                    remedy="Add a box or remove less.",
-                )
+                "boxes",
+                expected="a solid with a volume above 0",
+                got=f"{len(self.boxes)} boxes of which the {len(self.removed)} removed ones leave nothing",
+                remedy="Add a box or remove less.",
             )
 
     @cached_property
@@ -252,12 +248,10 @@ class Sphere:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.centre).all() and math.isfinite(self.radius) and self.radius > 0):
             raise SceneError(
-                explain(
-                    "sphere",
-                    expected="a finite centre and a radius above 0",
-                    got=f"centre {self.centre}, radius {self.radius}",
-                    remedy="Correct the two.",
-                )
+                "sphere",
+                expected="a finite centre and a radius above 0",
+                got=f"centre {self.centre}, radius {self.radius}",
+                remedy="Correct the two.",
             )
 
     @property

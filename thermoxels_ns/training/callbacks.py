@@ -11,7 +11,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch.nn import Parameter
 
-from thermoxels_ns.core.errors import PruningError, explain
+from thermoxels_ns.core.errors import PruningError
 from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.field.refine import RowChange, prune
 from thermoxels_ns.training.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
@@ -183,12 +183,10 @@ def prune_by_rays(
             total = math.prod(voxels.lattice.cell_shape)
             return PruningReport(int(keep.sum()), total, threshold, opened), prune(model.grid, keep)
     raise PruningError(
-        explain(
-            "pruning",
-            expected=f"to open at most {MOST_OPENED_RAYS:.0%} of the rays that end on something",
-            got=f"{opened:.1%} at threshold {threshold:.2g}",
-            remedy="Lower --pipeline.model.prune-threshold, or prune later when surfaces have formed.",
-        )
+        "pruning",
+        expected=f"to open at most {MOST_OPENED_RAYS:.0%} of the rays that end on something",
+        got=f"{opened:.1%} at threshold {threshold:.2g}",
+        remedy="Lower --pipeline.model.prune-threshold, or prune later when surfaces have formed.",
     )
 
 

@@ -15,7 +15,7 @@ from nerfstudio.utils import colormaps
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.feature_rays import Sightlines
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
@@ -56,12 +56,10 @@ class ThermoxelsModel(Model):
         temperature_range = (self.kwargs.get("metadata") or {}).get("temperature_range")
         if not isinstance(temperature_range, TemperatureRange):
             raise SceneError(
-                explain(
-                    "scene",
-                    expected="thermal images with a temperature range",
-                    got="none",
-                    remedy="Use the dataparser thermal-data.",
-                )
+                "scene",
+                expected="thermal images with a temperature range",
+                got="none",
+                remedy="Use the dataparser thermal-data.",
             )
         self.register_buffer(
             "temperature_bounds_c",

@@ -9,7 +9,7 @@ from typing import Literal
 
 from nerfstudio.models.base_model import ModelConfig
 
-from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.field.harmonics import MAX_DEGREE, num_coefficients
 from thermoxels_ns.field.voxel_grid import DensityActivation
 from thermoxels_ns.render.renderers import Backend
@@ -175,12 +175,10 @@ class ThermoxelsModelConfig(ModelConfig):
         for name in self.loss_overrides:
             if name not in known:
                 raise ThermoxelsError(
-                    explain(
-                        f"loss_overrides.{name}",
-                        expected="one of " + ", ".join(known),
-                        got=name,
-                        remedy="Correct the name.",
-                    )
+                    f"loss_overrides.{name}",
+                    expected="one of " + ", ".join(known),
+                    got=name,
+                    remedy="Correct the name.",
                 )
         return LossWeights(**{**known, **self.loss_overrides})
 
@@ -219,15 +217,11 @@ class ThermoxelsModelConfig(ModelConfig):
         for name, (value, low, high, expected) in values.items():
             if not low <= value <= high:  # NaN fails too
                 option = name.replace("_", "-")
-                raise ThermoxelsError(
-                    explain(name, expected=expected, got=value, remedy=f"Correct --pipeline.model.{option}.")
-                )
+                raise ThermoxelsError(name, expected=expected, got=value, remedy=f"Correct --pipeline.model.{option}.")
         for name in ("prune_at", "thin_at"):
             at = getattr(self, name)
             if at and min(at) < 1:
-                raise ThermoxelsError(
-                    explain(name, expected="steps of at least 1", got=at, remedy="Correct the steps.")
-                )
+                raise ThermoxelsError(name, expected="steps of at least 1", got=at, remedy="Correct the steps.")
 
     def refinements(self) -> dict[int, int]:
         """Step -> factor by which voxels are split there.
@@ -240,12 +234,10 @@ class ThermoxelsModelConfig(ModelConfig):
         increasing = increasing and min((1, *self.refine_at)) == 1
         if not self.resolutions or len(self.refine_at) != len(pairs) or not increasing:
             raise ThermoxelsError(
-                explain(
-                    "resolutions and refine_at",
-                    expected="resolutions that are multiples of each other and one ascending step fewer",
-                    got=f"{self.resolutions} at steps {self.refine_at}",
-                    remedy="For example --pipeline.model.resolutions 32 64 128 --pipeline.model.refine-at 400 800.",
-                )
+                "resolutions and refine_at",
+                expected="resolutions that are multiples of each other and one ascending step fewer",
+                got=f"{self.resolutions} at steps {self.refine_at}",
+                remedy="For example --pipeline.model.resolutions 32 64 128 --pipeline.model.refine-at 400 800.",
             )
         return {step: b // a for step, (a, b) in zip(self.refine_at, pairs)}
 

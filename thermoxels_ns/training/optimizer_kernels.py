@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from thermoxels_ns.core.kernel_cache import kernel
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def adam_rows(
     begin: int,
     end: int,
@@ -39,7 +40,7 @@ def adam_rows(
             at[k] -= rate * m[k] / (np.sqrt(v[k] * share) + tiny)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def rmsprop_rows(begin: int, end: int, rows, gradient, values, square, lr, alpha, eps):
     """One step of RMSprop on entries `begin` to `end` of the list of rows."""
     one = values.dtype.type

@@ -12,7 +12,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
-from thermoxels_ns.core.errors import CheckpointError, SceneError, explain
+from thermoxels_ns.core.errors import CheckpointError, SceneError
 from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.core.threads import set_num_threads
@@ -47,9 +47,7 @@ class ThermoxelsPipeline(VanillaPipeline):
 
     def __init__(self, config: ThermoxelsPipelineConfig, *args: Any, **kwargs: Any) -> None:
         if config.cpu_threads is not None and config.cpu_threads < 1:
-            raise SceneError(
-                explain("cpu_threads", expected="1 or more", got=config.cpu_threads, remedy="Leave it out.")
-            )
+            raise SceneError("cpu_threads", expected="1 or more", got=config.cpu_threads, remedy="Leave it out.")
         set_num_threads(config.cpu_threads)
         if "OMP_NUM_THREADS" not in os.environ:
             torch.set_num_threads(max(1, (os.cpu_count() or 2) // 2))
@@ -59,12 +57,10 @@ class ThermoxelsPipeline(VanillaPipeline):
         streams = getattr(config.datamanager, "streams", "both")
         if streams == "thermal" and (self.model.grid.sh is not None or not self.model.config.thermal_density_gradient):
             raise SceneError(
-                explain(
-                    "streams",
-                    expected="thermal images alone only for a model without colour whose density they move",
-                    got=f"thermal, with SH degree {self.model.config.sh_degree}",
-                    remedy="Use the method plenoxels-t.",
-                )
+                "streams",
+                expected="thermal images alone only for a model without colour whose density they move",
+                got=f"thermal, with SH degree {self.model.config.sh_degree}",
+                remedy="Use the method plenoxels-t.",
             )
         datamanager: Any = self.datamanager
         outputs = datamanager.train_dataparser_outputs
@@ -88,14 +84,12 @@ class ThermoxelsPipeline(VanillaPipeline):
         }
         if expected.keys() != found.keys() or any(found[name] not in columns for name, columns in expected.items()):
             raise CheckpointError(
-                explain(
-                    "checkpoint",
-                    expected=f"a voxel grid with the columns {_columns(expected)}",
-                    got=_columns({name: (columns,) for name, columns in found.items()})
-                    if found
-                    else "no voxel grid: the checkpoint of another method",
-                    remedy="Load it with the config.yml that was written beside it.",
-                )
+                "checkpoint",
+                expected=f"a voxel grid with the columns {_columns(expected)}",
+                got=_columns({name: (columns,) for name, columns in found.items()})
+                if found
+                else "no voxel grid: the checkpoint of another method",
+                remedy="Load it with the config.yml that was written beside it.",
             )
         own = self.state_dict()
         state.setdefault(_START, own[_START])  # of a training from before there was a choice
@@ -107,32 +101,26 @@ class ThermoxelsPipeline(VanillaPipeline):
         differing = sorted(set(own) ^ set(state))
         if differing:
             raise CheckpointError(
-                explain(
-                    "checkpoint",
-                    expected="the parts that the options build",
-                    got=f"a difference in {', '.join(differing)}",
-                    remedy="Use the same background, sky and per-image-offset options as in training.",
-                )
+                "checkpoint",
+                expected="the parts that the options build",
+                got=f"a difference in {', '.join(differing)}",
+                remedy="Use the same background, sky and per-image-offset options as in training.",
             )
         resolution = int(state[_GRID + "corner_shape"].max()) - 1
         if resolution not in self.model.config.resolutions:
             raise CheckpointError(
-                explain(
-                    "checkpoint",
-                    expected=f"one of the resolutions {self.model.config.resolutions}",
-                    got=f"{resolution} voxels",
-                    remedy="Pass --pipeline.model.resolutions as in training; finer ones may follow.",
-                )
+                "checkpoint",
+                expected=f"one of the resolutions {self.model.config.resolutions}",
+                got=f"{resolution} voxels",
+                remedy="Pass --pipeline.model.resolutions as in training; finer ones may follow.",
             )
         activations = [own[_ACTIVATION], state[_ACTIVATION]]
         if not torch.equal(activations[0].cpu(), activations[1].cpu()):
             raise CheckpointError(
-                explain(
-                    "density_activation",
-                    expected="the checkpoint's",
-                    got=self.model.config.density_activation,
-                    remedy="Use the option as in training.",
-                )
+                "density_activation",
+                expected="the checkpoint's",
+                got=self.model.config.density_activation,
+                remedy="Use the option as in training.",
             )
         for name, what, tolerance in (
             ("world_from_input", "poses and scene box", 1e-4),
@@ -146,12 +134,10 @@ class ThermoxelsPipeline(VanillaPipeline):
             same = here.shape == stored.shape and (offset or torch.allclose(here, stored, atol=tolerance, rtol=1e-4))
             if not same:
                 raise CheckpointError(
-                    explain(
-                        what,
-                        expected="those the checkpoint was trained with",
-                        got="others from the scene",
-                        remedy="Use the scene folder and the dataparser options of the training run.",
-                    )
+                    what,
+                    expected="those the checkpoint was trained with",
+                    got="others from the scene",
+                    remedy="Use the scene folder and the dataparser options of the training run.",
                 )
 
     def get_average_eval_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError
 
 COARSEST = 32
 """Voxels along the longest side that a training starts with, or a few more."""
@@ -66,12 +66,10 @@ def schedule_for(resolution: int, steps: int) -> Schedule:
     """
     if resolution < 1 or steps < 10:
         raise ThermoxelsError(
-            explain(
-                "schedule",
-                expected="at least 1 voxel and 10 steps",
-                got=f"{resolution} voxels, {steps} steps",
-                remedy="Raise them.",
-            )
+            "schedule",
+            expected="at least 1 voxel and 10 steps",
+            got=f"{resolution} voxels, {steps} steps",
+            remedy="Raise them.",
         )
     resolutions = [resolution]
     while resolutions[0] % 2 == 0 and resolutions[0] // 2 >= COARSEST and len(resolutions) <= max(_REFINE):

@@ -12,7 +12,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from thermoxels_ns.core.errors import CheckpointError, explain
+from thermoxels_ns.core.errors import CheckpointError
 from thermoxels_ns.training.schedule import QUALITIES, Quality, Schedule, schedule_for
 
 
@@ -80,12 +80,10 @@ class ThermoxelsTrainer(Trainer):
         quality = self.config.quality
         if quality is not None and first >= steps:
             raise CheckpointError(
-                explain(
-                    "checkpoint",
-                    expected=f"one from before step {steps}, where quality {quality} ends",
-                    got=f"step {first}",
-                    remedy="Pass --max-num-iterations, how many more steps to take, in place of --quality.",
-                )
+                "checkpoint",
+                expected=f"one from before step {steps}, where quality {quality} ends",
+                got=f"step {first}",
+                remedy="Pass --max-num-iterations, how many more steps to take, in place of --quality.",
             )
         self._check_lattice(first)
         if quality is not None:
@@ -104,12 +102,10 @@ class ThermoxelsTrainer(Trainer):
             missing = None if file is None or file.is_file() else f"no file {file}"
         if missing is not None:
             raise CheckpointError(
-                explain(
-                    "checkpoint",
-                    expected="a folder with step-*.ckpt for --load-dir, or such a file for --load-checkpoint",
-                    got=missing,
-                    remedy="Pass the folder nerfstudio_models of a training.",
-                )
+                "checkpoint",
+                expected="a folder with step-*.ckpt for --load-dir, or such a file for --load-checkpoint",
+                got=missing,
+                remedy="Pass the folder nerfstudio_models of a training.",
             )
 
     def _check_lattice(self, first: int) -> None:
@@ -119,12 +115,10 @@ class ThermoxelsTrainer(Trainer):
         expected, found = model.config.resolutions[refined], max(model.grid.lattice.cell_shape)
         if found < expected:
             raise CheckpointError(
-                explain(
-                    "checkpoint",
-                    expected=f"at least {expected} voxels at step {first}, which these options refine to before it",
-                    got=f"{found} voxels",
-                    remedy="Pass the quality, or the resolutions and refine-at, that the training began with.",
-                )
+                "checkpoint",
+                expected=f"at least {expected} voxels at step {first}, which these options refine to before it",
+                got=f"{found} voxels",
+                remedy="Pass the quality, or the resolutions and refine-at, that the training began with.",
             )
 
     def save_checkpoint(self, step: int) -> None:

@@ -42,22 +42,18 @@ def board_of(settings: CaptureSettings) -> CheckerBoard | None:
         return None
     if missing or settings.rig is not None:
         raise SceneError(
-            explain(
-                "checker board",
-                expected="--board-photos, --board and --board-square-m together, and no --rig beside them",
-                got=("no " + " and no ".join(missing)) if missing else "all of them and --rig",
-                remedy="Pass --board-photos FOLDER --board 7x5 --board-square-m 0.03, or none of them.",
-            )
+            "checker board",
+            expected="--board-photos, --board and --board-square-m together, and no --rig beside them",
+            got=("no " + " and no ".join(missing)) if missing else "all of them and --rig",
+            remedy="Pass --board-photos FOLDER --board 7x5 --board-square-m 0.03, or none of them.",
         )
     match = _SIZE.fullmatch(str(settings.board).strip())
     if match is None:
         raise SceneError(
-            explain(
-                "--board",
-                expected="inner corners along both sides, such as 7x5",
-                got=repr(settings.board),
-                remedy="Count the corners where four squares meet; one less than squares.",
-            )
+            "--board",
+            expected="inner corners along both sides, such as 7x5",
+            got=repr(settings.board),
+            remedy="Count the corners where four squares meet; one less than squares.",
         )
     sides = sorted(map(int, match.groups()), reverse=True)
     assert settings.board_square_m is not None
@@ -100,12 +96,10 @@ def rig_from_board_photos(
     if not search.pairs:
         example = next((f"{path.name}: {why}" for path, why in search.unpaired.items()), "no camera files")
         raise SceneError(
-            explain(
-                f"board pictures in {source}",
-                expected="photographs with thermal images",
-                got=f"none; {example}",
-                remedy="Give both of a shot the same name or time.",
-            )
+            f"board pictures in {source}",
+            expected="photographs with thermal images",
+            got=f"none; {example}",
+            remedy="Give both of a shot the same name or time.",
         )
     read = read_frames(search.pairs, source, folder, radiometry, settings.skip_bad, settings.thermal_mask, say)
     if read.thermal_size != thermal_size:
@@ -122,12 +116,10 @@ def rig_from_board_photos(
     estimate = rig_from_boards(pairs, visible, replace(start, translation_sigma=BASELINE_SIGMA_M), board)
     if not estimate.determined:
         raise SceneError(
-            explain(
-                f"board pictures in {source}",
-                expected=f"at least three pairs in which both cameras show the {board.columns} x {board.rows} corners",
-                got=estimate.explanation + f" Pairs: {_listed(names)}",
-                remedy="Check --board; heat the board evenly, hold it still, and let it fill a third of the picture.",
-            )
+            f"board pictures in {source}",
+            expected=f"at least three pairs in which both cameras show the {board.columns} x {board.rows} corners",
+            got=estimate.explanation + f" Pairs: {_listed(names)}",
+            remedy="Check --board; heat the board evenly, hold it still, and let it fill a third of the picture.",
         )
     say(f"board: {estimate.explanation}")
     return estimate
@@ -141,12 +133,10 @@ def in_scene_units(rig: RigEstimate, scale: MetricScale | None, missing: str) ->
     """
     if scale is None:
         raise SceneError(
-            explain(
-                "scale",
-                expected="a known scale, because a board gives the distance of the lenses in metres",
-                got=f"none: {missing}",
-                remedy="Pass --known-distance or --marker-side-m; poses that were found are kept.",
-            )
+            "scale",
+            expected="a known scale, because a board gives the distance of the lenses in metres",
+            got=f"none: {missing}",
+            remedy="Pass --known-distance or --marker-side-m; poses that were found are kept.",
         )
     transform, covariance = rig.visible_to_thermal.copy(), rig.covariance.copy()
     transform[:3, 3] /= scale.metres_per_unit

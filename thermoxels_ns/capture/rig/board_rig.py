@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel, prior_sigmas
 from thermoxels_ns.capture.stage_types import CameraModel, RigEstimate, RigStart
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -40,12 +40,10 @@ class CheckerBoard:
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or self.columns == self.rows or not self.square_m > 0.0:
             raise SceneError(
-                explain(
-                    "checker board",
-                    expected="at least 3 inner corners per side, not as many along both, and a square above 0 m",
-                    got=f"{self.columns} x {self.rows} corners of {self.square_m} m",
-                    remedy="Count the inner corners; use a board with sides that differ.",
-                )
+                "checker board",
+                expected="at least 3 inner corners per side, not as many along both, and a square above 0 m",
+                got=f"{self.columns} x {self.rows} corners of {self.square_m} m",
+                remedy="Count the inner corners; use a board with sides that differ.",
             )
 
     @property

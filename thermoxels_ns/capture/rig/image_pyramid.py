@@ -15,7 +15,7 @@ from thermoxels_ns.capture.rig.parameters import RigModel
 from thermoxels_ns.capture.rig.score import EdgePoints, RigScore, ThermalEdges
 from thermoxels_ns.capture.sfm.sparse_depth import SparseDepth
 from thermoxels_ns.capture.stage_types import CameraModel, RigFrame
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 
 FloatImage = npt.NDArray[np.float32]
 
@@ -141,12 +141,10 @@ def read_temperatures(frame: RigFrame, camera: CameraModel) -> FloatImage:
     image = np.load(source, allow_pickle=False) if isinstance(source, Path) else np.asarray(source)
     if image.shape != (camera.height, camera.width):
         raise SceneError(
-            explain(
-                f"{frame.name}: temperatures",
-                expected=f"the thermal camera's {camera.height} rows and {camera.width} columns",
-                got=image.shape,
-                remedy="Leave the frame out, or give the camera that took it.",
-            )
+            f"{frame.name}: temperatures",
+            expected=f"the thermal camera's {camera.height} rows and {camera.width} columns",
+            got=image.shape,
+            remedy="Leave the frame out, or give the camera that took it.",
         )
     return image.astype(np.float32)
 
@@ -160,12 +158,10 @@ def read_photograph(frame: RigFrame, camera: CameraModel) -> FloatImage:
         image = cv2.imdecode(encoded, flags) if len(encoded) else None
         if image is None:
             raise SceneError(
-                explain(
-                    f"{frame.name}: {source.name}",
-                    expected="a readable photograph",
-                    got="a file that is damaged or no image",
-                    remedy="Copy it from the camera again or leave the frame out.",
-                )
+                f"{frame.name}: {source.name}",
+                expected="a readable photograph",
+                got="a file that is damaged or no image",
+                remedy="Copy it from the camera again or leave the frame out.",
             )
     else:
         image = np.asarray(source)
@@ -173,11 +169,9 @@ def read_photograph(frame: RigFrame, camera: CameraModel) -> FloatImage:
     height, width = image.shape
     if abs(width * camera.height / (height * camera.width) - 1.0) > _ASPECT_TOLERANCE:
         raise SceneError(
-            explain(
-                f"{frame.name}: photograph",
-                expected=f"the aspect of the visible camera, {camera.width} x {camera.height}",
-                got=f"{width} x {height} pixels",
-                remedy="Use the photographs that the poses were computed from.",
-            )
+            f"{frame.name}: photograph",
+            expected=f"the aspect of the visible camera, {camera.width} x {camera.height}",
+            got=f"{width} x {height} pixels",
+            remedy="Use the photographs that the poses were computed from.",
         )
     return image.astype(np.float32)

@@ -14,7 +14,7 @@ from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.sfm.model import SfmModel
 from thermoxels_ns.capture.stage_types import CameraModel, RigEstimate, RigFrame, RigStart
 from thermoxels_ns.capture.stages import read_json
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 
 _MOST_ERROR_PX = 4.0
 """Points that project farther than this from where they were seen are not used, [pixels of the photographs]."""
@@ -129,21 +129,17 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
         if isinstance(problem, SceneError):
             raise
         got = f"no {problem}" if isinstance(problem, KeyError) else str(problem)
-        raise SceneError(explain(str(file), expected="'thermal_camera' and 'rig'", got=got, remedy=remedy)) from problem
+        raise SceneError(str(file), expected="'thermal_camera' and 'rig'", got=got, remedy=remedy) from problem
     if not _is_rigid(transform):
         raise SceneError(
-            explain(
-                f"{file}: rig", expected="4 x 4 numbers, a rotation and a shift", got=transform.tolist(), remedy=remedy
-            )
+            f"{file}: rig", expected="4 x 4 numbers, a rotation and a shift", got=transform.tolist(), remedy=remedy
         )
     if (camera.width, camera.height) != thermal_size:
         raise SceneError(
-            explain(
-                f"{file.name}: thermal_camera",
-                expected=f"{thermal_size[0]} x {thermal_size[1]} pixels, as the images have",
-                got=f"{camera.width} x {camera.height}",
-                remedy="Pass the rig of the same camera and mode.",
-            )
+            f"{file.name}: thermal_camera",
+            expected=f"{thermal_size[0]} x {thermal_size[1]} pixels, as the images have",
+            got=f"{camera.width} x {camera.height}",
+            remedy="Pass the rig of the same camera and mode.",
         )
     theirs = content.get("metres_per_unit")
     if metres_per_unit is not None and isinstance(theirs, (int, float)) and 0.0 < theirs < math.inf:
@@ -169,12 +165,10 @@ def _pixels(entries: Any, name: str, file: Path) -> int:
     number = float(entries[name])
     if not number.is_integer():  # neither infinity nor NaN is one
         raise SceneError(
-            explain(
-                f"{file.name}: thermal_camera.{name}",
-                expected="a whole number of pixels",
-                got=entries[name],
-                remedy="Pass the transforms.json of an earlier capture with the same camera.",
-            )
+            f"{file.name}: thermal_camera.{name}",
+            expected="a whole number of pixels",
+            got=entries[name],
+            remedy="Pass the transforms.json of an earlier capture with the same camera.",
         )
     return int(number)
 

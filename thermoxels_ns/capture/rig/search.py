@@ -20,7 +20,7 @@ from thermoxels_ns.capture.rig.score import RigScore
 from thermoxels_ns.capture.rig.subpixel import polish
 from thermoxels_ns.capture.rig.uncertainty import certainty_text
 from thermoxels_ns.capture.stage_types import CameraModel, RigEstimate, RigFrame, RigStart
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -59,12 +59,10 @@ def estimate_rig(
     usable = [frame for frame in frames if np.count_nonzero(frame.points_visible()[:, 2] > 0.0) >= _FEWEST_POINTS]
     if not usable:
         raise SceneError(
-            explain(
-                "rig",
-                expected=f"frames with a pose, a thermal partner and at least {_FEWEST_POINTS} scene points",
-                got=f"{len(frames)} frames, none of them with that many",
-                remedy="Check that structure from motion registered the photographs and that poses are in OpenGL axes.",
-            )
+            "rig",
+            expected=f"frames with a pose, a thermal partner and at least {_FEWEST_POINTS} scene points",
+            got=f"{len(frames)} frames, none of them with that many",
+            remedy="Check that structure from motion registered the photographs and that poses are in OpenGL axes.",
         )
     chosen = [usable[i] for i in np.unique(np.linspace(0, len(usable) - 1, min(len(usable), _MOST_FRAMES)).astype(int))]
     progress("Reading the frames", 0.0)

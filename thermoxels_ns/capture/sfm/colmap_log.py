@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from thermoxels_ns.capture.sfm.disk_space import filled, is_full
-from thermoxels_ns.core.errors import ThermoxelsError, explain
+from thermoxels_ns.core.errors import ThermoxelsError
 
 _FATAL_ONLY = 3
 
@@ -48,11 +48,9 @@ def colmap_stopped(reason: str, folder: Path) -> ThermoxelsError:
     if is_full(folder) or "disk is full" in reason:
         return filled(folder, "features, matches and poses")
     return ThermoxelsError(
-        explain(
-            "COLMAP",
-            expected="to end",
-            got=reason,
-            remedy="Check free space and memory and run the command again; if that does not help, begin anew with "
-            "--from-stage poses.",
-        )
+        "COLMAP",
+        expected="to end",
+        got=reason,
+        remedy="Check free space and memory and run the command again; if that does not help, begin anew with "
+        "--from-stage poses.",
     )

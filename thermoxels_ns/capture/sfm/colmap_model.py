@@ -10,7 +10,7 @@ import numpy as np
 
 from thermoxels_ns.capture.sfm.model import SfmModel
 from thermoxels_ns.capture.stage_types import OPENGL_FROM_OPENCV, CameraModel
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 
 _FIELDS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -31,12 +31,10 @@ def camera_of_colmap(camera: Any) -> CameraModel:
     name = camera.model.name
     if name not in _FIELDS:
         raise SceneError(
-            explain(
-                "COLMAP camera",
-                expected="a lens model out of " + ", ".join(_FIELDS),
-                got=name,
-                remedy="Run COLMAP with --ImageReader.camera_model OPENCV, or let thermoxels capture find the poses.",
-            )
+            "COLMAP camera",
+            expected="a lens model out of " + ", ".join(_FIELDS),
+            got=name,
+            remedy="Run COLMAP with --ImageReader.camera_model OPENCV, or let thermoxels capture find the poses.",
         )
     values = dict(zip(_FIELDS[name], map(float, camera.params)))
     focal = values.pop("f", None)
@@ -63,12 +61,10 @@ def model_of_colmap(
     cameras = {image.camera_id for image in posed.values()}
     if len(cameras) != 1:
         raise SceneError(
-            explain(
-                "COLMAP model",
-                expected="photographs of one camera",
-                got=f"{len(posed)} of the {len(frame_of_image)} photographs, of {len(cameras)} cameras",
-                remedy="Give a model of these photographs with one camera (--ImageReader.single_camera 1).",
-            )
+            "COLMAP model",
+            expected="photographs of one camera",
+            got=f"{len(posed)} of the {len(frame_of_image)} photographs, of {len(cameras)} cameras",
+            remedy="Give a model of these photographs with one camera (--ImageReader.single_camera 1).",
         )
     found = camera_of_colmap(reconstruction.cameras[cameras.pop()])
     size = size or (found.width, found.height)
@@ -112,10 +108,8 @@ def read_colmap(folder: Path) -> Any:
         return pycolmap.Reconstruction(str(folder))
     except Exception as problem:  # pycolmap raises RuntimeError, ValueError, IndexError by version
         raise SceneError(
-            explain(
-                str(folder),
-                expected="a COLMAP model (cameras, images and points3D as .bin or .txt)",
-                got=str(problem).splitlines()[0][:200] if str(problem) else type(problem).__name__,
-                remedy="Pass --poses the folder that holds them, such as sparse/0.",
-            )
+            str(folder),
+            expected="a COLMAP model (cameras, images and points3D as .bin or .txt)",
+            got=str(problem).splitlines()[0][:200] if str(problem) else type(problem).__name__,
+            remedy="Pass --poses the folder that holds them, such as sparse/0.",
         ) from problem

@@ -6,7 +6,7 @@ import os
 import shutil
 from pathlib import Path
 
-from thermoxels_ns.core.errors import OutputError, explain
+from thermoxels_ns.core.errors import OutputError
 
 _FULL_BYTES = 1_000_000
 """Free space up to which a disk is taken for the reason why a program ended: programs write whole pages."""
@@ -55,10 +55,8 @@ def disk_of(path: Path) -> Path:
 
 def _too_little(folder: Path, expected: str, free: int, remedy: str) -> OutputError:
     return OutputError(
-        explain(
-            f"disk at {disk_of(folder)}",
-            expected=expected,
-            got=f"{free / 1e6:.0f} MB",
-            remedy=f"{remedy}; finished stages are kept. It was to be written to {folder}.",
-        )
+        f"disk at {disk_of(folder)}",
+        expected=expected,
+        got=f"{free / 1e6:.0f} MB",
+        remedy=f"{remedy}; finished stages are kept. It was to be written to {folder}.",
     )

@@ -15,7 +15,7 @@ from thermoxels_ns.capture.sfm.model import SfmModel
 from thermoxels_ns.capture.sfm.poses import Poses, common_size
 from thermoxels_ns.capture.stage_types import CameraModel
 from thermoxels_ns.capture.stages import read_json
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.folder_walls import path_inside
 
 
@@ -41,12 +41,10 @@ def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
         model = _read_transforms(path, photographs)
     else:
         raise SceneError(
-            explain(
-                "poses",
-                expected="a COLMAP model's folder or a transforms.json",
-                got=f"nothing at {path}",
-                remedy="Check the path.",
-            )
+            "poses",
+            expected="a COLMAP model's folder or a transforms.json",
+            got=f"nothing at {path}",
+            remedy="Check the path.",
         )
     order = {name: number for number, name in enumerate(photographs)}
     missing = {name: f"{path.name} has no pose of it" for name in photographs if name not in model.frames}
@@ -78,13 +76,11 @@ def fitted_to_photographs(poses: Poses, photographs: Mapping[str, Path]) -> Pose
     # The sides of a reduced image are rounded to whole pixels.
     if abs(factors[0] / factors[1] - 1.0) > 1.0 / min(*size, camera.width, camera.height):
         raise SceneError(
-            explain(
-                "given poses",
-                expected=f"photographs with the proportions of {camera.width} x {camera.height} pixels, as their "
-                "camera has",
-                got=f"{size[0]} x {size[1]}",
-                remedy="Use the photographs that the poses were computed from, neither cropped nor turned.",
-            )
+            "given poses",
+            expected=f"photographs with the proportions of {camera.width} x {camera.height} pixels, as their "
+            "camera has",
+            got=f"{size[0]} x {size[1]}",
+            remedy="Use the photographs that the poses were computed from, neither cropped nor turned.",
         )
     fitted = replace(
         model,
@@ -116,9 +112,7 @@ def _read_transforms(path: Path, photographs: Mapping[str, str]) -> SfmModel:
     content: Any = read_json(path)
     entries = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise SceneError(
-            explain(str(path), expected="a list 'frames'", got="none", remedy="Pass another transforms.json.")
-        )
+        raise SceneError(str(path), expected="a list 'frames'", got="none", remedy="Pass another transforms.json.")
     names = []
     for index, entry in enumerate(entries):
         where = f"{path.name}: frame {index}"
@@ -135,19 +129,17 @@ def _read_transforms(path: Path, photographs: Mapping[str, str]) -> SfmModel:
         k1, k2, k3, k4, p1, p2 = lens.distortion
         if k3 or k4:
             raise SceneError(
-                explain(where, expected="distortion k1, k2, p1, p2", got=f"k3 {k3}, k4 {k4}", remedy="Undistort first.")
+                where, expected="distortion k1, k2, p1, p2", got=f"k3 {k3}, k4 {k4}", remedy="Undistort first."
             )
         cameras.add(CameraModel(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, k1, k2, p1, p2))
         frames.append(frame_of[name])
         poses.append(read_pose(entry.get("transform_matrix"), f"{where}: transform_matrix"))
     if len(cameras) != 1:
         raise SceneError(
-            explain(
-                str(path),
-                expected="photographs of one camera",
-                got=f"{len(frames)} photographs of {len(cameras)} cameras",
-                remedy="Give one set of intrinsics for all frames, or let thermoxels capture find the poses.",
-            )
+            str(path),
+            expected="photographs of one camera",
+            got=f"{len(frames)} photographs of {len(cameras)} cameras",
+            remedy="Give one set of intrinsics for all frames, or let thermoxels capture find the poses.",
         )
     return SfmModel(
         tuple(frames),
@@ -179,11 +171,9 @@ def _frames_of(names: list[str], photographs: Mapping[str, str], path: Path) -> 
     twice = {frame for frame, count in Counter(found.values()).items() if count > 1}
     if not found or twice:
         raise SceneError(
-            explain(
-                str(path),
-                expected="names of the capture's photographs",
-                got=f"{sorted(twice)[0]} twice" if twice else f"{names[0] if names else 'no name'} and no known one",
-                remedy="Pass the poses of these photographs; they are recognised by their file names.",
-            )
+            str(path),
+            expected="names of the capture's photographs",
+            got=f"{sorted(twice)[0]} twice" if twice else f"{names[0] if names else 'no name'} and no known one",
+            remedy="Pass the poses of these photographs; they are recognised by their file names.",
         )
     return found

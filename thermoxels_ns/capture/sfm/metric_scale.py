@@ -15,7 +15,7 @@ from thermoxels_ns.capture.photograph import GpsFix, open_photograph
 from thermoxels_ns.capture.sfm.model import SfmModel
 from thermoxels_ns.capture.stage_types import FloatArray
 from thermoxels_ns.core.checks import check_positive
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 
 _EARTH_RADIUS_M, _FLATTENING = 6378137.0, 1.0 / 298.257223563
 _WORST_GPS = 0.3
@@ -136,9 +136,7 @@ def scale_from_distance(model: SfmModel, measured: MeasuredDistance, photograph_
         errors.append(error)
     apart = float(np.linalg.norm(ends[0] - ends[1]))
     if not apart > 0:
-        raise SceneError(
-            explain("known distance", expected="two different points", got="one", remedy="Pass two pixels.")
-        )
+        raise SceneError("known distance", expected="two different points", got="one", remedy="Pass two pixels.")
     along = (ends[1] - ends[0]) / apart
     of_points = math.hypot(*(float(np.abs(error @ along)) for error in errors)) / apart
     of_tape = (measured.standard_error_m or 0.0) / measured.distance_m
@@ -220,12 +218,10 @@ def _frame_named(model: SfmModel, name: str, photograph_of: Mapping[str, str]) -
         if name in (frame, file, Path(file).name, Path(file).stem):
             return index
     raise SceneError(
-        explain(
-            "known distance",
-            expected="a photograph whose pose was found",
-            got=name,
-            remedy=f"Pass one of them, such as {photograph_of.get(model.frames[0], model.frames[0])}.",
-        )
+        "known distance",
+        expected="a photograph whose pose was found",
+        got=name,
+        remedy=f"Pass one of them, such as {photograph_of.get(model.frames[0], model.frames[0])}.",
     )
 
 
@@ -234,12 +230,10 @@ def _surface_point(model: SfmModel, index: int, pixel: tuple[float, float]) -> t
     camera = model.camera
     if not (0 <= pixel[0] <= camera.width and 0 <= pixel[1] <= camera.height):
         raise SceneError(
-            explain(
-                "known distance",
-                expected=f"pixels inside {camera.width} x {camera.height}",
-                got=pixel,
-                remedy="Count x to the right and y down from the upper left corner.",
-            )
+            "known distance",
+            expected=f"pixels inside {camera.width} x {camera.height}",
+            got=pixel,
+            remedy="Count x to the right and y down from the upper left corner.",
         )
     points, pixels = model.seen_by(index)
     apart = np.linalg.norm(pixels - pixel, axis=1)
@@ -247,12 +241,10 @@ def _surface_point(model: SfmModel, index: int, pixel: tuple[float, float]) -> t
     near = near[apart[near] <= _NEAR_SHARE * max(camera.width, camera.height)]
     if len(near) < 4:
         raise SceneError(
-            explain(
-                "known distance",
-                expected=f"scene points around pixel {pixel}",
-                got=len(near),
-                remedy="Measure between points with texture around them.",
-            )
+            "known distance",
+            expected=f"scene points around pixel {pixel}",
+            got=len(near),
+            remedy="Measure between points with texture around them.",
         )
     depth = model.in_camera(index, model.points[points[near]])[:, 2]
     weight = 1.0 / (1.0 + apart[near] / (np.median(apart[near]) + 1e-9))

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.capture.stage_types import OPENGL_FROM_OPENCV, CameraModel, FloatArray
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class SfmModel:
         for name, (array, shape) in shapes.items():
             if array.shape != shape:
                 raise SceneError(
-                    explain(f"SfM model: {name}", expected=f"shape {shape}", got=array.shape, remedy="Run it again.")
+                    f"SfM model: {name}", expected=f"shape {shape}", got=array.shape, remedy="Run it again."
                 )
 
     @property

@@ -16,7 +16,7 @@ from thermoxels_ns.capture.sfm.feature_matching import FeatureOptions, LensModel
 from thermoxels_ns.capture.sfm.mapping import MIN_FRAMES, MatchedPhotographs, map_photographs, triangulate
 from thermoxels_ns.capture.sfm.model import SfmModel
 from thermoxels_ns.capture.stage_types import CameraModel
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 
 _GUESSED_FOCAL = 1.0
 """Of the longest side, where the photograph does not say: a lens of 53 degrees."""
@@ -129,22 +129,18 @@ def add_points(
     names = list(given.frames)
     if len(names) < 2:
         raise SceneError(
-            explain(
-                "given poses",
-                expected="poses of at least 2 photographs, which see the same points",
-                got=len(names),
-                remedy="Give poses of more photographs, or let thermoxels capture find them.",
-            )
+            "given poses",
+            expected="poses of at least 2 photographs, which see the same points",
+            got=len(names),
+            remedy="Give poses of more photographs, or let thermoxels capture find them.",
         )
     size, other = common_size({name: photographs[name] for name in names})
     if other or size != (given.camera.width, given.camera.height):
         raise SceneError(
-            explain(
-                "given poses",
-                expected=f"photographs of {given.camera.width} x {given.camera.height} pixels, as their camera has",
-                got=f"{size[0]} x {size[1]}",
-                remedy="Use the photographs that the poses were computed from.",
-            )
+            "given poses",
+            expected=f"photographs of {given.camera.width} x {given.camera.height} pixels, as their camera has",
+            got=f"{size[0]} x {size[1]}",
+            remedy="Use the photographs that the poses were computed from.",
         )
     images = _reduced(photographs, names, folder / "images", size, options.image_size)
     mask_folder = _write_masks(masks, images, folder / "masks")
@@ -220,11 +216,9 @@ def _write_masks(masks: PhotographMasks | None, images: _ReducedImages, folder: 
 
 def _too_few(got: int, what: str) -> SceneError:
     return SceneError(
-        explain(
-            "poses",
-            expected=f"at least {MIN_FRAMES} {what}",
-            got=got,
-            remedy="Take more photographs with more overlap (each part of the scene in three or more), in focus and "
-            "with texture; or give poses with --poses.",
-        )
+        "poses",
+        expected=f"at least {MIN_FRAMES} {what}",
+        got=got,
+        remedy="Take more photographs with more overlap (each part of the scene in three or more), in focus and "
+        "with texture; or give poses with --poses.",
     )

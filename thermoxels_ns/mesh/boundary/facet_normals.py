@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from thermoxels_ns.core.checks import check_finite
 from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.mesh.boundary.net_planes import evened_normals, net_planes, net_vertices
 from thermoxels_ns.mesh.boundary.surface_net import surface_net, voxel_faces
 
@@ -76,7 +76,7 @@ def true_surface(
     return normal[faces.of_triangle], factor[faces.of_triangle]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _moved_quads(vertices, corners, outwards):
     """Unit normal and area of each quadrilateral; its face's own normal where it is folded or turned over."""
     normal, area = outwards.copy(), np.zeros(len(corners))

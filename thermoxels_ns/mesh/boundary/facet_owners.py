@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.voxel_tets import OUTWARD_FACES
 
 
@@ -53,12 +53,10 @@ def facet_owners(
     second = order[np.minimum(first + 1, len(order) - 1)]
     if len(first) != len(facets) or np.any(uses != 2) or np.any(second < len(facets)):
         raise MeshError(
-            explain(
-                "facets",
-                expected="different triangles, each a face of exactly one tetrahedron",
-                got=f"{len(facets) - np.count_nonzero((uses == 2) & (second >= len(facets)))} others",
-                remedy="Build the mesh with thermoxels_ns.mesh.build.",
-            )
+            "facets",
+            expected="different triangles, each a face of exactly one tetrahedron",
+            got=f"{len(facets) - np.count_nonzero((uses == 2) & (second >= len(facets)))} others",
+            remedy="Build the mesh with thermoxels_ns.mesh.build.",
         )
     face = np.empty(len(facets), dtype=np.int64)
     face[order[first]] = second - len(facets)

@@ -4,7 +4,6 @@ The planes start where the level function says that the surface crosses the line
 one. They are evened out between faces of about the same direction, and carried on to sharp edges from the flat parts
 beside them, because there the level function, which is smooth over three voxels, rounds the edges off.
 
-Kernels are kept compiled by numba, which watches a kernel's own file: none may call one of another file.
 """
 
 from __future__ import annotations
@@ -13,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.mesh.boundary.surface_net import SurfaceNet, VoxelFaces
 
 FloatArray = npt.NDArray[np.float64]
@@ -118,7 +117,7 @@ def evened_normals(normal: FloatArray, net: SurfaceNet) -> FloatArray:
     return normal
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _crossings(level, upper, axis, across_share):
     """Where the level is 0 between the two voxels of each face, linear in between, and minus its gradient there."""
     point, normal = np.empty((len(axis), 3)), np.empty((len(axis), 3))
@@ -154,7 +153,7 @@ def _crossings(level, upper, axis, across_share):
     return point, normal
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _roughness(point, normal, corners, first, around, least):
     """How far the points around each face are off its plane (root mean square), [voxels]; see `_evened_points`."""
     roughness = np.empty(len(corners))
@@ -177,7 +176,7 @@ def _roughness(point, normal, corners, first, around, least):
     return roughness
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _mean(values, corners, first, around):
     """Mean of each face's value and those around it."""
     mean = np.empty(len(corners))
@@ -193,7 +192,7 @@ def _mean(values, corners, first, around):
     return mean
 
 
-@njit(nogil=True, cache=True)
+@kernel(error_model="python")
 def _least(values, corners, first, around):
     """Least of each face's value and those around it."""
     least = values.copy()
@@ -205,7 +204,7 @@ def _least(values, corners, first, around):
     return least
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _evened_normals(normal, share, corners, first, around, least):
     """Average each normal with those of the faces around it, the more the smaller the angle between them.
 
@@ -235,7 +234,7 @@ def _evened_normals(normal, share, corners, first, around, least):
     return result
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _evened_points(point, normal, share, corners, first, around, least):
     """Move each plane along its normal to where its neighbours are.
 
@@ -265,7 +264,7 @@ def _evened_points(point, normal, share, corners, first, around, least):
     return result
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _spread_deg(normal, corners, first, around):
     """Root mean square angle between the normals around each face, its own included, and their mean, [degrees]."""
     spread = np.empty(len(corners))
@@ -285,7 +284,7 @@ def _spread_deg(normal, corners, first, around):
     return spread
 
 
-@njit(nogil=True, cache=True)
+@kernel(error_model="python")
 def _with_neighbours(marked, corners, first, around):
     """Faces that are marked or share a vertex with one that is."""
     result = marked.copy()
@@ -298,7 +297,7 @@ def _with_neighbours(marked, corners, first, around):
     return result
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _carried_on(waiting, point, normal, own, settled, corners, first, around, least, same, farthest):
     """Give waiting faces the plane of settled ones beside them, if it fits where they are."""
     new_point, new_normal, new_settled = point.copy(), normal.copy(), settled.copy()
@@ -337,7 +336,7 @@ def _carried_on(waiting, point, normal, own, settled, corners, first, around, le
     return new_point, new_normal, new_settled
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _meeting_points(point, normal, index, first, around, size, stiffness, farthest):
     """Vertices nearest to the planes of the faces around them, from the mean of these faces' points."""
     vertices = np.empty((len(index), 3))

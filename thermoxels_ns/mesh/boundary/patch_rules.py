@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 
 FACINGS = ("up", "side", "down")
 """Where a surface may face."""
@@ -213,4 +213,4 @@ def _shown(content: object) -> str:
 def _wrong(
     name: str, expected: str, got: object, remedy: str = "Correct the file; configs/patches-example.yaml explains it."
 ) -> MeshError:
-    return MeshError(explain(name, expected=expected, got=got, remedy=remedy))
+    return MeshError(name, expected=expected, got=got, remedy=remedy)

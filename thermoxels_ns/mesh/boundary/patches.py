@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_finite, check_shape
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.boundary.patch_rules import DEFAULT_PATCHES, DEFAULT_REGION, FACINGS, PatchRules, Rule
 
 _COS_45 = math.sqrt(0.5) + 1e-9
@@ -51,12 +51,10 @@ def facing(normals: npt.NDArray[np.float64], up: npt.ArrayLike) -> npt.NDArray[n
     length = float(np.linalg.norm(direction))
     if direction.shape != (3,) or not (math.isfinite(length) and length > 0.0):
         raise MeshError(
-            explain(
-                "up",
-                expected="three numbers that are not all 0",
-                got=direction.tolist(),
-                remedy="Pass the direction away from the ground.",
-            )
+            "up",
+            expected="three numbers that are not all 0",
+            got=direction.tolist(),
+            remedy="Pass the direction away from the ground.",
         )
     cosine = np.asarray(normals) @ (direction / length)
     return np.where(cosine > _COS_45, 0, np.where(cosine < -_COS_45, 2, 1)).astype(np.int64)
@@ -190,12 +188,10 @@ def _rule_of_each(
     if coloured:
         if colours is None:
             raise MeshError(
-                explain(
-                    f"{kind} {rules[coloured[0]].name}",
-                    expected="a mesh with colours, because its rule is by nearest_colour",
-                    got="a mesh without",
-                    remedy="Use box or plane, or a model that was trained on colour photographs.",
-                )
+                f"{kind} {rules[coloured[0]].name}",
+                expected="a mesh with colours, because its rule is by nearest_colour",
+                got="a mesh without",
+                remedy="Use box or plane, or a model that was trained on colour photographs.",
             )
         check_shape("colours", colours, (count, 3), remedy, MeshError)
         closest = np.full(count, np.inf)

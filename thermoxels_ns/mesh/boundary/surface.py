@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Colouring = Literal["temperature", "photographs"]
@@ -82,17 +82,15 @@ def surface_colours(
     if colouring == "photographs":
         if mesh.colour is None:
             raise MeshError(
-                explain(
-                    "colouring 'photographs'",
-                    expected="a mesh whose nodes have colours",
-                    got="a mesh without",
-                    remedy="Choose the colouring 'temperature', or build the mesh from a field that has colours.",
-                )
+                "colouring 'photographs'",
+                expected="a mesh whose nodes have colours",
+                got="a mesh without",
+                remedy="Choose the colouring 'temperature', or build the mesh from a field that has colours.",
             )
         return np.clip(np.asarray(mesh.colour, dtype=np.float64)[surface.nodes], 0.0, 1.0)
     if colouring != "temperature":
         raise MeshError(
-            explain("colouring", expected="'temperature' or 'photographs'", got=repr(colouring), remedy="Choose one.")
+            "colouring", expected="'temperature' or 'photographs'", got=repr(colouring), remedy="Choose one."
         )
     import matplotlib
 

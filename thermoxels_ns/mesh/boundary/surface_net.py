@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.core.kernel_cache import kernel
 
 IntArray = npt.NDArray[np.int64]
 
@@ -131,10 +131,10 @@ def surface_net(level: npt.NDArray, points_index: npt.NDArray, faces: VoxelFaces
 
 
 def _wrong(expected: str, got: str) -> MeshError:
-    return MeshError(explain("boundary facets", expected=expected, got=got, remedy=_REMEDY))
+    return MeshError("boundary facets", expected=expected, got=got, remedy=_REMEDY)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _halves(nodes, facets, shape):
     """Axis and lowest corner of each triangle; also how many are not half of a voxel face of the lattice."""
     axis = np.zeros(len(facets), np.int64)
@@ -159,7 +159,7 @@ def _halves(nodes, facets, shape):
     return axis, lowest, bad
 
 
-@njit(nogil=True, cache=True)
+@kernel(error_model="python")
 def _come_in_pairs(axis, lowest):
     """Whether triangles 2 n and 2 n + 1 are of one face, for all n."""
     for f in range(0, len(axis), 2):
@@ -171,7 +171,7 @@ def _come_in_pairs(axis, lowest):
     return True
 
 
-@njit(nogil=True, cache=True)
+@kernel(error_model="python")
 def _corners_and_sides(level, nodes, facets, of_triangle, axis, upper):
     """Nodes around each face, -1 where no triangle has one; side of the solid, 0 if it is on both or on none."""
     corners = np.full((len(axis), 4), -1)
@@ -194,7 +194,7 @@ def _corners_and_sides(level, nodes, facets, of_triangle, axis, upper):
     return corners, outwards, on_border
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _sheets(level, nodes, corners, rings, pairs):
     """Sheet of the surface at each pair of voxels around each node, -1 where both are the same; number of sheets.
 
@@ -253,7 +253,7 @@ def _sheets(level, nodes, corners, rings, pairs):
     return sheet, count
 
 
-@njit(nogil=True, cache=True)
+@kernel(error_model="python")
 def _vertices(upper, axis, corners, nodes, sheet, start):
     """Vertex at each corner of each face."""
     vertices = np.empty((len(corners), 4), np.int64)
@@ -276,7 +276,7 @@ def _vertices(upper, axis, corners, nodes, sheet, start):
     return vertices
 
 
-@njit(nogil=True, cache=True)
+@kernel(error_model="python")
 def _faces_of_vertices(corners, num_vertices):
     """Faces around each vertex, a counting sort."""
     first = np.zeros(num_vertices + 1, np.int64)

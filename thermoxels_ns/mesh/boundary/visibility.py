@@ -1,17 +1,14 @@
-"""Which boundary triangles some training camera has a free line of sight to.
-
-Kernels are kept compiled by numba, which watches a kernel's own file: none may call one of another file.
-"""
+"""Which boundary triangles some training camera has a free line of sight to."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy import ndimage
 
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 
@@ -178,7 +175,7 @@ class _EmptySpace:
         return _free_lines(self.block, np.ascontiguousarray(start - self.lowest), end - self.lowest)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _is_free(block, origin, x1, y1, z1):
     """Whether the line from a point to (x1, y1, z1) crosses no solid voxel; block is -1 in solid voxels."""
     x0, y0, z0 = origin[0], origin[1], origin[2]
@@ -212,7 +209,7 @@ def _is_free(block, origin, x1, y1, z1):
     return True
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _free_lines(block, start, end):
     """`_is_free` for many points and one end."""
     free = np.empty(len(start), np.bool_)
@@ -221,7 +218,7 @@ def _free_lines(block, start, end):
     return free
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _seen_by_any(block, lowest, middle, normal, start, open_start, centres, rotations, lenses):
     """Whether some camera that each point faces has it in its image, with a free line from the point's start.
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_positive, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import HeatError, MeshError, explain
+from thermoxels_ns.core.errors import HeatError, MeshError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.mesh.boundary.facet_owners import facet_owners
 from thermoxels_ns.mesh.files.content import FileContent, check_suffix, file_content
@@ -55,12 +55,7 @@ class HeatStep:
         whole = isinstance(self.steps, numbers.Integral) and not isinstance(self.steps, bool)
         if not whole or self.steps < 1:
             raise HeatError(
-                explain(
-                    "steps",
-                    expected="a whole number of at least 1",
-                    got=repr(self.steps),
-                    remedy="Pass 10, for example.",
-                )
+                "steps", expected="a whole number of at least 1", got=repr(self.steps), remedy="Pass 10, for example."
             )
 
 
@@ -118,13 +113,11 @@ def _set_names(name: str, names: Sequence[str]) -> list[str]:
     written = [re.sub(r"[^A-Za-z0-9_]+", "_", entry).upper() for entry in names]
     if len(set(written)) != len(written) or max(map(len, written)) > _LONGEST_NAME:
         raise MeshError(
-            explain(
-                name,
-                expected="names that differ in their letters and digits (capitals or not), of at most "
-                f"{_LONGEST_NAME} characters, as .inp files ask for",
-                got=list(names),
-                remedy="Rename them.",
-            )
+            name,
+            expected="names that differ in their letters and digits (capitals or not), of at most "
+            f"{_LONGEST_NAME} characters, as .inp files ask for",
+            got=list(names),
+            remedy="Rename them.",
         )
     return written
 

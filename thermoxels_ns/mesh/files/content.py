@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_finite, check_shape
-from thermoxels_ns.core.errors import MeshError, OutputError, explain
+from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.mesh.quality.checks import facet_area_vectors
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -71,7 +71,7 @@ def file_content(mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None =
         check_shape("colour", np.asarray(mesh.colour), (len(points), 3), remedy, MeshError)
         check_finite("colour", np.asarray(mesh.colour), remedy, MeshError)
     if not len(tets):
-        raise MeshError(explain("tets", expected="at least one tetrahedron", got="none", remedy=_REMEDY))
+        raise MeshError("tets", expected="at least one tetrahedron", got="none", remedy=_REMEDY)
     _check_indices("tets", tets, len(points))
     _check_indices("facets", facets, len(points))
 
@@ -114,7 +114,7 @@ def check_suffix(path: Path | str, suffix: str) -> Path:
     path = Path(path)
     if path.suffix != suffix:
         raise OutputError(
-            explain("mesh file", expected=f"a name that ends in {suffix}", got=path.name, remedy="Rename the file.")
+            "mesh file", expected=f"a name that ends in {suffix}", got=path.name, remedy="Rename the file."
         )
     return path
 
@@ -132,9 +132,7 @@ def _check_indices(name: str, values: npt.NDArray, count: int) -> None:
     if not np.issubdtype(values.dtype, np.integer) or (len(values) and (values.min() < 0 or values.max() >= count)):
         got = f"{values.min()} to {values.max()}" if len(values) else "nothing"
         raise MeshError(
-            explain(
-                name, expected=f"whole numbers from 0 to {count - 1}", got=f"{got} ({values.dtype})", remedy=_REMEDY
-            )
+            name, expected=f"whole numbers from 0 to {count - 1}", got=f"{got} ({values.dtype})", remedy=_REMEDY
         )
 
 
@@ -142,14 +140,10 @@ def _check_names(name: str, names: Sequence[str]) -> None:
     for entry in names:
         if not (isinstance(entry, str) and entry.strip() and entry.isprintable() and '"' not in entry):
             raise MeshError(
-                explain(
-                    name,
-                    expected="names of printable characters without a double quote",
-                    got=repr(entry),
-                    remedy="Rename it.",
-                )
+                name,
+                expected="names of printable characters without a double quote",
+                got=repr(entry),
+                remedy="Rename it.",
             )
     if len(set(names)) != len(names) or not names:
-        raise MeshError(
-            explain(name, expected="at least one name, all different", got=list(names), remedy="Rename them.")
-        )
+        raise MeshError(name, expected="at least one name, all different", got=list(names), remedy="Rename them.")

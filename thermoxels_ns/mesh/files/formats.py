@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import MeshError, OutputError, explain
+from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.mesh.boundary.surface import Colouring
 from thermoxels_ns.mesh.files.abaqus import HeatStep, write_inp
 from thermoxels_ns.mesh.files.gltf import write_glb
@@ -57,12 +57,10 @@ def _vtu(request: _Request) -> None:
 def _inp(request: _Request) -> None:
     if request.heat_step is None:
         raise MeshError(
-            explain(
-                "heat_step",
-                expected="material and times, which an .inp file runs with",
-                got=None,
-                remedy="Pass heat_step=HeatStep(...), or choose another format.",
-            )
+            "heat_step",
+            expected="material and times, which an .inp file runs with",
+            got=None,
+            remedy="Pass heat_step=HeatStep(...), or choose another format.",
         )
     write_inp(request.path, request.mesh, request.heat_step, temperature_c=request.temperature_c)
 
@@ -129,12 +127,10 @@ def mesh_format(path: Path | str) -> MeshFormat:
     path = Path(path)
     if path.suffix not in MESH_FORMATS:
         raise OutputError(
-            explain(
-                "mesh file",
-                expected=f"a name that ends in one of {', '.join(MESH_FORMATS)}",
-                got=path.name,
-                remedy="Rename the file.",
-            )
+            "mesh file",
+            expected=f"a name that ends in one of {', '.join(MESH_FORMATS)}",
+            got=path.name,
+            remedy="Rename the file.",
         )
     return MESH_FORMATS[path.suffix]
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.boundary.surface import Colouring, far_origin, surface_colours, surface_of, surface_range_c
 from thermoxels_ns.mesh.files.content import check_suffix, file_content
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -57,7 +57,7 @@ def write_glb(
     surface = surface_of(content.points_m, content.facets)
     if not len(surface.triangles):
         raise MeshError(
-            explain("facets", expected="at least one triangle", got="none", remedy="Build the mesh with its boundary.")
+            "facets", expected="at least one triangle", got="none", remedy="Build the mesh with its boundary."
         )
     rotation = _turn_to_y(up)
     light = _linear(surface_colours(mesh, surface, content.temperature_c, colouring))
@@ -144,9 +144,7 @@ def _turn_to_y(up: Sequence[float]) -> list[float]:
     direction = np.asarray(up, dtype=np.float64)
     length = float(np.linalg.norm(direction)) if direction.shape == (3,) else math.nan
     if not (math.isfinite(length) and length > 0.0):
-        raise MeshError(
-            explain("up", expected="three finite numbers, not all 0", got=up, remedy="Pass for instance (0, 0, 1).")
-        )
+        raise MeshError("up", expected="three finite numbers, not all 0", got=up, remedy="Pass for instance (0, 0, 1).")
     x, y, z = map(float, direction)
     # About up x y; about any level axis if up is +y or -y itself.
     level = math.hypot(x, z)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.boundary.facet_owners import facet_owners
 from thermoxels_ns.mesh.files.content import FileContent, check_suffix, file_content
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -53,12 +53,10 @@ def write_msh(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
     for name in (*content.region_names, *content.patch_names):
         if len(name.encode()) > _LONGEST_NAME:
             raise MeshError(
-                explain(
-                    "name of a region or patch",
-                    expected=f"at most {_LONGEST_NAME} bytes, which is what Gmsh reads",
-                    got=f"{len(name.encode())} bytes: {name!r}",
-                    remedy="Rename it.",
-                )
+                "name of a region or patch",
+                expected=f"at most {_LONGEST_NAME} bytes, which is what Gmsh reads",
+                got=f"{len(name.encode())} bytes: {name!r}",
+                remedy="Rename it.",
             )
     # All that can fail on a bad mesh comes before the file is opened.
     owner, _ = facet_owners(content.tets, content.facets)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_finite, check_shape
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.vtp import boundary_path
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, Boundary, TetMesh
 
@@ -139,4 +139,4 @@ def _array(data: Any, array: str, name: str) -> npt.NDArray:
 
 
 def _wrong(name: str, expected: str, got: object, remedy: str) -> MeshError:
-    return MeshError(explain(name, expected=expected, got=got, remedy=remedy))
+    return MeshError(name, expected=expected, got=got, remedy=remedy)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.boundary.surface import COLOUR_MAP, Colouring, surface_colours, surface_of, surface_range_c
 from thermoxels_ns.mesh.files.content import check_suffix, colour_bytes, file_content
 from thermoxels_ns.mesh.quality.checks import facet_area_vectors, facet_areas
@@ -55,12 +55,10 @@ def check_stl(mesh: TetMesh) -> None:
     rounding = 0.5 * float(np.spacing(np.float32(farthest)))
     if rounding > _ROUNDING_NOTICED * side:
         raise MeshError(
-            explain(
-                "mesh for .stl",
-                expected="coordinates near the origin, because STL has single precision",
-                got=f"one at {farthest:.6g}, where single precision moves nodes by up to {rounding:.3g}",
-                remedy="Write .ply, which has double precision, or shift the poses towards the origin.",
-            )
+            "mesh for .stl",
+            expected="coordinates near the origin, because STL has single precision",
+            got=f"one at {farthest:.6g}, where single precision moves nodes by up to {rounding:.3g}",
+            remedy="Write .ply, which has double precision, or shift the poses towards the origin.",
         )
 
 

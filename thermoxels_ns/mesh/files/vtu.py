@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_finite, check_shape, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import MeshError, OutputError, explain
+from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.core.units import celsius_to_kelvin
 from thermoxels_ns.mesh.files.content import check_suffix, colour_bytes, file_content
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -61,7 +61,7 @@ def write_vtu(
         values = np.asarray(values)
         if name in _OWN_ARRAYS:
             raise MeshError(
-                explain("point_data", expected=f"names other than {_OWN_ARRAYS}", got=repr(name), remedy="Rename it.")
+                "point_data", expected=f"names other than {_OWN_ARRAYS}", got=repr(name), remedy="Rename it."
             )
         check_shape(f"point_data[{name!r}]", values, (num_nodes, *values.shape[1:]), remedy, MeshError)
         arrays[name] = check_finite(f"point_data[{name!r}]", values, remedy, MeshError)
@@ -95,12 +95,10 @@ def write_vtk(writer: Any, path: Path, data: Any) -> None:
         writer.SetCompressionLevel(1)  # a quarter of the time of the default, for files 5 % larger
         if not writer.Write() or writer.GetErrorCode() or not temporary.is_file():
             raise OutputError(
-                explain(
-                    "mesh file",
-                    expected=f"to write {path}",
-                    got=f"VTK error {writer.GetErrorCode()}",
-                    remedy="Check the free space and the permissions of the folder.",
-                )
+                "mesh file",
+                expected=f"to write {path}",
+                got=f"VTK error {writer.GetErrorCode()}",
+                remedy="Check the free space and the permissions of the folder.",
             )
 
 
@@ -144,15 +142,13 @@ def _plain(name: str, value: Any) -> Any:
         return str(value)
     if isinstance(value, float) and not math.isfinite(value):
         raise MeshError(
-            explain(name, expected="a finite number", got=value, remedy="Leave it out, or write None for 'unknown'.")
+            name, expected="a finite number", got=value, remedy="Leave it out, or write None for 'unknown'."
         )
     if value is None or isinstance(value, (str, bool, int, float)):
         return value
     raise MeshError(
-        explain(
-            name,
-            expected="text, a number, a list, a mapping, a path or None",
-            got=type(value).__name__,
-            remedy="Convert it before writing.",
-        )
+        name,
+        expected="text, a number, a list, a mapping, a path or None",
+        got=type(value).__name__,
+        remedy="Convert it before writing.",
     )

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_finite, check_shape
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.face_count import Groups, IntArray, faces_of_rows, group_faces, group_pairs
 from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks, signed_volumes
 from thermoxels_ns.mesh.quality.topology import group_sides
@@ -233,7 +233,7 @@ def _volumes_and_angles(
 
 
 def _fail(name: str, expected: str, got: str) -> None:
-    raise MeshError(explain(f"mesh {name}", expected=expected, got=got, remedy=_REMEDY))
+    raise MeshError(f"mesh {name}", expected=expected, got=got, remedy=_REMEDY)
 
 
 def _smallest_first(facets: IntArray) -> IntArray:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
-from thermoxels_ns.core.errors import OutputError, explain
+from thermoxels_ns.core.errors import OutputError
 from thermoxels_ns.mesh.quality.criteria import DIHEDRAL_BOUNDS_DEG, angle_bins, in_percent
 from thermoxels_ns.mesh.quality.report import RATIO_BIN, QualityReport
 
@@ -36,9 +36,7 @@ def picture_of_quality(path: Path | str, report: QualityReport, title: str = "")
 
     path = Path(path)
     if path.suffix != ".png":
-        raise OutputError(
-            explain("picture", expected="a name that ends in .png", got=path.name, remedy="Rename the file.")
-        )
+        raise OutputError("picture", expected="a name that ends in .png", got=path.name, remedy="Rename the file.")
     figure = Figure(figsize=(12.5, 9.0), dpi=110, facecolor="white", layout="constrained")
     figure.suptitle(
         title or f"Mesh quality, {report.boundary_mode} boundary: {report.num_tets:,} tetrahedra",

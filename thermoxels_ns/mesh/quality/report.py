@@ -8,7 +8,7 @@ from typing import Any, get_args
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import (
     check_arrays,
     count_overlaps,
@@ -148,7 +148,7 @@ def quality_report(
     """
     if boundary_mode not in get_args(BoundaryMode):
         modes = " or ".join(get_args(BoundaryMode))
-        raise MeshError(explain("boundary_mode", expected=modes, got=repr(boundary_mode), remedy="Pass one of these."))
+        raise MeshError("boundary_mode", expected=modes, got=repr(boundary_mode), remedy="Pass one of these.")
     check_arrays(mesh)
     low_c, high_c = _observed_range(mesh, observed_range_c)
     shapes = _measure_shapes(mesh, angle_bins(boundary_mode))
@@ -263,23 +263,19 @@ def _observed_range(mesh: TetMesh, given: tuple[float, float] | None) -> tuple[f
         low, high = (float(value) for value in given)
         if not (np.isfinite([low, high]).all() and low <= high):
             raise MeshError(
-                explain(
-                    "observed_range_c",
-                    expected="two finite temperatures, the lower one first",
-                    got=given,
-                    remedy="Pass the lowest and the highest observed temperature.",
-                )
+                "observed_range_c",
+                expected="two finite temperatures, the lower one first",
+                got=given,
+                remedy="Pass the lowest and the highest observed temperature.",
             )
         return low, high
     observed = mesh.temperature_c[np.asarray(mesh.observed, dtype=bool)]
     if len(observed) == 0:
         raise MeshError(
-            explain(
-                "mesh observed",
-                expected="at least one node that a thermal ray saw",
-                got="none",
-                remedy="Pass observed_range_c, the lowest and the highest observed temperature.",
-            )
+            "mesh observed",
+            expected="at least one node that a thermal ray saw",
+            got="none",
+            remedy="Pass observed_range_c, the lowest and the highest observed temperature.",
         )
     return float(observed.min()), float(observed.max())
 

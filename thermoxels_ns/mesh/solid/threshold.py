@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
 
 FALLBACK_OPTICAL_DEPTH = 0.5
@@ -134,12 +134,10 @@ def percentile_threshold(density: npt.NDArray[np.float64], percentile: float) ->
     threshold = float(np.percentile(density, percentile))
     if percentile > 0.0 and 0.0 < density.min() == density.max():
         raise MeshError(
-            explain(
-                "density",
-                expected="some voxels denser than others",
-                got=f"the same density {threshold:.6g} in all {density.size} voxels",
-                remedy="Train longer, or pass --density-threshold to say from which density on a voxel is solid.",
-            )
+            "density",
+            expected="some voxels denser than others",
+            got=f"the same density {threshold:.6g} in all {density.size} voxels",
+            remedy="Train longer, or pass --density-threshold to say from which density on a voxel is solid.",
         )
     positive = density > 0.0
     reached = positive & (density >= threshold)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_positive
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.solid.interior import interior
 from thermoxels_ns.mesh.solid.level_set import level_of
@@ -85,46 +85,36 @@ class SolidSelection:
             value = getattr(self, name)
             if not (isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= _WIDEST):
                 remedy = f"Pass --{name.replace('_', '-')} {usual}."
-                raise MeshError(
-                    explain(name, expected=f"a whole number from 0 to {_WIDEST}", got=repr(value), remedy=remedy)
-                )
+                raise MeshError(name, expected=f"a whole number from 0 to {_WIDEST}", got=repr(value), remedy=remedy)
         if not 0.0 <= self.smallest_body <= 1.0:
             raise MeshError(
-                explain(
-                    "smallest_body",
-                    expected="a share from 0 to 1",
-                    got=self.smallest_body,
-                    remedy="Pass --smallest-body 0.01.",
-                )
+                "smallest_body",
+                expected="a share from 0 to 1",
+                got=self.smallest_body,
+                remedy="Pass --smallest-body 0.01.",
             )
         if self.density_percentile is not None and not 0.0 <= self.density_percentile <= 100.0:
             raise MeshError(
-                explain(
-                    "density_percentile",
-                    expected="a number from 0 to 100",
-                    got=self.density_percentile,
-                    remedy="Pass --density-percentile 90 to keep the densest tenth of the voxels.",
-                )
+                "density_percentile",
+                expected="a number from 0 to 100",
+                got=self.density_percentile,
+                remedy="Pass --density-percentile 90 to keep the densest tenth of the voxels.",
             )
         if self.density_threshold is not None and not (
             math.isfinite(self.density_threshold) and self.density_threshold >= 0.0
         ):
             raise MeshError(
-                explain(
-                    "density_threshold",
-                    expected="a finite number of at least 0, [1 / world unit]",
-                    got=self.density_threshold,
-                    remedy="Leave it out, and the training rays tell the threshold.",
-                )
+                "density_threshold",
+                expected="a finite number of at least 0, [1 / world unit]",
+                got=self.density_threshold,
+                remedy="Leave it out, and the training rays tell the threshold.",
             )
         if self.interior not in get_args(InteriorKind):
             raise MeshError(
-                explain(
-                    "interior",
-                    expected=" or ".join(get_args(InteriorKind)),
-                    got=repr(self.interior),
-                    remedy="Pass --interior solid.",
-                )
+                "interior",
+                expected=" or ".join(get_args(InteriorKind)),
+                got=repr(self.interior),
+                remedy="Pass --interior solid.",
             )
         if self.wall_thickness is not None:
             remedy = "Pass --wall-thickness 0.3, or leave it out to mesh what was seen."
@@ -195,12 +185,10 @@ def select_solid(
     chosen = _threshold(snapshot, density, selection)
     if not chosen.cells.any():
         raise MeshError(
-            explain(
-                "solid voxels",
-                expected=f"at least one voxel with density above 0 and at least the threshold {chosen.density:.6g}",
-                got=f"none of {density.size}; the highest density at a voxel centre is {density.max():.6g}",
-                remedy="Train longer, or lower --voxel-optical-depth, --density-threshold or --density-percentile.",
-            )
+            "solid voxels",
+            expected=f"at least one voxel with density above 0 and at least the threshold {chosen.density:.6g}",
+            got=f"none of {density.size}; the highest density at a voxel centre is {density.max():.6g}",
+            remedy="Train longer, or lower --voxel-optical-depth, --density-threshold or --density-percentile.",
         )
     cells = chosen.cells
     steps = [SolidStep("threshold", int(cells.sum()), 0, chosen.explanation)]
@@ -288,21 +276,17 @@ def _wall_voxels(
         return None
     if metres_per_world_unit is None:
         raise MeshError(
-            explain(
-                "wall_thickness",
-                expected="a scene whose scale is known",
-                got=f"{selection.wall_thickness:g} m, but no length of a unit",
-                remedy="Pass --metres-per-unit 1 if the input poses are in metres, or leave out --wall-thickness.",
-            )
+            "wall_thickness",
+            expected="a scene whose scale is known",
+            got=f"{selection.wall_thickness:g} m, but no length of a unit",
+            remedy="Pass --metres-per-unit 1 if the input poses are in metres, or leave out --wall-thickness.",
         )
     check_positive("metres_per_world_unit", metres_per_world_unit, "Pass --metres-per-unit.", MeshError)
     if snapshot.views is None or len(snapshot.views.focal) == 0:
         raise MeshError(
-            explain(
-                "wall_thickness",
-                expected="training cameras, which tell the side that is seen",
-                got="a field without cameras",
-                remedy="Export from a trained scene, or leave out --wall-thickness.",
-            )
+            "wall_thickness",
+            expected="training cameras, which tell the side that is seen",
+            got="a field without cameras",
+            remedy="Export from a trained scene, or leave out --wall-thickness.",
         )
     return selection.wall_thickness / (metres_per_world_unit * snapshot.lattice.voxel_size)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_finite, check_shape
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.stuffing.bcc_lattice import DIRECTIONS, BccLattice, bcc_lattice
 from thermoxels_ns.mesh.stuffing.interior import CoarseInterior, coarse_interior
 from thermoxels_ns.mesh.stuffing.stencils import (
@@ -94,12 +94,10 @@ def _check_coarsest(coarsest: int) -> None:
     whole = isinstance(coarsest, (int, np.integer)) and not isinstance(coarsest, bool)
     if not (whole and coarsest >= 1 and coarsest & (coarsest - 1) == 0):
         raise MeshError(
-            explain(
-                "coarsest",
-                expected="a power of two from 1 on, [voxels]",
-                got=repr(coarsest),
-                remedy="Pass 4, or 1 for cells of one voxel throughout.",
-            )
+            "coarsest",
+            expected="a power of two from 1 on, [voxels]",
+            got=repr(coarsest),
+            remedy="Pass 4, or 1 for cells of one voxel throughout.",
         )
 
 
@@ -112,7 +110,7 @@ def _checked(level: npt.NDArray) -> npt.NDArray[np.floating]:
     check_finite("level", level, remedy, MeshError)
     if not np.any(level > 0.0):
         raise MeshError(
-            explain("level", expected="solid voxels, with levels above 0", got="none", remedy="Lower the threshold.")
+            "level", expected="solid voxels, with levels above 0", got="none", remedy="Lower the threshold."
         )
     return level
 

@@ -15,7 +15,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from thermoxels_ns.core.errors import MeshError, explain
+from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
 from thermoxels_ns.mesh.stuffing.edge_planes import (
     BoolArray,
@@ -73,12 +73,10 @@ def sharpen(solid: StuffedSolid, shape: tuple[int, ...]) -> StuffedSolid:
     """
     if not (solid.points.min() >= 0.0 and np.all(solid.points.max(axis=0) <= shape)):
         raise MeshError(
-            explain(
-                "shape",
-                expected="the numbers of voxels of the lattice that the solid was made from",
-                got=f"{tuple(shape)}, with nodes from {solid.points.min(axis=0)} to {solid.points.max(axis=0)}",
-                remedy="Pass the shape of the level.",
-            )
+            "shape",
+            expected="the numbers of voxels of the lattice that the solid was made from",
+            got=f"{tuple(shape)}, with nodes from {solid.points.min(axis=0)} to {solid.points.max(axis=0)}",
+            remedy="Pass the shape of the level.",
         )
     surface = Surface.of(solid)
     moves = _moves(surface, edge_planes(surface))
