@@ -143,33 +143,6 @@ def test_what_is_left_out_counts_against_the_tolerance(monkeypatch) -> None:
     assert everything is not None and everything.left_out_k == 0.0 and given[1].temperature_k == 0.05
 
 
-@pytest.mark.parametrize(("tolerance_k", "allowed_k"), [(0.05, 0.048), (None, 0.008)])
-def test_a_body_of_one_temperature_may_err_by_what_is_left(monkeypatch, tolerance_k, allowed_k) -> None:
-    asked: list[float] = []
-
-    def remember(problem, time, most_k):
-        asked.append(most_k)
-        return inner(problem, time, most_k)
-
-    inner = heat_solving.lumped_body
-    monkeypatch.setattr(heat_solving, "lumped_body", remember)
-    solved(TimeSteps(2, 1e9), feebly_warmed(), tolerance=tolerance_k, allow_unmet=True)
-    assert asked == [pytest.approx(allowed_k, rel=1e-3)]
-
-
-def test_the_error_of_a_body_of_one_temperature_holds_what_is_left_out() -> None:
-    """A copper cube in air."""
-    x = planes(0.0, 0.02, step=0.01)
-    effects = Convection(("*",), 5.0, 0.0), HeatFlux(("x0",), 0.01)
-    problem = HeatProblem(
-        box_mesh(x, x, x, temperature_c=20.0), Material("copper", 380.0, 8900.0, 380.0), effects=effects
-    )
-    found = solved(TimeSteps(4, 600.0), problem, tolerance=0.5)
-    assert found.lumped is not None and found.lumped.bound_k is not None and found.accuracy is not None
-    assert found.accuracy.order == 0 and found.accuracy.left_out_k > 0.0
-    assert found.accuracy.estimated_k == found.lumped.bound_k + found.accuracy.left_out_k
-
-
 @pytest.mark.parametrize(
     ("tolerance_k", "share", "given", "expected"),
     [

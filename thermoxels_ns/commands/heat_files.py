@@ -19,7 +19,6 @@ from thermoxels_ns.core.checks import (
     writable_folder,
 )
 from thermoxels_ns.fem.solution import SteadySolution
-from thermoxels_ns.heat.lumped_body import LumpedBody
 from thermoxels_ns.heat.results import plain_values
 from thermoxels_ns.heat.solving import steps_taken, time_error_k
 from thermoxels_ns.heat.vtk_series import STEP_PATTERN, remove_heat_series, write_heat_series
@@ -62,22 +61,13 @@ def summary_of(run: HeatRun) -> dict[str, Any]:
         "left_out": plain_values(screening.left_out),
         "left_out_bound_k": screening.bound_k,
         "left_out_note": screening.note,
-        "lumped_model": _lumped_summary(run.lumped),
         "assembled": dict(run.solution.assembled.counts),
         "newton_iterations": int(np.sum(run.solution.newton_iterations)),
         "linear_iterations": int(np.sum(run.solution.iterations)),
         "steps": steps_taken(run.solution),
         "time_error_k": time_error_k(run.solution),
         "seconds": dict(run.seconds),
-        "seconds_saved": run.seconds_saved,
     }
-
-
-def _lumped_summary(lumped: LumpedBody | None) -> dict[str, Any] | None:
-    if lumped is None:
-        return None
-    used = lumped.solution is not None
-    return {"used": used, "biot": lumped.biot, "bound_k": lumped.bound_k, "reason": lumped.reason}
 
 
 def prepared_folder(output_dir: Path) -> Path:

@@ -19,9 +19,7 @@ from thermoxels_ns.fem.probes import Probes, place_probes
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.solution import SteadySolution
 from thermoxels_ns.fem.solution_nodes import Solution, SolutionNodes, solution_nodes
-from thermoxels_ns.heat.lumped_body import LumpedBody
 from thermoxels_ns.heat.results import Answers, heat_answers
-from thermoxels_ns.heat.savings import seconds_saved
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_file import load_heat_scene
 from thermoxels_ns.heat.scene_warnings import scene_doubts, unused_settings
@@ -30,9 +28,7 @@ from thermoxels_ns.heat.solving import (
     Accuracy,
     Say,
     check_accuracy_options,
-    problem_as_solved,
     solve_scene,
-    steps_taken,
 )
 from thermoxels_ns.heat.wall_results import WallAnswer, faces_inside, not_only_airs, wall_answer
 from thermoxels_ns.mesh.boundary.facet_owners import facet_owners
@@ -59,8 +55,6 @@ class HeatRun:
     """All temperatures of the solution on a mesh that has a node for each."""
     screening: Screening
     """What of it was built."""
-    lumped: LumpedBody | None
-    """Whether the body could have one temperature; None if that was not asked, as in a steady state."""
     accuracy: Accuracy | None
     """What is known of the error; None if no tolerance was given."""
     warnings: tuple[str, ...]
@@ -81,8 +75,6 @@ class HeatRun:
     """Temperatures there, shape (s, p), [degrees Celsius]."""
     seconds: Mapping[str, float]
     """Time that each part took, [s]."""
-    seconds_saved: float | None
-    """Time that leaving effects out saved, [s]; None if nothing was left out, in a steady state, or not known."""
 
 
 def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
@@ -134,16 +126,6 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     if found.accuracy is not None and not found.accuracy.met:
         say("Warning: the tolerance was not met.")
 
-    saved = None
-    steps = steps_taken(solution)
-    if screening.left_out and scene.time is not None and steps:
-        try:
-            saved = seconds_saved(problem_as_solved(problem, found), solved, scene.time, steps)
-            say(f"Leaving out saved about {saved:.1f} s and cost {screening.seconds:.1f} s.")
-        except HeatError as failure:  # Of a problem that nobody asked to solve: the solution stands.
-            say(f"What leaving out saved is not known: a step with all effects failed. {failure}")
-        lap("measure what was saved")
-
     facet_region = solved.mesh.region[facet_owners(solved.mesh.tets, solved.mesh.facets)[0]]
     nodes = solution_nodes(solved, solution)
     wall, no_wall = _wall(scene, solved, solution, facet_region, nodes, doubtful=bool(doubts))
@@ -156,7 +138,6 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
         solved=solved,
         nodes=nodes,
         screening=screening,
-        lumped=found.lumped,
         accuracy=found.accuracy,
         warnings=warnings,
         solution=solution,
@@ -167,7 +148,6 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
         probes=probes,
         probes_c=probes.at(nodes.states_c) if not nodes.quadratic else probes.at_quadratic(solved.mesh, nodes.states_c),
         seconds=seconds,
-        seconds_saved=saved,
     )
     lap("answers")
     return run

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,6 @@ from thermoxels_ns.fem.solution_nodes import Solution
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.tolerance import ToleratedSolution, solve_to_tolerance
-from thermoxels_ns.heat.lumped_body import LumpedBody, lumped_body
 from thermoxels_ns.heat.results import plain_values
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.screening import Screening, screen
@@ -50,18 +49,18 @@ class Accuracy:
     """Whether the estimates are within it."""
     estimated_k: float
     """Estimated largest error of a temperature, what is left out included, [K]."""
-    estimated_flow: float | None
-    """Estimated largest error of a heat flow as a share of all heat; None for the lumped model, which gives none."""
+    estimated_flow: float
+    """Estimated largest error of a heat flow as a share of all heat."""
     left_out_k: float
     """What of `estimated_k` is the bound of the effects that are left out, [K]."""
     order: int
-    """1 for linear tetrahedra, 2 for quadratic ones; 0 for the lumped model."""
+    """1 for linear tetrahedra, 2 for quadratic ones."""
     refinements: int
     """How often the size of the given mesh was halved."""
     step_tolerance_k: float | None
     """Tolerance of the time steps, [K]; None without steps."""
-    seconds: float | None
-    """Time for all solutions and estimates, [s]; None for the lumped model."""
+    seconds: float
+    """Time for all solutions and estimates, [s]."""
     status: str
     """The outcome as a sentence."""
     levels: tuple[dict[str, Any], ...]
@@ -78,8 +77,6 @@ class SolvedScene:
     """Temperatures and heat flows."""
     screening: Screening
     """What was built."""
-    lumped: LumpedBody | None
-    """Whether the body could have one temperature; None if that was not asked, as in a steady state."""
     accuracy: Accuracy | None
     """What is known of the error; None if no tolerance was given."""
 
@@ -143,35 +140,19 @@ def solve_scene(options: Heat, scene: HeatScene, problem: HeatProblem, say: Say,
     screening = screen(problem, scene.time, leave_out_below_k(options))
     lap("screen")
     _say_what_is_built(screening, say)
-    lumped: LumpedBody | None = None
-    asked = options.tolerance is not None or options.flow_tolerance is not None
-    if scene.time is not None and options.flow_tolerance is None:
-        most_k = leave_out_below_k(options) if options.tolerance is None else options.tolerance
-        allowed_k = most_k - screening.bound_k
-        lumped = lumped_body(screening.problem, scene.time, allowed_k) if allowed_k > 0.0 else None
-    if lumped is not None and lumped.solution is not None:
-        accuracy = _of_lumped(options, screening, lumped) if asked else None
-        return SolvedScene(screening.problem, lumped.solution, screening, lumped, accuracy)
-    if asked:
-        return _to_tolerance(options, scene, screening, lumped, say)
+    if options.tolerance is not None or options.flow_tolerance is not None:
+        return _to_tolerance(options, scene, screening, say)
     times = 1 if scene.time is None else scene.time.num_times
     needed = peak_bytes(screening.problem, times=times, adaptive=isinstance(scene.time, AdaptiveSteps))
     say(f"Memory: about {describe_bytes(needed)} at most.")
     check_memory(needed, options.memory_gb * 2**30, "Pass a larger --memory-gb, or export a coarser mesh.")
     if scene.time is None:
-        return SolvedScene(screening.problem, solve_steady(screening.problem), screening, None, None)
-    return SolvedScene(
-        screening.problem,
-        solve_heat(screening.problem, scene.time, progress=_Progress(say, scene.time)),
-        screening,
-        lumped,
-        None,
-    )
+        return SolvedScene(screening.problem, solve_steady(screening.problem), screening, None)
+    solution = solve_heat(screening.problem, scene.time, progress=_Progress(say, scene.time))
+    return SolvedScene(screening.problem, solution, screening, None)
 
 
-def _to_tolerance(
-    options: Heat, scene: HeatScene, screening: Screening, lumped: LumpedBody | None, say: Say
-) -> SolvedScene:
+def _to_tolerance(options: Heat, scene: HeatScene, screening: Screening, say: Say) -> SolvedScene:
     """Give the solver what is left of the tolerance."""
     left_k = None if options.tolerance is None else options.tolerance - screening.bound_k
     found = solve_to_tolerance(
@@ -184,7 +165,7 @@ def _to_tolerance(
         log=say,
         progress=_Progress(say, None),
     )
-    return SolvedScene(found.problem, found.solution, screening, lumped, _of_levels(options, screening, found))
+    return SolvedScene(found.problem, found.solution, screening, _of_levels(options, screening, found))
 
 
 def _of_levels(options: Heat, screening: Screening, found: ToleratedSolution) -> Accuracy:
@@ -205,31 +186,6 @@ def _of_levels(options: Heat, screening: Screening, found: ToleratedSolution) ->
     )
 
 
-def _of_lumped(options: Heat, screening: Screening, lumped: LumpedBody) -> Accuracy:
-    assert lumped.bound_k is not None, "there is a solution"
-    return Accuracy(
-        tolerance_k=options.tolerance,
-        flow_tolerance=None,
-        met=True,
-        estimated_k=lumped.bound_k + screening.bound_k,
-        estimated_flow=None,
-        left_out_k=screening.bound_k,
-        order=0,
-        refinements=0,
-        step_tolerance_k=None,
-        seconds=None,
-        status=f"Within {options.tolerance:g} K without steps or conduction. {lumped.reason}",
-        levels=(),
-    )
-
-
-def problem_as_solved(problem: HeatProblem, solved: SolvedScene) -> HeatProblem:
-    """Give the problem with all effects, also those that were left out, on the mesh that was solved."""
-    if solved.problem.mesh is problem.mesh:
-        return problem
-    return replace(solved.problem, effects=problem.effects)
-
-
 def time_error_k(solution: Solution) -> float | None:
     """Give the estimated error of the steps as their controller adds it up, [K]; None if there is none."""
     if isinstance(solution, SteadySolution) or not np.isfinite(solution.time_error_k):
@@ -238,7 +194,7 @@ def time_error_k(solution: Solution) -> float | None:
 
 
 def steps_taken(solution: Solution) -> int:
-    """Count the time steps; 0 in a steady state and for the lumped model."""
+    """Count the time steps; 0 in a steady state."""
     return solution.steps if isinstance(solution, HeatSolution) else 0
 
 

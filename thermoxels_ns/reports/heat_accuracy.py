@@ -43,7 +43,7 @@ def accuracy_card(accuracy: Accuracy | None) -> list[tuple[str, str]]:
     if accuracy is None:
         return []
     met = "within the tolerance" if accuracy.met else "NOT within the tolerance"
-    if accuracy.tolerance_k is None and accuracy.estimated_flow is not None:
+    if accuracy.tolerance_k is None:
         return [(f"{100.0 * accuracy.estimated_flow:.2g} %", f"estimated error of the heat flow, {met}")]
     return [(f"{accuracy.estimated_k:.2g} K", f"estimated error of temperatures, {met}")]
 
@@ -54,8 +54,6 @@ def how_time_was_followed(time: TimeSteps | AdaptiveSteps | None, accuracy: Accu
         return "the steady state"
     if accuracy is not None:
         duration = in_words(float(time.times_s[-1]))
-        if accuracy.step_tolerance_k is None:
-            return f"{duration}, without steps"
         return f"{duration} in steps chosen by the tolerance (they may err by {accuracy.step_tolerance_k:.2g} K)"
     if isinstance(time, TimeSteps):
         return f"{time.steps} steps of {time.step_seconds:g} s"

@@ -254,14 +254,9 @@ def _built(run: HeatRun) -> Section:
             f"Left out, together they could change temperatures by {screening.bound_k:.2g} K at most; the tolerance is "
             f"{screening.tolerance_k:g} K. {screening.note}"
         )
-        cost = f"To find out took {screening.seconds:.2f} s"
-        saved = run.seconds_saved
-        words.append(f"{cost}." if saved is None else f"{cost} and saved about {saved:.2f} s (measured on one step).")
+        words.append(f"To find out took {screening.seconds:.2f} s.")
     else:
         words.append(f"Nothing could be left out at a tolerance of {screening.tolerance_k:g} K. {screening.note}")
-    if run.lumped is not None:
-        used = "used: no steps were taken and no conduction solved" if run.lumped.solution is not None else "not used"
-        words.append(f"The lumped model, one temperature per connected piece, was {used}. {run.lumped.reason}")
     left = Table(
         ("Left out", "because", "at most K", "at most W"),
         tuple((e.effect, e.reason, f"{e.bound_k:.2g}", f"{e.bound_w:.3g}") for e in screening.left_out),
