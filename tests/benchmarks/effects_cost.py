@@ -28,7 +28,6 @@ from thermoxels_ns.fem.assembly import assemble
 from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.fixed_nodes import FixedNodes
 from thermoxels_ns.fem.linear_solver import ConjugateGradients
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.pieces import Pieces
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.schemes import BACKWARD_EULER
@@ -38,6 +37,7 @@ from thermoxels_ns.fem.sparsity import product_and_bound
 from thermoxels_ns.fem.stepper import Stepper
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.scene_file import load_heat_scene
 from thermoxels_ns.heat.screening import screen
 from thermoxels_ns.mesh.boundary.patches import default_patches

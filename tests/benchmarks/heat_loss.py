@@ -20,10 +20,10 @@ from thermoxels_ns.commands.export import load_trained_scene
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.evaluation.truth_comparison import load_known_truth
-from thermoxels_ns.fem.effects import Convection
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat.effects import Convection
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh
 from thermoxels_ns.mesh.quality.checks import facet_areas, signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidSelection

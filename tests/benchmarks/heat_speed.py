@@ -122,9 +122,9 @@ class HeatSpeed:
 
     def ours(self, points: np.ndarray, tets: np.ndarray, start: np.ndarray, lumped: bool) -> np.ndarray:
         """Temperatures of all times by this package."""
-        from thermoxels_ns.fem.materials import Material
         from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
         from thermoxels_ns.fem.stepping import solve_heat
+        from thermoxels_ns.heat.materials import Material
         from thermoxels_ns.mesh.tetrahedra import TetMesh
 
         none, seen, region = np.zeros((0, 3), np.int64), np.ones(len(points), bool), np.zeros(len(tets), np.int64)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from tests.support.obtuse_bodies import AT_THE_BOUNDS, CONCRETE, body
-from thermoxels_ns.fem.effects import FixedTemperature
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat.effects import FixedTemperature
 
 STEPS = (8, 16, 32)
 

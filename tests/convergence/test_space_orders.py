@@ -7,14 +7,14 @@ import pytest
 
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.fem.edge_midpoints import TET_EDGES
-from thermoxels_ns.fem.effects import FixedTemperature, InternalHeat
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quadratic_elements import edge_shapes
 from thermoxels_ns.fem.quadratic_space import QuadraticSpace
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.heat.effects import FixedTemperature, InternalHeat
+from thermoxels_ns.heat.materials import Material
 
 
 def exact(p: np.ndarray) -> np.ndarray:

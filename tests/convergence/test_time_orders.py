@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tests.support.heat_meshes import box_mesh
-from thermoxels_ns.fem.effects import Convection, Effect, FixedTemperature, HeatFlux, InternalHeat, Radiation
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Scheme, theta_scheme
 from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, HeatFlux, InternalHeat, Radiation
+from thermoxels_ns.heat.materials import Material
 
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
 DURATION_S = 4 * 3600.0

@@ -20,8 +20,8 @@ from thermoxels_ns import config
 from thermoxels_ns.core import presets
 from thermoxels_ns.core.errors import HeatError, ThermoxelsError
 from thermoxels_ns.core.presets import read_preset, with_overrides
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import TimeSteps
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.presets import HeatPreset, heat_preset_names, load_heat_preset
 
 if sys.version_info >= (3, 11):

@@ -12,8 +12,8 @@ import pytest
 
 from tests.support.demo_mesh import demo_mesh
 from tests.support.house_mesh import house_mesh
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _LONGEST_RUN_S = 300

@@ -11,8 +11,8 @@ import pytest
 
 from thermoxels_ns.fem.assembly import HeatMatrices, assemble
 from thermoxels_ns.fem.linear_solver import ConjugateGradients
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.files.abaqus import HeatStep, write_inp
 from thermoxels_ns.mesh.quality.checks import facet_areas
 

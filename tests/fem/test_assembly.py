@@ -12,7 +12,7 @@ from skfem.helpers import dot
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.assembly import HeatMatrices, assemble, assemble_mass, assemble_stiffness
-from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 

@@ -9,14 +9,14 @@ import pytest
 
 from tests.support.heat_meshes import SIDES, box_mesh
 from thermoxels_ns.fem import steady
-from thermoxels_ns.fem.effects import Convection, Effect, FixedTemperature, Radiation
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.solution import EffectHeat
 from thermoxels_ns.fem.steady import is_still, solve_steady
 from thermoxels_ns.fem.step_account import StepAccount
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, Radiation
+from thermoxels_ns.heat.materials import Material
 
 COPPER = Material("copper", 400.0, 8900.0, 385.0)
 INSULATION = Material("insulation", 0.03, 30.0, 1400.0)

@@ -7,16 +7,16 @@ import pytest
 
 from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effects import Convection, FixedTemperature, InternalHeat
 from thermoxels_ns.fem.error_estimate import RecoveredError, error_ratios, recovered_error, richardson
 from thermoxels_ns.fem.hierarchical_error_in_time import edge_surplus
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.recovered_gradient import curvature_k
 from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat.effects import Convection, FixedTemperature, InternalHeat
+from thermoxels_ns.heat.materials import Material
 
 STEEL = Material("steel", 50.0, 7800.0, 450.0)
 WOOL = Material("wool", 0.04, 30.0, 1000.0)

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from tests.support.heat_meshes import box_mesh
-from thermoxels_ns.fem.effects import Convection, FixedTemperature, InternalHeat, Radiation
 from thermoxels_ns.fem.error_budget import mean_flows_w
 from thermoxels_ns.fem.even_steps import EvenSteps
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.schemes import SDIRK2
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.heat.effects import Convection, FixedTemperature, InternalHeat, Radiation
+from thermoxels_ns.heat.materials import Material
 
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
 STEEL = Material("steel", 35.0, 7200.0, 440.5)

@@ -14,10 +14,8 @@ from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.edge_exchange import EdgeExchange, EdgeSpace
 from thermoxels_ns.fem.edge_operator import EdgeOperator
-from thermoxels_ns.fem.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.fem.hierarchical_error import steady_surplus
 from thermoxels_ns.fem.linear_start import linear_start
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.refine_mesh import refine_mesh
@@ -25,6 +23,8 @@ from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.sparsity import mesh_edges
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.heat.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
+from thermoxels_ns.heat.materials import Material
 
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
 WITHIN = 1.6

@@ -11,12 +11,12 @@ import pytest
 from tests.support.heat_meshes import box_mesh
 from tests.support.stuffed_shapes import SHAPES, tet_mesh
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effects import Convection, Radiation
 from thermoxels_ns.fem.memory import check_memory, describe_bytes, peak_bytes
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat.effects import Convection, Radiation
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 
 MIXED = (Convection(("*",), 8.0, 10.0), Radiation(("*",), 0.9, 0.0))

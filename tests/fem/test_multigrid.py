@@ -8,13 +8,13 @@ from scipy import sparse
 from threadpoolctl import threadpool_limits
 
 from tests.support.heat_meshes import box_mesh, planes
-from thermoxels_ns.fem.effects import Convection
 from thermoxels_ns.fem.linear_solver import ConjugateGradients
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.multigrid import MultigridConjugateGradients, _DirectSolver
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.fem.two_level import TwoLevelConjugateGradients
+from thermoxels_ns.heat.effects import Convection
+from thermoxels_ns.heat.materials import Material
 
 
 @pytest.fixture(scope="module")

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tests.support.heat_meshes import box_mesh
-from thermoxels_ns.fem.effects import Convection, HeatFlux, Radiation
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat.effects import Convection, HeatFlux, Radiation
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 

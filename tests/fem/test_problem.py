@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+from thermoxels_ns.heat.materials import Material
 
 
 @pytest.mark.parametrize("field", ["conductivity_w_mk", "density_kg_m3", "specific_heat_j_kgk"])

@@ -6,9 +6,7 @@ import pytest
 from tests.support.heat_meshes import box_mesh, planes
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.fem.linear_space import LinearSpace
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quadratic_elements import mass_table
 from thermoxels_ns.fem.quadratic_space import QuadraticSpace
@@ -16,6 +14,8 @@ from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.heat.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
+from thermoxels_ns.heat.materials import Material
 
 STEEL = Material("steel", 50.0, 7800.0, 450.0)
 HESSIAN = np.array([[2.0, 0.5, -1.0], [0.5, -3.0, 0.25], [-1.0, 0.25, 1.5]])

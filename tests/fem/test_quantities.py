@@ -5,11 +5,11 @@ import pytest
 
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effects import Convection, HeatFlux
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Places, Quantity, Varying, tabulated
 from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat.effects import Convection, HeatFlux
+from thermoxels_ns.heat.materials import Material
 
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
 HOUR_S = 3600.0

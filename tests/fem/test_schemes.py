@@ -7,7 +7,11 @@ from scipy.sparse.linalg import spsolve
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.assembly import assemble
-from thermoxels_ns.fem.effects import (
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Scheme, theta_scheme
+from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
     Convection,
     FixedTemperature,
@@ -15,11 +19,7 @@ from thermoxels_ns.fem.effects import (
     InternalHeat,
     Radiation,
 )
-from thermoxels_ns.fem.materials import Material
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Scheme, theta_scheme
-from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)

@@ -8,13 +8,13 @@ from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem import newton as newton_module
 from thermoxels_ns.fem import solver_choice, steady
-from thermoxels_ns.fem.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.solver_choice import PATIENCE, LinearSolver
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.heat.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
+from thermoxels_ns.heat.materials import Material
 
 STEEL = Material("steel", 50.0, 7800.0, 450.0)
 SIGMA = 5.67e-8

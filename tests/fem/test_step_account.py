@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from tests.support.heat_meshes import box_mesh
-from thermoxels_ns.fem.effects import Convection, HeatFlux
 from thermoxels_ns.fem.marching import Taken
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.step_account import StepAccount
 from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.heat.effects import Convection, HeatFlux
+from thermoxels_ns.heat.materials import Material
 
 LENGTHS_S = np.array([1.0, 2.0, 3.0, 0.5, 0.5, 0.5])
 INTERVALS = np.array([0, 0, 1, 2, 2, 2])

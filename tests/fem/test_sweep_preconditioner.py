@@ -11,11 +11,11 @@ from tests.support.heat_meshes import box_mesh, planes
 from tests.support.stuffed_shapes import SHAPES, stiffness
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.linear_solver import ConjugateGradients
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.solver_choice import LinearSolver
 from thermoxels_ns.fem.sweep_preconditioner import SweptConjugateGradients, suits_sweeps
 from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 
 KERSHAW = np.array([[3.0, -2.0, 0.0, 2.0], [-2.0, 3.0, -2.0, 0.0], [0.0, -2.0, 3.0, -2.0], [2.0, 0.0, -2.0, 3.0]])

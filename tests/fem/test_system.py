@@ -8,7 +8,10 @@ import pytest
 from tests.support.heat_meshes import SIDES, box_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.assembly import assemble
-from thermoxels_ns.fem.effects import (
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
     Convection,
     FixedTemperature,
@@ -17,10 +20,7 @@ from thermoxels_ns.fem.effects import (
     InternalHeat,
     Radiation,
 )
-from thermoxels_ns.fem.materials import Material
-from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 ALL = (
@@ -195,9 +195,9 @@ def test_labels_differ_even_where_a_patch_is_named_like_a_number() -> None:
     """Two equal labels would count the heat of both effects twice."""
     from tests.support.heat_meshes import box_mesh
     from thermoxels_ns.fem.effect_forms import effect_labels
-    from thermoxels_ns.fem.effects import Convection
-    from thermoxels_ns.fem.materials import Material
     from thermoxels_ns.fem.problem import HeatProblem
+    from thermoxels_ns.heat.effects import Convection
+    from thermoxels_ns.heat.materials import Material
 
     side = [0.0, 0.1]
     airs = tuple(Convection((name,), 8.0, 0.0) for name in ("wall (2)", "wall", "wall", "wall (2)"))

@@ -9,9 +9,7 @@ from tests.support.building_corner import building_corner
 from tests.support.heat_meshes import box_mesh, graded
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effects import Convection, FixedTemperature, Radiation
 from thermoxels_ns.fem.error_budget import ErrorSize, Tolerance, difference_between, mean_flows_w
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.refine_mesh import refine_mesh
@@ -19,6 +17,8 @@ from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.tolerance import ToleratedSolution, solve_to_tolerance
+from thermoxels_ns.heat.effects import Convection, FixedTemperature, Radiation
+from thermoxels_ns.heat.materials import Material
 
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
 WITHIN = 3.0

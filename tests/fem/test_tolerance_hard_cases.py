@@ -9,12 +9,12 @@ import pytest
 
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effects import Convection, Effect, HeatFlux
 from thermoxels_ns.fem.error_budget import Tolerance
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.tolerance import ToleratedSolution, solve_to_tolerance
+from thermoxels_ns.heat.effects import Convection, Effect, HeatFlux
+from thermoxels_ns.heat.materials import Material
 
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
 EMPTY = Material("next to nothing", 1.0, 1e-3, 1e-3)

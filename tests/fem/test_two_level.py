@@ -9,14 +9,14 @@ from scipy import sparse
 from tests.support.heat_meshes import box_mesh
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effects import Convection, FixedTemperature, InternalHeat, Radiation
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.fem.solver_choice import LinearSolver
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.fem.two_level import TwoLevelConjugateGradients
+from thermoxels_ns.heat.effects import Convection, FixedTemperature, InternalHeat, Radiation
+from thermoxels_ns.heat.materials import Material
 
 STEEL = Material("steel", 50.0, 7800.0, 450.0)
 

@@ -10,12 +10,12 @@ import pytest
 
 from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effects import AbsorbedSolar, Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.surface_heat import heat_by_part
+from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.results import heat_answers
 from thermoxels_ns.heat.wall_results import wall_answer
 from thermoxels_ns.mesh.boundary.facet_owners import facet_owners

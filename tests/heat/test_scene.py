@@ -9,7 +9,10 @@ import yaml
 
 from tests.support.scene_bodies import room, wall
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effects import (
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
     Convection,
     Effect,
@@ -19,11 +22,7 @@ from thermoxels_ns.fem.effects import (
     InternalHeat,
     Radiation,
 )
-from thermoxels_ns.fem.materials import Material
-from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.selection import Selection
-from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.heat.material_table import material
+from thermoxels_ns.heat.materials import Material, material
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import Ground, InsideAir, OutsideAir, Sky, Sun, Surface
 from thermoxels_ns.heat.sky import swinbank_sky_c

@@ -10,7 +10,11 @@ import yaml
 from tests.support.scene_bodies import room
 from thermoxels_ns.core.configs_folder import configs_folder
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effects import (
+from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.schemes import BACKWARD_EULER
+from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
     Convection,
     FixedTemperature,
@@ -19,11 +23,7 @@ from thermoxels_ns.fem.effects import (
     InternalHeat,
     Radiation,
 )
-from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
-from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.schemes import BACKWARD_EULER
-from thermoxels_ns.fem.stepping import solve_heat
-from thermoxels_ns.heat.material_table import material
+from thermoxels_ns.heat.materials import material
 from thermoxels_ns.heat.presets import load_heat_preset
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_file import heat_scene_names, load_heat_scene

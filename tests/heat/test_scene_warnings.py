@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.support.scene_bodies import Z_UP, room, tagged_body, wall
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import TimeSteps
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import InsideAir, OutsideAir
 from thermoxels_ns.heat.scene_warnings import scene_doubts, unused_settings

@@ -11,7 +11,12 @@ import pytest
 from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effect_forms import effect_labels
-from thermoxels_ns.fem.effects import (
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat import screening as screening_module
+from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
     Convection,
     Effect,
@@ -21,12 +26,7 @@ from thermoxels_ns.fem.effects import (
     InternalHeat,
     Radiation,
 )
-from thermoxels_ns.fem.materials import Material
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.stepping import solve_heat
-from thermoxels_ns.heat import screening as screening_module
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.nodal_heat import nodal_heats
 from thermoxels_ns.heat.screening import screen
 from thermoxels_ns.heat.sun import moving_sun

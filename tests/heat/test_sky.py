@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effects import STEFAN_BOLTZMANN_W_M2K4, Radiation
 from thermoxels_ns.fem.quantities import Places
+from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4, Radiation
 from thermoxels_ns.heat.sky import ground_view, outdoor_radiation, sky_view, swinbank_sky_c
 
 Z_UP = (0.0, 0.0, 1.0)

@@ -11,10 +11,10 @@ import pytest
 
 from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns.commands.heat import Heat
-from thermoxels_ns.fem.effects import Convection, HeatFlux
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.heat import solving as heat_solving
+from thermoxels_ns.heat.effects import Convection, HeatFlux
+from thermoxels_ns.heat.materials import Material
 
 
 class Clock:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effects import AbsorbedSolar
 from thermoxels_ns.fem.quantities import Places
+from thermoxels_ns.heat.effects import AbsorbedSolar
 from thermoxels_ns.heat.sun import (
     Sunlight,
     SunPosition,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effects import STEFAN_BOLTZMANN_W_M2K4, Convection
 from thermoxels_ns.fem.quantities import Places, Varying
+from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4, Convection
 from thermoxels_ns.heat.surface_coefficients import (
     by_orientation,
     inside_combined,

@@ -10,13 +10,13 @@ import pytest
 from tests.support.heat_meshes import box_mesh
 from tests.support.obtuse_bodies import AT_THE_BOUNDS, H, body, dressed
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effects import Convection, Effect, FixedTemperature, HeatFlux, InternalHeat, Radiation
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, HeatFlux, InternalHeat, Radiation
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 SEEDS = range(72)

@@ -12,13 +12,13 @@ from tests.support.heat_meshes import box_mesh
 from tests.support.obtuse_bodies import AT_THE_BOUNDS, CONCRETE, STEP_S, body, spots, stuffed
 from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, box_distance, centres, stiffness, tet_mesh, turn
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effects import Convection, Effect, FixedTemperature, Radiation
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.schemes import CRANK_NICOLSON, SDIRK2
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, Radiation
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.quality.checks import check_mesh
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 

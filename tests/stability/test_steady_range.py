@@ -10,12 +10,12 @@ import pytest
 from tests.support.heat_meshes import SIDES, box_mesh
 from tests.support.obtuse_bodies import AT_THE_BOUNDS, CONCRETE, body
 from thermoxels_ns.fem import steady_range
-from thermoxels_ns.fem.effects import Convection, Effect, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.stage import Stage
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, HeatFlux, InternalHeat, Radiation
 
 LOW, HIGH = -30.0, 90.0
 SAID = "couplings with the wrong sign were left out"

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from tests.support.heat_meshes import box_mesh
-from thermoxels_ns.fem.effects import Convection
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.heat.effects import Convection
+from thermoxels_ns.heat.materials import Material
 
 LISTED_W = (46.09, 13.89, -59.98)
 """Heat flows into the body from the lower room, the upper room and outside."""

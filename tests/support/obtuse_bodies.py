@@ -9,7 +9,7 @@ import numpy as np
 
 from tests.support.heat_meshes import Nodal
 from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, tet_mesh
-from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.quality.checks import dihedral_range_deg
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from tests.support.heat_meshes import box_mesh, graded, planes
-from thermoxels_ns.fem.effects import Convection, FixedTemperature
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.solution import SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.heat.effects import Convection, FixedTemperature
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 BOUNDARIES = pytest.mark.parametrize("lumped_boundary", [True, False])

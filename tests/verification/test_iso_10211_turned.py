@@ -13,10 +13,10 @@ import pytest
 
 from tests.support.heat_meshes import box_mesh, graded, planes
 from tests.verification.test_iso_10211 import CASE_1, CASE_2, at, conductor
-from thermoxels_ns.fem.effects import Convection, FixedTemperature
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.heat.effects import Convection, FixedTemperature
 
 
 @pytest.mark.parametrize("finest", [0.0125, 0.00625])

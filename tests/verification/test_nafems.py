@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from tests.support.heat_meshes import box_mesh
-from thermoxels_ns.fem.effects import Convection, FixedTemperature, Radiation
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Scheme
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat.effects import Convection, FixedTemperature, Radiation
+from thermoxels_ns.heat.materials import Material
 
 
 @pytest.mark.parametrize(("conductivity", "exact_k"), [(55.6, 927.0076), (55.563, 926.9707)])

@@ -8,10 +8,10 @@ import pytest
 from tests.support.building_corner import COLDEST_C, LISTED_W, building_corner
 from tests.support.heat_meshes import box_mesh, planes
 from tests.support.shell_mesh import shell_mesh
-from thermoxels_ns.fem.effects import Convection, FixedTemperature
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.heat.effects import Convection, FixedTemperature
+from thermoxels_ns.heat.materials import Material
 
 
 def test_iso_10211_case_3() -> None:

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from tests.support.heat_meshes import box_mesh, graded, planes
-from thermoxels_ns.fem.effects import Convection, FixedTemperature
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.schemes import SDIRK2
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat.effects import Convection, FixedTemperature
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)

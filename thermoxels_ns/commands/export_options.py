@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from typing import Any
 
-    from thermoxels_ns.fem.materials import Material
     from thermoxels_ns.fem.problem import TimeSteps
+    from thermoxels_ns.heat.materials import Material
     from thermoxels_ns.heat.presets import HeatPreset
     from thermoxels_ns.mesh.boundary.patch_rules import PatchRules
     from thermoxels_ns.mesh.solid.voxels import SolidSelection

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from thermoxels_ns.fem.elements import capacities, edge_couplings
-from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.problem import Conductor
 from thermoxels_ns.fem.sparsity import MeshEdges, mesh_edges, symmetric_matrix
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -26,7 +26,7 @@ class HeatMatrices:
     """Row sums of M, rho c * integral(phi_i), shape (n,), [J / K]."""
 
 
-def assemble(mesh: TetMesh, material: Material, *, lumped: bool = True) -> HeatMatrices:
+def assemble(mesh: TetMesh, material: Conductor, *, lumped: bool = True) -> HeatMatrices:
     """Assemble stiffness and mass for linear tetrahedra.
 
     Args:

@@ -7,6 +7,7 @@ import numbers
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +15,8 @@ import numpy.typing as npt
 from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.effects import Effect
 from thermoxels_ns.fem.flat_tets import count_flat_tets
-from thermoxels_ns.fem.materials import Material
+from thermoxels_ns.fem.terms import Effect
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 
@@ -104,6 +104,21 @@ class AdaptiveSteps:
         return np.linspace(0.0, self.duration_s, self.outputs + 1)
 
 
+@runtime_checkable
+class Conductor(Protocol):
+    """What the solver asks of a material, such as `heat.materials.Material`."""
+
+    @property
+    def conductivity_w_mk(self) -> float:
+        """Thermal conductivity, [W / (m K)], above 0."""
+        ...
+
+    @property
+    def heat_capacity_j_m3k(self) -> float:
+        """Heat that warms a cubic metre by a kelvin, rho c, [J / (m3 K)], above 0."""
+        ...
+
+
 @dataclass(frozen=True)
 class HeatProblem:
     """Heat in a body: conduction, storage, and the effects that the scene calls for.
@@ -114,7 +129,7 @@ class HeatProblem:
 
     mesh: TetMesh
     """The body."""
-    material: Material | Mapping[str, Material]
+    material: Conductor | Mapping[str, Conductor]
     """What all of it is made of, or one material per name of a region of the mesh."""
     initial_temperature_c: npt.NDArray[np.float64] | None = None
     """Nodal temperature at the start, shape (n,), [degrees Celsius]; None: the mesh's own. A steady solver starts its
@@ -173,14 +188,14 @@ class HeatProblem:
         return self._property("heat_capacity_j_m3k")
 
     def _property(self, name: str) -> float | npt.NDArray[np.float64]:
-        if isinstance(self.material, Material):
+        if isinstance(self.material, Conductor):
             return float(getattr(self.material, name))
         known, names = self.material, self.mesh.region_names
         by_region = [float(getattr(known[region], name)) if region in known else np.nan for region in names]
         return np.array(by_region)[self.mesh.region]
 
     def _check_materials(self) -> None:
-        if isinstance(self.material, Material):
+        if isinstance(self.material, Conductor):
             return
         remedy, names = "Give one Material, or one per region: {name of region: Material}.", self.mesh.region_names
         if not isinstance(self.material, Mapping):
@@ -195,7 +210,7 @@ class HeatProblem:
             raise HeatError("mesh region", expected=expected, got=got, remedy="Name every region of the mesh.")
         used = {names[number] for number in np.unique(region)}
         missing, unknown = used - set(self.material), set(self.material) - set(names)
-        wrong = [name for name, material in self.material.items() if not isinstance(material, Material)]
+        wrong = [name for name, material in self.material.items() if not isinstance(material, Conductor)]
         if missing or unknown or wrong:
             got = "; ".join(
                 f"{what}: {', '.join(sorted(names))}"
@@ -209,7 +224,7 @@ class HeatProblem:
         wrong = [type(effect).__name__ for effect in self.effects if not isinstance(effect, Effect)]
         if wrong or not isinstance(self.effects, tuple):
             got = ", ".join(wrong) or type(self.effects).__name__
-            remedy = "Use the effects of thermoxels_ns.fem.effects."
+            remedy = "Use the effects of thermoxels_ns.heat.effects."
             raise HeatError("effects", expected="a tuple of effects", got=got, remedy=remedy)
         length = math.hypot(*self.up) if len(self.up) == 3 else math.nan
         if not (math.isfinite(length) and length > 0.0):

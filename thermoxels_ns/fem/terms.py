@@ -1,18 +1,21 @@
 """The kinds of terms that the heat equation can have besides conduction and storage.
 
 Effects are turned into these, and the solver knows these only. They are data: how they become vectors and matrices on
-the nodes stands in `forms.py`.
+the nodes stands in `forms.py`. The effects that a scene may name stand in `heat/effects.py`.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.fem.quantities import Bounded
+from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.fem.quantities import Bounded, Bounds
+from thermoxels_ns.fem.selection import Selection
 
 
 @dataclass(frozen=True)
@@ -83,3 +86,53 @@ class FixedTerm:
 
 Term: TypeAlias = RobinTerm | FluxTerm | RadiationTerm | SourceTerm | FixedTerm
 """All kinds."""
+
+
+class Effect(ABC):
+    """Something that a heat problem may contain besides conduction: checked input that knows its own terms.
+
+    A dataclass whose fields are quantities, or names of `patches` or `regions` that it acts on.
+    """
+
+    kind: ClassVar[str]
+    """What it is called in reports."""
+    bounds: ClassVar[dict[str, Bounds]]
+    """Which fields are quantities, and their range."""
+
+    def __post_init__(self) -> None:
+        for name in ("patches", "regions"):
+            if hasattr(self, name):
+                object.__setattr__(self, name, _checked_names(name, getattr(self, name)))
+        for name, bounds in self.bounds.items():
+            object.__setattr__(self, name, bounds.check_quantity(getattr(self, name)))
+
+    @property
+    def where(self) -> tuple[str, ...]:
+        """Names or patterns of the patches, or of the regions, that it acts on."""
+        return getattr(self, "patches", None) or getattr(self, "regions", ())
+
+    @property
+    def label(self) -> str:
+        """Name for reports: what it is and where."""
+        return f"{self.kind} on {', '.join(self.where)}"
+
+    def bounded(self, name: str) -> Bounded:
+        """Give one of its quantities with its range."""
+        return Bounded(getattr(self, name), self.bounds[name])
+
+    @abstractmethod
+    def terms(self, selection: Selection) -> tuple[Term, ...]:
+        """Give the terms that it adds to the heat equation of a body.
+
+        Raises:
+            HeatError: The body has no such patch or region.
+        """
+
+
+def _checked_names(field: str, names: object) -> tuple[str, ...]:
+    """Return names as a tuple; a single text is refused because its letters would be taken for names."""
+    listed = tuple(names) if isinstance(names, (tuple, list)) else ()
+    if not listed or not all(isinstance(name, str) and name.strip() for name in listed):
+        remedy = f'Write {field}=("name",), for example.'
+        raise HeatError(field, expected="a tuple of names", got=repr(names), remedy=remedy)
+    return listed

@@ -14,8 +14,8 @@ import yaml
 
 from thermoxels_ns.core.configs_folder import configs_folder
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import TimeSteps
+from thermoxels_ns.heat.materials import Material
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,13 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_shape
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effects import Effect, InternalHeat
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import EffectHeat, SteadySolution
 from thermoxels_ns.fem.solution_nodes import Solution, SolutionNodes, solution_nodes
 from thermoxels_ns.fem.surface_heat import heat_by_part, heat_through_parts
+from thermoxels_ns.heat.effects import Effect, InternalHeat
+from thermoxels_ns.heat.materials import materials_by_region
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Vector = npt.NDArray[np.float64]
@@ -299,14 +299,14 @@ def _regions(
     volume = np.einsum("ti,ti->t", sides[:, 0], np.cross(sides[:, 1], sides[:, 2])) / 6.0
     total = np.bincount(mesh.region, volume, len(names))
     content = np.bincount(mesh.region, volume * last_c[mesh.tets].mean(axis=1), len(names))
+    made_of = materials_by_region(problem)
     answers = []
     for number in np.unique(mesh.region):
         inside = last_c[mesh.tets[mesh.region == number]]
-        made_of = problem.material if isinstance(problem.material, Material) else problem.material[names[number]]
         answers.append(
             RegionAnswer(
                 region=names[number],
-                material=made_of.name,
+                material=made_of[names[number]].name,
                 volume_m3=float(total[number]),
                 area_m2=float(area[number]),
                 heat_w=float(heat[number]),

@@ -10,7 +10,9 @@ from typing import TypeVar
 import numpy as np
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effects import (
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.quantities import Quantity, Varying
+from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
     Convection,
     Effect,
@@ -20,9 +22,7 @@ from thermoxels_ns.fem.effects import (
     InternalHeat,
     Radiation,
 )
-from thermoxels_ns.fem.materials import Material
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.quantities import Quantity, Varying
+from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.scene_fields import (
     WITH_RADIATION,
     Ground,

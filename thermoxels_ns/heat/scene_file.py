@@ -14,9 +14,8 @@ from typing import Any, get_type_hints
 from thermoxels_ns.core.configs_folder import configs_folder
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.yaml_records import as_mapping, as_record, as_value, check_keys, read_yaml, shown, wrong
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
-from thermoxels_ns.heat.material_table import material
+from thermoxels_ns.heat.materials import Material, material
 from thermoxels_ns.heat.scene import HeatScene
 
 _OWN_KEYS = ("materials", "initial", "steady", "time")

@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin
-from thermoxels_ns.fem.effects import STEFAN_BOLTZMANN_W_M2K4
 from thermoxels_ns.fem.quantities import Bounds, Places, Varying
+from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4
 
 HeatDirection: TypeAlias = Literal["up", "horizontal", "down"]
 """Where heat flows to."""

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermoxels_ns.fem.effect_forms import effect_labels
-from thermoxels_ns.fem.effects import Effect, FixedTemperature, InternalHeat
-from thermoxels_ns.fem.materials import Material
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import HeatSolution
+from thermoxels_ns.heat.effects import Effect, FixedTemperature, InternalHeat
+from thermoxels_ns.heat.materials import materials_by_region
 from thermoxels_ns.heat.results import Spot
 from thermoxels_ns.reports.heat_accuracy import accuracy_card, accuracy_sections, how_time_was_followed
 from thermoxels_ns.reports.heat_numbers import Dust, coordinate, degrees, dust_of, unit_signs
@@ -224,10 +224,7 @@ def _asked(run: HeatRun) -> Section:
         figures_from=2,
     )
     rows = []
-    made_of = run.problem.material
-    for number in np.unique(mesh.region):
-        name = mesh.region_names[number]
-        what = made_of if isinstance(made_of, Material) else made_of[name]
+    for name, what in materials_by_region(run.problem).items():
         figures = (what.conductivity_w_mk, what.density_kg_m3, what.specific_heat_j_kgk)
         rows.append((name, what.name, *(f"{figure:g}" for figure in figures)))
     columns = ("Region", "material", "W/(m K)", "kg/m\N{SUPERSCRIPT THREE}", "J/(kg K)")

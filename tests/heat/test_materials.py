@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.heat.material_table import load_material_table, material
+from thermoxels_ns.heat.materials import load_material_table, material
 from thermoxels_ns.heat.presets import load_heat_preset
 
 ROW = "{conductivity_w_mk: 1.0, density_kg_m3: 2000, specific_heat_j_kgk: 900, source: a book}"

@@ -6,58 +6,17 @@ which is asked at the centroids of boundary triangles (sources: of tetrahedra; f
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
 
-from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.quantities import Bounded, Bounds, Quantity
 from thermoxels_ns.fem.selection import Selection
-from thermoxels_ns.fem.terms import FixedTerm, FluxTerm, RadiationTerm, RobinTerm, SourceTerm, Term
+from thermoxels_ns.fem.terms import Effect, FixedTerm, FluxTerm, RadiationTerm, RobinTerm, SourceTerm, Term
 
 STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8
 """Stefan-Boltzmann constant (CODATA 2018), [W / (m2 K4)]."""
 
 _ABSOLUTE_ZERO_C = -ZERO_CELSIUS_K
-
-
-class Effect(ABC):
-    """Something that a heat problem may contain besides conduction."""
-
-    kind: ClassVar[str]
-    """What it is called in reports."""
-    bounds: ClassVar[dict[str, Bounds]]
-    """Which fields are quantities, and their range."""
-
-    def __post_init__(self) -> None:
-        for name in ("patches", "regions"):
-            if hasattr(self, name):
-                object.__setattr__(self, name, _checked_names(name, getattr(self, name)))
-        for name, bounds in self.bounds.items():
-            object.__setattr__(self, name, bounds.check_quantity(getattr(self, name)))
-
-    @property
-    def where(self) -> tuple[str, ...]:
-        """Names or patterns of the patches, or of the regions, that it acts on."""
-        return getattr(self, "patches", None) or getattr(self, "regions", ())
-
-    @property
-    def label(self) -> str:
-        """Name for reports: what it is and where."""
-        return f"{self.kind} on {', '.join(self.where)}"
-
-    def bounded(self, name: str) -> Bounded:
-        """Give one of its quantities with its range."""
-        return Bounded(getattr(self, name), self.bounds[name])
-
-    @abstractmethod
-    def terms(self, selection: Selection) -> tuple[Term, ...]:
-        """Give the terms that it adds to the heat equation of a body.
-
-        Raises:
-            HeatError: The body has no such patch or region.
-        """
 
 
 @dataclass(frozen=True)
@@ -206,12 +165,3 @@ class InternalHeat(Effect):
     def terms(self, selection: Selection) -> tuple[Term, ...]:
         """Rho c dT/dt = div(k grad T) + s."""
         return (SourceTerm(self.label, selection.tets(self.regions), self.bounded("source_w_m3")),)
-
-
-def _checked_names(field: str, names: object) -> tuple[str, ...]:
-    """Return names as a tuple; a single text is refused because its letters would be taken for names."""
-    listed = tuple(names) if isinstance(names, (tuple, list)) else ()
-    if not listed or not all(isinstance(name, str) and name.strip() for name in listed):
-        remedy = f'Write {field}=("name",), for example.'
-        raise HeatError(field, expected="a tuple of names", got=repr(names), remedy=remedy)
-    return listed

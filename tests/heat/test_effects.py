@@ -7,7 +7,11 @@ import pytest
 
 from tests.support.heat_meshes import SIDES, box_mesh
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effects import (
+from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.solution import HeatSolution
+from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.heat.effects import (
     STEFAN_BOLTZMANN_W_M2K4,
     AbsorbedSolar,
     Convection,
@@ -18,10 +22,6 @@ from thermoxels_ns.fem.effects import (
     InternalHeat,
     Radiation,
 )
-from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
-from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.solution import HeatSolution
-from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 AREA_X, VOLUME = 0.3 * 0.2, 0.4 * 0.3 * 0.2
