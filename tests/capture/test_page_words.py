@@ -20,6 +20,7 @@ from thermoxels_ns.radiometry.conditions import Conditions
 from thermoxels_ns.reports.capture_page import CapturePage, Overlay, build_page
 
 MODEL = ring_model(4)
+JPEG = b"\xff\xd8\xff"
 
 
 @pytest.fixture
@@ -45,7 +46,7 @@ def page() -> CapturePage:
         scale=None,
         scale_missing="no photograph has a GPS position",
         up=Up(np.array([-1e-9, -1e-12, 1.0]), "Assumed.", None),
-        overlays=[Overlay("a", "data:a", "data:b", "data:c", (12.34, 20.06))],
+        overlays=[Overlay("a", JPEG, JPEG, JPEG, (12.34, 20.06))],
         temperatures_c=np.linspace(10, 20, 100, dtype=np.float32),
         masked_share=0.0,
         dead_pixels=0,
@@ -65,7 +66,7 @@ def test_how_the_degrees_were_measured(page):
 
 
 def test_how_sure_the_rig_is(page):
-    assert "a point&#x27;s place is known to 0.33 thermal pixels" in words(page)
+    assert "a point&#39;s place is known to 0.33 thermal pixels" in words(page)
     assert "Rig known" in words(replace(page, rig=replace(page.rig, projection_sigma_px=np.nan)))
     unsure = words(replace(page, rig=replace(page.rig, determined=False, explanation="Too flat.")))
     assert "not determined: the start value is kept" in unsure and "Too flat." in unsure

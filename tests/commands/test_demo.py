@@ -294,7 +294,7 @@ def test_the_whole_demo_leaves_a_page(quick_demo, tmp_path, capfd):
     page = (folder / "index.html").read_text(encoding="utf-8")
     assert "Thermoxels demo: sphere" in page
     assert page.count("<img") == 3 + 2 * 6 + 4 * 2 + 4
-    assert ">10.0<" in page and ">40.0&nbsp;°C<" in page  # the bounds of the sphere's temperatures
+    assert ">10.0<" in page and ">40.0\xa0°C<" in page  # the bounds of the sphere's temperatures
     assert page.count(">yes<") == 4 and ">no<" not in page
     assert f"ns-viewer --load-config {folder}/outputs/demo/thermoxels/run/config.yml" in page
     assert sorted(path.name for path in (folder / "logs").iterdir()) == [

@@ -1,39 +1,14 @@
-"""Charts and overlays of the page: what they show is where the numbers say."""
+"""Overlays of the page: what they show is where the numbers say."""
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
-import pytest
 
 from tests.support.posed_model import ring_model
-from thermoxels_ns.capture.overlays import colours, data_url, spread_out, thermal_in_photograph
+from thermoxels_ns.capture.overlays import colours, jpeg_of, spread_out, thermal_in_photograph
 from thermoxels_ns.capture.stage_types import CameraModel, RigEstimate, RigFrame
-from thermoxels_ns.reports.svg_charts import bars, histogram
 
 THERMAL = CameraModel(80, 60, 70.0, 70.0, 41.0, 29.0)
-
-
-def rectangles(svg: str) -> list[tuple[float, float, float, float]]:
-    found = re.findall(r'<rect x="([-\d.]+)" y="([-\d.]+)" width="([-\d.]+)" height="([-\d.]+)"', svg)
-    return [tuple(map(float, row)) for row in found]
-
-
-def test_heights_of_a_histogram_are_its_counts():
-    heights = [row[3] for row in rectangles(histogram(np.array([0.0, 0.1, 0.9, 0.95, 1.0, np.nan]), "x", bins=2))]
-    assert heights[0] / heights[1] == pytest.approx(2 / 3, abs=0.01)
-    assert "No values" in histogram(np.array([np.nan]), "x")
-
-
-def test_bars_go_up_and_down_from_zero():
-    up, down = rectangles(bars([2.0, -1.0], "x"))
-    assert up[3] == pytest.approx(2 * down[3], rel=0.02)
-    assert up[1] + up[3] == pytest.approx(down[1], abs=0.11)
-
-
-def test_text_of_a_chart_cannot_be_markup():
-    assert "<b>" not in histogram(np.arange(4.0), "<b>&\"'")
 
 
 def test_a_point_of_the_thermal_image_lands_where_the_scene_has_it():
@@ -65,4 +40,4 @@ def test_small_things():
     assert spread_out(100, 3) == [0, 50, 99]
     assert list(spread_out(2, 6)) == [0, 1]
     assert list(spread_out(0, 6)) == []
-    assert data_url(np.zeros((2, 2, 3), np.uint8)).startswith("data:image/jpeg;base64,/9j/")
+    assert jpeg_of(np.zeros((2, 2, 3), np.uint8)).startswith(b"\xff\xd8\xff")

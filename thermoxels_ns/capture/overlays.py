@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 from collections.abc import Sequence
 
@@ -94,11 +93,11 @@ def colours(temperature_c: npt.NDArray, limits: tuple[float, float] | None = Non
     return shown
 
 
-def data_url(picture: npt.NDArray[np.uint8], quality: int = 82) -> str:
-    """A picture as a url that holds it, for a page that needs no other file."""
+def jpeg_of(picture: npt.NDArray[np.uint8], quality: int = 82) -> bytes:
+    """Encode a picture as a JPEG file."""
     stream = io.BytesIO()
     Image.fromarray(picture).save(stream, format="JPEG", quality=quality)
-    return "data:image/jpeg;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
+    return stream.getvalue()
 
 
 def spread_out(count: int, shown: int) -> Sequence[int]:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from thermoxels_ns.core.checks import replace_when_done, writable_folder
+from thermoxels_ns.core.checks import writable_folder
 from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 
 if TYPE_CHECKING:
@@ -84,6 +84,7 @@ def run_demo(demo: Demo, console: Console) -> None:
     from thermoxels_ns.commands.demo_commands import command_line, run_command
     from thermoxels_ns.commands.demo_results import read_results
     from thermoxels_ns.reports.demo_page import build_page
+    from thermoxels_ns.reports.page import write_page
     from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
     if demo.iterations is not None and demo.iterations < 1:
@@ -108,8 +109,7 @@ def run_demo(demo: Demo, console: Console) -> None:
     shown = [command_line(command) for command in commands]
     page = assemble_page(folder, demo.scene, results, steps.seconds, shown)
     index = folder / "index.html"
-    with replace_when_done(index) as temporary:
-        temporary.write_text(build_page(page), encoding="utf-8")
+    write_page(index, build_page(page))
     console.print(f"All pictures and figures: {index}", markup=False, soft_wrap=True)
     if demo.open_browser:
         webbrowser.open(index.resolve().as_uri())
@@ -201,7 +201,8 @@ def assemble_page(
         ThermoxelsError: A picture that a command should have written is missing.
     """
     from thermoxels_ns.commands.demo_commands import command_line
-    from thermoxels_ns.reports.demo_page import Check, DemoPage, Figure, HeldOutView
+    from thermoxels_ns.reports.demo_page import Check, DemoPage, HeldOutView
+    from thermoxels_ns.reports.page import Picture, Table
 
     bar = _colour_bar(folder / "scene")
     renders = folder / "renders" / "test"
@@ -211,18 +212,18 @@ def assemble_page(
     pairs = tuple(_training_pairs(folder / "scene"))
     return DemoPage(
         title=f"Thermoxels demo: {scene}",
-        intro=(
+        summary=(
             f"{_TRAIN_VIEWS} photographs and their thermal images became a model, a tetrahedral mesh with temperatures "
             "and a heat computation. The scene is synthetic: its shape and temperature are known exactly, so the "
             "result can be measured."
         ),
         at_a_glance=(
-            Figure(pairs[0][0], f"In: {_TRAIN_VIEWS} photographs"),
-            Figure(pairs[0][1], "In: their thermal images"),
-            Figure(_picture(export / "mesh.png"), "Out: a solid in which heat can flow"),
+            Picture(pairs[0][0], f"In: {_TRAIN_VIEWS} photographs"),
+            Picture(pairs[0][1], "In: their thermal images"),
+            Picture(_picture(export / "mesh.png"), "Out: a solid in which heat can flow"),
         ),
         checks=tuple(Check(t.name, t.measured_text, t.bound_text, t.met, t.meaning) for t in results.targets),
-        more_figures=results.others,
+        more_figures=Table(("", ""), results.others, summary="More figures"),
         training_pairs=pairs,
         views=tuple(
             HeldOutView(
@@ -232,10 +233,12 @@ def assemble_page(
         ),
         colour_bar=bar,
         mesh_pictures=(
-            Figure(before, "Before: the temperatures that the photographs gave."),
-            Figure(after, "After: heat has flowed through the solid. Both in one range of colours."),
-            Figure(change, "The change, on a scale of its own."),
-            Figure(_picture(export / "mesh-measured.png"), "Grey: no thermal ray saw the surface; it is interpolated."),
+            Picture(before, "Before: the temperatures that the photographs gave."),
+            Picture(after, "After: heat has flowed through the solid. Both in one range of colours."),
+            Picture(change, "The change, on a scale of its own."),
+            Picture(
+                _picture(export / "mesh-measured.png"), "Grey: no thermal ray saw the surface; it is interpolated."
+            ),
         ),
         next_steps=(
             (

@@ -25,7 +25,7 @@ from thermoxels_ns.heat.vtk_series import STEP_PATTERN, remove_heat_series, writ
 from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtu
 from thermoxels_ns.reports.heat_page import heat_page
 from thermoxels_ns.reports.heat_pictures import PICTURES, draw_surface
-from thermoxels_ns.reports.heat_report import build_report
+from thermoxels_ns.reports.page import build_page, write_page
 
 if TYPE_CHECKING:
     from thermoxels_ns.commands.heat_run import HeatRun
@@ -112,9 +112,8 @@ def write_heat_files(folder: Path, run: HeatRun, say: Callable[[str], None]) -> 
     drawn = {name: (folder / name).read_bytes() for name in pictures}
     fields = STEADY if isinstance(run.solution, SteadySolution) else THROUGH_TIME
     files = [PAGE, ANSWERS, SERIES, fields, *pictures]
-    page = build_report(heat_page(run, drawn, command_line(run.options), files))
-    with replace_when_done(folder / PAGE) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    page = build_page(heat_page(run, drawn, command_line(run.options), files))
+    write_page(folder / PAGE, page)
     write_summary(folder / ANSWERS, summary_of(run))
     say(f"Written to {folder}: {', '.join(files)}")
 

@@ -1,12 +1,10 @@
-"""capture.html: what the capture found, on one page that fetches nothing and runs no script."""
+"""What a capture found, as sections of capture.html."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -19,10 +17,10 @@ from thermoxels_ns.capture.sfm.gravity import Up
 from thermoxels_ns.capture.sfm.metric_scale import MetricScale
 from thermoxels_ns.capture.sfm.model import SfmModel
 from thermoxels_ns.capture.stage_types import CameraModel, DriftEstimate, RigEstimate
-from thermoxels_ns.core.checks import replace_when_done
 from thermoxels_ns.radiometry.dead_pixels import MIN_FRAMES
-from thermoxels_ns.reports.page_style import html_page, scrolling
-from thermoxels_ns.reports.svg_charts import bars, histogram
+from thermoxels_ns.reports.charts import bars, histogram
+from thermoxels_ns.reports.page import Gallery, Page, Picture, Section, Table
+from thermoxels_ns.reports.page import build_page as build_html
 
 _PERCENTILES = (0.1, 99.9)
 _TOO_FEW = f"not looked for in fewer than {MIN_FRAMES} frames"
@@ -33,11 +31,11 @@ class Overlay:
     """One frame for a person to judge."""
 
     name: str
-    start_url: str
+    start: bytes
     """Thermal colours over the photograph with the rig's start value."""
-    found_url: str
+    found: bytes
     """The same with the rig that was found."""
-    thermal_url: str
+    thermal: bytes
     """The thermal image alone."""
     shown_c: tuple[float, float] | None = None
     """Temperatures of its darkest and its brightest colour, [degrees C]; None: it has none."""
@@ -74,31 +72,23 @@ class CapturePage:
     seconds: Sequence[tuple[str, float]]
 
 
-def write_page(page: CapturePage, path: Path) -> None:
-    """Write the page, whole or not at all."""
-    with replace_when_done(path) as temporary:
-        temporary.write_text(build_page(page), encoding="utf-8")
-
-
 def build_page(page: CapturePage) -> str:
     """Build the html text; it depends on `page` alone."""
-    sections = [
-        ("In short", _summary(page)),
-        ("Judge for yourself: thermal colours over the photographs", _overlays(page)),
-        (f"Left out ({len(page.dropped)})", _dropped(page.dropped)),
-        ("Cameras", _cameras(page)),
-        ("Poses", _poses(page)),
-        ("Scale and up", _scale(page)),
-        ("Temperatures", _temperatures(page)),
-        ("Drift", _drift(page)),
-        (f"Pairs ({len(page.pairs)})", _pairs(page)),
-        ("Time", _rows([(name, f"{took:.1f} s") for name, took in page.seconds])),
-    ]
-    body = "\n".join(f"<section><h2>{escape(heading)}</h2>{content}</section>" for heading, content in sections)
-    return html_page(page.title, f"<h1>{escape(page.title)}</h1>\n{body}", _STYLE)
+    sections = (
+        _overlays(page),
+        _dropped(page.dropped),
+        _cameras(page),
+        _poses(page),
+        Section("Scale and up", tables=(_rows(_scale(page)),)),
+        _temperatures(page),
+        _drift(page),
+        _pairs(page),
+        Section("Time", tables=(_rows([(name, f"{took:.1f} s") for name, took in page.seconds]),)),
+    )
+    return build_html(Page(page.title, "", (Section("In short", tables=(_rows(_summary(page)),)), *sections)))
 
 
-def _summary(page: CapturePage) -> str:
+def _summary(page: CapturePage) -> list[tuple[str, str]]:
     registered, pairs = len(page.model.frames), len(page.pairs)
     error = page.model.sighting_error_px()
     rows = [
@@ -110,7 +100,7 @@ def _summary(page: CapturePage) -> str:
     ]
     if len(error):
         rows.insert(2, ("Median reprojection error", f"{np.median(error):.2f} pixels"))
-    return _rows(rows)
+    return rows
 
 
 def _rig_text(rig: RigEstimate) -> str:
@@ -136,22 +126,29 @@ def _scale_text(page: CapturePage) -> str:
     return f"{page.scale.metres_per_unit:.5g}{plus} m per unit"
 
 
-def _overlays(page: CapturePage) -> str:
+def _overlays(page: CapturePage) -> Section:
+    heading = "Judge for yourself: thermal colours over the photographs"
     if not page.overlays:
-        return "<p>No frame has both a pose and a thermal image.</p>"
+        return Section(heading, words=("No frame has both a pose and a thermal image.",))
     words = "White lines are the photograph's edges. Warm and cold shapes should lie on them. "
     words += (
         "Left: where the search for the rig began. Middle: where it ended."
         if page.rig.determined
         else f"The rig was not determined: {page.rig.explanation}"
     )
-    cells = "".join(
-        f"<h3>{escape(one.name)}</h3><div class=three>"
-        f"{_figure(one.start_url, 'start value')}{_figure(one.found_url, 'as written')}"
-        f"{_figure(one.thermal_url, _colours_text(one.shown_c))}</div>"
+    galleries = tuple(
+        Gallery(
+            (
+                Picture(one.start, "start value"),
+                Picture(one.found, "as written"),
+                Picture(one.thermal, _colours_text(one.shown_c)),
+            ),
+            columns=3,
+            heading=one.name,
+        )
         for one in page.overlays
     )
-    return f"<p>{escape(words)}</p>{cells}"
+    return Section(heading, words=(words,), galleries=galleries)
 
 
 def _colours_text(shown_c: tuple[float, float] | None) -> str:
@@ -160,43 +157,35 @@ def _colours_text(shown_c: tuple[float, float] | None) -> str:
     return f"thermal image: {shown_c[0]:.1f} °C and less are black, {shown_c[1]:.1f} °C and more are bright yellow"
 
 
-def _figure(url: str, words: str) -> str:
-    return (
-        f'<figure><img src="{url}" alt="{escape(words, quote=True)}"><figcaption>{escape(words)}</figcaption></figure>'
-    )
-
-
-def _dropped(dropped: Mapping[str, str]) -> str:
+def _dropped(dropped: Mapping[str, str]) -> Section:
+    heading = f"Left out ({len(dropped)})"
     if not dropped:
-        return "<p>Nothing: every file is in a pair and every pair has a pose.</p>"
-    rows = "".join(f"<tr><td>{escape(name)}</td><td>{escape(why)}</td></tr>" for name, why in dropped.items())
-    head = "<tr><th>file or frame</th><th>why</th></tr>"
-    return scrolling(f"<table><thead>{head}</thead><tbody>{rows}</tbody></table>")
+        return Section(heading, words=("Nothing: every file is in a pair and every pair has a pose.",))
+    return Section(heading, tables=(Table(("file or frame", "why"), tuple(dropped.items()), figures_from=2),))
 
 
-def _cameras(page: CapturePage) -> str:
+def _cameras(page: CapturePage) -> Section:
     found = page.rig.standard_errors
-    focal_error = found.get("log_focal", float("nan")) * page.rig.thermal_camera.fl_x
+    focal_error = found.get("log_focal", math.nan) * page.rig.thermal_camera.fl_x
     errors = {"focal": focal_error, **{name: found[name] for name in ("cx", "cy") if name in found}}
     columns = (
         ("photographs", page.model.camera, {}),
         ("thermal, start value", page.start.thermal_camera, {}),
         ("thermal, as written", page.rig.thermal_camera, errors),
     )
-    lines = [
-        ("size, pixels", [f"{camera.width} x {camera.height}" for _, camera, _ in columns]),
+    cameras = Table(
+        ("", *(name for name, _, _ in columns)),
         (
-            "focal length, pixels",
-            [with_error(camera.fl_x, own.get("focal", math.nan), 1) for _, camera, own in columns],
+            ("size, pixels", *(f"{camera.width} x {camera.height}" for _, camera, _ in columns)),
+            (
+                "focal length, pixels",
+                *(with_error(camera.fl_x, own.get("focal", math.nan), 1) for _, camera, own in columns),
+            ),
+            ("angle of view, degrees", *(f"{_angle(camera):.1f}" for _, camera, _ in columns)),
+            ("principal point, pixels", *(_principal_point(camera, own) for _, camera, own in columns)),
+            ("distortion k1, k2", *(f"{camera.k1:.4f}, {camera.k2:.4f}" for _, camera, _ in columns)),
         ),
-        ("angle of view, degrees", [f"{_angle(camera):.1f}" for _, camera, _ in columns]),
-        ("principal point, pixels", [_principal_point(camera, own) for _, camera, own in columns]),
-        ("distortion k1, k2", [f"{camera.k1:.4f}, {camera.k2:.4f}" for _, camera, _ in columns]),
-    ]
-    head = "".join(f"<th class=num>{escape(name)}</th>" for name, _, _ in columns)
-    rows = "".join(
-        f"<tr><td>{escape(name)}</td>{''.join(f'<td class=num>{escape(cell)}</td>' for cell in cells)}</tr>"
-        for name, cells in lines
+        look="cameras",
     )
     turn = with_error(turn_deg(page.rig), turn_error_deg(page.rig), 2)
     shift = float(np.linalg.norm(page.rig.visible_to_thermal[:3, 3]))
@@ -214,8 +203,7 @@ def _cameras(page: CapturePage) -> str:
         extra.append(("agreement of edges", f"{page.rig.score_before:.3f} before, {page.rig.score_after:.3f} after"))
     if np.isfinite(page.rig.projection_sigma_px):
         extra.append(("standard error of a point's place", f"{page.rig.projection_sigma_px:.2f} thermal pixels"))
-    table = f"<table class=cameras><thead><tr><th></th>{head}</tr></thead><tbody>{rows}</tbody></table>"
-    return scrolling(table) + _rows(extra)
+    return Section("Cameras", tables=(cameras, _rows(extra)))
 
 
 def _principal_point(camera: CameraModel, errors: Mapping[str, float]) -> str:
@@ -228,46 +216,42 @@ def _angle(camera: CameraModel) -> float:
     return float(2 * np.degrees(np.arctan(camera.width / (2 * camera.fl_x))))
 
 
-def _poses(page: CapturePage) -> str:
+def _poses(page: CapturePage) -> Section:
     error = page.model.sighting_error_px()
     if not len(error):
-        return f"<p>{escape(page.poses_source)}</p>"
+        return Section("Poses", words=(page.poses_source,))
     limit = float(np.percentile(error, 99))
-    chart = histogram(error, "reprojection error, pixels of the photographs", limits=(0.0, max(limit, 0.1)))
     rows = []
     for index, name in enumerate(page.model.frames):
         own = error[page.model.sighting_frame == index]
         median = f"{np.median(own):.2f}" if len(own) else "-"
-        rows.append(
-            f"<tr><td>{escape(page.scene_names[index])}</td><td>{escape(name)}</td><td class=num>{len(own)}</td>"
-            f"<td class=num>{median}</td></tr>"
-        )
-    head = (
-        "<tr><th>in the scene</th><th>frame</th><th class=num>points</th><th class=num>median error, pixels</th></tr>"
-    )
-    table = scrolling(f"<table><thead>{head}</thead><tbody>{''.join(rows)}</tbody></table>")
-    details = f"<details><summary>Frame by frame</summary>{table}</details>"
+        rows.append((page.scene_names[index], name, str(len(own)), median))
+    head = ("in the scene", "frame", "points", "median error, pixels")
     figures = [
         ("source", page.poses_source),
         ("points", f"{len(page.model.points)}"),
         ("mean and median error", f"{error.mean():.2f} and {np.median(error):.2f} pixels"),
     ]
-    return _rows(figures) + chart + details
+    return Section(
+        "Poses",
+        svg=histogram(error, "reprojection error, pixels of the photographs", limits=(0.0, max(limit, 0.1))),
+        tables=(_rows(figures), Table(head, tuple(rows), figures_from=2, summary="Frame by frame")),
+    )
 
 
-def _scale(page: CapturePage) -> str:
+def _scale(page: CapturePage) -> list[tuple[str, str]]:
     rows = [("scale", _scale_text(page))]
     if page.scale is not None:
         rows.append(("from", page.scale.source))
     spread = "" if page.up.spread_deg is None else f" Single photographs differ by {page.up.spread_deg:.1f} degrees."
     direction = ", ".join(f"{value + 0.0:.3f}" for value in np.round(page.up.direction, 3))
-    return _rows([*rows, ("up, as x, y, z", f"{direction}. {page.up.source}{spread}")])
+    return [*rows, ("up, as x, y, z", f"{direction}. {page.up.source}{spread}")]
 
 
-def _temperatures(page: CapturePage) -> str:
+def _temperatures(page: CapturePage) -> Section:
     values = page.temperatures_c[np.isfinite(page.temperatures_c)]
     if not values.size:
-        return "<p>No thermal pixel has a temperature.</p>"
+        return Section("Temperatures", words=("No thermal pixel has a temperature.",))
     low, high = (float(value) for value in np.percentile(values, _PERCENTILES))
     rows = [
         *measurement_rows(page.frames),
@@ -278,10 +262,10 @@ def _temperatures(page: CapturePage) -> str:
     if page.overlay_share is not None:
         rows.append(("photographs masked", f"{100 * page.overlay_share:.1f} %"))
     label = "temperature, °C; how many pixels of a sample, without the coldest and hottest 0.1 %"
-    return _rows(rows) + histogram(values, label, limits=(low, high))
+    return Section("Temperatures", svg=histogram(values, label, limits=(low, high)), tables=(_rows(rows),))
 
 
-def _drift(page: CapturePage) -> str:
+def _drift(page: CapturePage) -> Section:
     drift = page.drift
     rows = [("result", drift.explanation)]
     if np.isfinite(drift.before_k):
@@ -289,41 +273,14 @@ def _drift(page: CapturePage) -> str:
     if np.isfinite(drift.after_k):
         rows.append(("after, at points it was not fitted to", f"{drift.after_k:.3f} K"))
     chart = bars(drift.offsets_k.tolist(), "frame; how much it reads too high, K") if drift.used else ""
-    return _rows(rows) + chart
+    return Section("Drift", svg=chart, tables=(_rows(rows),))
 
 
-def _pairs(page: CapturePage) -> str:
-    rows = "".join(
-        f"<tr><td>{escape(pair.name)}</td><td>{escape(pair.photograph.name)}</td><td>{escape(pair.thermal.name)}</td>"
-        f"<td>{escape(pair.how)}</td></tr>"
-        for pair in page.pairs
-    )
-    head = "<tr><th>frame</th><th>photograph</th><th>thermal</th><th>how</th></tr>"
-    table = scrolling(f"<table><thead>{head}</thead><tbody>{rows}</tbody></table>")
-    return f"<details><summary>All pairs</summary>{table}</details>"
+def _pairs(page: CapturePage) -> Section:
+    rows = tuple((pair.name, pair.photograph.name, pair.thermal.name, pair.how) for pair in page.pairs)
+    head = ("frame", "photograph", "thermal", "how")
+    return Section(f"Pairs ({len(rows)})", tables=(Table(head, rows, figures_from=4, summary="All pairs"),))
 
 
-def _rows(rows: Sequence[tuple[str, str]]) -> str:
-    body = "".join(f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in rows)
-    return f"<div class=rows>{scrolling(f'<table><tbody>{body}</tbody></table>')}</div>"
-
-
-_STYLE = """
-.rows { max-width: 56rem; }
-.rows td:first-child { width: 17rem; }
-td { overflow-wrap: anywhere; }
-td:first-child { min-width: 6rem; }
-.three { display: grid; grid-template-columns: repeat(3, 1fr); gap: .6rem; align-items: start; break-inside: avoid; }
-svg { max-width: 46rem; font-size: 11px; }
-svg rect { fill: var(--accent); opacity: .8; }
-svg line { stroke: var(--soft); }
-svg text { fill: var(--soft); }
-@media screen and (max-width: 640px) {
-  .three { grid-template-columns: 1fr; }
-  .rows td:first-child { width: 40%; }
-  .cameras tr { display: grid; grid-template-columns: repeat(3, 1fr); border-bottom: 1px solid var(--line); }
-  .cameras td, .cameras th { border: 0; text-align: left; white-space: normal; }
-  .cameras td:first-child { grid-column: 1 / -1; padding-bottom: 0; color: var(--soft); }
-  .cameras th:first-child { display: none; }
-}
-"""
+def _rows(rows: Sequence[tuple[str, str]]) -> Table:
+    return Table(("", ""), tuple(rows), figures_from=2, look="rows")

@@ -54,27 +54,27 @@ def unit_signs(unit: str) -> str:
 
 
 @dataclass(frozen=True)
-class Dust:
+class RoundOff:
     """Heat flows so small that they are rounding: of a steady body, what flows in and out of it again."""
 
     below_w: float
-    """Flows smaller than this are dust, [W]."""
+    """Flows smaller than this are round-off, [W]."""
 
     def flow(self, heat_w: float) -> str:
-        """Write a heat flow; dust is 0.
+        """Write a heat flow; round-off is 0.
 
-        >>> Dust(1e-6).flow(6e-10), Dust(1e-6).flow(-12.5)
+        >>> RoundOff(1e-6).flow(6e-10), RoundOff(1e-6).flow(-12.5)
         ('0', '-12.50')
         """
         return "0" if abs(heat_w) < self.below_w else figure(heat_w)
 
     def per_area(self, heat_w_m2: float, heat_w: float) -> str:
-        """Write a heat flow per area; that of dust is 0."""
+        """Write a heat flow per area; that of round-off is 0."""
         return "0" if abs(heat_w) < self.below_w else figure(heat_w_m2)
 
 
-def dust_of(flows_w: Sequence[float], area_m2: float) -> Dust:
-    """Say what is dust in a body.
+def round_off_of(flows_w: Sequence[float], area_m2: float) -> RoundOff:
+    """Say which flows are round-off in a body.
 
     It is less than a billionth of the largest flow, which a balance need not close to, or less than a billionth of a
     watt per square metre, which is what rounding makes of a surface as warm as the air beside it.
@@ -83,8 +83,8 @@ def dust_of(flows_w: Sequence[float], area_m2: float) -> Dust:
         flows_w: Heat flows of everything that acts, [W].
         area_m2: Area of the surface, [m^2].
 
-    >>> f"{dust_of((1e3, -1e3), 200.0).below_w:g} {dust_of((), 200.0).below_w:g}"
+    >>> f"{round_off_of((1e3, -1e3), 200.0).below_w:g} {round_off_of((), 200.0).below_w:g}"
     '1e-06 2e-07'
     """
     largest = max((abs(flow) for flow in flows_w), default=0.0)
-    return Dust(1e-9 * max(largest, area_m2))
+    return RoundOff(1e-9 * max(largest, area_m2))

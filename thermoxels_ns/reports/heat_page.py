@@ -1,26 +1,26 @@
-"""What the report of a heat computation says, in which order and words."""
+"""What the report of a heat computation says."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from thermoxels_ns.fem.effect_forms import effect_labels
-from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.heat.effects import Effect, FixedTemperature, InternalHeat
 from thermoxels_ns.heat.materials import materials_by_region
 from thermoxels_ns.heat.results import Spot
-from thermoxels_ns.reports.heat_accuracy import accuracy_card, accuracy_sections, how_time_was_followed
-from thermoxels_ns.reports.heat_numbers import Dust, coordinate, degrees, dust_of, unit_signs
+from thermoxels_ns.heat.solving import Accuracy
+from thermoxels_ns.reports.heat_numbers import RoundOff, coordinate, degrees, round_off_of, unit_signs
 from thermoxels_ns.reports.heat_numbers import figure as _figure
 from thermoxels_ns.reports.heat_pictures import in_words, plot_over_time
-from thermoxels_ns.reports.heat_report import HeatReport, Section, Table
+from thermoxels_ns.reports.page import Gallery, Page, Picture, Section, Table
 
 if TYPE_CHECKING:
     from thermoxels_ns.commands.heat_run import HeatRun
@@ -35,7 +35,7 @@ _LARGE_K = 100.0
 _INTO_BODY = "Heat flows are positive into the body; what is lost is negative."
 
 
-def heat_page(run: HeatRun, pictures: Mapping[str, bytes], command: str, files: Sequence[str]) -> HeatReport:
+def heat_page(run: HeatRun, pictures: Mapping[str, bytes], command: str, files: Sequence[str]) -> Page:
     """Put a run into words.
 
     Args:
@@ -49,7 +49,7 @@ def heat_page(run: HeatRun, pictures: Mapping[str, bytes], command: str, files: 
         *_wall(run),
         *_probes(run),
         _balance(run),
-        *accuracy_sections(run.accuracy),
+        *_accuracy(run.accuracy),
     ]
     if isinstance(run.solution, HeatSolution):
         plot = plot_over_time(run.solution, run.mean_c, run.probes_c, _probe_names(run))
@@ -57,17 +57,17 @@ def heat_page(run: HeatRun, pictures: Mapping[str, bytes], command: str, files: 
         sections.append(Section("Over time", words=words, svg=plot))
     if pictures:
         captioned = tuple(
-            (png, _CAPTIONS[name].replace(" at the end", "") if run.scene.steady else _CAPTIONS[name])
+            Picture(png, _CAPTIONS[name].replace(" at the end", "") if run.scene.steady else _CAPTIONS[name])
             for name, png in pictures.items()
         )
-        sections.append(Section("Pictures", pictures=captioned))
+        sections.append(Section("Pictures", galleries=(Gallery(captioned),)))
     sections += [_asked(run), _built(run), _made(run, command, files)]
-    return HeatReport(
+    return Page(
         title=run.scene.description or "Heat flow",
         summary=_summary(run),
         figures=_figures(run),
         sections=tuple(sections),
-        doubts=run.warnings,
+        warnings=run.warnings,
     )
 
 
@@ -82,13 +82,13 @@ def _summary(run: HeatRun) -> str:
 
 def _figures(run: HeatRun) -> tuple[tuple[str, str], ...]:
     """The figures that matter most."""
-    answers, cards, dust = run.answers, [], _dust(run)
+    answers, cards, round_off = run.answers, [], _round_off(run)
     steady = run.scene.steady
     lost = -sum(effect.heat_w for effect in answers.effects if effect.heat_w < 0.0)
     won = sum(effect.heat_w for effect in answers.effects if effect.heat_w > 0.0)
-    cards.append((f"{dust.flow(lost)} W", "heat loss" if steady else "mean heat loss"))
+    cards.append((f"{round_off.flow(lost)} W", "heat loss" if steady else "mean heat loss"))
     if not steady:
-        cards.append((f"{dust.flow(won)} W", "mean heat gain"))
+        cards.append((f"{round_off.flow(won)} W", "mean heat gain"))
     if run.wall is not None:
         cards.append((f"{run.wall.u_value_w_m2k:.3f} {unit_signs('W/(m2 K)')}", "mean U-value of the inner surface"))
         cards.append((f"{run.wall.temperature_factor:.3f}", "surface temperature factor f_Rsi"))
@@ -98,12 +98,12 @@ def _figures(run: HeatRun) -> tuple[tuple[str, str], ...]:
     cards.append(
         (f"{degrees(answers.hottest.temperature_c)} \N{DEGREE SIGN}C", f"hottest spot {_place(answers.hottest)}")
     )
-    cards += accuracy_card(run.accuracy)
+    cards += _accuracy_card(run.accuracy)
     return tuple(cards)
 
 
 def _answers(run: HeatRun) -> Section:
-    answers, steady, dust = run.answers, run.scene.steady, _dust(run)
+    answers, steady, round_off = run.answers, run.scene.steady, _round_off(run)
     flow = "W" if steady else "mean W"
     last = () if steady else ("last interval W",)
     effects = Table(
@@ -112,9 +112,9 @@ def _answers(run: HeatRun) -> Section:
             (
                 effect.effect,
                 _optional(effect.area_m2),
-                dust.flow(effect.heat_w),
-                "" if effect.heat_w_m2 is None else dust.per_area(effect.heat_w_m2, effect.heat_w),
-                *(() if steady else (dust.flow(effect.last_heat_w),)),
+                round_off.flow(effect.heat_w),
+                "" if effect.heat_w_m2 is None else round_off.per_area(effect.heat_w_m2, effect.heat_w),
+                *(() if steady else (round_off.flow(effect.last_heat_w),)),
             )
             for effect in answers.effects
         ),
@@ -128,8 +128,8 @@ def _answers(run: HeatRun) -> Section:
         tuple(
             (
                 *(patch.patch, _figure(patch.area_m2)),
-                *(dust.flow(patch.heat_w), dust.per_area(patch.heat_w_m2, patch.heat_w)),
-                *(() if steady else (dust.flow(patch.last_heat_w),)),
+                *(round_off.flow(patch.heat_w), round_off.per_area(patch.heat_w_m2, patch.heat_w)),
+                *(() if steady else (round_off.flow(patch.last_heat_w),)),
                 *(degrees(patch.mean_c), _warm_and_where(patch.coldest), _warm_and_where(patch.hottest)),
             )
             for patch in answers.patches
@@ -145,7 +145,7 @@ def _answers(run: HeatRun) -> Section:
         tuple(
             (
                 *(region.region, region.material, _figure(region.volume_m3), _figure(region.area_m2)),
-                *(dust.flow(region.heat_w), dust.per_area(region.heat_w_m2, region.heat_w)),
+                *(round_off.flow(region.heat_w), round_off.per_area(region.heat_w_m2, region.heat_w)),
                 *(degrees(region.mean_c), degrees(region.min_c), degrees(region.max_c)),
             )
             for region in answers.regions
@@ -196,8 +196,8 @@ def _probes(run: HeatRun) -> list[Section]:
 def _balance(run: HeatRun) -> Section:
     balance = run.answers.balance
     scale, unit = (1.0, "W") if balance.unit == "W" else (3.6e6, "kWh")
-    dust = _dust(run).below_w * (1.0 if balance.unit == "W" else _duration_s(run))
-    left = 0.0 if abs(balance.residual) < dust else balance.residual
+    round_off = _round_off(run).below_w * (1.0 if balance.unit == "W" else _duration_s(run))
+    left = 0.0 if abs(balance.residual) < round_off else balance.residual
     rows = (
         ("into the body", f"{_figure(balance.into_body / scale)} {unit}"),
         ("out of the body", f"{_figure(balance.out_of_body / scale)} {unit}"),
@@ -211,7 +211,7 @@ def _balance(run: HeatRun) -> Section:
 def _asked(run: HeatRun) -> Section:
     mesh, scene, time = run.problem.mesh, run.scene, run.scene.time
     start = "the photographs" if scene.initial_c is None else f"{scene.initial_c:g} \N{DEGREE SIGN}C everywhere"
-    how = how_time_was_followed(time, run.accuracy)
+    how = _how_time_was_followed(time, run.accuracy)
     general = Table(
         ("", ""),
         (
@@ -320,10 +320,10 @@ def _values(effect: Effect, selection: Selection) -> list[str]:
     return shown
 
 
-def _dust(run: HeatRun) -> Dust:
+def _round_off(run: HeatRun) -> RoundOff:
     answers = run.answers
     flows = [flow for effect in answers.effects for flow in (effect.heat_w, effect.last_heat_w)]
-    return dust_of(flows, sum(patch.area_m2 for patch in answers.patches))
+    return round_off_of(flows, sum(patch.area_m2 for patch in answers.patches))
 
 
 def _duration_s(run: HeatRun) -> float:
@@ -352,3 +352,77 @@ def _up_to(bound_k: float | None) -> str:
 
 def _optional(value: float | None) -> str:
     return "" if value is None else _figure(value)
+
+
+def _accuracy(accuracy: Accuracy | None) -> list[Section]:
+    """Say what the error is, what was chosen, and all solutions on the way; nothing without a tolerance.
+
+    Args:
+        accuracy: What is known of the error; None if no tolerance was given.
+    """
+    if accuracy is None:
+        return []
+    words = [f"{'Met' if accuracy.met else 'Not met'}: {_tolerance_asked(accuracy)}. {accuracy.status}"]
+    if accuracy.left_out_k > 0.0:
+        words.append(
+            f"Of the error, {accuracy.left_out_k:.2g} K at most are what is left out; the solver had the rest of the "
+            "tolerance."
+        )
+    if accuracy.order == 2:
+        words.append(
+            "Tetrahedra are quadratic, with a temperature in the middle of every edge. Files, pictures and extremes "
+            "show those too, on the mesh with all edges halved; heat flows are those of the quadratic tetrahedra."
+        )
+    words.append(
+        "The estimate is of the error in solving the heat equation in the body as the mesh describes it, usually right "
+        "to a factor of three. How far the mesh, its materials and the scene are from the real thing is not in it."
+    )
+    columns = ("Solution", "unknowns", "error K", "error of heat flow %", "s")
+    note = "Estimated errors. The last one is the result."
+    return [Section("Accuracy", words=tuple(words), tables=(Table(columns, _levels(accuracy), note=note),))]
+
+
+def _accuracy_card(accuracy: Accuracy | None) -> list[tuple[str, str]]:
+    """Give the figure for the top of the page: value with unit, and what it is; nothing without a tolerance."""
+    if accuracy is None:
+        return []
+    met = "within the tolerance" if accuracy.met else "NOT within the tolerance"
+    if accuracy.tolerance_k is None:
+        return [(f"{100.0 * accuracy.estimated_flow:.2g} %", f"estimated error of the heat flow, {met}")]
+    return [(f"{accuracy.estimated_k:.2g} K", f"estimated error of temperatures, {met}")]
+
+
+def _how_time_was_followed(time: TimeSteps | AdaptiveSteps | None, accuracy: Accuracy | None) -> str:
+    """Say in words how a body was followed, by the scene's own steps or to a tolerance."""
+    if time is None:
+        return "the steady state"
+    if accuracy is not None:
+        duration = in_words(float(time.times_s[-1]))
+        return f"{duration} in steps chosen by the tolerance (they may err by {accuracy.step_tolerance_k:.2g} K)"
+    if isinstance(time, TimeSteps):
+        return f"{time.steps} steps of {time.step_seconds:g} s"
+    return f"{in_words(time.duration_s)} in steps that keep within {time.tolerance_k:g} K"
+
+
+def _tolerance_asked(accuracy: Accuracy) -> str:
+    parts = [] if accuracy.tolerance_k is None else [f"{accuracy.tolerance_k:g} K"]
+    parts += [] if accuracy.flow_tolerance is None else [f"{100.0 * accuracy.flow_tolerance:g} % of the heat flow"]
+    return f"a tolerance of {' and '.join(parts)}"
+
+
+def _levels(accuracy: Accuracy) -> tuple[tuple[str, ...], ...]:
+    return tuple(_level(level) for level in accuracy.levels)
+
+
+def _level(level: dict[str, Any]) -> tuple[str, ...]:
+    kind = "linear tetrahedra" if level["order"] == 1 else "quadratic tetrahedra"
+    mesh = "given mesh" if level["refinements"] == 0 else f"mesh size halved {level['refinements']}x"
+    steps = "" if level["step_tolerance_k"] is None else f", steps to {level['step_tolerance_k']:.2g} K"
+    error = level["error"]
+    return (
+        f"{kind}, {mesh}{steps}",
+        f"{level['num_nodes']:,}",
+        f"{error['temperature_k']:.2g}",
+        f"{100.0 * error['heat_flow']:.2g}",
+        f"{level['seconds']:.2f}",
+    )

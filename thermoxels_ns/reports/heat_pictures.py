@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
+from thermoxels_ns.reports.charts import curves_over_time
 
 Vector = npt.NDArray[np.float64]
 
@@ -131,37 +131,19 @@ def plot_over_time(solution: HeatSolution, mean_c: Vector, probes_c: Vector, pro
     Returns:
         An svg element, the same for the same figures.
     """
-    from matplotlib import rc_context
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
-
     unit, seconds = time_unit(float(solution.times_s[-1]))
-    time = solution.times_s / seconds
-    with rc_context({"svg.hashsalt": "heat", "font.size": 10, "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(figsize=(10.5, 7.0), layout="constrained")
-        FigureCanvasSVG(figure)
-        above, below = figure.subplots(2, 1, sharex=True)
-        states = solution.temperature_c
-        above.fill_between(time, states.min(axis=1), states.max(axis=1), color="#e9dcd6", label="coldest to hottest")
-        above.plot(time, mean_c, color="#1d2430", linewidth=2, label="mean of the volume")
-        for column, name in list(enumerate(probe_names))[:_MOST_LINES]:
-            above.plot(time, probes_c[:, column], linewidth=1.4, label=name)
-        above.set_ylabel("temperature [\N{DEGREE SIGN}C]")
-        below.axhline(0.0, color="#9aa3ae", linewidth=0.8)
-        # An effect's heat is a mean over each interval.
-        for heat in strongest(solution)[:_MOST_LINES]:
-            below.stairs(heat.heat_w, time, baseline=None, linewidth=1.4, label=heat.effect)
-        below.stairs(solution.heat_w, time, baseline=None, color="#1d2430", linewidth=2, label="all together: stored")
-        below.set_ylabel("heat flow into the body [W]")
-        below.set_xlabel(f"time [{unit}]")
-        below.set_xlim(time[0], time[-1])
-        for axis in (above, below):
-            axis.grid(color="#e1e5ea", linewidth=0.6)
-            axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8.5)
-        text = StringIO()
-        figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
-    svg = text.getvalue()
-    return svg[svg.index("<svg") :].rstrip()
+    probes = [(name, probes_c[:, column]) for column, name in enumerate(probe_names)][:_MOST_LINES]
+    states = solution.temperature_c
+    # An effect's heat is a mean over each interval.
+    flows = [(heat.effect, heat.heat_w) for heat in strongest(solution)[:_MOST_LINES]]
+    return curves_over_time(
+        solution.times_s / seconds,
+        unit,
+        [("mean of the volume", mean_c), *probes],
+        ("coldest to hottest", states.min(axis=1), states.max(axis=1)),
+        [*flows, ("all together: stored", solution.heat_w)],
+        ("temperature [\N{DEGREE SIGN}C]", "heat flow into the body [W]"),
+    )
 
 
 def strongest(solution: HeatSolution) -> list[Any]:

@@ -1,0 +1,129 @@
+"""Charts as SVG text, for pages that fetch nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from io import StringIO
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+INK, SOFT, LINE, ACCENT = "#1d2430", "#9aa3ae", "#e1e5ea", "#b3431e"
+"""Colours of the pages' style sheet."""
+
+
+@contextmanager
+def chart(width: float, height: float, rows: int = 1) -> Iterator[tuple[Figure, list[Axes]]]:
+    """Give a figure whose axes stand one above the other, in the look of the pages.
+
+    Args:
+        width: In units of 1/10 of the font's height.
+        height: The same.
+        rows: Number of axes.
+    """
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    look = {"svg.hashsalt": "thermoxels", "svg.fonttype": "none", "font.size": 10}
+    look |= {"axes.spines.top": False, "axes.spines.right": False}
+    with rc_context(look):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        FigureCanvasSVG(figure)
+        axes = np.atleast_1d(figure.subplots(rows, 1, sharex=True)).tolist()
+        for axis in axes:
+            axis.grid(color=LINE, linewidth=0.6)
+            axis.set_axisbelow(True)
+        yield figure, axes
+
+
+def svg_text(figure: Figure) -> str:
+    """Write a figure as an svg element, the same for the same figure."""
+    text = StringIO()
+    figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+    svg = text.getvalue()
+    return svg[svg.index("<svg") :].rstrip()
+
+
+def histogram(values: npt.NDArray, label: str, bins: int = 60, limits: tuple[float, float] | None = None) -> str:
+    """Draw how often values occur.
+
+    Args:
+        values: Numbers of any shape; those that are not finite do not count.
+        label: What the horizontal axis is, with its unit.
+        bins: Number of bars.
+        limits: From and to; None: all values.
+
+    Returns:
+        An svg element; empty without values.
+    """
+    values = values[np.isfinite(values)]
+    if not values.size:
+        return ""
+    with chart(7.0, 2.2) as (figure, (axis,)):
+        axis.hist(values, bins=bins, range=limits, color=ACCENT, alpha=0.8)
+        axis.set_xlabel(label)
+        return svg_text(figure)
+
+
+def bars(values: Sequence[float], label: str) -> str:
+    """Draw one bar per item, from zero up or down.
+
+    Args:
+        values: Finite numbers in order.
+        label: What the axis along the items is; the numbers' unit belongs in it.
+
+    Returns:
+        An svg element; empty without values.
+    """
+    if not len(values):
+        return ""
+    with chart(7.0, 2.2) as (figure, (axis,)):
+        axis.bar(np.arange(1, len(values) + 1), values, color=ACCENT, alpha=0.8)
+        axis.axhline(0.0, color=SOFT, linewidth=0.8)
+        axis.set_xlabel(label)
+        return svg_text(figure)
+
+
+def curves_over_time(
+    times: npt.NDArray,
+    unit: str,
+    curves: Sequence[tuple[str, npt.NDArray]],
+    band: tuple[str, npt.NDArray, npt.NDArray],
+    steps: Sequence[tuple[str, npt.NDArray]],
+    labels: tuple[str, str],
+) -> str:
+    """Draw curves, and below them means over the intervals between the times.
+
+    Args:
+        times: Shape (s + 1,).
+        unit: Of the times.
+        curves: Name and values, shape (s + 1,), the most important one first.
+        band: Name, lowest and highest values, shape (s + 1,) each.
+        steps: Name and means, shape (s,), the most important one last.
+        labels: Of the upper and the lower vertical axis.
+
+    Returns:
+        An svg element, the same for the same figures.
+    """
+    with chart(10.5, 7.0, rows=2) as (figure, (above, below)):
+        name, low, high = band
+        above.fill_between(times, low, high, color="#e9dcd6", label=name)
+        for number, (name, values) in enumerate(curves):
+            above.plot(times, values, label=name, **({"color": INK, "linewidth": 2} if number == 0 else {}))
+        below.axhline(0.0, color=SOFT, linewidth=0.8)
+        for number, (name, values) in enumerate(steps):
+            strong = {"color": INK, "linewidth": 2} if number == len(steps) - 1 else {"linewidth": 1.4}
+            below.stairs(values, times, baseline=None, label=name, **strong)
+        below.set_xlabel(f"time [{unit}]")
+        below.set_xlim(times[0], times[-1])
+        for axis, label in zip((above, below), labels):
+            axis.set_ylabel(label)
+            axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8.5)
+        return svg_text(figure)

@@ -1,0 +1,146 @@
+"""Html pages from templates: complete in one file, nothing fetched, no script."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from thermoxels_ns.core.checks import replace_when_done
+from thermoxels_ns.core.errors import ThermoxelsError
+
+_SIGNATURES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text; figures are aligned to the right."""
+
+    columns: tuple[str, ...]
+    """Headings of the columns; all empty: the table has no head."""
+    rows: tuple[tuple[str, ...], ...]
+    """As many entries each as there are columns; further lines of an entry are written small below its first."""
+    figures_from: int = 1
+    """First column of figures."""
+    note: str = ""
+    """A sentence below."""
+    summary: str = ""
+    """Words to click on where the table is folded away at first; empty: it is shown."""
+    look: str = ""
+    """Class of the style sheet: ``rows`` for names with their values, ``cameras`` for few wide columns."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture with its caption."""
+
+    image: bytes
+    """Content of a PNG or JPEG file."""
+    caption: str
+    """What it shows."""
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """Pictures side by side."""
+
+    pictures: tuple[Picture, ...]
+    """From left to right."""
+    columns: int = 2
+    """How many stand in a row on a wide screen, 2 to 4."""
+    heading: str = ""
+    """Words above."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading and what stands below it, in this order."""
+
+    heading: str
+    """What it is about."""
+    words: tuple[str, ...] = ()
+    """Paragraphs."""
+    galleries: tuple[Gallery, ...] = ()
+    """Pictures."""
+    svg: str = ""
+    """A chart as an svg element."""
+    tables: tuple[Table, ...] = ()
+    """Tables; one without rows is left out."""
+    lines: tuple[str, ...] = ()
+    """Lines as they are typed or written, in a box."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """Everything a page says."""
+
+    title: str
+    """Heading of the page."""
+    summary: str
+    """One or two sentences below it."""
+    sections: tuple[Section, ...]
+    """The rest."""
+    figures: tuple[tuple[str, str], ...] = ()
+    """The figures that matter most: value with unit, and what it is."""
+    warnings: tuple[str, ...] = ()
+    """What to know before any figure is believed; stands above the figures."""
+
+
+def build_page(page: Any, template: str = "page.html.j2") -> str:
+    """Build the html text of a page; it depends on the arguments alone.
+
+    Args:
+        page: A `Page`, or what the template asks for under this name.
+        template: File in the folder ``templates``.
+
+    Raises:
+        ThermoxelsError: A picture is neither PNG nor JPEG.
+    """
+    return _environment().get_template(template).render(page=page)
+
+
+def write_page(path: Path, text: str) -> None:
+    """Write a page, whole or not at all."""
+    with replace_when_done(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def image_address(image: bytes, words: str) -> str:
+    """Put an image into its own address.
+
+    Args:
+        image: Content of a PNG or JPEG file.
+        words: What it shows, for the error.
+
+    Raises:
+        ThermoxelsError: The content is neither.
+    """
+    kind = next((kind for signature, kind in _SIGNATURES.items() if image.startswith(signature)), None)
+    if kind is None:
+        raise ThermoxelsError(
+            words,
+            expected="the content of a PNG or JPEG file",
+            got=f"{len(image)} bytes that begin with {image[:8]!r}",
+            remedy="Draw the picture again.",
+        )
+    return f"data:{kind};base64,{base64.b64encode(image).decode()}"
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("thermoxels_ns.reports"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["address"] = image_address
+    # The style sheet and charts are ours; every other text is escaped.
+    environment.filters["markup"] = Markup
+    return environment
