@@ -158,12 +158,12 @@ class Recorder:
         }
 
     def without_place(self, value: Any) -> Any:
-        """A json value whose texts do not name the working folder."""
+        """A json value whose texts name neither the working folder nor seconds."""
         if isinstance(value, dict):
             return {key: self.without_place(one) for key, one in value.items()}
-        if isinstance(value, list):
-            return [self.without_place(one) for one in value]
-        return value.replace(str(self.work), "WORK") if isinstance(value, str) else value
+        if isinstance(value, str):
+            return re.sub(r"\d[\d.]* s\b", "N s", value.replace(str(self.work), "WORK"))
+        return [self.without_place(one) for one in value] if isinstance(value, list) else value
 
 
 def digest(content: bytes) -> str:
@@ -257,7 +257,7 @@ def _compare_leaves(old: dict[str, Any], new: dict[str, Any]) -> Iterator[str]:
     yield from (f"added: {name} = {_short(new[name])}" for name in come)
     for name in sorted(old.keys() & new.keys()):
         one, other = old[name], new[name]
-        if one == other or _VOLATILE.search(name.rsplit("/", 1)[-1]) or (one != one and other != other):
+        if one == other or _VOLATILE.search(name.partition(".json/")[2]) or (one != one and other != other):
             continue
         if all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in (one, other)):
             change = (other - one) / abs(one) if one else float("inf")
