@@ -6,11 +6,13 @@ from typing import Any
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.reference.two_renderers import random_grid, random_request
 from tests.support.short_training import train_with_optimizers
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.threads import num_threads, set_num_threads
+from thermoxels_ns.field.background import SkyTemperature, SphereImage, seen_behind
 from thermoxels_ns.render.ray_render import RenderOptions
 from thermoxels_ns.render.renderers import fused_render, sample_rays
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
@@ -115,4 +117,55 @@ def test_a_training_that_refines_and_prunes(tmp_path):
         states = {name: optimizer.state_dict()["state"] for name, optimizer in optimizers.optimizers.items()}
         results.append(flat({"model": dict(pipeline.state_dict()), "optimizers": states}))
     assert any("optimizers.sh.0.exp_avg" in name for name in results[0])
+    assert_same_bits(results)
+
+
+TOO_MANY_FOR_ONE_THREAD = 40_000
+"""Rays of a batch whose tensors torch and BLAS split among their threads on every processor."""
+
+
+@pytest.mark.parametrize("make", [SphereImage, SkyTemperature])
+def test_backgrounds_of_large_batches(make):
+    directions = torch.randn(TOO_MANY_FOR_ONE_THREAD, 3, generator=torch.Generator().manual_seed(0))
+    directions = torch.nn.functional.normalize(directions, dim=-1)
+    results = []
+    for count in (1, 2, 3, 5, 7):
+        torch.set_num_threads(count)
+        background = make()
+        (parameter,) = background.parameters()
+        parameter.data = torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1))
+        values = seen_behind(background, directions, directions[:, 0] > -0.9)
+        (gradient,) = torch.autograd.grad((values * torch.sin(values)).sum(), parameter)
+        results.append({"values": values.detach(), "gradient": gradient})
+    assert_same_bits(results)
+
+
+class NoProductOfLongVectors(TorchDispatchMode):
+    """Refuses matrix products that sum over rays: BLAS splits them among its threads on some processors only."""
+
+    longest = 64
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func.overloadpacket.__name__
+        if name in ("mm", "mv", "dot", "vdot", "bmm", "addmm", "addmv", "baddbmm"):
+            left = args[1] if name.startswith(("add", "badd")) else args[0]
+            assert left.shape[-1] <= self.longest, f"{name} sums {left.shape[-1]} products"
+        return func(*args, **(kwargs or {}))
+
+
+def test_a_training_with_large_batches(tmp_path):
+    """Every tensor with a row per ray is one that torch splits among its threads."""
+    scene = write_scene(make_scene("sphere"), tmp_path / "scene", 6, 1, width=40, height=30, progress=False)
+    settings = {"resolutions": [8], "refine_at": [], "start_density": 3.0, "prune_at": [3], "prune_threshold": 0.02}
+    settings |= {"per_image_offset": True, "thermal_background": "learned", "background": "on"}
+    results = []
+    for count in COUNTS:
+        torch.set_num_threads(count)
+        with NoProductOfLongVectors():
+            pipeline, optimizers = train_with_optimizers(
+                scene, 5, settings, rays=TOO_MANY_FOR_ONE_THREAD, threads=count
+            )
+        states = {name: optimizer.state_dict()["state"] for name, optimizer in optimizers.optimizers.items()}
+        results.append(flat({"model": dict(pipeline.state_dict()), "optimizers": states}))
+    assert any("thermal_offset" in name for name in results[0])
     assert_same_bits(results)

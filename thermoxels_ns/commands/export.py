@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.commands.export_options import ExportOptions, Viewpoint, check_options, scale_of
 from thermoxels_ns.commands.export_snapshot import export_snapshot, prepare_folder
@@ -58,7 +59,9 @@ class ExportThermoxelsMesh(ExportOptions):
         from rich.markup import escape
 
         try:
-            self.run(lambda line: CONSOLE.print(escape(line)))
+            # The last bits of a product of long vectors depend on how many threads BLAS has.
+            with threadpool_limits(1, "blas"):
+                self.run(lambda line: CONSOLE.print(escape(line)))
         except ThermoxelsError as problem:
             CONSOLE.print(f"[bold red]Error:[/bold red] {escape(str(problem))}")
             raise SystemExit(1) from None

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
+from threadpoolctl import threadpool_limits
 
 
 @dataclass
@@ -59,4 +60,6 @@ class Heat:
         from thermoxels_ns.commands.heat_run import run_heat
 
         console = Console(highlight=False)
-        run_heat(self, lambda line: console.print(line, markup=False, soft_wrap=True))
+        # The last bits of a product of long vectors depend on how many threads BLAS has.
+        with threadpool_limits(1, "blas"):
+            run_heat(self, lambda line: console.print(line, markup=False, soft_wrap=True))

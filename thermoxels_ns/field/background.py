@@ -1,17 +1,19 @@
-"""What a ray sees that leaves the box: a sphere image for colour, a low-order sky for temperature.
-
-Either is built only where a scene calls for it; the model decides (`backdrop.py`).
-"""
+"""What a ray sees that leaves the box: a sphere image for colour, a low-order sky for temperature."""
 
 from __future__ import annotations
 
 import math
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from thermoxels_ns.field.harmonics import harmonics_with_unit_mean, num_coefficients
+
+RAYS_AT_ONCE = 8192
+"""Rays for which a background is evaluated together: torch splits tensors of 32,768 entries or more among its threads,
+and then the last bits of gradients and of some functions depend on how many there are."""
 
 
 def seen_behind(
@@ -19,9 +21,11 @@ def seen_behind(
 ) -> Float[Tensor, "n c"]:
     """What is behind the box along unit directions; 0 for rays that do not want it, which are not asked for."""
     if wanted is None or bool(wanted.all()):
-        return background(directions)
+        if len(directions) <= RAYS_AT_ONCE:
+            return background(directions)
+        return torch.cat([background(part) for part in directions.split(RAYS_AT_ONCE)])
     (places,) = wanted.nonzero(as_tuple=True)
-    values = background(directions[places])
+    values = seen_behind(background, directions[places], None)
     return values.new_zeros((len(directions), values.shape[1])).index_copy(0, places, values)
 
 
@@ -68,4 +72,7 @@ class SkyTemperature(nn.Module):
 
     def forward(self, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
         """Normalised temperature seen along unit directions."""
-        return (harmonics_with_unit_mean(directions, self.degree) @ self.coefficients)[:, None]
+        # BLAS splits a product over rays among its threads; the gradient of `embedding` adds rays in their order.
+        one = torch.zeros(len(directions), dtype=torch.long, device=directions.device)
+        coefficients = F.embedding(one, self.coefficients[None])
+        return (harmonics_with_unit_mean(directions, self.degree) * coefficients).sum(-1, keepdim=True)

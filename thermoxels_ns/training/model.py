@@ -239,7 +239,8 @@ class ThermoxelsModel(Model):
         if self.thermal_offset is not None:
             assert ray_bundle.camera_indices is not None
             offset = self.thermal_offset - self.thermal_offset.mean()
-            thermal = thermal + offset[ray_bundle.camera_indices[:, 0]][:, None]
+            # The gradient of `index_select` adds rays in their order; that of an index leaves the order to a race.
+            thermal = thermal + offset.index_select(0, ray_bundle.camera_indices[:, 0])[:, None]
         return batch | {"rgb": rgb, "thermal": thermal, "accumulation": seen.accumulation[:, None], "render": seen}
 
     def _image_outputs(self, request: RayRequest) -> dict[str, Tensor]:
