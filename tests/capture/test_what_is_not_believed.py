@@ -26,7 +26,7 @@ from thermoxels_ns.capture.sfm.metric_scale import (
     scale_from_markers,
 )
 from thermoxels_ns.capture.sfm.model import SfmModel
-from thermoxels_ns.synthetic.pinhole import look_at
+from thermoxels_ns.synthetic.camera_rings import look_at
 
 
 def readings(offsets_k: np.ndarray, points: int, seed: int) -> DriftSamples:

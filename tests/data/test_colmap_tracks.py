@@ -39,7 +39,7 @@ def write_model(
             model="PINHOLE",
             width=round(first.width * focal_factor),
             height=round(first.height * focal_factor),
-            params=[v * focal_factor for v in (first.fx, first.fy, first.cx, first.cy)],
+            params=[v * focal_factor for v in (first.fl_x, first.fl_y, first.cx, first.cy)],
         )
     )
     for number, (frame, name) in enumerate(zip(frames, names), start=1):
@@ -48,7 +48,7 @@ def write_model(
         world[:, :3] = (turn @ pose[:3, :3]).T
         world[:, 3] = -world[:, :3] @ (scale * turn @ pose[:3, 3] + shift)
         seen = (points - frame.pose[:3, 3]) @ frame.pose[:3, :3]
-        pixels = np.column_stack((seen[:, 0] / -seen[:, 2], -seen[:, 1] / -seen[:, 2])) * first.fx * focal_factor
+        pixels = np.column_stack((seen[:, 0] / -seen[:, 2], -seen[:, 1] / -seen[:, 2])) * first.fl_x * focal_factor
         image = pycolmap.Image(name=name, image_id=number, camera_id=1)
         image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels])
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(world))

@@ -151,7 +151,7 @@ def test_the_error_of_a_length_is_that_of_a_triangulation(scene):
     one = SparseTracks(np.zeros((1, 3)), np.ones(1), ("0", "1", "2"), np.arange(3), np.zeros(3, dtype=np.int64))
     lines = sightlines(one, frames)
     angle = 2.0 * np.arctan2(1.0, 2.0)
-    expected = 1.0 / frame.intrinsics.fx / np.sin(angle) * np.sqrt([5.0, 4.0, 5.0])
+    expected = 1.0 / frame.intrinsics.fl_x / np.sin(angle) * np.sqrt([5.0, 4.0, 5.0])
     assert lines.uncertainty == pytest.approx(expected)
 
 

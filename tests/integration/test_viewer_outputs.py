@@ -18,7 +18,7 @@ import websockets
 from PIL import Image
 
 from tests.integration.commands import Trained
-from thermoxels_ns.synthetic.pinhole import look_at
+from thermoxels_ns.synthetic.camera_rings import look_at
 
 LONGEST_S = 280.0
 

@@ -16,7 +16,7 @@ from thermoxels_ns.capture.stage_types import (
     RigStart,
     radius_squared,
 )
-from thermoxels_ns.synthetic.pinhole import PinholeCamera
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.synthetic.raycast import render_view
 from thermoxels_ns.synthetic.scene_folder import make_scene
 
@@ -114,7 +114,7 @@ def known_capture(
     small = scene.camera(thermal_width, thermal_width * 4 // 5)
     focal = small.fl_x * zoom
     cx, cy = small.cx + centre_px[0], small.cy + centre_px[1]
-    pinhole = PinholeCamera(small.width, small.height, focal, focal, cx, cy)
+    pinhole = Camera(small.width, small.height, focal, focal, cx, cy)
     visible = CameraModel(plain.width, plain.height, plain.fl_x, plain.fl_y, plain.cx, plain.cy)
     thermal = CameraModel(small.width, small.height, focal, focal, cx, cy)
     rig = np.eye(4)
@@ -140,10 +140,9 @@ def known_capture(
     points = np.concatenate(world)
     frames = []
     for number, pose in enumerate(poses):
-        pixels, inside = plain.project(pose, points)
-        column, row = (
-            np.where(inside[:, None], np.minimum(pixels, (plain.width - 1, plain.height - 1)), 0).astype(int).T
-        )
+        pixel = plain.project_world(pose, points)
+        inside = plain.contains(pixel)
+        column, row = np.where(inside[:, None], np.minimum(pixel, (plain.width - 1, plain.height - 1)), 0).astype(int).T
         distance = np.linalg.norm(points - pose[:3, 3], axis=1)
         ids = np.flatnonzero(inside & (np.abs(depths[number][row, column] - distance) < 0.01 * distance))
         frames.append(

@@ -6,7 +6,7 @@ import numpy as np
 
 from thermoxels_ns.capture.sfm.model import SfmModel
 from thermoxels_ns.capture.stage_types import CameraModel
-from thermoxels_ns.synthetic.pinhole import look_at
+from thermoxels_ns.synthetic.camera_rings import look_at
 
 CAMERA = CameraModel(640, 480, 500.0, 500.0, 320.0, 240.0, k1=0.02)
 

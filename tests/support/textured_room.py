@@ -10,7 +10,7 @@ from PIL import Image
 
 from tests.support.camera_card import counts
 from thermoxels_ns.capture.stage_types import OPENGL_FROM_OPENCV, CameraModel
-from thermoxels_ns.synthetic.pinhole import look_at
+from thermoxels_ns.synthetic.camera_rings import look_at
 
 VISIBLE = CameraModel(480, 360, 420.0, 420.0, 240.0, 180.0)
 THERMAL = CameraModel(160, 128, 150.0, 150.0, 81.0, 63.0)

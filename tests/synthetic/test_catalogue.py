@@ -6,9 +6,10 @@ import itertools
 import numpy as np
 import pytest
 
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.synthetic.camera_rings import CameraRing, look_at, ring_poses
 from thermoxels_ns.synthetic.catalogue import SCENE_NAMES, make_scene
-from thermoxels_ns.synthetic.pinhole import CameraRing, PinholeCamera, look_at, ring_poses
 from thermoxels_ns.synthetic.raycast import render_view, visible_surface_points
 
 
@@ -147,7 +148,8 @@ def test_every_view_frames_the_scene_from_outside(scene) -> None:
     camera = scene.camera(320, 240)
     points, _ = scene.surface_points(5000)
     for pose in np.concatenate(scene.poses(42, 6)):
-        pixel, inside = camera.project(pose, points)
+        pixel = camera.project_world(pose, points)
+        inside = camera.contains(pixel)
         assert inside.all() and not scene.contains(pose[None, :3, 3])[0]
         assert np.ptp(pixel, axis=0).max() > 0.4 * 320
 
@@ -179,7 +181,8 @@ def test_look_at_points_the_view_axis_at_the_target() -> None:
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-15)
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
     assert pose[2, 0] == pytest.approx(0.0) and pose[2, 1] > 0.9
-    pixel, inside = PinholeCamera(40, 30, 50.0, 50.0, 18.0, 16.0).project(pose, [[0.5, 0.25, 0.5], [6.0, -4.0, 1.5]])
+    pixel = Camera(40, 30, 50.0, 50.0, 18.0, 16.0).project_world(pose, [[0.5, 0.25, 0.5], [6.0, -4.0, 1.5]])
+    inside = Camera(40, 30, 50.0, 50.0, 18.0, 16.0).contains(pixel)
     np.testing.assert_allclose(pixel[0], [18.0, 16.0])
     assert inside.tolist() == [True, False]
     with pytest.raises(SceneError, match="not vertical"):
@@ -187,11 +190,11 @@ def test_look_at_points_the_view_axis_at_the_target() -> None:
 
 
 def test_rays_go_through_the_pixels_they_project_to() -> None:
-    camera, pose = PinholeCamera(7, 5, 9.0, 8.0, 3.2, 2.6), look_at((1.0, 2.0, 3.0), (0.0, 0.1, 0.2))
+    camera, pose = Camera(7, 5, 9.0, 8.0, 3.2, 2.6), look_at((1.0, 2.0, 3.0), (0.0, 0.1, 0.2))
     for samples in (1, 3):
         directions = camera.directions(pose, samples)
         assert directions.shape == (5, 7, samples**2, 3)
-        pixel, _ = camera.project(pose, pose[:3, 3] + 2.5 * directions.reshape(-1, 3))
+        pixel = camera.project_world(pose, pose[:3, 3] + 2.5 * directions.reshape(-1, 3))
         rows, columns = np.mgrid[:5, :7]
         centres = np.stack([columns + 0.5, rows + 0.5], axis=-1)
         np.testing.assert_allclose(pixel.reshape(5, 7, samples**2, 2).mean(axis=2), centres, atol=1e-12)
@@ -287,7 +290,8 @@ def test_visible_points_are_those_the_depth_image_shows(scene) -> None:
     camera = scene.camera(320, 240)
     points, normals = scene.surface_points(1500)
     seen = visible_surface_points(scene, train[:1], camera, points, normals, min_views=1)
-    pixel, inside = camera.project(train[0], points)
+    pixel = camera.project_world(train[0], points)
+    inside = camera.contains(pixel)
     assert inside.all()
     depth = render_view(scene, train[0], camera, samples_per_axis=1).depth_m
     column, row = np.floor(pixel).astype(int).T

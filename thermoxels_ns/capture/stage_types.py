@@ -7,117 +7,18 @@ of the world that structure from motion found; its scale may be unknown.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.core.camera import Camera as CameraModel
 
 FloatArray = npt.NDArray[np.float64]
 
 OPENGL_FROM_OPENCV: FloatArray = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns camera axes; it is its own inverse. ``pose @ OPENGL_FROM_OPENCV`` is camera to world in OpenCV's axes."""
-
-_UNDISTORT_STEPS = 20
-
-
-@dataclass(frozen=True)
-class CameraModel:
-    """A pinhole camera with radial (and, where structure from motion found one, tangential) distortion."""
-
-    width: int
-    """Image width [pixels]."""
-    height: int
-    """Image height [pixels]."""
-    fl_x: float
-    """Focal length along x [pixels]."""
-    fl_y: float
-    """Focal length along y [pixels]."""
-    cx: float
-    """Principal point, x [pixels]."""
-    cy: float
-    """Principal point, y [pixels]."""
-    k1: float = 0.0
-    """Radial distortion, second order, as in OpenCV."""
-    k2: float = 0.0
-    """Radial distortion, fourth order."""
-    p1: float = 0.0
-    """Tangential distortion."""
-    p2: float = 0.0
-    """Tangential distortion."""
-
-    def __post_init__(self) -> None:
-        numbers = (self.fl_x, self.fl_y, self.cx, self.cy, self.k1, self.k2, self.p1, self.p2)
-        good = all(map(math.isfinite, numbers)) and min(self.fl_x, self.fl_y) > 0 and min(self.width, self.height) > 0
-        if not good:
-            raise SceneError(
-                "camera",
-                expected="at least one pixel, focal lengths above 0 and finite numbers",
-                got=f"{self.width} x {self.height} pixels, {numbers}",
-                remedy="Correct the intrinsics.",
-            )
-
-    @classmethod
-    def from_field_of_view(cls, width: int, height: int, horizontal_deg: float) -> CameraModel:
-        """Camera with square pixels, its principal point at the centre and a given horizontal angle of view.
-
-        >>> round(CameraModel.from_field_of_view(640, 480, 90.0).fl_x, 6)
-        320.0
-        """
-        if not 0.0 < horizontal_deg < 179.0:
-            raise SceneError(
-                "field of view",
-                expected="an angle above 0 and below 179 degrees",
-                got=horizontal_deg,
-                remedy="Pass the horizontal angle of view from the lens's data sheet.",
-            )
-        focal = 0.5 * width / math.tan(math.radians(0.5 * horizontal_deg))
-        return cls(width, height, focal, focal, 0.5 * width, 0.5 * height)
-
-    def resized(self, width: int, height: int) -> CameraModel:
-        """Same camera, its image sampled with another number of pixels."""
-        x, y = width / self.width, height / self.height
-        return replace(
-            self, width=width, height=height, fl_x=self.fl_x * x, fl_y=self.fl_y * y, cx=self.cx * x, cy=self.cy * y
-        )
-
-    def project(self, points: npt.ArrayLike) -> FloatArray:
-        """Project points (n, 3) in OpenCV camera axes to pixels (n, 2); NaN for points not ahead of the camera."""
-        local = np.asarray(points, dtype=np.float64)
-        ahead = local[:, 2] > 0.0
-        scale = np.divide(1.0, local[:, 2], out=np.full(len(local), np.nan), where=ahead)
-        return self._to_pixels(local[:, :2] * scale[:, None])
-
-    def rays(self, pixels: npt.ArrayLike) -> FloatArray:
-        """Points (n, 3) at depth 1 in OpenCV camera axes that the pixels (n, 2) see (distortion removed)."""
-        pixels = np.asarray(pixels, dtype=np.float64)
-        distorted = (pixels - (self.cx, self.cy)) / (self.fl_x, self.fl_y)
-        plane = distorted
-        if any((self.k1, self.k2, self.p1, self.p2)):
-            for _ in range(_UNDISTORT_STEPS):
-                plane = plane + (distorted - self._distort(plane))
-        return np.column_stack([plane, np.ones(len(plane))])
-
-    def contains(self, pixels: npt.ArrayLike, border: float = 0.0) -> npt.NDArray[np.bool_]:
-        """Which pixels (n, 2) lie in the image, at least `border` pixels from its edge."""
-        x, y = np.asarray(pixels, dtype=np.float64).T
-        return (x >= border) & (x <= self.width - border) & (y >= border) & (y <= self.height - border)
-
-    def _to_pixels(self, plane: FloatArray) -> FloatArray:
-        return self._distort(plane) * (self.fl_x, self.fl_y) + (self.cx, self.cy)
-
-    def _distort(self, plane: FloatArray) -> FloatArray:
-        if not any((self.k1, self.k2, self.p1, self.p2)):
-            return plane
-        x, y = plane[:, 0], plane[:, 1]
-        r2 = x * x + y * y
-        radial = 1.0 + r2 * (self.k1 + r2 * self.k2)
-        dx = 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x)
-        dy = self.p1 * (r2 + 2.0 * y * y) + 2.0 * self.p2 * x * y
-        return np.column_stack([x * radial + dx, y * radial + dy])
 
 
 @dataclass(frozen=True, eq=False)

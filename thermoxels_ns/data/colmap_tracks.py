@@ -201,7 +201,7 @@ def _off_px(
     for poses, points in (model, given):
         line = np.einsum("sji,sj->si", poses[frame, :3, :3], points[point] - poses[frame, :3, 3])
         seen.append(line / np.maximum(np.linalg.norm(line, axis=1), 1e-300)[:, None])
-    focal = np.array([min(one.intrinsics.fx, one.intrinsics.fy) for one in frames])
+    focal = np.array([min(one.intrinsics.fl_x, one.intrinsics.fl_y) for one in frames])
     off = np.linalg.norm(seen[0] - seen[1], axis=1) * focal[frame]
     order = np.lexsort((off, frame))
     counts = np.bincount(frame, minlength=len(frames))

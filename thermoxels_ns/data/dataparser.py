@@ -10,14 +10,14 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.feature_rays import Sightlines
-from thermoxels_ns.data.pose_file_cameras import Intrinsics
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
 from thermoxels_ns.data.splits import Split, split_frames
@@ -266,7 +266,7 @@ def _nearest_rotation(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64
     return np.asarray(left @ right, dtype=np.float64)
 
 
-def _thermal_intrinsics(frame: Frame, shape: tuple[int, int]) -> Intrinsics:
+def _thermal_intrinsics(frame: Frame, shape: tuple[int, int]) -> Camera:
     """The projection of a thermal image: its own camera's, or the photograph's at the thermal resolution."""
     height, width = shape
     own = frame.thermal_intrinsics
@@ -291,20 +291,20 @@ def _thermal_intrinsics(frame: Frame, shape: tuple[int, int]) -> Intrinsics:
     return colour.resized(width, height)
 
 
-def _cameras(intrinsics: list[Intrinsics], poses: torch.Tensor) -> Cameras:
+def _cameras(intrinsics: list[Camera], poses: torch.Tensor) -> Cameras:
     def column(name: str, kind: torch.dtype) -> torch.Tensor:
         return torch.tensor([[getattr(one, name)] for one in intrinsics], dtype=kind)
 
     return Cameras(
         camera_to_worlds=poses,
-        fx=column("fx", torch.float32),
-        fy=column("fy", torch.float32),
+        fx=column("fl_x", torch.float32),
+        fy=column("fl_y", torch.float32),
         cx=column("cx", torch.float32),
         cy=column("cy", torch.float32),
         width=column("width", torch.int64),
         height=column("height", torch.int64),
         distortion_params=torch.tensor([one.distortion for one in intrinsics], dtype=torch.float32),
-        camera_type=column("camera_type", torch.int64),
+        camera_type=torch.tensor([[CameraType[one.lens.upper()].value] for one in intrinsics]),
     )
 
 

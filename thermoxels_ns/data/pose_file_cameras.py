@@ -2,47 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 from PIL import Image
 
+from thermoxels_ns.core.camera import Camera, Lens
 from thermoxels_ns.core.errors import SceneError
 
-# One centre per camera: the training rays store one direction per pixel and one origin per photograph.
-_CENTRAL = (CameraType.PERSPECTIVE, CameraType.FISHEYE, CameraType.EQUIRECTANGULAR)
-
-
-@dataclass(frozen=True)
-class Intrinsics:
-    """One camera's projection in pixels; the centre of the top left pixel is at (0.5, 0.5)."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    """OpenCV's k1, k2, k3, k4, p1, p2 in nerfstudio's order."""
-    camera_type: int = CameraType.PERSPECTIVE.value
-
-    def resized(self, width: int, height: int) -> Intrinsics:
-        """Same camera, its image sampled with another number of pixels; distortion does not change."""
-        x, y = width / self.width, height / self.height
-        return Intrinsics(
-            width, height, self.fx * x, self.fy * y, self.cx * x, self.cy * y, self.distortion, self.camera_type
-        )
-
-    def scaled(self, factor: float) -> Intrinsics:
-        """Same camera with pixels `1 / factor` times as large; a last part of a pixel is cut off."""
-        width, height = (max(int(length * factor + 1e-6), 1) for length in (self.width, self.height))
-        focal = (self.fx * factor, self.fy * factor, self.cx * factor, self.cy * factor)
-        return Intrinsics(width, height, *focal, self.distortion, self.camera_type)
+_LENS_OF_MODEL: dict[str, Lens] = {
+    "SIMPLE_PINHOLE": "perspective",
+    "PINHOLE": "perspective",
+    "SIMPLE_RADIAL": "perspective",
+    "RADIAL": "perspective",
+    "OPENCV": "perspective",
+    "OPENCV_FISHEYE": "fisheye",
+    "EQUIRECTANGULAR": "equirectangular",
+}
+"""nerfstudio's camera models whose rays start in one point."""
 
 
 def read_pose(values: Any, where: str) -> npt.NDArray[np.float64]:
@@ -64,13 +43,13 @@ def read_pose(values: Any, where: str) -> npt.NDArray[np.float64]:
     return pose
 
 
-def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | None, where: str) -> Intrinsics:
+def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | None, where: str) -> Camera:
     """Read a camera; the frame's own values go before the scene's, the image's size before nothing."""
     values = {**meta, **entry}
     remedy = "Correct the json."
     model = values.get("camera_model", "OPENCV")
-    camera_type = CAMERA_MODEL_TO_TYPE.get(model) if isinstance(model, str) else None
-    if camera_type not in _CENTRAL:
+    lens = _LENS_OF_MODEL.get(model) if isinstance(model, str) else None
+    if lens is None:
         raise SceneError(
             f"{where}: camera_model",
             expected="PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, OPENCV_FISHEYE or EQUIRECTANGULAR",
@@ -82,25 +61,22 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
         width, height = (
             int(values[key]) if size is None else int(values.get(key, size[i])) for i, key in enumerate("wh")
         )
-        focal = tuple(float(values[key]) for key in ("fl_x", "fl_y", "cx", "cy"))
-        if "distortion_params" in values:
-            distortion = tuple(float(value) for value in values["distortion_params"])
-        else:
-            distortion = tuple(float(values.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+        numbers: dict[str, Any] = {key: float(values[key]) for key in ("fl_x", "fl_y", "cx", "cy")}
+        names = ("k1", "k2", "k3", "k4", "p1", "p2")
+        listed = values.get("distortion_params", [values.get(key, 0.0) for key in names])
+        numbers |= {key: float(value) for key, value in zip(names, listed, strict=True)}
+        camera = Camera(width, height, **numbers, lens=lens)
     except KeyError as problem:
         raise SceneError(
             where, expected="intrinsics fl_x, fl_y, cx, cy, w, h", got=f"no {problem.args[0]}", remedy=remedy
         ) from problem
-    except (TypeError, ValueError, OverflowError) as problem:
-        raise SceneError(where, expected="numbers as intrinsics", got=problem, remedy=remedy) from problem
-    good = np.isfinite((*focal, *distortion)).all() and len(distortion) == 6 and min(width, height) > 0
-    if not good or min(focal[:2]) <= 0:
+    except (SceneError, TypeError, ValueError, OverflowError) as problem:
         raise SceneError(
             where,
-            expected="finite intrinsics, positive focal lengths and size, six distortion parameters",
-            got={"w": width, "h": height, "fl_x, fl_y, cx, cy": focal, "distortion": distortion},
+            expected="numbers: finite intrinsics, positive focal lengths and size, six distortion parameters",
+            got=problem,
             remedy=remedy,
-        )
+        ) from problem
     if size is not None and (width, height) != size:
         raise SceneError(
             where,
@@ -108,7 +84,7 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
             got=f"{size[0]} x {size[1]}",
             remedy="Use the photographs that the poses were computed from, or scale the intrinsics.",
         )
-    return Intrinsics(width, height, *focal, distortion, camera_type.value)  # type: ignore[arg-type]
+    return camera
 
 
 def _image_size(path: Path, where: str) -> tuple[int, int]:

@@ -122,7 +122,7 @@ def box_of_cameras(frames: Sequence[Frame], rotation: npt.NDArray[np.float64]) -
             remedy=_REMEDY,
         )
     half_view = np.array(
-        [max(f.intrinsics.width / f.intrinsics.fx, f.intrinsics.height / f.intrinsics.fy) / 2 for f in frames]
+        [max(f.intrinsics.width / f.intrinsics.fl_x, f.intrinsics.height / f.intrinsics.fl_y) / 2 for f in frames]
     )
     half = np.median(depth[depth > 0] * half_view[depth > 0])
     return _checked(np.stack([centre - half, centre + half]), "box of the cameras")

@@ -11,8 +11,9 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError, explain
-from thermoxels_ns.data.pose_file_cameras import Intrinsics, read_intrinsics, read_pose
+from thermoxels_ns.data.pose_file_cameras import read_intrinsics, read_pose
 from thermoxels_ns.radiometry.thermal_files import THERMAL_SUFFIXES, ThermalUnit
 
 JSON_NAMES = ("transforms.json", "transforms_thermal.json")
@@ -30,10 +31,10 @@ class Frame:
     mask: Path | None
     pose: npt.NDArray[np.float64]
     """Camera to world, shape (4, 4), OpenGL axes, input coordinates."""
-    intrinsics: Intrinsics
+    intrinsics: Camera
     thermal_pose: npt.NDArray[np.float64] | None
     """Pose of the thermal camera; None: the photograph's."""
-    thermal_intrinsics: Intrinsics | None
+    thermal_intrinsics: Camera | None
     """The thermal camera's own projection; None: the photograph's at the thermal image's resolution."""
 
 

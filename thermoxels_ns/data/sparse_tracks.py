@@ -141,7 +141,7 @@ def sightlines(
     pairs = np.unique(tracks.sighting_point[used] * max(1, len(frames)) + number[tracks.sighting_frame[used]])
     frame, point = pairs % max(1, len(frames)), pairs // max(1, len(frames))
     poses = np.stack([one.pose for one in frames]) if len(frames) else np.zeros((0, 4, 4))
-    focal = np.array([min(one.intrinsics.fx, one.intrinsics.fy) for one in frames])
+    focal = np.array([min(one.intrinsics.fl_x, one.intrinsics.fl_y) for one in frames])
     line = tracks.points[point] - poses[frame, :3, 3]
     behind = (line * -poses[frame, :3, 2]).sum(axis=1) <= 0.0
     if behind.sum() > MOST_BEHIND * len(behind):

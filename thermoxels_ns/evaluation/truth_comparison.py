@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import MeshError, SceneError
 from thermoxels_ns.core.lattice import Lattice
@@ -20,7 +21,6 @@ from thermoxels_ns.mesh.build import check_similarity
 from thermoxels_ns.mesh.quality.checks import facet_areas, signed_volumes
 from thermoxels_ns.mesh.solid.morphology import fill_enclosed
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-from thermoxels_ns.synthetic.pinhole import PinholeCamera
 from thermoxels_ns.synthetic.scene_folder import load_truth, visible_surface_points
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
@@ -42,7 +42,7 @@ class KnownTruth:
     """The exact scene."""
     training_poses: npt.NDArray[np.float64]
     """Training cameras, camera to world (OpenGL), shape (c, 4, 4), [m]."""
-    camera: PinholeCamera
+    camera: Camera
     """Intrinsics of all training photographs."""
 
 
@@ -73,7 +73,7 @@ def load_known_truth(scene_folder: Path | str) -> KnownTruth | None:
             for frame in content["frames"]
             if Path(frame["file_path"]).name.startswith(_TRAINING_PREFIX)
         ]
-        camera = PinholeCamera(
+        camera = Camera(
             int(content["w"]), int(content["h"]), *(float(content[key]) for key in ("fl_x", "fl_y", "cx", "cy"))
         )
         training_poses = np.asarray(poses, dtype=np.float64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -10,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.multiview.photo_consistency import Photographs
 
 MOST_PHOTOGRAPHS = 32
@@ -69,36 +71,25 @@ def _pinhole(
     size = (max(2, round(width / shrink)), max(2, round(height / shrink)))
     if shrink > 1.0:
         picture, shown = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (picture, shown))
-    size = (picture.shape[1], picture.shape[0])
-    along_x, along_y = size[0] / width, size[1] / height
-    focal = np.array([float(cameras.fx[index, 0]) * along_x, float(cameras.fy[index, 0]) * along_y])
-    centre = np.array([float(cameras.cx[index, 0]) * along_x, float(cameras.cy[index, 0]) * along_y])
-    distortion = None if cameras.distortion_params is None else cameras.distortion_params[index].double().numpy()
-    if distortion is not None and np.any(distortion):
-        places = _distorted_places(size, focal, centre, distortion)
+    distortion = [0.0] * 6 if cameras.distortion_params is None else cameras.distortion_params[index].double().tolist()
+    named: dict[str, Any] = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), distortion))
+    lengths = (float(getattr(cameras, name)[index, 0]) for name in ("fx", "fy", "cx", "cy"))
+    camera = Camera(width, height, *lengths, **named).resized(picture.shape[1], picture.shape[0])
+    if any(camera.distortion):
+        places = _distorted_places(camera)
         picture = cv2.remap(picture, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         shown = cv2.remap(shown, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0.0,))
     picture = np.where(shown[..., None] < 0.999, np.float32(np.nan), picture).astype(np.float32)
     pose = np.asarray(cameras.camera_to_worlds[index], dtype=np.float64)
     turned = pose[:, :3].T * np.array([[1.0], [-1.0], [-1.0]])  # x right, y down, z forward
-    intrinsics = np.array([[focal[0], 0.0, centre[0]], [0.0, focal[1], centre[1]], [0.0, 0.0, 1.0]])
+    intrinsics = np.array([[camera.fl_x, 0.0, camera.cx], [0.0, camera.fl_y, camera.cy], [0.0, 0.0, 1.0]])
     return picture, intrinsics @ np.column_stack((turned, -turned @ pose[:, 3]))
 
 
-def _distorted_places(
-    size: tuple[int, int], focal: npt.NDArray, centre: npt.NDArray, distortion: npt.NDArray
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Where the pixels of a pinhole picture lie in the distorted one: columns and rows for `cv2.remap`.
-
-    Brown's model with nerfstudio's coefficients k1, k2, k3, k4, p1, p2.
-    """
-    k1, k2, k3, k4, p1, p2 = distortion
-    x, y = np.meshgrid(*((np.arange(n) + 0.5 - centre[i]) / focal[i] for i, n in enumerate(size)))
-    r = x * x + y * y
-    radial = 1.0 + r * (k1 + r * (k2 + r * (k3 + r * k4)))
-    u = x * radial + 2.0 * p1 * x * y + p2 * (r + 2.0 * x * x)
-    v = y * radial + 2.0 * p2 * x * y + p1 * (r + 2.0 * y * y)
-    return (
-        (u * focal[0] + centre[0] - 0.5).astype(np.float32),
-        (v * focal[1] + centre[1] - 0.5).astype(np.float32),
-    )
+def _distorted_places(camera: Camera) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Where the pixels of a pinhole picture lie in the distorted one: columns and rows for `cv2.remap`."""
+    pinhole = replace(camera, k1=0.0, k2=0.0, k3=0.0, k4=0.0, p1=0.0, p2=0.0)
+    rows, columns = np.mgrid[: camera.height, : camera.width]
+    pixels = camera.project(pinhole.rays(np.column_stack((columns.ravel() + 0.5, rows.ravel() + 0.5)))) - 0.5
+    x, y = pixels.reshape(camera.height, camera.width, 2).astype(np.float32).transpose(2, 0, 1)
+    return np.ascontiguousarray(x), np.ascontiguousarray(y)

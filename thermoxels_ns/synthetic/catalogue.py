@@ -10,9 +10,9 @@ import numpy.typing as npt
 from tyro.constructors import PrimitiveConstructorSpec
 
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.synthetic.camera_rings import CameraRing
 from thermoxels_ns.synthetic.courtyard import courtyard
 from thermoxels_ns.synthetic.house_corner import house_corner
-from thermoxels_ns.synthetic.pinhole import CameraRing
 from thermoxels_ns.synthetic.pipes import pipes
 from thermoxels_ns.synthetic.random_scene import RANDOM_NAME, random_scene, random_seed
 from thermoxels_ns.synthetic.rectangles import distance_to_box

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.synthetic.pinhole import CameraRing
+from thermoxels_ns.synthetic.camera_rings import CameraRing
 from thermoxels_ns.synthetic.rectangles import distance_to_box
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 from thermoxels_ns.synthetic.solids import Box, BoxSolid

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.synthetic.pinhole import CameraRing
+from thermoxels_ns.synthetic.camera_rings import CameraRing
 from thermoxels_ns.synthetic.solids import Box
 
 _PICTURE_ASPECT = 0.75

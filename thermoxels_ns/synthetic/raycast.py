@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.synthetic.pinhole import PinholeCamera
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 FloatArray = npt.NDArray[np.float64]
@@ -32,9 +32,7 @@ class RenderedView:
     """Whether the ray through the pixel's centre meets the solid, shape (height, width)."""
 
 
-def render_view(
-    scene: SyntheticScene, pose: npt.ArrayLike, camera: PinholeCamera, samples_per_axis: int = 2
-) -> RenderedView:
+def render_view(scene: SyntheticScene, pose: npt.ArrayLike, camera: Camera, samples_per_axis: int = 2) -> RenderedView:
     """Render both bands of one view.
 
     Args:
@@ -68,7 +66,7 @@ def render_view(
 def visible_surface_points(
     scene: SyntheticScene,
     poses: npt.ArrayLike,
-    camera: PinholeCamera,
+    camera: Camera,
     points: npt.ArrayLike,
     normals: npt.ArrayLike,
     min_views: int = 3,
@@ -94,7 +92,7 @@ def visible_surface_points(
         origin = _position_outside(scene, pose)
         ray = points - origin
         distance = np.linalg.norm(ray, axis=1)
-        _, candidate = camera.project(pose, points)
+        candidate = camera.contains(camera.project_world(pose, points))
         candidate &= np.einsum("ij,ij->i", ray, normals) < -_GRAZING_COSINE * distance
         index = np.flatnonzero(candidate)
         # Unnormalised directions: a free line of sight hits at 1.

@@ -16,10 +16,10 @@ import numpy.typing as npt
 from PIL import Image
 from rich.progress import track
 
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.catalogue import SCENE_NAMES, make_scene
-from thermoxels_ns.synthetic.pinhole import PinholeCamera
 from thermoxels_ns.synthetic.raycast import RenderedView, render_view, visible_surface_points
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
@@ -234,12 +234,12 @@ def _listed_files(folder: Path, transforms: dict[str, Any]) -> list[Path]:
     return [path for path in paths if path.resolve().is_relative_to(inside) and path.is_file()]
 
 
-def _second_camera(scene: SyntheticScene, width: int, height: int) -> PinholeCamera:
+def _second_camera(scene: SyntheticScene, width: int, height: int) -> Camera:
     """Intrinsics of the thermal camera: a slightly different field of view and an off-centre principal point."""
     plain = scene.camera(width, height)
     dx, dy = _THERMAL_CENTRE_SHIFT
     focal = plain.fl_x * _THERMAL_ZOOM
-    return PinholeCamera(width, height, focal, focal, plain.cx + dx * width, plain.cy + dy * width)
+    return Camera(width, height, focal, focal, plain.cx + dx * width, plain.cy + dy * width)
 
 
 def _second_camera_offset(scene: SyntheticScene) -> FloatArray:
@@ -284,7 +284,7 @@ def _save_thermal(path: Path, temperature_c: FloatArray, unit: dict[str, float] 
     Image.fromarray(np.clip(counts, 0, _LARGEST_COUNT).astype(np.uint16)).save(path)
 
 
-def _intrinsics(camera: PinholeCamera) -> dict[str, Any]:
+def _intrinsics(camera: Camera) -> dict[str, Any]:
     distortion = dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
     return {
         "camera_model": "OPENCV",

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.synthetic.pinhole import CameraRing, PinholeCamera, ring_poses
+from thermoxels_ns.core.camera import Camera
+from thermoxels_ns.synthetic.camera_rings import CameraRing, ring_poses
 from thermoxels_ns.synthetic.solids import Box, Solid
 
 FloatArray = npt.NDArray[np.float64]
@@ -64,10 +65,10 @@ class SyntheticScene:
         """Draw points uniformly by area: positions (count, 3) and outward normals (count, 3)."""
         return self.solid.surface_points(count, seed)
 
-    def camera(self, width: int, height: int) -> PinholeCamera:
+    def camera(self, width: int, height: int) -> Camera:
         """Camera of the given image size [pixels] that frames the scene in every view of the rings."""
         focal = self.focal_share * min(float(width), height * _ASPECT)
-        return PinholeCamera(width, height, focal, focal, 0.5 * width, 0.5 * height)
+        return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height)
 
     def poses(self, num_train: int, num_eval: int) -> tuple[FloatArray, FloatArray]:
         """Training (num_train, 4, 4) and held-out evaluation poses (num_eval, 4, 4), camera to world (OpenGL)."""

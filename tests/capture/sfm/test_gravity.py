@@ -10,7 +10,7 @@ from PIL import Image, ImageOps
 from scipy.spatial.transform import Rotation
 
 from thermoxels_ns.capture.sfm.gravity import find_up, level_rotation
-from thermoxels_ns.synthetic.pinhole import look_at
+from thermoxels_ns.synthetic.camera_rings import look_at
 
 SHAKEN = Rotation.from_euler("xyz", [40, -70, 25], degrees=True).as_matrix()
 """World in which nothing is level; its up is the third column."""

@@ -13,10 +13,10 @@ import numpy as np
 from thermoxels_ns.capture.sfm.colmap_model import model_of_colmap, read_colmap
 from thermoxels_ns.capture.sfm.model import SfmModel
 from thermoxels_ns.capture.sfm.poses import Poses, common_size
-from thermoxels_ns.capture.stage_types import CameraModel
 from thermoxels_ns.capture.stages import read_json
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.folder_walls import path_inside
+from thermoxels_ns.data.pose_file_cameras import read_intrinsics, read_pose
 
 
 def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
@@ -107,8 +107,6 @@ def in_order(model: SfmModel, key: Callable[[str], Any]) -> SfmModel:
 
 
 def _read_transforms(path: Path, photographs: Mapping[str, str]) -> SfmModel:
-    from thermoxels_ns.data.pose_file_cameras import read_intrinsics, read_pose  # loads torch
-
     content: Any = read_json(path)
     entries = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
@@ -125,13 +123,15 @@ def _read_transforms(path: Path, photographs: Mapping[str, str]) -> SfmModel:
         if name not in frame_of:
             continue
         where = f"{path.name}: frame {index}"
-        lens = read_intrinsics(content, entry, None, where)
-        k1, k2, k3, k4, p1, p2 = lens.distortion
-        if k3 or k4:
+        camera = read_intrinsics(content, entry, None, where)
+        if camera.k3 or camera.k4 or camera.lens != "perspective":
             raise SceneError(
-                where, expected="distortion k1, k2, p1, p2", got=f"k3 {k3}, k4 {k4}", remedy="Undistort first."
+                where,
+                expected="a perspective lens with distortion k1, k2, p1, p2",
+                got=f"{camera.lens}, k3 {camera.k3}, k4 {camera.k4}",
+                remedy="Undistort first.",
             )
-        cameras.add(CameraModel(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, k1, k2, p1, p2))
+        cameras.add(camera)
         frames.append(frame_of[name])
         poses.append(read_pose(entry.get("transform_matrix"), f"{where}: transform_matrix"))
     if len(cameras) != 1:

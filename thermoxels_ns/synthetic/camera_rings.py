@@ -1,4 +1,4 @@
-"""Pinhole cameras and the rings they are placed on. Poses are camera to world, x right, y up, z back (OpenGL)."""
+"""Camera poses on rings that look at a point."""
 
 from __future__ import annotations
 
@@ -12,71 +12,6 @@ import numpy.typing as npt
 from thermoxels_ns.core.errors import SceneError
 
 FloatArray = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class PinholeCamera:
-    """Intrinsics of a camera without distortion; the centre of the top left pixel is at (0.5, 0.5)."""
-
-    width: int
-    """Image width [pixels]."""
-    height: int
-    """Image height [pixels]."""
-    fl_x: float
-    """Focal length along x [pixels]."""
-    fl_y: float
-    """Focal length along y [pixels]."""
-    cx: float
-    """Principal point, x [pixels]."""
-    cy: float
-    """Principal point, y [pixels]."""
-
-    def __post_init__(self) -> None:
-        lengths = (self.fl_x, self.fl_y)
-        if min(self.width, self.height) < 1 or not all(math.isfinite(f) and f > 0 for f in lengths):
-            raise SceneError(
-                "camera",
-                expected="at least one pixel and focal lengths above 0",
-                got=f"{self.width} x {self.height} pixels, focal lengths {lengths}",
-                remedy="Correct the intrinsics.",
-            )
-
-    def directions(self, pose: npt.ArrayLike, samples_per_axis: int = 1) -> FloatArray:
-        """Unit ray directions in the world through a regular grid of points in every pixel.
-
-        Args:
-            pose: Camera to world, shape (3, 4) or (4, 4).
-            samples_per_axis: Grid points per pixel along each axis; 1 is the pixel's centre.
-
-        Returns:
-            Directions, shape (height, width, samples_per_axis ** 2, 3).
-        """
-        s = samples_per_axis
-        x = (np.arange(self.width * s) + 0.5) / s
-        y = (np.arange(self.height * s) + 0.5) / s
-        local = np.empty((self.height * s, self.width * s, 3))
-        local[..., 0] = (x - self.cx) / self.fl_x
-        local[..., 1] = -(y[:, None] - self.cy) / self.fl_y
-        local[..., 2] = -1.0
-        local /= np.sqrt(np.einsum("ijk,ijk->ij", local, local))[..., None]
-        world = local @ np.asarray(pose, dtype=np.float64)[:3, :3].T
-        blocks = world.reshape(self.height, s, self.width, s, 3).transpose(0, 2, 1, 3, 4)
-        return np.ascontiguousarray(blocks).reshape(self.height, self.width, s * s, 3)
-
-    def project(self, pose: npt.ArrayLike, points: npt.ArrayLike) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-        """Project world points (n, 3).
-
-        Returns:
-            Pixel positions (n, 2), NaN behind the camera, and which points lie within the image (n,).
-        """
-        pose = np.asarray(pose, dtype=np.float64)
-        local = (np.asarray(points, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3]
-        depth = -local[:, 2]
-        ahead = depth > 0.0
-        scale = np.divide(1.0, depth, out=np.full(len(depth), np.nan), where=ahead)
-        pixel = np.stack([self.cx + self.fl_x * local[:, 0] * scale, self.cy - self.fl_y * local[:, 1] * scale], axis=1)
-        inside = ahead & np.all((pixel >= 0.0) & (pixel <= (self.width, self.height)), axis=1)
-        return pixel, inside
 
 
 def look_at(position: npt.ArrayLike, target: npt.ArrayLike) -> FloatArray:

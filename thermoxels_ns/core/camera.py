@@ -1,0 +1,157 @@
+"""One camera for all rooms: image size, lens and distortion; poses stand beside it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.core.errors import SceneError
+
+FloatArray = npt.NDArray[np.float64]
+
+Lens = Literal["perspective", "fisheye", "equirectangular"]
+
+_UNDISTORT_STEPS = 20
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera's projection; its fields are named as in transforms.json.
+
+    Poses beside it are camera to world with x right, y up, z back (OpenGL), as in transforms.json. Points in camera
+    axes have x right, y down, z ahead (OpenCV). The centre of the top left pixel is at (0.5, 0.5). Only for perspective
+    lenses are there `project`, `rays` and `directions`.
+    """
+
+    width: int
+    """Image width [pixels]."""
+    height: int
+    """Image height [pixels]."""
+    fl_x: float
+    """Focal length along x [pixels]."""
+    fl_y: float
+    """Focal length along y [pixels]."""
+    cx: float
+    """Principal point, x [pixels]."""
+    cy: float
+    """Principal point, y [pixels]."""
+    k1: float = 0.0
+    """Radial distortion, second order, as in OpenCV; k2, k3, k4 are the fourth, sixth and eighth order."""
+    k2: float = 0.0
+    p1: float = 0.0
+    """Tangential distortion, as in OpenCV; p2 too."""
+    p2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    lens: Lens = "perspective"
+
+    def __post_init__(self) -> None:
+        numbers = (self.fl_x, self.fl_y, self.cx, self.cy, *self.distortion)
+        good = all(map(math.isfinite, numbers)) and min(self.fl_x, self.fl_y) > 0 and min(self.width, self.height) > 0
+        if not good:
+            raise SceneError(
+                "camera",
+                expected="at least one pixel, focal lengths above 0 and finite numbers",
+                got=f"{self.width} x {self.height} pixels, {numbers}",
+                remedy="Correct the intrinsics.",
+            )
+
+    @classmethod
+    def from_field_of_view(cls, width: int, height: int, horizontal_deg: float) -> Camera:
+        """Camera with square pixels, its principal point at the centre and a given horizontal angle of view.
+
+        >>> round(Camera.from_field_of_view(640, 480, 90.0).fl_x, 6)
+        320.0
+        """
+        if not 0.0 < horizontal_deg < 179.0:
+            raise SceneError(
+                "field of view",
+                expected="an angle above 0 and below 179 degrees",
+                got=horizontal_deg,
+                remedy="Pass the horizontal angle of view from the lens's data sheet.",
+            )
+        focal = 0.5 * width / math.tan(math.radians(0.5 * horizontal_deg))
+        return cls(width, height, focal, focal, 0.5 * width, 0.5 * height)
+
+    @property
+    def distortion(self) -> tuple[float, float, float, float, float, float]:
+        """k1, k2, k3, k4, p1, p2, in nerfstudio's order."""
+        return self.k1, self.k2, self.k3, self.k4, self.p1, self.p2
+
+    def resized(self, width: int, height: int) -> Camera:
+        """Same camera, its image sampled with another number of pixels; distortion does not change."""
+        x, y = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fl_x=self.fl_x * x, fl_y=self.fl_y * y, cx=self.cx * x, cy=self.cy * y
+        )
+
+    def scaled(self, factor: float) -> Camera:
+        """Same camera with pixels `1 / factor` times as large; a last part of a pixel is cut off."""
+        width, height = (max(int(length * factor + 1e-6), 1) for length in (self.width, self.height))
+        lengths = {name: getattr(self, name) * factor for name in ("fl_x", "fl_y", "cx", "cy")}
+        return replace(self, width=width, height=height, **lengths)
+
+    def project(self, points: npt.ArrayLike) -> FloatArray:
+        """Project points (n, 3) in OpenCV camera axes to pixels (n, 2); NaN for points not ahead of the camera."""
+        local = np.asarray(points, dtype=np.float64)
+        ahead = local[:, 2] > 0.0
+        scale = np.divide(1.0, local[:, 2], out=np.full(len(local), np.nan), where=ahead)
+        return self._distort(local[:, :2] * scale[:, None]) * (self.fl_x, self.fl_y) + (self.cx, self.cy)
+
+    def project_world(self, pose: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
+        """Project world points (n, 3) with a pose (3, 4) or (4, 4) to pixels (n, 2); NaN behind the camera."""
+        pose = np.asarray(pose, dtype=np.float64)
+        local = (np.asarray(points, dtype=np.float64) - pose[:3, 3]) @ pose[:3, :3]
+        return self.project(local * (1.0, -1.0, -1.0))
+
+    def rays(self, pixels: npt.ArrayLike) -> FloatArray:
+        """Points (n, 3) at depth 1 in OpenCV camera axes that the pixels (n, 2) see (distortion removed)."""
+        pixels = np.asarray(pixels, dtype=np.float64)
+        distorted = (pixels - (self.cx, self.cy)) / (self.fl_x, self.fl_y)
+        plane = distorted
+        if any(self.distortion):
+            for _ in range(_UNDISTORT_STEPS):
+                plane = plane + (distorted - self._distort(plane))
+        return np.column_stack([plane, np.ones(len(plane))])
+
+    def directions(self, pose: npt.ArrayLike, samples_per_axis: int = 1) -> FloatArray:
+        """Unit ray directions in the world through a regular grid of points in every pixel, without distortion.
+
+        Args:
+            pose: Camera to world, shape (3, 4) or (4, 4).
+            samples_per_axis: Grid points per pixel along each axis; 1 is the pixel's centre.
+
+        Returns:
+            Directions, shape (height, width, samples_per_axis ** 2, 3).
+        """
+        s = samples_per_axis
+        x = (np.arange(self.width * s) + 0.5) / s
+        y = (np.arange(self.height * s) + 0.5) / s
+        local = np.empty((self.height * s, self.width * s, 3))
+        local[..., 0] = (x - self.cx) / self.fl_x
+        local[..., 1] = -(y[:, None] - self.cy) / self.fl_y
+        local[..., 2] = -1.0
+        local /= np.sqrt(np.einsum("ijk,ijk->ij", local, local))[..., None]
+        world = local @ np.asarray(pose, dtype=np.float64)[:3, :3].T
+        blocks = world.reshape(self.height, s, self.width, s, 3).transpose(0, 2, 1, 3, 4)
+        return np.ascontiguousarray(blocks).reshape(self.height, self.width, s * s, 3)
+
+    def contains(self, pixels: npt.ArrayLike, border: float = 0.0) -> npt.NDArray[np.bool_]:
+        """Which pixels (n, 2) lie in the image, at least `border` pixels from its edge; NaN does not."""
+        x, y = np.asarray(pixels, dtype=np.float64).T
+        return (x >= border) & (x <= self.width - border) & (y >= border) & (y <= self.height - border)
+
+    def _distort(self, plane: FloatArray) -> FloatArray:
+        """Brown's model on points (n, 2) at depth 1."""
+        if not any(self.distortion):
+            return plane
+        x, y = plane[:, 0], plane[:, 1]
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * (self.k3 + r2 * self.k4)))
+        dx = 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x)
+        dy = self.p1 * (r2 + 2.0 * y * y) + 2.0 * self.p2 * x * y
+        return np.column_stack([x * radial + dx, y * radial + dy])
