@@ -10,8 +10,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from tests.support.scene_folders import look_at_origin
 from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.data.camera_views import views_of_cameras
-from thermoxels_ns.data.datamanager import ThermalDataManager, ThermalDataManagerConfig
+from thermoxels_ns.data.datamanager import ThermalDataManager, ThermalDataManagerConfig, views_of_cameras
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 
 

@@ -11,8 +11,8 @@ import pycolmap
 import pytest
 
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.data.colmap_files import check_complete
-from thermoxels_ns.data.colmap_tracks import COLMAP_FOLDERS, _matched, _points, read_colmap_tracks
+from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, check_complete
+from thermoxels_ns.data.colmap_tracks import _matched, _points, read_colmap_tracks
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import read_scene_file

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from thermoxels_ns.data.pose_alignment import align_poses
+from thermoxels_ns.data.colmap_tracks import _fit, align_poses
 
 TURN = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
 SCALE, SHIFT = 0.37, np.array([5.0, -2.0, 0.3])
@@ -58,3 +58,17 @@ def test_too_few_cameras_or_all_at_one_place_have_no_similarity():
     source, target = worlds(5)
     source[:, :3, 3] = [1.0, 2.0, 3.0]
     assert align_poses(source, target) is None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_all_cameras_but_strays_take_part(seed) -> None:
+    """Not only the half that fits best: what the others know of the similarity would be lost."""
+    source, _ = worlds(12)
+    target = source.copy()
+    target[:, :3, 3] = 2.0 * source[:, :3, 3] + 1.0 + 0.01 * np.random.default_rng(seed).normal(size=(12, 3))
+    target[5, :3, 3] += 3.0
+    good = np.arange(12) != 5
+    found, expected = align_poses(source, target), _fit(source[good], target[good])
+    assert found is not None and expected is not None
+    assert found.scale == pytest.approx(expected.scale, rel=1e-12)
+    np.testing.assert_allclose(found.translation, expected.translation, atol=1e-12)

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from thermoxels_ns.core.errors import ThermalFileError
-from thermoxels_ns.data.thermal_survey import survey_thermal_files
+from thermoxels_ns.data.dataparser import survey_thermal_files
 from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
 from thermoxels_ns.radiometry.thermal_files import ThermalUnit, read_temperature_c, read_thermal_file
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from thermoxels_ns.capture.camera_files import ROLE_WORDS, CameraFile, CameraFolder, natural_key, words_of
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.data.folder_walls import path_inside
+from thermoxels_ns.data.transforms_json import path_inside
 
 _DJI = re.compile(r"^(?P<head>.*?dji)_(?:(?P<time>\d{14})_)?(?P<number>\d{3,})_(?P<role>[a-z])(?P<tail>.*)$")
 _DJI_LATE_S = 3.0

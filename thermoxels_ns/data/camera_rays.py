@@ -1,4 +1,4 @@
-"""Rays of all pixels of many photographs, addressed by one flat number and computed before training."""
+"""Rays of all pixels of many photographs, addressed by one number, computed before training."""
 
 from __future__ import annotations
 

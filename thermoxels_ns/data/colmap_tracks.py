@@ -1,24 +1,22 @@
-"""Tracks out of a COLMAP model beside a scene whose poses are given."""
+"""Feature rays of a scene, from its file of tracks or a COLMAP model."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.core.feature_rays import FloatArray, IntArray
-from thermoxels_ns.data.colmap_files import check_complete
-from thermoxels_ns.data.folder_walls import path_inside
-from thermoxels_ns.data.pose_alignment import align_poses
+from thermoxels_ns.core.feature_rays import FloatArray, IntArray, Sightlines
+from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, read_model
 from thermoxels_ns.data.scene_file import Frame, SceneFile
-from thermoxels_ns.data.sparse_tracks import SparseTracks
+from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, SparseTracks, read_tracks, sightlines
+from thermoxels_ns.data.transforms_json import path_inside
 
-COLMAP_FOLDERS = ("colmap/sparse/0", "colmap/sparse", "colmap", "sparse/0", "sparse")
-"""Where a model may lie in a scene's folder, the first that does counts."""
 MOST_OFF_PX = 2.0
 """Median distance in a photograph between points as the model's pose and as the given one sees them, above which the
 photograph is left out."""
@@ -26,6 +24,47 @@ LEAST_AGREEING = 0.7
 """Share of the photographs in common whose poses must agree; with fewer the model belongs to other poses."""
 _PARTS = ("cameras", "images", "points3D")
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+_ROUNDS = 20
+_FEWEST = 3
+"""Cameras from which a similarity is found; fewer cannot outvote a wrong one."""
+_STRAY = 5.0
+"""Medians of the misfit above which a camera takes no part in the last fit."""
+
+TrackSource = Literal["auto", "given", "off"]
+
+
+def find_sightlines(scene: SceneFile, training: Sequence[int], source: TrackSource = "auto") -> Sightlines | None:
+    """The lines of sight of the photographs that train, if the scene has tracks.
+
+    Args:
+        scene: The scene.
+        training: Numbers of its frames that train; what others see is not used.
+        source: auto: the file that the json names, else a COLMAP model in the scene's folder; given: only the file;
+            off: none.
+
+    Returns:
+        Lines in input coordinates; None where there are no tracks.
+
+    Raises:
+        SceneError: The file that the json names lies outside the scene, cannot be used, or does not fit the poses. A
+            COLMAP model that does not is left out with a warning: nobody asked for it.
+    """
+    frames = [scene.frames[index] for index in training]
+    if source == "off":
+        return None
+    if TRACKS_KEY in scene.meta:
+        path = path_inside(scene.folder, str(scene.meta[TRACKS_KEY]), f"transforms.json: {TRACKS_KEY}")
+        return sightlines(read_tracks(path), frames, path.name)
+    found = read_colmap_tracks(scene) if source == "auto" else None
+    if found is None:
+        return None
+    try:
+        return sightlines(
+            found, frames, "its tracks", "Give it the photographs and poses of the json, or move it away."
+        )
+    except SceneError as problem:
+        warn_unused("the scene's folder", str(problem))
+        return None
 
 
 def read_colmap_tracks(scene: SceneFile) -> SparseTracks | None:
@@ -69,7 +108,12 @@ def _model_folder(folder: Path) -> str | None:
 
 
 def _tracks(scene: SceneFile, folder: str) -> SparseTracks:
-    model = _read(scene.folder, folder)
+    for path in sorted((scene.folder / folder).iterdir()):
+        if path.suffix in (".bin", ".txt"):
+            path_inside(scene.folder, f"{folder}/{path.name}", f"COLMAP model {folder}")
+    model = read_model(scene.folder / folder)
+    if any(point.error < 0.0 for point in model.points3D.values()):  # not computed
+        model.update_point_3d_errors()
     images = {number: image for number, image in model.images.items() if image.has_pose}
     numbers = list(images)
     pairs = _matched([image.name for image in images.values()], [frame.name for frame in scene.frames])
@@ -110,22 +154,6 @@ def _tracks(scene: SceneFile, folder: str) -> SparseTracks:
         CONSOLE.print(f"Tracks: other poses than COLMAP's, left out: {', '.join(strays)}", style="bold yellow")
     kept = agree[frame]
     return SparseTracks(moved, error_px, tuple(one.name for one in frames), frame[kept], point[kept])
-
-
-def _read(root: Path, folder: str) -> Any:
-    import pycolmap  # slow to import and only needed here
-
-    for path in sorted((root / folder).iterdir()):
-        if path.suffix in (".bin", ".txt"):
-            path_inside(root, f"{folder}/{path.name}", f"COLMAP model {folder}")
-    check_complete(root / folder)
-    try:
-        model = pycolmap.Reconstruction(str(root / folder))
-    except Exception as problem:  # pycolmap raises RuntimeError, ValueError, IndexError by version
-        raise SceneError(f"it cannot be read, {(str(problem).strip() or repr(problem)).splitlines()[-1]}") from problem
-    if any(point.error < 0.0 for point in model.points3D.values()):  # not computed
-        model.update_point_3d_errors()
-    return model
 
 
 def _pose(image: Any) -> FloatArray:
@@ -209,3 +237,75 @@ def _off_px(
     median = np.full(len(frames), np.nan)
     median[counts > 0] = off[order][middle[counts > 0]]
     return median
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """Brings points of one world into another: scale * rotation p + translation."""
+
+    rotation: FloatArray
+    """Shape (3, 3)."""
+    translation: FloatArray
+    """Shape (3,)."""
+    scale: float
+
+    def points(self, points: FloatArray) -> FloatArray:
+        """Move points, shape (n, 3)."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+
+def align_poses(source: FloatArray, target: FloatArray) -> Similarity | None:
+    """Find the similarity that brings cameras of one world to their poses in another.
+
+    The rotation is that between the cameras' axes, so that cameras on one line will do; scale and translation fit the
+    centres in the least squares. The half of the cameras that fits worst is left out and the fit repeated until the
+    half stays the same (least trimmed squares), so that some wrong poses do not move the others.
+
+    Args:
+        source: Camera to world, shape (n, 4, 4).
+        target: The same cameras in the same order, with the same axes, shape (n, 4, 4).
+
+    Returns:
+        The similarity, however well it fits; None where the cameras are fewer than three or at one place.
+    """
+    if len(source) < _FEWEST:
+        return None
+    used = np.ones(len(source), dtype=bool)
+    found = None
+    for number in range(_ROUNDS):
+        found = _fit(source[used], target[used])
+        if found is None:
+            return None
+        misfit = _misfit(found, source, target)
+        middle = float(np.sort(misfit)[max(_FEWEST, (len(misfit) + 1) // 2) - 1])
+        best = misfit <= max(middle, 1e-12)
+        if number and (best == used).all():
+            break
+        used = best
+    used = misfit <= _STRAY * max(middle, 1e-12)
+    return _fit(source[used], target[used])
+
+
+def _fit(source: FloatArray, target: FloatArray) -> Similarity | None:
+    # Sum of the rotations from source to target; the nearest rotation to it is their chordal mean.
+    turns = np.einsum("nij,nkj->ik", target[:, :3, :3], source[:, :3, :3])
+    left, _, right = np.linalg.svd(turns)
+    rotation = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
+    centres, wanted = source[:, :3, 3] @ rotation.T, target[:, :3, 3]
+    middle, wanted_middle = centres.mean(axis=0), wanted.mean(axis=0)
+    spread = np.square(centres - middle).sum()
+    scale = ((centres - middle) * (wanted - wanted_middle)).sum() / max(spread, 1e-300)
+    if not (np.isfinite(scale) and scale > 0.0 and spread > 1e-18 * max(np.square(centres).sum(), 1e-300)):
+        return None
+    return Similarity(rotation, wanted_middle - scale * middle, float(scale))
+
+
+def _misfit(found: Similarity, source: FloatArray, target: FloatArray) -> FloatArray:
+    """Of each camera: distance between the centres over the spread of all, and angle between the axes [radians]."""
+    wanted = target[:, :3, 3]
+    spread = np.median(np.linalg.norm(wanted - np.median(wanted, axis=0), axis=1))
+    off = np.linalg.norm(found.points(source[:, :3, 3]) - wanted, axis=1) / max(spread, 1e-300)
+    turned = found.rotation @ source[:, :3, :3]
+    # |A - B| of rotations is 2 sqrt(2) sin(angle / 2).
+    chord = np.linalg.norm(turned - target[:, :3, :3], axis=(1, 2))
+    return off + 2.0 * np.arcsin(np.minimum(chord / np.sqrt(8.0), 1.0))

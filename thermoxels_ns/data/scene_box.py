@@ -1,4 +1,4 @@
-"""The box that the voxel lattice fills: given, or found from sparse points or from the cameras."""
+"""The box of the voxel lattice: given, or found from points or cameras."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.data.colmap_files import check_complete
-from thermoxels_ns.data.colmap_tracks import COLMAP_FOLDERS
+from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, read_model
 from thermoxels_ns.data.scene_file import Frame, SceneFile
 
 Box = npt.NDArray[np.float64]
@@ -56,7 +55,7 @@ def find_scene_box(
         return box_of_points(_read_ply(path) @ rotation.T, scene.frames, rotation), f"the points of {path.name}"
     for folder in COLMAP_FOLDERS:
         if any((scene.folder / folder / f"points3D.{suffix}").is_file() for suffix in ("bin", "txt")):
-            points = _read_colmap(scene.folder / folder, scene)
+            points = _read_colmap(folder, scene)
             return box_of_points(points @ rotation.T, scene.frames, rotation), f"the points of {folder}"
     return box_of_cameras(scene.frames, rotation), "the cameras (no scene_box and no sparse points found)"
 
@@ -164,19 +163,16 @@ def _read_ply(path: Path) -> npt.NDArray[np.float64]:
     return points
 
 
-def _read_colmap(folder: Path, scene: SceneFile) -> npt.NDArray[np.float64]:
+def _read_colmap(folder: str, scene: SceneFile) -> npt.NDArray[np.float64]:
     """Read a COLMAP model's points and bring them into the coordinates of the json.
 
     The json may hold COLMAP's world or one with other axes (``applied_transform``). Which one is decided by the
     camera centres that both files know, so that a stale model cannot give a wrong box.
     """
-    import pycolmap  # slow to import and only needed here
-
     try:
-        check_complete(folder)
-        model = pycolmap.Reconstruction(str(folder))
-    except Exception as problem:  # pycolmap raises RuntimeError, ValueError, IndexError by version
-        raise SceneError(str(folder), expected="a readable COLMAP model", got=problem, remedy=_REMEDY) from problem
+        model = read_model(scene.folder / folder)
+    except SceneError as problem:
+        raise SceneError(folder, expected="a readable COLMAP model", got=problem, remedy=_REMEDY) from problem
     centres = {Path(image.name).name: np.asarray(image.projection_center()) for image in model.images.values()}
     known = [(centres[frame.image.name], frame.pose[:3, 3]) for frame in scene.frames if frame.image.name in centres]
     in_colmap, in_json = (np.array(side).reshape(-1, 3) for side in (zip(*known) if known else ([], [])))
@@ -191,7 +187,7 @@ def _read_colmap(folder: Path, scene: SceneFile) -> npt.NDArray[np.float64]:
             points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
             return points @ transform[:, :3].T + transform[:, 3]
     raise SceneError(
-        str(folder),
+        folder,
         expected="a COLMAP model with the camera centres of the json",
         got=f"{len(known)} photographs in common, at other places" if known else "no photograph in common",
         remedy=_REMEDY,

@@ -1,4 +1,4 @@
-"""The scene folder on disk: transforms.json and its thermal partners, checked and turned into plain frames."""
+"""Read a scene folder: transforms.json, photographs and their thermal partners, checked."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError, explain
-from thermoxels_ns.data.pose_file_cameras import read_intrinsics, read_pose
+from thermoxels_ns.data.transforms_json import read_intrinsics, read_pose
 from thermoxels_ns.radiometry.thermal_files import THERMAL_SUFFIXES, ThermalUnit
 
 JSON_NAMES = ("transforms.json", "transforms_thermal.json")

@@ -1,4 +1,4 @@
-"""Tracks of structure from motion beside a scene: which photographs see which point, so which rays cross only air."""
+"""Tracks of structure from motion: their file, and the feature rays they give."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The synthetic scenes by name: an object on a table, a house corner, a sphere, a courtyard, pipes, or `random-N`."""
+"""The synthetic scenes by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The synthetic scene `courtyard`: a hard building, with plain walls, thin parts and a yard few cameras look into."""
+"""The synthetic scene `courtyard`: plain walls, thin parts, a yard few cameras see."""
 
 from __future__ import annotations
 

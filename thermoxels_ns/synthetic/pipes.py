@@ -1,4 +1,4 @@
-"""The synthetic scene `pipes`: three hot pipes before a wall indoors, seen from one side only."""
+"""The synthetic scene `pipes`: hot pipes before a wall, seen from one side."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Buildings that a seed lays out: a detached house, an L or U of wings, a facade strip. Lengths in plan voxels."""
+"""Random buildings: a detached house, wings in L or U, a facade."""
 
 from __future__ import annotations
 

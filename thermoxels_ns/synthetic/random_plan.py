@@ -1,4 +1,4 @@
-"""The plan that a random scene is drawn on: pieces with paint and warmth, openings and warm spots, in voxels."""
+"""The plan of a random scene: pieces, openings and warm spots, in voxels."""
 
 from __future__ import annotations
 

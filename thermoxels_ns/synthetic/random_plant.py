@@ -1,4 +1,4 @@
-"""Plant that a seed lays out: machinery on a floor slab, pipes and radiators at a free-standing wall. Plan voxels."""
+"""Random plant: machinery on a slab, pipes and radiators at a wall."""
 
 from __future__ import annotations
 

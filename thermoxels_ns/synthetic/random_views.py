@@ -1,4 +1,4 @@
-"""Where a random scene is photographed from: rings as close as they can be with the whole scene in every picture."""
+"""Camera rings of a random scene, as close as the whole scene allows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Photographs and thermal images of a synthetic scene by exact ray casting, and which surface they see."""
+"""Exact ray casting of photographs, thermal images and visible surface points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What cameras see past a synthetic scene: an open sky or the walls of a room. Depends on the direction only."""
+"""Surroundings of a synthetic scene: open sky or the walls of a room."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Procedural colour in space: smooth noise at several scales, none finer than a voxel field can hold."""
+"""Procedural colour in space: smooth noise at several scales."""
 
 from __future__ import annotations
 

@@ -15,8 +15,7 @@ from thermoxels_ns.capture.sfm.model import SfmModel
 from thermoxels_ns.capture.sfm.poses import Poses, common_size
 from thermoxels_ns.capture.stages import read_json
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.data.folder_walls import path_inside
-from thermoxels_ns.data.pose_file_cameras import read_intrinsics, read_pose
+from thermoxels_ns.data.transforms_json import path_inside, read_intrinsics, read_pose
 
 
 def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:

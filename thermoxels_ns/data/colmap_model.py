@@ -1,11 +1,15 @@
-"""Whether the binary files of a COLMAP model are complete; its readers go on behind the end of one that is cut off."""
+"""Find, check and read a COLMAP model beside a scene."""
 
 from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 from thermoxels_ns.core.errors import SceneError
+
+COLMAP_FOLDERS = ("colmap/sparse/0", "colmap/sparse", "colmap", "sparse/0", "sparse")
+"""Where a model may lie in a scene's folder, the first that does counts."""
 
 _LEAST_CAMERA_BYTES = 48
 """Of a camera with three parameters; others have more."""
@@ -18,8 +22,26 @@ _IMAGE_BYTES, _FEATURE_BYTES = 64, 24
 _LENGTH = struct.Struct("<Q")
 
 
+def read_model(folder: Path) -> Any:
+    """Read the COLMAP model in a folder.
+
+    Returns:
+        A `pycolmap.Reconstruction`.
+
+    Raises:
+        SceneError: A file ends too early or cannot be read.
+    """
+    import pycolmap  # slow to import and only needed here
+
+    check_complete(folder)
+    try:
+        return pycolmap.Reconstruction(str(folder))
+    except Exception as problem:  # pycolmap raises RuntimeError, ValueError, IndexError by version
+        raise SceneError(f"it cannot be read, {(str(problem).strip() or repr(problem)).splitlines()[-1]}") from problem
+
+
 def check_complete(folder: Path) -> None:
-    """Refuse a model whose files end before what they announce, as those of an interrupted copy do.
+    """Refuse a model whose files end before what they announce: pycolmap would read on behind the end.
 
     Args:
         folder: Holds cameras, images, points3D and, of newer versions, frames; text is not looked at.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.data.folder_walls import path_inside
+from thermoxels_ns.data.transforms_json import path_inside
 
 
 @pytest.mark.parametrize("name", ["a.tiff", "thermal/a.tiff", "./a.tiff", "thermal\\a.tiff", "a..b/c.jpg"])
