@@ -70,13 +70,13 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
         raise SceneError(
             where, expected="intrinsics fl_x, fl_y, cx, cy, w, h", got=f"no {problem.args[0]}", remedy=remedy
         ) from problem
-    except (SceneError, TypeError, ValueError, OverflowError) as problem:
+    except SceneError as problem:
         raise SceneError(
-            where,
-            expected="numbers: finite intrinsics, positive focal lengths and size, six distortion parameters",
-            got=problem,
-            remedy=remedy,
+            where, expected="finite intrinsics, positive focal lengths and size", got=problem, remedy=remedy
         ) from problem
+    except (TypeError, ValueError, OverflowError) as problem:
+        expected = "numbers as intrinsics, six of them for distortion_params"
+        raise SceneError(where, expected=expected, got=problem, remedy=remedy) from problem
     if size is not None and (width, height) != size:
         raise SceneError(
             where,
