@@ -17,8 +17,7 @@ import tyro
 from tests.support.scene_bodies import room, tagged_body, wall
 from thermoxels_ns import cli
 from thermoxels_ns.commands.heat import Heat
-from thermoxels_ns.commands.heat_files import command_line
-from thermoxels_ns.commands.heat_run import compute_heat, run_heat
+from thermoxels_ns.commands.heat_run import command_line, compute_heat, run_heat
 from thermoxels_ns.core.errors import HeatError, OutputError, ThermoxelsError
 from thermoxels_ns.fem.probes import place_probes
 from thermoxels_ns.fem.problem import AdaptiveSteps
@@ -134,7 +133,7 @@ def test_what_does_not_matter_is_left_out_and_said_so(hour) -> None:
 def test_everything_is_built_at_a_tolerance_of_0(folder) -> None:
     mesh, scene = folder / "room" / "mesh.vtu", str(folder / "hour.yaml")
     run = compute_heat(Heat(mesh, scene, folder, leave_out_below_k=0.0))
-    assert run.screening.left_out == () and len(run.answers.effects) == 4
+    assert run.screening.left_out == () and len(run.results.effects) == 4
     assert run.solution.assembled.counts["radiation"] > 0
     less = compute_heat(Heat(mesh, scene, folder))
     difference = np.abs(run.solution.temperature_c - less.solution.temperature_c).max()
@@ -434,12 +433,12 @@ def test_the_plot_is_the_same_for_the_same_figures(folder) -> None:
 def test_rounding_errors_are_no_heat_flows_and_places_stand_below_temperatures(folder, tmp_path) -> None:
     """What flows through all of a steady body's surface is 0, but for rounding."""
     run = compute_heat(Heat(folder / "room" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path, pictures=False))
-    (region,) = run.answers.regions
-    largest = max(abs(effect.heat_w) for effect in run.answers.effects)
+    (region,) = run.results.regions
+    largest = max(abs(effect.heat_w) for effect in run.results.effects)
     assert largest > 100.0
     rounding = replace(region, heat_w=6e-10, heat_w_m2=2.5e-12, min_c=-0.001)
-    run = replace(run, answers=replace(run.answers, regions=(rounding,)))
-    page = build_page(heat_page(run, {}, "command", []))
+    run = replace(run, results=replace(run.results, regions=(rounding,)))
+    page = build_page(heat_page(run, {}, "mesh.vtu", "command", []))
     section = page.split("<h2>Answers</h2>")[1].split("<section>")[0]
     figures = re.findall(r"<td class=num>([^<]*)", section)
     assert len(figures) > 30 and not [shown for shown in figures if "e-" in shown or shown == "-0.00"]

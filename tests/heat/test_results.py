@@ -1,4 +1,4 @@
-"""Answers against walls whose figures are known, and against each other."""
+"""Results against walls whose figures are known, and against each other."""
 
 from __future__ import annotations
 
@@ -16,20 +16,14 @@ from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.surface_heat import heat_by_part
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.heat.materials import Material
-from thermoxels_ns.heat.results import heat_answers
-from thermoxels_ns.heat.wall_results import wall_answer
-from thermoxels_ns.mesh.boundary.facet_owners import facet_owners
-from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.heat.results import heat_results
+from thermoxels_ns.heat.wall_results import wall_result
 
 BRICK, WOOL = Material("brick", 0.7, 1600.0, 940.0), Material("wool", 0.04, 30.0, 1030.0)
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
 
 
-def regions_of(mesh: TetMesh) -> np.ndarray:
-    return mesh.region[facet_owners(mesh.tets, mesh.facets)[0]]
-
-
-def two_walls() -> tuple[HeatProblem, TetMesh]:
+def two_walls() -> HeatProblem:
     """Side by side and 0.2 m thick: 1 m of brick and 3 m of wool with an insulated gap between them, 2 m high."""
     mesh = box_mesh(
         planes(0.0, 0.2, step=0.1),
@@ -39,13 +33,13 @@ def two_walls() -> tuple[HeatProblem, TetMesh]:
         regions={"brick": lambda p: p[..., 1] < 1.0, "wool": lambda p: p[..., 1] > 1.0},
     )
     effects = (Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, -10.0))
-    return HeatProblem(mesh, {"brick": BRICK, "wool": WOOL}, effects=effects), mesh
+    return HeatProblem(mesh, {"brick": BRICK, "wool": WOOL}, effects=effects)
 
 
 def test_u_values_of_two_walls_side_by_side() -> None:
     """U = 1 / (1/8 + 0.2/k + 1/25): 2.21878 of brick, 0.19361 of wool; f_Rsi = 1 - U / 8 at the worse one."""
-    problem, mesh = two_walls()
-    wall = wall_answer(problem, solve_steady(problem), ("x0",), 20.0, -10.0, facet_region=regions_of(mesh))
+    problem = two_walls()
+    wall = wall_result(problem, solve_steady(problem), ("x0",), 20.0, -10.0)
     u = {name: 1.0 / (1 / 8 + 0.2 / k + 1 / 25) for name, k in (("brick", 0.7), ("wool", 0.04))}
     assert u == pytest.approx({"brick": 2.218700, "wool": 0.193611}, abs=1e-6)
     assert {part.name: part.u_value_w_m2k for part in wall.regions} == pytest.approx(u, rel=1e-9)
@@ -59,10 +53,10 @@ def test_u_values_of_two_walls_side_by_side() -> None:
 
 
 def test_of_a_cooled_room_the_warmest_spot_is_the_worst() -> None:
-    problem, mesh = two_walls()
+    problem = two_walls()
     effects = (Convection(("x0",), 8.0, 5.0), Convection(("x1",), 25.0, 35.0))
     problem = dataclasses.replace(problem, effects=effects)
-    wall = wall_answer(problem, solve_steady(problem), ("x0",), 5.0, 35.0, facet_region=regions_of(mesh))
+    wall = wall_result(problem, solve_steady(problem), ("x0",), 5.0, 35.0)
     u = 1.0 / (1 / 8 + 0.2 / 0.7 + 1 / 25)
     assert wall.temperature_factor == pytest.approx(1.0 - u / 8.0, rel=1e-9)
     assert wall.coldest.temperature_c == pytest.approx(5.0 + 30.0 * u / 8.0, rel=1e-9)
@@ -70,25 +64,25 @@ def test_of_a_cooled_room_the_warmest_spot_is_the_worst() -> None:
 
 
 def test_a_wall_between_equal_airs_or_without_an_inside_is_refused() -> None:
-    problem, mesh = two_walls()
-    solution, behind = solve_steady(problem), regions_of(mesh)
+    problem = two_walls()
+    solution = solve_steady(problem)
     with pytest.raises(HeatError, match="airs of a wall: expected two temperatures, got 5 and 5 C"):
-        wall_answer(problem, solution, ("x0",), 5.0, 5.0, facet_region=behind)
+        wall_result(problem, solution, ("x0",), 5.0, 5.0)
     with pytest.raises(HeatError, match=r"inside of a wall: expected some of the patches x0, x1.*got attic"):
-        wall_answer(problem, solution, ("attic",), 20.0, 5.0, facet_region=behind)
+        wall_result(problem, solution, ("attic",), 20.0, 5.0)
 
 
 def test_heat_by_patch_effect_and_region_of_a_steady_state() -> None:
-    problem, mesh = two_walls()
-    answers = heat_answers(problem, solve_steady(problem), facet_region=regions_of(mesh))
-    patches = {answer.patch: answer for answer in answers.patches}
+    problem = two_walls()
+    results = heat_results(problem, solve_steady(problem))
+    patches = {result.patch: result for result in results.patches}
     through = 30.0 * (2.0 * 2.2187005 + 6.0 * 0.1936108)
     assert [patches["x0"].heat_w, patches["x1"].heat_w] == pytest.approx([through, -through], rel=1e-6)
     assert patches["x1"].heat_w_m2 == pytest.approx(-through / 8.0, rel=1e-6)
     assert patches["other"].heat_w == 0.0 and patches["x0"].last_heat_w == patches["x0"].heat_w
-    assert [effect.area_m2 for effect in answers.effects] == pytest.approx([8.0, 8.0])
-    assert answers.effects[1].groups == pytest.approx({"x1": -through}, rel=1e-6)
-    regions = {answer.region: answer for answer in answers.regions}
+    assert [effect.area_m2 for effect in results.effects] == pytest.approx([8.0, 8.0])
+    assert results.effects[1].groups == pytest.approx({"x1": -through}, rel=1e-6)
+    regions = {result.region: result for result in results.regions}
     # What comes in through brick leaves through brick.
     assert [regions["brick"].heat_w, regions["wool"].heat_w] == pytest.approx([0.0, 0.0], abs=1e-8)
     assert [regions["brick"].volume_m3, regions["wool"].volume_m3] == pytest.approx([0.4, 1.2])
@@ -96,10 +90,10 @@ def test_heat_by_patch_effect_and_region_of_a_steady_state() -> None:
     # Temperature is linear across each wall: its mean is that of its sides.
     flux = 30.0 * 0.1936108
     assert regions["wool"].mean_c == pytest.approx(0.5 * (20.0 - flux / 8.0 - 10.0 + flux / 25.0), abs=1e-5)
-    balance = answers.balance
+    balance = results.balance
     assert (balance.unit, balance.stored) == ("W", 0.0) and balance.into_body == pytest.approx(through, rel=1e-6)
     assert abs(balance.residual) < 1e-9 * through and balance.relative_residual < 1e-10
-    assert json.loads(json.dumps(answers.as_mapping()))["patches"][0]["patch"] == "x0"
+    assert json.loads(json.dumps(dataclasses.asdict(results)))["patches"][0]["patch"] == "x0"
 
 
 @pytest.mark.parametrize("time", [TimeSteps(6, 600.0), AdaptiveSteps(3600.0, 0.1, outputs=6)])
@@ -118,19 +112,19 @@ def test_energy_balance_through_time(time) -> None:
     )
     problem = HeatProblem(mesh, CONCRETE, effects=effects)
     solution = solve_heat(problem, time)
-    answers = heat_answers(problem, solution)
-    balance, duration = answers.balance, 3600.0
+    results = heat_results(problem, solution)
+    balance, duration = results.balance, 3600.0
     exchanged = balance.into_body + balance.out_of_body
     assert balance.unit == "J" and abs(balance.residual) < 1e-9 * exchanged
     assert balance.into_body > 1e3 and balance.out_of_body > 1e3
-    assert balance.stored == pytest.approx(duration * sum(effect.heat_w for effect in answers.effects), rel=1e-9)
-    surface = sum(effect.heat_w for effect in answers.effects if effect.area_m2 is not None)
-    assert sum(patch.heat_w for patch in answers.patches) == pytest.approx(surface, rel=1e-9)
-    assert answers.effects[5].area_m2 is None and answers.effects[5].groups == pytest.approx({"solid": 500.0 * 0.036})
-    assert answers.effects[2].heat_w == pytest.approx(150.0 * 0.12) and answers.effects[2].area_m2 == pytest.approx(
+    assert balance.stored == pytest.approx(duration * sum(effect.heat_w for effect in results.effects), rel=1e-9)
+    surface = sum(effect.heat_w for effect in results.effects if effect.area_m2 is not None)
+    assert sum(patch.heat_w for patch in results.patches) == pytest.approx(surface, rel=1e-9)
+    assert results.effects[5].area_m2 is None and results.effects[5].groups == pytest.approx({"solid": 500.0 * 0.036})
+    assert results.effects[2].heat_w == pytest.approx(150.0 * 0.12) and results.effects[2].area_m2 == pytest.approx(
         0.12
     )
-    assert answers.times_s[-1] == 3600.0 and len(answers.times_s) == 7
+    assert results.times_s[-1] == 3600.0 and len(results.times_s) == 7
 
 
 def test_hottest_and_coldest_spots_are_where_they_are() -> None:
@@ -139,12 +133,12 @@ def test_hottest_and_coldest_spots_are_where_they_are() -> None:
     start = np.full(len(mesh.points_m), 20.0)
     start[corner] = 50.0
     problem = HeatProblem(mesh, CONCRETE, start, effects=(FixedTemperature(("x0",), 5.0),))
-    answers = heat_answers(problem, solve_heat(problem, TimeSteps(3, 1e4)))
-    assert answers.hottest.temperature_c == 50.0 and answers.hottest.node == corner
-    assert answers.hottest.point_m == (0.4, 0.2, 0.2) and answers.hottest.patches == ("x1", "y1", "z1")
-    assert answers.hottest.time_s == 0.0
-    assert answers.coldest.temperature_c == 5.0 and answers.coldest.patches[0] == "x0"
-    last = {patch.patch: patch for patch in answers.patches}
+    results = heat_results(problem, solve_heat(problem, TimeSteps(3, 1e4)))
+    assert results.hottest.temperature_c == 50.0 and results.hottest.node == corner
+    assert results.hottest.point_m == (0.4, 0.2, 0.2) and results.hottest.patches == ("x1", "y1", "z1")
+    assert results.hottest.time_s == 0.0
+    assert results.coldest.temperature_c == 5.0 and results.coldest.patches[0] == "x0"
+    last = {patch.patch: patch for patch in results.patches}
     assert last["x1"].hottest.time_s == 3e4 and last["x1"].hottest.temperature_c < 50.0
     assert last["x0"].mean_c == pytest.approx(5.0) and last["x1"].coldest.temperature_c > 5.0
 
@@ -179,25 +173,16 @@ def test_true_areas_count() -> None:
     smaller = dataclasses.replace(mesh, boundary=dataclasses.replace(mesh.boundary, area_factor=factor))
     effects = (Convection(("x0",), 8.0, 20.0), Convection(("x1",), 8.0, 0.0))
     problem = HeatProblem(smaller, CONCRETE, effects=effects)
-    answers = heat_answers(problem, solve_steady(problem))
-    assert answers.patches[0].area_m2 == pytest.approx(0.7)
-    assert answers.patches[0].heat_w_m2 == pytest.approx(answers.effects[0].heat_w_m2, rel=1e-12)
-    assert answers.regions[0].area_m2 == pytest.approx(0.7 * 2.8)
+    results = heat_results(problem, solve_steady(problem))
+    assert results.patches[0].area_m2 == pytest.approx(0.7)
+    assert results.patches[0].heat_w_m2 == pytest.approx(results.effects[0].heat_w_m2, rel=1e-12)
+    assert results.regions[0].area_m2 == pytest.approx(0.7 * 2.8)
 
 
-def test_an_insulated_body_has_answers() -> None:
+def test_an_insulated_body_has_results() -> None:
     mesh = box_mesh([0.0, 0.1], [0.0, 0.1], [0.0, 0.1], temperature_c=lambda p: 100.0 * p[:, 0])
     problem = HeatProblem(mesh, CONCRETE)
-    answers = heat_answers(problem, solve_heat(problem, TimeSteps(2, 60.0)))
-    assert answers.effects == () and [patch.heat_w for patch in answers.patches] == [0.0] * 6
-    assert answers.balance.into_body == answers.balance.out_of_body == 0.0
-    assert answers.regions[0].mean_c == pytest.approx(5.0)
-
-
-def test_several_regions_need_the_region_behind_each_triangle() -> None:
-    problem, mesh = two_walls()
-    solution = solve_steady(problem)
-    with pytest.raises(HeatError, match="facet_region: expected one number per triangle, got none for 2 regions"):
-        heat_answers(problem, solution)
-    with pytest.raises(HeatError, match="facet_region: expected shape"):
-        heat_answers(problem, solution, facet_region=regions_of(mesh)[1:])
+    results = heat_results(problem, solve_heat(problem, TimeSteps(2, 60.0)))
+    assert results.effects == () and [patch.heat_w for patch in results.patches] == [0.0] * 6
+    assert results.balance.into_body == results.balance.out_of_body == 0.0
+    assert results.regions[0].mean_c == pytest.approx(5.0)

@@ -10,7 +10,7 @@ from thermoxels_ns.fem.problem import TimeSteps
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import InsideAir, OutsideAir
-from thermoxels_ns.heat.scene_warnings import scene_doubts, unused_settings
+from thermoxels_ns.heat.scene_warnings import patch_warnings, unused_settings
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 CONCRETE = {"*": Material("concrete", 1.7, 2200.0, 880.0)}
@@ -35,30 +35,30 @@ def photographed_from_within() -> TetMesh:
 
 def test_rooms_and_walls_are_trusted() -> None:
     scene = HeatScene(CONCRETE, **AIRS)
-    assert scene_doubts(scene, room(), Z_UP) == () and scene_doubts(scene, wall(), Z_UP) == ()
+    assert patch_warnings(scene, room(), Z_UP) == () and patch_warnings(scene, wall(), Z_UP) == ()
 
 
 def test_a_filled_body_has_no_rooms() -> None:
-    (doubt,) = scene_doubts(HeatScene(CONCRETE, **AIRS), filled(), Z_UP)
-    assert "of the 9 m² that no photograph saw" in doubt and "--interior hollow" in doubt and "--patches" in doubt
+    (warning,) = patch_warnings(HeatScene(CONCRETE, **AIRS), filled(), Z_UP)
+    assert "of the 9 m² that no photograph saw" in warning and "--interior hollow" in warning and "--patches" in warning
 
 
 def test_without_air_inside_a_filled_body_is_fine() -> None:
-    assert scene_doubts(HeatScene(CONCRETE, outside_air=AIRS["outside_air"]), filled(), Z_UP) == ()
+    assert patch_warnings(HeatScene(CONCRETE, outside_air=AIRS["outside_air"]), filled(), Z_UP) == ()
 
 
 def test_a_room_seen_from_within_is_inside_out() -> None:
     scene = HeatScene(CONCRETE, **AIRS)
-    (doubt,) = scene_doubts(scene, photographed_from_within(), Z_UP)
-    assert "faces inwards" in doubt and 'patches: ["exterior-*"] to the inside air' in doubt
+    (warning,) = patch_warnings(scene, photographed_from_within(), Z_UP)
+    assert "faces inwards" in warning and 'patches: ["exterior-*"] to the inside air' in warning
     turned = {name: replace(air, patches=(where,)) for (name, air), where in zip(AIRS.items(), ("ext*", "int*"))}
-    assert scene_doubts(HeatScene(CONCRETE, **turned), photographed_from_within(), Z_UP) == ()
+    assert patch_warnings(HeatScene(CONCRETE, **turned), photographed_from_within(), Z_UP) == ()
 
 
 @pytest.mark.parametrize("up", [(1.0, 0.0, 0.0), (0.0, -3.0, 0.0)])
 def test_up_decides_what_an_underside_is(up) -> None:
     """What faces down as the mesh was made is a wall if another direction is up."""
-    assert scene_doubts(HeatScene(CONCRETE, **AIRS), filled(), up) == ()
+    assert patch_warnings(HeatScene(CONCRETE, **AIRS), filled(), up) == ()
 
 
 def test_a_start_that_a_steady_state_does_not_know_is_named() -> None:

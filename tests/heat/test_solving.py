@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.support.heat_meshes import box_mesh, planes
-from thermoxels_ns.commands.heat import Heat
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.heat import solving as heat_solving
 from thermoxels_ns.heat.effects import Convection, HeatFlux
@@ -108,11 +105,6 @@ def test_steps_too_short_to_count_are_no_progress(clock) -> None:
     assert lines == ["25% of the time after 2 steps; about 60 s left."]
 
 
-def scene_of(time: TimeSteps | AdaptiveSteps | None) -> Any:
-    """What `solve_scene` asks of a heat scene."""
-    return SimpleNamespace(time=time)
-
-
 def feebly_warmed(depth_m: float = 0.3) -> HeatProblem:
     """A wall between two airs, warmed by 0.05 W/m2, which 25 W/(m2 K) turn into at most 2 mK."""
     mesh = box_mesh(planes(0.0, depth_m, step=depth_m / 6), [0.0, 0.1], [0.0, 0.1], temperature_c=20.0)
@@ -120,9 +112,8 @@ def feebly_warmed(depth_m: float = 0.3) -> HeatProblem:
     return HeatProblem(mesh, Material("concrete", 1.7, 2200.0, 880.0), effects=effects)
 
 
-def solved(time: TimeSteps | None, problem: HeatProblem, **options: Any) -> heat_solving.SolvedScene:
-    chosen = Heat(mesh=Path("mesh.vtu"), scene="scene", **options)
-    return heat_solving.solve_scene(chosen, scene_of(time), problem, lambda _: None, lambda _: None)
+def solved(problem: HeatProblem, **goals: Any) -> heat_solving.SolvedProblem:
+    return heat_solving.solve_problem(problem, None, heat_solving.Goals(**goals))
 
 
 def test_what_is_left_out_counts_against_the_tolerance(monkeypatch) -> None:
@@ -135,11 +126,11 @@ def test_what_is_left_out_counts_against_the_tolerance(monkeypatch) -> None:
         return inner(problem, tolerance, **named)
 
     monkeypatch.setattr(heat_solving, "solve_to_tolerance", remember)
-    found = solved(None, feebly_warmed(), tolerance=0.05).accuracy
+    found = solved(feebly_warmed(), tolerance_k=0.05).accuracy
     assert found is not None and found.left_out_k == pytest.approx(0.002, rel=1e-6)
     assert given[0].temperature_k == pytest.approx(0.048, rel=1e-6)
     assert found.left_out_k < found.estimated_k <= 0.05 and found.met
-    everything = solved(None, feebly_warmed(), tolerance=0.05, leave_out_below_k=0.0).accuracy
+    everything = solved(feebly_warmed(), tolerance_k=0.05, leave_out_below_k=0.0).accuracy
     assert everything is not None and everything.left_out_k == 0.0 and given[1].temperature_k == 0.05
 
 
@@ -151,7 +142,5 @@ def test_what_is_left_out_counts_against_the_tolerance(monkeypatch) -> None:
     ],
 )
 def test_what_may_be_left_out_unless_it_is_said(tolerance_k, share, given, expected) -> None:
-    options = Heat(
-        mesh=Path("mesh.vtu"), scene="s", tolerance=tolerance_k, flow_tolerance=share, leave_out_below_k=given
-    )
-    assert heat_solving.leave_out_below_k(options) == pytest.approx(expected) and np.isfinite(expected)
+    goals = heat_solving.Goals(tolerance_k=tolerance_k, flow_tolerance=share, leave_out_below_k=given)
+    assert goals.left_out_k == pytest.approx(expected) and np.isfinite(expected)

@@ -1,80 +1,42 @@
-"""From an exported mesh and a heat scene to answers: what ``thermoxels heat`` does."""
+"""From an exported mesh and a heat scene to the files that ``thermoxels heat`` writes."""
 
 from __future__ import annotations
 
+import csv
 import json
+import shlex
 import time as clock
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from thermoxels_ns.commands.heat import Heat
-from thermoxels_ns.commands.heat_files import prepared_folder, write_heat_files
-from thermoxels_ns.core.errors import HeatError, MeshError
-from thermoxels_ns.fem.probes import Probes, place_probes
-from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.solution import SteadySolution
-from thermoxels_ns.fem.solution_nodes import Solution, SolutionNodes, solution_nodes
-from thermoxels_ns.heat.results import Answers, heat_answers
-from thermoxels_ns.heat.scene import HeatScene
-from thermoxels_ns.heat.scene_file import load_heat_scene
-from thermoxels_ns.heat.scene_warnings import scene_doubts, unused_settings
-from thermoxels_ns.heat.screening import Screening
-from thermoxels_ns.heat.solving import (
-    Accuracy,
-    Say,
-    check_accuracy_options,
-    solve_scene,
+from thermoxels_ns.core.checks import (
+    refuse_what_is_in_the_way,
+    remove_file,
+    remove_stale_temporaries,
+    replace_when_done,
+    writable_folder,
 )
-from thermoxels_ns.heat.wall_results import WallAnswer, faces_inside, not_only_airs, wall_answer
-from thermoxels_ns.mesh.boundary.facet_owners import facet_owners
+from thermoxels_ns.core.errors import HeatError, MeshError
+from thermoxels_ns.fem.solution import SteadySolution
+from thermoxels_ns.fem.solution_nodes import Solution
+from thermoxels_ns.heat.run import HeatRun, run_scene
+from thermoxels_ns.heat.scene_file import load_heat_scene
+from thermoxels_ns.heat.solving import Goals, Say
+from thermoxels_ns.heat.vtk_series import STEP_PATTERN, remove_heat_series, write_heat_series
 from thermoxels_ns.mesh.files.read import read_mesh
-from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtu
+from thermoxels_ns.reports.heat_page import heat_page
+from thermoxels_ns.reports.heat_pictures import PICTURES, draw_surface
+from thermoxels_ns.reports.page import build_page, write_page
 
-Vector = npt.NDArray[np.float64]
 Direction = tuple[float, float, float]
 
-
-@dataclass(frozen=True)
-class HeatRun:
-    """All that a run found out."""
-
-    options: Heat
-    """What was asked."""
-    scene: HeatScene
-    """The scene."""
-    problem: HeatProblem
-    """The problem with all that the scene names, on the given mesh."""
-    solved: HeatProblem
-    """What was solved: without what is left out, and, if a tolerance asked for it, on a finer mesh."""
-    nodes: SolutionNodes
-    """All temperatures of the solution on a mesh that has a node for each."""
-    screening: Screening
-    """What of it was built."""
-    accuracy: Accuracy | None
-    """What is known of the error; None if no tolerance was given."""
-    warnings: tuple[str, ...]
-    """What looks wrong about the scene on this mesh, a sentence or two each."""
-    solution: Solution
-    """Temperatures and heat flows."""
-    answers: Answers
-    """What people ask."""
-    wall: WallAnswer | None
-    """The body as a wall, if its steady state between two airs was asked for and nothing else acts."""
-    no_wall: str
-    """Why there is no such answer although there are two airs, a sentence; else empty."""
-    mean_c: Vector
-    """Mean temperature of the volume at each time, shape (s,), [degrees Celsius]."""
-    probes: Probes
-    """Where temperatures were followed."""
-    probes_c: Vector
-    """Temperatures there, shape (s, p), [degrees Celsius]."""
-    seconds: Mapping[str, float]
-    """Time that each part took, [s]."""
+ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY = "answers.json", "series.csv", "report.html", "heat.pvd", "heat.vtu"
+"""Files of a run; pictures come on top."""
 
 
 def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
@@ -89,86 +51,30 @@ def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     """
     folder = prepared_folder(options.output_dir)
     run = compute_heat(options, say)
-    write_heat_files(folder, run, say)
+    write_heat_files(folder, options, run, say)
     return run
 
 
 def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     """Do what `run_heat` does without writing anything."""
-    seconds: dict[str, float] = {}
-    start = clock.perf_counter()
-
-    def lap(name: str) -> None:
-        nonlocal start
-        seconds[name], start = clock.perf_counter() - start, clock.perf_counter()
-
+    begin = clock.perf_counter()
     scene = load_heat_scene(options.scene)
-    check_accuracy_options(options, scene)
+    goals = Goals(
+        tolerance_k=options.tolerance,
+        flow_tolerance=options.flow_tolerance,
+        leave_out_below_k=options.leave_out_below_k,
+        memory_gb=options.memory_gb,
+        allow_unmet=options.allow_unmet,
+    )
+    goals.check_fits(scene.time)
     mesh = read_mesh(options.mesh)
     export = _export_summary(options.mesh, say)
     up = options.up if options.up is not None else _direction(export.get("up"), options.mesh)
-    problem = scene.problem(mesh, up=up)
-    probes = place_probes(mesh, np.array(options.probes, dtype=np.float64).reshape(-1, 3))
-    lap("read")
     say(f"Mesh: {len(mesh.tets):,} tetrahedra, {len(mesh.points_m):,} nodes.")
     say(f"Scene: {scene.description or options.scene}.")
-
-    doubts = scene_doubts(scene, mesh, problem.up)
-    warnings = (*doubts, *unused_settings(scene), *_shell_doubts(scene, export))
-    for warning in warnings:
-        say(f"Warning: {warning}")
-
-    found = solve_scene(options, scene, problem, say, lap)
-    screening, solution, solved = found.screening, found.solution, found.problem
-    lap("solve")
-    say(f"Heat: {solution.status} ({seconds['solve']:.1f} s)")
-    say(f"Energy balance closed to {solution.energy_residual:.1e}.")
-    if found.accuracy is not None and not found.accuracy.met:
-        say("Warning: the tolerance was not met.")
-
-    facet_region = solved.mesh.region[facet_owners(solved.mesh.tets, solved.mesh.facets)[0]]
-    nodes = solution_nodes(solved, solution)
-    wall, no_wall = _wall(scene, solved, solution, facet_region, nodes, doubtful=bool(doubts))
-    # Around each probe in the mesh that was solved.
-    probes = place_probes(solved.mesh, probes.points_m)
-    run = HeatRun(
-        options=options,
-        scene=scene,
-        problem=problem,
-        solved=solved,
-        nodes=nodes,
-        screening=screening,
-        accuracy=found.accuracy,
-        warnings=warnings,
-        solution=solution,
-        answers=heat_answers(solved, solution, facet_region=facet_region, nodes=nodes),
-        wall=wall,
-        no_wall=no_wall,
-        mean_c=nodes.states_c @ _volume_weights(nodes.mesh),
-        probes=probes,
-        probes_c=probes.at(nodes.states_c) if not nodes.quadratic else probes.at_quadratic(solved.mesh, nodes.states_c),
-        seconds=seconds,
-    )
-    lap("answers")
-    return run
-
-
-def _shell_doubts(scene: HeatScene, export: Mapping[str, Any]) -> tuple[str, ...]:
-    """Warn that the walls of a hollow export are as thick as photographs happened to make them."""
-    options, mesh = export.get("options"), export.get("mesh")
-    if scene.inside_air is None or not isinstance(options, dict) or not isinstance(mesh, dict):
-        return ()
-    if options.get("interior") != "hollow" or options.get("wall_thickness") is not None:
-        return ()
-    try:
-        thickness_m = 2.0 * float(mesh["volume"]) / float(mesh["area"])
-    except (KeyError, TypeError, ValueError, ZeroDivisionError):
-        return ()
-    return (
-        f"The mesh is a shell (--interior hollow), {thickness_m:.2g} m thick on average. Photographs do not show how "
-        "thick walls are, nor what no camera saw, such as floors: heat losses and U-values are those of this shell, "
-        "with its holes and loose parts. Where you know the walls, export with --wall-thickness.",
-    )
+    read_s = clock.perf_counter() - begin
+    run = run_scene(scene, mesh, goals, up=up, probes_m=options.probes, export=export, say=say)
+    return replace(run, seconds={"read": read_s, **run.seconds})
 
 
 def _export_summary(mesh: Path, say: Say) -> dict[str, Any]:
@@ -211,38 +117,131 @@ def _direction(up: Any, mesh: Path) -> Direction | None:
     return (x, y, z)
 
 
-def _wall(
-    scene: HeatScene,
-    problem: HeatProblem,
-    solution: Solution,
-    facet_region: npt.NDArray[np.int64],
-    nodes: SolutionNodes,
-    *,
-    doubtful: bool,
-) -> tuple[WallAnswer | None, str]:
-    """The body as a wall, if the scene asks for a steady state between two airs of different temperature and nothing
-    else, or why that cannot be said.
+def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
+    """Everything that answers.json says."""
+    screening = run.screening
+    return {
+        "mesh": options.mesh,
+        "scene": options.scene,
+        "description": run.scene.description,
+        "steady": run.scene.steady,
+        "warnings": list(run.warnings),
+        "leave_out_below_k": screening.tolerance_k,
+        "accuracy": None if run.accuracy is None else asdict(run.accuracy),
+        "solved": {
+            "tets": len(run.solved.mesh.tets),
+            "nodes": len(run.solved.mesh.points_m),
+            "unknowns": run.nodes.states_c.shape[1],
+        },
+        **asdict(run.results),
+        "wall": None if run.wall is None else asdict(run.wall),
+        "no_wall": run.no_wall,
+        "probes": [
+            {"point_m": point, "temperature_c": run.probes_c[:, number]}
+            for number, point in enumerate(run.probes.points_m)
+        ],
+        "built": [asdict(entry) for entry in screening.kept],
+        "left_out": [asdict(entry) for entry in screening.left_out],
+        "left_out_bound_k": screening.bound_k,
+        "left_out_note": screening.note,
+        "assembled": dict(run.solution.assembled.counts),
+        "newton_iterations": int(np.sum(run.solution.newton_iterations)),
+        "linear_iterations": int(np.sum(run.solution.iterations)),
+        "steps": 0 if isinstance(run.solution, SteadySolution) else run.solution.steps,
+        "time_error_k": _time_error_k(run.solution),
+        "seconds": dict(run.seconds),
+    }
+
+
+def prepared_folder(output_dir: Path) -> Path:
+    """Make the folder, and find out what is in the way before anything is computed.
+
+    Raises:
+        OutputError: It cannot be written to, or something has the name of what is to be written.
     """
-    inside, outside = scene.inside_air, scene.outside_air
-    if not isinstance(solution, SteadySolution) or inside is None or outside is None:
-        return None, ""
-    if inside.air_c == outside.air_c:
-        return None, ""
-    if doubtful:
-        return None, "There is no U-value, because it is doubtful which surface faces the air inside."
-    other = not_only_airs(problem, inside.air_c, outside.air_c)
-    if other:
-        return None, f"There is no U-value, because its heat would count in it: {other}. Ask for the two airs alone."
-    if not faces_inside(problem, inside.patches).any():
-        return None, "There is no U-value, because no surface of the body faces the air inside."
-    airs = inside.air_c, outside.air_c
-    return wall_answer(problem, solution, inside.patches, *airs, facet_region=facet_region, nodes=nodes), ""
+    folder = writable_folder(output_dir)
+    names = (ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY, *PICTURES)
+    series = folder / Path(THROUGH_TIME).stem
+    refuse_what_is_in_the_way(folder, names, [series.name])
+    remove_stale_temporaries(folder, names)
+    remove_stale_temporaries(series, [STEP_PATTERN])
+    return folder
 
 
-def _volume_weights(mesh: TetMesh) -> Vector:
-    """Share of the volume around each node, shape (n,)."""
-    corner = mesh.points_m[mesh.tets]
-    sides = corner[:, 1:] - corner[:, :1]
-    volume = np.einsum("ti,ti->t", sides[:, 0], np.cross(sides[:, 1], sides[:, 2])) / 24.0
-    weights = np.bincount(mesh.tets.ravel(), np.repeat(volume, 4), len(mesh.points_m))
-    return weights / weights.sum()
+def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> None:
+    """Write everything; answers.json comes last, so that files beside one belong together.
+
+    Args:
+        folder: From `prepared_folder`.
+        options: What was asked.
+        run: What was computed.
+        say: Called with one line of progress at a time.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    answers = answers_of(options, run)
+    summary_text(answers)  # raises if json cannot hold it
+    shown, pictures = run.nodes, list[str]()
+    remove_file(folder / ANSWERS)
+    for name in (PAGE, STEADY, *PICTURES):
+        remove_file(folder / name)
+    if isinstance(run.solution, SteadySolution):
+        remove_heat_series(folder / THROUGH_TIME)
+        write_vtu(folder / STEADY, shown.mesh, temperature_c=shown.states_c[-1])
+    else:
+        write_heat_series(folder / THROUGH_TIME, shown.mesh, run.solution)
+    _write_series(folder / SERIES, run)
+    if options.pictures:
+        pictures = draw_surface(folder, shown.mesh, shown.states_c, shown.times_s, run.problem.up)
+    drawn = {name: (folder / name).read_bytes() for name in pictures}
+    fields = STEADY if isinstance(run.solution, SteadySolution) else THROUGH_TIME
+    files = [PAGE, ANSWERS, SERIES, fields, *pictures]
+    page = build_page(heat_page(run, drawn, options.mesh.name, command_line(options), files))
+    write_page(folder / PAGE, page)
+    write_summary(folder / ANSWERS, answers)
+    say(f"Written to {folder}: {', '.join(files)}")
+
+
+def _time_error_k(solution: Solution) -> float | None:
+    """Give the estimated error of the steps as their controller adds it up, [K]; None if there is none."""
+    if isinstance(solution, SteadySolution) or not np.isfinite(solution.time_error_k):
+        return None
+    return solution.time_error_k
+
+
+def command_line(options: Heat) -> str:
+    """Write the command as it is typed."""
+    words = ["thermoxels", "heat", str(options.mesh), "--scene", options.scene, "--output-dir", str(options.output_dir)]
+    if options.probes:
+        words += ["--probes", *(repr(float(part)) for point in options.probes for part in point)]
+    for name, value in (
+        ("--tolerance", options.tolerance),
+        ("--flow-tolerance", options.flow_tolerance),
+        ("--leave-out-below-k", options.leave_out_below_k),
+    ):
+        words += [] if value is None else [name, repr(float(value))]
+    words += ["--memory-gb", repr(float(options.memory_gb))] if options.memory_gb != Heat.memory_gb else []
+    words += ["--allow-unmet", "True"] if options.allow_unmet else []
+    if options.up is not None:
+        words += ["--up", *(repr(float(part)) for part in options.up)]
+    words += [] if options.pictures else ["--pictures", "False"]
+    return shlex.join(words)
+
+
+def _write_series(path: Path, run: HeatRun) -> None:
+    """Temperatures at each time, and mean heat flows during the interval that ends there."""
+    times, states = run.nodes.times_s, run.nodes.states_c
+    effects = run.solution.effects
+    head = ["time_s", "min_c", "mean_c", "max_c"]
+    head += [f"probe {number + 1} [C]" for number in range(run.probes_c.shape[1])]
+    head += [f"{heat.effect} [W]" for heat in effects]
+    heat_w = np.stack([heat.heat_w for heat in effects], axis=1) if effects else np.zeros((max(len(times) - 1, 1), 0))
+    with replace_when_done(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(head)
+        for number, time_s in enumerate(times):
+            temperatures = [states[number].min(), run.mean_c[number], states[number].max(), *run.probes_c[number]]
+            interval = number if len(times) == 1 else number - 1
+            flows = ["" for _ in effects] if interval < 0 else [repr(float(flow)) for flow in heat_w[interval]]
+            writer.writerow([repr(float(time_s)), *(repr(float(value)) for value in temperatures), *flows])

@@ -1,23 +1,20 @@
-"""Answers people use: where heat is lost and how much, where it is hottest and coldest, and whether it adds up."""
+"""Heat flows by patch, effect and region, hottest and coldest spots, and the energy balance."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.checks import check_shape
-from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
-from thermoxels_ns.fem.solution import EffectHeat, SteadySolution
+from thermoxels_ns.fem.solution import SteadySolution
 from thermoxels_ns.fem.solution_nodes import Solution, SolutionNodes, solution_nodes
 from thermoxels_ns.fem.surface_heat import heat_by_part, heat_through_parts
-from thermoxels_ns.heat.effects import Effect, InternalHeat
+from thermoxels_ns.heat.effects import InternalHeat
 from thermoxels_ns.heat.materials import materials_by_region
+from thermoxels_ns.mesh.boundary.facet_owners import facet_owners
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Vector = npt.NDArray[np.float64]
@@ -40,7 +37,7 @@ class Spot:
 
 
 @dataclass(frozen=True)
-class PatchAnswer:
+class PatchResult:
     """A part of the surface."""
 
     patch: str
@@ -62,7 +59,7 @@ class PatchAnswer:
 
 
 @dataclass(frozen=True)
-class EffectAnswer:
+class EffectResult:
     """Something that acts on the body."""
 
     effect: str
@@ -80,7 +77,7 @@ class EffectAnswer:
 
 
 @dataclass(frozen=True)
-class RegionAnswer:
+class RegionResult:
     """A part of the volume, such as all that is made of one material."""
 
     region: str
@@ -122,18 +119,18 @@ class EnergyBalance:
 
 
 @dataclass(frozen=True)
-class Answers:
-    """All of it. Heat flows are positive into the body."""
+class HeatResults:
+    """What people ask of a solution. Heat flows are positive into the body."""
 
     status: str
     """The outcome of the computation as a sentence."""
     times_s: tuple[float, ...]
     """Times of the kept temperatures, [s]; 0 alone for a steady state."""
-    patches: tuple[PatchAnswer, ...]
+    patches: tuple[PatchResult, ...]
     """Parts of the surface that have some area."""
-    effects: tuple[EffectAnswer, ...]
+    effects: tuple[EffectResult, ...]
     """What acts, in the order of the problem."""
-    regions: tuple[RegionAnswer, ...]
+    regions: tuple[RegionResult, ...]
     """Parts of the volume that have some."""
     balance: EnergyBalance
     """Whether it adds up."""
@@ -142,65 +139,29 @@ class Answers:
     hottest: Spot
     """The hottest node of all times."""
 
-    def as_mapping(self) -> dict[str, Any]:
-        """Return names and values, nested, as json has them."""
-        return plain_values(self)
 
-
-def plain_values(value: Any) -> Any:
-    """Turn nested dataclasses into mappings.
-
-    >>> plain_values((EnergyBalance("W", 2.0, 2.0, 0.0, 0.0, 0.0),))[0]["unit"]
-    'W'
-    """
-    if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain_values(getattr(value, field.name)) for field in fields(value)}
-    return [plain_values(entry) for entry in value] if isinstance(value, tuple) else value
-
-
-def heat_answers(
-    problem: HeatProblem,
-    solution: Solution,
-    *,
-    facet_region: npt.NDArray[np.int64] | None = None,
-    end_s: float | None = None,
-    nodes: SolutionNodes | None = None,
-) -> Answers:
-    """Work out the answers from a solution.
+def heat_results(problem: HeatProblem, solution: Solution, nodes: SolutionNodes | None = None) -> HeatResults:
+    """Work out what people ask of a solution.
 
     Temperatures are those of all its unknowns, heat flows those that its own tetrahedra, linear or quadratic, bring.
 
     Args:
         problem: What was solved.
         solution: Its outcome.
-        facet_region: Region of the tetrahedron behind each boundary triangle, shape (f,); needed only if the body has
-            several regions.
-        end_s: Time at which effects that change are taken for the flows of regions, [s]; None: the last one.
         nodes: What `solution_nodes` gives, if it is there already.
-
-    Raises:
-        HeatError: The body has several regions and `facet_region` is missing or does not fit.
     """
     nodes = solution_nodes(problem, solution) if nodes is None else nodes
     times, states, selection = nodes.times_s, nodes.states_c, Selection(nodes.mesh, problem.up)
-    end_s = float(times[-1]) if end_s is None else end_s
-    facet_region = _checked_regions(problem.mesh, facet_region)
-    names = problem.mesh.region_names
-    by_region = heat_by_part(problem, end_state_c(solution), end_s, facet_region, names)
     lengths = np.diff(times) if len(times) > 1 else np.ones(1)
-    spots = _Spots(selection, times, states)
-    surface = [heat for effect, heat in zip(problem.effects, solution.effects) if not isinstance(effect, InternalHeat)]
-    return Answers(
+    return HeatResults(
         status=solution.status,
         times_s=tuple(times.tolist()),
-        patches=_patches(selection, surface, lengths, states[-1], spots),
-        effects=_effects(selection, problem.effects, solution.effects, lengths),
-        regions=_regions(
-            problem, selection, states[-1], heat_through_parts(by_region, names)[0], nodes.of_facets(facet_region)
-        ),
+        patches=_patches(problem, solution, selection, nodes, lengths),
+        effects=_effects(problem, solution, selection, lengths),
+        regions=_regions(problem, solution, selection, nodes),
         balance=_balance(solution, lengths),
-        coldest=spots.extreme(np.argmin),
-        hottest=spots.extreme(np.argmax),
+        coldest=_first_spot(selection, nodes, int(states.argmin())),
+        hottest=_first_spot(selection, nodes, int(states.argmax())),
     )
 
 
@@ -211,24 +172,15 @@ def end_state_c(solution: Solution) -> Vector:
     return solution.temperature_c[-1]
 
 
-class _Spots:
-    """Finds nodes and says where they are."""
+def region_behind_facets(mesh: TetMesh) -> npt.NDArray[np.int64]:
+    """Give the region of the tetrahedron behind each boundary triangle, shape (f,)."""
+    return mesh.region[facet_owners(mesh.tets, mesh.facets)[0]]
 
-    def __init__(self, selection: Selection, times_s: Vector, states_c: Vector) -> None:
-        self._selection, self._times, self._states = selection, times_s, states_c
 
-    def extreme(self, which: Any) -> Spot:
-        """Find the first of the coldest or hottest of all nodes and times."""
-        time, node = np.unravel_index(int(which(self._states)), self._states.shape)
-        return self.at(int(time), int(node))
-
-    def on(self, nodes: npt.NDArray[np.int64], which: Any) -> Spot:
-        """Find the coldest or hottest of some nodes at the end."""
-        return self.at(len(self._times) - 1, int(nodes[which(self._states[-1][nodes])]))
-
-    def at(self, time: int, node: int) -> Spot:
-        """Describe a node at a time."""
-        return describe_spot(self._selection, node, float(self._states[time, node]), float(self._times[time]))
+def volume_shares(mesh: TetMesh) -> Vector:
+    """Give the share of the volume around each node, shape (n,)."""
+    weights = np.bincount(mesh.tets.ravel(), np.repeat(_volumes_m3(mesh) / 4.0, 4), len(mesh.points_m))
+    return weights / weights.sum()
 
 
 def describe_spot(selection: Selection, node: int, temperature_c: float, time_s: float) -> Spot:
@@ -239,45 +191,52 @@ def describe_spot(selection: Selection, node: int, temperature_c: float, time_s:
     return Spot(temperature_c, (x, y, z), time_s, node, patches)
 
 
+def _first_spot(selection: Selection, nodes: SolutionNodes, index: int) -> Spot:
+    """Describe an entry of the flattened temperatures of all times."""
+    time, node = np.unravel_index(index, nodes.states_c.shape)
+    return describe_spot(selection, int(node), float(nodes.states_c[time, node]), float(nodes.times_s[time]))
+
+
 def _patches(
-    selection: Selection, surface: Sequence[EffectHeat], lengths: Vector, last_c: Vector, spots: _Spots
-) -> tuple[PatchAnswer, ...]:
-    mesh, area = selection.mesh, selection.facet_area_m2
-    heat = np.zeros((len(lengths), len(selection.patch_names)))
-    heat += heat_through_parts(surface, selection.patch_names)
-    facet_c = last_c[mesh.facets].mean(axis=1)
-    answers = []
+    problem: HeatProblem, solution: Solution, selection: Selection, nodes: SolutionNodes, lengths: Vector
+) -> tuple[PatchResult, ...]:
+    mesh, area, names, last_c = selection.mesh, selection.facet_area_m2, selection.patch_names, nodes.states_c[-1]
+    surface = [heat for effect, heat in zip(problem.effects, solution.effects) if not isinstance(effect, InternalHeat)]
+    heat = np.zeros((len(lengths), len(names))) + heat_through_parts(surface, names)
+    facet_c, end_s = last_c[mesh.facets].mean(axis=1), float(nodes.times_s[-1])
+    results = []
     for number in np.unique(selection.facet_patch):
         chosen = selection.facet_patch == number
-        nodes, total = np.unique(mesh.facets[chosen]), float(area[chosen].sum())
+        on_patch, total = np.unique(mesh.facets[chosen]), float(area[chosen].sum())
+        coldest, hottest = (int(on_patch[which(last_c[on_patch])]) for which in (np.argmin, np.argmax))
         mean = float(heat[:, number] @ lengths / lengths.sum())
-        answers.append(
-            PatchAnswer(
-                patch=selection.patch_names[number],
+        results.append(
+            PatchResult(
+                patch=names[number],
                 area_m2=total,
                 heat_w=mean,
                 heat_w_m2=mean / total,
                 last_heat_w=float(heat[-1, number]),
                 mean_c=float(facet_c[chosen] @ area[chosen]) / total,
-                coldest=spots.on(nodes, np.argmin),
-                hottest=spots.on(nodes, np.argmax),
+                coldest=describe_spot(selection, coldest, float(last_c[coldest]), end_s),
+                hottest=describe_spot(selection, hottest, float(last_c[hottest]), end_s),
             )
         )
-    return tuple(answers)
+    return tuple(results)
 
 
 def _effects(
-    selection: Selection, effects: Sequence[Effect], heats: Sequence[EffectHeat], lengths: Vector
-) -> tuple[EffectAnswer, ...]:
+    problem: HeatProblem, solution: Solution, selection: Selection, lengths: Vector
+) -> tuple[EffectResult, ...]:
     by_patch = np.bincount(selection.facet_patch, selection.facet_area_m2, len(selection.patch_names))
     area = dict(zip(selection.patch_names, by_patch.tolist()))
-    answers = []
-    for effect, heat in zip(effects, heats):
+    results = []
+    for effect, heat in zip(problem.effects, solution.effects):
         mean = float(heat.heat_w @ lengths / lengths.sum())
         groups = (heat.group_heat_w.T @ lengths / lengths.sum()).tolist()
         total = None if isinstance(effect, InternalHeat) else sum(area[name] for name in heat.group_names)
-        answers.append(
-            EffectAnswer(
+        results.append(
+            EffectResult(
                 effect=heat.effect,
                 heat_w=mean,
                 area_m2=total,
@@ -286,25 +245,25 @@ def _effects(
                 groups=dict(zip(heat.group_names, groups)),
             )
         )
-    return tuple(answers)
+    return tuple(results)
 
 
 def _regions(
-    problem: HeatProblem, selection: Selection, last_c: Vector, heat: Vector, facet_region: npt.NDArray[np.int64]
-) -> tuple[RegionAnswer, ...]:
-    mesh, names = selection.mesh, selection.mesh.region_names
-    area = np.bincount(facet_region, selection.facet_area_m2, len(names))
-    corner = mesh.points_m[mesh.tets]
-    sides = corner[:, 1:] - corner[:, :1]
-    volume = np.einsum("ti,ti->t", sides[:, 0], np.cross(sides[:, 1], sides[:, 2])) / 6.0
+    problem: HeatProblem, solution: Solution, selection: Selection, nodes: SolutionNodes
+) -> tuple[RegionResult, ...]:
+    mesh, names, last_c = selection.mesh, selection.mesh.region_names, nodes.states_c[-1]
+    behind, made_of = region_behind_facets(problem.mesh), materials_by_region(problem)
+    by_region = heat_by_part(problem, end_state_c(solution), float(nodes.times_s[-1]), behind, names)
+    heat = heat_through_parts(by_region, names)[0]
+    area = np.bincount(nodes.of_facets(behind), selection.facet_area_m2, len(names))
+    volume = _volumes_m3(mesh)
     total = np.bincount(mesh.region, volume, len(names))
     content = np.bincount(mesh.region, volume * last_c[mesh.tets].mean(axis=1), len(names))
-    made_of = materials_by_region(problem)
-    answers = []
+    results = []
     for number in np.unique(mesh.region):
         inside = last_c[mesh.tets[mesh.region == number]]
-        answers.append(
-            RegionAnswer(
+        results.append(
+            RegionResult(
                 region=names[number],
                 material=made_of[names[number]].name,
                 volume_m3=float(total[number]),
@@ -316,7 +275,14 @@ def _regions(
                 max_c=float(inside.max()),
             )
         )
-    return tuple(answers)
+    return tuple(results)
+
+
+def _volumes_m3(mesh: TetMesh) -> Vector:
+    """Volume of each tetrahedron, shape (t,)."""
+    corner = mesh.points_m[mesh.tets]
+    sides = corner[:, 1:] - corner[:, :1]
+    return np.einsum("ti,ti->t", sides[:, 0], np.cross(sides[:, 1], sides[:, 2])) / 6.0
 
 
 def _balance(solution: Solution, lengths: Vector) -> EnergyBalance:
@@ -334,15 +300,3 @@ def _balance(solution: Solution, lengths: Vector) -> EnergyBalance:
         residual=stored - into + out,
         relative_residual=solution.energy_residual,
     )
-
-
-def _checked_regions(mesh: TetMesh, facet_region: npt.NDArray[np.int64] | None) -> npt.NDArray[np.int64]:
-    """Region behind each boundary triangle, which is clear if there is only one."""
-    used = np.unique(mesh.region)
-    if facet_region is None and len(used) == 1:
-        return np.full(len(mesh.facets), used[0])
-    remedy = "Give the region of the tetrahedron behind each boundary triangle."
-    if facet_region is None:
-        got = f"none for {len(used)} regions"
-        raise HeatError("facet_region", expected="one number per triangle", got=got, remedy=remedy)
-    return check_shape("facet_region", np.asarray(facet_region), (len(mesh.facets),), remedy, HeatError)

@@ -1,8 +1,10 @@
-"""What looks wrong about a heat scene around a body although it is possible, and what it gives for nothing."""
+"""Warnings about a heat scene that is possible but probably not meant on its mesh."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from fnmatch import fnmatchcase
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +23,7 @@ _INWARDS = -0.2
 around it, 0 for a plane, -0.8 to -1 for a room seen from within."""
 
 
-def scene_doubts(scene: HeatScene, mesh: TetMesh, up: Vector) -> tuple[str, ...]:
+def patch_warnings(scene: HeatScene, mesh: TetMesh, up: Vector) -> tuple[str, ...]:
     """Find what a scene's default patches mean on a mesh for which they were not meant.
 
     Which surfaces are inside is known from what no camera saw. That is wrong for a body that was filled, of which only
@@ -34,15 +36,15 @@ def scene_doubts(scene: HeatScene, mesh: TetMesh, up: Vector) -> tuple[str, ...]
         up: Direction that points up.
 
     Returns:
-        What is doubtful and what to do about it, one or two sentences each.
+        What is probably wrong and what to do about it, one or two sentences each.
     """
     selection = Selection(mesh, up)
     inside, outside = _chosen(selection, INSIDE), _chosen(selection, OUTSIDE)
     inside_air = scene.inside_air is not None and scene.inside_air.patches == INSIDE
     outside_air = scene.outside_air is not None and scene.outside_air.patches == OUTSIDE
-    doubts = []
+    warnings = []
     if (inside_air or outside_air) and _outwards(selection, outside) < _INWARDS:
-        doubts.append(
+        warnings.append(
             "The surface that photographs see faces inwards, as that of a room photographed from within. The scene's "
             "outside air (and sun and sky) acts on surfaces that were seen, its inside air on those that were not. If "
             "the seen surface is that of the room, give inside_air and outside_air their patches in the scene: "
@@ -50,13 +52,13 @@ def scene_doubts(scene: HeatScene, mesh: TetMesh, up: Vector) -> tuple[str, ...]
         )
     elif inside_air and not _has_rooms(selection, inside):
         area = float(selection.facet_area_m2[inside].sum())
-        doubts.append(
+        warnings.append(
             f"The scene names air inside, but the body has no rooms: of the {area:.4g} m² that no photograph saw, next "
             "to nothing is walls or floor of a room. The air acts on what is left, such as the underside, and U-values "
             "and heat losses are those of that. Export again with --interior hollow, which keeps the inside empty, or "
             "name the inner surface with --patches."
         )
-    return tuple(doubts)
+    return tuple(warnings)
 
 
 def unused_settings(scene: HeatScene) -> tuple[str, ...]:
@@ -74,6 +76,32 @@ def unused_settings(scene: HeatScene) -> tuple[str, ...]:
         f"The scene gives an initial temperature of {scene.initial_c:g} degrees Celsius, but asks for the steady "
         "state, which does not depend on the start: initial changes nothing. Remove it, or give time in place of "
         "steady.",
+    )
+
+
+def shell_warnings(scene: HeatScene, export: Mapping[str, Any]) -> tuple[str, ...]:
+    """Warn that the walls of a hollow export are as thick as photographs happened to make them.
+
+    Args:
+        scene: The scene.
+        export: The summary of the export that the mesh comes from.
+
+    Returns:
+        A sentence or two each.
+    """
+    options, mesh = export.get("options"), export.get("mesh")
+    if scene.inside_air is None or not isinstance(options, dict) or not isinstance(mesh, dict):
+        return ()
+    if options.get("interior") != "hollow" or options.get("wall_thickness") is not None:
+        return ()
+    try:
+        thickness_m = 2.0 * float(mesh["volume"]) / float(mesh["area"])
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return ()
+    return (
+        f"The mesh is a shell (--interior hollow), {thickness_m:.2g} m thick on average. Photographs do not show how "
+        "thick walls are, nor what no camera saw, such as floors: heat losses and U-values are those of this shell, "
+        "with its holes and loose parts. Where you know the walls, export with --wall-thickness.",
     )
 
 

@@ -1,31 +1,28 @@
-"""How ``thermoxels heat`` solves a scene: with the scene's own steps on the mesh as it is, or to a tolerance."""
+"""Solve a heat problem with its own steps on the mesh as it is, or to a tolerance."""
 
 from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.commands.heat import Heat
-from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.error_budget import Tolerance
 from thermoxels_ns.fem.memory import check_memory, describe_bytes, peak_bytes
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
+from thermoxels_ns.fem.quantities import Bounds
 from thermoxels_ns.fem.solution_nodes import Solution
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.tolerance import ToleratedSolution, solve_to_tolerance
-from thermoxels_ns.heat.results import plain_values
-from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.screening import Screening, screen
 
 Say = Callable[[str], None]
-Lap = Callable[[str], None]
+Time = TimeSteps | AdaptiveSteps | None
+"""How a body is followed; None: its steady state."""
 
 LEFT_OUT_SHARE = 0.2
 """Share of the tolerance that effects which are left out may use together; the solver gets what they do not use."""
@@ -35,6 +32,67 @@ SAY_EVERY_S = 10.0
 """Time between two lines of progress, [s]."""
 SAY_FIRST_S = 1.0
 """Time of a first step from which on it is said, [s]: then the next ones will take some, too."""
+
+_BOUNDS = {
+    "tolerance_k": Bounds("tolerance", "K", 0.0, above_low=True),
+    "flow_tolerance": Bounds("flow-tolerance", "share of the heat flow", 0.0, np.nextafter(1.0, 0.0), above_low=True),
+    "leave_out_below_k": Bounds("leave-out-below-k", "K", 0.0),
+    "memory_gb": Bounds("memory-gb", "GiB", 0.0, above_low=True),
+}
+
+
+@dataclass(frozen=True)
+class Goals:
+    """How exact a solution must be, and what it may take.
+
+    Raises:
+        HeatError: A number is out of range, or more may be left out than the tolerance.
+    """
+
+    tolerance_k: float | None = None
+    """Largest error of any temperature, [K]; None: any."""
+    flow_tolerance: float | None = None
+    """Largest error of the mean heat flow of any effect, as a share of all heat; None: any."""
+    leave_out_below_k: float | None = None
+    """Effects that together can change no temperature by more than this are left out, [K]; None: `left_out_k`."""
+    memory_gb: float = 4.0
+    """Most memory that solving may take, [GiB]."""
+    allow_unmet: bool = False
+    """Whether the best that fits into the memory will do if a tolerance cannot be met."""
+
+    def __post_init__(self) -> None:
+        for name, bounds in _BOUNDS.items():
+            if getattr(self, name) is not None:
+                bounds.check(getattr(self, name))
+        if self.tolerance_k is not None and self.left_out_k >= self.tolerance_k:
+            expected = f"less than the tolerance of {self.tolerance_k:g} K"
+            remedy = "Leave it out for a fifth of the tolerance."
+            raise HeatError("leave-out-below-k", expected=expected, got=f"{self.left_out_k:g} K", remedy=remedy)
+
+    @property
+    def estimated(self) -> bool:
+        """Whether the error has to be known."""
+        return self.tolerance_k is not None or self.flow_tolerance is not None
+
+    @property
+    def left_out_k(self) -> float:
+        """What effects that are left out may change together, [K]."""
+        if self.leave_out_below_k is not None:
+            return self.leave_out_below_k
+        if self.flow_tolerance is not None:
+            return 0.0
+        return LEAVE_OUT_BELOW_K if self.tolerance_k is None else LEFT_OUT_SHARE * self.tolerance_k
+
+    def check_fits(self, time: Time) -> None:
+        """Refuse goals that do not say how to choose the steps in time.
+
+        Raises:
+            HeatError: There is a tolerance for heat flows alone, and a duration.
+        """
+        if time is not None and self.flow_tolerance is not None and self.tolerance_k is None:
+            expected = "--tolerance beside it if the scene has a duration"
+            remedy = "Pass --tolerance too: steps in time are chosen by it."
+            raise HeatError("flow-tolerance", expected=expected, got="none", remedy=remedy)
 
 
 @dataclass(frozen=True)
@@ -68,7 +126,7 @@ class Accuracy:
 
 
 @dataclass(frozen=True)
-class SolvedScene:
+class SolvedProblem:
     """A solution and what it is one of."""
 
     problem: HeatProblem
@@ -81,98 +139,48 @@ class SolvedScene:
     """What is known of the error; None if no tolerance was given."""
 
 
-def leave_out_below_k(options: Heat) -> float:
-    """Tell what effects that are left out may change together, [K].
-
-    Raises:
-        HeatError: It is negative, or all of the tolerance.
-    """
-    given, tolerance_k = options.leave_out_below_k, options.tolerance
-    if given is None:
-        if options.flow_tolerance is not None:
-            return 0.0
-        return LEAVE_OUT_BELOW_K if tolerance_k is None else LEFT_OUT_SHARE * tolerance_k
-    if not 0.0 <= given < np.inf:
-        expected, remedy = "a finite number of at least 0", "Pass 0 to build everything."
-        raise HeatError("leave-out-below-k", expected=expected, got=given, remedy=remedy)
-    if tolerance_k is not None and given >= tolerance_k:
-        expected, remedy = f"less than the tolerance of {tolerance_k:g} K", "Leave it out for a fifth of the tolerance."
-        raise HeatError("leave-out-below-k", expected=expected, got=f"{given:g} K", remedy=remedy)
-    return given
-
-
-def check_accuracy_options(options: Heat, scene: HeatScene) -> None:
-    """Refuse options that make no sense together, before anything is read or computed.
-
-    Raises:
-        HeatError: One is out of range or needs another.
-    """
-    check_positive("memory-gb", options.memory_gb, "Give it in GiB, such as 4.", HeatError)
-    if options.tolerance is not None:
-        check_positive("tolerance", options.tolerance, "Give it in kelvin, such as 0.05.", HeatError)
-    if options.flow_tolerance is not None:
-        remedy = "Give a share, such as 0.01 for 1 %."
-        check_positive("flow-tolerance", options.flow_tolerance, remedy, HeatError)
-        if options.flow_tolerance >= 1.0:
-            got = f"{options.flow_tolerance:g}, which is {100.0 * options.flow_tolerance:g} %"
-            raise HeatError("flow-tolerance", expected="less than 1", got=got, remedy=remedy)
-    if scene.time is not None and options.flow_tolerance is not None and options.tolerance is None:
-        remedy = "Pass --tolerance too: steps in time are chosen by it."
-        raise HeatError(
-            "flow-tolerance", expected="--tolerance beside it if the scene has a duration", got="none", remedy=remedy
-        )
-    leave_out_below_k(options)
-
-
-def solve_scene(options: Heat, scene: HeatScene, problem: HeatProblem, say: Say, lap: Lap) -> SolvedScene:
+def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lambda _: None) -> SolvedProblem:
     """Leave out what does not matter, and solve the rest.
 
     Args:
-        options: What was asked.
-        scene: The scene.
-        problem: The scene around the mesh.
+        problem: Body, materials and all effects that the scene names.
+        time: How the body is followed; None: its steady state.
+        goals: How exact the solution must be, and what it may take.
         say: Called with one line of progress at a time.
-        lap: Called with the name of each part when it is done.
 
     Raises:
         HeatError: The problem needs more memory than allowed, its solver fails, or the tolerance cannot be met.
     """
-    screening = screen(problem, scene.time, leave_out_below_k(options))
-    lap("screen")
+    goals.check_fits(time)
+    screening = screen(problem, time, goals.left_out_k)
     _say_what_is_built(screening, say)
-    if options.tolerance is not None or options.flow_tolerance is not None:
-        return _to_tolerance(options, scene, screening, say)
-    times = 1 if scene.time is None else scene.time.num_times
-    needed = peak_bytes(screening.problem, times=times, adaptive=isinstance(scene.time, AdaptiveSteps))
+    kept, memory_bytes = screening.problem, goals.memory_gb * 2**30
+    if goals.estimated:
+        left_k = None if goals.tolerance_k is None else goals.tolerance_k - screening.bound_k
+        found = solve_to_tolerance(
+            kept,
+            Tolerance(left_k, goals.flow_tolerance),
+            duration_s=None if time is None else time.duration_s,
+            outputs=1 if time is None else time.num_times - 1,
+            memory_bytes=memory_bytes,
+            allow_unmet=goals.allow_unmet,
+            log=say,
+            progress=_Progress(say, None),
+        )
+        return SolvedProblem(found.problem, found.solution, screening, _accuracy(goals, screening, found))
+    times = 1 if time is None else time.num_times
+    needed = peak_bytes(kept, times=times, adaptive=isinstance(time, AdaptiveSteps))
     say(f"Memory: about {describe_bytes(needed)} at most.")
-    check_memory(needed, options.memory_gb * 2**30, "Pass a larger --memory-gb, or export a coarser mesh.")
-    if scene.time is None:
-        return SolvedScene(screening.problem, solve_steady(screening.problem), screening, None)
-    solution = solve_heat(screening.problem, scene.time, progress=_Progress(say, scene.time))
-    return SolvedScene(screening.problem, solution, screening, None)
+    check_memory(needed, memory_bytes, "Pass a larger --memory-gb, or export a coarser mesh.")
+    solution = solve_steady(kept) if time is None else solve_heat(kept, time, progress=_Progress(say, time))
+    return SolvedProblem(kept, solution, screening, None)
 
 
-def _to_tolerance(options: Heat, scene: HeatScene, screening: Screening, say: Say) -> SolvedScene:
-    """Give the solver what is left of the tolerance."""
-    left_k = None if options.tolerance is None else options.tolerance - screening.bound_k
-    found = solve_to_tolerance(
-        screening.problem,
-        Tolerance(left_k, options.flow_tolerance),
-        duration_s=None if scene.time is None else scene.time.duration_s,
-        outputs=1 if scene.time is None else scene.time.num_times - 1,
-        memory_bytes=options.memory_gb * 2**30,
-        allow_unmet=options.allow_unmet,
-        log=say,
-        progress=_Progress(say, None),
-    )
-    return SolvedScene(found.problem, found.solution, screening, _of_levels(options, screening, found))
-
-
-def _of_levels(options: Heat, screening: Screening, found: ToleratedSolution) -> Accuracy:
+def _accuracy(goals: Goals, screening: Screening, found: ToleratedSolution) -> Accuracy:
     last = found.settings
     return Accuracy(
-        tolerance_k=options.tolerance,
-        flow_tolerance=options.flow_tolerance,
+        tolerance_k=goals.tolerance_k,
+        flow_tolerance=goals.flow_tolerance,
         met=found.met,
         estimated_k=last.error.temperature_k + screening.bound_k,
         estimated_flow=last.error.heat_flow,
@@ -182,20 +190,8 @@ def _of_levels(options: Heat, screening: Screening, found: ToleratedSolution) ->
         step_tolerance_k=last.step_tolerance_k,
         seconds=found.seconds,
         status=found.status,
-        levels=tuple(plain_values(level) for level in found.levels),
+        levels=tuple(asdict(level) for level in found.levels),
     )
-
-
-def time_error_k(solution: Solution) -> float | None:
-    """Give the estimated error of the steps as their controller adds it up, [K]; None if there is none."""
-    if isinstance(solution, SteadySolution) or not np.isfinite(solution.time_error_k):
-        return None
-    return solution.time_error_k
-
-
-def steps_taken(solution: Solution) -> int:
-    """Count the time steps; 0 in a steady state."""
-    return solution.steps if isinstance(solution, HeatSolution) else 0
 
 
 def _say_what_is_built(screening: Screening, say: Say) -> None:

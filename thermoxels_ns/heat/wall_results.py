@@ -1,4 +1,4 @@
-"""What a wall between two airs is worth in a steady state: coupling, U-value and surface temperature factor."""
+"""Thermal coupling, U-value and surface temperature factor of a wall between two airs."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import SteadySolution
-from thermoxels_ns.fem.solution_nodes import SolutionNodes, solution_nodes
+from thermoxels_ns.fem.solution_nodes import Solution, SolutionNodes, solution_nodes
 from thermoxels_ns.fem.surface_heat import heat_by_part, heat_through_parts
 from thermoxels_ns.heat.effects import Convection
-from thermoxels_ns.heat.results import Spot, describe_spot, end_state_c
+from thermoxels_ns.heat.results import Spot, describe_spot, end_state_c, region_behind_facets
+from thermoxels_ns.heat.scene import HeatScene
 
 _LEAST_DIFFERENCE_K = 1e-6
 
@@ -37,7 +38,7 @@ class WallPart:
 
 
 @dataclass(frozen=True)
-class WallAnswer:
+class WallResult:
     """A body as a wall between an inside and an outside."""
 
     inside_c: float
@@ -65,35 +66,48 @@ class WallAnswer:
     """The inner surface by region of the body behind it."""
 
 
-def not_only_airs(problem: HeatProblem, inside_c: float, outside_c: float) -> str:
-    """Name an effect that is not exchange with one of two airs, so that a U-value would count its heat; "" if none."""
+def wall_of_scene(
+    scene: HeatScene, problem: HeatProblem, solution: Solution, nodes: SolutionNodes, *, doubtful: bool
+) -> WallResult | str:
+    """See a body as a wall, if its steady state between two airs of different temperature is asked for.
+
+    Args:
+        scene: The scene.
+        problem: What was solved.
+        solution: Its outcome.
+        nodes: What `solution_nodes` gives.
+        doubtful: Whether the surfaces that the scene's airs act on are probably not those that were meant.
+
+    Returns:
+        The wall; or why there is none although there are two airs, a sentence; "" without two airs.
+    """
+    inside, outside = scene.inside_air, scene.outside_air
+    if not isinstance(solution, SteadySolution) or inside is None or outside is None:
+        return ""
+    if inside.air_c == outside.air_c:
+        return ""
+    if doubtful:
+        return "There is no U-value, because it is doubtful which surface faces the air inside."
     for label, effect in zip(effect_labels(problem), problem.effects):
-        if not (isinstance(effect, Convection) and effect.air_c in (inside_c, outside_c)):
-            return label
-    return ""
+        if not (isinstance(effect, Convection) and effect.air_c in (inside.air_c, outside.air_c)):
+            return f"There is no U-value, because its heat would count in it: {label}. Ask for the two airs alone."
+    if not _faces_inside(problem, inside.patches).any():
+        return "There is no U-value, because no surface of the body faces the air inside."
+    return wall_result(problem, solution, inside.patches, inside.air_c, outside.air_c, nodes)
 
 
-def faces_inside(problem: HeatProblem, inside: Sequence[str]) -> npt.NDArray[np.bool_]:
-    """Mark the boundary triangles of patches whose names match one of some names or patterns, shape (f,)."""
-    selection = Selection(problem.mesh, problem.up)
-    matching = [any(fnmatchcase(name, pattern) for pattern in inside) for name in selection.patch_names]
-    return np.array(matching, dtype=bool)[selection.facet_patch]
-
-
-def wall_answer(
+def wall_result(
     problem: HeatProblem,
     solution: SteadySolution,
     inside: Sequence[str],
     inside_c: float,
     outside_c: float,
-    *,
-    facet_region: npt.NDArray[np.int64],
     nodes: SolutionNodes | None = None,
-) -> WallAnswer:
+) -> WallResult:
     """Work out what a body between two airs lets through.
 
     What it says is that of a wall only if nothing but the two airs acts: sunlight or a cold sky count as heat through
-    it. `not_only_airs` tells.
+    it.
 
     Args:
         problem: What was solved.
@@ -101,7 +115,6 @@ def wall_answer(
         inside: Names or patterns of the patches that face the inside.
         inside_c: Temperature of the air inside, [degrees Celsius].
         outside_c: Temperature of the air outside, [degrees Celsius].
-        facet_region: Region of the tetrahedron behind each boundary triangle, shape (f,).
         nodes: What `solution_nodes` gives, if it is there already.
 
     Raises:
@@ -114,7 +127,7 @@ def wall_answer(
         raise HeatError("airs of a wall", expected="two temperatures", got=got, remedy=remedy)
     selection, mesh = Selection(problem.mesh, problem.up), problem.mesh
     every_c = end_state_c(solution)
-    inner = faces_inside(problem, inside)
+    inner = _faces_inside(problem, inside)
     if not inner.any():
         expected = f"some of the patches {', '.join(selection.patch_names)}"
         remedy = "Name patches that have some surface."
@@ -138,7 +151,7 @@ def wall_answer(
     # The worst spot: the coldest if it is colder outside, else the hottest.
     worst = int(inner_nodes[np.argmin(np.sign(difference_k) * every_c[inner_nodes])])
     spot = describe_spot(Selection(shown.mesh, problem.up), worst, float(every_c[worst]), 0.0)
-    return WallAnswer(
+    return WallResult(
         inside_c=inside_c,
         outside_c=outside_c,
         area_m2=area,
@@ -148,5 +161,12 @@ def wall_answer(
         temperature_factor=(spot.temperature_c - outside_c) / difference_k,
         coldest=spot,
         patches=patches,
-        regions=parts(facet_region, mesh.region_names),
+        regions=parts(region_behind_facets(mesh), mesh.region_names),
     )
+
+
+def _faces_inside(problem: HeatProblem, inside: Sequence[str]) -> npt.NDArray[np.bool_]:
+    """Mark the boundary triangles of patches whose names match one of some names or patterns, shape (f,)."""
+    selection = Selection(problem.mesh, problem.up)
+    matching = [any(fnmatchcase(name, pattern) for pattern in inside) for name in selection.patch_names]
+    return np.array(matching, dtype=bool)[selection.facet_patch]

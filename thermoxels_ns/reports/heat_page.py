@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,14 +16,12 @@ from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.heat.effects import Effect, FixedTemperature, InternalHeat
 from thermoxels_ns.heat.materials import materials_by_region
 from thermoxels_ns.heat.results import Spot
+from thermoxels_ns.heat.run import HeatRun
 from thermoxels_ns.heat.solving import Accuracy
 from thermoxels_ns.reports.heat_numbers import RoundOff, coordinate, degrees, round_off_of, unit_signs
 from thermoxels_ns.reports.heat_numbers import figure as _figure
 from thermoxels_ns.reports.heat_pictures import in_words, plot_over_time
 from thermoxels_ns.reports.page import Gallery, Page, Picture, Section, Table
-
-if TYPE_CHECKING:
-    from thermoxels_ns.commands.heat_run import HeatRun
 
 _CAPTIONS = {
     "surface-start.png": "The surface at the start.",
@@ -35,17 +33,18 @@ _LARGE_K = 100.0
 _INTO_BODY = "Heat flows are positive into the body; what is lost is negative."
 
 
-def heat_page(run: HeatRun, pictures: Mapping[str, bytes], command: str, files: Sequence[str]) -> Page:
+def heat_page(run: HeatRun, pictures: Mapping[str, bytes], mesh_name: str, command: str, files: Sequence[str]) -> Page:
     """Put a run into words.
 
     Args:
         run: What was computed.
         pictures: PNG files by their names.
+        mesh_name: Name of the mesh's file.
         command: The command that made it.
         files: Names of the files beside the page.
     """
     sections = [
-        _answers(run),
+        _results(run),
         *_wall(run),
         *_probes(run),
         _balance(run),
@@ -61,7 +60,7 @@ def heat_page(run: HeatRun, pictures: Mapping[str, bytes], command: str, files: 
             for name, png in pictures.items()
         )
         sections.append(Section("Pictures", galleries=(Gallery(captioned),)))
-    sections += [_asked(run), _built(run), _made(run, command, files)]
+    sections += [_asked(run, mesh_name), _built(run), _made(run, command, files)]
     return Page(
         title=run.scene.description or "Heat flow",
         summary=_summary(run),
@@ -82,10 +81,10 @@ def _summary(run: HeatRun) -> str:
 
 def _figures(run: HeatRun) -> tuple[tuple[str, str], ...]:
     """The figures that matter most."""
-    answers, cards, round_off = run.answers, [], _round_off(run)
+    results, cards, round_off = run.results, [], _round_off(run)
     steady = run.scene.steady
-    lost = -sum(effect.heat_w for effect in answers.effects if effect.heat_w < 0.0)
-    won = sum(effect.heat_w for effect in answers.effects if effect.heat_w > 0.0)
+    lost = -sum(effect.heat_w for effect in results.effects if effect.heat_w < 0.0)
+    won = sum(effect.heat_w for effect in results.effects if effect.heat_w > 0.0)
     cards.append((f"{round_off.flow(lost)} W", "heat loss" if steady else "mean heat loss"))
     if not steady:
         cards.append((f"{round_off.flow(won)} W", "mean heat gain"))
@@ -93,17 +92,17 @@ def _figures(run: HeatRun) -> tuple[tuple[str, str], ...]:
         cards.append((f"{run.wall.u_value_w_m2k:.3f} {unit_signs('W/(m2 K)')}", "mean U-value of the inner surface"))
         cards.append((f"{run.wall.temperature_factor:.3f}", "surface temperature factor f_Rsi"))
     cards.append(
-        (f"{degrees(answers.coldest.temperature_c)} \N{DEGREE SIGN}C", f"coldest spot {_place(answers.coldest)}")
+        (f"{degrees(results.coldest.temperature_c)} \N{DEGREE SIGN}C", f"coldest spot {_place(results.coldest)}")
     )
     cards.append(
-        (f"{degrees(answers.hottest.temperature_c)} \N{DEGREE SIGN}C", f"hottest spot {_place(answers.hottest)}")
+        (f"{degrees(results.hottest.temperature_c)} \N{DEGREE SIGN}C", f"hottest spot {_place(results.hottest)}")
     )
     cards += _accuracy_card(run.accuracy)
     return tuple(cards)
 
 
-def _answers(run: HeatRun) -> Section:
-    answers, steady, round_off = run.answers, run.scene.steady, _round_off(run)
+def _results(run: HeatRun) -> Section:
+    results, steady, round_off = run.results, run.scene.steady, _round_off(run)
     flow = "W" if steady else "mean W"
     last = () if steady else ("last interval W",)
     effects = Table(
@@ -116,7 +115,7 @@ def _answers(run: HeatRun) -> Section:
                 "" if effect.heat_w_m2 is None else round_off.per_area(effect.heat_w_m2, effect.heat_w),
                 *(() if steady else (round_off.flow(effect.last_heat_w),)),
             )
-            for effect in answers.effects
+            for effect in results.effects
         ),
         note=_INTO_BODY,
     )
@@ -132,7 +131,7 @@ def _answers(run: HeatRun) -> Section:
                 *(() if steady else (round_off.flow(patch.last_heat_w),)),
                 *(degrees(patch.mean_c), _warm_and_where(patch.coldest), _warm_and_where(patch.hottest)),
             )
-            for patch in answers.patches
+            for patch in results.patches
         ),
         note="Areas are those of the true surface. Temperatures are those at the end." * (not steady)
         or "Areas are those of the true surface.",
@@ -148,7 +147,7 @@ def _answers(run: HeatRun) -> Section:
                 *(round_off.flow(region.heat_w), round_off.per_area(region.heat_w_m2, region.heat_w)),
                 *(degrees(region.mean_c), degrees(region.min_c), degrees(region.max_c)),
             )
-            for region in answers.regions
+            for region in results.regions
         ),
         figures_from=2,
         note="Heat flow through the region's own part of the surface" + ("." if steady else ", at the end."),
@@ -194,7 +193,7 @@ def _probes(run: HeatRun) -> list[Section]:
 
 
 def _balance(run: HeatRun) -> Section:
-    balance = run.answers.balance
+    balance = run.results.balance
     scale, unit = (1.0, "W") if balance.unit == "W" else (3.6e6, "kWh")
     round_off = _round_off(run).below_w * (1.0 if balance.unit == "W" else _duration_s(run))
     left = 0.0 if abs(balance.residual) < round_off else balance.residual
@@ -208,14 +207,14 @@ def _balance(run: HeatRun) -> Section:
     return Section("Energy balance", tables=(Table(("", ""), rows),))
 
 
-def _asked(run: HeatRun) -> Section:
+def _asked(run: HeatRun, mesh_name: str) -> Section:
     mesh, scene, time = run.problem.mesh, run.scene, run.scene.time
     start = "the photographs" if scene.initial_c is None else f"{scene.initial_c:g} \N{DEGREE SIGN}C everywhere"
     how = _how_time_was_followed(time, run.accuracy)
     general = Table(
         ("", ""),
         (
-            ("mesh", f"{run.options.mesh.name}: {len(mesh.tets):,} tetrahedra, {len(mesh.points_m):,} nodes"),
+            ("mesh", f"{mesh_name}: {len(mesh.tets):,} tetrahedra, {len(mesh.points_m):,} nodes"),
             ("time", how),
             *((("start", start),) if time is not None else ()),
             ("up", ", ".join(f"{part:g}" for part in run.problem.up)),
@@ -321,9 +320,9 @@ def _values(effect: Effect, selection: Selection) -> list[str]:
 
 
 def _round_off(run: HeatRun) -> RoundOff:
-    answers = run.answers
-    flows = [flow for effect in answers.effects for flow in (effect.heat_w, effect.last_heat_w)]
-    return round_off_of(flows, sum(patch.area_m2 for patch in answers.patches))
+    results = run.results
+    flows = [flow for effect in results.effects for flow in (effect.heat_w, effect.last_heat_w)]
+    return round_off_of(flows, sum(patch.area_m2 for patch in results.patches))
 
 
 def _duration_s(run: HeatRun) -> float:
