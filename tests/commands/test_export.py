@@ -30,6 +30,7 @@ from thermoxels_ns.commands.export_snapshot import export_snapshot, volume_in_wo
 from thermoxels_ns.core.errors import CheckpointError, HeatError, MeshError, OutputError, SceneError, ThermoxelsError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
+from thermoxels_ns.fem.problem import TimeSteps
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 
 UNSEEN = 0.35
@@ -207,7 +208,8 @@ def test_impossible_dataparser_transforms_are_refused(transform, scale) -> None:
         ("metres_per_unit", float("nan"), ThermoxelsError, "metres_per_unit"),
         ("density_percentile", 101.0, MeshError, "density_percentile"),
         ("density_threshold", -1.0, MeshError, "density_threshold"),
-        ("heat_preset", "cheese", HeatError, "heat preset"),
+        ("heat_preset", "cheese", HeatError, "heat scene"),
+        ("heat_preset", "winter-night", HeatError, "heat_preset: expected a scene of one material"),
         ("steps", 0, HeatError, "steps"),
         ("step_seconds", -1.0, HeatError, "step_seconds"),
         ("conductivity_w_mk", 0.0, HeatError, "conductivity_w_mk"),
@@ -247,9 +249,8 @@ def test_command_line_gives_every_option() -> None:
 def test_plain_command_line_takes_the_preset() -> None:
     parsed = tyro.cli(ExportThermoxelsMesh, args=["--load-config", "c", "--output-dir", "o"])
     checked = check_options(parsed)
-    preset = checked.preset
     assert checked.selection == SolidSelection() and checked.distance is None
-    assert (preset.material.name, preset.time.steps, preset.time.step_seconds) == ("concrete", 10, 60.0)
+    assert (checked.material.name, checked.time) == ("concrete", TimeSteps(10, 60.0))
 
 
 def test_truth_and_viewpoint_reach_the_summary_and_the_pictures(ball, tmp_path, monkeypatch) -> None:
@@ -298,10 +299,10 @@ def test_failed_export_leaves_the_earlier_one_untouched(ball, tmp_path, monkeypa
         compare = lambda *_: {"fscore": float("nan")}  # noqa: E731
     else:
 
-        def fail(*_) -> None:
+        def fail(*_, **__) -> None:
             raise HeatError("Step 1 failed.")
 
-        monkeypatch.setattr("thermoxels_ns.fem.stepping.solve_heat", fail)
+        monkeypatch.setattr("thermoxels_ns.heat.solving.solve_heat", fail)
     with pytest.raises(ThermoxelsError):
         export_snapshot(ball, np.eye(4), ExportOptions(density_threshold=6.0, **SCALED), tmp_path, compare=compare)
     assert contents(tmp_path) == before

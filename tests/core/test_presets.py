@@ -18,11 +18,8 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from thermoxels_ns import config
 from thermoxels_ns.core import presets
-from thermoxels_ns.core.errors import HeatError, ThermoxelsError
+from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.presets import read_preset, with_overrides
-from thermoxels_ns.fem.problem import TimeSteps
-from thermoxels_ns.heat.materials import Material
-from thermoxels_ns.heat.presets import HeatPreset, heat_preset_names, load_heat_preset
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -35,9 +32,8 @@ METHODS: dict[str, str] = PROJECT["entry-points"]["nerfstudio.method_configs"]
 DATAPARSERS: dict[str, str] = PROJECT["entry-points"]["nerfstudio.dataparser_configs"]
 
 FILES = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
-HEAT = [name for name in FILES if name.startswith("heat-")]
 SCENES = [name for name in FILES if name.startswith("scene-")]
-OTHERS = ("heat-", "patches-", "scene-", "materials")
+OTHERS = ("patches-", "scene-", "materials")
 METHOD_FILES = [name for name in FILES if not name.startswith(OTHERS)]
 
 
@@ -71,9 +67,8 @@ def _settings(name: str) -> dict[str, Any]:
 
 
 def test_every_file_belongs_to_a_command() -> None:
-    assert METHOD_FILES and HEAT
+    assert METHOD_FILES
     assert set(METHOD_FILES) == set(METHODS) - {"thermoxels"}
-    assert [name.removeprefix("heat-") for name in HEAT] == heat_preset_names()
 
 
 @pytest.mark.parametrize("name", METHOD_FILES)
@@ -181,34 +176,6 @@ def test_a_preset_that_is_no_mapping_is_refused(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(presets, "configs_folder", lambda: tmp_path)
     with pytest.raises(ThermoxelsError, match=r"^mine\.yaml: expected a mapping, got list"):
         read_preset("mine")
-
-
-@pytest.mark.parametrize("name", HEAT)
-def test_heat_settings_are_those_of_the_file_and_go_round(name: str, tmp_path: Path) -> None:
-    path = ROOT / "configs" / f"{name}.yaml"
-    preset = load_heat_preset(name.removeprefix("heat-"))
-    leaves = dict(_leaves(yaml.safe_load(path.read_text(encoding="utf-8"))))
-    assert leaves == dict(_leaves(preset.as_mapping()))
-    copy = tmp_path / "copy.yaml"
-    copy.write_text(yaml.safe_dump(preset.as_mapping()), encoding="utf-8")
-    assert load_heat_preset(str(copy)) == preset
-
-
-@pytest.mark.parametrize("part", [HeatPreset, Material, TimeSteps])
-def test_heat_settings_have_no_defaults_to_repeat(part: type) -> None:
-    missing = dataclasses.MISSING
-    assert all(field.default is missing and field.default_factory is missing for field in dataclasses.fields(part))
-
-
-@pytest.mark.parametrize("name", HEAT)
-@pytest.mark.parametrize("where", [(), ("material",), ("time",)])
-def test_an_unknown_heat_key_is_refused(name: str, where: tuple[str, ...], tmp_path: Path) -> None:
-    content = yaml.safe_load((ROOT / "configs" / f"{name}.yaml").read_text(encoding="utf-8"))
-    _at(content, where)["cheese"] = 1
-    path = tmp_path / "mine.yaml"
-    path.write_text(yaml.safe_dump(content), encoding="utf-8")
-    with pytest.raises(HeatError, match=r"^mine\.yaml.*: expected the keys .*cheese"):
-        load_heat_preset(str(path))
 
 
 def test_an_installed_package_brings_the_presets(tmp_path: Path) -> None:

@@ -3,8 +3,7 @@ from __future__ import annotations
 import pytest
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.heat.materials import load_material_table, material
-from thermoxels_ns.heat.presets import load_heat_preset
+from thermoxels_ns.heat.materials import Material, load_material_table, material
 
 ROW = "{conductivity_w_mk: 1.0, density_kg_m3: 2000, specific_heat_j_kgk: 900, source: a book}"
 
@@ -33,7 +32,7 @@ def test_conductivity_fits_the_kind_of_material() -> None:
 
 
 def test_concrete_means_the_same_everywhere() -> None:
-    assert material("concrete") == load_heat_preset("concrete").material
+    assert material("concrete") == Material("concrete", 1.7, 2200.0, 880.0)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from thermoxels_ns.commands.scene_scale import (
     scale_from_option,
     up_from_scene_file,
 )
-from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.core.errors import HeatError, MeshError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from thermoxels_ns.fem.problem import TimeSteps
     from thermoxels_ns.heat.materials import Material
-    from thermoxels_ns.heat.presets import HeatPreset
+    from thermoxels_ns.heat.scene import HeatScene
     from thermoxels_ns.mesh.boundary.patch_rules import PatchRules
     from thermoxels_ns.mesh.solid.voxels import SolidSelection
 
@@ -86,17 +86,19 @@ class ExportOptions:
     """Files to write the mesh to: vtu (ParaView), xdmf (FEniCSx), msh (Gmsh), inp (CalculiX, Abaqus), stl, ply
     (surface), glb (browsers, phones)."""
     heat_preset: str = "concrete"
-    """Material and time steps: the name of a preset, or the path of a yaml file like it."""
+    """Heat scene of the heat step, of one material and with equal steps: the name of one of configs/scene-NAME.yaml, or
+    the path of a yaml file. concrete: a body of concrete that is left to itself. The file for CalculiX and Abaqus takes
+    material and steps from it, not what acts on the body."""
     steps: int | None = None
-    """Number of time steps; the preset's by default (10 for concrete)."""
+    """Number of time steps; the scene's by default (10 for concrete)."""
     step_seconds: float | None = None
-    """Length of a time step, [s]; the preset's by default (60 for concrete)."""
+    """Length of a time step, [s]; the scene's by default (60 for concrete)."""
     conductivity_w_mk: float | None = None
-    """Thermal conductivity, [W / (m K)]; the preset's by default."""
+    """Thermal conductivity, [W / (m K)]; the scene's by default."""
     density_kg_m3: float | None = None
-    """Mass density of the material, [kg / m3]; the preset's by default."""
+    """Mass density of the material, [kg / m3]; the scene's by default."""
     specific_heat_j_kgk: float | None = None
-    """Specific heat capacity, [J / (kg K)]; the preset's by default."""
+    """Specific heat capacity, [J / (kg K)]; the scene's by default."""
     pictures: bool = True
     """Write PNG pictures of the mesh coloured by temperature, and of its quality."""
 
@@ -119,8 +121,12 @@ class CheckedOptions:
 
     selection: SolidSelection
     """Which voxels are solid."""
-    preset: HeatPreset
-    """Material and time steps with the options' changes applied."""
+    scene: HeatScene
+    """The scene of the heat step with the options' changes applied."""
+    material: Material
+    """What it says the body is made of."""
+    time: TimeSteps
+    """How long it says the body is followed."""
     rules: PatchRules
     """Patches and regions of the user."""
     distance: SceneScale | None
@@ -133,7 +139,6 @@ def check_options(options: ExportOptions) -> CheckedOptions:
     Raises:
         ThermoxelsError: An option is out of range, or a file cannot be read.
     """
-    from thermoxels_ns.heat.presets import load_heat_preset
     from thermoxels_ns.mesh.boundary.patch_rules import PatchRules, load_patch_rules
     from thermoxels_ns.mesh.build import MeshOptions
     from thermoxels_ns.mesh.solid.voxels import SolidSelection
@@ -161,13 +166,9 @@ def check_options(options: ExportOptions) -> CheckedOptions:
         )
     MeshOptions(options.boundary, options.coarsest_cell)  # refuses what is out of range
     selection = SolidSelection(**{field.name: getattr(options, field.name) for field in fields(SolidSelection)})
-    preset = load_heat_preset(options.heat_preset)
-    material = _with_options(preset.material, options)
-    if material != preset.material:
-        material = replace(material, name=f"{material.name} (changed)")
     return CheckedOptions(
         selection,
-        replace(preset, material=material, time=_with_options(preset.time, options)),
+        *_heat_settings(options),
         PatchRules() if options.patches is None else load_patch_rules(options.patches),
         distance,
     )
@@ -213,7 +214,27 @@ def up_of(options: ExportOptions, scene_file: Mapping[str, Any] | None, viewpoin
     return viewpoint.up, viewpoint.up_source
 
 
-def _with_options(preset: Settings, options: ExportOptions) -> Settings:
-    """Replace a preset's values by the options of the same name that were given."""
-    given = {field.name: getattr(options, field.name, None) for field in fields(preset)}
-    return replace(preset, **{name: value for name, value in given.items() if value is not None})
+def _heat_settings(options: ExportOptions) -> tuple[HeatScene, Material, TimeSteps]:
+    """The scene of the heat step, its material and its steps, with the options' changes applied."""
+    from thermoxels_ns.fem.problem import TimeSteps
+    from thermoxels_ns.heat.scene_file import load_heat_scene
+
+    scene = load_heat_scene(options.heat_preset)
+    given, *others = set(scene.materials.values())
+    if others or not isinstance(scene.time, TimeSteps):
+        raise HeatError(
+            "heat_preset",
+            expected="a scene of one material, with time: {steps: 10, step_seconds: 60}",
+            got=options.heat_preset,
+            remedy="Export without it, then run thermoxels heat with that scene on the mesh.",
+        )
+    material, time = _with_options(given, options), _with_options(scene.time, options)
+    if material != given:
+        material = replace(material, name=f"{material.name} (changed)")
+    return replace(scene, materials=dict.fromkeys(scene.materials, material), time=time), material, time
+
+
+def _with_options(settings: Settings, options: ExportOptions) -> Settings:
+    """Replace values by the options of the same name that were given."""
+    given = {field.name: getattr(options, field.name, None) for field in fields(settings)}
+    return replace(settings, **{name: value for name, value in given.items() if value is not None})

@@ -92,8 +92,7 @@ def export_snapshot(
         ThermoxelsError: An option is out of range, nothing is solid, the folder cannot be written to, or heat fails.
     """
     from thermoxels_ns.commands.export_summary import HEAT_SKIPPED, heat_summary, mesh_summary, versions
-    from thermoxels_ns.fem.problem import HeatProblem
-    from thermoxels_ns.fem.stepping import solve_heat
+    from thermoxels_ns.heat.solving import Goals, solve_problem
     from thermoxels_ns.heat.vtk_series import heat_series_paths, remove_heat_series, write_heat_series
     from thermoxels_ns.mesh.build import MeshOptions, build_mesh
     from thermoxels_ns.mesh.files.abaqus import HeatStep
@@ -127,11 +126,12 @@ def export_snapshot(
     say(f"Up: {', '.join(f'{value:.3g}' for value in up)}. {up_source}")
     _tell(built, report.volume_m3, unit, None if scale is None else voxel_size, say)
 
-    preset, solution, truth = checked.preset, None, None
+    scene, material, time = checked.scene, checked.material, checked.time
+    solution, truth = None, None
     if scale is not None:
-        time = preset.time
-        say(f"Heat: {time.steps} steps of {time.step_seconds:g} s through {preset.material.name}")
-        solution = solve_heat(HeatProblem(mesh, preset.material), time)
+        say(f"Heat: {time.steps} steps of {time.step_seconds:g} s through {material.name}")
+        everything = Goals(leave_out_below_k=0.0, memory_gb=None)
+        solution = solve_problem(scene.problem(mesh, up=up), time, everything, say).solution
         say(f"Heat: {solution.status} Energy conserved to {solution.energy_residual:.1e}.")
         inner_side = options.interior == "hollow" or options.wall_thickness is not None
         truth = None if compare is None else _compared(compare, built, metres, inner_side, say)
@@ -152,7 +152,7 @@ def export_snapshot(
         "up": up,
         "up_source": up_source,
         "mesh": mesh_summary(built, report, checked.selection, scale, voxel_size),
-        "heat": skipped if solution is None else heat_summary(preset, solution),
+        "heat": skipped if solution is None else heat_summary(material, time, solution),
         **({} if truth is None else {"truth": truth}),
         "files": [*files, _SUMMARY],
     }
@@ -164,11 +164,11 @@ def export_snapshot(
     if solution is None:
         remove_heat_series(folder / _HEAT)
     heat_step = HeatStep(
-        preset.material.conductivity_w_mk,
-        preset.material.density_kg_m3,
-        preset.material.specific_heat_j_kgk,
-        preset.time.steps,
-        preset.time.step_seconds,
+        material.conductivity_w_mk,
+        material.density_kg_m3,
+        material.specific_heat_j_kgk,
+        time.steps,
+        time.step_seconds,
     )
     for suffix in suffixes:
         write_mesh(folder / f"{_MESH_STEM}{suffix}", mesh, heat_step=heat_step, up=up)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from dataclasses import asdict
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +13,9 @@ from thermoxels_ns import __version__
 
 if TYPE_CHECKING:
     from thermoxels_ns.commands.scene_scale import SceneScale
+    from thermoxels_ns.fem.problem import TimeSteps
     from thermoxels_ns.fem.solution import HeatSolution
-    from thermoxels_ns.heat.presets import HeatPreset
+    from thermoxels_ns.heat.materials import Material
     from thermoxels_ns.mesh.build import BuiltMesh
     from thermoxels_ns.mesh.quality.report import QualityReport
     from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection
@@ -149,11 +151,12 @@ def _share_of_area_unobserved(mesh: TetMesh) -> float:
     return float(area[~mesh.observed[mesh.facets].all(axis=1)].sum() / area.sum())
 
 
-def heat_summary(preset: HeatPreset, solution: HeatSolution) -> dict[str, Any]:
+def heat_summary(material: Material, time: TimeSteps, solution: HeatSolution) -> dict[str, Any]:
     """The heat balance and how it was computed."""
     return {
         "computed": True,
-        **preset.as_mapping(),
+        "material": asdict(material),
+        "time": asdict(time),
         "scheme": "P1 tetrahedra, lumped mass, backward Euler, conjugate gradients with Jacobi preconditioner",
         "energy_before_j": float(solution.heat_content_j[0]),
         "energy_after_j": float(solution.heat_content_j[-1]),

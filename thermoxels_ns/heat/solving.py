@@ -55,8 +55,8 @@ class Goals:
     """Largest error of the mean heat flow of any effect, as a share of all heat; None: any."""
     leave_out_below_k: float | None = None
     """Effects that together can change no temperature by more than this are left out, [K]; None: `left_out_k`."""
-    memory_gb: float = 4.0
-    """Most memory that solving may take, [GiB]."""
+    memory_gb: float | None = 4.0
+    """Most memory that solving may take, [GiB]; None: any."""
     allow_unmet: bool = False
     """Whether the best that fits into the memory will do if a tolerance cannot be met."""
 
@@ -154,7 +154,7 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
     goals.check_fits(time)
     screening = screen(problem, time, goals.left_out_k)
     _say_what_is_built(screening, say)
-    kept, memory_bytes = screening.problem, goals.memory_gb * 2**30
+    kept, memory_bytes = screening.problem, np.inf if goals.memory_gb is None else goals.memory_gb * 2**30
     if goals.estimated:
         left_k = None if goals.tolerance_k is None else goals.tolerance_k - screening.bound_k
         found = solve_to_tolerance(
