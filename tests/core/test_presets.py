@@ -174,7 +174,7 @@ def test_an_unknown_preset_lists_the_known() -> None:
 def test_a_preset_that_is_no_mapping_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "mine.yaml").write_text("- a\n- list\n")
     monkeypatch.setattr(presets, "configs_folder", lambda: tmp_path)
-    with pytest.raises(ThermoxelsError, match=r"^mine\.yaml: expected a mapping, got list"):
+    with pytest.raises(ThermoxelsError, match=r"^mine\.yaml: expected key: value lines, got \['a', 'list'\]"):
         read_preset("mine")
 
 

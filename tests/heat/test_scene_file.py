@@ -8,8 +8,8 @@ import pytest
 import yaml
 
 from tests.support.scene_bodies import room
-from thermoxels_ns.core.configs_folder import configs_folder
 from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.schemes import BACKWARD_EULER

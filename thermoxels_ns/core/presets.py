@@ -6,10 +6,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-import yaml
-
-from thermoxels_ns.core.configs_folder import configs_folder
 from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.yaml_records import configs_folder, read_yaml
 
 Config = TypeVar("Config")
 
@@ -27,12 +25,7 @@ def read_preset(name: str) -> dict[str, Any]:
     if not path.is_file():
         known = ", ".join(sorted(p.stem for pattern in _PATTERNS for p in configs_folder().glob(pattern))) or "none"
         raise ThermoxelsError("preset", expected=f"one of {known}", got=name, remedy="Correct the name.")
-    content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    if not isinstance(content, dict):
-        raise ThermoxelsError(
-            str(path.name), expected="a mapping", got=type(content).__name__, remedy="Write key: value lines."
-        )
-    return content
+    return read_yaml(path)
 
 
 def with_overrides(config: Config, overrides: Mapping[str, Any], name: str = "preset") -> Config:

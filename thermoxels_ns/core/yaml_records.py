@@ -1,4 +1,4 @@
-"""Yaml files turned into checked dataclasses; every error names the file, the key, what was expected and got."""
+"""Yaml files turned into checked dataclasses; errors name the file and the key."""
 
 from __future__ import annotations
 
@@ -7,24 +7,46 @@ import difflib
 import math
 import re
 import types
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import date, datetime
+from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
-from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.core.errors import ThermoxelsError
 
 Record = TypeVar("Record")
 
+_PACKAGE = Path(__file__).resolve().parents[1]
 _NUMBER = "Write it without quotes and without a unit; a power of ten needs a point and a sign, as in 1.0e+3."
+
+
+def configs_folder() -> Path:
+    """Find the folder of our yaml files: inside an installed package, or beside it in a source tree."""
+    for folder in (_PACKAGE / "configs", _PACKAGE.parent / "configs"):
+        if folder.is_dir():
+            return folder
+    got = f"none in or beside {_PACKAGE}"
+    raise wrong("configuration files", "a folder configs", got, "Install the package again.")
+
+
+@contextmanager
+def raising(error: type[ThermoxelsError]) -> Iterator[None]:
+    """Raise what is wrong with a file as an error of the caller's kind; a context, or a decorator of a reader."""
+    try:
+        yield
+    except ThermoxelsError as problem:
+        raise error(str(problem)) from problem
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a yaml file whose content is a mapping.
 
     Raises:
-        HeatError: There is no such file, it is no yaml, a key stands twice in it, or it is no mapping.
+        ThermoxelsError: There is no such file, it is no yaml, a key stands twice in it, or it is no mapping.
     """
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)
@@ -53,10 +75,10 @@ def as_record(name: str, content: object, target: type[Record]) -> Record:
     Args:
         name: Where the mapping stands, for messages, such as "winter.yaml: sky".
         content: What was read.
-        target: The dataclass. Fields without a default are required; its own checks may raise `HeatError`.
+        target: The dataclass. Fields without a default are required; its own checks may raise `ThermoxelsError`.
 
     Raises:
-        HeatError: A key is unknown or missing, or a value is of the wrong kind or out of range.
+        ThermoxelsError: A key is unknown or missing, or a value is of the wrong kind or out of range.
     """
     content = as_mapping(name, content)
     hints = get_type_hints(target)
@@ -68,8 +90,8 @@ def as_record(name: str, content: object, target: type[Record]) -> Record:
     values = {key: as_value(f"{name}: {key}", value, hints[key]) for key, value in content.items()}
     try:
         return target(**values)
-    except HeatError as problem:
-        raise HeatError(f"{name}: {problem}") from problem
+    except ThermoxelsError as problem:
+        raise ThermoxelsError(f"{name}: {problem}") from problem
 
 
 def check_keys(name: str, content: dict[str, Any], known: tuple[str, ...]) -> None:
@@ -84,11 +106,11 @@ def check_keys(name: str, content: dict[str, Any], known: tuple[str, ...]) -> No
 def as_value(name: str, content: object, hint: Any) -> Any:
     """Turn what was read into a value of the type that a dataclass field has.
 
-    Numbers, truth values, texts, moments, choices (Literal), tuples of fixed or any length, and dataclasses are known;
-    of a union, a field takes the first of these kinds.
+    Numbers (`Real`: as written, whole or not), truth values, texts, moments, choices (Literal), tuples of fixed or any
+    length, and dataclasses are known; of a union, a field takes the first of these kinds.
 
     Raises:
-        HeatError: It is of another kind.
+        ThermoxelsError: It is of another kind.
     """
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
@@ -120,15 +142,15 @@ def shown(content: object) -> str:
     return "nothing" if content is None else repr(content)
 
 
-def wrong(name: str, expected: str, got: object, remedy: str = "Correct the file.") -> HeatError:
+def wrong(name: str, expected: str, got: object, remedy: str = "Correct the file.") -> ThermoxelsError:
     """Make the error for something in a file."""
-    return HeatError(name, expected=expected, got=got, remedy=remedy)
+    return ThermoxelsError(name, expected=expected, got=got, remedy=remedy)
 
 
 def _plain(name: str, content: object, kind: type) -> Any:
-    if kind is float:
+    if kind in (float, Real):
         if isinstance(content, (int, float)) and not isinstance(content, bool):
-            return float(content)
+            return float(content) if kind is float else content
         raise wrong(name, "a number", shown(content), _as_number(content))
     if kind is int:
         if isinstance(content, int) and not isinstance(content, bool):

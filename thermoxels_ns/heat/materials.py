@@ -12,9 +12,8 @@ from typing import cast
 import numpy as np
 
 from thermoxels_ns.core.checks import check_positive
-from thermoxels_ns.core.configs_folder import configs_folder
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.core.yaml_records import as_record, read_yaml
+from thermoxels_ns.core.yaml_records import as_record, configs_folder, raising, read_yaml
 from thermoxels_ns.fem.problem import HeatProblem
 
 
@@ -85,6 +84,7 @@ class MaterialRow:
         return Material(name, self.conductivity_w_mk, self.density_kg_m3, self.specific_heat_j_kgk)
 
 
+@raising(HeatError)
 def load_material_table(path: Path | str | None = None) -> dict[str, MaterialRow]:
     """Read a table of materials.
 

@@ -11,9 +11,18 @@ import dataclasses
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from thermoxels_ns.core.configs_folder import configs_folder
-from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.core.yaml_records import as_mapping, as_record, as_value, check_keys, read_yaml, shown, wrong
+from thermoxels_ns.core.errors import HeatError, ThermoxelsError
+from thermoxels_ns.core.yaml_records import (
+    as_mapping,
+    as_record,
+    as_value,
+    check_keys,
+    configs_folder,
+    raising,
+    read_yaml,
+    shown,
+    wrong,
+)
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
 from thermoxels_ns.heat.materials import Material, material
 from thermoxels_ns.heat.scene import HeatScene
@@ -45,6 +54,7 @@ def heat_scene_names() -> list[str]:
     return sorted(path.stem.removeprefix("scene-") for path in configs_folder().glob("scene-*.yaml"))
 
 
+@raising(HeatError)
 def load_heat_scene(name: Path | str) -> HeatScene:
     """Read a heat scene.
 
@@ -94,7 +104,7 @@ def _materials(file: str, content: dict[str, Any]) -> dict[str, Material]:
                 continue
             figures = as_record(region, entry, _Inline)
             made_of[region] = Material(region, **dataclasses.asdict(figures))
-        except HeatError as problem:
+        except ThermoxelsError as problem:
             raise HeatError(f"{name}: {problem}") from problem
     return made_of
 

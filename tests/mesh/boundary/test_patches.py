@@ -229,66 +229,72 @@ def test_empty_lists_are_no_rules(tmp_path: Path, text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", r"^mine\.yaml: expected the keys patches, regions, got nothing"),
-        ("[]", r"^mine\.yaml: expected the keys patches, regions, got \[\]"),
+        ("", r"^mine\.yaml: expected key: value lines, got nothing"),
+        ("[]", r"^mine\.yaml: expected key: value lines, got \[\]"),
         ("patches: [", r"^mine\.yaml: expected a yaml file, got"),
-        ("patch: []", r"^mine\.yaml: expected keys out of patches, regions, got 'patch'\. Correct or remove"),
+        ("patch: []", r"^mine\.yaml: expected keys out of patches, regions, got patch\. Did you mean patches"),
         ("patches:", r"mine\.yaml: patches: expected a list of entries.*got nothing"),
         ("patches: {name: a}", "patches: expected a list of entries"),
-        ("patches: [a]", "patches entry 1: expected the keys name, box, plane, nearest_colour, only, facing, got 'a'"),
+        ("patches: [a]", "patches entry 1: expected key: value lines, got 'a'"),
         ("patches: [{facing: up}]", "patches entry 1: expected the key name, got facing. Add name"),
-        ("patches: [{name: a, facing: up}, {name: b}]", r"patches entry 2 \(b\): expected at least one of box, plane"),
-        ("patches: [{name: a, colour: 3}]", "entry 1: expected keys out of name, box.*got 'colour'"),
-        ("patches: [{name: 7, facing: up}]", "entry 1: name: expected up to 40 letters.*got 7"),
+        ("patches: [{name: a, facing: up}, {name: b}]", r"patches entry 2: b: expected at least one of box, plane"),
+        ("patches: [{name: a, colour: 3}]", "entry 1: expected keys out of name, box.*got colour"),
+        ("patches: [{name: 7, facing: up}]", "entry 1: name: expected a text, got 7"),
         ("patches: [{name: a b, facing: up}]", "entry 1: name: expected up to 40 letters.*got 'a b'"),
         ("patches: [{name: 2nd, facing: up}]", "name: expected up to 40 letters"),
         ("patches: [{name: cut, facing: up}]", "entry 1: name: expected a name other than exterior-up.*got cut"),
         ("patches: [{name: Exterior-Up, facing: up}]", "expected a name other than.*got Exterior-Up"),
-        ("regions: [{name: solid, box: {}}]", r"\(solid\): box: expected the keys lower, upper"),
+        ("regions: [{name: solid, box: {}}]", r"entry 1: box: expected key: value lines"),
         (
             "regions: [{name: solid, box: {lower: [0, 0, 0], upper: [1, 1, 1]}}]",
             "entry 1: name: expected a name other than solid, got solid",
         ),
         (
             "patches: [{name: wall, facing: up}, {name: Wall, facing: side}]",
-            "entry 2: name: expected wall, as above, or another name, got Wall",
+            "entry 2: name: expected wall, as above, or another, got Wall",
         ),
         ("regions: [{name: a, facing: up}]", "regions entry 1: expected keys out of name, box, plane, nearest_colour"),
-        ("patches: [{name: a, facing: north}]", r"\(a\): facing: expected one of up, side, down, any, got 'north'"),
-        ("patches: [{name: a, only: seen}]", r"\(a\): only: expected one of exterior, interior, cut, all, got 'seen'"),
+        ("patches: [{name: a, facing: north}]", r"entry 1: facing: expected one of up, side, down, any, got 'north'"),
+        (
+            "patches: [{name: a, only: seen}]",
+            r"entry 1: only: expected one of exterior.* cut, all, got 'seen'",
+        ),
         ("patches: [{name: a, only: [cut]}]", r"only: expected one of exterior, interior, cut, all, got \['cut'\]"),
         ("patches: [{name: a, only: cut, only: all}]", "expected a yaml file, got the key only twice"),
-        ("patches: [{name: a, box: {lower: [0, 0, 0]}}]", r"\(a\): box: expected the key upper, got lower"),
+        ("patches: [{name: a, box: {lower: [0, 0, 0]}}]", r"entry 1: box: expected the key upper, got lower"),
         (
             "patches: [{name: a, box: {lower: [0, 0], upper: [1, 1, 1]}}]",
-            r"box\.lower: expected three numbers in square brackets, got \[0, 0\]",
+            r"box: lower: expected 3 numbers in square brackets, got \[0, 0\]",
         ),
         (
             "patches: [{name: a, box: {lower: [0, 0, 1], upper: [1, 1, 1]}}]",
-            r"box: expected each number of lower below that of upper, got \[0.0, 0.0, 1.0\] and \[1.0, 1.0, 1.0\]",
+            r"box: corners: expected each number of lower below that of upper, got \[0.0, 0.0, 1.0\] and \[1.0",
         ),
         (
             "patches: [{name: a, box: {lower: [0, 0, 1e-3], upper: [1, 1, 1]}}]",
-            r"box\.lower: expected a number, got '1e-3'\. Write it without quotes",
+            r"box: lower: expected a number, got '1e-3'\. Write 0\.001, without quotes",
         ),
-        ("patches: [{name: a, box: {lower: [0, 0, .nan], upper: [1, 1, 1]}}]", "expected a number, got nan"),
+        (
+            "patches: [{name: a, box: {lower: [0, 0, .nan], upper: [1, 1, 1]}}]",
+            "expected each number of lower below.*nan",
+        ),
         ("patches: [{name: a, box: {lower: [0, 0, true], upper: [1, 1, 1]}}]", "expected a number, got True"),
         ("patches: [{name: a, box: {lower: [0, 0, 2 m], upper: [1, 1, 1]}}]", "expected a number, got '2 m'"),
         (
             "patches: [{name: a, plane: {point: [0, 0, 0], normal: [0, 0, 0]}}]",
-            r"plane\.normal: expected three numbers that are not all 0",
+            r"plane: point and normal: expected finite numbers, and a normal that is not 0",
         ),
         (
             "patches: [{name: a, plane: {point: [0, 0, .inf], normal: [0, 0, 1]}}]",
-            r"plane\.point: expected a finite number, got inf",
+            r"plane: point and normal: expected finite numbers, .*inf",
         ),
         (
             "patches: [{name: a, nearest_colour: [1, 2, 3]}]",
-            "nearest_colour: expected the keys rgb, max_distance",
+            "nearest_colour: expected key: value lines",
         ),
         (
             "patches: [{name: a, nearest_colour: {rgb: [0, 0, 256]}}]",
-            r"nearest_colour\.rgb: expected three numbers from 0 to 255",
+            r"nearest_colour: rgb: expected three numbers from 0 to 255",
         ),
         ("patches: [{name: a, nearest_colour: {rgb: [0, 0, -1]}}]", "expected three numbers from 0 to 255"),
         (
@@ -307,7 +313,7 @@ def test_wrong_files_are_refused(tmp_path: Path, text: str, message: str) -> Non
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(MeshError, match=r"none\.yaml: expected a yaml file with patches and regions, got No such file"):
+    with pytest.raises(MeshError, match=r"none\.yaml: expected a yaml file, got No such file"):
         load_patch_rules(tmp_path / "none.yaml")
 
 

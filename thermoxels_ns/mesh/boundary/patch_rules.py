@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
-from typing import Any
-
-import yaml
+from typing import Literal
 
 from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.core.yaml_records import as_record, raising, read_yaml, wrong
 
 FACINGS = ("up", "side", "down")
 """Where a surface may face."""
@@ -25,7 +24,6 @@ DEFAULT_REGION = "solid"
 
 Vector = tuple[float, float, float]
 
-_ONLY = ("exterior", "interior", "cut", "all")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,39}")
 
 
@@ -59,6 +57,113 @@ class PatchRules:
     """Rules for tetrahedra."""
 
 
+@dataclass(frozen=True)
+class _Box:
+    """Two corners in a file."""
+
+    lower: Vector
+    upper: Vector
+
+    def __post_init__(self) -> None:
+        if not all(low < high for low, high in zip(self.lower, self.upper)):
+            got = f"{[*self.lower]} and {[*self.upper]}"
+            raise wrong("corners", "each number of lower below that of upper", got, "Correct them.")
+
+
+@dataclass(frozen=True)
+class _Plane:
+    """A plane in a file."""
+
+    point: Vector
+    normal: Vector
+
+    def __post_init__(self) -> None:
+        if not (all(map(math.isfinite, self.point)) and 0.0 < math.hypot(*self.normal) < math.inf):
+            got = f"{[*self.point]} and {[*self.normal]}"
+            raise wrong("point and normal", "finite numbers, and a normal that is not 0", got, "Correct them.")
+
+
+@dataclass(frozen=True)
+class _Colour:
+    """A colour in a file, in whole numbers to 255 or in decimals to 1.0."""
+
+    rgb: tuple[Real, Real, Real]
+    max_distance: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not all(0.0 <= float(part) <= 255.0 for part in self.rgb):
+            raise wrong("rgb", "three numbers from 0 to 255, or from 0.0 to 1.0", [*self.rgb])
+        if self.whole and max(map(float, self.rgb)) == 1.0:
+            bright, dark = [float(part) for part in self.rgb], [round(float(part) / 255.0, 4) for part in self.rgb]
+            raise wrong(
+                "rgb",
+                "whole numbers up to 255 or decimals up to 1.0",
+                f"{[*self.rgb]}, which may be either",
+                f"Write {bright} for a bright colour or {dark} for a dark one.",
+            )
+        if not self.max_distance > 0.0:
+            raise wrong("max_distance", "a number above 0, on the scale of rgb", self.max_distance)
+
+    @property
+    def whole(self) -> bool:
+        """Whether it is written in whole numbers."""
+        return all(isinstance(part, int) for part in self.rgb)
+
+    @property
+    def scale(self) -> float:
+        """What its numbers are divided by to lie in [0, 1]."""
+        return 255.0 if self.whole or max(map(float, self.rgb)) > 1.0 else 1.0
+
+
+@dataclass(frozen=True)
+class _RegionEntry:
+    """What a file says of a region."""
+
+    name: str
+    box: _Box | None = None
+    plane: _Plane | None = None
+    nearest_colour: _Colour | None = None
+
+    def __post_init__(self) -> None:
+        if not _NAME.fullmatch(self.name):
+            expected = "up to 40 letters, digits, - and _ that start with a letter"
+            raise wrong("name", expected, repr(self.name), "Rename it.")
+        conditions = [*vars(self)][1:]
+        if all(getattr(self, key) is None for key in conditions):
+            raise wrong(self.name, f"at least one of {', '.join(conditions)}", "only a name")
+
+    def rule(self) -> Rule:
+        """Make the rule."""
+        conditions = dict(vars(self))  # of a patch more than of a region
+        box, plane, colour = (conditions.pop(key) for key in ("box", "plane", "nearest_colour"))
+        if box is not None:
+            conditions["box"] = (box.lower, box.upper)
+        if plane is not None:
+            length = math.hypot(*plane.normal)
+            conditions["plane"] = (plane.point, tuple(part / length for part in plane.normal))
+        if colour is not None:
+            conditions["colour"] = tuple(float(part) / colour.scale for part in colour.rgb)
+            conditions["max_colour_distance"] = colour.max_distance / colour.scale
+        return Rule(**{key: value for key, value in conditions.items() if value is not None})
+
+
+@dataclass(frozen=True)
+class _PatchEntry(_RegionEntry):
+    """What a file says of a patch."""
+
+    only: Literal["exterior", "interior", "cut", "all"] | None = None
+    facing: Literal["up", "side", "down", "any"] | None = None
+
+
+@dataclass(frozen=True)
+class _File:
+    """A file of patches and regions."""
+
+    patches: tuple[_PatchEntry, ...] = ()
+    regions: tuple[_RegionEntry, ...] = ()
+
+
+@raising(MeshError)
 def load_patch_rules(path: Path | str) -> PatchRules:
     """Read a user's patches and regions from a yaml file.
 
@@ -66,151 +171,18 @@ def load_patch_rules(path: Path | str) -> PatchRules:
         MeshError: No such file, no yaml, or an entry that cannot be understood; the message says which.
     """
     path = Path(path)
-    try:
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)
-    except OSError as problem:
-        raise _wrong(str(path), "a yaml file with patches and regions", problem.strerror or problem) from problem
-    except (yaml.YAMLError, UnicodeDecodeError) as problem:
-        raise _wrong(path.name, "a yaml file", problem) from problem
-    lists = _mapping(path.name, content, ("patches", "regions"))
-    patches = _rules(f"{path.name}: patches", lists.get("patches", []), DEFAULT_PATCHES, ("only", "facing"))
-    return PatchRules(patches, _rules(f"{path.name}: regions", lists.get("regions", []), (DEFAULT_REGION,), ()))
+    file = as_record(path.name, read_yaml(path), _File)
+    _check_names(f"{path.name}: patches", file.patches, DEFAULT_PATCHES)
+    _check_names(f"{path.name}: regions", file.regions, (DEFAULT_REGION,))
+    return PatchRules(*(tuple(entry.rule() for entry in entries) for entries in (file.patches, file.regions)))
 
 
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """Refuses a key that stands twice in one mapping, where yaml forgets the first."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = [key.value for key, _ in node.value]
-        twice = next((key for number, (key, _) in enumerate(node.value) if key.value in keys[:number]), None)
-        if twice is not None:
-            raise yaml.constructor.ConstructorError(None, None, f"the key {twice.value} twice", twice.start_mark)
-        return super().construct_mapping(node, deep)
-
-
-def _rules(name: str, content: object, taken: tuple[str, ...], restrictions: tuple[str, ...]) -> tuple[Rule, ...]:
-    if not isinstance(content, list):
-        raise _wrong(name, "a list of entries, each with a dash before its name", _shown(content))
-    known = {known.lower(): known for known in taken}
-    rules = []
-    for number, entry in enumerate(content, start=1):
-        rule = _rule(f"{name} entry {number}", entry, restrictions)
-        before = known.setdefault(rule.name.lower(), rule.name)
-        if before in taken or before != rule.name:
-            raise _wrong(
-                f"{name} entry {number}: name",
-                f"a name other than {', '.join(taken)}" if before in taken else f"{before}, as above, or another name",
-                rule.name,
-                "Choose another name; solvers do not tell capitals from small letters.",
-            )
-        rules.append(rule)
-    return tuple(rules)
-
-
-def _rule(name: str, content: object, restrictions: tuple[str, ...]) -> Rule:
-    conditions = ("box", "plane", "nearest_colour", *restrictions)
-    entry = _mapping(name, content, ("name", *conditions), needed=("name",))
-    label = entry["name"]
-    if not isinstance(label, str) or not _NAME.fullmatch(label):
-        raise _wrong(
-            f"{name}: name", "up to 40 letters, digits, - and _ that start with a letter", _shown(label), "Rename it."
-        )
-    if len(entry) == 1:
-        raise _wrong(f"{name} ({label})", f"at least one of {', '.join(conditions)}", "only a name")
-    name = f"{name} ({label})"
-    rule: dict[str, Any] = {"name": label}
-    if "box" in entry:
-        rule["box"] = _box(f"{name}: box", entry["box"])
-    if "plane" in entry:
-        rule["plane"] = _plane(f"{name}: plane", entry["plane"])
-    if "nearest_colour" in entry:
-        rule["colour"], rule["max_colour_distance"] = _colour(f"{name}: nearest_colour", entry["nearest_colour"])
-    for key, choices in (("only", _ONLY), ("facing", (*FACINGS, "any"))):
-        if key in entry:
-            if entry[key] not in choices:
-                raise _wrong(f"{name}: {key}", f"one of {', '.join(choices)}", _shown(entry[key]))
-            rule[key] = entry[key]
-    return Rule(**rule)
-
-
-def _box(name: str, content: object) -> tuple[Vector, Vector]:
-    entry = _mapping(name, content, ("lower", "upper"), needed=("lower", "upper"))
-    lower, upper = (_three(f"{name}.{key}", entry[key], finite=False) for key in ("lower", "upper"))
-    if not all(low < high for low, high in zip(lower, upper)):
-        raise _wrong(name, "each number of lower below that of upper", f"{[*lower]} and {[*upper]}", "Correct them.")
-    return lower, upper
-
-
-def _plane(name: str, content: object) -> tuple[Vector, Vector]:
-    entry = _mapping(name, content, ("point", "normal"), needed=("point", "normal"))
-    point, normal = (_three(f"{name}.{key}", entry[key]) for key in ("point", "normal"))
-    length = math.hypot(*normal)
-    if not 0.0 < length < math.inf:
-        raise _wrong(f"{name}.normal", "three numbers that are not all 0", [*normal])
-    x, y, z = normal
-    return point, (x / length, y / length, z / length)
-
-
-def _colour(name: str, content: object) -> tuple[Vector, float]:
-    entry = _mapping(name, content, ("rgb", "max_distance"), needed=("rgb",))
-    red, green, blue = rgb = _three(f"{name}.rgb", entry["rgb"])
-    if min(rgb) < 0.0 or max(rgb) > 255.0:
-        raise _wrong(f"{name}.rgb", "three numbers from 0 to 255, or from 0.0 to 1.0", entry["rgb"])
-    whole = all(isinstance(value, int) for value in entry["rgb"])
-    if whole and max(rgb) == 1.0:
-        raise _wrong(
-            f"{name}.rgb",
-            "whole numbers up to 255 or decimals up to 1.0",
-            f"{entry['rgb']}, which may be either",
-            f"Write {[*rgb]} for a bright colour or {[round(value / 255.0, 4) for value in rgb]} for a dark one.",
-        )
-    scale = 255.0 if whole or max(rgb) > 1.0 else 1.0
-    most = math.inf
-    if "max_distance" in entry:
-        most = _number(f"{name}.max_distance", entry["max_distance"])
-        if not most > 0.0:
-            raise _wrong(f"{name}.max_distance", "a number above 0, on the scale of rgb", most)
-    return (red / scale, green / scale, blue / scale), most / scale
-
-
-def _three(name: str, content: object, *, finite: bool = True) -> Vector:
-    if not isinstance(content, list) or len(content) != 3:
-        raise _wrong(name, "three numbers in square brackets", _shown(content))
-    x, y, z = (_number(name, value, finite=finite) for value in content)
-    return x, y, z
-
-
-def _number(name: str, content: object, *, finite: bool = True) -> float:
-    if isinstance(content, (int, float)) and not isinstance(content, bool):
-        number = float(content)
-        if math.isfinite(number) or (math.isinf(number) and not finite):
-            return number
-    raise _wrong(
-        name,
-        "a finite number" if finite else "a number",
-        _shown(content),
-        "Write it without quotes and without a unit, with a point and a sign in a power of ten, as in 1.0e-3.",
-    )
-
-
-def _mapping(name: str, content: object, known: Sequence[str], needed: Sequence[str] = ()) -> dict[str, Any]:
-    """Return `content` if it is a mapping with keys out of `known`, all of `needed` among them."""
-    if not isinstance(content, dict) or not content:
-        raise _wrong(name, f"the keys {', '.join(known)}", _shown(content))
-    for key in content:
-        if key not in known:
-            raise _wrong(name, f"keys out of {', '.join(known)}", _shown(key), "Correct or remove that key.")
-    for key in needed:
-        if key not in content:
-            raise _wrong(name, f"the key {key}", ", ".join(content), f"Add {key}.")
-    return content
-
-
-def _shown(content: object) -> str:
-    return "nothing" if content is None else repr(content)
-
-
-def _wrong(
-    name: str, expected: str, got: object, remedy: str = "Correct the file; configs/patches-example.yaml explains it."
-) -> MeshError:
-    return MeshError(name, expected=expected, got=got, remedy=remedy)
+def _check_names(where: str, entries: tuple[_RegionEntry, ...], taken: tuple[str, ...]) -> None:
+    """Refuse names of the mesher's own, and names that differ in capitals alone."""
+    known = {name.lower(): name for name in taken}
+    for number, entry in enumerate(entries, start=1):
+        before = known.setdefault(entry.name.lower(), entry.name)
+        if before in taken or before != entry.name:
+            expected = f"a name other than {', '.join(taken)}" if before in taken else f"{before}, as above, or another"
+            remedy = "Choose another name; solvers do not tell capitals from small letters."
+            raise wrong(f"{where} entry {number}: name", expected, entry.name, remedy)
