@@ -63,15 +63,6 @@ def test_of_a_cooled_room_the_warmest_spot_is_the_worst() -> None:
     assert wall.coldest.point_m[1] <= 1.0 and wall.heat_w < 0.0
 
 
-def test_a_wall_between_equal_airs_or_without_an_inside_is_refused() -> None:
-    problem = two_walls()
-    solution = solve_steady(problem)
-    with pytest.raises(HeatError, match="airs of a wall: expected two temperatures, got 5 and 5 C"):
-        wall_result(problem, solution, ("x0",), 5.0, 5.0)
-    with pytest.raises(HeatError, match=r"inside of a wall: expected some of the patches x0, x1.*got attic"):
-        wall_result(problem, solution, ("attic",), 20.0, 5.0)
-
-
 def test_heat_by_patch_effect_and_region_of_a_steady_state() -> None:
     problem = two_walls()
     results = heat_results(problem, solve_steady(problem))

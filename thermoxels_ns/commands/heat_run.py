@@ -33,8 +33,6 @@ from thermoxels_ns.reports.heat_page import heat_page
 from thermoxels_ns.reports.heat_pictures import PICTURES, draw_surface
 from thermoxels_ns.reports.page import build_page, write_page
 
-Direction = tuple[float, float, float]
-
 ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY = "answers.json", "series.csv", "report.html", "heat.pvd", "heat.vtu"
 """Files of a run; pictures come on top."""
 
@@ -69,7 +67,7 @@ def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     goals.check_fits(scene.time)
     mesh = read_mesh(options.mesh)
     export = _export_summary(options.mesh, say)
-    up = options.up if options.up is not None else _direction(export.get("up"), options.mesh)
+    up = export.get("up") if options.up is None else options.up
     say(f"Mesh: {len(mesh.tets):,} tetrahedra, {len(mesh.points_m):,} nodes.")
     say(f"Scene: {scene.description or options.scene}.")
     read_s = clock.perf_counter() - begin
@@ -85,36 +83,23 @@ def _export_summary(mesh: Path, say: Say) -> dict[str, Any]:
         return {}
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(summary, dict):
+            raise ValueError(repr(summary)[:40])
     except (OSError, ValueError) as problem:
         remedy = "Export the mesh again, or move the file away."
         raise MeshError(str(path), expected="the summary of an export", got=problem, remedy=remedy) from problem
-    if not isinstance(summary, dict):
-        remedy = "Export the mesh again, or move the file away."
-        raise MeshError(str(path), expected="the summary of an export", got=repr(summary)[:40], remedy=remedy)
     if summary.get("length_unit", "m") != "m":
-        raise HeatError(
-            "scale of the mesh",
-            expected="an export in metres",
-            got=f"one in {summary['length_unit']}s",
-            remedy="Export again with --metres-per-unit or --known-distance.",
-        )
-    return summary
-
-
-def _direction(up: Any, mesh: Path) -> Direction | None:
-    """Return the three numbers that a summary gives, or None for none."""
-    if up is None:
-        return None
+        remedy = "Export again with --metres-per-unit or --known-distance."
+        got = f"one in {summary['length_unit']}s"
+        raise HeatError("scale of the mesh", expected="an export in metres", got=got, remedy=remedy)
     try:
-        x, y, z = (float(part) for part in up)
+        if summary.get("up") is not None:
+            x, y, z = map(float, summary["up"])
+            summary["up"] = (x, y, z)
     except (TypeError, ValueError) as problem:
-        raise MeshError(
-            f"{mesh.with_name('summary.json')}: up",
-            expected="three numbers",
-            got=repr(up),
-            remedy="Pass --up 0 0 1, or export the mesh again.",
-        ) from problem
-    return (x, y, z)
+        name, remedy = f"{path}: up", "Pass --up 0 0 1, or export the mesh again."
+        raise MeshError(name, expected="three numbers", got=repr(summary["up"]), remedy=remedy) from problem
+    return summary
 
 
 def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:

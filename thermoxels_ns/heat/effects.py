@@ -20,11 +20,17 @@ _ABSOLUTE_ZERO_C = -ZERO_CELSIUS_K
 
 
 @dataclass(frozen=True)
-class FixedTemperature(Effect):
-    """A surface kept at a temperature."""
+class SurfaceEffect(Effect):
+    """What acts on patches of the boundary."""
 
     patches: tuple[str, ...]
     """Names of boundary patches, or patterns such as exterior-*; * is the whole boundary."""
+
+
+@dataclass(frozen=True)
+class FixedTemperature(SurfaceEffect):
+    """A surface kept at a temperature."""
+
     temperature_c: Quantity
     """Temperature of the surface, [degrees Celsius], at least -273.15. Asked at the nodes."""
 
@@ -37,11 +43,9 @@ class FixedTemperature(Effect):
 
 
 @dataclass(frozen=True)
-class HeatFlux(Effect):
+class HeatFlux(SurfaceEffect):
     """A given heat flux through a surface."""
 
-    patches: tuple[str, ...]
-    """Names of boundary patches, or patterns such as exterior-*; * is the whole boundary."""
     flux_w_m2: Quantity
     """Heat flux, [W / m2], positive into the body."""
 
@@ -54,11 +58,9 @@ class HeatFlux(Effect):
 
 
 @dataclass(frozen=True)
-class Convection(Effect):
+class Convection(SurfaceEffect):
     """Heat exchange with air (Newton's law of cooling)."""
 
-    patches: tuple[str, ...]
-    """Names of boundary patches, or patterns such as exterior-*; * is the whole boundary."""
     coefficient_w_m2k: Quantity
     """Surface heat transfer coefficient h, [W / (m2 K)], at least 0."""
     air_c: Quantity
@@ -77,11 +79,9 @@ class Convection(Effect):
 
 
 @dataclass(frozen=True)
-class Radiation(Effect):
+class Radiation(SurfaceEffect):
     """Long-wave exchange with large surroundings such as the sky, the ground or a room (Stefan-Boltzmann law)."""
 
-    patches: tuple[str, ...]
-    """Names of boundary patches, or patterns such as exterior-*; * is the whole boundary."""
     emissivity: Quantity
     """Emissivity of the surface, times the view factor of the surroundings if they do not fill its view; 0 to 1."""
     surroundings_c: Quantity
@@ -103,11 +103,9 @@ class Radiation(Effect):
 
 
 @dataclass(frozen=True)
-class AbsorbedSolar(Effect):
+class AbsorbedSolar(SurfaceEffect):
     """Sunlight that a surface takes up."""
 
-    patches: tuple[str, ...]
-    """Names of boundary patches, or patterns such as exterior-*; * is the whole boundary."""
     absorptivity: Quantity
     """Share of the sunlight that the surface absorbs, 0 to 1."""
     irradiance_w_m2: Quantity
@@ -126,11 +124,9 @@ class AbsorbedSolar(Effect):
 
 
 @dataclass(frozen=True)
-class GroundContact(Effect):
+class GroundContact(SurfaceEffect):
     """Heat exchange with the ground through a thermal resistance."""
 
-    patches: tuple[str, ...]
-    """Names of boundary patches, or patterns such as exterior-*; * is the whole boundary."""
     resistance_m2k_w: float
     """Thermal resistance between the surface and the undisturbed ground, [m2 K / W], above 0."""
     ground_c: Quantity

@@ -165,14 +165,14 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
             memory_bytes=memory_bytes,
             allow_unmet=goals.allow_unmet,
             log=say,
-            progress=_Progress(say, None),
+            progress=_Progress(say),
         )
         return SolvedProblem(found.problem, found.solution, screening, _accuracy(goals, screening, found))
     times = 1 if time is None else time.num_times
     needed = peak_bytes(kept, times=times, adaptive=isinstance(time, AdaptiveSteps))
     say(f"Memory: about {describe_bytes(needed)} at most.")
     check_memory(needed, memory_bytes, "Pass a larger --memory-gb, or export a coarser mesh.")
-    solution = solve_steady(kept) if time is None else solve_heat(kept, time, progress=_Progress(say, time))
+    solution = solve_steady(kept) if time is None else solve_heat(kept, time, progress=_Progress(say))
     return SolvedProblem(kept, solution, screening, None)
 
 
@@ -205,42 +205,32 @@ def _say_what_is_built(screening: Screening, say: Say) -> None:
 
 
 class _Progress:
-    """Says after the first step how long it took, and every now and then how far a solution has come.
+    """Says how long a slow first step took, and every now and then how far a solution has come.
 
-    The pace of the first step, which makes the matrices too, is about the slowest of equal steps. Those that are chosen
-    by their error begin short, and how many will follow is not known yet; later the pace since the last line counts,
-    because that from the start on would tell hours where minutes are left.
+    What is left is told by the pace since the last line: steps that are chosen by their error begin short.
     """
 
-    def __init__(self, say: Say, time: TimeSteps | AdaptiveSteps | None) -> None:
-        self._say, self._share = say, 0.0
-        self._equal = isinstance(time, TimeSteps)
-        self._begin_s = self._said_s = self._called_s = clock.perf_counter()
-        self._said_share = 0.0
+    def __init__(self, say: Say) -> None:
+        self._say = say
+        self._share = self._said_share = 0.0
+        self._called_s = self._said_s = clock.perf_counter()
 
     def __call__(self, share: float, steps: int) -> None:
         """Take the share of the duration that is done, and the number of steps."""
-        now_s = clock.perf_counter()
         if share < self._share:  # the next solution has begun
-            self._begin_s = self._said_s = self._called_s
-            self._said_share = 0.0
-        took_s = now_s - self._begin_s
-        self._share, self._called_s = share, now_s
-        if steps == 1 and share < 1.0:
-            self._say_first(share, took_s)
-        elif now_s - self._said_s >= SAY_EVERY_S and self._said_share < share < 1.0:
-            pace_s = took_s / share if self._equal else (now_s - self._said_s) / (share - self._said_share)
-            left_s = pace_s * (1.0 - share)
-            self._said_s, self._said_share = now_s, share
-            self._say(f"{_percent(share)} of the time after {steps} steps; about {_duration(left_s)} left.")
-
-    def _say_first(self, share: float, took_s: float) -> None:
-        left_s = took_s * (1.0 - share) / share
-        if self._equal and left_s >= SAY_EVERY_S:
-            self._say(f"The first step took {took_s:.1f} s; at that pace about {_duration(left_s)} left.")
-        elif not self._equal and took_s >= SAY_FIRST_S:
-            self._said_s, self._said_share = self._called_s, share
+            self._said_share, self._said_s = 0.0, self._called_s
+        self._share, self._called_s = share, clock.perf_counter()
+        took_s = self._called_s - self._said_s
+        if share >= 1.0 or share <= self._said_share:
+            return
+        if steps == 1 and took_s >= SAY_FIRST_S:
             self._say(f"The first step took {took_s:.1f} s, for {_percent(share)} of the time.")
+        elif steps > 1 and took_s >= SAY_EVERY_S:
+            left_s = took_s / (share - self._said_share) * (1.0 - share)
+            self._say(f"{_percent(share)} of the time after {steps} steps; about {_duration(left_s)} left.")
+        else:
+            return
+        self._said_share, self._said_s = share, self._called_s
 
 
 def _percent(share: float) -> str:

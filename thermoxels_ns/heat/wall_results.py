@@ -9,7 +9,6 @@ from fnmatch import fnmatchcase
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
@@ -84,7 +83,7 @@ def wall_of_scene(
     inside, outside = scene.inside_air, scene.outside_air
     if not isinstance(solution, SteadySolution) or inside is None or outside is None:
         return ""
-    if inside.air_c == outside.air_c:
+    if abs(inside.air_c - outside.air_c) < _LEAST_DIFFERENCE_K:
         return ""
     if doubtful:
         return "There is no U-value, because it is doubtful which surface faces the air inside."
@@ -112,26 +111,15 @@ def wall_result(
     Args:
         problem: What was solved.
         solution: Its steady state.
-        inside: Names or patterns of the patches that face the inside.
+        inside: Names or patterns of the patches that face the inside, some of which have area.
         inside_c: Temperature of the air inside, [degrees Celsius].
-        outside_c: Temperature of the air outside, [degrees Celsius].
+        outside_c: Temperature of the air outside, [degrees Celsius], another one.
         nodes: What `solution_nodes` gives, if it is there already.
-
-    Raises:
-        HeatError: Both airs are equally warm, or no surface faces the inside.
     """
     difference_k = inside_c - outside_c
-    if not abs(difference_k) >= _LEAST_DIFFERENCE_K:
-        remedy = "A U-value needs two different temperatures."
-        got = f"{inside_c:g} and {outside_c:g} C"
-        raise HeatError("airs of a wall", expected="two temperatures", got=got, remedy=remedy)
     selection, mesh = Selection(problem.mesh, problem.up), problem.mesh
     every_c = end_state_c(solution)
     inner = _faces_inside(problem, inside)
-    if not inner.any():
-        expected = f"some of the patches {', '.join(selection.patch_names)}"
-        remedy = "Name patches that have some surface."
-        raise HeatError("inside of a wall", expected=expected, got=", ".join(inside), remedy=remedy)
 
     def parts(numbers: npt.NDArray[np.int64], names: tuple[str, ...]) -> tuple[WallPart, ...]:
         number = np.where(inner, numbers, len(names))
