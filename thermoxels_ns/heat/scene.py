@@ -11,7 +11,7 @@ import numpy as np
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.quantities import Quantity, Varying
+from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
     Convection,
@@ -37,15 +37,6 @@ from thermoxels_ns.heat.scene_fields import (
 from thermoxels_ns.heat.scene_patches import ScenePatches, check_disjoint
 from thermoxels_ns.heat.sky import Vector, outdoor_radiation, swinbank_sky_c
 from thermoxels_ns.heat.sun import Sunlight, fixed_sun, moving_sun
-from thermoxels_ns.heat.surface_coefficients import (
-    inside_combined,
-    inside_convection,
-    inside_separate,
-    outside_combined,
-    outside_convection,
-    radiative_coefficient,
-    thermoxels_original,
-)
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Value = TypeVar("Value")
@@ -146,9 +137,9 @@ class HeatScene:
         """Effects on the surface, each with the entry of the scene that it comes from."""
         named: list[tuple[str, Effect]] = []
         if self.inside_air is not None:
-            named.append(("inside_air", _inside(self.inside_air)))
+            named.append(("inside_air", self.inside_air.convection()))
         if self.outside_air is not None:
-            named.append(("outside_air", _outside(self.outside_air)))
+            named.append(("outside_air", self.outside_air.convection()))
         named += [("sky and ground", effect) for effect in self._sky_and_ground(patches)]
         named += [("sun", effect) for effect in self._sunlight(patches)]
         for key in ("fixed_temperature", "heat_flux", "convection", "radiation", "absorbed_solar", "ground_contact"):
@@ -239,34 +230,6 @@ class HeatScene:
                     if name in linear:
                         remedy = f"Set coefficient: iso-6946-convection in {name}, which leaves radiation out."
                     check_disjoint("radiation", [(name, chosen), (other, elsewhere)], remedy)
-
-
-def _inside(air: InsideAir) -> Convection:
-    coefficient: Quantity
-    if air.coefficient == "iso-6946-combined":
-        coefficient = inside_combined(air.heat_flow)
-    elif air.coefficient == "iso-6946-convection":
-        coefficient = inside_convection(air.heat_flow)
-    elif air.coefficient == "iso-6946-separate":
-        coefficient = inside_separate(air.air_c, _given(air.emissivity), air.heat_flow)
-    else:
-        coefficient = _given(air.coefficient_w_m2k)
-    return Convection(air.patches, coefficient, air.air_c)
-
-
-def _outside(air: OutsideAir) -> Convection:
-    if air.coefficient == "iso-6946-combined":
-        coefficient = outside_combined()
-    elif air.coefficient == "iso-6946-convection":
-        coefficient = outside_convection(_given(air.wind_m_s))
-    elif air.coefficient == "iso-6946-separate":
-        radiative = radiative_coefficient(air.air_c, _given(air.emissivity))
-        coefficient = outside_convection(_given(air.wind_m_s)) + radiative
-    elif air.coefficient == "thermoxels-original":
-        coefficient = thermoxels_original(_given(air.wind_m_s))
-    else:
-        coefficient = _given(air.coefficient_w_m2k)
-    return Convection(air.patches, coefficient, air.air_c)
 
 
 def _irradiance(sun: Sun, reflectance: float) -> Varying:

@@ -12,17 +12,21 @@ from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.quantities import Bounds
+from thermoxels_ns.fem.quantities import Bounds, Quantity
+from thermoxels_ns.heat.effects import Convection
 from thermoxels_ns.heat.sky import Vector
-from thermoxels_ns.heat.surface_coefficients import HeatFlow
+from thermoxels_ns.heat.surface_coefficients import (
+    HeatFlow,
+    InsideCoefficient,
+    OutsideCoefficient,
+    inside_coefficient,
+    outside_coefficient,
+)
 
 OUTSIDE = ("exterior-*",)
 """Patches that what is outside acts on, unless others are named."""
 INSIDE = ("interior-*",)
 """Patches that the air inside acts on, unless others are named."""
-
-InsideCoefficient = Literal["iso-6946-combined", "iso-6946-separate", "iso-6946-convection"]
-OutsideCoefficient = Literal["iso-6946-combined", "iso-6946-separate", "iso-6946-convection", "thermoxels-original"]
 
 WITH_RADIATION = ("iso-6946-combined", "iso-6946-separate")
 """Coefficients that hold radiation as well."""
@@ -103,6 +107,14 @@ class InsideAir(Section):
     def _check(self) -> None:
         _check_coefficient(self.coefficient, self.coefficient_w_m2k, self.emissivity)
 
+    def convection(self) -> Convection:
+        """What it does to the body."""
+        coefficient: Quantity | None = self.coefficient_w_m2k
+        if self.coefficient is not None:
+            coefficient = inside_coefficient(self.coefficient, self.heat_flow, self.air_c, self.emissivity or 0.0)
+        assert coefficient is not None, "checked when the section was made"
+        return Convection(self.patches, coefficient, self.air_c)
+
 
 @dataclass(frozen=True)
 class OutsideAir(Section):
@@ -127,6 +139,15 @@ class OutsideAir(Section):
         _check_coefficient(self.coefficient, self.coefficient_w_m2k, self.emissivity)
         windy = self.coefficient not in (None, "iso-6946-combined")
         _check_only_if("wind_m_s", self.wind_m_s, windy, self.coefficient or "coefficient_w_m2k")
+
+    def convection(self) -> Convection:
+        """What it does to the body."""
+        coefficient = self.coefficient_w_m2k
+        if self.coefficient is not None:
+            wind, emissivity = self.wind_m_s or 0.0, self.emissivity or 0.0
+            coefficient = outside_coefficient(self.coefficient, wind, self.air_c, emissivity)
+        assert coefficient is not None, "checked when the section was made"
+        return Convection(self.patches, coefficient, self.air_c)
 
 
 @dataclass(frozen=True)
