@@ -51,7 +51,8 @@ def test_what_is_not_named_is_not_built() -> None:
         (OutsideAir(0.0, "iso-6946-combined"), 25.0),
         (CONVECTION, 20.0),
         (OutsideAir(0.0, "iso-6946-separate", wind_m_s=4.0, emissivity=0.9), 20.0 + 0.9 * 4.6223),
-        (OutsideAir(0.0, "thermoxels-original", wind_m_s=5.56), 18.6 * 5.56**0.605),
+        (OutsideAir(0.0, "thermoxels-original", wind_m_s=0.0), 0.0),
+        (OutsideAir(0.0, "thermoxels-original", wind_m_s=5.56), 52.51),
     ],
 )
 def test_outside_air(air: OutsideAir, h: float) -> None:
@@ -65,6 +66,7 @@ def test_outside_air(air: OutsideAir, h: float) -> None:
     [
         (InsideAir(20.0, coefficient_w_m2k=8.0), [8.0, 8.0, 8.0]),
         (InsideAir(20.0, "iso-6946-combined"), [1 / 0.10, 1 / 0.13, 1 / 0.17]),
+        (InsideAir(20.0, "iso-6946-combined", heat_flow="out-of-body"), [1 / 0.17, 1 / 0.13, 1 / 0.10]),
         (InsideAir(20.0, "iso-6946-convection"), [5.0, 2.5, 0.7]),
         (InsideAir(20.0, "iso-6946-convection", heat_flow="out-of-body"), [0.7, 2.5, 5.0]),
         (InsideAir(10.0, "iso-6946-separate", emissivity=1.0), [10.149, 7.649, 5.849]),

@@ -165,7 +165,7 @@ SUNNY = (
         ),
         (
             SMALL.replace("concrete", "{conductivity_w_mk: 0, density_kg_m3: 1, specific_heat_j_kgk: 1}"),
-            r"mine.yaml: materials: conductivity_w_mk: expected a finite number above 0, got 0",
+            r"mine.yaml: materials: \*: conductivity_w_mk: expected a finite number above 0, got 0",
         ),
         (SMALL + "initial: warm\n", "mine.yaml: initial: expected photographs, or a mapping .*, got 'warm'"),
         (SMALL + "initial: {temperature_k: 300}\n", "initial: .* got temperature_k. Did you mean temperature_c"),
@@ -185,7 +185,6 @@ SUNNY = (
         (AIR.replace("air_c: 0", "air_c:"), "outside_air: air_c: expected a number, got nothing"),
         (AIR.replace("iso-6946-combined", "windy"), "outside_air: coefficient: expected one of iso-6946-combined"),
         (AIR.replace("iso-6946-combined", "[]"), r"outside_air: coefficient: expected one of .*, got \[\]"),
-        (AIR.replace("combined", "convection"), "mine.yaml: outside_air: wind_m_s: expected a number, because"),
         (AIR.replace("air_c: 0", "air_c: 0, patches: roof"), r"patches: expected a list of names in square brackets"),
         (
             AIR.replace("air_c: 0", "air_c: 0, patches: [1]"),
@@ -205,16 +204,9 @@ SUNNY = (
         (SMALL + "up: [0, 1]\n", r"mine.yaml: up: expected 3 numbers in square brackets, got \[0, 1\]"),
         (SMALL + "up: [0, 0, one]\n", "mine.yaml: up: expected a number, got 'one'"),
         (SMALL + "up: [0, 0, 0]\n", "mine.yaml: up: expected a direction"),
-        (
-            SUNNY.replace("+02:00", ""),
-            r"sun: start: expected a date and time with a time zone, got 2025-06-21T12:00:00",
-        ),
         (SUNNY.replace("T12:00:00+02:00", ""), "sun: start: expected a date and a time, got 2025-06-21. Write"),
         (SUNNY.replace("2025-06-21", "2025-13-21"), "mine.yaml: expected a yaml file with dates that exist, got month"),
         (SUNNY.replace("2025-06-21T12:00:00+02:00", "noon"), "sun: start: expected a date and a time, got 'noon'"),
-        (SUNNY.replace("longitude_deg: 8", "longitude_deg: 200"), "sun: longitude_deg: .* at most 180"),
-        (SUNNY.replace(", north: [0, 1, 0]", ""), "sun: start: expected north beside it"),
-        (SMALL + "surfaces: [{absorptivity: 0.5}]\n", "mine.yaml: surfaces: absorptivity: expected sun beside it"),
         (
             SMALL.replace("steady: true", "time: {steps: 1}"),
             "mine.yaml: time: expected the key step_seconds, got steps. Add step_seconds",
@@ -226,10 +218,6 @@ SUNNY = (
         ),
         (SMALL.replace("steady: true", "time: {hours: 1}"), "mine.yaml: time: expected keys out of .* got hours"),
         (SMALL.replace("steady: true", "time: {steps: 1.5, step_seconds: 1}"), "time: steps: expected a whole number"),
-        (
-            SMALL.replace("steady: true", "time: {steps: 0, step_seconds: 1}"),
-            "mine.yaml: time: steps: expected a whole",
-        ),
         (
             SMALL.replace("steady: true", "time: {duration_s: 0}"),
             "mine.yaml: time: duration_s: expected a finite number",

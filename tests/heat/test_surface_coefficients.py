@@ -17,26 +17,6 @@ def at(coefficient: Varying, *normals: tuple[float, float, float], up=Z_UP) -> l
     return np.asarray(coefficient.function(places, 0.0)).tolist()
 
 
-def test_combined_inside_by_orientation() -> None:
-    """ISO 6946: Rsi 0.10 for heat that flows up (into the ceiling of a heated room), 0.13 sideways, 0.17 down."""
-    assert at(inside_coefficient("iso-6946-combined"), CEILING, WALL, FLOOR) == [1 / 0.10, 1 / 0.13, 1 / 0.17]
-    # Heat that leaves the body flows up from the floor.
-    assert at(inside_coefficient("iso-6946-combined", "out-of-body"), CEILING, WALL, FLOOR) == [
-        1 / 0.17,
-        1 / 0.13,
-        1 / 0.10,
-    ]
-
-
-def test_combined_outside() -> None:
-    assert outside_coefficient("iso-6946-combined") == 25.0
-
-
-def test_convection_alone() -> None:
-    assert at(inside_coefficient("iso-6946-convection"), CEILING, WALL, FLOOR) == [5.0, 2.5, 0.7]
-    assert [outside_coefficient("iso-6946-convection", wind) for wind in (0.0, 1.0, 4.0)] == [4.0, 8.0, 20.0]
-
-
 @pytest.mark.parametrize(
     ("mean_c", "published"), [(-10.0, 4.13), (0.0, 4.62), (10.0, 5.15), (20.0, 5.71), (30.0, 6.32)]
 )
@@ -56,12 +36,6 @@ def test_separate_parts_make_up_the_combined_resistances() -> None:
     inside = at(inside_coefficient("iso-6946-separate", mean_c=20.0, emissivity=0.9), CEILING, WALL, FLOOR)
     assert [round(1.0 / value, 2) for value in inside] == [0.10, 0.13, 0.17]
     assert round(1.0 / outside_coefficient("iso-6946-separate", 4.0, 0.0, 0.9), 2) == 0.04
-
-
-def test_the_original_code_s_coefficient() -> None:
-    assert outside_coefficient("thermoxels-original", 0.0) == 0.0
-    assert outside_coefficient("thermoxels-original", 1.0) == 18.6
-    assert outside_coefficient("thermoxels-original", 5.56) == pytest.approx(52.51, abs=0.01)
 
 
 def test_horizontal_reaches_to_30_degrees() -> None:

@@ -57,8 +57,8 @@ class Material:
 
 
 @dataclass(frozen=True)
-class MaterialRow:
-    """A row of the table: design values for conditions as in a building."""
+class MaterialFigures:
+    """A material in a file, whose name is the key before it."""
 
     conductivity_w_mk: float
     """Thermal conductivity, [W / (m K)], above 0."""
@@ -66,14 +66,9 @@ class MaterialRow:
     """Mass density, [kg / m3], above 0."""
     specific_heat_j_kgk: float
     """Specific heat capacity, [J / (kg K)], above 0."""
-    source: str
-    """Where the figures come from."""
 
     def __post_init__(self) -> None:
-        self.named("row")
-        if not self.source.strip():
-            remedy = "Write where the figures come from."
-            raise HeatError("source", expected="a text", got=repr(self.source), remedy=remedy)
+        self.named("it")
 
     def named(self, name: str) -> Material:
         """Make the material.
@@ -82,6 +77,20 @@ class MaterialRow:
             HeatError: A figure is not above 0.
         """
         return Material(name, self.conductivity_w_mk, self.density_kg_m3, self.specific_heat_j_kgk)
+
+
+@dataclass(frozen=True)
+class MaterialRow(MaterialFigures):
+    """A row of the table: design values for conditions as in a building."""
+
+    source: str
+    """Where the figures come from."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.source.strip():
+            remedy = "Write where the figures come from."
+            raise HeatError("source", expected="a text", got=repr(self.source), remedy=remedy)
 
 
 @raising(HeatError)

@@ -24,22 +24,13 @@ from thermoxels_ns.core.yaml_records import (
     wrong,
 )
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
-from thermoxels_ns.heat.materials import Material, material
+from thermoxels_ns.heat.materials import Material, MaterialFigures, material
 from thermoxels_ns.heat.scene import HeatScene
 
 _OWN_KEYS = ("materials", "initial", "steady", "time")
 _FIELDS = tuple(
     field.name for field in dataclasses.fields(HeatScene) if field.name not in ("materials", "initial_c", "time")
 )
-
-
-@dataclasses.dataclass(frozen=True)
-class _Inline:
-    """A material given by its figures."""
-
-    conductivity_w_mk: float
-    density_kg_m3: float
-    specific_heat_j_kgk: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,8 +93,7 @@ def _materials(file: str, content: dict[str, Any]) -> dict[str, Material]:
             if isinstance(entry, str):
                 made_of[region] = material(entry)
                 continue
-            figures = as_record(region, entry, _Inline)
-            made_of[region] = Material(region, **dataclasses.asdict(figures))
+            made_of[region] = as_record(region, entry, MaterialFigures).named(region)
         except ThermoxelsError as problem:
             raise HeatError(f"{name}: {problem}") from problem
     return made_of
