@@ -1,7 +1,6 @@
-"""The command ``ns-export thermoxels-mesh``: a trained model to a mesh with temperatures and a heat computation.
+"""The command ``ns-export thermoxels-mesh``: a trained model to a mesh and its heat."""
 
-Only light imports at the top: nerfstudio's exporter reads this module for ``--help`` of every subcommand.
-"""
+# Only light imports at the top: nerfstudio's exporter reads this module for --help of every subcommand.
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""Everything a mesh export can be told, and how pictures look at the mesh.
+"""Options of a mesh export, and how its pictures look at the mesh."""
 
-Imports at the top are light: nerfstudio's exporter reads the options for ``--help`` of every subcommand.
-"""
+# Only light imports at the top: nerfstudio's exporter reads this module for --help of every subcommand.
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""From a trained field to the files of an export: mesh, heat series, pictures and summary.
+"""From a trained field to the files of an export."""
 
-Knows nothing of nerfstudio. Imports at the top are light; the mesher, the solver and pyvista load when they run.
-"""
+# Only light imports at the top: the mesher, the solver and pyvista load when they run.
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""The command ``thermoxels heat``: put a heat scene around an exported mesh and answer what people ask of it.
+"""The command ``thermoxels heat``: heat flow through an exported mesh in a scene."""
 
-Only light imports at the top, so that ``thermoxels --help`` answers at once.
-"""
+# Only light imports at the top, so that --help answers at once.
 
 from __future__ import annotations
 

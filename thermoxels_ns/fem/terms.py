@@ -1,8 +1,4 @@
-"""The kinds of terms that the heat equation can have besides conduction and storage.
-
-Effects are turned into these, and the solver knows these only. They are data: how they become vectors and matrices on
-the nodes stands in `forms.py`. The effects that a scene may name stand in `heat/effects.py`.
-"""
+"""Terms of the heat equation besides conduction and storage, and the effects that add them."""
 
 from __future__ import annotations
 

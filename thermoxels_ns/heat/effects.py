@@ -1,8 +1,4 @@
-"""What a scene may call for: each effect is checked SI input that knows its own terms and nothing of the solver.
-
-Temperatures are given in degrees Celsius; a positive heat flux goes into the body. A value is a number or a `Varying`,
-which is asked at the centroids of boundary triangles (sources: of tetrahedra; fixed temperatures: at nodes).
-"""
+"""Effects that a scene may name: convection, radiation, sunlight, sources and others."""
 
 from __future__ import annotations
 
@@ -21,7 +17,12 @@ _ABSOLUTE_ZERO_C = -ZERO_CELSIUS_K
 
 @dataclass(frozen=True)
 class SurfaceEffect(Effect):
-    """What acts on patches of the boundary."""
+    """What acts on patches of the boundary.
+
+    Of all effects, temperatures are in degrees Celsius, and a positive heat flux goes into the body. A value is a
+    number or a `Varying`, which is asked at the centroids of boundary triangles (sources: of tetrahedra; fixed
+    temperatures: at nodes).
+    """
 
     patches: tuple[str, ...]
     """Names of boundary patches, or patterns such as exterior-*; * is the whole boundary."""

@@ -1,9 +1,4 @@
-"""How much heat each effect of a problem can bring to each node, before anything is solved.
-
-Exchange counts at the nodes, as in the solvers' default. Quantities that change with time are asked for at given times;
-between them they may go beyond by as much as they change from one of them to the next. Where these times are too far
-apart to say how a quantity changes, such as every noon of a year for the sun, it may be all that it is allowed to be.
-"""
+"""Bounds of the heat that each effect can bring to each node."""
 
 from __future__ import annotations
 
@@ -60,7 +55,13 @@ class _Exchange:
 
 
 class NodalHeat:
-    """What one effect can do to the nodes."""
+    """What one effect can do to the nodes.
+
+    Exchange counts at the nodes, as in the solvers' default. Quantities that change with time are asked for at given
+    times; between them they may go beyond by as much as they change from one of them to the next. Where these times are
+    too far apart to say how a quantity changes, such as every noon of a year for the sun, it may be all that it is
+    allowed to be.
+    """
 
     def __init__(
         self, effect: str, terms: Sequence[Term], space: LinearSpace, times_s: Vector, *, between: bool

@@ -1,4 +1,4 @@
-"""Everything that a run of ``thermoxels heat`` finds out, and the way from a scene on a mesh to it."""
+"""The course and the result of a heat run: a scene on a mesh."""
 
 from __future__ import annotations
 

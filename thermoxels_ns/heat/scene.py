@@ -1,4 +1,4 @@
-"""A heat scene: what a body is made of, what is around it, and for how long; it becomes a problem on a mesh."""
+"""A heat scene: materials, surroundings and time; it becomes a problem on a mesh."""
 
 from __future__ import annotations
 

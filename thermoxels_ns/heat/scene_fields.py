@@ -1,7 +1,4 @@
-"""The sections of a heat scene: what is around a body, in fields whose names carry their units.
-
-Each section is checked when it is made. What acts on the body follows from them in `heat_scene.py`.
-"""
+"""The sections of a heat scene, checked when they are made."""
 
 from __future__ import annotations
 
@@ -61,7 +58,7 @@ def field_bounds(name: str) -> Bounds:
 
 
 class Section:
-    """Checks the fields of a section: numbers by their names, choices, and names of patches."""
+    """Checks the fields of a section: numbers by the units in their names, choices, and names of patches."""
 
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self))

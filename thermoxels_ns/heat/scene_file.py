@@ -1,9 +1,4 @@
-"""Heat scenes from yaml files; ``configs/scene-all-effects.yaml`` explains every key.
-
-A file has the fields of `HeatScene` as keys, with three differences: materials are names of the table or three figures,
-the start is ``initial: photographs`` or ``initial: {temperature_c: 15}``, and a scene has either ``steady: true`` or
-``time:`` with the fields of `TimeSteps` or of `AdaptiveSteps`.
-"""
+"""Heat scenes from yaml files; ``configs/scene-all-effects.yaml`` explains every key."""
 
 from __future__ import annotations
 
@@ -48,6 +43,10 @@ def heat_scene_names() -> list[str]:
 @raising(HeatError)
 def load_heat_scene(name: Path | str) -> HeatScene:
     """Read a heat scene.
+
+    A file has the fields of `HeatScene` as keys, with three differences: materials are names of the table or three
+    figures, the start is ``initial: photographs`` or ``initial: {temperature_c: 15}``, and a scene has either
+    ``steady: true`` or ``time:`` with the fields of `TimeSteps` or of `AdaptiveSteps`.
 
     Args:
         name: The path of a yaml file (recognised by its suffix), or the name of a scene that the package brings, such

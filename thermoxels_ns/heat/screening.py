@@ -1,19 +1,4 @@
-"""Which effects of a problem matter: those that cannot change the answer by more than a tolerance are left out.
-
-Without an effect, the temperatures differ by w with M w' + (K + R) w + radiation's own damping = f, where f is the heat
-that the effect would bring, and w = 0 at the start. K has no entry above 0 off its diagonal (no obtuse angles), masses
-and exchange are lumped: so whatever z >= 0 fulfils M z' + (K + R) z >= |f| at every node is a bound, |w| <= z (discrete
-maximum principle; it holds for backward Euler at any step length). Two such z are tried, F being the largest |f|:
-
-- z rises at the rate max F / M towards the ceiling max F / r, r being the exchange that is kept at the node (in a
-  steady state there is the ceiling alone: the flux over the coefficient, q / h);
-- from one implicit step over the whole duration t, (M / t + K) v = F: z = v + t max (F - K v) / M, which is 2 max v if
-  v is exact. It knows how far heat spreads into the body in that time (the Fourier number).
-
-Exchange brings at most its coefficient times the largest difference between its surroundings and the range that
-temperatures can reach, which follows from the start, all surroundings, and the bound of all fluxes and sources.
-Where angles are obtuse, which the principle does not allow for, the range is widened and bounds are doubled.
-"""
+"""Leave out effects that can change no temperature by more than a tolerance."""
 
 from __future__ import annotations
 
@@ -101,6 +86,21 @@ class _Bound:
 
 def screen(problem: HeatProblem, time: TimeSteps | AdaptiveSteps | None, tolerance_k: float) -> Screening:
     """Leave out what cannot matter.
+
+    Without an effect, the temperatures differ by w with M w' + (K + R) w + radiation's own damping = f, where f is the
+    heat that the effect would bring, and w = 0 at the start. K has no entry above 0 off its diagonal (no obtuse
+    angles), masses and exchange are lumped: so whatever z >= 0 fulfils M z' + (K + R) z >= |f| at every node is a
+    bound, |w| <= z (discrete maximum principle; it holds for backward Euler at any step length). Two such z are tried,
+    F being the largest |f|:
+
+    - z rises at the rate max F / M towards the ceiling max F / r, r being the exchange that is kept at the node (in a
+      steady state there is the ceiling alone: the flux over the coefficient, q / h);
+    - from one implicit step over the whole duration t, (M / t + K) v = F: z = v + t max (F - K v) / M, which is 2 max v
+      if v is exact. It knows how far heat spreads into the body in that time (the Fourier number).
+
+    Exchange brings at most its coefficient times the largest difference between its surroundings and the range that
+    temperatures can reach, which follows from the start, all surroundings, and the bound of all fluxes and sources.
+    Where angles are obtuse, which the principle does not allow for, the range is widened and bounds are doubled.
 
     Args:
         problem: The problem as the scene has it.

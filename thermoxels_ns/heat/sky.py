@@ -1,4 +1,4 @@
-"""Long-wave exchange with the sky and the ground: how warm the sky seems, and how much of it a surface sees."""
+"""Long-wave exchange with the sky and the ground."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Solve a heat problem with its own steps on the mesh as it is, or to a tolerance."""
+"""Solve a problem with its own steps on its mesh, or to a tolerance."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Sunlight on surfaces: where the sun stands, how strong it is, and what reaches a facet.
-
-No surface shades another: what other parts of the body or neighbours hide is counted as sunlit.
-"""
+"""Sunlight on surfaces: where the sun stands and what reaches a facet."""
 
 from __future__ import annotations
 
@@ -167,7 +164,7 @@ def facet_irradiance(
     sunlight: Sunlight,
     ground_reflectance: float = 0.0,
 ) -> npt.NDArray[np.float64]:
-    """Compute the sunlight that falls on facets.
+    """Compute the sunlight that falls on facets. None shades another.
 
     Direct light by the cosine of its angle; diffuse light alike from all of the sky, by (1 + cos tilt) / 2; what the
     ground reflects, alike to all sides, by (1 - cos tilt) / 2 (Liu and Jordan 1963).

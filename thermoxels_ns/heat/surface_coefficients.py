@@ -1,9 +1,4 @@
-"""Heat transfer coefficients of surfaces in air: by ISO 6946, and that of the original Thermoxels code.
-
-ISO 6946 tells three directions of the heat flow apart, because warm air rises; "horizontal" is up to 30 degrees off.
-Combined coefficients, 1 / Rsi and 1 / Rse, hold convection and radiation between surfaces of emissivity 0.9; separate
-ones are convection alone, to which radiation is added.
-"""
+"""Heat transfer coefficients of surfaces in air, by ISO 6946 or the original code."""
 
 from __future__ import annotations
 
@@ -41,6 +36,10 @@ def inside_coefficient(
     name: InsideCoefficient, heat_flow: HeatFlow = "into-body", mean_c: float = 20.0, emissivity: float = 0.9
 ) -> Varying:
     """Make the coefficient of surfaces in a room by their orientation, for `Convection.coefficient_w_m2k`.
+
+    ISO 6946 tells three directions of the heat flow apart, because warm air rises; "horizontal" is up to 30 degrees
+    off. Combined coefficients hold convection and radiation between surfaces of emissivity 0.9; separate ones are
+    convection alone, to which radiation is added.
 
     Args:
         name: 1 / Rsi (combined), hci + hr (separate) or hci (convection).

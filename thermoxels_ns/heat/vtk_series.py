@@ -1,4 +1,4 @@
-"""A heat computation as files: one .vtu per output time and a .pvd that lists them."""
+"""A heat computation as .vtu files and the .pvd that lists them."""
 
 from __future__ import annotations
 

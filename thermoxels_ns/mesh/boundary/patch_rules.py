@@ -1,7 +1,4 @@
-"""A user's rules for patches and regions, and the yaml file that they stand in.
-
-``configs/patches-example.yaml`` explains every key.
-"""
+"""A user's rules for patches and regions; ``configs/patches-example.yaml`` explains every key."""
 
 from __future__ import annotations
 
