@@ -25,7 +25,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from thermoxels_ns.commands.demo_commands import run_command
+from thermoxels_ns.commands.installed_commands import run_command
 from thermoxels_ns.synthetic.random_scene import FAMILIES
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene

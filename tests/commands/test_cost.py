@@ -15,12 +15,14 @@ import pytest
 from rich.console import Console
 
 from thermoxels_ns import cli
-from thermoxels_ns.commands.cost import Cost, planned_settings, run_cost
-from thermoxels_ns.commands.cost_runs import (
+from thermoxels_ns.commands.cost import (
     FIGURES,
+    Cost,
     parse_setting,
+    planned_settings,
     read_evaluation,
     read_runs,
+    run_cost,
     scene_fingerprint,
     training_options,
     training_seconds,
@@ -63,7 +65,7 @@ def commands(tmp_path, monkeypatch):
     """Fake ns-train and ns-eval; gives a function that replaces one, and one that lists what was called."""
     folder = tmp_path / "bin"
     folder.mkdir()
-    monkeypatch.setattr("thermoxels_ns.commands.cost_process.sys.executable", str(folder / "python"))
+    monkeypatch.setattr("thermoxels_ns.commands.installed_commands.sys.executable", str(folder / "python"))
 
     def write(name: str, body: str) -> None:
         path = folder / name

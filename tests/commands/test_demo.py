@@ -18,10 +18,10 @@ from rich.console import Console
 from thermoxels_ns import cli
 from thermoxels_ns.commands import demo
 from thermoxels_ns.commands.demo import Demo, run_demo
-from thermoxels_ns.commands.demo_commands import command_line, run_command
 from thermoxels_ns.commands.demo_results import Target, read_results
 from thermoxels_ns.commands.export import ExportThermoxelsMesh
 from thermoxels_ns.commands.heat import Heat
+from thermoxels_ns.commands.installed_commands import command_line, run_command
 from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 
 PYTHON = sys.executable
@@ -70,7 +70,7 @@ def fake_commands(tmp_path, monkeypatch):
     """A folder of commands beside a Python of its own; gives a function that writes one."""
     folder = tmp_path / "bin"
     folder.mkdir()
-    monkeypatch.setattr("thermoxels_ns.commands.demo_commands.sys.executable", str(folder / "python"))
+    monkeypatch.setattr("thermoxels_ns.commands.installed_commands.sys.executable", str(folder / "python"))
 
     def write(name: str, body: str) -> None:
         path = folder / name

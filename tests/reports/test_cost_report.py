@@ -10,9 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from thermoxels_ns.commands.cost_runs import FIGURES, CostRun, CostSetting
 from thermoxels_ns.reports.cost_report import (
+    FIGURES,
     CostRow,
+    CostRun,
+    CostSetting,
     Targets,
     cheapest,
     draw_plot,

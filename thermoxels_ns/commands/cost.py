@@ -1,15 +1,17 @@
-"""The command ``thermoxels cost``: what accuracy costs on a scene, from real training runs.
-
-Only light imports at the top, so that ``thermoxels --help`` answers at once.
-"""
+"""The command ``thermoxels cost``: what accuracy costs on a scene, from real training runs."""
 
 from __future__ import annotations
 
+import csv
+import hashlib
+import json
 import math
 import os
+import re
 import shlex
+import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,18 +19,30 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from thermoxels_ns import __version__
+from thermoxels_ns.commands.installed_commands import ProcessCost, Watch, run_command
 from thermoxels_ns.core.checks import check_positive, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError
+from thermoxels_ns.reports.cost_report import (
+    FIGURES,
+    CostRun,
+    CostSetting,
+    Targets,
+    draw_plot,
+    markdown_table,
+    median_rows,
+    verdict,
+    write_csv,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from thermoxels_ns.commands.cost_process import Watch
-    from thermoxels_ns.commands.cost_runs import Bench, CostRun, CostSetting
-    from thermoxels_ns.reports.cost_report import Targets
-
 _RUNS, _TABLE, _PLOT, _PAGE = "runs.csv", "cost.csv", "cost.png", "cost.md"
 _QUIET_S = 60.0
+_EVALUATED = tuple(FIGURES)[3:]
+_KEYS = ("setting", "repeat", "scene", "version", "training")
+_GROUPS = ("density", "sh", "temperature", "background", "thermal_offset")
 
 
 @dataclass
@@ -86,8 +100,6 @@ class Cost:
 
 def run_cost(cost: Cost, console: Console) -> None:
     """Measure and report, see `Cost`."""
-    from thermoxels_ns.commands.cost_runs import Bench, read_runs, write_runs
-
     targets = _targets(cost)
     settings, baseline = planned_settings(cost)
     if cost.repeats < 1:
@@ -139,8 +151,6 @@ def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
     Raises:
         ThermoxelsError: Nothing is to be trained, a setting is not one, or the baseline is none of them.
     """
-    from thermoxels_ns.commands.cost_runs import CostSetting, parse_setting, training_options
-
     for name in ("methods", "recipes"):
         if not getattr(cost, name):
             raise ThermoxelsError(
@@ -184,8 +194,6 @@ def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
 
 
 def _targets(cost: Cost) -> Targets:
-    from thermoxels_ns.reports.cost_report import Targets
-
     for name in ("target_mae", "target_psnr"):
         value = getattr(cost, name)
         if value is not None:
@@ -229,8 +237,6 @@ def _report(
     console: Console,
 ) -> None:
     """Write and print the table, the plot and which setting will do."""
-    from thermoxels_ns.reports.cost_report import draw_plot, markdown_table, median_rows, verdict, write_csv
-
     rows = median_rows(settings, runs, baseline)
     counts = sorted({row.repeats for row in rows})
     medians = "one run each" if counts == [1] else f"medians of {' or '.join(map(str, counts))} runs"
@@ -305,3 +311,208 @@ class _Display:
             if counts:
                 self._done += 1
                 self._bars.update(self._all, completed=self._done)
+
+
+def parse_setting(text: str) -> tuple[int, int]:
+    """Read ``resolution:steps``.
+
+    Raises:
+        ThermoxelsError: It is something else.
+
+    >>> parse_setting("64:800")
+    (64, 800)
+    """
+    match = re.fullmatch(r"([1-9]\d*):([1-9]\d*)", text)
+    if match is None:
+        raise ThermoxelsError(
+            "settings",
+            expected="voxels and steps, such as 64:800",
+            got=repr(text),
+            remedy="Pass --settings 64:800 128:1500.",
+        )
+    return int(match[1]), int(match[2])
+
+
+def training_options(resolution: int, steps: int) -> list[str]:
+    """Options of ns-train for a final resolution and a number of steps.
+
+    Raises:
+        ThermoxelsError: There is no schedule for them.
+    """
+    from thermoxels_ns.training.schedule import schedule_for
+
+    schedule = schedule_for(resolution, steps)
+    words = ["--max-num-iterations", str(schedule.steps)]
+    for group in _GROUPS:
+        words += [f"--optimizers.{group}.scheduler.max-steps", str(schedule.steps)]
+    for name in ("resolutions", "refine_at", "prune_at", "thin_at", "distortion_ramp"):
+        words += [f"--pipeline.model.{name.replace('_', '-')}", *map(str, getattr(schedule, name))]
+    words += ["--pipeline.model.view-dependence-from", str(schedule.view_dependence_from)]
+    return words
+
+
+def scene_fingerprint(scene: Path) -> str:
+    """Tell scenes apart: names and sizes of all files, and the contents of the json files beside the photographs."""
+    digest = hashlib.sha256()
+    for path in sorted(path for path in scene.rglob("*") if path.is_file()):
+        digest.update(f"{path.relative_to(scene).as_posix()} {path.stat().st_size}\n".encode())
+        if path.parent == scene and path.suffix == ".json":
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def read_runs(path: Path) -> list[CostRun]:
+    """Read the finished runs; none if there is no file yet.
+
+    Raises:
+        ThermoxelsError: The file is not one that `write_runs` made.
+    """
+    if not path.is_file():
+        return []
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file, strict=True)
+            if missing := {*_KEYS, *FIGURES} - set(reader.fieldnames or ()):
+                raise ValueError(f"no column {', '.join(sorted(missing))}")
+            rows = list(reader)
+        return [
+            CostRun(
+                **{key: row[key] for key in _KEYS if key != "repeat"},
+                repeat=int(row["repeat"]),
+                figures={name: float(row[name] or "nan") for name in FIGURES},
+            )
+            for row in rows
+        ]
+    except (OSError, KeyError, TypeError, ValueError, csv.Error) as problem:
+        raise ThermoxelsError(
+            str(path),
+            expected="the finished runs of an earlier start",
+            got=f"{type(problem).__name__}: {problem}",
+            remedy="Remove the file to measure again, or choose another --output-dir.",
+        ) from problem
+
+
+def write_runs(path: Path, runs: Iterable[CostRun]) -> None:
+    """Write the finished runs; an interrupted write leaves the old file."""
+    with replace_when_done(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow([*_KEYS, *FIGURES])
+        for run in runs:
+            figures = [run.figures[name] for name in FIGURES]
+            writer.writerow([getattr(run, key) for key in _KEYS] + ["" if math.isnan(v) else repr(v) for v in figures])
+
+
+class Bench:
+    """Runs settings on one scene, each in a folder of its own that goes when it is done."""
+
+    def __init__(self, scene: Path, folder: Path, keep_models: bool = False) -> None:
+        """Remember where things go.
+
+        Args:
+            scene: The scene folder.
+            folder: Where logs, figures and models go.
+            keep_models: Leave the trained models in ``folder/models``.
+
+        Raises:
+            SceneError: There is no such scene folder.
+        """
+        if not scene.is_dir():
+            raise SceneError("scene", expected="a scene folder", got=f"none at {scene}", remedy="Correct the path.")
+        self.scene = scene
+        self.fingerprint = scene_fingerprint(scene)
+        self._folder = folder
+        self._keep = keep_models
+
+    def planned(self, setting: CostSetting, repeat: int) -> CostRun:
+        """The run as it will be remembered, still without figures."""
+        return CostRun(setting.name, repeat, self.fingerprint, __version__, setting.training, {})
+
+    def train(self, setting: CostSetting, name: str, watch: Watch) -> tuple[Path, ProcessCost]:
+        """Train a setting anew.
+
+        Args:
+            setting: How.
+            name: Of the run's folder and log.
+            watch: Called now and then.
+
+        Returns:
+            The run's folder, as nerfstudio makes it, and what the command took.
+        """
+        models = writable_folder(self._folder / "models")
+        shutil.rmtree(models / name, ignore_errors=True)
+        words = [
+            *("ns-train", setting.method, "--data", str(self.scene), "--output-dir", str(models)),
+            *("--experiment-name", name, "--timestamp", "run", "--vis", "tensorboard"),
+            # One line every fifty steps instead of a block that is drawn over and over.
+            *("--logging.steps-per-log", "50", "--logging.local-writer.max-log-size", "0"),
+            *("--logging.profiler", "none", *setting.options),
+        ]
+        cost = run_command(words, self._log(name, "train"), watch=watch)
+        return models / name / setting.method / "run", cost
+
+    def measure(self, setting: CostSetting, repeat: int, watch: Watch) -> CostRun:
+        """Train and evaluate a setting.
+
+        Raises:
+            ThermoxelsError: A command failed, or did not write what it should.
+        """
+        name = f"{setting.file_name}-{repeat}"
+        try:
+            run_folder, cost = self.train(setting, name, watch)
+            figures = {
+                "seconds": cost.seconds,
+                "training_seconds": training_seconds(run_folder),
+                "peak_memory_gb": cost.peak_memory_gb,
+            }
+            output = writable_folder(self._folder / "eval") / f"{name}.json"
+            words = ["ns-eval", "--load-config", str(run_folder / "config.yml"), "--output-path", str(output)]
+            run_command(words, self._log(name, "eval"), watch=lambda _: watch(None))
+            figures |= read_evaluation(output)
+        finally:
+            if not self._keep:
+                self.discard(name)
+        planned = self.planned(setting, repeat)
+        return CostRun(*planned.key, figures=figures)
+
+    def discard(self, name: str) -> None:
+        """Remove a run's model."""
+        shutil.rmtree(self._folder / "models" / name, ignore_errors=True)
+
+    def _log(self, name: str, what: str) -> Path:
+        return writable_folder(self._folder / "logs") / f"{name}-{what}.log"
+
+
+def training_seconds(run_folder: Path) -> float:
+    """Seconds from the start of nerfstudio's training loop, when it writes its transform, to the last checkpoint.
+
+    Raises:
+        ThermoxelsError: The run has not written them.
+    """
+    start = run_folder / "dataparser_transforms.json"
+    checkpoints = sorted((run_folder / "nerfstudio_models").glob("step-*.ckpt"))
+    if not (start.is_file() and checkpoints):
+        raise ThermoxelsError(
+            str(run_folder),
+            expected="dataparser_transforms.json and a checkpoint of a finished run",
+            got="a folder without them",
+            remedy="Look into the run's log.",
+        )
+    return checkpoints[-1].stat().st_mtime - start.stat().st_mtime
+
+
+def read_evaluation(path: Path) -> dict[str, float]:
+    """The figures that ns-eval wrote; NaN for those that the scene or the method does not have.
+
+    Raises:
+        ThermoxelsError: The file is missing or not ns-eval's.
+    """
+    try:
+        results = json.loads(path.read_text(encoding="utf-8"))["results"]
+        return {name: float(results.get(name, math.nan)) for name in _EVALUATED}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as problem:
+        raise ThermoxelsError(
+            str(path),
+            expected="the results of ns-eval",
+            got=f"{type(problem).__name__}: {problem}",
+            remedy="Start the command again; finished runs are kept.",
+        ) from problem

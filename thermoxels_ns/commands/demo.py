@@ -81,8 +81,8 @@ class _Steps:
 
 def run_demo(demo: Demo, console: Console) -> None:
     """Run all steps; see `Demo`."""
-    from thermoxels_ns.commands.demo_commands import command_line, run_command
     from thermoxels_ns.commands.demo_results import read_results
+    from thermoxels_ns.commands.installed_commands import command_line, run_command
     from thermoxels_ns.reports.demo_page import build_page
     from thermoxels_ns.reports.page import write_page
     from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
@@ -200,7 +200,7 @@ def assemble_page(
     Raises:
         ThermoxelsError: A picture that a command should have written is missing.
     """
-    from thermoxels_ns.commands.demo_commands import command_line
+    from thermoxels_ns.commands.installed_commands import command_line
     from thermoxels_ns.reports.demo_page import Check, DemoPage, HeldOutView
     from thermoxels_ns.reports.page import Picture, Table
 
@@ -271,7 +271,7 @@ def assemble_page(
 
 def heat_steps(folder: Path, scene: str) -> Iterator[tuple[str, str]]:
     """Commands that lead to a heat report: of a building with walls, of anything else as it was exported."""
-    from thermoxels_ns.commands.demo_commands import command_line
+    from thermoxels_ns.commands.installed_commands import command_line
 
     config = folder / "outputs" / "demo" / "thermoxels" / "run" / "config.yml"
     mesh, weather, said = folder / "export" / "mesh.vtu", "original", "ten windy, sunny minutes"

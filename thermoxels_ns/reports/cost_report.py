@@ -4,18 +4,35 @@ from __future__ import annotations
 
 import csv
 import math
+import re
+import shlex
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from thermoxels_ns.commands.cost_runs import FIGURES, CostRun, CostSetting
 from thermoxels_ns.core.checks import replace_when_done
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+FIGURES: Mapping[str, str] = {
+    "seconds": "wall time of the whole ns-train command, from its start to its end",
+    "training_seconds": "from the first training step to the last checkpoint",
+    "peak_memory_gb": "largest resident memory of the ns-train process, 1e9 bytes",
+    "psnr": "RGB PSNR of the held-out views, dB",
+    "ssim": "RGB SSIM of the held-out views",
+    "thermal_mae_c": "mean absolute temperature error of the held-out views, degrees Celsius",
+    "half_transparent": "share of rays that are neither through nor stopped",
+    "fscore": "surface F-score at 1.5 voxels of the setting's own lattice",
+    "precision": "precision of the same",
+    "recall": "recall of the same",
+    "fscore_128": "surface F-score at 1.5 voxels of a lattice of 128 voxels",
+    "surface_distance_voxels": "mean distance of the surface to the true one, voxels of the setting's own lattice",
+    "surface_distance_m": "the same in metres",
+}
+"""What is measured, by the name of its column."""
 FRONTS = ("thermal_mae_c", "psnr")
 """Figures whose Pareto front against seconds is marked."""
 
@@ -46,6 +63,59 @@ NamedPoint = tuple[str, float, float]
 
 
 @dataclass(frozen=True)
+class CostSetting:
+    """One way to train."""
+
+    name: str
+    """What the user calls it, for instance ``64:800``, ``standard`` or ``standard, recipe paper``."""
+    method: str
+    """Method of ns-train."""
+    options: tuple[str, ...]
+    """Options of ns-train."""
+    work: float = math.inf
+    """Roughly how much there is to do, to find the cheapest before anything ran; infinite if not known."""
+    beside: bool = False
+    """Another method or recipe at the baseline, for comparison."""
+
+    @property
+    def training(self) -> str:
+        """The words that make it what it is, as typed in a shell."""
+        return shlex.join(["ns-train", self.method, *self.options])
+
+    def command(self, scene: Path | str) -> str:
+        """How to train a scene with it, as typed in a shell."""
+        return shlex.join(["ns-train", self.method, "--data", str(scene), *self.options])
+
+    @property
+    def file_name(self) -> str:
+        """The name as part of a path."""
+        return re.sub(r"[^0-9A-Za-z.-]+", "-", self.name)
+
+
+@dataclass(frozen=True)
+class CostRun:
+    """One finished run of a setting."""
+
+    setting: str
+    """Name of the setting."""
+    repeat: int
+    """Number of the run, from 1."""
+    scene: str
+    """Fingerprint of the scene."""
+    version: str
+    """Version of this package."""
+    training: str
+    """The words of ns-train."""
+    figures: Mapping[str, float]
+    """What was measured, by the names in `FIGURES`; NaN where there is nothing to measure."""
+
+    @property
+    def key(self) -> tuple[str, int, str, str, str]:
+        """Two runs with the same key measured the same thing."""
+        return (self.setting, self.repeat, self.scene, self.version, self.training)
+
+
+@dataclass(frozen=True)
 class CostRow:
     """A setting and the medians of its runs."""
 
@@ -54,7 +124,7 @@ class CostRow:
     repeats: int
     """Runs that the medians are of."""
     figures: Mapping[str, float]
-    """Medians by the names in `cost_runs.FIGURES`; NaN where there is nothing to measure."""
+    """Medians by the names in `FIGURES`; NaN where there is nothing to measure."""
     time_ratio: float
     """Median wall time over that of the baseline; NaN if the baseline has none."""
     fronts: frozenset[str]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from thermoxels_ns.commands.cost_process import run_measured
+from thermoxels_ns.commands.installed_commands import run_command
 from thermoxels_ns.core.errors import ThermoxelsError
 
 PYTHON = sys.executable
@@ -21,7 +21,7 @@ def command(tmp_path, monkeypatch):
     """Gives a function that writes a command beside a Python of its own and returns the words to run it."""
     folder = tmp_path / "bin"
     folder.mkdir()
-    monkeypatch.setattr("thermoxels_ns.commands.cost_process.sys.executable", str(folder / "python"))
+    monkeypatch.setattr("thermoxels_ns.commands.installed_commands.sys.executable", str(folder / "python"))
 
     def write(body: str) -> list[str]:
         path = folder / "work"
@@ -33,7 +33,7 @@ def command(tmp_path, monkeypatch):
 
 
 def test_time_is_that_of_the_whole_command(command, tmp_path):
-    assert run_measured(command("time.sleep(0.5)"), tmp_path / "log").seconds >= 0.5
+    assert run_command(command("time.sleep(0.5)"), tmp_path / "log").seconds >= 0.5
 
 
 def test_memory_is_that_of_the_command(command, tmp_path):
@@ -44,10 +44,10 @@ def test_memory_is_that_of_the_command(command, tmp_path):
     command("x = b'1' * int(sys.argv[1]); del x")
     script = (
         "import math, pathlib, sys\n"
-        "from thermoxels_ns.commands.cost_process import run_measured\n"
+        "from thermoxels_ns.commands.installed_commands import run_command\n"
         f"sys.executable = {str(tmp_path / 'bin' / 'python')!r}\n"
         f"log = pathlib.Path({str(tmp_path / 'log')!r})\n"
-        "peak = lambda size: run_measured(['work', str(size)], log).peak_memory_gb\n"
+        "peak = lambda size: run_command(['work', str(size)], log).peak_memory_gb\n"
         "print(peak(200_000_000), peak(600_000_000))\n"
         "large = b'1' * 500_000_000\n"
         "del large\n"
@@ -63,7 +63,7 @@ def test_memory_is_that_of_the_command(command, tmp_path):
 def test_output_is_kept_and_the_watcher_hears_how_far_it_is(command, tmp_path):
     heard: list[float | None] = []
     words = command("print('Step'); print('5 (12.50%)  1 ms'); time.sleep(0.8); print('9 (50.00%)'); time.sleep(0.8)")
-    run_measured([*words, "a b"], tmp_path / "log", heard.append)
+    run_command([*words, "a b"], tmp_path / "log", watch=heard.append)
     assert heard[0] == 0.125 and heard[-1] == 0.5
     assert (tmp_path / "log").read_text().splitlines()[1:] == ["5 (12.50%)  1 ms", "9 (50.00%)"]
 
@@ -71,17 +71,17 @@ def test_output_is_kept_and_the_watcher_hears_how_far_it_is(command, tmp_path):
 def test_a_failed_command_is_told_with_its_last_lines(command, tmp_path):
     words = command("print('first'); print('CUDA?', file=sys.stderr); sys.exit(3)")
     with pytest.raises(ThermoxelsError, match=r"(?s)work: expected exit status 0, got 3.*log.*CUDA\?"):
-        run_measured(words, tmp_path / "log")
+        run_command(words, tmp_path / "log")
 
 
 def test_a_killed_command_is_told(command, tmp_path):
     with pytest.raises(ThermoxelsError, match="got -9"):
-        run_measured(command("os.kill(os.getpid(), 9)"), tmp_path / "log")
+        run_command(command("os.kill(os.getpid(), 9)"), tmp_path / "log")
 
 
 def test_a_missing_command_is_told(tmp_path, command):
     with pytest.raises(ThermoxelsError, match=r"ns-paint: expected a command in"):
-        run_measured(["ns-paint"], tmp_path / "log")
+        run_command(["ns-paint"], tmp_path / "log")
 
 
 def test_an_interrupt_ends_the_command(command, tmp_path):
@@ -96,12 +96,12 @@ def test_an_interrupt_ends_the_command(command, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_measured(words, tmp_path / "log", interrupt)
+        run_command(words, tmp_path / "log", watch=interrupt)
     assert not Path(f"/proc/{(tmp_path / 'pid').read_text()}").exists()
     assert not mark.exists()
 
 
 def test_systems_that_do_not_tell_memory_still_measure_time(command, tmp_path, monkeypatch):
     monkeypatch.delattr("os.wait4")
-    cost = run_measured(command("sys.exit(0)"), tmp_path / "log")
+    cost = run_command(command("sys.exit(0)"), tmp_path / "log")
     assert cost.seconds > 0 and cost.peak_memory_gb != cost.peak_memory_gb

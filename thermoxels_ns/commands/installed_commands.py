@@ -1,0 +1,179 @@
+"""Run the console commands of this installation; show what they say, measure what they take."""
+
+from __future__ import annotations
+
+import codecs
+import math
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from thermoxels_ns.core.errors import ThermoxelsError, explain
+
+if TYPE_CHECKING:
+    # The peak that Linux reports for a process is at least that of the process which started it, so this stays small.
+    from rich.console import Console
+
+_POLL_S = 0.05
+_QUIET_S = 20.0
+_TAIL_BYTES = 4096
+_LAST_LINES = 12
+_DONE = re.compile(rb"^\d+ \((\d+(?:\.\d+)?)%\)", re.MULTILINE)
+# What nerfstudio 1.1 and torch tell their programmers, not their users.
+_SILENCED = ",".join(
+    (
+        "ignore::FutureWarning",
+        "ignore::DeprecationWarning",
+        "ignore:Using a non-tuple sequence:UserWarning",
+        "ignore:Converting a tensor with requires_grad:UserWarning",
+    )
+)
+
+Watch = Callable[[float | None], None]
+"""Called while a command runs with the share of the training that is done, None if it does not say."""
+
+
+@dataclass(frozen=True)
+class ProcessCost:
+    """What a finished process took."""
+
+    seconds: float
+    """Wall time, [s]."""
+    peak_memory_gb: float
+    """Largest resident memory of the process, [1e9 bytes]; NaN where it cannot be told: the system has no `wait4`, or
+    the command stayed smaller than the process that started it."""
+
+
+def command_line(arguments: Sequence[str | Path]) -> str:
+    """Write a command as it is typed in a shell.
+
+    >>> command_line(["ns-train", "thermoxels", "--data", "my scene"])
+    "ns-train thermoxels --data 'my scene'"
+    """
+    return shlex.join(str(argument) for argument in arguments)
+
+
+def run_command(
+    arguments: Sequence[str | Path], log: Path, console: Console | None = None, watch: Watch = lambda _: None
+) -> ProcessCost:
+    """Run a command of this installation with its output in a file, and measure it.
+
+    Args:
+        arguments: The command's name, found beside the running Python, and its arguments.
+        log: File for the output; its folder exists.
+        console: Where the output is shown as it comes, progress bars included; elsewhere than on a terminal a line says
+            now and then that a quiet command still runs. None: it is not shown.
+        watch: Called now and then while it runs.
+
+    Raises:
+        ThermoxelsError: There is no such command, or it failed; the message holds its last lines.
+    """
+    words = [str(argument) for argument in arguments]
+    program = _installed_command(words[0])
+    if console is not None:
+        console.print(f"$ {command_line(words)}", style="bold", markup=False, highlight=False, soft_wrap=True)
+    start = time.monotonic()
+    with log.open("wb") as file:
+        process = subprocess.Popen(
+            [program, *words[1:]],
+            stdin=subprocess.DEVNULL,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            env=_environment(console),
+        )
+    try:
+        peak_memory_gb = _wait(process, log, console, watch, f"... {words[0]} is at work")
+    finally:
+        if process.poll() is None:
+            process.terminate()
+            process.wait()
+    if process.returncode != 0:
+        remedy = f"Its whole output is in {log}; its last lines:"
+        message = explain(words[0], expected="exit status 0", got=process.returncode, remedy=remedy)
+        lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+        raise ThermoxelsError("\n".join([message, *(f"    {line}" for line in lines[-_LAST_LINES:])]))
+    return ProcessCost(time.monotonic() - start, peak_memory_gb)
+
+
+def _installed_command(name: str) -> str:
+    """Path of a command of this installation."""
+    folder = Path(sys.executable).parent
+    program = shutil.which(name, path=str(folder))
+    if program is None:
+        raise ThermoxelsError(
+            name,
+            expected=f"a command in {folder}",
+            got="none",
+            remedy="Install this package and nerfstudio into the environment of this Python.",
+        )
+    return program
+
+
+def _environment(console: Console | None) -> dict[str, str]:
+    """The environment of a command: output at once, without warnings that concern programmers, colours if wanted."""
+    environment = dict(os.environ, PYTHONUNBUFFERED="1", PYTHONIOENCODING="utf-8")
+    environment.setdefault("PYTHONWARNINGS", _SILENCED)
+    if console is not None and console.is_terminal:
+        environment |= {"FORCE_COLOR": "1", "COLUMNS": str(console.width)}
+    return environment
+
+
+def _wait(process: subprocess.Popen[bytes], log: Path, console: Console | None, watch: Watch, quiet: str) -> float:
+    """Show the output and tell the watcher until a process ends; return its peak memory [1e9 bytes]."""
+    start = looked = heard = time.monotonic()
+    decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")  # what has arrived may end within a character
+    with log.open("rb") as output:
+        while True:
+            ended, peak_memory_gb = _ended(process)
+            now = time.monotonic()
+            if console is not None:
+                if arrived := output.read():
+                    heard = now
+                    console.file.write(decoder.decode(arrived))
+                    console.file.flush()
+                elif now - heard > _QUIET_S and not console.is_terminal:
+                    heard = now
+                    console.print(f"{quiet}, {now - start:.0f} s", highlight=False)
+            if ended:
+                return peak_memory_gb
+            if now - looked > 10 * _POLL_S:
+                looked = now
+                watch(_share_done(log))
+            time.sleep(_POLL_S)
+
+
+def _ended(process: subprocess.Popen[bytes]) -> tuple[bool, float]:
+    """Whether a process has ended, and its peak memory [1e9 bytes] then."""
+    wait4 = getattr(os, "wait4", None)  # POSIX; elsewhere memory is not measured
+    if wait4 is None:
+        return process.poll() is not None, math.nan
+    pid, status, usage = wait4(process.pid, os.WNOHANG)
+    if pid != process.pid:
+        return False, math.nan
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if usage.ru_maxrss <= _own_peak_kib():
+        return True, math.nan
+    return True, usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
+
+
+def _own_peak_kib() -> int:
+    """Largest resident memory of this process on Linux, [KiB], the least that it reports for others; else 0."""
+    status = Path("/proc/self/status")
+    found = re.search(r"^VmHWM:\s*(\d+) kB", status.read_text(), re.MULTILINE) if status.is_file() else None
+    return int(found[1]) if found else 0
+
+
+def _share_done(log: Path) -> float | None:
+    """How much of the training is done according to the last line of steps in its log, 0 to 1."""
+    with log.open("rb") as file:
+        file.seek(max(0, log.stat().st_size - _TAIL_BYTES))
+        found = _DONE.findall(file.read())
+    return min(1.0, float(found[-1]) / 100.0) if found else None
