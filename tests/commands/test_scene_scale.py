@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.commands.scene_scale import (
-    UP_ASSUMED,
     SceneScale,
     choose_scale,
     scale_from_known_distance,
@@ -23,8 +22,8 @@ from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
 def test_option_is_taken_as_it_is_and_its_error_is_not_known():
     scale = scale_from_option(2.5)
-    assert (scale.metres_per_unit, scale.standard_error, scale.up) == (2.5, None, UP_ASSUMED)
-    assert "user" in scale.source and "assumed" in scale.up_source
+    assert (scale.metres_per_unit, scale.standard_error) == (2.5, None)
+    assert "user" in scale.source
     assert scale.volume_standard_error(3.0) is None and scale.area_standard_error(3.0) is None
 
 
@@ -95,8 +94,8 @@ def test_scene_file():
     meta = {"metres_per_unit": 0.25, "metres_per_unit_standard_error": 0.01, "up": [0, -3, 4]}
     scale = scale_from_scene_file(meta)
     assert scale is not None
-    assert (scale.metres_per_unit, scale.standard_error, scale.up) == (0.25, 0.01, (0.0, -0.6, 0.8))
-    assert "transforms.json" in scale.source and "transforms.json" in scale.up_source
+    assert (scale.metres_per_unit, scale.standard_error) == (0.25, 0.01)
+    assert "transforms.json" in scale.source and up_from_scene_file(meta) == (0.0, -0.6, 0.8)
     assert scale_from_scene_file({}) is None
     assert scale_from_scene_file({"up": [0, 1, 0]}) is None and up_from_scene_file({"up": [0, 1, 0]}) == (0, 1, 0)
     assert up_from_scene_file({}) is None
@@ -105,38 +104,39 @@ def test_scene_file():
 @pytest.mark.parametrize(
     ("meta", "match"),
     [
-        ({"metres_per_unit": 0}, "other.json: metres_per_unit: expected a finite number above 0, got 0"),
-        ({"metres_per_unit": "1"}, "other.json: metres_per_unit: expected a finite number above 0, got '1'"),
-        ({"metres_per_unit": True}, "other.json: metres_per_unit"),
+        ({"metres_per_unit": 0}, "transforms.json: metres_per_unit: expected a finite number above 0, got 0"),
+        ({"metres_per_unit": "1"}, "transforms.json: metres_per_unit: expected a finite number above 0, got '1'"),
+        ({"metres_per_unit": True}, "transforms.json: metres_per_unit"),
         (
             {"metres_per_unit": 1, "metres_per_unit_standard_error": -1},
             "standard_error: expected .* at least 0, got -1",
         ),
         ({"metres_per_unit": 1, "metres_per_unit_standard_error": [0]}, "standard_error: expected"),
         ({"metres_per_unit_standard_error": 0.1}, "expected 'metres_per_unit' beside it"),
-        ({"metres_per_unit": 1, "up": [0, 0, 0]}, "other.json: up: expected three finite numbers, not all 0"),
-        ({"metres_per_unit": 1, "up": [0, 1]}, "other.json: up"),
-        ({"metres_per_unit": 1, "up": "z"}, "other.json: up"),
-        ({"metres_per_unit": 1, "up": [0, 0, math.nan]}, "other.json: up"),
-        ({"metres_per_unit": 1, "up": [0, 0, True]}, "other.json: up"),
-        ({"metres_per_unit": 1, "up": {"x": 1}}, "other.json: up"),
+        ({"metres_per_unit": 1, "up": [0, 0, 0]}, "transforms.json: up: expected three finite numbers, not all 0"),
+        ({"metres_per_unit": 1, "up": [0, 1]}, "transforms.json: up"),
+        ({"metres_per_unit": 1, "up": "z"}, "transforms.json: up"),
+        ({"metres_per_unit": 1, "up": [0, 0, math.nan]}, "transforms.json: up"),
+        ({"metres_per_unit": 1, "up": [0, 0, True]}, "transforms.json: up"),
+        ({"metres_per_unit": 1, "up": {"x": 1}}, "transforms.json: up"),
     ],
 )
 def test_bad_scene_file(meta, match):
     with pytest.raises(SceneError, match=match):
-        scale_from_scene_file(meta, "other.json")
+        scale_from_scene_file(meta)
+        up_from_scene_file(meta)
 
 
 def test_the_user_goes_before_the_scene_file_and_it_says_so():
-    meta = {"metres_per_unit": 0.25, "up": [1, 0, 0]}
+    meta = {"metres_per_unit": 0.25}
     chosen = choose_scale(option=3.0, scene_file=meta)
     assert chosen is not None
-    assert (chosen.metres_per_unit, chosen.up) == (3.0, (1.0, 0.0, 0.0))
+    assert chosen.metres_per_unit == 3.0
     assert "user" in chosen.source and "goes before the 0.25 m per unit of transforms.json" in chosen.source
     measured = scale_from_known_distance((0, 0, 0), (2, 0, 0), 1.0, 0.1)
     chosen = choose_scale(known_distance=measured, scene_file=meta)
     assert chosen is not None
-    assert (chosen.metres_per_unit, chosen.standard_error, chosen.up) == (0.5, 0.05, (1.0, 0.0, 0.0))
+    assert (chosen.metres_per_unit, chosen.standard_error) == (0.5, 0.05)
     assert "goes before" in chosen.source
 
 
@@ -160,13 +160,12 @@ def test_a_damaged_scene_file_is_refused_even_if_the_user_gives_a_scale():
 def test_mapping_is_json():
     scale = scale_from_known_distance((0, 0, 0), (2, 0, 0), 1.0, 0.1)
     mapping = json.loads(json.dumps(scale.as_mapping(), allow_nan=False))
-    assert mapping["metres_per_unit"] == 0.5 and mapping["standard_error"] == 0.05 and mapping["up"] == [0, 0, 1]
-    assert set(mapping) == {"metres_per_unit", "standard_error", "source", "up", "up_source"}
+    assert set(mapping) == {"metres_per_unit", "standard_error", "source"} and mapping["standard_error"] == 0.05
 
 
 def test_synthetic_scenes_are_in_metres_with_z_up(tmp_path):
     write_scene(make_scene("hot-object"), tmp_path, num_train=1, num_eval=1, width=8, height=6, progress=False)
-    scale = choose_scale(scene_file=json.loads((tmp_path / "transforms.json").read_text()))
+    meta = json.loads((tmp_path / "transforms.json").read_text())
+    scale = choose_scale(scene_file=meta)
     assert scale is not None
-    assert (scale.metres_per_unit, scale.standard_error, scale.up) == (1.0, None, (0.0, 0.0, 1.0))
-    assert "transforms.json" in scale.up_source
+    assert (scale.metres_per_unit, scale.standard_error, up_from_scene_file(meta)) == (1.0, None, (0.0, 0.0, 1.0))

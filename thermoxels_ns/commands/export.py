@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from thermoxels_ns.commands.export_options import ExportOptions, Viewpoint, check_options, scale_of
+from thermoxels_ns.commands.export_options import ExportOptions, Viewpoint, check_options, scale_of, up_of
 from thermoxels_ns.commands.export_snapshot import export_snapshot, prepare_folder
 from thermoxels_ns.core.checks import check_shape
 from thermoxels_ns.core.errors import CheckpointError, ThermoxelsError
@@ -80,13 +80,14 @@ class ExportThermoxelsMesh(ExportOptions):
         say(f"Loading {self.load_config}")
 
         def check_scale(scene_folder: Path) -> None:
-            """Refuse what needs a scale before photographs and checkpoint are loaded."""
+            """Refuse a wrong scale or up, and what needs a scale, before photographs and checkpoint are loaded."""
             try:
                 content = scene_json(scene_folder)
             except (OSError, ValueError):
                 return  # whoever reads the scene says what is wrong with it
             if content or scene_folder.is_dir():
                 scale_of(self, checked, content)
+                up_of(self, content, Viewpoint())
 
         scene = load_trained_scene(self.load_config, check_scale)
 

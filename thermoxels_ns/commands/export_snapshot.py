@@ -147,7 +147,7 @@ def export_snapshot(
         "options": {field.name: getattr(options, field.name) for field in fields(options)},
         "versions": versions(),
         "length_unit": unit,
-        "scale": None if scale is None else _without_up(scale.as_mapping()),
+        "scale": None if scale is None else scale.as_mapping(),
         "up": up,
         "up_source": up_source,
         "mesh": mesh_summary(built, report, checked.selection, scale, voxel_size),
@@ -183,11 +183,6 @@ def export_snapshot(
     write_summary(folder / _SUMMARY, summary)
     say(f"Written to {folder}: {', '.join(name for name in summary['files'] if '/' not in name)}")
     return summary
-
-
-def _without_up(scale: Mapping[str, Any]) -> dict[str, Any]:
-    """What a scale says of length; up is decided and reported apart from it."""
-    return {name: value for name, value in scale.items() if not name.startswith("up")}
 
 
 def _mesh_files(suffixes: Iterable[str]) -> list[str]:

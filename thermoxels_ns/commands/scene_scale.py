@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,15 +15,13 @@ from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 
 Vector = tuple[float, float, float]
 
-UP_ASSUMED: Vector = (0.0, 0.0, 1.0)
-"""Up of a scene that does not say: structure from motion that levels its scenes puts z up."""
-
+_FILE = "transforms.json"
 _KEY, _ERROR_KEY, _UP_KEY = "metres_per_unit", "metres_per_unit_standard_error", "up"
 
 
 @dataclass(frozen=True)
 class SceneScale:
-    """Metres per unit of the scene's coordinates, with its standard error, and the direction that is up."""
+    """Metres per unit of the scene's coordinates, with its standard error."""
 
     metres_per_unit: float
     """Length of one input unit, above 0, [m]."""
@@ -31,10 +29,6 @@ class SceneScale:
     """Standard error of `metres_per_unit`, at least 0, [m]; None where nobody knows it."""
     source: str
     """Where the scale comes from: a sentence."""
-    up: Vector = UP_ASSUMED
-    """Unit vector that points up, in input coordinates."""
-    up_source: str = "Up is assumed to be z."
-    """Where the direction comes from: a sentence."""
 
     @property
     def relative_standard_error(self) -> float | None:
@@ -55,13 +49,7 @@ class SceneScale:
 
     def as_mapping(self) -> dict[str, Any]:
         """The scale as json can hold it."""
-        return {
-            "metres_per_unit": self.metres_per_unit,
-            "standard_error": self.standard_error,
-            "source": self.source,
-            "up": list(self.up),
-            "up_source": self.up_source,
-        }
+        return asdict(self)
 
     def _share(self, power: int, size: float) -> float | None:
         """Standard error of a quantity that grows with a power of the scale, to first order."""
@@ -122,13 +110,12 @@ def scale_from_known_distance(
     return SceneScale(float(distance_m) / apart, error, source)
 
 
-def scale_from_scene_file(meta: Mapping[str, Any], name: str = "transforms.json") -> SceneScale | None:
-    """Read scale, standard error and up from a scene's json.
+def scale_from_scene_file(meta: Mapping[str, Any]) -> SceneScale | None:
+    """Read scale and standard error from a scene's json.
 
     Args:
-        meta: The json; the keys are "metres_per_unit" (above 0), "metres_per_unit_standard_error" (at least 0,
-            optional) and "up" (three numbers, optional).
-        name: The json's name, for messages.
+        meta: The json; the keys are "metres_per_unit" (above 0) and "metres_per_unit_standard_error" (at least 0,
+            optional).
 
     Returns:
         The scale, or None if the json has none.
@@ -140,20 +127,19 @@ def scale_from_scene_file(meta: Mapping[str, Any], name: str = "transforms.json"
     if value is None:
         if error is not None:
             raise SceneError(
-                f"{name}: {_ERROR_KEY}",
+                f"{_FILE}: {_ERROR_KEY}",
                 expected=f"'{_KEY}' beside it",
                 got="none",
                 remedy=f"Add '{_KEY}' or remove '{_ERROR_KEY}'.",
             )
         return None
-    check_positive(f"{name}: {_KEY}", value, "Correct the json, or remove the key.", SceneError)
+    check_positive(f"{_FILE}: {_KEY}", value, "Correct the json, or remove the key.", SceneError)
     if error is not None:
-        _check_not_negative(f"{name}: {_ERROR_KEY}", error, "Correct the json, or remove the key.", SceneError)
-    scale = SceneScale(float(value), None if error is None else float(error), f"From {name}: {value:g} m per unit.")
-    return _with_up(scale, meta, name)
+        _check_not_negative(f"{_FILE}: {_ERROR_KEY}", error, "Correct the json, or remove the key.", SceneError)
+    return SceneScale(float(value), None if error is None else float(error), f"From {_FILE}: {value:g} m per unit.")
 
 
-def up_from_scene_file(meta: Mapping[str, Any], name: str = "transforms.json") -> Vector | None:
+def up_from_scene_file(meta: Mapping[str, Any]) -> Vector | None:
     """Read the direction that is up from a scene's json and make it a unit vector; None if the json has none.
 
     Raises:
@@ -169,7 +155,7 @@ def up_from_scene_file(meta: Mapping[str, Any], name: str = "transforms.json") -
     length = math.hypot(*value) if numbers else 0.0
     if not numbers or len(value) != 3 or not 0.0 < length < math.inf:
         raise SceneError(
-            f"{name}: {_UP_KEY}",
+            f"{_FILE}: {_UP_KEY}",
             expected="three finite numbers, not all 0",
             got=repr(value),
             remedy="Correct the json, for instance to [0, 0, 1], or remove the key.",
@@ -182,17 +168,13 @@ def choose_scale(
     option: float | None = None,
     known_distance: SceneScale | None = None,
     scene_file: Mapping[str, Any] | None = None,
-    name: str = "transforms.json",
 ) -> SceneScale | None:
     """Choose between what the user gives and what the scene's json says; the user goes before the json.
-
-    Up comes from the json if it says so, whatever the scale comes from.
 
     Args:
         option: Metres per unit given by the user.
         known_distance: What `scale_from_known_distance` made of a distance given by the user.
         scene_file: The scene's json, if there is one.
-        name: The json's name, for messages.
 
     Returns:
         The scale, whose source says what it was preferred to; None if nobody gives one.
@@ -207,20 +189,15 @@ def choose_scale(
             got=f"both: {option} m per unit, and {known_distance.metres_per_unit:g} from the distance",
             remedy="Leave one of them out.",
         )
-    meta = {} if scene_file is None else scene_file
-    in_file = scale_from_scene_file(meta, name)
+    in_file = scale_from_scene_file(scene_file or {})
     given = known_distance if option is None else scale_from_option(option)
     if given is None:
         return in_file
     if in_file is not None:
-        source = f"{given.source} It goes before the {in_file.metres_per_unit:g} m per unit of {name}."
-        given = replace(given, source=source)
-    return _with_up(given, meta, name)
-
-
-def _with_up(scale: SceneScale, meta: Mapping[str, Any], name: str) -> SceneScale:
-    up = up_from_scene_file(meta, name)
-    return scale if up is None else replace(scale, up=up, up_source=f"From {name}.")
+        return replace(
+            given, source=f"{given.source} It goes before the {in_file.metres_per_unit:g} m per unit of {_FILE}."
+        )
+    return given
 
 
 def _point(name: str, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
