@@ -241,7 +241,7 @@ def test_images_do_not_depend_on_how_rays_are_chunked(scene, monkeypatch: pytest
     pose, camera = scene.poses(3, 0)[0][0], scene.camera(32, 24)
     whole = render_view(scene, pose, camera)
     monkeypatch.setattr("thermoxels_ns.synthetic.raycast._RAYS_PER_CHUNK", 101)
-    monkeypatch.setattr("thermoxels_ns.synthetic.solids._RAYS_PER_CHUNK", 37)
+    monkeypatch.setattr("thermoxels_ns.synthetic.box_solid._RAYS_PER_CHUNK", 37)
     parts = render_view(scene, pose, camera)
     np.testing.assert_allclose(parts.rgb, whole.rgb, atol=1e-6)
     np.testing.assert_array_equal(parts.depth_m, whole.depth_m)

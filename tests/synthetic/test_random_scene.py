@@ -12,15 +12,14 @@ import pytest
 import tyro
 
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.synthetic.box_solid import BoxSolid, distance_to_box
 from thermoxels_ns.synthetic.catalogue import SceneWord, make_scene
 from thermoxels_ns.synthetic.random_plan import SMALLEST, WIDEST, Plan
 from thermoxels_ns.synthetic.random_scene import FAMILIES, random_scene, random_seed
 from thermoxels_ns.synthetic.raycast import render_view, visible_surface_points
-from thermoxels_ns.synthetic.rectangles import distance_to_box
 from thermoxels_ns.synthetic.scene_folder import load_truth, write_scene
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 from thermoxels_ns.synthetic.solid_union import SolidUnion
-from thermoxels_ns.synthetic.solids import BoxSolid
 
 MANY = range(30)
 ONE_OF_EACH = range(len(FAMILIES))

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.synthetic.box_solid import BoxSolid, distance_to_box
 from thermoxels_ns.synthetic.catalogue import SCENE_NAMES, make_scene
-from thermoxels_ns.synthetic.cylinder import Cylinder
-from thermoxels_ns.synthetic.rectangles import distance_to_box
 from thermoxels_ns.synthetic.solid_union import SolidUnion
-from thermoxels_ns.synthetic.solids import BoxSolid, Sphere
+from thermoxels_ns.synthetic.solids import Cylinder, Sphere
 
 CUBE = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 NOTCHED = BoxSolid(

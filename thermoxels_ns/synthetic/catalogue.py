@@ -11,15 +11,14 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.appearance import Paint, SolidTexture, SunLight, painted, room_rgb
+from thermoxels_ns.synthetic.box_solid import BoxSolid, distance_to_box
 from thermoxels_ns.synthetic.camera_rings import CameraRing
 from thermoxels_ns.synthetic.courtyard import courtyard
-from thermoxels_ns.synthetic.cylinder import Cylinder
 from thermoxels_ns.synthetic.house_corner import house_corner
 from thermoxels_ns.synthetic.random_scene import RANDOM_NAME, random_scene, random_seed
-from thermoxels_ns.synthetic.rectangles import distance_to_box
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 from thermoxels_ns.synthetic.solid_union import SolidUnion
-from thermoxels_ns.synthetic.solids import Box, BoxSolid, Sphere
+from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere
 
 FloatArray = npt.NDArray[np.float64]
 

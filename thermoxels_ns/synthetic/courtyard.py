@@ -6,10 +6,10 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.synthetic.appearance import Paint, SolidTexture, SunLight, painted, sky_rgb, sky_temperature_c
+from thermoxels_ns.synthetic.box_solid import BoxSolid, distance_to_box
 from thermoxels_ns.synthetic.camera_rings import CameraRing
-from thermoxels_ns.synthetic.rectangles import distance_to_box
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
-from thermoxels_ns.synthetic.solids import Box, BoxSolid
+from thermoxels_ns.synthetic.solids import Box
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -8,10 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.synthetic.appearance import Paint
-from thermoxels_ns.synthetic.cylinder import Cylinder
-from thermoxels_ns.synthetic.rectangles import distance_to_box
+from thermoxels_ns.synthetic.box_solid import BoxSolid, distance_to_box
 from thermoxels_ns.synthetic.solid_union import SolidUnion
-from thermoxels_ns.synthetic.solids import Box, BoxSolid, Sphere, Vector
+from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere, Vector
 
 FloatArray = npt.NDArray[np.float64]
 Shape = Box | Sphere | Cylinder

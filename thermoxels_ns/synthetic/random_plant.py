@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from thermoxels_ns.synthetic.cylinder import Cylinder
 from thermoxels_ns.synthetic.random_plan import HAIR, SMALLEST, WIDEST, Plan, Range
-from thermoxels_ns.synthetic.solids import Box, Sphere
+from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere
 
 _AISLE = 4.0
 

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.synthetic.cylinder import Cylinder
-from thermoxels_ns.synthetic.solids import Box, BoxSolid, Hits, Sphere
+from thermoxels_ns.synthetic.box_solid import BoxSolid
+from thermoxels_ns.synthetic.solids import Box, Cylinder, Hits, Sphere
 
 FloatArray = npt.NDArray[np.float64]
 Part = BoxSolid | Sphere | Cylinder
