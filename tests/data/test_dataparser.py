@@ -39,39 +39,6 @@ def test_split_by_frame_names(scene_folder):
     assert len(names(train)) == 8 and not set(names(train)) & set(names(evaluate))
 
 
-def test_split_lists_keep_val_and_test_apart(scene_folder):
-    scene = scene_folder(frames=6, names=[f"p{i}" for i in range(6)])
-    scene.meta.update(train_filenames=["images/p0.png", "./images/p3.png", "images/p5.png"])
-    scene.meta.update(val_filenames=["images/p1.png"], test_filenames=["images/p2.png", "images/p4.png"])
-    scene.rewrite()
-    assert names(parse(scene.path)) == ["p0", "p3", "p5"]
-    assert names(parse(scene.path, "val")) == ["p1"] and names(parse(scene.path, "test")) == ["p2", "p4"]
-    for key in ("train_filenames", "test_filenames"):
-        del scene.meta[key]
-    scene.rewrite()
-    assert names(parse(scene.path)) == ["p0", "p2", "p3", "p4", "p5"]
-
-
-def test_split_lists_that_overlap_or_name_strangers_are_refused(scene_folder):
-    scene = scene_folder(frames=3, names=["a", "b", "c"])
-    scene.meta.update(train_filenames=["images/a.png", "images/b.png"], test_filenames=["images/b.png"])
-    scene.rewrite()
-    with pytest.raises(SceneError, match=r"images/b\.png in training and in evaluation"):
-        parse(scene.path)
-    scene.meta.update(test_filenames=["images/nobody.png"])
-    scene.rewrite()
-    with pytest.raises(SceneError, match="nobody"):
-        parse(scene.path)
-
-
-def test_split_by_interval_starts_in_the_middle(scene_folder):
-    scene = scene_folder(frames=20, names=[f"p{i:02d}" for i in range(20)])
-    evaluate = names(parse(scene.path, "val"))
-    assert evaluate == ["p04", "p12"]
-    assert set(names(parse(scene.path))) == {f"p{i:02d}" for i in range(20)} - set(evaluate)
-    assert names(parse(scene.path, "val", eval_interval=10, eval_offset=0)) == ["p00", "p10"]
-
-
 def test_frames_are_sorted_by_name_with_their_own_poses(scene_folder):
     scene = scene_folder()
     scene.meta["frames"].reverse()
@@ -82,18 +49,6 @@ def test_frames_are_sorted_by_name_with_their_own_poses(scene_folder):
     expected = torch.tensor([by_name[name] for name in names(outputs)])[:, :3]
     torch.testing.assert_close(outputs.cameras.camera_to_worlds, expected)
     assert [path.stem for path in outputs.metadata["thermal_filenames"]] == names(outputs)
-
-
-@pytest.mark.parametrize("tag", ["train", "eval"])
-def test_one_side_without_frames_is_refused(scene_folder, tag):
-    scene = scene_folder(frames=4, names=[f"frame_{tag}_{i}" for i in range(4)])
-    with pytest.raises(SceneError, match=("evaluation" if tag == "train" else "training") + " frames"):
-        parse(scene.path)
-
-
-def test_mixed_names_are_refused(scene_folder):
-    with pytest.raises(SceneError, match="plain"):
-        parse(scene_folder(frames=3, names=["frame_train_0", "frame_eval_0", "plain"]).path)
 
 
 # --- World ---

@@ -118,21 +118,21 @@ def run_cost(cost: Cost, console: Console) -> None:
         console.print(f"{kept} of {len(plan)} runs are in {folder / _RUNS} already; --again True measures them again.")
     failed: list[str] = []
     if pending:
-        with _Display(console, len(pending)).opened() as display:
-            if cost.warm_up:
-                _warm_up(bench, [setting for setting, _ in pending], display)
-            for setting, repeat in pending:
-                title = setting.name if cost.repeats == 1 else f"{setting.name}, run {repeat}"
+        display = _Display(console, len(pending))
+        if cost.warm_up:
+            _warm_up(bench, [setting for setting, _ in pending], display)
+        for setting, repeat in pending:
+            title = setting.name if cost.repeats == 1 else f"{setting.name}, run {repeat}"
+            try:
                 with display.run(title) as watch:
-                    try:
-                        run = bench.measure(setting, repeat, watch)
-                    except ThermoxelsError as problem:
-                        failed.append(f"{title}: {problem}")
-                        display.say(f"{title} failed: {problem}")
-                        continue
-                runs.append(run)
-                write_runs(folder / _RUNS, runs)
-                display.say(f"{title}: {_in_words(run)}")
+                    run = bench.measure(setting, repeat, watch)
+            except ThermoxelsError as problem:
+                failed.append(f"{title}: {problem}")
+                display.say(f"{title} failed: {problem}")
+                continue
+            runs.append(run)
+            write_runs(folder / _RUNS, runs)
+            display.say(f"{title}: {_in_words(run)}")
     counted = [run for run in runs if run.key in keys]
     if counted:
         _report(cost, folder, settings, counted, baseline, targets, console)
@@ -255,62 +255,36 @@ def _report(
 
 
 class _Display:
-    """Shows which run is at work: bars on a terminal, lines elsewhere."""
+    """Says which run is at work: in the last line of a terminal, in a line a minute elsewhere."""
 
     def __init__(self, console: Console, total: int) -> None:
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
         self._console = console
         self._total = total
         self._done = 0
-        self._bars = Progress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        )
-        self._all = self._bars.add_task("all runs", total=total)
-
-    @contextmanager
-    def opened(self) -> Iterator[_Display]:
-        """Show the bars as long as the block runs."""
-        with self._bars:
-            yield self
 
     def say(self, line: str) -> None:
-        """Print a line above the bars."""
+        """Print a line."""
         self._console.print(line, markup=False, soft_wrap=True)
 
     @contextmanager
     def run(self, title: str, counts: bool = True) -> Iterator[Watch]:
         """Show a run; gives what is to be called with the share that is done."""
         start = told = time.monotonic()
-        number = f"[{self._done + 1}/{self._total}] " if counts else ""
-        bar = self._bars.add_task(f"{number}{title}", total=None)
-        if not self._console.is_terminal:
-            self.say(f"{number}{title} ...")
+        name = f"[{self._done + 1}/{self._total}] {title}" if counts else title
+        self.say(f"{name} ...")
+        with self._console.status("at work") as status:
 
-        def watch(share: float | None) -> None:
-            nonlocal told
-            if share is None:
-                self._bars.update(bar, total=None)
-            else:
-                self._bars.update(bar, total=100, completed=round(100 * share))
-            if not self._console.is_terminal and time.monotonic() - told > _QUIET_S:
-                told = time.monotonic()
+            def watch(share: float | None) -> None:
+                nonlocal told
                 done = "" if share is None else f", {share:.0%} of the training done"
-                self.say(f"... at work for {told - start:.0f} s{done}")
+                line = f"... at work for {time.monotonic() - start:.0f} s{done}"
+                status.update(line)
+                if not self._console.is_terminal and time.monotonic() - told > _QUIET_S:
+                    told = time.monotonic()
+                    self.say(line)
 
-        try:
+            self._done += counts
             yield watch
-        finally:
-            self._bars.remove_task(bar)
-            if counts:
-                self._done += 1
-                self._bars.update(self._all, completed=self._done)
 
 
 def parse_setting(text: str) -> tuple[int, int]:
