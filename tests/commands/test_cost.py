@@ -6,8 +6,6 @@ import csv
 import io
 import json
 import math
-import stat
-import sys
 import types
 from pathlib import Path
 
@@ -30,7 +28,6 @@ from thermoxels_ns.commands.cost import (
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 from thermoxels_ns.training.schedule import schedule_for
 
-PYTHON = sys.executable
 # A training takes `steps` / 100 seconds by its files' times; the evaluation improves with the steps.
 NS_TRAIN = """
 folder = value("--output-dir"), value("--experiment-name"), sys.argv[1], value("--timestamp")
@@ -61,19 +58,14 @@ with open(pathlib.Path(__file__).parent / "calls", "a") as calls:
 
 
 @pytest.fixture
-def commands(tmp_path, monkeypatch):
+def commands(tmp_path, fake_command):
     """Fake ns-train and ns-eval; gives a function that replaces one, and one that lists what was called."""
-    folder = tmp_path / "bin"
-    folder.mkdir()
-    monkeypatch.setattr("thermoxels_ns.commands.installed_commands.sys.executable", str(folder / "python"))
 
     def write(name: str, body: str) -> None:
-        path = folder / name
-        path.write_text(f"#!{PYTHON} -S\n{PRELUDE}\n{body}\n")
-        path.chmod(path.stat().st_mode | stat.S_IXUSR)
+        fake_command(name, f"{PRELUDE}\n{body}")
 
     def calls() -> list[list[str]]:
-        path = folder / "calls"
+        path = tmp_path / "bin" / "calls"
         lines = path.read_text().splitlines() if path.is_file() else []
         path.unlink(missing_ok=True)
         return [line.split() for line in lines]

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
-import os
 import shlex
-import stat
-import sys
 from pathlib import Path
 
 import pytest
@@ -21,10 +17,9 @@ from thermoxels_ns.commands.demo import Demo, run_demo
 from thermoxels_ns.commands.demo_results import Target, read_results
 from thermoxels_ns.commands.export import ExportThermoxelsMesh
 from thermoxels_ns.commands.heat import Heat
-from thermoxels_ns.commands.installed_commands import command_line, run_command
+from thermoxels_ns.commands.installed_commands import command_line
 from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 
-PYTHON = sys.executable
 IMAGES = {
     "psnr": 28.0,
     "ssim": 0.9,
@@ -53,31 +48,6 @@ SUMMARY = {
     "heat": {"energy_residual": 2e-14, "energy_before_j": 1e6, "energy_after_j": 1e6},
     "mesh": {"tets": 60000, "nodes": 15000, "share_of_nodes_observed": 0.6},
 }
-
-
-@pytest.fixture
-def console() -> Console:
-    return Console(file=io.StringIO(), width=200)
-
-
-def shown(console: Console) -> str:
-    assert isinstance(console.file, io.StringIO)
-    return console.file.getvalue()
-
-
-@pytest.fixture
-def fake_commands(tmp_path, monkeypatch):
-    """A folder of commands beside a Python of its own; gives a function that writes one."""
-    folder = tmp_path / "bin"
-    folder.mkdir()
-    monkeypatch.setattr("thermoxels_ns.commands.installed_commands.sys.executable", str(folder / "python"))
-
-    def write(name: str, body: str) -> None:
-        path = folder / name
-        path.write_text(f"#!{PYTHON}\nimport os, sys, json\n{body}\n")
-        path.chmod(path.stat().st_mode | stat.S_IXUSR)
-
-    return write
 
 
 def test_the_folder_of_an_earlier_demo_is_cleared_of_what_the_demo_wrote_only(tmp_path):
@@ -126,64 +96,6 @@ def test_the_next_steps_lead_to_a_heat_report_by_commands_that_exist(scene, weat
         assert (export.interior, export.wall_thickness) == ("hollow", 0.3)
         assert export.output_dir == heat.mesh.parent == Path("my demo/walls")  # the demo's own export stays
         assert ["--load-config", str(export.load_config)] == demo.demo_commands(Path("my demo"), scene)[2][1:3]
-
-
-def test_output_of_a_command_is_shown_and_kept(fake_commands, tmp_path, console):
-    fake_commands("say", "print('it says [bold]', *sys.argv[1:]); print('\\u00b0C', file=sys.stderr)")
-    run_command(["say", "a b", "c"], tmp_path / "say.log", console)
-    assert shown(console).splitlines() == ["$ say 'a b' c", "it says [bold] a b c", "°C"]
-    assert (tmp_path / "say.log").read_text(encoding="utf-8") == "it says [bold] a b c\n°C\n"
-
-
-def test_output_of_a_command_comes_while_it_runs(fake_commands, tmp_path, console):
-    gate = tmp_path / "gate"
-    # The command ends well only after its first line was shown: showing it opens the gate.
-    fake_commands(
-        "wait",
-        "import time\nprint('first')\n"
-        f"for _ in range(200):\n    if os.path.exists({str(gate)!r}): break\n    time.sleep(0.05)\n"
-        "else: sys.exit('the gate stayed shut')\nprint('second')",
-    )
-
-    class Opener(io.StringIO):
-        def write(self, text: str) -> int:
-            if "first" in text:
-                gate.write_text("open")
-            return super().write(text)
-
-    seen = Console(file=Opener(), width=200)
-    run_command(["wait"], tmp_path / "wait.log", seen)
-    assert shown(seen).splitlines()[-2:] == ["first", "second"]
-
-
-def test_a_command_draws_for_the_terminal_that_shows_it(fake_commands, tmp_path, console, monkeypatch):
-    monkeypatch.setenv("TERM", "xterm")
-    fake_commands("ask", "print(os.environ.get('FORCE_COLOR'), os.environ.get('COLUMNS'))")
-    run_command(["ask"], tmp_path / "ask.log", Console(file=io.StringIO(), width=77, force_terminal=True))
-    assert (tmp_path / "ask.log").read_text() == "1 77\n"
-    run_command(["ask"], tmp_path / "ask.log", console)
-    assert (tmp_path / "ask.log").read_text().startswith(f"{os.environ.get('FORCE_COLOR')} ")
-
-
-def test_a_failing_command_is_an_error_with_its_last_lines(fake_commands, tmp_path, console):
-    fake_commands("fail", "for n in range(40): print('line', n)\nsys.exit('no space left')")
-    with pytest.raises(ThermoxelsError) as caught:
-        run_command(["fail"], tmp_path / "fail.log", console)
-    message = str(caught.value)
-    assert message.startswith("fail: expected exit status 0, got 1.")
-    assert message.splitlines()[-2:] == ["    line 39", "    no space left"]
-    assert len(message.splitlines()) < 20
-    assert str(tmp_path / "fail.log") in message
-
-
-def test_a_command_of_another_environment_is_not_used(fake_commands, tmp_path, console, monkeypatch):
-    other = tmp_path / "other"
-    other.mkdir()
-    (other / "ns-train").write_text("#!/bin/sh\n")
-    (other / "ns-train").chmod(0o755)
-    monkeypatch.setenv("PATH", str(other))
-    with pytest.raises(ThermoxelsError, match=r"ns-train: expected a command in .*bin, got none"):
-        run_command(["ns-train"], tmp_path / "x.log", console)
 
 
 @pytest.mark.parametrize(
@@ -249,15 +161,15 @@ def test_a_missing_figure_is_named(tmp_path, images, summary, message):
 
 
 @pytest.fixture
-def quick_demo(fake_commands, monkeypatch):
+def quick_demo(fake_command, monkeypatch):
     """A demo on a tiny scene whose commands write what the real ones would, without training."""
     for name, value in (("_TRAIN_VIEWS", 3), ("_HELD_OUT_VIEWS", 2), ("_WIDTH", 16), ("_HEIGHT", 12)):
         monkeypatch.setattr(demo, name, value)
     after = "def after(name): return sys.argv[sys.argv.index(name) + 1]\n"
     picture = "from PIL import Image\n"
-    fake_commands("ns-train", after + "assert os.path.isfile(after('--data') + '/transforms.json')")
-    fake_commands("ns-eval", after + f"json.dump({{'results': {IMAGES}}}, open(after('--output-path'), 'w'))")
-    fake_commands(
+    fake_command("ns-train", after + "assert os.path.isfile(after('--data') + '/transforms.json')")
+    fake_command("ns-eval", after + f"json.dump({{'results': {IMAGES}}}, open(after('--output-path'), 'w'))")
+    fake_command(
         "ns-render",
         after
         + picture
@@ -268,7 +180,7 @@ def quick_demo(fake_commands, monkeypatch):
     )
 
     def export(summary: dict) -> None:
-        fake_commands(
+        fake_command(
             "ns-export",
             after
             + picture
@@ -312,8 +224,8 @@ def test_a_missed_target_is_shown_and_fails_after_the_page_is_written(quick_demo
     assert ">no<" in (tmp_path / "demo" / "index.html").read_text(encoding="utf-8")
 
 
-def test_a_failing_step_stops_the_demo(quick_demo, fake_commands, tmp_path, capfd):
-    fake_commands("ns-eval", "sys.exit('checkpoint not found')")
+def test_a_failing_step_stops_the_demo(quick_demo, fake_command, tmp_path, capfd):
+    fake_command("ns-eval", "sys.exit('checkpoint not found')")
     assert cli.main(["demo", "--output-dir", str(tmp_path / "demo"), "--scene", "sphere"]) == 1
     shown_text = capfd.readouterr()
     assert "ns-eval: expected exit status 0, got 1" in shown_text.err

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import math
-import stat
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from thermoxels_ns.commands.installed_commands import run_command
 from thermoxels_ns.core.errors import ThermoxelsError
@@ -17,19 +19,61 @@ PYTHON = sys.executable
 
 
 @pytest.fixture
-def command(tmp_path, monkeypatch):
-    """Gives a function that writes a command beside a Python of its own and returns the words to run it."""
-    folder = tmp_path / "bin"
-    folder.mkdir()
-    monkeypatch.setattr("thermoxels_ns.commands.installed_commands.sys.executable", str(folder / "python"))
+def command(fake_command):
+    """Gives a function that writes a command and returns the words to run it."""
 
     def write(body: str) -> list[str]:
-        path = folder / "work"
-        path.write_text(f"#!{PYTHON} -S\nimport os, sys, time\n{body}\n")
-        path.chmod(path.stat().st_mode | stat.S_IXUSR)
+        fake_command("work", body)
         return ["work"]
 
     return write
+
+
+@pytest.fixture
+def console() -> Console:
+    return Console(file=io.StringIO(), width=200)
+
+
+def shown(console: Console) -> str:
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def test_output_of_a_command_is_shown_and_kept(fake_command, tmp_path, console):
+    fake_command("say", "print('it says [bold]', *sys.argv[1:]); print('\\u00b0C', file=sys.stderr)")
+    run_command(["say", "a b", "c"], tmp_path / "say.log", console)
+    assert shown(console).splitlines() == ["$ say 'a b' c", "it says [bold] a b c", "°C"]
+    assert (tmp_path / "say.log").read_text(encoding="utf-8") == "it says [bold] a b c\n°C\n"
+
+
+def test_output_of_a_command_comes_while_it_runs(fake_command, tmp_path, console):
+    gate = tmp_path / "gate"
+    # The command ends well only after its first line was shown: showing it opens the gate.
+    fake_command(
+        "wait",
+        "import time\nprint('first')\n"
+        f"for _ in range(200):\n    if os.path.exists({str(gate)!r}): break\n    time.sleep(0.05)\n"
+        "else: sys.exit('the gate stayed shut')\nprint('second')",
+    )
+
+    class Opener(io.StringIO):
+        def write(self, text: str) -> int:
+            if "first" in text:
+                gate.write_text("open")
+            return super().write(text)
+
+    seen = Console(file=Opener(), width=200)
+    run_command(["wait"], tmp_path / "wait.log", seen)
+    assert shown(seen).splitlines()[-2:] == ["first", "second"]
+
+
+def test_a_command_draws_for_the_terminal_that_shows_it(fake_command, tmp_path, console, monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
+    fake_command("ask", "print(os.environ.get('FORCE_COLOR'), os.environ.get('COLUMNS'))")
+    run_command(["ask"], tmp_path / "ask.log", Console(file=io.StringIO(), width=77, force_terminal=True))
+    assert (tmp_path / "ask.log").read_text() == "1 77\n"
+    run_command(["ask"], tmp_path / "ask.log", console)
+    assert (tmp_path / "ask.log").read_text().startswith(f"{os.environ.get('FORCE_COLOR')} ")
 
 
 def test_time_is_that_of_the_whole_command(command, tmp_path):
@@ -68,10 +112,15 @@ def test_output_is_kept_and_the_watcher_hears_how_far_it_is(command, tmp_path):
     assert (tmp_path / "log").read_text().splitlines()[1:] == ["5 (12.50%)  1 ms", "9 (50.00%)"]
 
 
-def test_a_failed_command_is_told_with_its_last_lines(command, tmp_path):
-    words = command("print('first'); print('CUDA?', file=sys.stderr); sys.exit(3)")
-    with pytest.raises(ThermoxelsError, match=r"(?s)work: expected exit status 0, got 3.*log.*CUDA\?"):
-        run_command(words, tmp_path / "log")
+def test_a_failing_command_is_an_error_with_its_last_lines(fake_command, tmp_path, console):
+    fake_command("fail", "for n in range(40): print('line', n)\nsys.exit('no space left')")
+    with pytest.raises(ThermoxelsError) as caught:
+        run_command(["fail"], tmp_path / "fail.log", console)
+    message = str(caught.value)
+    assert message.startswith("fail: expected exit status 0, got 1.")
+    assert message.splitlines()[-2:] == ["    line 39", "    no space left"]
+    assert len(message.splitlines()) < 20
+    assert str(tmp_path / "fail.log") in message
 
 
 def test_a_killed_command_is_told(command, tmp_path):
@@ -79,9 +128,14 @@ def test_a_killed_command_is_told(command, tmp_path):
         run_command(command("os.kill(os.getpid(), 9)"), tmp_path / "log")
 
 
-def test_a_missing_command_is_told(tmp_path, command):
-    with pytest.raises(ThermoxelsError, match=r"ns-paint: expected a command in"):
-        run_command(["ns-paint"], tmp_path / "log")
+def test_a_command_of_another_environment_is_not_used(fake_command, tmp_path, monkeypatch):
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "ns-train").write_text("#!/bin/sh\n")
+    (other / "ns-train").chmod(0o755)
+    monkeypatch.setenv("PATH", str(other))
+    with pytest.raises(ThermoxelsError, match=r"ns-train: expected a command in .*bin, got none"):
+        run_command(["ns-train"], tmp_path / "log")
 
 
 def test_an_interrupt_ends_the_command(command, tmp_path):
