@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -13,20 +12,8 @@ from nerfstudio.configs.method_configs import all_methods
 from tests.integration.commands import SHORT_TRAINING, Trained, run
 
 
-def edit(scene: Path, change) -> None:
-    path = scene / "transforms.json"
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
-
-
 def lose_partner(scene: Path) -> None:
     next((scene / "thermal").glob("frame_train_00003*")).unlink()
-
-
-def lose_photograph(scene: Path) -> None:
-    """One frame fewer than thermal files."""
-    next((scene / "images").glob("frame_train_00004*")).unlink()
 
 
 def corrupt_image(scene: Path) -> None:
@@ -34,30 +21,9 @@ def corrupt_image(scene: Path) -> None:
     path.write_bytes(path.read_bytes()[:400])
 
 
-def no_poses(scene: Path) -> None:
-    edit(scene, lambda c: [frame.pop("transform_matrix") for frame in c["frames"]])
-
-
-def nan_pose(scene: Path) -> None:
-    edit(scene, lambda c: c["frames"][5]["transform_matrix"][1].__setitem__(3, float("nan")))
-
-
-def zero_box(scene: Path) -> None:
-    edit(scene, lambda c: c.__setitem__("scene_box", [[0, 0, 0], [1, 0, 1]]))
-
-
-@pytest.mark.parametrize(
-    "damage, words",
-    [
-        (lose_partner, ["frame_train_00003"]),
-        (lose_photograph, ["frame_train_00004"]),
-        (corrupt_image, ["frame_train_00002"]),
-        (no_poses, ["transform_matrix"]),
-        (nan_pose, ["frame_train_00006"]),
-        (zero_box, ["scene_box"]),
-    ],
-)
-def test_damaged_scene(tiny_scene, tmp_path, damage, words):
+@pytest.mark.parametrize("damage, word", [(lose_partner, "frame_train_00003"), (corrupt_image, "frame_train_00002")])
+def test_damaged_scene(tiny_scene, tmp_path, damage, word):
+    """What else may be wrong with a scene is tested without a command, in tests/data."""
     scene = tmp_path / "scene"
     shutil.copytree(tiny_scene, scene)
     damage(scene)
@@ -67,9 +33,7 @@ def test_damaged_scene(tiny_scene, tmp_path, damage, words):
     )
     assert result.returncode != 0
     assert "Error: " in result.stdout and "expected" in result.stdout
-    assert "Traceback" not in result.stdout
-    for word in words:
-        assert word in result.stdout
+    assert "Traceback" not in result.stdout and word in result.stdout
 
 
 def export(config: Path, output: Path, *options: str):
