@@ -1,10 +1,8 @@
-"""The command ``thermoxels``: what nerfstudio's own commands do not offer.
-
-Only light imports at the top, so that ``--help`` answers at once.
-"""
+"""The command ``thermoxels``: what nerfstudio's own commands do not offer."""
 
 from __future__ import annotations
 
+# Only light imports at the top, so that ``--help`` answers at once.
 import shlex
 import sys
 import warnings

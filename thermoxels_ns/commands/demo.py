@@ -1,10 +1,8 @@
-"""The command ``thermoxels demo``: a synthetic scene from photographs to heat flow, held against its exact truth.
-
-Only light imports at the top, so that ``thermoxels --help`` answers at once.
-"""
+"""The command ``thermoxels demo``: photographs to heat flow, held against the truth."""
 
 from __future__ import annotations
 
+# Only light imports at the top, so that ``thermoxels --help`` answers at once.
 import json
 import shutil
 import time

@@ -1,13 +1,13 @@
-"""The figures of a demo run: read from what the commands wrote, held against their targets."""
+"""The figures of a demo run, read from files and held against targets."""
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from thermoxels_ns.core.checks import read_json_object
 from thermoxels_ns.core.errors import ThermoxelsError
 
 _ENERGY_UNITS = ("J", "kJ", "MJ", "GJ", "TJ", "PJ")
@@ -144,13 +144,7 @@ class _Section:
 
     def __init__(self, path: Path, name: str) -> None:
         self._path, self._name = path, name
-        try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as problem:
-            raise ThermoxelsError(
-                str(path), expected="a readable json file", got=str(problem), remedy="Run the demo again."
-            ) from problem
-        self._content: dict[str, Any] = content.get(name) if isinstance(content, dict) else None  # type: ignore[assignment]
+        self._content: Any = read_json_object(path, "Run the demo again.").get(name)
         if not isinstance(self._content, dict):
             raise self._error("an object", self._content)
 

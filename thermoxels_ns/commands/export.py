@@ -1,9 +1,8 @@
-"""The command ``ns-export thermoxels-mesh``: a trained model to a mesh and its heat."""
-
-# Only light imports at the top: nerfstudio's exporter reads this module for --help of every subcommand.
+"""The command ``ns-export thermoxels-mesh``: a trained model to mesh and heat."""
 
 from __future__ import annotations
 
+# Only light imports at the top: nerfstudio's exporter reads this module for ``--help`` of every subcommand.
 import json
 import pickle
 import traceback

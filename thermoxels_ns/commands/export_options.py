@@ -1,9 +1,8 @@
-"""Options of a mesh export, and how its pictures look at the mesh."""
-
-# Only light imports at the top: nerfstudio's exporter reads this module for --help of every subcommand.
+"""Options of a mesh export, checked; and how pictures look at it."""
 
 from __future__ import annotations
 
+# Imports at the top are light: nerfstudio's exporter reads the options for ``--help`` of every subcommand.
 import math
 from dataclasses import dataclass, fields, replace
 from pathlib import Path

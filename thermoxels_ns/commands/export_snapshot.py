@@ -1,9 +1,8 @@
 """From a trained field to the files of an export."""
 
-# Only light imports at the top: the mesher, the solver and pyvista load when they run.
-
 from __future__ import annotations
 
+# Imports at the top are light; the mesher, the solver and pyvista load when they run.
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""How long a unit of the scene is in metres, how well that is known, and which way is up."""
+"""Metres per unit of a scene, how well that is known, and which way is up."""
 
 from __future__ import annotations
 

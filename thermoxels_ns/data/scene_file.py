@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.checks import read_json_object
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.transforms_json import read_intrinsics, read_pose
 from thermoxels_ns.radiometry.thermal_files import THERMAL_SUFFIXES, ThermalUnit
 
@@ -66,7 +66,7 @@ def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "err
     """
     json_path = _find_json(data)
     folder = json_path.parent
-    meta = _load_json(json_path)
+    meta = read_json_object(json_path, "Write the file again.", SceneError)
     entries = meta.get("frames")
     if not isinstance(entries, list) or not entries:
         raise SceneError(
@@ -90,7 +90,13 @@ def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "err
             continue
         frames.append(_frame(meta, entry, name, image, thermal, folder, where))
     if missing_thermal == "error" and left_out:
-        raise SceneError(_missing_text(json_path, left_out, len(entries), partners))
+        raise SceneError(
+            json_path.name,
+            expected=f"a thermal partner for each of the {len(entries)} frames (thermal_file_path, or the same stem in "
+            "thermal/)",
+            got=f"none for {len(left_out)}: {_some(left_out)} ({partners.count} files in thermal/)",
+            remedy="Restore the thermal images, remove these frames, or pass --missing-thermal skip.",
+        )
     orphans = partners.orphans(folder, [frame.image for frame in frames])
     if missing_thermal == "error" and orphans:
         raise SceneError(
@@ -168,25 +174,11 @@ def _find_json(data: Path) -> Path:
     )
 
 
-def _load_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError) as problem:
-        raise SceneError(
-            str(path), expected="valid json", got=str(problem), remedy="Write the file again."
-        ) from problem
-    if not isinstance(content, dict):
-        raise SceneError(
-            str(path), expected="a json object", got=type(content).__name__, remedy="Write the file again."
-        )
-    return content
-
-
 def _read_bounds(folder: Path) -> tuple[float, float] | None:
     path = folder / BOUNDS_NAME
     if not path.is_file():
         return None
-    content = _load_json(path)
+    content = read_json_object(path, "Write the file again.", SceneError)
     keys = ("absolute_min_temperature", "absolute_max_temperature")
     try:
         first, second = (float(content[key]) for key in keys)
@@ -292,15 +284,6 @@ def _refuse_half_masks(json_path: Path, frames: list[Frame]) -> None:
             got=f"{masks} masks for {len(frames)} frames",
             remedy="Add the missing ones (white: use the pixel).",
         )
-
-
-def _missing_text(json_path: Path, names: list[str], frames: int, partners: _ThermalPartners) -> str:
-    return explain(
-        json_path.name,
-        expected=f"a thermal partner for each of the {frames} frames (thermal_file_path, or the same stem in thermal/)",
-        got=f"none for {len(names)}: {_some(names)} ({partners.count} files in thermal/)",
-        remedy="Restore the thermal images, remove these frames, or pass --missing-thermal skip.",
-    )
 
 
 def _some(names: list[str]) -> str:

@@ -1,9 +1,4 @@
-"""Write a synthetic scene as a folder of photographs and thermal images, and get its truth back from the folder.
-
-The layout is that of ThermoScenes: ``images/``, ``thermal/``, ``transforms.json`` and ``temperature_bounds.json``,
-with ``frame_train_`` and ``frame_eval_`` names. The scene box, the scale (metres), up (z) and the name of the truth are
-added to the json.
-"""
+"""Write a synthetic scene as a scene folder, and get its truth back."""
 
 from __future__ import annotations
 
@@ -17,7 +12,7 @@ from PIL import Image
 from rich.progress import track
 
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import read_json_object, remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.catalogue import SCENE_NAMES, make_scene
 from thermoxels_ns.synthetic.raycast import RenderedView, render_view, visible_surface_points
@@ -64,6 +59,10 @@ def write_scene(
     progress: bool = True,
 ) -> Path:
     """Photograph a scene in both bands and write the folder; ``transforms.json`` comes last.
+
+    The layout is that of ThermoScenes: ``images/``, ``thermal/``, ``transforms.json`` and ``temperature_bounds.json``,
+    with ``frame_train_`` and ``frame_eval_`` names. The scene box, the scale (metres), up (z) and the name of the truth
+    are added to the json.
 
     Args:
         scene: What to photograph.
@@ -299,23 +298,7 @@ def _intrinsics(camera: Camera) -> dict[str, Any]:
 
 
 def _read_transforms(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError) as problem:
-        raise SceneError(
-            "transforms.json",
-            expected=f"a readable json file at {path}",
-            got=str(problem),
-            remedy="Check the scene folder, or write the scene again.",
-        ) from problem
-    if not isinstance(content, dict):
-        raise SceneError(
-            "transforms.json",
-            expected="a json object",
-            got=type(content).__name__,
-            remedy="Check the scene folder, or write the scene again.",
-        )
-    return content
+    return read_json_object(path, "Check the scene folder, or write the scene again.", SceneError)
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:

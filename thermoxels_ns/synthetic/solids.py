@@ -1,8 +1,4 @@
-"""Exact solids: what each can tell, and the round ones.
-
-A solid is a closed set and answers, without approximation, where a point lies, how far the surface is, how large
-volume and area are, and where a ray first enters. Lengths are metres; nothing here depends on a lattice.
-"""
+"""Exact solids: what each can tell, spheres and cylinders."""
 
 from __future__ import annotations
 
@@ -39,7 +35,7 @@ class Hits:
 
 
 class Solid(Protocol):
-    """What every exact solid can tell.
+    """What every exact solid can tell, without approximation and without a lattice; it is a closed set, lengths in m.
 
     `intersect` counts only the points where a ray passes from outside to inside, the surface's front: a ray that
     starts within the solid does not see its walls from behind. Touching an edge counts as a hit.
