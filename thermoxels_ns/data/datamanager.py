@@ -23,7 +23,7 @@ from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.dataset import ThermalDataset
-from thermoxels_ns.data.photo_streams import PhotoStreams, draw_generator
+from thermoxels_ns.data.ray_sampler import RaySampler, draw_generator
 
 _TRAIN, _EVAL, _EVAL_IMAGE = 0, 1, 2
 _WIDEST = np.deg2rad(80.0)
@@ -80,7 +80,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         """Precompute the rays and load the photographs of the training split; report what is masked."""
         # Stock exporters and dynamic batches set the number of rays on this object.
         self.train_pixel_sampler = _ray_counter(self.config.train_num_rays_per_batch)
-        self.train_streams.load()
+        self.train_rays.load()
         dataset = self.train_dataset
         temperatures = dataset.temperature_range
         CONSOLE.print(
@@ -97,14 +97,14 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         CONSOLE.print(f"Evaluating on {len(self.eval_dataset)} pairs; thermal: {self.eval_dataset.thermal_report()}.")
 
     @cached_property
-    def train_streams(self) -> PhotoStreams:
+    def train_rays(self) -> RaySampler:
         """Pixels and rays of the training split."""
-        return self._streams(self.train_dataset)
+        return self._sampler(self.train_dataset)
 
     @cached_property
-    def eval_streams(self) -> PhotoStreams:
+    def eval_rays(self) -> RaySampler:
         """Pixels and rays of the evaluation split."""
-        return self._streams(self.eval_dataset)
+        return self._sampler(self.eval_dataset)
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
         """Return the training batch of a step: rays, and ``image`` (n, 3) and ``thermal`` (n, 1) targets.
@@ -114,7 +114,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         number = step if self.test_mode == "val" else self.train_count
         self.train_count += 1
         generator = draw_generator(self.config.seed, self.local_rank, _TRAIN, number)
-        return self.train_streams.draw(generator, self._rgb_rays(), self.config.thermal_num_rays_per_batch)
+        return self.train_rays.draw(generator, self._rgb_rays(), self.config.thermal_num_rays_per_batch)
 
     def next_eval(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
         """Return a batch of evaluation rays with the keys of `next_train`."""
@@ -122,7 +122,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         rgb_rays = self.config.eval_num_rays_per_batch
         share = self.config.thermal_num_rays_per_batch / max(self.config.train_num_rays_per_batch, 1)
         generator = draw_generator(self.config.seed, self.local_rank, _EVAL, step)
-        return self.eval_streams.draw(generator, rgb_rays, max(round(rgb_rays * share), 1))
+        return self.eval_rays.draw(generator, rgb_rays, max(round(rgb_rays * share), 1))
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict]:
         """Return one whole evaluation image; which one depends on seed and step alone."""
@@ -144,7 +144,7 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
             stride: Every n-th pixel in both directions.
             chunk: Rays per bundle; the last one may have fewer.
         """
-        return self.train_streams.grid(stream, stride, max_rays_per_image, chunk)
+        return self.train_rays.grid(stream, stride, max_rays_per_image, chunk)
 
     def training_views(self) -> Views:
         """Give the cameras of the streams that train: the photographs', and the thermal ones where they differ."""
@@ -170,13 +170,13 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         sampler = self.train_pixel_sampler
         return self.config.train_num_rays_per_batch if sampler is None else sampler.num_rays_per_batch
 
-    def _streams(self, dataset: ThermalDataset) -> PhotoStreams:
+    def _sampler(self, dataset: ThermalDataset) -> RaySampler:
         if self.config.seed < 0:
             raise SceneError(
                 "seed", expected="0 or more", got=self.config.seed, remedy="Pass --pipeline.datamanager.seed 42."
             )
         storage = self.device if self.config.images_on_gpu else "cpu"
-        return PhotoStreams(dataset, self.config.streams, storage, self.device)
+        return RaySampler(dataset, self.config.streams, storage, self.device)
 
 
 def _ray_counter(rays: int) -> PixelSampler:

@@ -1,4 +1,4 @@
-"""The two streams of training rays of one split, and what their pixels saw."""
+"""Rays of a split with what their pixels saw, drawn at random or on a grid."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Streams = Literal["both", "rgb", "thermal"]
 _BITS = {"both": RGB_STREAM | THERMAL_STREAM, "rgb": RGB_STREAM, "thermal": THERMAL_STREAM}
 
 
-class PhotoStreams:
+class RaySampler:
     """Pixels of a `ThermalDataset` in memory, drawn at random or on a regular grid.
 
     Where a pair shares its camera, a ray through a photograph's pixel carries both targets, and the thermal target
