@@ -1,4 +1,6 @@
-"""The command ``ns-export thermoxels-mesh``: a trained model to mesh and heat."""
+"""The command ``ns-export thermoxels-mesh``: a trained model to a mesh and its heat."""
+
+# Only light imports at the top: nerfstudio's exporter reads this module for --help of every subcommand.
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Options of a mesh export, checked; and how pictures look at it."""
+"""Options of a mesh export, and how its pictures look at the mesh."""
+
+# Only light imports at the top: nerfstudio's exporter reads this module for --help of every subcommand.
 
 from __future__ import annotations
 

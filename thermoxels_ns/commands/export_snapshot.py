@@ -1,5 +1,7 @@
 """From a trained field to the files of an export."""
 
+# Only light imports at the top: the mesher, the solver and pyvista load when they run.
+
 from __future__ import annotations
 
 # Imports at the top are light; the mesher, the solver and pyvista load when they run.
