@@ -44,7 +44,7 @@ from tests.support.building_corner import building_corner
 from tests.support.heat_meshes import box_mesh, planes
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.core.checks import replace_when_done
-from thermoxels_ns.fem.error_budget import ErrorSize, Tolerance, difference_between
+from thermoxels_ns.fem.error_estimate import ErrorSize, difference_between
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.refine_mesh import refine_mesh
@@ -52,7 +52,7 @@ from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
-from thermoxels_ns.fem.tolerance import ToleratedSolution, solve_to_tolerance
+from thermoxels_ns.fem.tolerance import Tolerance, ToleratedSolution, solve_to_tolerance
 from thermoxels_ns.heat.effects import Convection, FixedTemperature
 from thermoxels_ns.heat.materials import Material
 

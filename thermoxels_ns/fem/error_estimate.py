@@ -1,104 +1,65 @@
-"""How far a solution is from that of the equations themselves: by recovered gradients, and from two levels.
-
-Both are about the body that the mesh describes; that a mesh cuts corners of a round body is another error.
-"""
+"""Errors of heat solutions estimated from two levels (Richardson) and recovered fluxes."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
+from thermoxels_ns.fem.edge_midpoints import TET_EDGES
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quadratic_space import QuadraticSpace
-from thermoxels_ns.fem.recovered_gradient import gradient_defect
 from thermoxels_ns.fem.selection import Selection
-from thermoxels_ns.fem.solution import SteadySolution
+from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 
-HALF_THE_SIZE = 0.3
-"""What halving the mesh size leaves of an error of P1: 1/4 where temperatures are smooth, 0.4 at the edges of a notch
-of a right angle, where they behave as r^(2/3). An estimate with the value between is off by a factor of 1.6 after one
-halving and of 2.6 after three."""
+Vector = npt.NDArray[np.float64]
+Flows = Mapping[str, float]
+"""Mean heat flow into the body of each effect, [W]."""
+
+HALVED = 0.3
+"""Share of an error that is left after the mesh size of linear tetrahedra, or the steps of SDIRK2, are halved. Theory
+says 1/4 where temperatures are smooth, and 0.4 at the edges of a notch of a right angle, where they behave as r^(2/3).
+An estimate with the value between is off by a factor of 1.6 after one halving and of 2.6 after three."""
 _RATIO_RANGE = (1e-3, 0.7)
+"""Range of ratios between the errors of two levels; outside of it an estimate of either error cannot be trusted."""
+_QUADRATIC_RECOVERY = 0.5
+"""Factor on the recovered error of quadratic tetrahedra beside that of linear ones: where a temperature is
+singular it is found two to three times too large. Then ratios are 0.3 to 1.4 times the true ones."""
 _FROM_P1_TO_P2 = 0.57
 """The error of a node falls as this power of the squared error of the flux. Theory says 1/2 where temperatures are
-smooth, from h^2 to h^3 against h^2 to h^4. Measured: 0.35 to 0.5 on a smooth solution, 0.5 to 0.6 on shells, 0.35 to
-0.85 on bodies with notches. This value between estimates 0.35 to 2.7 times the true errors of them."""
+smooth, from h^2 to h^3 against h^2 to h^4. With this value estimates are 0.45 to 1.5 times the true error on smooth
+solutions, shells and bodies with notches, and 3.4 times where a given temperature meets convection at an edge."""
+_EQUAL = 1e-9
+"""Temperatures that differ by less than this share of the absolute temperature are equal."""
 
 
 @dataclass(frozen=True)
-class RecoveredError:
-    """Error of the heat flux by its distance from a smoother one (Zienkiewicz and Zhu 1987)."""
+class ErrorSize:
+    """Errors of a solution."""
 
-    tet_w_k: npt.NDArray[np.float64]
-    """Estimate of integral(k |grad(T_exact - T)|^2) over each tetrahedron, shape (t,), [W K]: where to refine."""
+    temperature_k: float
+    """Largest error of the temperature at the nodes of the given mesh, [K]."""
+    heat_flow: float
+    """Largest error of the mean heat flow of an effect, as a share of all heat that flows through the body."""
 
-    @property
-    def total_w_k(self) -> float:
-        """Its sum, [W K].
-
-        With P1 it is 0.6 to 1.1 times the true one, with P2 0.4 to 0.5 times: means around a node gain less there.
-
-        Divided by the difference between the temperatures of two surroundings it is the error of the heat flow from one
-        to the other, since the error of a heat flow is of the second order in that of the flux.
-        """
-        return float(self.tet_w_k.sum())
-
-
-def recovered_error(problem: HeatProblem, solution: SteadySolution) -> RecoveredError:
-    """Estimate the error of the heat flux by recovery.
-
-    The recovered flux interpolates means of k grad T over the tetrahedra around each node, taken in every material
-    apart: it is continuous there and closer to the exact one than k grad T.
-
-    Args:
-        problem: What was solved.
-        solution: Its steady state, with linear or quadratic tetrahedra.
-
-    Raises:
-        HeatError: The solution is not of this problem's mesh.
-    """
-    mesh = problem.mesh
-    nodal_k, nodes = solution.temperature_c, mesh.tets
-    if len(nodal_k) != len(mesh.points_m):
-        raise _of_another_mesh(len(mesh.points_m), len(nodal_k))
-    if len(solution.edge_temperature_c):
-        nodal_k = np.concatenate([nodal_k, solution.edge_temperature_c])
-        space = QuadraticSpace(Selection(mesh))
-        if len(nodal_k) != space.num_nodes:
-            raise _of_another_mesh(space.num_nodes, len(nodal_k))
-        nodes = space.tet_nodes()
-    defect = gradient_defect(mesh.points_m, mesh.tets, nodes, nodal_k, mesh.region)
-    return RecoveredError(problem.conductivity_w_mk * defect)
+    def describe(self) -> str:
+        """Say it in words."""
+        return f"{self.temperature_k:.2g} K and {100.0 * self.heat_flow:.2g} % of the heat flow"
 
 
 @dataclass(frozen=True)
 class ErrorRatios:
-    """What a finer solution leaves of the errors of a coarser one, for `richardson`."""
+    """Errors of a finer solution over those of a coarser one, for `richardson`."""
 
     temperature: float
     """Of temperatures at nodes."""
     heat_flow: float
     """Of heat flows."""
-
-
-def error_ratios(before: RecoveredError, after: RecoveredError, *, same_order: bool) -> ErrorRatios:
-    """Tell how much of their errors solutions lose, from those of their fluxes.
-
-    The error of a heat flow is of second order in that of the flux. So is that of a temperature from one mesh to a
-    finer one; from P1 to P2 it gains less. Ratios are kept between 0.001 and 0.7, outside of which an estimate of
-    either error cannot be trusted.
-
-    Args:
-        before: Of the coarser solution.
-        after: Of the finer one.
-        same_order: Whether both have tetrahedra of the same order.
-    """
-    total = before.total_w_k
-    squared = float(np.clip(after.total_w_k / total if total > 0.0 else 0.0, *_RATIO_RANGE))
-    return ErrorRatios(squared if same_order else squared**_FROM_P1_TO_P2, squared)
 
 
 def richardson(difference: float, ratio: float) -> float:
@@ -121,6 +82,115 @@ def richardson(difference: float, ratio: float) -> float:
         remedy = "Use 1/4 for two meshes of linear tetrahedra, one with half the size of the other."
         raise HeatError("ratio", expected="a number above 0 and below 1", got=repr(ratio), remedy=remedy)
     return abs(difference) * ratio / (1.0 - ratio)
+
+
+def mean_flows_w(solution: SteadySolution | HeatSolution) -> dict[str, float]:
+    """Give the mean heat flow into the body of each effect over all times, [W].
+
+    Not of each patch: how much of the heat of a fixed node between two patches belongs to either is a convention.
+    """
+    lengths = np.diff(solution.times_s) if isinstance(solution, HeatSolution) else np.ones(1)
+    return {heat.effect: float(lengths @ heat.heat_w / lengths.sum()) for heat in solution.effects}
+
+
+def flow_error(difference: Flows, solution: SteadySolution | HeatSolution) -> float:
+    """Largest error of a solution's mean heat flows as a share of what flows through the body, half the sum of sizes.
+
+    Where all temperatures are equal nothing flows but round-off, which has no share of it.
+
+    Args:
+        difference: Error of the flow of each effect, [W].
+        solution: The solution.
+    """
+    level_k = float(np.abs(solution.temperature_c).max()) + ZERO_CELSIUS_K
+    largest = max((abs(part) for part in difference.values()), default=0.0)
+    if largest == 0.0 or float(np.ptp(solution.temperature_c)) <= _EQUAL * level_k:
+        return 0.0
+    through = 0.5 * sum(abs(flow) for flow in mean_flows_w(solution).values())
+    return largest / through if through > 0.0 else math.inf
+
+
+def difference_between(
+    coarse: SteadySolution | HeatSolution, fine: SteadySolution | HeatSolution, num_nodes: int
+) -> ErrorSize:
+    """Compare two solutions of one problem at the same times.
+
+    Args:
+        coarse: One of them.
+        fine: The other.
+        num_nodes: Number of nodes of the mesh that both have in common; they come first in both.
+    """
+    change_k = fine.temperature_c[..., :num_nodes] - coarse.temperature_c[..., :num_nodes]
+    before = mean_flows_w(coarse)
+    change_w = {group: flow - before[group] for group, flow in mean_flows_w(fine).items()}
+    return ErrorSize(float(np.max(np.abs(change_k))), flow_error(change_w, fine))
+
+
+def recovered_error_w_k(problem: HeatProblem, solution: SteadySolution) -> Vector:
+    """Estimate integral(k |grad(T_exact - T)|^2) over each tetrahedron (Zienkiewicz and Zhu 1987), shape (t,), [W K].
+
+    The recovered gradient interpolates means of grad T over the tetrahedra around each corner, weighted by volume. The
+    means are taken in every region apart, because gradients jump where the conductivity does.
+
+    Args:
+        problem: What was solved.
+        solution: Its steady state, with linear or quadratic tetrahedra.
+
+    Raises:
+        HeatError: The solution is not of this problem's mesh.
+    """
+    mesh = problem.mesh
+    gradient, volumes_m3 = _corner_gradients(problem, solution)
+    key = (mesh.region[:, None] * len(mesh.points_m) + mesh.tets).ravel()
+    weights = np.repeat(volumes_m3, 4)
+    totals = [np.bincount(key, weights * gradient[..., axis].ravel()) for axis in range(3)]
+    mean = np.stack([total[key] for total in totals], axis=-1) / np.bincount(key, weights)[key, None]
+    defect = gradient - mean.reshape(gradient.shape)
+    squares = np.square(defect.sum(axis=1)).sum(axis=1) + np.square(defect).sum(axis=(1, 2))
+    return problem.conductivity_w_mk * volumes_m3 * squares / 20.0
+
+
+def error_ratios(before_w_k: Vector, after_w_k: Vector, *, same_order: bool) -> ErrorRatios:
+    """Tell how much of their errors solutions lose, from the recovered errors of their fluxes.
+
+    The error of a heat flow is of second order in that of the flux. So is that of a temperature from one mesh to a
+    finer one; from P1 to P2 it gains less.
+
+    Args:
+        before_w_k: `recovered_error_w_k` of the coarser solution.
+        after_w_k: The same of the finer one.
+        same_order: Whether both have tetrahedra of the same order; otherwise the finer one has quadratic ones.
+    """
+    before, after = float(before_w_k.sum()), float(after_w_k.sum())
+    share = after / before if before > 0.0 else 0.0
+    squared = float(np.clip(share if same_order else _QUADRATIC_RECOVERY * share, *_RATIO_RANGE))
+    return ErrorRatios(squared if same_order else squared**_FROM_P1_TO_P2, squared)
+
+
+def _corner_gradients(problem: HeatProblem, solution: SteadySolution) -> tuple[Vector, Vector]:
+    """Gradient of T at the corners of each tetrahedron, shape (t, 4, 3), [K / m], and volumes, shape (t,), [m3]."""
+    mesh, nodal_c = problem.mesh, solution.temperature_c
+    if len(nodal_c) != len(mesh.points_m):
+        raise _of_another_mesh(len(mesh.points_m), len(nodal_c))
+    corners = mesh.points_m[mesh.tets]
+    sides = corners[:, 1:] - corners[:, :1]
+    slopes = np.linalg.inv(sides).transpose(0, 2, 1)
+    slopes = np.concatenate([-slopes.sum(axis=1, keepdims=True), slopes], axis=1)
+    volumes_m3 = np.abs(np.linalg.det(sides)) / 6.0
+    corner_c = nodal_c[mesh.tets]
+    if len(solution.edge_temperature_c) == 0:
+        gradient = np.einsum("ti,tix->tx", corner_c, slopes)
+        return np.repeat(gradient[:, None], 4, axis=1), volumes_m3
+    nodal_c, space = np.concatenate([nodal_c, solution.edge_temperature_c]), QuadraticSpace(Selection(mesh))
+    if len(nodal_c) != space.num_nodes:
+        raise _of_another_mesh(space.num_nodes, len(nodal_c))
+    # Slopes of the quadratic functions of corners are 3 times those of linear ones at the corner itself, -1 elsewhere.
+    gradient = np.einsum("ci,ti,tix->tcx", 4.0 * np.eye(4) - 1.0, corner_c, slopes)
+    edge_c = nodal_c[space.tet_nodes()[:, 4:], None]
+    for number, (first, second) in enumerate(TET_EDGES):
+        gradient[:, first] += 4.0 * edge_c[:, number] * slopes[:, second]
+        gradient[:, second] += 4.0 * edge_c[:, number] * slopes[:, first]
+    return gradient, volumes_m3
 
 
 def _of_another_mesh(expected: int, got: int) -> HeatError:

@@ -121,12 +121,7 @@ class RangeWatch:
             slack_k: How far out of it a temperature may be besides round-off, [K], but no more than `MOST_SLACK` of the
                 widest range.
         """
-        return self.after(float(start_k.min()), float(start_k.max()), times_s, slack_k)
-
-    def after(
-        self, coldest_k: float, warmest_k: float, times_s: tuple[float, ...], slack_k: float
-    ) -> tuple[float, float]:
-        """As `at`, where the range of the temperatures at the start is known."""
+        coldest_k, warmest_k = float(start_k.min()), float(start_k.max())
         low, high = self._system.allowed_range_k((coldest_k, warmest_k), times_s)
         if np.isfinite(high - low):
             self._widest_k = max(self._widest_k, high - low)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.fem.limiter import RangeKeeper, RangeWatch, is_in_range
-from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
+from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, TimeSteps
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, Scheme
 from thermoxels_ns.fem.stepper import Step, Stepper
 from thermoxels_ns.fem.system import HeatSystem
@@ -110,7 +110,13 @@ class AdaptiveMarch:
     """
 
     def __init__(
-        self, system: HeatSystem, scheme: Scheme, start_k: Vector, time: AdaptiveSteps, *, relative_tolerance: float
+        self,
+        system: HeatSystem,
+        scheme: Scheme,
+        start_k: Vector,
+        time: AdaptiveSteps | GivenSteps,
+        *,
+        relative_tolerance: float,
     ) -> None:
         """Prepare.
 
@@ -126,7 +132,8 @@ class AdaptiveMarch:
         self._system, self._time, self._start_k = system, time, start_k
         self._scheme = Stepper(system, scheme, relative_tolerance=relative_tolerance)
         self._safe = RangeKeeper(system, relative_tolerance=relative_tolerance)
-        self._allowed_k = STEP_SHARE * time.tolerance_k
+        self._given = time.lengths_s if isinstance(time, GivenSteps) else None
+        self._allowed_k = STEP_SHARE * time.tolerance_k if self._given is None else np.inf
         self._slack_k = RANGE_SHARE * time.tolerance_k
         self._range = RangeWatch(system)
         self._longest_s = system.problem.resolution_s
@@ -141,6 +148,9 @@ class AdaptiveMarch:
         Yields:
             Every step that counts; the last one may be a failure.
         """
+        if self._given is not None:
+            yield from self._given_steps(self._given)
+            return
         relative_k, now_s, wished_s = self._start_k, 0.0, self._first_length()
         for end_s in self._time.times_s[1:]:
             while now_s < end_s:
@@ -163,17 +173,27 @@ class AdaptiveMarch:
                 wished_s = max(next_s, wished_s) if step_s < wished_s and factor >= 1.0 else next_s
                 yield Taken(attempt.step, step_s, now_s == end_s, attempt.limited, attempt.in_range)
 
+    def _given_steps(self, lengths_s: tuple[Vector, ...]) -> Iterator[Taken]:
+        relative_k, now_s = self._start_k, 0.0
+        for end_s, interval_s in zip(self._time.times_s[1:].tolist(), lengths_s):
+            for number, step_s in enumerate(interval_s.tolist(), start=1):
+                attempt, ends = self._try(relative_k, now_s, step_s), number == len(interval_s)
+                self.made_safe += attempt.made_safe
+                failure = "" if attempt.step.converged else f"At {now_s:.6g} s a step failed. {attempt.step.status}"
+                yield Taken(attempt.step, step_s, ends, attempt.limited, attempt.in_range, failure)
+                relative_k, now_s = attempt.step.relative_k, end_s if ends else now_s + step_s
+
     def _first_length(self) -> float:
         system, time = self._system, self._time
         rate = system.net_heat(self._start_k, 0.0)[0] / system.nodal_mass_j_k
         fastest = float(np.max(np.abs(rate[system.fixed.free]), initial=0.0))
-        interval_s = time.duration_s / time.outputs
+        interval_s = time.duration_s / (time.num_times - 1)
         if fastest == 0.0:
             return interval_s
         return float(np.clip(time.tolerance_k / fastest, _SHORTEST * time.duration_s, interval_s))
 
     def _try(self, start_k: Vector, now_s: float, step_s: float) -> _Attempt:
-        step = self._scheme.step(start_k, now_s, step_s, estimate=True)
+        step = self._scheme.step(start_k, now_s, step_s, estimate=self._given is None)
         plain = _Attempt(step, self._scheme.scheme.order + 1)
         if not step.converged or step.error_k > self._allowed_k or self._in_range(step, start_k, now_s, step_s):
             return plain

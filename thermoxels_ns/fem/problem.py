@@ -120,6 +120,38 @@ class Conductor(Protocol):
 
 
 @dataclass(frozen=True)
+class GivenSteps:
+    """Steps of given lengths, such as those of an adaptive computation, halved.
+
+    >>> GivenSteps(6.0, (np.array([1.0, 2.0]), np.array([3.0])), 0.1).halved().lengths_s[0].tolist()
+    [0.5, 0.5, 1.0, 1.0]
+    """
+
+    duration_s: float
+    """Time to follow the body for, [s]."""
+    lengths_s: tuple[npt.NDArray[np.float64], ...]
+    """Lengths of the steps in each of some equal intervals at whose ends temperatures are kept, [s]."""
+    tolerance_k: float
+    """Error that the steps were chosen for, [K]: a thousandth of it is how far temperatures may leave their range."""
+
+    def halved(self, times: int = 1) -> GivenSteps:
+        """Halve every step so many times."""
+        parts = 2**times
+        lengths_s = tuple(np.repeat(interval_s / parts, parts) for interval_s in self.lengths_s)
+        return GivenSteps(self.duration_s, lengths_s, self.tolerance_k)
+
+    @property
+    def num_times(self) -> int:
+        """Number of times at which temperatures are kept."""
+        return len(self.lengths_s) + 1
+
+    @property
+    def times_s(self) -> npt.NDArray[np.float64]:
+        """Start, then the end of every interval, [s]."""
+        return np.linspace(0.0, self.duration_s, self.num_times)
+
+
+@dataclass(frozen=True)
 class HeatProblem:
     """Heat in a body: conduction, storage, and the effects that the scene calls for.
 

@@ -67,6 +67,8 @@ class HeatSolution:
     """Steps of Newton's method in each interval, shape (s,); all 0 without radiation."""
     steps: int = 0
     """Number of time steps taken."""
+    step_lengths_s: tuple[npt.NDArray[np.float64], ...] = ()
+    """Lengths of the steps in each interval, [s]."""
     time_error_k: float = float("nan")
     """Estimated largest error of the steps at any temperature, their estimates added up, [K]; NaN for fixed steps."""
     assembled: Assembled = field(default_factory=Assembled)

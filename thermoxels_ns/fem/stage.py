@@ -141,25 +141,6 @@ class Stage:
         much = abs(np.sum(rest.heat_w)) > _UNEXPLAINED * np.sum(np.abs(stored_w))
         return rest if much and not rest.is_round_off else None
 
-    def balance(self, heat_w: Vector, piece_heat_w: Vector) -> tuple[Vector, LinearSolution]:
-        """Solve (M / step + K + R) change = heat with what was learned from earlier solutions; linear equations only.
-
-        Args:
-            heat_w: Shape (n,), [W]; what stands at fixed nodes does not matter.
-            piece_heat_w: Its sum over each piece without the round-off of conduction, 0 of those with fixed nodes,
-                shape (p,), [W].
-
-        Returns:
-            The change, 0 at fixed nodes, shape (n,), [K], and how well it was found.
-        """
-        heat_w = self.at_free(heat_w)
-        if not self.floats:
-            found = _solved(self._own_solver, heat_w, self._guess)
-            return self.everywhere(found.x), found
-        rest = Residual(heat_w, piece_heat_w, np.zeros_like(heat_w), np.zeros_like(piece_heat_w))
-        change, linear = self.correction(self._own_solver, self.held_w_k, rest, self._guess)
-        return self.everywhere(change), linear
-
     @cached_property
     def _own_solver(self) -> SystemSolver:
         return self.system.linear_solver(self.matrix, self._relative_tolerance)

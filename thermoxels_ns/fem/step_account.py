@@ -39,6 +39,7 @@ class StepAccount:
         self._exchanged_j = np.zeros(len(times_s) - 1)
         self._iterations = np.zeros((len(times_s) - 1, 2), dtype=np.int64)
         self._error_k = 0.0
+        self._lengths_s: list[list[float]] = [[] for _ in times_s[1:]]
         self._limited = self._out_of_range = 0
 
     @property
@@ -50,6 +51,7 @@ class StepAccount:
         """Count a step."""
         step, row = taken.step, self._done
         self.followed_s += taken.step_s
+        self._lengths_s[row].append(taken.step_s)
         self._heat_j[row] += taken.step_s * step.group_heat_w
         self._exchanged_j[row] += taken.step_s * float(np.abs(step.group_heat_w).sum())
         self._iterations[row] += step.iterations, step.newton_iterations
@@ -61,25 +63,6 @@ class StepAccount:
         if taken.ends_interval:
             self._done += 1
             self._states[self._done] = step.relative_k
-
-    def add_all(
-        self, intervals: npt.NDArray[np.int64], lengths_s: Vector, group_heat_w: Vector, iterations: list[int]
-    ) -> None:
-        """Count all steps at once, of linear equations and within range; whoever calls keeps the states.
-
-        Args:
-            intervals: Number of each step's interval, ascending, shape (l,).
-            lengths_s: Length of each step, shape (l,), [s].
-            group_heat_w: Mean heat flow of each group during each step, shape (l, g), [W].
-            iterations: Iterations of the linear solver in each step.
-        """
-        self.followed_s += float(lengths_s.sum())
-        np.add.at(self._heat_j, intervals, lengths_s[:, None] * group_heat_w)
-        np.add.at(self._exchanged_j, intervals, lengths_s * np.abs(group_heat_w).sum(axis=1))
-        np.add.at(self._iterations[:, 0], intervals, iterations)
-        self._most_iterations = max(self._most_iterations, *iterations)
-        self._steps += len(intervals)
-        self._done = int(intervals[-1]) + 1
 
     def success(self, march: AdaptiveMarch | None) -> str:
         """Say that all went well, and how."""
@@ -136,6 +119,7 @@ class StepAccount:
             effects=heat_by_effect(effect_labels(system.problem), system.groups, heat_j / lengths[:, None]),
             newton_iterations=self._iterations[:done, 1],
             steps=self._steps,
+            step_lengths_s=tuple(np.array(lengths) for lengths in self._lengths_s[:done]),
             time_error_k=self._error_k if adaptive else float("nan"),
             assembled=system.assembled,
         )

@@ -11,7 +11,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.floating_components import check_stored
 from thermoxels_ns.fem.marching import AdaptiveMarch, Taken, equal_steps
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, SDIRK2, Scheme
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.steady import too_cold
@@ -26,7 +26,7 @@ MAX_STATE_BYTES = 4 * 2**30
 
 def solve_heat(
     problem: HeatProblem,
-    time: TimeSteps | AdaptiveSteps,
+    time: TimeSteps | AdaptiveSteps | GivenSteps,
     *,
     scheme: Scheme | None = None,
     lumped: bool = True,
@@ -43,7 +43,7 @@ def solve_heat(
 
     Args:
         problem: Body, materials, initial temperatures and effects; without effects the boundary is insulated.
-        time: Equal steps, or steps as long as a tolerance allows.
+        time: Equal steps, steps as long as a tolerance allows, or steps of given lengths.
         scheme: The scheme in time; None: backward Euler for equal steps, SDIRK2 (with backward Euler where it would
             overshoot) for a tolerance, which needs a scheme with an estimate.
         lumped: Lump the mass matrix, which keeps temperatures within their range at any step length.
@@ -88,14 +88,14 @@ def solve_heat(
     return account.close(failure or account.success(march) + skips(problem, time), not failure, adaptive=bool(march))
 
 
-def skips(problem: HeatProblem, time: TimeSteps | AdaptiveSteps) -> str:
+def skips(problem: HeatProblem, time: TimeSteps | AdaptiveSteps | GivenSteps) -> str:
     """Say that steps may be too long to see how an effect changes, or nothing.
 
     Args:
         problem: The effects.
         time: The steps.
     """
-    if isinstance(time, AdaptiveSteps):
+    if not isinstance(time, TimeSteps):
         labelled = zip(effect_labels(problem), problem.effects)
         names = [label for label, effect in labelled if any(effect.bounded(name).unresolved for name in effect.bounds)]
         if not names:

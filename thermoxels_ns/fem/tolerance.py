@@ -1,29 +1,129 @@
-"""From a tolerance to a solution that meets it, at least cost."""
+"""Solve a heat problem to a tolerance: solve, refine or halve, estimate, repeat."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.error_budget import ErrorSize, Tolerance, difference_between
-from thermoxels_ns.fem.error_estimate import ErrorRatios, error_ratios, recovered_error, richardson
-from thermoxels_ns.fem.linear_start import linear_start
-from thermoxels_ns.fem.memory import DEFAULT_MEMORY_BYTES
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
-from thermoxels_ns.fem.refine_mesh import refine_mesh
-from thermoxels_ns.fem.solution import SteadySolution
+from thermoxels_ns.fem.error_estimate import (
+    HALVED,
+    ErrorSize,
+    difference_between,
+    error_ratios,
+    flow_error,
+    mean_flows_w,
+    recovered_error_w_k,
+    richardson,
+)
+from thermoxels_ns.fem.memory import DEFAULT_MEMORY_BYTES, describe_bytes, peak_bytes
+from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem
+from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
+from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.tolerance_in_time import follow_to_tolerance
-from thermoxels_ns.fem.tolerance_run import Level, Run, ToleratedSolution
+from thermoxels_ns.fem.stepping import solve_heat
 
-__all__ = ["Level", "ToleratedSolution", "solve_to_tolerance"]
+Vector = npt.NDArray[np.float64]
 
-_LINEAR_TOLERANCE = 1e-8
-"""Of the linear solver for a steady state: its error is far below any estimate here."""
+_STEADY_TOLERANCE, _STEP_TOLERANCE = 1e-8, 1e-10
+"""Of the linear solver: its error is far below any estimate here."""
+_STEPS_OVER_ERROR = 6.0
+"""Tolerance of the first, adaptive steps over the allowed error: steps that are controlled to 1 K make an error of 0.03
+to 0.07 K in all, because conduction forgets."""
+_AIM = 0.95
+"""Share of the allowed error that a solution is chosen to make."""
+_MOST_HALVINGS = 8
+"""Halvings of the mesh size or of the steps beyond which nothing is tried."""
+_MESH_COST, _STEP_COST = 10.0, 2.0
+"""How much more half the mesh size and half the steps cost."""
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Errors that a user allows; what is None does not matter."""
+
+    temperature_k: float | None = 0.05
+    """Largest error of the temperature at any node of the mesh, [K]. The default is half of what building physics asks
+    of a temperature (ISO 10211: 0.1 K)."""
+    heat_flow: float | None = None
+    """Largest error of the mean heat flow that any effect brings, as a share of all heat that flows through the body;
+    0.01 is what building physics asks for (ISO 10211)."""
+
+    def __post_init__(self) -> None:
+        if self.temperature_k is None and self.heat_flow is None:
+            remedy = "Give a tolerance in kelvin, or one for heat flows such as 0.01."
+            raise HeatError("tolerance", expected="temperature_k or heat_flow", got="neither", remedy=remedy)
+        for name, remedy in (("temperature_k", "Give it in kelvin."), ("heat_flow", "Give a share, such as 0.01.")):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, check_positive(name, value, remedy, HeatError))
+
+    def excess(self, error: ErrorSize) -> float:
+        """Error over what is allowed, whichever is worse; at most 1 is good."""
+        shares = [0.0]
+        if self.temperature_k is not None:
+            shares.append(error.temperature_k / self.temperature_k)
+        if self.heat_flow is not None:
+            shares.append(error.heat_flow / self.heat_flow)
+        return max(shares)
+
+    def describe(self) -> str:
+        """Say it in words."""
+        parts = [] if self.temperature_k is None else [f"{self.temperature_k:g} K"]
+        parts += [] if self.heat_flow is None else [f"{100.0 * self.heat_flow:g} % of the heat flow"]
+        return " and ".join(parts)
+
+
+@dataclass(frozen=True)
+class Level:
+    """A solution on the way."""
+
+    order: int
+    """1 for linear tetrahedra, 2 for quadratic ones."""
+    refinements: int
+    """How often the size of the given mesh was halved."""
+    step_tolerance_k: float | None
+    """Error that the time steps are estimated to make, [K]; None for a steady state."""
+    num_nodes: int
+    """Number of unknowns."""
+    error: ErrorSize
+    """Estimated errors."""
+    seconds: float
+    """Time to solve it, [s]."""
+
+    def describe(self) -> str:
+        """Say it in a line."""
+        mesh = "given mesh" if self.refinements == 0 else f"mesh size halved {self.refinements}x"
+        steps = "" if self.step_tolerance_k is None else f", steps to {self.step_tolerance_k:.2g} K"
+        return (
+            f"P{self.order}, {mesh}{steps}, {self.num_nodes} unknowns: estimated error {self.error.describe()}, "
+            f"{self.seconds:.2f} s"
+        )
+
+
+@dataclass(frozen=True)
+class ToleratedSolution:
+    """A solution with what is known of its error."""
+
+    solution: SteadySolution | HeatSolution
+    """Temperatures and heat flows. Nodes of the given mesh come first."""
+    problem: HeatProblem
+    """What was solved: the given problem, or the same on a finer mesh."""
+    settings: Level
+    """Order, refinements and steps that were chosen, and the estimated errors."""
+    met: bool
+    """Whether the estimated errors are within the tolerance."""
+    status: str
+    """The outcome as a sentence, with the estimate and the seconds."""
+    seconds: float
+    """Time for all, [s]."""
+    levels: tuple[Level, ...]
+    """All solutions on the way, the last one is `settings`."""
 
 
 def solve_to_tolerance(
@@ -38,19 +138,16 @@ def solve_to_tolerance(
     log: Callable[[str], None] = print,
     progress: Callable[[float, int], None] | None = None,
 ) -> ToleratedSolution:
-    """Solve a problem with the cheapest choice of order, mesh size and time steps whose estimated error is allowed.
+    """Solve a problem with order, mesh size and time steps whose estimated error is allowed.
 
-    A steady state is solved with linear tetrahedra on the given mesh, and what bubbles on its edges would add tells
-    their error. If it is too large quadratic tetrahedra follow; how the errors of the fluxes of both compare tells the
-    error of the better one. Then the mesh size is halved, again and again: quadratic tetrahedra cost less than linear
-    ones of half the size and err less.
+    A steady state is solved with linear and with quadratic tetrahedra on the given mesh. Their difference, and the
+    ratio between the recovered errors of their fluxes, tell the errors of both. If they are too large, quadratic
+    tetrahedra on meshes of half the size follow, again and again.
 
-    In time tetrahedra stay linear, since the mass of quadratic ones cannot be lumped. Steps are as long as their error
-    allows, which is followed from each to the next. The surplus of quadratic tetrahedra tells the error of the given
-    mesh, and the mesh is made as fine as the tolerance asks for; where neighbouring gradients differ so much that the
-    given mesh is clearly too coarse, a finer one follows at once. How a finer mesh differs from the given one tells its
-    error. Those of mesh and steps are added, node by node and with their signs. The body is the one that the mesh
-    describes: what flat facets lack of a round body's area is not estimated.
+    In time tetrahedra stay linear, since the mass of quadratic ones cannot be lumped. Three solutions tell the errors
+    of the mesh and of the steps: one on the given mesh, one with all steps halved, one on a mesh of half the size. From
+    then on mesh and steps are made as fine as the tolerance asks for. Both errors are added with their signs, node by
+    node. The body is the one that the mesh describes: what flat facets lack of a round body's area is not estimated.
 
     Args:
         problem: Body, materials, initial temperatures and effects.
@@ -59,7 +156,7 @@ def solve_to_tolerance(
         outputs: Number of equal intervals at whose ends temperatures are kept and compared.
         time_s: Time at which effects that change are taken in a steady state, [s].
         memory_bytes: Most memory that a solution may need, [bytes].
-        allow_unmet: Return the last solution that fits into memory, with `met` False and the reason in `status`,
+        allow_unmet: Return the best solution that fits into memory, with `met` False and the reason in `status`,
             instead of raising.
         log: Takes a line per solution and one on the outcome; print by default.
         progress: As in `solve_heat`, of each solution through time.
@@ -68,60 +165,227 @@ def solve_to_tolerance(
         HeatError: The tolerance cannot be met within the memory, or a solution fails.
     """
     check_positive("memory_bytes", memory_bytes, "Give the memory in bytes, such as 4e9.", HeatError)
-    run = Run(problem, tolerance, float(memory_bytes), log)
+    run = _Run(problem, tolerance, float(memory_bytes), log)
     if duration_s is None:
-        failure = _steady(run, time_s)
-    else:
-        steps = AdaptiveSteps(duration_s, tolerance_k=_needs_kelvin(tolerance), outputs=outputs)
-        failure = follow_to_tolerance(run, steps, progress)
-    return run.close(failure, allow_unmet)
-
-
-def _steady(run: Run, time_s: float) -> str:
-    """Climb to a steady state that is good enough; returns why that was not possible, or nothing."""
-
-    def solve(problem: HeatProblem, order: int) -> SteadySolution:
-        return solve_steady(problem, time_s=time_s, order=order, relative_tolerance=_LINEAR_TOLERANCE)
-
-    given, num_nodes = run.given, len(run.given.mesh.points_m)
-    failure = run.lacks_memory(1, 0)
-    if failure:
-        return failure
-    start = linear_start(given, time_s=time_s, relative_tolerance=_LINEAR_TOLERANCE)
-    linear = start.solution
-    run.add(given, linear, start.error, refinements=0)
-    earlier, before, refinements = given, linear, 0
-    while run.excess > 1.0:
-        failure = run.lacks_memory(2, refinements)
-        if failure:
-            return failure
-        if refinements == 0:
-            problem = replace(given, initial_temperature_c=linear.temperature_c)
-        else:
-            # The nodes of quadratic tetrahedra are those of the finer mesh.
-            problem = _refined(earlier, np.concatenate([before.temperature_c, before.edge_temperature_c]))
-        solution = solve(problem, 2)
-        both = recovered_error(earlier, before), recovered_error(problem, solution)
-        ratios = error_ratios(*both, same_order=refinements > 0)
-        run.add(problem, solution, _richardson(before, solution, num_nodes, ratios), refinements=refinements)
-        earlier, before, refinements = problem, solution, refinements + 1
-    return ""
-
-
-def _refined(problem: HeatProblem, start_c: np.ndarray) -> HeatProblem:
-    """Pose the same problem on a finer mesh, with temperatures to start from."""
-    return replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=start_c)
-
-
-def _richardson(coarse: SteadySolution, fine: SteadySolution, num_nodes: int, ratios: ErrorRatios) -> ErrorSize:
-    difference = difference_between(coarse, fine, num_nodes)
-    return ErrorSize(
-        richardson(difference.temperature_k, ratios.temperature), richardson(difference.heat_flow, ratios.heat_flow)
-    )
-
-
-def _needs_kelvin(tolerance: Tolerance) -> float:
+        return run.close(_solve_steady(run, time_s), allow_unmet)
     if tolerance.temperature_k is None:
         remedy = "Give temperature_k too: steps in time are chosen by it."
         raise HeatError("tolerance", expected="one in kelvin", got="heat_flow only", remedy=remedy)
-    return tolerance.temperature_k
+    steps = AdaptiveSteps(duration_s, _STEPS_OVER_ERROR * tolerance.temperature_k, outputs=outputs)
+    return run.close(_solve_in_time(run, steps, progress), allow_unmet)
+
+
+class _Run:
+    """The solutions so far."""
+
+    def __init__(
+        self, problem: HeatProblem, tolerance: Tolerance, memory_bytes: float, log: Callable[[str], None]
+    ) -> None:
+        self.given, self.tolerance, self._memory_bytes, self._log = problem, tolerance, memory_bytes, log
+        self._solved: list[tuple[Level, HeatProblem, SteadySolution | HeatSolution]] = []
+        self._begin_s = time.perf_counter()
+
+    @property
+    def excess(self) -> float:
+        """Smallest error of a solution over what is allowed."""
+        return min((self.tolerance.excess(level.error) for level, _, _ in self._solved), default=np.inf)
+
+    def add(self, problem: HeatProblem, timed: _Timed, error: ErrorSize, refinements: int) -> None:
+        """Keep a solution, with its estimated errors and the number of times that the mesh size was halved for it."""
+        solution, edges, steps_k = timed.solution, 0, None
+        if isinstance(solution, SteadySolution):
+            edges = len(solution.edge_temperature_c)
+        else:
+            steps_k = solution.time_error_k
+        num_nodes = solution.temperature_c.shape[-1] + edges
+        level = Level(2 if edges else 1, refinements, steps_k, num_nodes, error, timed.seconds)
+        self._solved.append((level, problem, solution))
+        self._log(level.describe())
+
+    def lacks_memory(self, order: int, refinements: int, times: int = 1) -> str:
+        """Say what a solution on the given mesh with its size halved so often takes; return that it does not fit."""
+        needed = peak_bytes(self.given, order=order, refinements=refinements, times=times, adaptive=times > 1)
+        where = "the given mesh" if refinements == 0 else f"the mesh size halved {refinements}x"
+        what = f"P{order} on {where} needs about {describe_bytes(needed)}"
+        if needed <= self._memory_bytes:
+            self._log(f"{what} at most.")
+            return ""
+        return f"{what}, more than the {describe_bytes(self._memory_bytes)} allowed"
+
+    def close(self, failure: str, allow_unmet: bool) -> ToleratedSolution:
+        """Choose the smallest solution whose error is allowed, or else the best, and say how it ended.
+
+        Args:
+            failure: Why the tolerance was not met, or nothing.
+            allow_unmet: Return a solution even so.
+
+        Raises:
+            HeatError: The tolerance was not met, or nothing was solved at all.
+        """
+        if not self._solved:
+            remedy = "Allow more memory, or use a coarser mesh."
+            raise HeatError("memory_bytes", expected="room for a first estimate", got=failure, remedy=remedy)
+
+        def rank(solved: tuple[Level, HeatProblem, SteadySolution | HeatSolution]) -> tuple[float, float]:
+            excess = self.tolerance.excess(solved[0].error)
+            return (float(solved[0].num_nodes), excess) if excess <= 1.0 else (np.inf, excess)
+
+        chosen = min(self._solved, key=rank)
+        levels = *(solved[0] for solved in self._solved if solved is not chosen), chosen[0]
+        last, seconds = chosen[0], time.perf_counter() - self._begin_s
+        allowed = self.tolerance.describe()
+        status = f"{'Not within' if failure else 'Within'} {allowed}: {last.describe()}, {seconds:.2f} s in all."
+        if failure:
+            status += (
+                f" {failure}. Allow more memory (--memory-gb) or a larger error, or take what there is (--allow-unmet "
+                "True); the worst temperature is often at a sharp edge."
+            )
+            if last.step_tolerance_k is None and self.tolerance.heat_flow is None:
+                status += " Heat flows are met far sooner: ask for them instead (--flow-tolerance 0.01)."
+        if failure and not allow_unmet:
+            raise HeatError(status)
+        self._log(status)
+        return ToleratedSolution(chosen[2], chosen[1], last, not failure, status, seconds, levels)
+
+
+@dataclass(frozen=True)
+class _Timed:
+    """A solution and the time it took."""
+
+    solution: SteadySolution | HeatSolution
+    seconds: float
+
+
+def _solve_steady(run: _Run, time_s: float) -> str:
+    """Find a steady state that is good enough; returns why that was not possible, or nothing."""
+
+    def solve(problem: HeatProblem, order: int) -> tuple[SteadySolution, _Timed]:
+        begin_s = time.perf_counter()
+        solution = solve_steady(problem, time_s=time_s, order=order, relative_tolerance=_STEADY_TOLERANCE)
+        return solution, _Timed(solution, time.perf_counter() - begin_s)
+
+    problem, num_nodes = run.given, len(run.given.mesh.points_m)
+    failure = run.lacks_memory(2, 0)
+    if failure:
+        return failure
+    before, timed = solve(problem, 1)
+    before_w_k, refinements = recovered_error_w_k(problem, before), 0
+    first = timed
+    problem = replace(problem, initial_temperature_c=before.temperature_c)
+    while True:
+        solution, timed = solve(problem, 2)
+        after_w_k = recovered_error_w_k(problem, solution)
+        ratios = error_ratios(before_w_k, after_w_k, same_order=refinements > 0)
+        apart = difference_between(before, solution, num_nodes)
+        error = ErrorSize(
+            richardson(apart.temperature_k, ratios.temperature), richardson(apart.heat_flow, ratios.heat_flow)
+        )
+        if refinements == 0:
+            both = ErrorSize(error.temperature_k + apart.temperature_k, error.heat_flow + apart.heat_flow)
+            run.add(run.given, first, both, 0)
+        run.add(problem, timed, error, refinements)
+        if run.excess <= 1.0:
+            return ""
+        refinements += 1
+        failure = run.lacks_memory(2, refinements)
+        if failure:
+            return failure
+        # The nodes of quadratic tetrahedra are those of the finer mesh.
+        start_c = np.concatenate([solution.temperature_c, solution.edge_temperature_c])
+        problem = replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=start_c)
+        before, before_w_k = solution, after_w_k
+
+
+@dataclass(frozen=True)
+class _SignedError:
+    """An error with its sign at the outputs and nodes of the given mesh, and of the mean flow of each effect."""
+
+    temperature_k: Vector
+    """Shape (s + 1, n), [K]."""
+    flows_w: Vector
+    """Shape (e,), [W]."""
+
+    def plus(self, other: _SignedError, share: float = 1.0) -> _SignedError:
+        """Add a share of another one."""
+        return _SignedError(self.temperature_k + share * other.temperature_k, self.flows_w + share * other.flows_w)
+
+    def times(self, factor: float) -> _SignedError:
+        """Scale it."""
+        return _SignedError(factor * self.temperature_k, factor * self.flows_w)
+
+    def size(self, solution: HeatSolution) -> ErrorSize:
+        """Give its largest parts; `solution` tells what the flows are shares of."""
+        change_w = dict(zip(mean_flows_w(solution), self.flows_w.tolist()))
+        return ErrorSize(float(np.max(np.abs(self.temperature_k))), flow_error(change_w, solution))
+
+
+class _Refinable:
+    """Solves a problem in time on meshes of halved size, with halved steps."""
+
+    def __init__(
+        self, problem: HeatProblem, steps: AdaptiveSteps, progress: Callable[[float, int], None] | None
+    ) -> None:
+        self.problems, self._steps, self._progress = [problem], steps, progress
+        self._num_nodes = len(problem.mesh.points_m)
+        self._first_steps: GivenSteps | None = None
+
+    def solve(self, refinements: int, halvings: int) -> tuple[_Timed, _SignedError]:
+        """Solve, and give what is compared; the first solution, on the given mesh, chooses the steps to halve."""
+        begin_s = time.perf_counter()
+        while len(self.problems) <= refinements:
+            coarse = self.problems[-1]
+            start_c = refined_values(coarse.mesh, coarse.start_c)
+            self.problems.append(replace(coarse, mesh=refine_mesh(coarse.mesh), initial_temperature_c=start_c))
+        steps = self._steps if self._first_steps is None else self._first_steps.halved(halvings)
+        solution = solve_heat(
+            self.problems[refinements], steps, relative_tolerance=_STEP_TOLERANCE, progress=self._progress
+        )
+        if self._first_steps is None:
+            self._first_steps = GivenSteps(self._steps.duration_s, solution.step_lengths_s, self._steps.tolerance_k)
+        values = _SignedError(
+            solution.temperature_c[:, : self._num_nodes], np.array(list(mean_flows_w(solution).values()))
+        )
+        return _Timed(solution, time.perf_counter() - begin_s), values
+
+
+def _solve_in_time(run: _Run, steps: AdaptiveSteps, progress: Callable[[float, int], None] | None) -> str:
+    """Follow a body through time well enough; returns why that was not possible, or nothing."""
+    failure = run.lacks_memory(1, 1, steps.num_times)
+    if failure:
+        return failure
+    body, solved = _Refinable(run.given, steps, progress), {}
+    for choice in ((0, 0), (0, 1), (1, 0)):
+        solved[choice] = body.solve(*choice)
+    first = solved[0, 0][1]
+    of_mesh = first.plus(solved[1, 0][1], -1.0).times(1.0 / (1.0 - HALVED))
+    of_steps = first.plus(solved[0, 1][1], -1.0).times(1.0 / (1.0 - HALVED))
+
+    def error(choice: tuple[int, int]) -> ErrorSize:
+        total = of_mesh.times(HALVED ** choice[0]).plus(of_steps, HALVED ** choice[1])
+        return total.size(solved[1, 0][0].solution)
+
+    def keep(choice: tuple[int, int]) -> None:
+        timed, steps_k = solved[choice][0], HALVED ** choice[1] * float(np.max(np.abs(of_steps.temperature_k)))
+        solution = replace(timed.solution, time_error_k=steps_k)
+        run.add(body.problems[choice[0]], _Timed(solution, timed.seconds), error(choice), choice[0])
+
+    for choice in tuple(solved):
+        keep(choice)
+    while run.excess > 1.0:
+        choices = [(m, j) for m in range(_MOST_HALVINGS + 1) for j in range(_MOST_HALVINGS + 1) if (m, j) not in solved]
+        choices.sort(key=lambda choice: _MESH_COST ** choice[0] * _STEP_COST ** choice[1])
+        choice = next((choice for choice in choices if run.tolerance.excess(error(choice)) <= _AIM), None)
+        if choice is None:
+            return f"It would take more than {_MOST_HALVINGS} halvings of the mesh size or of the steps"
+        failure = run.lacks_memory(1, choice[0], steps.num_times)
+        if failure:
+            return failure
+        solved[choice] = body.solve(*choice)
+        change = first.plus(solved[choice][1], -1.0)
+        mesh_gain, steps_gain = 1.0 - HALVED ** choice[0], 1.0 - HALVED ** choice[1]
+        if choice[0] > 0:
+            of_mesh = change.plus(of_steps, -steps_gain).times(1.0 / mesh_gain)
+        else:
+            of_steps = change.times(1.0 / steps_gain)
+        keep(choice)
+    return ""

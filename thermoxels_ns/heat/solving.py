@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.error_budget import Tolerance
 from thermoxels_ns.fem.memory import check_memory, describe_bytes, peak_bytes
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Bounds
 from thermoxels_ns.fem.solution_nodes import Solution
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
-from thermoxels_ns.fem.tolerance import ToleratedSolution, solve_to_tolerance
+from thermoxels_ns.fem.tolerance import Tolerance, ToleratedSolution, solve_to_tolerance
 from thermoxels_ns.heat.screening import Screening, screen
 
 Say = Callable[[str], None]
