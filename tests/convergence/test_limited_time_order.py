@@ -1,4 +1,4 @@
-"""Measured order in time while couplings with the wrong sign are left out to keep temperatures in range."""
+"""Measured order in time while the maximum-principle limiter acts."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ STEPS = (8, 16, 32)
 @pytest.mark.parametrize(
     ("shape", "fourier"), [("torus", 0.003), ("slab at 30 degrees", 0.003), ("cylinder", 0.001), (AT_THE_BOUNDS, 0.012)]
 )
-def test_backward_euler_stays_first_order_where_couplings_are_left_out(shape, fourier) -> None:
+def test_backward_euler_stays_first_order_where_the_limiter_acts(shape, fourier) -> None:
     """One half is warmed from 20 to 40 C, smoothly, and so soon that its heat has not come far into the other half.
 
-    That is where the mesh resolves least; couplings are left out in half of the steps at least. Its own short steps are
+    That is where the mesh resolves least; the limiter acts in half of the steps at least. Its own short steps are
     what they are compared with.
     """
     mesh = body(shape)

@@ -9,10 +9,10 @@ import pytest
 
 from tests.support.heat_meshes import SIDES, box_mesh
 from thermoxels_ns.fem import steady
+from thermoxels_ns.fem.heat_balance import HeatBalance
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.solution import EffectHeat
 from thermoxels_ns.fem.steady import is_still, solve_steady
-from thermoxels_ns.fem.step_account import StepAccount
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, Radiation
@@ -64,14 +64,14 @@ def test_a_balance_through_time_that_is_wrong_is_seen(monkeypatch, effects, thic
     def moved_j(heat: EffectHeat) -> float:
         return float(np.abs(heat.heat_w).sum()) * step_s
 
-    problem, steps, add = sheet(thickness_m, *effects), TimeSteps(3, step_s), StepAccount.add
+    problem, steps, add = sheet(thickness_m, *effects), TimeSteps(3, step_s), HeatBalance.add
 
-    def wrong(account, taken) -> None:
-        heat_w = taken.step.group_heat_w.copy()
+    def wrong(balance, step, step_s, **options) -> None:
+        heat_w = step.group_heat_w.copy()
         heat_w[0] *= 1.0 + WRONG
-        add(account, replace(taken, step=replace(taken.step, group_heat_w=heat_w)))
+        add(balance, replace(step, group_heat_w=heat_w), step_s, **options)
 
-    monkeypatch.setattr(StepAccount, "add", wrong)
+    monkeypatch.setattr(HeatBalance, "add", wrong)
     solution = solve_heat(problem, steps)
     share = moved_j(solution.effects[0]) / sum(moved_j(heat) for heat in solution.effects)
     # What the body stores in differences counts too, and is up to a hundred times as much as flows in a short time.

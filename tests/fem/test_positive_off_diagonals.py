@@ -6,8 +6,7 @@ from scipy import sparse
 
 from tests.support.heat_meshes import box_mesh
 from tests.support.obtuse_bodies import AT_THE_BOUNDS, CONCRETE, body
-from thermoxels_ns.fem.maximum_principle import holds_maximum_principle
-from thermoxels_ns.fem.positive_off_diagonals import WrongCouplings
+from thermoxels_ns.fem.limiter import PositiveOffDiagonals, holds_maximum_principle
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.system import HeatSystem
 
@@ -18,11 +17,11 @@ def obtuse() -> HeatSystem:
 
 def test_without_all_of_them_the_maximum_principle_holds() -> None:
     system = obtuse()
-    left_out = WrongCouplings(system).begin()
+    left_out = PositiveOffDiagonals(system)
     assert not holds_maximum_principle(system.stiffness) and left_out.count == 0
-    limited = left_out.more(np.ones(system.num_nodes, dtype=bool))
+    limited = left_out.leave_out(np.ones(system.num_nodes, dtype=bool))
     assert limited is not None and holds_maximum_principle(limited.stiffness)
-    assert left_out.count > 100 and left_out.more(np.ones(system.num_nodes, dtype=bool)) is None
+    assert left_out.count > 100 and left_out.leave_out(np.ones(system.num_nodes, dtype=bool)) is None
 
 
 @pytest.mark.parametrize("share", [0.02, 0.2, 1.0])
@@ -30,7 +29,7 @@ def test_heat_is_conserved_and_flows_both_ways_alike(share) -> None:
     """The matrix stays symmetric, rows sum to 0, and it only gains: no piece comes apart."""
     system = obtuse()
     outside = np.random.default_rng(0).random(system.num_nodes) < share
-    limited = WrongCouplings(system).begin().more(outside)
+    limited = PositiveOffDiagonals(system).leave_out(outside)
     assert limited is not None
     matrix = limited.stiffness.toarray()
     size = np.abs(matrix).max()
@@ -43,7 +42,7 @@ def test_only_those_of_the_given_nodes_are_left_out() -> None:
     system = obtuse()
     outside = np.zeros(system.num_nodes, dtype=bool)
     outside[7] = True
-    limited = WrongCouplings(system).begin().more(outside)
+    limited = PositiveOffDiagonals(system).leave_out(outside)
     assert limited is not None
     changed = np.abs((limited.stiffness - system.stiffness).toarray()) > 1e-12
     row = changed[7].copy()
@@ -54,10 +53,10 @@ def test_only_those_of_the_given_nodes_are_left_out() -> None:
 
 def test_all_go_after_some_attempts() -> None:
     system = obtuse()
-    left_out, attempts = WrongCouplings(system).begin(), 0
+    left_out, attempts = PositiveOffDiagonals(system), 0
     for node in range(system.num_nodes):
         outside = np.arange(system.num_nodes) == node
-        limited = left_out.more(outside)
+        limited = left_out.leave_out(outside)
         attempts += limited is not None
         if limited is not None and holds_maximum_principle(limited.stiffness):
             break
@@ -70,6 +69,6 @@ def test_what_rounding_leaves_of_nothing_is_no_coupling(share, wrong) -> None:
     system = HeatSystem(HeatProblem(box_mesh(axis, axis, axis), CONCRETE))
     last, size = system.num_nodes - 1, share * float(system.stiffness.diagonal().min())
     entries = sparse.csr_matrix(([size, size], ([0, last], [last, 0])), shape=system.stiffness.shape)
-    left_out = WrongCouplings(system.with_stiffness(sparse.csr_matrix(system.stiffness + entries))).begin()
-    left_out.more(np.ones(system.num_nodes, dtype=bool))
+    left_out = PositiveOffDiagonals(system.with_stiffness(sparse.csr_matrix(system.stiffness + entries)))
+    left_out.leave_out(np.ones(system.num_nodes, dtype=bool))
     assert left_out.count == wrong

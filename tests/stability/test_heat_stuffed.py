@@ -38,7 +38,7 @@ def faults(solution: HeatSolution, low: float, high: float) -> list[str]:
 
 
 def test_these_meshes_do_have_obtuse_angles() -> None:
-    """Or the tests below would show nothing: couplings with the wrong sign, up to the size of the diagonal."""
+    """Or the tests below would show nothing: positive off-diagonals, up to the size of the diagonal."""
     for shape, least in (("sphere", 0.02), ("slab at 30 degrees", 0.02), (AT_THE_BOUNDS, 0.5)):
         mesh = body(shape)
         matrix = stiffness(mesh.points_m, mesh.tets).tocoo()
@@ -141,7 +141,7 @@ def jump() -> HeatProblem:
 def test_what_is_left_out_is_said_and_only_where_needed() -> None:
     short = solve_heat(jump(), TimeSteps(2, 1e-2 * STEP_S))
     assert faults(short, 20.0, 100.0) == []
-    assert "couplings with the wrong sign were left out" in short.status
+    assert "positive off-diagonals were left out" in short.status
     # Long steps are smooth: nothing to mend, and nothing that changes the answer.
     long = solve_heat(jump(), TimeSteps(4, 20.0 * STEP_S))
     assert faults(long, 20.0, 100.0) == []

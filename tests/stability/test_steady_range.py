@@ -9,7 +9,7 @@ import pytest
 
 from tests.support.heat_meshes import SIDES, box_mesh
 from tests.support.obtuse_bodies import AT_THE_BOUNDS, CONCRETE, body
-from thermoxels_ns.fem import steady_range
+from thermoxels_ns.fem import steady
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.stage import Stage
@@ -18,7 +18,7 @@ from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, HeatFlux, InternalHeat, Radiation
 
 LOW, HIGH = -30.0, 90.0
-SAID = "couplings with the wrong sign were left out"
+SAID = "positive off-diagonals were left out"
 STRONG = Convection(("x1",), 1e5, LOW)
 
 
@@ -108,14 +108,14 @@ def test_where_nothing_overshoots_the_first_answer_is_the_last(monkeypatch, shap
             super().__init__(*args, **kwargs)
 
     before = plain(given)
-    monkeypatch.setattr(steady_range, "Stage", Counted)
+    monkeypatch.setattr(steady, "Stage", Counted)
     solution = solve_steady(given)
     np.testing.assert_array_equal(solution.temperature_c, before)
     assert len(made) == 1 and "range" not in solution.status
 
 
 def test_meshes_without_obtuse_angles_need_none() -> None:
-    """Rounding leaves entries a little above 0 there: they are not taken for couplings, nor is the solver's error."""
+    """Rounding leaves entries a little above 0 there: they do not count as positive, nor is the solver's error."""
     axis = np.linspace(0.0, 0.7, 8)
     mesh = box_mesh(axis, axis, axis)
     for tolerance in (1e-6, 1e-8, 1e-12):

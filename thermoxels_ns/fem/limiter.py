@@ -1,30 +1,34 @@
-"""Steps of backward Euler whose temperatures stay in range on any mesh.
+"""Maximum-principle limiter: keeps temperatures in the range they come from, on any mesh.
 
-Where faces meet at an obtuse angle, the stiffness matrix couples two nodes with the wrong sign: heat flows from the
-colder to the warmer one. With smooth temperatures that is right, because flows along other edges outweigh it; beside a
-jump that the mesh cannot resolve, a temperature may leave the range that it came from and that surrounds it.
+Where faces meet at an obtuse angle, the stiffness matrix has an entry above 0 off its diagonal: heat flows from the
+colder to the warmer of two nodes. With smooth temperatures that is right, because flows along other edges outweigh it;
+beside a jump that the mesh cannot resolve, a temperature may leave the range that it came from and that surrounds it.
 
-A step after which one has left is taken again without the wrong-signed couplings of the nodes that left, and again if
-others leave then; without all of them (see `WrongCouplings`) none can, so it ends. Where temperatures stay in range,
-that is wherever the mesh resolves them, nothing is left out and the order of the error is what it was. Steps with
-couplings left out were measured to be of first order too, on three meshes from isosurface stuffing and on one whose
-angles are at the bounds.
+A step of backward Euler, or a steady state, in which a temperature has left is solved again without the positive
+off-diagonals of the nodes that left, and again if others leave then. Without all of them the matrix is an M-matrix, of
+which no temperature leaves its range (Ciarlet and Raviart, Computer Methods in Applied Mechanics and Engineering 2,
+1973), so it ends. Where the mesh resolves the temperatures nothing is left out, and the order of the error is what it
+was. Steps with entries left out were measured to be of first order too.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from scipy import sparse
 
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.positive_off_diagonals import WrongCouplings
 from thermoxels_ns.fem.schemes import BACKWARD_EULER
+from thermoxels_ns.fem.stage import StageSolution
 from thermoxels_ns.fem.stepper import Step, Stepper
 from thermoxels_ns.fem.system import HeatSystem
 
 Vector = npt.NDArray[np.float64]
+Solved = TypeVar("Solved", Step, StageSolution)
 
 RANGE_ROUND_OFF = 1e-9
 """How far out of its range a temperature may be, as a share of the range of the whole computation so far."""
@@ -32,73 +36,113 @@ MOST_SLACK = 1e-6
 """The most that a temperature may be out of range besides round-off, as such a share, however loose a tolerance is."""
 LEVEL_ROUND_OFF = 1e-12
 """The same as a share of the absolute temperature: what the linear solver and floating point leave."""
+_POSITIVE = 1e-9
+"""Share of the diagonal above which an entry off it counts as above 0."""
+_ROUND_OFF = 16.0 * float(np.finfo(np.float64).eps)
+"""An entry above 0 by less than this share of the diagonal is what floating point left of 0."""
+_ATTEMPTS = 8
+"""Attempts after which all positive off-diagonals are left out."""
 
 
-@dataclass(frozen=True)
-class KeptStep:
-    """A step of backward Euler that was kept in range."""
+def holds_maximum_principle(stiffness: sparse.csr_matrix) -> bool:
+    """Whether a stiffness matrix has no entry above 0 off its diagonal, so that it is an M-matrix.
 
-    step: Step
-    """Its outcome; iterations of all repetitions count."""
-    plain_k: Vector
-    """Temperatures after it as they were before any coupling was left out, shape (n,), [K]."""
-    limited: bool
-    """Whether couplings were left out."""
-    in_range: bool
-    """Whether all temperatures are in range. They are not if the step failed, and may not be with consistent masses or
-    boundary exchange."""
+    So it is on meshes without obtuse angles between faces; then no temperature leaves the range of its neighbours.
+
+    >>> holds_maximum_principle(sparse.csr_matrix([[1.0, -1.0], [-1.0, 1.0]]))
+    True
+    """
+    entries = stiffness.tocoo()
+    off = entries.row != entries.col
+    return not np.any(entries.data[off] > _POSITIVE * stiffness.diagonal()[entries.row[off]])
 
 
-class RangeKeeper:
-    """Backward Euler with a watch on the range."""
+class PositiveOffDiagonals:
+    """Positive entries off the diagonal of a stiffness matrix, and which of them are left out.
 
-    def __init__(self, system: HeatSystem, *, relative_tolerance: float) -> None:
-        """Prepare; what only some meshes need is made when it is needed.
+    To leave one out keeps the matrix symmetric, its rows sum to 0 and heat is conserved. What is taken from an entry
+    off the diagonal is added on it, so that the matrix stays positive semidefinite and no component comes apart.
+    """
+
+    def __init__(self, system: HeatSystem) -> None:
+        """Find them; none is left out.
 
         Args:
             system: The equations.
-            relative_tolerance: Of the linear solver.
         """
-        self._system, self._relative_tolerance = system, relative_tolerance
-        self._plain = Stepper(system, BACKWARD_EULER, relative_tolerance=relative_tolerance)
-        self._range = RangeWatch(system)
-        self._wrong: WrongCouplings | None = None
+        self._system = system
+        upper, diagonal = sparse.triu(system.stiffness, k=1, format="coo"), system.stiffness.diagonal()
+        positive = upper.data > _ROUND_OFF * np.minimum(diagonal[upper.row], diagonal[upper.col])
+        self._first, self._second, self._size = upper.row[positive], upper.col[positive], upper.data[positive]
+        self.reset()
 
-    def step(self, start_k: Vector, time_s: float, step_s: float, slack_k: float = 0.0) -> KeptStep:
-        """Take one step.
+    def reset(self) -> None:
+        """Leave none out."""
+        self._left_out, self._attempts = np.zeros(len(self._size), dtype=bool), 0
+
+    @property
+    def count(self) -> int:
+        """How many are left out."""
+        return int(np.count_nonzero(self._left_out))
+
+    def leave_out(self, outside: npt.NDArray[np.bool_]) -> HeatSystem | None:
+        """Leave out those of more nodes, and all after some attempts.
 
         Args:
-            start_k: Temperatures at the start, relative to the system's reference, shape (n,), [K].
-            time_s: Time at the start.
-            step_s: Length, [s].
-            slack_k: As in `RangeWatch.at`.
+            outside: Marks nodes whose temperature is out of range, shape (n,).
+
+        Returns:
+            The equations without them; None if there are no more to leave out.
         """
-        step = self._plain.step(start_k, time_s, step_s)
-        if not step.converged:
-            return KeptStep(step, step.relative_k, limited=False, in_range=False)
-        low, high = self._range.at(start_k, (time_s, time_s + step_s), slack_k)
-        if is_in_range(step, low, high):
-            return KeptStep(step, step.relative_k, limited=False, in_range=True)
-        if not self._system.lumped:
-            return KeptStep(step, step.relative_k, limited=False, in_range=False)
-        if self._wrong is None:
-            self._wrong = WrongCouplings(self._system)
-        plain_k, couplings = step.relative_k, self._wrong.begin()
-        iterations, newton_iterations = step.iterations, step.newton_iterations
-        while step.converged and not is_in_range(step, low, high):
-            limited = couplings.more((step.relative_k < low) | (step.relative_k > high))
-            if limited is None:
-                break
-            stepper = Stepper(limited, BACKWARD_EULER, relative_tolerance=self._relative_tolerance)
-            step = stepper.step(start_k, time_s, step_s)
-            iterations, newton_iterations = iterations + step.iterations, newton_iterations + step.newton_iterations
-        step = step.with_iterations(iterations, newton_iterations)
-        in_range = step.converged and is_in_range(step, low, high)
-        return KeptStep(step, plain_k, limited=couplings.count > 0, in_range=in_range)
+        last = self._attempts == _ATTEMPTS
+        more = ~self._left_out if last else (outside[self._first] | outside[self._second]) & ~self._left_out
+        if self._attempts > _ATTEMPTS or not more.any():
+            return None
+        self._attempts += 1
+        self._left_out |= more
+        first, second, size = (part[self._left_out] for part in (self._first, self._second, self._size))
+        rows, columns = np.concatenate([first, second, first, second]), np.concatenate([second, first, first, second])
+        entries = np.concatenate([-size, -size, size, size])
+        change = sparse.csr_matrix((entries, (rows, columns)), shape=self._system.stiffness.shape)
+        return self._system.with_stiffness(sparse.csr_matrix(self._system.stiffness + change))
 
 
-class RangeWatch:
-    """The range that temperatures may have, with slack for round-off.
+def solve_in_range(
+    entries: PositiveOffDiagonals,
+    first: Solved,
+    low: float,
+    high: float,
+    solve: Callable[[HeatSystem, Solved], Solved],
+) -> tuple[Solved, HeatSystem | None]:
+    """Solve again without positive off-diagonals of nodes out of range until none is, or nothing is left to leave out.
+
+    Args:
+        entries: The positive off-diagonals, none of them left out.
+        first: The solution of the unchanged equations.
+        low: Lowest temperature that is in range, [K].
+        high: Highest one, [K].
+        solve: Solves limited equations; gets the last solution too.
+
+    Returns:
+        The last solution with the iterations of all, and the equations that it fulfils; None: the unchanged ones.
+    """
+    solution, limited = first, None
+    while solution.converged:
+        outside = (solution.relative_k < low) | (solution.relative_k > high)
+        more = entries.leave_out(outside) if outside.any() else None
+        if more is None:
+            break
+        limited, again = more, solve(more, solution)
+        solution = replace(
+            again,
+            iterations=solution.iterations + again.iterations,
+            newton_iterations=solution.newton_iterations + again.newton_iterations,
+        )
+    return solution, limited
+
+
+class AllowedRange:
+    """The range that temperatures may have after a step, with slack for round-off.
 
     Near equilibrium the range of a single step shrinks to nothing, round-off does not; so its slack is a share of the
     widest range so far.
@@ -134,3 +178,50 @@ class RangeWatch:
 def is_in_range(step: Step, low: float, high: float) -> bool:
     """Whether all temperatures after a step are from `low` to `high`."""
     return low <= float(step.relative_k.min()) and float(step.relative_k.max()) <= high
+
+
+class Limiter:
+    """Steps of backward Euler that keep temperatures in range."""
+
+    def __init__(self, system: HeatSystem, *, relative_tolerance: float) -> None:
+        """Prepare; what only some meshes need is made when it is needed.
+
+        Args:
+            system: The equations.
+            relative_tolerance: Of the linear solver.
+        """
+        self._system, self._relative_tolerance = system, relative_tolerance
+        self._plain = Stepper(system, BACKWARD_EULER, relative_tolerance=relative_tolerance)
+        self._range = AllowedRange(system)
+        self._entries: PositiveOffDiagonals | None = None
+
+    def step(self, start_k: Vector, time_s: float, step_s: float, slack_k: float = 0.0) -> tuple[Step, Vector]:
+        """Take one step.
+
+        Args:
+            start_k: Temperatures at the start, relative to the system's reference, shape (n,), [K].
+            time_s: Time at the start.
+            step_s: Length, [s].
+            slack_k: As in `AllowedRange.at`.
+
+        Returns:
+            The step, and the temperatures after it as they were before any entry was left out, shape (n,), [K]. They
+            may be out of range if the step failed, or with consistent masses or boundary exchange.
+        """
+        plain = self._plain.step(start_k, time_s, step_s)
+        if not plain.converged:
+            return replace(plain, in_range=False), plain.relative_k
+        low, high = self._range.at(start_k, (time_s, time_s + step_s), slack_k)
+        if is_in_range(plain, low, high) or not self._system.lumped:
+            return replace(plain, in_range=is_in_range(plain, low, high)), plain.relative_k
+        if self._entries is None:
+            self._entries = PositiveOffDiagonals(self._system)
+        self._entries.reset()
+
+        def solve(limited: HeatSystem, _: Step) -> Step:
+            stepper = Stepper(limited, BACKWARD_EULER, relative_tolerance=self._relative_tolerance)
+            return stepper.step(start_k, time_s, step_s)
+
+        step, limited = solve_in_range(self._entries, plain, low, high, solve)
+        in_range = step.converged and is_in_range(step, low, high)
+        return replace(step, limited=limited is not None, in_range=in_range), plain.relative_k

@@ -12,12 +12,12 @@ from scipy import sparse
 
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.forms import COLDEST_SLOPE_K
+from thermoxels_ns.fem.initial_guess import InitialGuess
 from thermoxels_ns.fem.linear_solver import LinearSolution
 from thermoxels_ns.fem.matrix_parts import block_of
 from thermoxels_ns.fem.newton import Residual, newton
 from thermoxels_ns.fem.piece_balance import is_within, weighted_sums, without_sums
 from thermoxels_ns.fem.solver_choice import LinearSolver
-from thermoxels_ns.fem.starting_guess import StartingGuess
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.fem.two_level import SystemSolver
 
@@ -90,7 +90,7 @@ class Stage:
         self.floats = bool(self.floating.any())
         """Whether there are any."""
         self._rough_solver: SystemSolver | None = None
-        self._guess = StartingGuess() if len(self.matrix.indptr) > _WORTH_A_GUESS else None
+        self._guess = InitialGuess() if len(self.matrix.indptr) > _WORTH_A_GUESS else None
 
     def solve(
         self,
@@ -172,7 +172,7 @@ class Stage:
         return self.everywhere(self.correction(solver, held_w_k, balance)[0])
 
     def correction(
-        self, solver: SystemSolver, held_w_k: Vector, residual: Residual, guess: StartingGuess | None = None
+        self, solver: SystemSolver, held_w_k: Vector, residual: Residual, guess: InitialGuess | None = None
     ) -> tuple[Vector, LinearSolution]:
         """Solve for a change of the free nodes, its mean over floating pieces by their balance.
 
@@ -215,7 +215,7 @@ class Stage:
         return full
 
 
-def _solved(solver: SystemSolver, heat_w: Vector, guess: StartingGuess | None) -> LinearSolution:
+def _solved(solver: SystemSolver, heat_w: Vector, guess: InitialGuess | None) -> LinearSolution:
     """Solve from a guess and learn from the solution."""
     if guess is None or not isinstance(solver, LinearSolver):
         return solver.solve(heat_w)

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.floating_components import check_held
+from thermoxels_ns.fem.limiter import LEVEL_ROUND_OFF, MOST_SLACK, RANGE_ROUND_OFF, PositiveOffDiagonals, solve_in_range
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.solution import SteadySolution, heat_by_effect
-from thermoxels_ns.fem.stage import StageSolution
-from thermoxels_ns.fem.steady_range import state_in_range
+from thermoxels_ns.fem.stage import Stage, StageSolution
 from thermoxels_ns.fem.system import HeatSystem
 
 _SUSPICIOUS = 1e-12
 """Residual from which on it is worth to look whether it is a share of nothing."""
 _ROUND_OFF = 64.0 * float(np.finfo(np.float64).eps)
 """Share of the absolute temperature below which a difference is round-off."""
+_ERROR_OVER_TOLERANCE = 1e3
+"""Error of a temperature that the linear solver's tolerance may leave, as a share of the range over the tolerance."""
 _LEVEL = 1e-10
 """Share of the terms of a sum below which a level temperature balances them, if the linear solver allows it."""
 
@@ -30,13 +34,12 @@ def solve_steady(
     lumped_boundary: bool | None = None,
     relative_tolerance: float = 1e-12,
     allow_unconverged: bool = False,
-    system: HeatSystem | None = None,
 ) -> SteadySolution:
     """Find the temperatures at which the effects of a problem balance, div(k grad T) + s = 0.
 
     With the defaults no temperature leaves the range of the surroundings, unless a flux or source drives it out, on any
-    mesh: where obtuse angles would let one leave, see `state_in_range`. If other choices let one leave, the status
-    says so.
+    mesh: the limiter leaves out positive off-diagonals where obtuse angles would let one leave. If other choices let
+    one leave, the status says so.
 
     Args:
         problem: Body, materials and effects. Its initial temperatures are where iterations start.
@@ -49,8 +52,6 @@ def solve_steady(
         relative_tolerance: Of the linear solver, and of Newton's method if there is radiation.
         allow_unconverged: Return what was computed, with `converged` False and the reason in `status`, instead of
             raising.
-        system: The equations of the problem if they have been made already; `order` and `lumped_boundary` then say
-            nothing. None: they are made here.
 
     Returns:
         Temperatures and heat flows.
@@ -59,12 +60,13 @@ def solve_steady(
         HeatError: A piece of the body exchanges heat with nothing whose temperature is known, two effects fix one node
             differently, quadratic tetrahedra are to be lumped, or the solver does not converge.
     """
-    if system is None:
-        system = HeatSystem(problem, lumped=order == 1, lumped_boundary=lumped_boundary, order=order)
+    system = HeatSystem(problem, lumped=order == 1, lumped_boundary=lumped_boundary, order=order)
     check_held(system, time_s)
-    state = state_in_range(system, time_s, relative_tolerance=relative_tolerance)
+    state = _limited_state(system, time_s, relative_tolerance)
     solution, system = state.solution, state.system
-    failure = _failure(system, solution)
+    failure = too_cold(system, solution.relative_k)
+    if not solution.converged:
+        failure = f"No steady state was found. {solution.status} Check the mesh's quality and the effects."
     if failure and not allow_unconverged:
         raise HeatError(failure)
     relative_k = solution.relative_k
@@ -81,6 +83,80 @@ def solve_steady(
         assembled=system.assembled,
         edge_temperature_c=relative_k[num_mesh_nodes:] + system.reference_c,
     )
+
+
+@dataclass(frozen=True)
+class _LimitedState:
+    """A steady state and what was done to keep it in range."""
+
+    solution: StageSolution
+    """Temperatures and how they were found; iterations of all repetitions count."""
+    system: HeatSystem
+    """The equations that they fulfil."""
+    left_out: int
+    """Positive off-diagonals that were left out."""
+    outside: int
+    """Nodes that are out of range all the same."""
+    outside_k: float
+    """By how much at most, [K]."""
+
+    def describe(self) -> str:
+        """Say what was done and what was not, or nothing."""
+        sentence = ""
+        if self.left_out:
+            sentence += (
+                " Obtuse angles would have let temperatures leave the range of the surroundings; "
+                f"{self.left_out} positive off-diagonals were left out."
+            )
+        if self.outside:
+            sentence += (
+                f" The temperature of {self.outside} of {self.system.num_nodes} nodes is up to {self.outside_k:.2g} K "
+                "out of the range of the surroundings"
+            )
+            if self.system.lumped:
+                sentence += ", by the tolerance of the linear solver."
+            elif self.system.num_nodes > len(self.system.problem.mesh.points_m):
+                sentence += ", which quadratic tetrahedra may do where they do not resolve the temperature."
+            else:
+                sentence += ", which boundary exchange that is not lumped may do."
+        return sentence
+
+
+def _limited_state(system: HeatSystem, time_s: float, relative_tolerance: float) -> _LimitedState:
+    """Find a steady state in the range of all given and surrounding temperatures; fluxes and sources open its sides."""
+
+    def solve(equations: HeatSystem, before: StageSolution | None) -> StageSolution:
+        # Radiation is found soonest from where the temperatures are already.
+        start_k = before.relative_k if before is not None and system.nonlinear else system.start_k
+        stage = Stage(equations, time_s, np.inf, relative_tolerance=relative_tolerance)
+        return stage.solve(start_k, time_s)
+
+    solution, solved, left_out = solve(system, None), system, 0
+    if not solution.converged:
+        return _LimitedState(solution, system, 0, 0, 0.0)
+    low, high = system.surroundings_k(time_s)  # a steady state does not know its start
+    slack_k = _slack_k(system, low, high, relative_tolerance)
+    least, most = low - slack_k, high + slack_k
+    if system.lumped and (solution.relative_k.min() < least or solution.relative_k.max() > most):
+        entries = PositiveOffDiagonals(system)
+        solution, limited = solve_in_range(entries, solution, least, most, solve)
+        solved, left_out = limited or system, entries.count
+    relative_k = solution.relative_k
+    outside = int(np.count_nonzero((relative_k < least) | (relative_k > most)))
+    outside_k = max(low - float(relative_k.min()), float(relative_k.max()) - high) if outside else 0.0
+    return _LimitedState(solution, solved, left_out, outside, outside_k)
+
+
+def _slack_k(system: HeatSystem, low: float, high: float, relative_tolerance: float) -> float:
+    """How far out of range floating point and the linear solver may put a temperature, [K].
+
+    What the solver looks for is the change from the start, so that its error is a share of that.
+    """
+    start_k = system.start_k
+    ends = [end for end in (low, high, float(start_k.min()), float(start_k.max())) if np.isfinite(end)]
+    level_k = max(abs(end) for end in ends) + abs(system.reference_c + ZERO_CELSIUS_K)
+    share = min(max(_ERROR_OVER_TOLERANCE * relative_tolerance, RANGE_ROUND_OFF), MOST_SLACK)
+    return max(share * (max(ends) - min(ends)), LEVEL_ROUND_OFF * level_k)
 
 
 def _residual(
@@ -142,26 +218,13 @@ def heat_of_groups_w(
     return np.concatenate([system.group_heat_w(relative_k, time_s), system.fixed.shares @ kept])
 
 
-def _failure(system: HeatSystem, solution: StageSolution) -> str:
-    """Say why a solution is none, or nothing."""
-    if not solution.converged:
-        return f"No steady state was found. {solution.status} Check the mesh's quality and the effects."
-    return too_cold(system, solution.relative_k)
-
-
 def too_cold(system: HeatSystem, relative_k: np.ndarray) -> str:
-    """Say that temperatures are impossible, or nothing."""
-    coldest_k = float(relative_k.min())
-    if not is_too_cold(system, coldest_k):
+    """Say that temperatures are below absolute zero, or nothing."""
+    coldest_k = float(relative_k.min()) + system.reference_c + ZERO_CELSIUS_K
+    if coldest_k >= -1e-6:
         return ""
-    coldest_k += system.reference_c + ZERO_CELSIUS_K
     return (
         f"The temperature falls to {coldest_k:.6g} K, below absolute zero: the given fluxes or sources take out more "
         "heat than can flow in. Check their sign (positive is into the body). In long steps, schemes other than "
         "backward Euler may overshoot, too."
     )
-
-
-def is_too_cold(system: HeatSystem, coldest_k: float) -> bool:
-    """Whether the coldest temperature, relative to the system's reference, is below absolute zero."""
-    return not coldest_k + system.reference_c + ZERO_CELSIUS_K >= -1e-6

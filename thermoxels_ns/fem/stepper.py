@@ -1,8 +1,8 @@
-"""One time step of any scheme, with the heat that flowed during it."""
+"""One time step of any scheme, with the heat that flows during it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import isclose
 
 import numpy as np
@@ -38,10 +38,10 @@ class Step:
     """Whether all stages were solved."""
     status: str
     """The outcome as a sentence."""
-
-    def with_iterations(self, iterations: int, newton_iterations: int) -> Step:
-        """Copy it with other numbers of iterations, those of repetitions included."""
-        return replace(self, iterations=iterations, newton_iterations=newton_iterations)
+    limited: bool = False
+    """Whether the maximum-principle limiter changed the equations."""
+    in_range: bool = True
+    """Whether all temperatures are in the range of the start and of the surroundings."""
 
 
 class Stepper:

@@ -1,8 +1,9 @@
-"""The temperatures of a body through time."""
+"""The temperatures of a body through time, in equal, given or adaptive steps."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -10,18 +11,30 @@ import numpy.typing as npt
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.floating_components import check_stored
-from thermoxels_ns.fem.marching import AdaptiveMarch, Taken, equal_steps
+from thermoxels_ns.fem.heat_balance import HeatBalance
+from thermoxels_ns.fem.limiter import AllowedRange, Limiter, is_in_range
 from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, SDIRK2, Scheme
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.steady import too_cold
-from thermoxels_ns.fem.step_account import StepAccount
+from thermoxels_ns.fem.stepper import Step, Stepper
 from thermoxels_ns.fem.system import HeatSystem
 
 Vector = npt.NDArray[np.float64]
 
 MAX_STATE_BYTES = 4 * 2**30
 """Most memory that the temperatures of all times may take, [bytes]; every time is also a file of an export."""
+STEP_SHARE = 0.1
+"""Share of the tolerance that one step may use. Conduction forgets errors, so that those of many steps do not add up
+to their sum."""
+RANGE_SHARE = 1e-3
+"""Share of the tolerance by which a temperature may leave its range: less than that is not worth shorter steps."""
+_SAFETY = 0.9
+_SHRINK, _GROW = 0.2, 5.0
+_KEEP_BELOW = 1.25
+"""A step that could be longer by less than this stays as it is, and so do its matrices."""
+_SHORTEST = 1e-60
+"""Shortest step as a share of the duration; bodies with next to no heat capacity begin with such short ones."""
 
 
 def solve_heat(
@@ -38,14 +51,14 @@ def solve_heat(
     """Follow the temperatures of a body through time.
 
     With the defaults no temperature leaves the range of the start and of the surroundings, unless a flux or source
-    drives it out, at any step length and on any mesh: where obtuse angles would let one leave, see `RangeKeeper`. If
-    other choices let one leave, the status says so.
+    drives it out, at any step length and on any mesh: where obtuse angles would let one leave, see `Limiter`. If other
+    choices let one leave, the status says so.
 
     Args:
         problem: Body, materials, initial temperatures and effects; without effects the boundary is insulated.
         time: Equal steps, steps as long as a tolerance allows, or steps of given lengths.
-        scheme: The scheme in time; None: backward Euler for equal steps, SDIRK2 (with backward Euler where it would
-            overshoot) for a tolerance, which needs a scheme with an estimate.
+        scheme: The scheme in time; None: backward Euler for equal steps, otherwise SDIRK2 (with backward Euler where it
+            would overshoot). Adaptive steps need a scheme with an estimate.
         lumped: Lump the mass matrix, which keeps temperatures within their range at any step length.
         lumped_boundary: Evaluate convection and radiation at the nodes, for the same reason.
         relative_tolerance: Of the linear solver in each step.
@@ -58,7 +71,7 @@ def solve_heat(
 
     Raises:
         HeatError: If the temperatures of all times do not fit into memory, an effect does not fit the mesh, heat flows
-            into a piece that neither stores nor passes it on, a step's solver does not converge, or the temperature
+            into a component that neither stores nor passes it on, a step's solver does not converge, or the temperature
             falls below absolute zero.
     """
     states = _room_for_states(time.num_times, len(problem.mesh.points_m))
@@ -67,34 +80,194 @@ def solve_heat(
     if len(system.fixed.nodes):
         states[0, system.fixed.nodes] = system.fixed.temperature_k(0.0)
     check_stored(system, time.duration_s)
-    account = StepAccount(system, states, time.times_s)
-    march: AdaptiveMarch | None = None
-    if isinstance(time, TimeSteps):
-        steps: Iterator[Taken] = equal_steps(system, scheme or BACKWARD_EULER, states[0], time, relative_tolerance)
-    else:
-        _check_estimate(scheme)
-        march = AdaptiveMarch(system, scheme or SDIRK2, states[0], time, relative_tolerance=relative_tolerance)
-        steps = march.steps()
+    balance, adaptive = HeatBalance(system, states, time.times_s), isinstance(time, AdaptiveSteps)
+    if adaptive and scheme is not None and scheme.estimate is None:
+        expected = "one with an error estimate for adaptive steps"
+        raise HeatError("scheme", expected=expected, got=scheme.name, remedy="Use SDIRK2, or equal steps.")
+    if scheme is None:
+        scheme = BACKWARD_EULER if isinstance(time, TimeSteps) else SDIRK2
+    march = _March(system, scheme, time, relative_tolerance)
     failure = ""
-    for taken in steps:
+    for taken in march.steps(states[0]):
         failure = taken.failure or too_cold(system, taken.step.relative_k)
         if failure:
             break
-        account.add(taken)
+        balance.add(taken.step, taken.step_s, ends_interval=taken.ends_interval)
         if progress is not None:
-            progress(account.followed_s / time.duration_s, account.steps)
+            progress(balance.followed_s / time.duration_s, balance.steps)
     if failure and not allow_unconverged:
         raise HeatError(failure)
-    return account.close(failure or account.success(march) + skips(problem, time), not failure, adaptive=bool(march))
+    status = failure or balance.success(march.describe()) + _skips(problem, time)
+    return balance.close(status, not failure, adaptive=adaptive)
 
 
-def skips(problem: HeatProblem, time: TimeSteps | AdaptiveSteps | GivenSteps) -> str:
-    """Say that steps may be too long to see how an effect changes, or nothing.
+@dataclass(frozen=True)
+class _Taken:
+    """A step that counts."""
 
-    Args:
-        problem: The effects.
-        time: The steps.
+    step: Step
+    step_s: float
+    """Its length, [s]."""
+    ends_interval: bool
+    """Whether temperatures are kept at its end."""
+    failure: str = ""
+    """Why the computation ends here; then the step does not count."""
+
+
+class _March:
+    """Takes steps.
+
+    Equal steps of backward Euler are limited to the range that temperatures may have, that of the step's start and of
+    all surroundings; those of other schemes are watched only. An adaptive or given step whose result leaves the range
+    is taken with the limiter's backward Euler instead; of an adaptive one the difference between both schemes is then
+    the error estimate. What the limiter changes is the mesh's error, not the step's, and no part of it: it would ask
+    for ever shorter steps. So nothing overshoots by more than a thousandth of the tolerance or a millionth of the
+    range, and second order returns as soon as it is safe. No adaptive step is longer than effects can be followed by,
+    so that none steps over a day of sunshine.
     """
+
+    def __init__(
+        self,
+        system: HeatSystem,
+        scheme: Scheme,
+        time: TimeSteps | AdaptiveSteps | GivenSteps,
+        relative_tolerance: float,
+    ) -> None:
+        self._system, self._scheme, self._time = system, scheme, time
+        self._stepper = Stepper(system, scheme, relative_tolerance=relative_tolerance)
+        self._limiter = Limiter(system, relative_tolerance=relative_tolerance)
+        self._range = AllowedRange(system)
+        tolerance_k = 0.0 if isinstance(time, TimeSteps) else time.tolerance_k
+        self._slack_k = RANGE_SHARE * tolerance_k
+        self._allowed_k = STEP_SHARE * tolerance_k if isinstance(time, AdaptiveSteps) else np.inf
+        self._repeated = self._replaced = 0
+
+    def steps(self, start_k: Vector) -> Iterator[_Taken]:
+        """Take all steps; the last one may be a failure."""
+        if isinstance(self._time, AdaptiveSteps):
+            return self._adaptive(start_k, self._time)
+        return self._given(start_k, self._time)
+
+    def describe(self) -> str:
+        """Say what was done besides the steps that count."""
+        sentence = ""
+        if self._repeated:
+            sentence += f" {self._repeated} more were repeated with a shorter length."
+        if self._replaced:
+            sentence += (
+                f" {self._replaced} were taken with backward Euler because {self._scheme.name} would have overshot."
+            )
+        return sentence
+
+    def _given(self, start_k: Vector, time: TimeSteps | GivenSteps) -> Iterator[_Taken]:
+        """Take steps of known lengths."""
+        if isinstance(time, TimeSteps):
+            intervals = [[time.step_seconds]] * time.steps
+        else:
+            intervals = [lengths_s.tolist() for lengths_s in time.lengths_s]
+        relative_k, count, total = start_k, 0, sum(len(lengths_s) for lengths_s in intervals)
+        for now_s, lengths_s in zip(time.times_s.tolist(), intervals):
+            for number, step_s in enumerate(lengths_s, start=1):
+                count += 1
+                step = self._fixed_step(relative_k, now_s, step_s)
+                failure = ""
+                if not step.converged:
+                    remedy = "Use shorter steps or check the mesh's quality."
+                    failure = f"Step {count} of {total} failed. {step.status} {remedy}"
+                yield _Taken(step, step_s, number == len(lengths_s), failure)
+                relative_k, now_s = step.relative_k, now_s + step_s
+
+    def _fixed_step(self, start_k: Vector, now_s: float, step_s: float) -> Step:
+        if isinstance(self._time, GivenSteps):
+            return self._safe_step(start_k, now_s, step_s)[0]
+        if self._scheme is BACKWARD_EULER:
+            return self._limiter.step(start_k, now_s, step_s)[0]
+        step = self._stepper.step(start_k, now_s, step_s)
+        return replace(step, in_range=step.converged and self._in_range(step, start_k, now_s, step_s))
+
+    def _adaptive(self, start_k: Vector, time: AdaptiveSteps) -> Iterator[_Taken]:
+        """Take steps as long as their estimated errors allow."""
+        relative_k, now_s, wished_s = start_k, 0.0, self._first_length(start_k, time)
+        for end_s in time.times_s[1:]:
+            while now_s < end_s:
+                left_s = float(end_s) - now_s
+                step_s = _fitted(min(wished_s, self._system.problem.resolution_s), left_s)
+                step, order = self._safe_step(relative_k, now_s, step_s)
+                factor = self._factor(step, order)
+                if not step.converged or step.error_k > self._allowed_k:
+                    self._repeated += 1
+                    wished_s = step_s * min(factor, _SAFETY)
+                    if wished_s < _SHORTEST * time.duration_s or now_s + 0.25 * wished_s == now_s:
+                        yield _Taken(step, step_s, False, self._failure(step, now_s, time))
+                        return
+                    continue
+                now_s = float(end_s) if step_s == left_s else now_s + step_s
+                relative_k = step.relative_k
+                next_s = step_s * (factor if factor > _KEEP_BELOW else min(factor, 1.0))
+                # A step cut short by an interval's end says nothing against the length wished for.
+                wished_s = max(next_s, wished_s) if step_s < wished_s and factor >= 1.0 else next_s
+                yield _Taken(step, step_s, now_s == end_s)
+
+    def _first_length(self, start_k: Vector, time: AdaptiveSteps) -> float:
+        system = self._system
+        rate = system.net_heat(start_k, 0.0)[0] / system.nodal_mass_j_k
+        fastest = float(np.max(np.abs(rate[system.fixed.free]), initial=0.0))
+        interval_s = time.duration_s / time.outputs
+        if fastest == 0.0:
+            return interval_s
+        return float(np.clip(time.tolerance_k / fastest, _SHORTEST * time.duration_s, interval_s))
+
+    def _safe_step(self, start_k: Vector, now_s: float, step_s: float) -> tuple[Step, int]:
+        """Take a step, with backward Euler if it leaves the range; the second value is the order of the scheme."""
+        plain = self._stepper.step(start_k, now_s, step_s, estimate=isinstance(self._time, AdaptiveSteps))
+        order = self._scheme.order
+        if not plain.converged or plain.error_k > self._allowed_k or self._in_range(plain, start_k, now_s, step_s):
+            return plain, order
+        limited, unlimited_k = self._limiter.step(start_k, now_s, step_s, self._slack_k)
+        if not limited.in_range:
+            return replace(plain, in_range=False), order
+        error_k = float(np.max(np.abs(unlimited_k - plain.relative_k)))
+        self._replaced += error_k <= self._allowed_k
+        limited = replace(
+            limited,
+            error_k=error_k,
+            iterations=limited.iterations + plain.iterations,
+            newton_iterations=limited.newton_iterations + plain.newton_iterations,
+        )
+        return limited, BACKWARD_EULER.order
+
+    def _in_range(self, step: Step, start_k: Vector, now_s: float, step_s: float) -> bool:
+        times = (now_s, *(now_s + node * step_s for node in self._scheme.nodes))
+        return is_in_range(step, *self._range.at(start_k, times, self._slack_k))
+
+    def _factor(self, step: Step, order: int) -> float:
+        """How much longer the next step may be."""
+        if not step.converged or not np.isfinite(step.error_k):
+            return _SHRINK
+        if step.error_k == 0.0:
+            return _GROW
+        return float(np.clip(_SAFETY * (self._allowed_k / step.error_k) ** (1.0 / (order + 1)), _SHRINK, _GROW))
+
+    def _failure(self, step: Step, now_s: float, time: AdaptiveSteps) -> str:
+        if not step.converged:
+            return f"At {now_s:.6g} s no step however short succeeds. {step.status} Check the mesh's quality."
+        return (
+            f"At {now_s:.6g} s no step however short keeps within {time.tolerance_k:g} K. Something jumps in "
+            "time: end an interval there, or raise the tolerance."
+        )
+
+
+def _fitted(wished_s: float, left_s: float) -> float:
+    """Fit a step into what is left of an interval: two even steps to its end rather than a long and a tiny one.
+
+    >>> [_fitted(wished, 10.0) for wished in (12.0, 8.0, 3.0)]
+    [10.0, 5.0, 3.0]
+    """
+    return left_s if wished_s >= left_s else min(wished_s, 0.5 * left_s)
+
+
+def _skips(problem: HeatProblem, time: TimeSteps | AdaptiveSteps | GivenSteps) -> str:
+    """Say that steps may be too long to see how an effect changes, or nothing."""
     if not isinstance(time, TimeSteps):
         labelled = zip(effect_labels(problem), problem.effects)
         names = [label for label, effect in labelled if any(effect.bounded(name).unresolved for name in effect.bounds)]
@@ -110,14 +283,6 @@ def skips(problem: HeatProblem, time: TimeSteps | AdaptiveSteps | GivenSteps) ->
         f" Steps of {time.step_seconds:g} s are longer than the {problem.resolution_s:g} s by which effects that "
         "change with time can be followed; what happens in between is missed."
     )
-
-
-def _check_estimate(scheme: Scheme | None) -> None:
-    if scheme is not None and scheme.estimate is None:
-        remedy = "Use SDIRK2, or equal steps."
-        raise HeatError(
-            "scheme", expected="one with an error estimate for adaptive steps", got=scheme.name, remedy=remedy
-        )
 
 
 def _room_for_states(num_times: int, num_nodes: int) -> Vector:

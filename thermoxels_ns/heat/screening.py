@@ -12,9 +12,9 @@ from scipy import sparse
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.elements import capacities
+from thermoxels_ns.fem.limiter import holds_maximum_principle
 from thermoxels_ns.fem.linear_solver import ConjugateGradients
 from thermoxels_ns.fem.linear_space import LinearSpace
-from thermoxels_ns.fem.maximum_principle import holds_maximum_principle
 from thermoxels_ns.fem.pieces import Pieces
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.selection import Selection

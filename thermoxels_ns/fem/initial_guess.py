@@ -1,4 +1,4 @@
-"""Where to start to solve one more equation with the same matrix: what the last solutions have in common with it.
+"""Initial guess of a linear solve from earlier solutions with the same matrix.
 
 The change of one time step resembles those of the steps before it. Among all combinations of the last solutions the
 one is taken that is nearest to the new solution in the norm of the matrix (Fischer, Computer Methods in Applied
@@ -23,10 +23,10 @@ _DEPENDENT = 1e-10
 """Share of the largest singular value below which combinations count as the same."""
 
 
-class StartingGuess:
+class InitialGuess:
     """The last solutions x_i of A x_i = b_i, scaled to a largest entry of 1.
 
-    >>> guess = StartingGuess()
+    >>> guess = InitialGuess()
     >>> guess.for_right_hand_side(np.array([2.0, 6.0])) is None
     True
     >>> guess.keep(np.array([1.0, 3.0]), np.array([1.0, 1.0]))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import sparse
 
+from thermoxels_ns.fem.initial_guess import InitialGuess
 from thermoxels_ns.fem.linear_solver import ConjugateGradients
-from thermoxels_ns.fem.starting_guess import StartingGuess
 
 
 @pytest.fixture
@@ -16,7 +16,7 @@ def matrix() -> sparse.csr_matrix:
     return sparse.diags([off, np.full(300, 2.01), off], [-1, 0, 1], format="csr")
 
 
-def guessed(guess: StartingGuess, right_hand_side: np.ndarray) -> np.ndarray:
+def guessed(guess: InitialGuess, right_hand_side: np.ndarray) -> np.ndarray:
     found = guess.for_right_hand_side(right_hand_side)
     assert found is not None
     return found
@@ -24,7 +24,7 @@ def guessed(guess: StartingGuess, right_hand_side: np.ndarray) -> np.ndarray:
 
 def test_a_combination_of_what_was_solved_is_found(matrix) -> None:
     solutions = np.random.default_rng(0).normal(size=(3, 300))
-    guess = StartingGuess()
+    guess = InitialGuess()
     for x in solutions:
         guess.keep(matrix @ x, x)
     wanted = np.array([2.0, -1.0, 1e-3]) @ solutions
@@ -33,7 +33,7 @@ def test_a_combination_of_what_was_solved_is_found(matrix) -> None:
 
 def test_the_oldest_is_forgotten_and_the_same_twice_does_no_harm(matrix) -> None:
     first, second = np.random.default_rng(1).normal(size=(2, 300))
-    guess = StartingGuess()
+    guess = InitialGuess()
     for x in (first, second, second, 1e-200 * second):
         guess.keep(matrix @ x, x)
     np.testing.assert_allclose(guessed(guess, matrix @ second), second, atol=1e-9)
@@ -44,7 +44,7 @@ def test_the_oldest_is_forgotten_and_the_same_twice_does_no_harm(matrix) -> None
 def test_it_is_nearest_in_the_norm_of_the_matrix(matrix) -> None:
     rng = np.random.default_rng(2)
     known, wanted = rng.normal(size=(2, 300)), rng.normal(size=300)
-    guess = StartingGuess()
+    guess = InitialGuess()
     for x in known:
         guess.keep(matrix @ x, x)
     lacking = matrix @ (wanted - guessed(guess, matrix @ wanted))
@@ -53,7 +53,7 @@ def test_it_is_nearest_in_the_norm_of_the_matrix(matrix) -> None:
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_what_is_not_finite_is_not_guessed_from(matrix, bad) -> None:
-    guess = StartingGuess()
+    guess = InitialGuess()
     guess.keep(np.ones(300), np.full(300, bad))
     assert guess.for_right_hand_side(np.ones(300)) is None
     guess.keep(matrix @ np.ones(300), np.ones(300))
@@ -61,7 +61,7 @@ def test_what_is_not_finite_is_not_guessed_from(matrix, bad) -> None:
 
 
 def test_short_solutions_need_none(matrix) -> None:
-    guess = StartingGuess()
+    guess = InitialGuess()
     guess.keep(matrix @ np.ones(300), np.ones(300))
     guess.keep(np.ones(300), np.ones(300), iterations=3)
     assert guess.for_right_hand_side(np.ones(300)) is None

@@ -1,4 +1,4 @@
-"""The account of steps in time: which states are kept, and the balance of the heat that flowed in between."""
+"""Heat balance of a computation in time, with the states that are kept."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.units import celsius_to_kelvin
 from thermoxels_ns.fem.effect_forms import effect_labels
-from thermoxels_ns.fem.marching import AdaptiveMarch, Taken
 from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect, left_out
 from thermoxels_ns.fem.steady import is_still
+from thermoxels_ns.fem.stepper import Step
 from thermoxels_ns.fem.system import HeatSystem
 
 Vector = npt.NDArray[np.float64]
@@ -20,7 +20,7 @@ _SUSPICIOUS = 1e-12
 """Residual from which on it is worth to look whether it is round-off."""
 
 
-class StepAccount:
+class HeatBalance:
     """Keeps states at the ends of intervals and adds up the heat that flowed in between."""
 
     def __init__(self, system: HeatSystem, states_k: Vector, times_s: Vector) -> None:
@@ -47,34 +47,30 @@ class StepAccount:
         """Number of steps so far."""
         return self._steps
 
-    def add(self, taken: Taken) -> None:
-        """Count a step."""
-        step, row = taken.step, self._done
-        self.followed_s += taken.step_s
-        self._lengths_s[row].append(taken.step_s)
-        self._heat_j[row] += taken.step_s * step.group_heat_w
-        self._exchanged_j[row] += taken.step_s * float(np.abs(step.group_heat_w).sum())
+    def add(self, step: Step, step_s: float, *, ends_interval: bool) -> None:
+        """Count a step of a length, [s]; at the end of an interval its temperatures are kept."""
+        row = self._done
+        self.followed_s += step_s
+        self._lengths_s[row].append(step_s)
+        self._heat_j[row] += step_s * step.group_heat_w
+        self._exchanged_j[row] += step_s * float(np.abs(step.group_heat_w).sum())
         self._iterations[row] += step.iterations, step.newton_iterations
         self._most_iterations = max(self._most_iterations, step.iterations)
         self._error_k += step.error_k
         self._steps += 1
-        self._limited += taken.limited
-        self._out_of_range += not taken.in_range
-        if taken.ends_interval:
+        self._limited += step.limited
+        self._out_of_range += not step.in_range
+        if ends_interval:
             self._done += 1
             self._states[self._done] = step.relative_k
 
-    def success(self, march: AdaptiveMarch | None) -> str:
-        """Say that all went well, and how."""
-        sentence = f"All {self._steps} steps converged, in {self._most_iterations} iterations at most."
-        if march is not None and march.repeated:
-            sentence += f" {march.repeated} more were repeated with a shorter length."
-        if march is not None and march.made_safe:
-            sentence += f" {march.made_safe} were taken with backward Euler because {march.name} would have overshot."
+    def success(self, of_steps: str) -> str:
+        """Say that all went well, and how; `of_steps` is what is to be said about other steps."""
+        sentence = f"All {self._steps} steps converged, in {self._most_iterations} iterations at most.{of_steps}"
         if self._limited:
             sentence += (
-                f" In {self._limited}, obtuse angles would have let a temperature leave its range; couplings with the "
-                "wrong sign were left out there."
+                f" In {self._limited}, obtuse angles would have let a temperature leave its range; positive "
+                "off-diagonals were left out there."
             )
         if self._out_of_range:
             sentence += (
