@@ -112,12 +112,12 @@ def test_richardson() -> None:
 def test_error_ratios() -> None:
     first, second, nothing = np.array([1.0, 3.0]), np.array([0.5, 0.5]), np.zeros(2)
     ratios = error_ratios(first, second, same_order=True)
-    assert (ratios.temperature, ratios.heat_flow) == (0.25, 0.25)
+    assert (ratios.temperature_k, ratios.heat_flow) == (0.25, 0.25)
     ratios = error_ratios(first, second, same_order=False)
-    assert (ratios.temperature, ratios.heat_flow) == (pytest.approx(0.125**0.57), 0.125)
+    assert (ratios.temperature_k, ratios.heat_flow) == (pytest.approx(0.125**0.57), 0.125)
     assert error_ratios(second, first, same_order=True).heat_flow == 0.7
     for pair in ((first, nothing), (nothing, first)):
-        assert error_ratios(*pair, same_order=True).temperature == 1e-3
+        assert error_ratios(*pair, same_order=True).temperature_k == 1e-3
 
 
 def test_a_solution_of_another_mesh_is_refused() -> None:

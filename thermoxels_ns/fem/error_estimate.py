@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +17,6 @@ from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 
 Vector = npt.NDArray[np.float64]
-Flows = Mapping[str, float]
-"""Mean heat flow into the body of each effect, [W]."""
 
 HALVED = 0.3
 """Share of an error that is left after the mesh size of linear tetrahedra, or the steps of SDIRK2, are halved. Theory
@@ -50,16 +47,6 @@ class ErrorSize:
     def describe(self) -> str:
         """Say it in words."""
         return f"{self.temperature_k:.2g} K and {100.0 * self.heat_flow:.2g} % of the heat flow"
-
-
-@dataclass(frozen=True)
-class ErrorRatios:
-    """Errors of a finer solution over those of a coarser one, for `richardson`."""
-
-    temperature: float
-    """Of temperatures at nodes."""
-    heat_flow: float
-    """Of heat flows."""
 
 
 def richardson(difference: float, ratio: float) -> float:
@@ -93,37 +80,42 @@ def mean_flows_w(solution: SteadySolution | HeatSolution) -> dict[str, float]:
     return {heat.effect: float(lengths @ heat.heat_w / lengths.sum()) for heat in solution.effects}
 
 
-def flow_error(difference: Flows, solution: SteadySolution | HeatSolution) -> float:
-    """Largest error of a solution's mean heat flows as a share of what flows through the body, half the sum of sizes.
+def compared_values(solution: SteadySolution | HeatSolution, num_nodes: int) -> Vector:
+    """List what solutions are compared by: temperatures of the first nodes at all times, then `mean_flows_w`.
+
+    Args:
+        solution: One of them.
+        num_nodes: Number of nodes of the mesh that all have in common; they come first.
+    """
+    flows_w = np.array(list(mean_flows_w(solution).values()))
+    return np.concatenate([solution.temperature_c[..., :num_nodes].ravel(), flows_w])
+
+
+def error_size(error: Vector, solution: SteadySolution | HeatSolution) -> ErrorSize:
+    """Give the largest errors of a solution.
 
     Where all temperatures are equal nothing flows but round-off, which has no share of it.
 
     Args:
-        difference: Error of the flow of each effect, [W].
-        solution: The solution.
+        error: Errors of its `compared_values`.
+        solution: The solution, whose flows errors are shares of.
     """
+    flows_w = np.abs(list(mean_flows_w(solution).values()))
+    errors = np.abs(error)
+    temperature_k = float(np.max(errors[: len(errors) - len(flows_w)]))
+    largest_w = float(np.max(errors[len(errors) - len(flows_w) :], initial=0.0))
     level_k = float(np.abs(solution.temperature_c).max()) + ZERO_CELSIUS_K
-    largest = max((abs(part) for part in difference.values()), default=0.0)
-    if largest == 0.0 or float(np.ptp(solution.temperature_c)) <= _EQUAL * level_k:
-        return 0.0
-    through = 0.5 * sum(abs(flow) for flow in mean_flows_w(solution).values())
-    return largest / through if through > 0.0 else math.inf
+    if largest_w == 0.0 or float(np.ptp(solution.temperature_c)) <= _EQUAL * level_k:
+        return ErrorSize(temperature_k, 0.0)
+    through_w = 0.5 * float(flows_w.sum())
+    return ErrorSize(temperature_k, largest_w / through_w if through_w > 0.0 else math.inf)
 
 
 def difference_between(
     coarse: SteadySolution | HeatSolution, fine: SteadySolution | HeatSolution, num_nodes: int
 ) -> ErrorSize:
-    """Compare two solutions of one problem at the same times.
-
-    Args:
-        coarse: One of them.
-        fine: The other.
-        num_nodes: Number of nodes of the mesh that both have in common; they come first in both.
-    """
-    change_k = fine.temperature_c[..., :num_nodes] - coarse.temperature_c[..., :num_nodes]
-    before = mean_flows_w(coarse)
-    change_w = {group: flow - before[group] for group, flow in mean_flows_w(fine).items()}
-    return ErrorSize(float(np.max(np.abs(change_k))), flow_error(change_w, fine))
+    """Compare two solutions of one problem at the same times; `num_nodes` as in `compared_values`."""
+    return error_size(compared_values(fine, num_nodes) - compared_values(coarse, num_nodes), fine)
 
 
 def recovered_error_w_k(problem: HeatProblem, solution: SteadySolution) -> Vector:
@@ -150,8 +142,8 @@ def recovered_error_w_k(problem: HeatProblem, solution: SteadySolution) -> Vecto
     return problem.conductivity_w_mk * volumes_m3 * squares / 20.0
 
 
-def error_ratios(before_w_k: Vector, after_w_k: Vector, *, same_order: bool) -> ErrorRatios:
-    """Tell how much of their errors solutions lose, from the recovered errors of their fluxes.
+def error_ratios(before_w_k: Vector, after_w_k: Vector, *, same_order: bool) -> ErrorSize:
+    """Tell what is left of the errors of a coarser solution in a finer one, for `richardson`, from recovered errors.
 
     The error of a heat flow is of second order in that of the flux. So is that of a temperature from one mesh to a
     finer one; from P1 to P2 it gains less.
@@ -164,7 +156,7 @@ def error_ratios(before_w_k: Vector, after_w_k: Vector, *, same_order: bool) -> 
     before, after = float(before_w_k.sum()), float(after_w_k.sum())
     share = after / before if before > 0.0 else 0.0
     squared = float(np.clip(share if same_order else _QUADRATIC_RECOVERY * share, *_RATIO_RANGE))
-    return ErrorRatios(squared if same_order else squared**_FROM_P1_TO_P2, squared)
+    return ErrorSize(squared if same_order else squared**_FROM_P1_TO_P2, squared)
 
 
 def _corner_gradients(problem: HeatProblem, solution: SteadySolution) -> tuple[Vector, Vector]:

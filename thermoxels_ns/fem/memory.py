@@ -12,7 +12,6 @@ from __future__ import annotations
 import numpy as np
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -23,6 +22,8 @@ _SAMPLE = 500
 """Tetrahedra of the sample: more would take as long as a small body's solution."""
 _RUNS = 4
 """Runs of successive tetrahedra in it."""
+_FACES = np.array([(1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)])
+"""Corners of the face opposite to each corner."""
 _RIGHT = 1e-9
 """Cosine up to which an angle between faces counts as right."""
 _VECTORS = 15
@@ -103,42 +104,16 @@ def _coupled_share(mesh: TetMesh) -> float:
     begins = np.linspace(0, total - length, _RUNS).astype(np.int64)
     # Short runs may overlap where there are few tetrahedra: one that counts twice changes no share of coupled edges.
     chosen = (begins[:, None] + np.arange(length)).ravel() if total > _SAMPLE else np.arange(total)
-    keys = np.empty(6 * len(chosen), np.int64)
-    _edges_and_angles(
-        np.ascontiguousarray(mesh.points_m, np.float64), np.ascontiguousarray(mesh.tets[chosen], np.int64), _RIGHT, keys
-    )
-    keys.sort()
+    points, nodes = mesh.points_m, mesh.tets[chosen]
+    corners = points[nodes]
+    faces = corners[:, _FACES]
+    normals = np.cross(faces[:, :, 1] - faces[:, :, 0], faces[:, :, 2] - faces[:, :, 0])
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    first, second = np.triu_indices(4, 1)
+    # The angle that couples the ends of an edge is the one between the two faces opposite to them.
+    couples = np.abs(np.sum(normals[:, first] * normals[:, second], axis=-1)) > _RIGHT
+    low, high = np.minimum(nodes[:, first], nodes[:, second]), np.maximum(nodes[:, first], nodes[:, second])
+    keys = np.sort((2 * (low * len(points) + high) + couples).ravel())
     # Of the same edge, one that couples its ends stands last.
     last = np.append(keys[1:] >> 1 != keys[:-1] >> 1, True)
     return float(np.mean(keys[last] & 1))
-
-
-@kernel
-def _edges_and_angles(points, tets, right, keys):
-    """Number every edge of every tetrahedron by its ends, times two, plus one if it lies at an angle that couples them.
-
-    The angle is that between the two faces which the edge pierces: those opposite to its ends.
-    """
-    side, normal = np.empty((3, 3)), np.empty((4, 3))
-    place = 0
-    for t in range(len(tets)):
-        for i in range(3):
-            for x in range(3):
-                side[i, x] = points[tets[t, i + 1], x] - points[tets[t, 0], x]
-        for i in range(3):
-            u, v = side[(i + 1) % 3], side[(i + 2) % 3]
-            normal[i + 1, 0] = u[1] * v[2] - u[2] * v[1]
-            normal[i + 1, 1] = u[2] * v[0] - u[0] * v[2]
-            normal[i + 1, 2] = u[0] * v[1] - u[1] * v[0]
-        for x in range(3):
-            normal[0, x] = -normal[1, x] - normal[2, x] - normal[3, x]
-        for i in range(4):
-            length = np.sqrt(normal[i, 0] ** 2 + normal[i, 1] ** 2 + normal[i, 2] ** 2)
-            for x in range(3):
-                normal[i, x] /= length
-        for i in range(3):
-            for j in range(i + 1, 4):
-                cosine = normal[i, 0] * normal[j, 0] + normal[i, 1] * normal[j, 1] + normal[i, 2] * normal[j, 2]
-                low, high = min(tets[t, i], tets[t, j]), max(tets[t, i], tets[t, j])
-                keys[place] = 2 * (low * len(points) + high) + (abs(cosine) > right)
-                place += 1

@@ -5,19 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
-import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.error_estimate import (
     HALVED,
     ErrorSize,
+    compared_values,
     difference_between,
     error_ratios,
-    flow_error,
-    mean_flows_w,
+    error_size,
     recovered_error_w_k,
     richardson,
 )
@@ -27,8 +27,6 @@ from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
-
-Vector = npt.NDArray[np.float64]
 
 _STEADY_TOLERANCE, _STEP_TOLERANCE = 1e-8, 1e-10
 """Of the linear solver: its error is far below any estimate here."""
@@ -190,15 +188,22 @@ class _Run:
         """Smallest error of a solution over what is allowed."""
         return min((self.tolerance.excess(level.error) for level, _, _ in self._solved), default=np.inf)
 
-    def add(self, problem: HeatProblem, timed: _Timed, error: ErrorSize, refinements: int) -> None:
+    def add(
+        self,
+        problem: HeatProblem,
+        solution: SteadySolution | HeatSolution,
+        seconds: float,
+        error: ErrorSize,
+        refinements: int,
+    ) -> None:
         """Keep a solution, with its estimated errors and the number of times that the mesh size was halved for it."""
-        solution, edges, steps_k = timed.solution, 0, None
+        edges, steps_k = 0, None
         if isinstance(solution, SteadySolution):
             edges = len(solution.edge_temperature_c)
         else:
             steps_k = solution.time_error_k
         num_nodes = solution.temperature_c.shape[-1] + edges
-        level = Level(2 if edges else 1, refinements, steps_k, num_nodes, error, timed.seconds)
+        level = Level(2 if edges else 1, refinements, steps_k, num_nodes, error, seconds)
         self._solved.append((level, problem, solution))
         self._log(level.describe())
 
@@ -248,42 +253,33 @@ class _Run:
         return ToleratedSolution(chosen[2], chosen[1], last, not failure, status, seconds, levels)
 
 
-@dataclass(frozen=True)
-class _Timed:
-    """A solution and the time it took."""
-
-    solution: SteadySolution | HeatSolution
-    seconds: float
-
-
 def _solve_steady(run: _Run, time_s: float) -> str:
     """Find a steady state that is good enough; returns why that was not possible, or nothing."""
 
-    def solve(problem: HeatProblem, order: int) -> tuple[SteadySolution, _Timed]:
+    def solve(problem: HeatProblem, order: int) -> tuple[SteadySolution, float]:
         begin_s = time.perf_counter()
         solution = solve_steady(problem, time_s=time_s, order=order, relative_tolerance=_STEADY_TOLERANCE)
-        return solution, _Timed(solution, time.perf_counter() - begin_s)
+        return solution, time.perf_counter() - begin_s
 
-    problem, num_nodes = run.given, len(run.given.mesh.points_m)
+    problem, refinements = run.given, 0
     failure = run.lacks_memory(2, 0)
     if failure:
         return failure
-    before, timed = solve(problem, 1)
-    before_w_k, refinements = recovered_error_w_k(problem, before), 0
-    first = timed
+    before, first_seconds = solve(problem, 1)
+    before_w_k = recovered_error_w_k(problem, before)
     problem = replace(problem, initial_temperature_c=before.temperature_c)
     while True:
-        solution, timed = solve(problem, 2)
+        solution, seconds = solve(problem, 2)
         after_w_k = recovered_error_w_k(problem, solution)
         ratios = error_ratios(before_w_k, after_w_k, same_order=refinements > 0)
-        apart = difference_between(before, solution, num_nodes)
+        apart = difference_between(before, solution, len(run.given.mesh.points_m))
         error = ErrorSize(
-            richardson(apart.temperature_k, ratios.temperature), richardson(apart.heat_flow, ratios.heat_flow)
+            richardson(apart.temperature_k, ratios.temperature_k), richardson(apart.heat_flow, ratios.heat_flow)
         )
         if refinements == 0:
             both = ErrorSize(error.temperature_k + apart.temperature_k, error.heat_flow + apart.heat_flow)
-            run.add(run.given, first, both, 0)
-        run.add(problem, timed, error, refinements)
+            run.add(run.given, before, first_seconds, both, 0)
+        run.add(problem, solution, seconds, error, refinements)
         if run.excess <= 1.0:
             return ""
         refinements += 1
@@ -296,29 +292,6 @@ def _solve_steady(run: _Run, time_s: float) -> str:
         before, before_w_k = solution, after_w_k
 
 
-@dataclass(frozen=True)
-class _SignedError:
-    """An error with its sign at the outputs and nodes of the given mesh, and of the mean flow of each effect."""
-
-    temperature_k: Vector
-    """Shape (s + 1, n), [K]."""
-    flows_w: Vector
-    """Shape (e,), [W]."""
-
-    def plus(self, other: _SignedError, share: float = 1.0) -> _SignedError:
-        """Add a share of another one."""
-        return _SignedError(self.temperature_k + share * other.temperature_k, self.flows_w + share * other.flows_w)
-
-    def times(self, factor: float) -> _SignedError:
-        """Scale it."""
-        return _SignedError(factor * self.temperature_k, factor * self.flows_w)
-
-    def size(self, solution: HeatSolution) -> ErrorSize:
-        """Give its largest parts; `solution` tells what the flows are shares of."""
-        change_w = dict(zip(mean_flows_w(solution), self.flows_w.tolist()))
-        return ErrorSize(float(np.max(np.abs(self.temperature_k))), flow_error(change_w, solution))
-
-
 class _Refinable:
     """Solves a problem in time on meshes of halved size, with halved steps."""
 
@@ -329,8 +302,8 @@ class _Refinable:
         self._num_nodes = len(problem.mesh.points_m)
         self._first_steps: GivenSteps | None = None
 
-    def solve(self, refinements: int, halvings: int) -> tuple[_Timed, _SignedError]:
-        """Solve, and give what is compared; the first solution, on the given mesh, chooses the steps to halve."""
+    def solve(self, refinements: int, halvings: int) -> tuple[HeatSolution, float]:
+        """Solve; the first solution, on the given mesh, chooses the steps to halve. Gives the seconds it took too."""
         begin_s = time.perf_counter()
         while len(self.problems) <= refinements:
             coarse = self.problems[-1]
@@ -342,50 +315,52 @@ class _Refinable:
         )
         if self._first_steps is None:
             self._first_steps = GivenSteps(self._steps.duration_s, solution.step_lengths_s, self._steps.tolerance_k)
-        values = _SignedError(
-            solution.temperature_c[:, : self._num_nodes], np.array(list(mean_flows_w(solution).values()))
-        )
-        return _Timed(solution, time.perf_counter() - begin_s), values
+        return solution, time.perf_counter() - begin_s
 
 
 def _solve_in_time(run: _Run, steps: AdaptiveSteps, progress: Callable[[float, int], None] | None) -> str:
-    """Follow a body through time well enough; returns why that was not possible, or nothing."""
+    """Follow a body through time well enough; returns why that was not possible, or nothing.
+
+    Choices (m, j) have the mesh size halved m times and the steps j times. Their error is
+    of_mesh * HALVED^m + of_steps * HALVED^j, and the difference of two of them tells the unknown parts.
+    """
     failure = run.lacks_memory(1, 1, steps.num_times)
     if failure:
         return failure
-    body, solved = _Refinable(run.given, steps, progress), {}
-    for choice in ((0, 0), (0, 1), (1, 0)):
-        solved[choice] = body.solve(*choice)
-    first = solved[0, 0][1]
-    of_mesh = first.plus(solved[1, 0][1], -1.0).times(1.0 / (1.0 - HALVED))
-    of_steps = first.plus(solved[0, 1][1], -1.0).times(1.0 / (1.0 - HALVED))
+    num_nodes, num_values = len(run.given.mesh.points_m), len(run.given.mesh.points_m) * steps.num_times
+    body = _Refinable(run.given, steps, progress)
+    solved = {choice: body.solve(*choice) for choice in ((0, 0), (0, 1), (1, 0))}
+    values = {choice: compared_values(solution, num_nodes) for choice, (solution, _) in solved.items()}
+    first = values[0, 0]
+    of_steps, of_mesh = ((first - values[choice]) / (1.0 - HALVED) for choice in ((0, 1), (1, 0)))
 
     def error(choice: tuple[int, int]) -> ErrorSize:
-        total = of_mesh.times(HALVED ** choice[0]).plus(of_steps, HALVED ** choice[1])
-        return total.size(solved[1, 0][0].solution)
+        total = of_mesh * HALVED ** choice[0] + of_steps * HALVED ** choice[1]
+        return error_size(total, solved[1, 0][0])
 
     def keep(choice: tuple[int, int]) -> None:
-        timed, steps_k = solved[choice][0], HALVED ** choice[1] * float(np.max(np.abs(of_steps.temperature_k)))
-        solution = replace(timed.solution, time_error_k=steps_k)
-        run.add(body.problems[choice[0]], _Timed(solution, timed.seconds), error(choice), choice[0])
+        (solution, seconds), of_halved = solved[choice], HALVED ** choice[1] * of_steps[:num_values]
+        solution = replace(solution, time_error_k=float(np.max(np.abs(of_halved))))
+        run.add(body.problems[choice[0]], solution, seconds, error(choice), choice[0])
 
     for choice in tuple(solved):
         keep(choice)
+    halvings = range(_MOST_HALVINGS + 1)
+    choices = sorted(product(halvings, halvings), key=lambda choice: _MESH_COST ** choice[0] * _STEP_COST ** choice[1])
     while run.excess > 1.0:
-        choices = [(m, j) for m in range(_MOST_HALVINGS + 1) for j in range(_MOST_HALVINGS + 1) if (m, j) not in solved]
-        choices.sort(key=lambda choice: _MESH_COST ** choice[0] * _STEP_COST ** choice[1])
-        choice = next((choice for choice in choices if run.tolerance.excess(error(choice)) <= _AIM), None)
+        open_choices = (choice for choice in choices if choice not in solved)
+        choice = next((choice for choice in open_choices if run.tolerance.excess(error(choice)) <= _AIM), None)
         if choice is None:
             return f"It would take more than {_MOST_HALVINGS} halvings of the mesh size or of the steps"
         failure = run.lacks_memory(1, choice[0], steps.num_times)
         if failure:
             return failure
         solved[choice] = body.solve(*choice)
-        change = first.plus(solved[choice][1], -1.0)
+        change = first - compared_values(solved[choice][0], num_nodes)
         mesh_gain, steps_gain = 1.0 - HALVED ** choice[0], 1.0 - HALVED ** choice[1]
         if choice[0] > 0:
-            of_mesh = change.plus(of_steps, -steps_gain).times(1.0 / mesh_gain)
+            of_mesh = (change - of_steps * steps_gain) / mesh_gain
         else:
-            of_steps = change.times(1.0 / steps_gain)
+            of_steps = change / steps_gain
         keep(choice)
     return ""
