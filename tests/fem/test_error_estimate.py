@@ -111,13 +111,14 @@ def test_richardson() -> None:
 
 def test_error_ratios() -> None:
     first, second, nothing = np.array([1.0, 3.0]), np.array([0.5, 0.5]), np.zeros(2)
-    ratios = error_ratios(first, second, same_order=True)
-    assert (ratios.temperature_k, ratios.heat_flow) == (0.25, 0.25)
-    ratios = error_ratios(first, second, same_order=False)
-    assert (ratios.temperature_k, ratios.heat_flow) == (pytest.approx(0.125**0.57), 0.125)
-    assert error_ratios(second, first, same_order=True).heat_flow == 0.7
+    ratios = error_ratios(first, second, decrease=0.16)
+    assert (ratios.temperature_k, ratios.heat_flow) == (pytest.approx(0.2), 0.25)
+    assert error_ratios(second, first, decrease=2.0).heat_flow == 0.7
+    ratios = error_ratios(first, 0.1 * second)
+    assert (ratios.temperature_k, ratios.heat_flow) == (pytest.approx(0.0125**0.57), pytest.approx(0.0125))
+    assert error_ratios(first, second).temperature_k == 0.24
     for pair in ((first, nothing), (nothing, first)):
-        assert error_ratios(*pair, same_order=True).temperature_k == 1e-3
+        assert error_ratios(*pair, decrease=0.0).temperature_k == 0.17
 
 
 def test_a_solution_of_another_mesh_is_refused() -> None:

@@ -101,6 +101,46 @@ def test_nafems_t3(tolerance_k, refinements) -> None:
     assert 1 / WITHIN < found.settings.error.temperature_k / true_k < WITHIN, (found.settings, true_k)
 
 
+def nafems_t4() -> HeatProblem:
+    mesh = box_mesh(np.linspace(0.0, 0.6, 7), np.linspace(0.0, 1.0, 11), [0.0, 0.1], temperature_c=50.0)
+    effects = (FixedTemperature(("y0",), 100.0), Convection(("x1", "y1"), 750.0, 0.0))
+    return HeatProblem(mesh, Material("plate", 52.0, 7850.0, 460.0), effects=effects)
+
+
+@pytest.mark.parametrize("tolerance", [Tolerance(15.0), Tolerance(8.0), Tolerance(1.0), Tolerance(None, 0.01)])
+def test_nafems_t4(tolerance) -> None:
+    problem = nafems_t4()
+    exact = solve_steady(finer(problem, 3), order=2, relative_tolerance=1e-8)
+    found = solve_to_tolerance(problem, tolerance, log=silent)
+    true, estimate = true_error(found, problem, exact), found.settings.error
+    assert found.met and tolerance.excess(true) <= 1.0
+    assert 1 / WITHIN < estimate.temperature_k / true.temperature_k < WITHIN, (found.settings, true)
+    assert 1 / WITHIN < estimate.heat_flow / true.heat_flow < WITHIN, (found.settings, true)
+
+
+def test_nafems_t2_has_no_error() -> None:
+    """Temperatures of a rod with radiation at its end are straight."""
+    mesh = box_mesh(np.linspace(0.0, 0.1, 3), [0.0, 0.01], [0.0, 0.01])
+    effects = (FixedTemperature(("x0",), 1000.0 - 273.15), Radiation(("x1",), 0.98, 300.0 - 273.15))
+    problem = HeatProblem(mesh, Material("rod", 55.6, 7850.0, 460.0), effects=effects)
+    found = solve_to_tolerance(problem, Tolerance(1e-4, 1e-6), log=silent)
+    assert found.met and (found.settings.order, found.settings.refinements) == (1, 0)
+
+
+@pytest.mark.parametrize("biot", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize("tolerance_k", [2.0, 0.5, 0.1])
+def test_slab_with_convection(biot, tolerance_k) -> None:
+    mesh = box_mesh(np.linspace(0.0, 0.1, 6), [0.0, 0.02], [0.0, 0.02], temperature_c=100.0)
+    problem = HeatProblem(mesh, CONCRETE, effects=(Convection(("x1",), biot * 17.0, 0.0),))
+    duration_s = 0.5 * 0.1**2 / CONCRETE.diffusivity_m2_s
+    exact = solve_heat(finer(problem, 4), AdaptiveSteps(duration_s, 0.01))
+    found = solve_to_tolerance(problem, Tolerance(tolerance_k), duration_s=duration_s, log=silent)
+    true, estimate = true_error(found, problem, exact), found.settings.error
+    assert found.met and true.temperature_k <= tolerance_k
+    assert 1 / WITHIN < estimate.temperature_k / true.temperature_k < WITHIN, (found.settings, true)
+    assert 1 / WITHIN < estimate.heat_flow / true.heat_flow < WITHIN, (found.settings, true)
+
+
 def test_three_solutions_tell_the_errors_of_mesh_and_steps() -> None:
     """The given mesh, the same with halved steps, and half the size; then what the tolerance asks for."""
     levels = solve_to_tolerance(nafems_t3(), Tolerance(0.2), duration_s=32.0, log=silent).levels

@@ -27,10 +27,14 @@ _RATIO_RANGE = (1e-3, 0.7)
 _QUADRATIC_RECOVERY = 0.5
 """Factor on the recovered error of quadratic tetrahedra beside that of linear ones: where a temperature is
 singular it is found two to three times too large. Then ratios are 0.3 to 1.4 times the true ones."""
-_FROM_P1_TO_P2 = 0.57
-"""The error of a node falls as this power of the squared error of the flux. Theory says 1/2 where temperatures are
-smooth, from h^2 to h^3 against h^2 to h^4. With this value estimates are 0.45 to 1.5 times the true error on smooth
-solutions, shells and bodies with notches, and 3.4 times where a given temperature meets convection at an edge."""
+_FROM_P1_TO_P2, _MOST_FROM_P1_TO_P2 = 0.57, 0.24
+"""The error of a node falls as this power of the squared error of the flux from linear to quadratic tetrahedra, and to
+no more than this share. Theory says 1/2 where temperatures are smooth, from h^2 to h^3 against h^2 to h^4. Estimates
+with both are 0.45 to 1.5 times the true error on smooth solutions, shells and bodies with notches, and 2.9 times where
+a given temperature meets convection at an edge."""
+_LEAST_OF_HALF_THE_SIZE = 0.17
+"""Least share of a node's error with quadratic tetrahedra that is left after the mesh size is halved: 1/8 where
+temperatures are smooth, 0.3 where two airs meet at an edge."""
 _EQUAL = 1e-9
 """Temperatures that differ by less than this share of the absolute temperature are equal."""
 
@@ -142,21 +146,26 @@ def recovered_error_w_k(problem: HeatProblem, solution: SteadySolution) -> Vecto
     return problem.conductivity_w_mk * volumes_m3 * squares / 20.0
 
 
-def error_ratios(before_w_k: Vector, after_w_k: Vector, *, same_order: bool) -> ErrorSize:
+def error_ratios(before_w_k: Vector, after_w_k: Vector, decrease: float | None = None) -> ErrorSize:
     """Tell what is left of the errors of a coarser solution in a finer one, for `richardson`, from recovered errors.
 
     The error of a heat flow is of second order in that of the flux. So is that of a temperature from one mesh to a
-    finer one; from P1 to P2 it gains less.
+    finer one. Where a given temperature meets convection at an edge, nodes gain more than that, which the difference
+    between two levels shows; the mean of both, kept above a least ratio, is within a factor of two of the true one.
 
     Args:
         before_w_k: `recovered_error_w_k` of the coarser solution.
-        after_w_k: The same of the finer one.
-        same_order: Whether both have tetrahedra of the same order; otherwise the finer one has quadratic ones.
+        after_w_k: The same of the finer one, which has quadratic tetrahedra.
+        decrease: Difference of the temperatures of both solutions over that of the coarser one and the one before it;
+            None: the coarser solution has linear tetrahedra.
     """
     before, after = float(before_w_k.sum()), float(after_w_k.sum())
     share = after / before if before > 0.0 else 0.0
-    squared = float(np.clip(share if same_order else _QUADRATIC_RECOVERY * share, *_RATIO_RANGE))
-    return ErrorSize(squared if same_order else squared**_FROM_P1_TO_P2, squared)
+    if decrease is None:
+        squared = float(np.clip(_QUADRATIC_RECOVERY * share, *_RATIO_RANGE))
+        return ErrorSize(min(squared**_FROM_P1_TO_P2, _MOST_FROM_P1_TO_P2), squared)
+    squared = float(np.clip(share, *_RATIO_RANGE))
+    return ErrorSize(max(float(np.sqrt(squared * np.clip(decrease, *_RATIO_RANGE))), _LEAST_OF_HALF_THE_SIZE), squared)
 
 
 def _corner_gradients(problem: HeatProblem, solution: SteadySolution) -> tuple[Vector, Vector]:

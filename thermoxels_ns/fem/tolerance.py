@@ -261,7 +261,7 @@ def _solve_steady(run: _Run, time_s: float) -> str:
         solution = solve_steady(problem, time_s=time_s, order=order, relative_tolerance=_STEADY_TOLERANCE)
         return solution, time.perf_counter() - begin_s
 
-    problem, refinements = run.given, 0
+    problem, refinements, apart_k = run.given, 0, 0.0
     failure = run.lacks_memory(2, 0)
     if failure:
         return failure
@@ -271,8 +271,9 @@ def _solve_steady(run: _Run, time_s: float) -> str:
     while True:
         solution, seconds = solve(problem, 2)
         after_w_k = recovered_error_w_k(problem, solution)
-        ratios = error_ratios(before_w_k, after_w_k, same_order=refinements > 0)
         apart = difference_between(before, solution, len(run.given.mesh.points_m))
+        decrease = apart.temperature_k / apart_k if apart_k > 0.0 else None
+        ratios = error_ratios(before_w_k, after_w_k, decrease)
         error = ErrorSize(
             richardson(apart.temperature_k, ratios.temperature_k), richardson(apart.heat_flow, ratios.heat_flow)
         )
@@ -289,7 +290,7 @@ def _solve_steady(run: _Run, time_s: float) -> str:
         # The nodes of quadratic tetrahedra are those of the finer mesh.
         start_c = np.concatenate([solution.temperature_c, solution.edge_temperature_c])
         problem = replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=start_c)
-        before, before_w_k = solution, after_w_k
+        before, before_w_k, apart_k = solution, after_w_k, apart.temperature_k
 
 
 class _Refinable:
