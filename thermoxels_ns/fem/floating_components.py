@@ -1,4 +1,4 @@
-"""Pieces of a body that exchange heat with nothing whose temperature is known."""
+"""Connected components of a body that no known temperature holds."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""Initial guess of a linear solve from earlier solutions with the same matrix.
-
-The change of one time step resembles those of the steps before it. Among all combinations of the last solutions the
-one is taken that is nearest to the new solution in the norm of the matrix (Fischer, Computer Methods in Applied
-Mechanics and Engineering 163, 1998); since A x_i = b_i is known, no product with the matrix is needed to find it.
-"""
+"""Initial guess of a linear solve from earlier solutions with the same matrix."""
 
 from __future__ import annotations
 
@@ -25,6 +20,10 @@ _DEPENDENT = 1e-10
 
 class InitialGuess:
     """The last solutions x_i of A x_i = b_i, scaled to a largest entry of 1.
+
+    The change of one time step resembles those of the steps before it. Among all combinations of the last solutions the
+    one is taken that is nearest to the new solution in the norm of the matrix (Fischer, Computer Methods in Applied
+    Mechanics and Engineering 163, 1998); since A x_i = b_i is known, no product with the matrix is needed to find it.
 
     >>> guess = InitialGuess()
     >>> guess.for_right_hand_side(np.array([2.0, 6.0])) is None

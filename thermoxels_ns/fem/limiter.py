@@ -1,15 +1,4 @@
-"""Maximum-principle limiter: keeps temperatures in the range they come from, on any mesh.
-
-Where faces meet at an obtuse angle, the stiffness matrix has an entry above 0 off its diagonal: heat flows from the
-colder to the warmer of two nodes. With smooth temperatures that is right, because flows along other edges outweigh it;
-beside a jump that the mesh cannot resolve, a temperature may leave the range that it came from and that surrounds it.
-
-A step of backward Euler, or a steady state, in which a temperature has left is solved again without the positive
-off-diagonals of the nodes that left, and again if others leave then. Without all of them the matrix is an M-matrix, of
-which no temperature leaves its range (Ciarlet and Raviart, Computer Methods in Applied Mechanics and Engineering 2,
-1973), so it ends. Where the mesh resolves the temperatures nothing is left out, and the order of the error is what it
-was. Steps with entries left out were measured to be of first order too.
-"""
+"""Maximum-principle limiter: keeps temperatures in the range they come from, on any mesh."""
 
 from __future__ import annotations
 
@@ -181,7 +170,19 @@ def is_in_range(step: Step, low: float, high: float) -> bool:
 
 
 class Limiter:
-    """Steps of backward Euler that keep temperatures in range."""
+    """Steps of backward Euler that keep temperatures in range.
+
+    Where faces meet at an obtuse angle, the stiffness matrix has an entry above 0 off its diagonal: heat flows from the
+    colder to the warmer of two nodes. With smooth temperatures that is right, because flows along other edges outweigh
+    it; beside a jump that the mesh cannot resolve, a temperature may leave the range that it came from and that
+    surrounds it.
+
+    A step of backward Euler, or a steady state, in which a temperature has left is solved again without the positive
+    off-diagonals of the nodes that left, and again if others leave then. Without all of them the matrix is an M-matrix,
+    of which no temperature leaves its range (Ciarlet and Raviart, Computer Methods in Applied Mechanics and Engineering
+    2, 1973), so it ends. Where the mesh resolves the temperatures nothing is left out, and the order of the error is
+    what it was. Steps with entries left out were measured to be of first order too.
+    """
 
     def __init__(self, system: HeatSystem, *, relative_tolerance: float) -> None:
         """Prepare; what only some meshes need is made when it is needed.

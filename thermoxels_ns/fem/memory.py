@@ -1,11 +1,4 @@
-"""How much memory a heat computation takes at its peak, said and refused before it is taken.
-
-The arrays that are alive together are counted: matrices by the number of nodes and of couplings between them, vectors
-by the number of nodes. Couplings are counted on a sample, because lattices have none along edges between right angles.
-Measured on lattices and on conforming meshes; interpreter and libraries, which need about 150 MB, come on top, and so
-does multigrid, which takes over where conjugate gradients are slow and needs about as much as the matrices.
-
-"""
+"""Memory that a heat computation takes at its peak."""
 
 from __future__ import annotations
 
@@ -38,6 +31,12 @@ def peak_bytes(
     problem: HeatProblem, *, order: int = 1, refinements: int = 0, times: int = 1, adaptive: bool = False
 ) -> float:
     """Estimate the most memory that a computation takes besides the problem itself, [bytes].
+
+    The arrays that are alive together are counted: matrices by the number of nodes and of couplings between them,
+    vectors by the number of nodes. Couplings are counted on a sample, because lattices have none along edges between
+    right angles. Measured on lattices and on conforming meshes; interpreter and libraries, which need about 150 MB,
+    come on top, and so does multigrid, which takes over where conjugate gradients are slow and needs about as much as
+    the matrices.
 
     Args:
         problem: Body, materials and effects.

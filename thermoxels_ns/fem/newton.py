@@ -1,9 +1,4 @@
-"""Newton's method for the heat equation with radiation.
-
-Radiation grows with the temperature and its slope is symmetric, so the solution is the one minimum of a convex energy.
-Newton's direction always leads down, and how far to go is a search for the zero of one increasing function along it:
-no damping factor is guessed, and the method converges from any start.
-"""
+"""Newton's method for the heat balance with radiation."""
 
 from __future__ import annotations
 
@@ -105,6 +100,10 @@ class NewtonSolution:
 
 def newton(equations: Equations, num_unknowns: int, *, relative_tolerance: float) -> NewtonSolution:
     """Find where the residual vanishes, from u = 0.
+
+    Radiation grows with the temperature and its slope is symmetric, so the solution is the one minimum of a convex
+    energy. Newton's direction always leads down, and how far to go is a search for the zero of one increasing function
+    along it: no damping factor is guessed, and the method converges from any start.
 
     Args:
         equations: The equations.

@@ -1,10 +1,4 @@
-"""Schemes in time: diagonally implicit Runge-Kutta methods whose last stage is the end of the step.
-
-A scheme is its table of coefficients (Hairer and Wanner, Solving Ordinary Differential Equations II, section IV.6).
-Each stage i solves M (T_i - T_n) = dt * sum_j a_ij F(T_j), F being the net heat flow into the nodes, and
-M (T_n+1 - T_n) = dt * sum_j b_j F(T_j): the heat that flows in during a step is the sum of the stages' flows, so the
-balance of heat closes whatever the step length.
-"""
+"""Schemes in time: diagonally implicit Runge-Kutta methods."""
 
 from __future__ import annotations
 
@@ -16,7 +10,13 @@ from thermoxels_ns.core.errors import HeatError
 
 @dataclass(frozen=True)
 class Scheme:
-    """Coefficients of a scheme."""
+    """Coefficients of a scheme.
+
+    A scheme is its table of coefficients (Hairer and Wanner, Solving Ordinary Differential Equations II, section IV.6).
+    Each stage i solves M (T_i - T_n) = dt * sum_j a_ij F(T_j), F being the net heat flow into the nodes, and M (T_n+1 -
+    T_n) = dt * sum_j b_j F(T_j): the heat that flows in during a step is the sum of the stages' flows, so the balance
+    of heat closes whatever the step length.
+    """
 
     name: str
     """Name for reports."""

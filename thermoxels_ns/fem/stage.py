@@ -1,4 +1,4 @@
-"""One implicit stage of a time step, or a steady state: where heat flow and storage balance at every free node."""
+"""One implicit stage of a time step, or a steady state."""
 
 from __future__ import annotations
 
