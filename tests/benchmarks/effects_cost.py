@@ -24,16 +24,14 @@ import numpy as np
 import tyro
 from scipy import sparse
 
-from thermoxels_ns.fem.assembly import assemble
-from thermoxels_ns.fem.effect_forms import effect_labels
+from tests.support.heat_matrices import assemble
+from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients, LinearSolver
 from thermoxels_ns.fem.fixed_nodes import FixedNodes
-from thermoxels_ns.fem.linear_solver import ConjugateGradients
+from thermoxels_ns.fem.p1_kernels import product_and_bound
 from thermoxels_ns.fem.pieces import Pieces
-from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.schemes import BACKWARD_EULER
 from thermoxels_ns.fem.solution import HeatSolution
-from thermoxels_ns.fem.solver_choice import LinearSolver
-from thermoxels_ns.fem.sparsity import product_and_bound
 from thermoxels_ns.fem.stepper import Stepper
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.system import HeatSystem

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from thermoxels_ns.fem.assembly import HeatMatrices, assemble
-from thermoxels_ns.fem.linear_solver import ConjugateGradients
+from tests.support.heat_matrices import HeatMatrices, assemble
+from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.files.abaqus import HeatStep, write_inp

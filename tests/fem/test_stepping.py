@@ -6,9 +6,9 @@ from datetime import datetime, timezone
 import numpy as np
 import pytest
 
+from tests.support.heat_matrices import assemble
 from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.assembly import assemble
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.support.heat_matrices import assemble
 from tests.support.heat_meshes import SIDES, box_mesh
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.assembly import assemble
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.system import HeatSystem
@@ -194,8 +194,7 @@ def test_shares_of_fixed_nodes_add_up(box, concrete) -> None:
 def test_labels_differ_even_where_a_patch_is_named_like_a_number() -> None:
     """Two equal labels would count the heat of both effects twice."""
     from tests.support.heat_meshes import box_mesh
-    from thermoxels_ns.fem.effect_forms import effect_labels
-    from thermoxels_ns.fem.problem import HeatProblem
+    from thermoxels_ns.fem.problem import HeatProblem, effect_labels
     from thermoxels_ns.heat.effects import Convection
     from thermoxels_ns.heat.materials import Material
 

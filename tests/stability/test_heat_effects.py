@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.support.heat_matrices import assemble
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.assembly import assemble
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from thermoxels_ns.fem.assembly import assemble
+from tests.support.heat_matrices import assemble
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.heat.materials import Material

@@ -21,8 +21,7 @@ from thermoxels_ns.core.checks import (
     writable_folder,
 )
 from thermoxels_ns.core.errors import HeatError, MeshError
-from thermoxels_ns.fem.solution import SteadySolution
-from thermoxels_ns.fem.solution_nodes import Solution
+from thermoxels_ns.fem.solution import Solution, SteadySolution
 from thermoxels_ns.heat.run import HeatRun, run_scene
 from thermoxels_ns.heat.scene_file import load_heat_scene
 from thermoxels_ns.heat.solving import Goals, Say

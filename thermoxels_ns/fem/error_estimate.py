@@ -10,11 +10,11 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.edge_midpoints import TET_EDGES
+from thermoxels_ns.fem.p1_kernels import TET_EDGES
 from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.quadratic_space import QuadraticSpace
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
+from thermoxels_ns.fem.space import Space
 
 Vector = npt.NDArray[np.float64]
 
@@ -182,7 +182,10 @@ def _corner_gradients(problem: HeatProblem, solution: SteadySolution) -> tuple[V
     if len(solution.edge_temperature_c) == 0:
         gradient = np.einsum("ti,tix->tx", corner_c, slopes)
         return np.repeat(gradient[:, None], 4, axis=1), volumes_m3
-    nodal_c, space = np.concatenate([nodal_c, solution.edge_temperature_c]), QuadraticSpace(Selection(mesh))
+    nodal_c, space = (
+        np.concatenate([nodal_c, solution.edge_temperature_c]),
+        Space(Selection(mesh), order=2, lumped=False),
+    )
     if len(nodal_c) != space.num_nodes:
         raise _of_another_mesh(space.num_nodes, len(nodal_c))
     # Slopes of the quadratic functions of corners are 3 times those of linear ones at the corner itself, -1 elsewhere.

@@ -16,9 +16,8 @@ Vector = npt.NDArray[np.float64]
 
 _SAME_TEMPERATURE_K = 1e-9
 """Two effects may fix the same node if their temperatures differ by no more than this, [K]."""
-_KEPT_TIMES, _KEPT_NUMBERS = 4, 20_000
-"""Times whose temperatures are kept at least, because what begins a step has ended the one before, and numbers that are
-kept where more times are: an estimate of the error asks for them again."""
+_KEPT_TIMES = 4
+"""Times whose temperatures are kept, because what begins a step has ended the one before."""
 
 
 class FixedNodes:
@@ -42,8 +41,6 @@ class FixedNodes:
         """Effect and patch of each row of `shares`."""
         self._num_nodes = num_nodes
         self._kept: dict[float, Vector] = {}
-        self.in_time = any(form.in_time for form in forms)
-        """Whether a temperature changes with time."""
 
     @cached_property
     def shares(self) -> sparse.csr_matrix:
@@ -76,10 +73,15 @@ class FixedNodes:
         """
         known = self._kept.get(time_s)
         if known is None:
-            known = self._with(self._steady, time_s, in_time=True) if self.in_time else self._steady
+            known = np.full(len(self.nodes), np.nan)
+            for number, form in enumerate(self._forms):
+                place, wanted = self._places[number], form.temperature_k(time_s)
+                clash = np.abs(known[place] - wanted) > _SAME_TEMPERATURE_K
+                if clash.any():
+                    raise HeatError(self._explain_clash(number, form.nodes[clash], wanted[clash], time_s))
+                known[place] = wanted
             known.setflags(write=False)
-            most = max(_KEPT_TIMES, _KEPT_NUMBERS // max(len(self.nodes), 1))
-            while len(self._kept) >= most:
+            while len(self._kept) >= _KEPT_TIMES:
                 del self._kept[next(iter(self._kept))]
             self._kept[time_s] = known
         return known
@@ -88,30 +90,6 @@ class FixedNodes:
     def _places(self) -> list[npt.NDArray[np.int64]]:
         """Where the nodes of each form stand in `nodes`."""
         return [np.searchsorted(self.nodes, form.nodes) for form in self._forms]
-
-    @cached_property
-    def _shares_nodes(self) -> list[bool]:
-        """Whether another form fixes any of each form's nodes, too."""
-        owners = np.bincount(np.concatenate([np.zeros(0, np.int64), *self._places]), minlength=len(self.nodes))
-        return [bool(np.any(owners[place] > 1)) for place in self._places]
-
-    @cached_property
-    def _steady(self) -> Vector:
-        """What does not change with time; NaN elsewhere."""
-        return self._with(np.full(len(self.nodes), np.nan), 0.0, in_time=False)
-
-    def _with(self, others: Vector, time_s: float, *, in_time: bool) -> Vector:
-        """Fill in what some forms say at a time."""
-        fixed = others.copy()
-        for number, form in enumerate(self._forms):
-            if form.in_time == in_time:
-                place, wanted = self._places[number], form.temperature_k(time_s)
-                if self._shares_nodes[number]:
-                    clash = np.abs(fixed[place] - wanted) > _SAME_TEMPERATURE_K
-                    if clash.any():
-                        raise HeatError(self._explain_clash(number, form.nodes[clash], wanted[clash], time_s))
-                fixed[place] = wanted
-        return fixed
 
     def _explain_clash(self, number: int, nodes: npt.NDArray[np.int64], wanted: Vector, time_s: float) -> str:
         form = self._forms[number]

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.units import celsius_to_kelvin
-from thermoxels_ns.fem.effect_forms import effect_labels
+from thermoxels_ns.fem.problem import effect_labels
 from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect, left_out
 from thermoxels_ns.fem.steady import is_still
 from thermoxels_ns.fem.stepper import Step

@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.fem.linear_solver import LinearSolution
-from thermoxels_ns.fem.piece_balance import is_within
+from thermoxels_ns.fem.conjugate_gradients import LinearSolution
+from thermoxels_ns.fem.pieces import is_within
 
 Vector = npt.NDArray[np.float64]
 

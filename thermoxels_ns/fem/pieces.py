@@ -1,4 +1,4 @@
-"""Connected pieces of a body: heat goes from node to node within a piece and never from one to another."""
+"""Connected pieces of a body, between which no heat flows, and sums over them."""
 
 from __future__ import annotations
 
@@ -42,3 +42,25 @@ class Pieces:
         marks = np.zeros(self.count, dtype=bool)
         marks[self.number[nodes]] = True
         return marks
+
+    def without_sums(self, floating: npt.NDArray[np.bool_], nodal: Vector, held: Vector, sums: Vector) -> Vector:
+        """Subtract multiples of a vector so that what is left sums to 0 over each floating piece, twice for round-off.
+
+        Args:
+            floating: Which of the pieces to treat, shape (p,).
+            nodal: Values of the nodes, shape (n,).
+            held: The vector, shape (n,).
+            sums: Its sums over the pieces, shape (p,); those of pieces that do not float count for nothing.
+        """
+        for _ in range(2):
+            nodal = nodal - self.at_nodes(np.where(floating, self.sums(nodal) / sums, 0.0)) * held
+        return nodal
+
+
+def is_within(values: Vector, bounds: Vector, slack: float = 0.0, sizes: Vector | None = None) -> bool:
+    """Whether |values| <= bounds + slack * |sizes| everywhere.
+
+    >>> is_within(np.array([1.0, -2.0]), np.array([1.0, 2.0])), is_within(np.array([np.nan]), np.array([1.0]))
+    (True, False)
+    """
+    return bool(np.all(np.abs(values) <= (bounds if sizes is None else bounds + slack * np.abs(sizes))))

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from skfem import ElementTetP2
 
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.edge_midpoints import TET_EDGES, edge_numbers
-from thermoxels_ns.fem.quadratic_elements import edge_shapes
-from thermoxels_ns.fem.sparsity import mesh_edges
+from thermoxels_ns.fem.p1_kernels import TET_EDGES, mesh_edges
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _OUTSIDE = 1e-9
@@ -40,10 +39,10 @@ class Probes:
             mesh: The mesh in which the probes were placed.
             values: Of its nodes and then of the middles of its edges, in the order of `mesh_edges`, shape (..., n).
         """
-        edges = mesh_edges(mesh.tets, len(mesh.points_m))
-        middles = len(mesh.points_m) + edge_numbers(edges, self.nodes, TET_EDGES)
-        shapes = edge_shapes(self.weights)
-        return np.einsum("...pa,pa->...p", values[..., np.concatenate([self.nodes, middles], axis=1)], shapes)
+        middles = len(mesh.points_m) + mesh_edges(mesh.tets, len(mesh.points_m)).numbers(self.nodes, TET_EDGES)
+        nodes, element = np.concatenate([self.nodes, middles], axis=1), ElementTetP2()
+        shapes = np.stack([element.lbasis(self.weights[:, 1:].T, i)[0] for i in range(nodes.shape[1])], axis=1)
+        return np.einsum("...pa,pa->...p", values[..., nodes], shapes)
 
 
 def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> Probes:

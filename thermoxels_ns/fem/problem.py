@@ -15,7 +15,7 @@ import numpy.typing as npt
 from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.flat_tets import count_flat_tets
+from thermoxels_ns.fem.p1_kernels import count_flat_tets
 from thermoxels_ns.fem.terms import Effect
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -286,3 +286,15 @@ class HeatProblem:
                 got=f"{start.min():.6g} C",
                 remedy=remedy,
             )
+
+
+def effect_labels(problem: HeatProblem) -> tuple[str, ...]:
+    """Names of a problem's effects for reports, all different: a second one of the same kind and place is numbered."""
+    labels: list[str] = []
+    for effect in problem.effects:
+        label, number = effect.label, 1
+        while label in labels:
+            number += 1
+            label = f"{effect.label} ({number})"
+        labels.append(label)
+    return tuple(labels)

@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.kernel_cache import kernel
-from thermoxels_ns.fem.edge_midpoints import FACET_EDGES, TET_EDGES, edge_numbers, midpoints
-from thermoxels_ns.fem.sparsity import mesh_edges
+from thermoxels_ns.fem.p1_kernels import FACET_EDGES, TET_EDGES, mesh_edges
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 
@@ -32,17 +31,17 @@ def refine_mesh(mesh: TetMesh) -> TetMesh:
     """
     edges = mesh_edges(mesh.tets, len(mesh.points_m))
     num_nodes, low, high = len(mesh.points_m), edges.smaller_nodes(), edges.other
-    points = np.concatenate([mesh.points_m, midpoints(edges, mesh.points_m)])
-    local = np.concatenate([mesh.tets, num_nodes + edge_numbers(edges, mesh.tets, TET_EDGES)], axis=1)
+    points = np.concatenate([mesh.points_m, edges.midpoints(mesh.points_m)])
+    local = np.concatenate([mesh.tets, num_nodes + edges.numbers(mesh.tets, TET_EDGES)], axis=1)
     chosen = np.empty(len(mesh.tets), np.int64)
     _choose_diagonals(points, local, _CHILDREN, chosen)
-    facets = np.concatenate([mesh.facets, num_nodes + edge_numbers(edges, mesh.facets, FACET_EDGES)], axis=1)
+    facets = np.concatenate([mesh.facets, num_nodes + edges.numbers(mesh.facets, FACET_EDGES)], axis=1)
     tags, colour = mesh.boundary, mesh.colour
     return replace(
         mesh,
         points_m=points,
         tets=np.take_along_axis(local[:, None], _CHILDREN[chosen], axis=2).reshape(-1, 4),
-        temperature_c=np.concatenate([mesh.temperature_c, midpoints(edges, mesh.temperature_c)]),
+        temperature_c=np.concatenate([mesh.temperature_c, edges.midpoints(mesh.temperature_c)]),
         observed=np.concatenate([mesh.observed, mesh.observed[low] & mesh.observed[high]]),
         facets=facets[:, _FACET_CHILDREN].reshape(-1, 3),
         facet_tags=np.repeat(mesh.facet_tags, 4),
@@ -62,7 +61,11 @@ def refine_mesh(mesh: TetMesh) -> TetMesh:
 
 def refined_values(mesh: TetMesh, nodal: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Interpolate values of a mesh's nodes to those of the refined one."""
-    return np.concatenate([nodal, midpoints(mesh_edges(mesh.tets, len(mesh.points_m)), nodal)])
+    return np.concatenate([nodal, mesh_edges(mesh.tets, len(mesh.points_m)).midpoints(nodal)])
+
+
+_OPPOSITE = ((4, 9), (6, 8), (7, 5))
+"""Middles of opposite edges: 4 to 9 are those of `TET_EDGES`."""
 
 
 def _children() -> npt.NDArray[np.int64]:
@@ -76,9 +79,9 @@ def _children() -> npt.NDArray[np.int64]:
     place = np.concatenate([place, [place[list(ends)].mean(axis=0) for ends in TET_EDGES]])
     table = []
     for first in range(3):
-        # Middles 4 + i and 9 - i belong to opposite edges; the other two pairs are the ring around the diagonal.
-        (a, b), (c, d) = ((4 + i, 9 - i) for i in range(3) if i != first)
-        ring = [[4 + first, 9 - first, *pair] for pair in ((a, c), (c, b), (b, d), (d, a))]
+        # The middles of one pair are the ends of the diagonal; the other two pairs are the ring around it.
+        (a, b), (c, d) = (pair for pair in _OPPOSITE if pair is not _OPPOSITE[first])
+        ring = [[*_OPPOSITE[first], *pair] for pair in ((a, c), (c, b), (b, d), (d, a))]
         upright = [t if np.linalg.det(place[t[1:]] - place[t[0]]) > 0.0 else [t[1], t[0], *t[2:]] for t in ring]
         table.append(corners + upright)
     return np.array(table)

@@ -1,14 +1,21 @@
-"""What a heat computation returns."""
+"""What a heat computation returns, and its temperatures on a mesh that can be shown."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.fem.solver_statistics import Assembled
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.refine_mesh import refine_mesh
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+Vector = npt.NDArray[np.float64]
 
 LEFT_OUT = {
     "convection": "Convection: not modelled, {}.",
@@ -16,6 +23,31 @@ LEFT_OUT = {
     "absorbed solar": "Solar gain and internal sources: not modelled.",
 }
 """What a computation without an effect of this kind says."""
+
+
+@dataclass
+class Assembled:
+    """Forms that were assembled, by kind; what a problem does not call for has no entry.
+
+    >>> bill = Assembled()
+    >>> with bill.form("stiffness"):
+    ...     pass
+    >>> bill.counts
+    {'stiffness': 1}
+    """
+
+    counts: dict[str, int] = field(default_factory=dict)
+    """How often each kind was assembled: stiffness, mass, robin, flux, radiation, source, fixed."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Time each kind took, [s]."""
+
+    @contextmanager
+    def form(self, kind: str) -> Iterator[None]:
+        """Count what is assembled inside."""
+        start = time.perf_counter()
+        yield
+        self.seconds[kind] = self.seconds.get(kind, 0.0) + time.perf_counter() - start
+        self.counts[kind] = self.counts.get(kind, 0) + 1
 
 
 @dataclass(frozen=True)
@@ -122,3 +154,43 @@ def left_out(kinds: Sequence[str]) -> tuple[str, ...]:
     """Say what a computation with effects of these kinds leaves out, one sentence each."""
     why = "no effect asks for it" if kinds else "the boundary is insulated"
     return tuple(sentence.format(why) for kind, sentence in LEFT_OUT.items() if kind not in kinds)
+
+
+Solution: TypeAlias = HeatSolution | SteadySolution
+"""What either solver returns."""
+
+_CHILD_FACETS = 4
+
+
+@dataclass(frozen=True)
+class SolutionNodes:
+    """A mesh with a temperature at every node."""
+
+    mesh: TetMesh
+    """The mesh that was solved; of quadratic tetrahedra the same with all edges halved, whose new nodes are where their
+    further unknowns sit. So pictures, files and extremes show every temperature that was computed."""
+    times_s: Vector
+    """Times, shape (s,), [s]; 0 alone for a steady state."""
+    states_c: Vector
+    """Nodal temperatures, shape (s, n), [degrees Celsius]."""
+    quadratic: bool
+    """Whether the tetrahedra that were solved are quadratic."""
+
+    def of_facets(self, values: npt.NDArray) -> npt.NDArray:
+        """Give values of the boundary triangles that were solved to those of the mesh, shape (f, ...)."""
+        return np.repeat(values, _CHILD_FACETS, axis=0) if self.quadratic else values
+
+
+def solution_nodes(problem: HeatProblem, solution: Solution) -> SolutionNodes:
+    """Put a solution on a mesh of linear tetrahedra without losing any of its temperatures.
+
+    Args:
+        problem: What was solved.
+        solution: Its outcome.
+    """
+    if isinstance(solution, HeatSolution):
+        return SolutionNodes(problem.mesh, solution.times_s, solution.temperature_c, False)
+    if not len(solution.edge_temperature_c):
+        return SolutionNodes(problem.mesh, np.zeros(1), solution.temperature_c[None], False)
+    every_c = np.concatenate([solution.temperature_c, solution.edge_temperature_c])
+    return SolutionNodes(refine_mesh(problem.mesh), np.zeros(1), every_c[None], True)

@@ -11,15 +11,11 @@ import numpy.typing as npt
 from scipy import sparse
 
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
+from thermoxels_ns.fem.conjugate_gradients import LinearSolution
 from thermoxels_ns.fem.forms import COLDEST_SLOPE_K
-from thermoxels_ns.fem.initial_guess import InitialGuess
-from thermoxels_ns.fem.linear_solver import LinearSolution
-from thermoxels_ns.fem.matrix_parts import block_of
 from thermoxels_ns.fem.newton import Residual, newton
-from thermoxels_ns.fem.piece_balance import is_within, weighted_sums, without_sums
-from thermoxels_ns.fem.solver_choice import LinearSolver
-from thermoxels_ns.fem.system import HeatSystem
-from thermoxels_ns.fem.two_level import SystemSolver
+from thermoxels_ns.fem.pieces import is_within
+from thermoxels_ns.fem.system import HeatSystem, SystemSolver
 
 Vector = npt.NDArray[np.float64]
 
@@ -29,8 +25,6 @@ _NEWTON_TOLERANCE = 1e-6
 """Relative tolerance of the linear solver in a step of Newton's method: the next step corrects the rest."""
 _UNEXPLAINED = 1e-11
 """Largest share of the stored heat that may be unaccounted for where nodes are fixed."""
-_WORTH_A_GUESS = 2000
-"""Unknowns from which on to find where to start takes less time than the iterations that it saves."""
 _EPS = float(np.finfo(np.float64).eps)
 ROUND_OFF = 8.0 * _EPS
 """Round-off of a sum as a share of the sum of sizes."""
@@ -90,7 +84,6 @@ class Stage:
         self.floats = bool(self.floating.any())
         """Whether there are any."""
         self._rough_solver: SystemSolver | None = None
-        self._guess = InitialGuess() if len(self.matrix.indptr) > _WORTH_A_GUESS else None
 
     def solve(
         self,
@@ -120,7 +113,7 @@ class Stage:
                 more, linear = balance.correction(u, rest)
                 u, spent = u + more if linear.converged else u, spent + linear.iterations
             return balance.solution(u, spent, found.iterations, found.converged, found.status)
-        change, linear = self.correction(self._own_solver, self.held_w_k, first, self._guess)
+        change, linear = self.correction(self._own_solver, self.held_w_k, first)
         iterations = linear.iterations
         rest = self._unexplained(balance, change) if linear.converged else None
         if rest is not None:
@@ -171,30 +164,27 @@ class Stage:
         balance = Residual(heat_w, np.where(self.floating, piece_heat_w, 0.0), nothing, np.zeros_like(piece_heat_w))
         return self.everywhere(self.correction(solver, held_w_k, balance)[0])
 
-    def correction(
-        self, solver: SystemSolver, held_w_k: Vector, residual: Residual, guess: InitialGuess | None = None
-    ) -> tuple[Vector, LinearSolution]:
+    def correction(self, solver: SystemSolver, held_w_k: Vector, residual: Residual) -> tuple[Vector, LinearSolution]:
         """Solve for a change of the free nodes, its mean over floating pieces by their balance.
 
         Args:
             solver: Of the matrix.
             held_w_k: The matrix's row sums, exactly, shape (n,).
             residual: What is to be balanced.
-            guess: Earlier solutions with this matrix, to which this one is added; None: start from nothing.
         """
         if not self.floats:
-            linear = _solved(solver, residual.heat_w, guess)
+            linear = solver.solve(residual.heat_w)
             return linear.x, linear
         pieces, full_w = self.system.pieces, self.everywhere(residual.heat_w)
         held = np.where(self.floating, pieces.sums(held_w_k), 1.0)
         # In multiples of the row sums, this shifts the solution by a constant in each piece.
-        rest_w = self.at_free(without_sums(pieces, self.floating, full_w, held_w_k, held))
+        rest_w = self.at_free(pieces.without_sums(self.floating, full_w, held_w_k, held))
         if is_within(rest_w, residual.round_off_w, ROUND_OFF, residual.heat_w):
             linear = LinearSolution(np.zeros_like(rest_w), 0, 0.0, True, "Each piece changes as a whole.")
         else:
-            linear = _solved(solver, rest_w, guess)
+            linear = solver.solve(rest_w)
         full_k = self.everywhere(linear.x)
-        stored_w = weighted_sums(pieces, held_w_k, full_k)
+        stored_w = pieces.sums(held_w_k * full_k)
         shift = np.where(self.floating, (residual.piece_heat_w - stored_w) / held, 0.0)
         return self.at_free(full_k + pieces.at_nodes(shift)), linear
 
@@ -204,7 +194,7 @@ class Stage:
 
     def free_block(self, matrix: sparse.csr_matrix) -> sparse.csr_matrix:
         """Rows and columns of the nodes that are not fixed."""
-        return matrix if self._free is None else block_of(matrix, self._free)
+        return matrix if self._free is None else sparse.csr_matrix(matrix[self._free][:, self._free])
 
     def everywhere(self, free: Vector) -> Vector:
         """Put 0 at the fixed nodes."""
@@ -213,16 +203,6 @@ class Stage:
         full = np.zeros(self.system.num_nodes)
         full[self._free] = free
         return full
-
-
-def _solved(solver: SystemSolver, heat_w: Vector, guess: InitialGuess | None) -> LinearSolution:
-    """Solve from a guess and learn from the solution."""
-    if guess is None or not isinstance(solver, LinearSolver):
-        return solver.solve(heat_w)
-    solution = solver.solve(heat_w, guess.for_right_hand_side(heat_w))
-    if solution.converged:
-        guess.keep(heat_w, solution.x, solution.iterations)
-    return solution
 
 
 class _Balance:

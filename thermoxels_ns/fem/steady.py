@@ -8,10 +8,9 @@ import numpy as np
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.effect_forms import effect_labels
 from thermoxels_ns.fem.floating_components import check_held
 from thermoxels_ns.fem.limiter import LEVEL_ROUND_OFF, MOST_SLACK, RANGE_ROUND_OFF, PositiveOffDiagonals, solve_in_range
-from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.solution import SteadySolution, heat_by_effect
 from thermoxels_ns.fem.stage import Stage, StageSolution
 from thermoxels_ns.fem.system import HeatSystem

@@ -10,14 +10,12 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_shape
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effect_forms import effect_forms, effect_labels
 from thermoxels_ns.fem.fixed_nodes import FixedNodes
-from thermoxels_ns.fem.forms import SourceForm
-from thermoxels_ns.fem.linear_space import LinearSpace
-from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.quadratic_space import QuadraticSpace
+from thermoxels_ns.fem.forms import SourceForm, effect_forms
+from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import EffectHeat, heat_by_effect
+from thermoxels_ns.fem.space import Space
 from thermoxels_ns.fem.system import HeatSystem
 
 Vector = npt.NDArray[np.float64]
@@ -56,7 +54,7 @@ def heat_by_part(
     parted = copy.copy(selection)
     parted.facet_patch, parted.patch_names = part, tuple(part_names)
     order = 1 if len(temperature_c) == len(problem.mesh.points_m) else 2
-    space = LinearSpace(parted) if order == 1 else QuadraticSpace(parted)
+    space = Space(parted, order=order, lumped=order == 1)
     remedy = "Give the temperatures of the problem that was solved."
     check_shape("temperature_c", temperature_c, (space.num_nodes,), remedy, HeatError)
     reference_c = 0.5 * (float(temperature_c.min()) + float(temperature_c.max()))

@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 from copy import copy
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.effect_forms import effect_forms
+from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients, LinearSolver, TwoLevel
 from thermoxels_ns.fem.fixed_nodes import FixedNodes
-from thermoxels_ns.fem.forms import FluxForm, RobinForm, SourceForm
-from thermoxels_ns.fem.linear_space import CORNERS, LinearSpace
-from thermoxels_ns.fem.matrix_parts import with_more_on_diagonal
+from thermoxels_ns.fem.forms import FluxForm, RobinForm, SourceForm, effect_forms
+from thermoxels_ns.fem.p1_kernels import product_and_bound
 from thermoxels_ns.fem.pieces import Pieces
 from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.quadratic_space import QuadraticSpace
 from thermoxels_ns.fem.selection import Selection
-from thermoxels_ns.fem.solver_choice import LinearSolver
-from thermoxels_ns.fem.solver_statistics import Assembled
-from thermoxels_ns.fem.sparsity import product_and_bound
-from thermoxels_ns.fem.two_level import SystemSolver, TwoLevelConjugateGradients
+from thermoxels_ns.fem.solution import Assembled
+from thermoxels_ns.fem.space import Space
 
 Vector = npt.NDArray[np.float64]
 
-_FEW, _ROUGH = 5000, 1e-3
-"""So few unknowns are solved for so roughly without a coarse level, which would take longer to make and to use."""
+SystemSolver: TypeAlias = LinearSolver | ConjugateGradients
+"""What solves the equations of a system, by the order of its tetrahedra."""
+
 _KEPT_RANGES = 64
 """Times at which the range of the surroundings is kept."""
 
@@ -58,7 +55,7 @@ class HeatSystem:
         self.reference_c: float = 0.5 * (float(start.min()) + float(start.max()))
         """What temperatures are relative to, [degrees Celsius]."""
         selection = Selection(problem.mesh, problem.up)
-        self._space = _space(selection, lumped, lumped_boundary, order)
+        self._space = Space(selection, order=order, lumped=lumped, lumped_boundary=lumped_boundary)
         forms = effect_forms(problem, self._space, self.reference_c, self.assembled)
         self._robin, self._loads, self._radiation = forms.robin, forms.loads, forms.radiation
         self.fixed: FixedNodes = FixedNodes(forms.fixed, self.num_nodes)
@@ -92,7 +89,7 @@ class HeatSystem:
         return self._space.num_nodes
 
     @property
-    def space(self) -> LinearSpace:
+    def space(self) -> Space:
         """The nodes, and how what happens becomes numbers on them."""
         return self._space
 
@@ -104,7 +101,7 @@ class HeatSystem:
     @property
     def lumped(self) -> bool:
         """Whether masses and boundary exchange are both on the diagonal."""
-        return self._space.lumped and self._space.rule is CORNERS
+        return self._space.lumped and self._space.lumped_boundary
 
     def with_stiffness(self, stiffness: sparse.csr_matrix) -> HeatSystem:
         """Copy the system with another K between the same nodes; all else is shared."""
@@ -152,19 +149,20 @@ class HeatSystem:
             return matrix
         mass, nodal = self._masses()
         if mass is None:
-            return with_more_on_diagonal(matrix, nodal / step_s)
+            return sparse.csr_matrix(matrix + sparse.diags(nodal / step_s, format="csr"))
         return sparse.csr_matrix(matrix + mass / step_s)
 
     def linear_solver(self, matrix: sparse.csr_matrix, relative_tolerance: float) -> SystemSolver:
         """Make the solver for a matrix between the free nodes that suits the tetrahedra."""
-        few = len(matrix.indptr) <= _FEW and relative_tolerance >= _ROUGH
-        if few or not isinstance(self._space, QuadraticSpace):
+        if self._space.order == 1:
             return LinearSolver(matrix, relative_tolerance=relative_tolerance)
         if self._prolongation is None:
             free, num_mesh_nodes = self.fixed.free, len(self.problem.mesh.points_m)
             rows = sparse.csr_matrix(self._space.prolongation()[free])
             self._prolongation = sparse.csr_matrix(rows[:, free[free < num_mesh_nodes]])
-        return TwoLevelConjugateGradients(matrix, self._prolongation, relative_tolerance=relative_tolerance)
+        return ConjugateGradients(
+            matrix, TwoLevel(matrix, self._prolongation), relative_tolerance=relative_tolerance, max_iterations=500
+        )
 
     def held_w_k(self, time_s: float, step_s: float) -> Vector:
         """Row sums of M / step + R, shape (n,), [W / K]: of the matrix too, because those of K are 0, but exact."""
@@ -324,19 +322,6 @@ class HeatSystem:
     def _kinds_of_loads(self) -> list[tuple[str, RobinForm | FluxForm | SourceForm]]:
         kinds: list[tuple[str, RobinForm | FluxForm | SourceForm]] = [("robin", form) for form in self._robin]
         return kinds + [("source" if isinstance(form, SourceForm) else "flux", form) for form in self._loads]
-
-
-def _space(selection: Selection, lumped: bool, lumped_boundary: bool | None, order: int) -> LinearSpace:
-    if order == 1:
-        return LinearSpace(selection, lumped=lumped, lumped_boundary=lumped_boundary is not False)
-    if order != 2:
-        remedy = "Use 1 for linear tetrahedra or 2 for quadratic ones."
-        raise HeatError("order", expected="1 or 2", got=repr(order), remedy=remedy)
-    if lumped or lumped_boundary:
-        got = "lumped=True" if lumped else "lumped_boundary=True"
-        remedy = "Leave it out: lumped, a quadratic tetrahedron would have negative masses at its corners."
-        raise HeatError("order 2", expected="integrals that are not lumped", got=got, remedy=remedy)
-    return QuadraticSpace(selection)
 
 
 def _sum_of(first: sparse.csr_matrix | None, second: sparse.csr_matrix | None) -> sparse.csr_matrix | None:

@@ -9,11 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.effect_forms import effect_labels
-from thermoxels_ns.fem.linear_space import LinearSpace, sums_by_number
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.quantities import Bounded, Places
 from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.space import Space, sums_by_number
 from thermoxels_ns.fem.terms import FixedTerm, FluxTerm, RobinTerm, SourceTerm, Term
 
 Vector = npt.NDArray[np.float64]
@@ -63,9 +62,7 @@ class NodalHeat:
     allowed to be.
     """
 
-    def __init__(
-        self, effect: str, terms: Sequence[Term], space: LinearSpace, times_s: Vector, *, between: bool
-    ) -> None:
+    def __init__(self, effect: str, terms: Sequence[Term], space: Space, times_s: Vector, *, between: bool) -> None:
         """Evaluate an effect.
 
         Args:
@@ -113,8 +110,8 @@ class NodalHeat:
         if isinstance(term, SourceTerm):
             source = self._over_time(term.source_w_m3, selection.tet_places(term.tets))
             volume = space.tet_volumes_m3(term.tets)
-            self.cooling_w += space.tet_load(term.tets, volume * np.maximum(-source.low, 0.0))
-            self.heating_w += space.tet_load(term.tets, volume * np.maximum(source.high, 0.0))
+            self.cooling_w += space.source_load(term.tets, volume * np.maximum(-source.low, 0.0))
+            self.heating_w += space.source_load(term.tets, volume * np.maximum(source.high, 0.0))
             return
         nodes, places = selection.mesh.facets[term.facets], selection.facet_places(term.facets)
         area = selection.facet_area_m2[term.facets]
@@ -160,7 +157,7 @@ class NodalHeat:
 
 
 def nodal_heats(
-    problem: HeatProblem, time: TimeSteps | AdaptiveSteps | None, space: LinearSpace | None = None
+    problem: HeatProblem, time: TimeSteps | AdaptiveSteps | None, space: Space | None = None
 ) -> list[NodalHeat]:
     """Evaluate all effects of a problem.
 
@@ -172,7 +169,7 @@ def nodal_heats(
     Raises:
         HeatError: An effect does not fit the mesh.
     """
-    space = LinearSpace(Selection(problem.mesh, problem.up)) if space is None else space
+    space = Space(Selection(problem.mesh, problem.up)) if space is None else space
     times_s, between = sample_times(time)
     return [
         NodalHeat(label, effect.terms(space.selection), space, times_s, between=between)

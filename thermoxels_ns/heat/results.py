@@ -9,8 +9,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
-from thermoxels_ns.fem.solution import SteadySolution
-from thermoxels_ns.fem.solution_nodes import Solution, SolutionNodes, solution_nodes
+from thermoxels_ns.fem.solution import Solution, SolutionNodes, SteadySolution, solution_nodes
 from thermoxels_ns.fem.surface_heat import heat_by_part, heat_through_parts
 from thermoxels_ns.heat.effects import InternalHeat
 from thermoxels_ns.heat.materials import materials_by_region

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.fem.probes import Probes, place_probes
 from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.solution_nodes import Solution, SolutionNodes, solution_nodes
+from thermoxels_ns.fem.solution import Solution, SolutionNodes, solution_nodes
 from thermoxels_ns.heat.results import HeatResults, heat_results, volume_shares
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_warnings import patch_warnings, shell_warnings, unused_settings

@@ -11,13 +11,13 @@ from scipy import sparse
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.elements import capacities
+from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients
 from thermoxels_ns.fem.limiter import holds_maximum_principle
-from thermoxels_ns.fem.linear_solver import ConjugateGradients
-from thermoxels_ns.fem.linear_space import LinearSpace
+from thermoxels_ns.fem.p1_kernels import lumped_mass
 from thermoxels_ns.fem.pieces import Pieces
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.space import Space
 from thermoxels_ns.heat.nodal_heat import Span, nodal_heats
 
 Vector = npt.NDArray[np.float64]
@@ -142,12 +142,12 @@ class _Screener:
     def __init__(self, problem: HeatProblem, time: TimeSteps | AdaptiveSteps | None, tolerance_k: float) -> None:
         self._problem, self._tolerance = problem, tolerance_k
         self._duration_s = np.inf if time is None else time.duration_s
-        self._space = LinearSpace(Selection(problem.mesh, problem.up))
+        self._space = Space(Selection(problem.mesh, problem.up))
         self.heats = nodal_heats(problem, time, self._space)
         mesh = problem.mesh
         self._mass: Vector = np.ones(0)
         if time is not None:
-            self._mass = capacities(mesh.points_m, mesh.tets, problem.heat_capacity_j_m3k)[0]
+            self._mass = lumped_mass(mesh.points_m, mesh.tets, problem.heat_capacity_j_m3k)
         self._free = ~np.logical_or.reduce([heat.fixed for heat in self.heats])
         self._stiffness: sparse.csr_matrix | None = None
         self._obtuse = False

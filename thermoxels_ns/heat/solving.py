@@ -13,7 +13,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.memory import check_memory, describe_bytes, peak_bytes
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Bounds
-from thermoxels_ns.fem.solution_nodes import Solution
+from thermoxels_ns.fem.solution import Solution
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.tolerance import Tolerance, ToleratedSolution, solve_to_tolerance

@@ -9,11 +9,9 @@ from fnmatch import fnmatchcase
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.fem.effect_forms import effect_labels
-from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.selection import Selection
-from thermoxels_ns.fem.solution import SteadySolution
-from thermoxels_ns.fem.solution_nodes import Solution, SolutionNodes, solution_nodes
+from thermoxels_ns.fem.solution import Solution, SolutionNodes, SteadySolution, solution_nodes
 from thermoxels_ns.fem.surface_heat import heat_by_part, heat_through_parts
 from thermoxels_ns.heat.effects import Convection
 from thermoxels_ns.heat.results import Spot, describe_spot, end_state_c, region_behind_facets

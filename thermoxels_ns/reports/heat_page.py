@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.fem.effect_forms import effect_labels
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import HeatSolution

@@ -7,11 +7,12 @@ import pytest
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import Delaunay
-from skfem import Basis, BilinearForm, ElementTetP1, MeshTet
-from skfem.helpers import dot
 
+from tests.support.heat_matrices import assemble
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.assembly import HeatMatrices, assemble, assemble_mass, assemble_stiffness
+from thermoxels_ns.fem.p1_kernels import MeshEdges, mass_matrix, mesh_edges, product_and_bound, stiffness_matrix
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.space import Space, conduction, storage
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
@@ -150,19 +151,10 @@ def fan_mesh() -> tuple[np.ndarray, np.ndarray]:
 MESHES = {"kuhn": kuhn_mesh, "bcc": bcc_mesh, "random": random_mesh, "fan": fan_mesh}
 
 
-@BilinearForm
-def weighted_gradients(u, v, w):
-    return w["weight"] * dot(u.grad, v.grad)
-
-
-@BilinearForm
-def weighted_product(u, v, w):
-    return w["weight"] * u * v
-
-
-def by_scikit_fem(form, points: np.ndarray, tets: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    basis = Basis(MeshTet(points.T.copy(), tets.T.copy(), validate=False), ElementTetP1(), intorder=2)
-    return form.assemble(basis, weight=np.broadcast_to(weight[:, None], basis.dx.shape)).toarray()
+def space(points: np.ndarray, tets: np.ndarray) -> Space:
+    none, regions = np.zeros((0, 3), np.int64), np.zeros(len(tets), np.int64)
+    mesh = TetMesh(points, tets, np.zeros(len(points)), np.ones(len(points), bool), none, none[:, 0], regions)
+    return Space(Selection(mesh), lumped=False)
 
 
 def entries_per_row(matrix: sparse.csr_matrix) -> int:
@@ -170,21 +162,20 @@ def entries_per_row(matrix: sparse.csr_matrix) -> int:
 
 
 @pytest.mark.parametrize("mesh", MESHES)
-def test_stiffness_is_that_of_an_independent_assembly(mesh: str) -> None:
+def test_stiffness_is_that_of_the_form_of_scikit_fem(mesh: str) -> None:
     points, tets = MESHES[mesh]()
-    conductivity = 10.0 ** np.random.default_rng(9).uniform(-3.0, 3.0, len(tets))
-    for weight in (np.full(len(tets), 1.7), conductivity):
-        expected = by_scikit_fem(weighted_gradients, points, tets, weight)
-        stiffness = assemble_stiffness(points, tets, 1.7 if weight is not conductivity else conductivity)
+    for conductivity in (1.7, 10.0 ** np.random.default_rng(9).uniform(-3.0, 3.0, len(tets))):
+        expected = space(points, tets).assembled(conduction, conductivity=conductivity).toarray()
+        stiffness = stiffness_matrix(points, tets, conductivity)
         assert np.abs(stiffness.toarray() - expected).max() < 1e-13 * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("mesh", MESHES)
-def test_mass_is_that_of_an_independent_assembly(mesh: str) -> None:
+def test_mass_is_that_of_the_form_of_scikit_fem(mesh: str) -> None:
     points, tets = MESHES[mesh]()
     for capacity in (2.0e6, 10.0 ** np.random.default_rng(9).uniform(3.0, 7.0, len(tets))):
-        expected = by_scikit_fem(weighted_product, points, tets, np.broadcast_to(capacity, len(tets)))
-        mass, nodal = assemble_mass(points, tets, capacity)
+        expected = space(points, tets).assembled(storage, heat_capacity=capacity).toarray()
+        mass, nodal = mass_matrix(points, tets, capacity)
         assert np.abs(mass.toarray() - expected).max() < 1e-13 * np.abs(expected).max()
         np.testing.assert_allclose(nodal, expected.sum(axis=1), rtol=1e-12)
         assert (mass != mass.T).nnz == 0
@@ -193,10 +184,10 @@ def test_mass_is_that_of_an_independent_assembly(mesh: str) -> None:
 @pytest.mark.parametrize("mesh", MESHES)
 def test_stiffness_is_symmetric_bit_for_bit_and_its_rows_sum_to_zero(mesh: str) -> None:
     points, tets = MESHES[mesh]()
-    stiffness = assemble_stiffness(points, tets, 1.7)
+    stiffness = stiffness_matrix(points, tets, 1.7)
     assert (stiffness != stiffness.T).nnz == 0
     assert np.all(np.abs(stiffness.sum(axis=1)).A1 <= 1e-15 * np.abs(stiffness).sum(axis=1).A1)
-    again = assemble_stiffness(points, tets, 1.7)
+    again = stiffness_matrix(points, tets, 1.7)
     np.testing.assert_array_equal(stiffness.data, again.data)
     np.testing.assert_array_equal(stiffness.indices, again.indices)
 
@@ -212,8 +203,8 @@ def turned(points: np.ndarray) -> np.ndarray:
 def test_right_angles_couple_nothing_wherever_the_body_stands(mesh: str, entries: int) -> None:
     """Nodes that only right angles lie between have no entry, so that matrices of lattices are small."""
     points, tets = MESHES[mesh]()
-    stiffness = assemble_stiffness(points, tets, 1.7)
-    moved = assemble_stiffness(turned(points), tets, 1.7)
+    stiffness = stiffness_matrix(points, tets, 1.7)
+    moved = stiffness_matrix(turned(points), tets, 1.7)
     assert entries_per_row(stiffness) == entries_per_row(moved) == entries
     assert stiffness.nnz == moved.nnz
     assert np.abs(stiffness - moved).max() < 1e-11 * stiffness.max()
@@ -221,7 +212,7 @@ def test_right_angles_couple_nothing_wherever_the_body_stands(mesh: str, entries
 
 def test_an_angle_that_is_nearly_right_is_no_right_angle() -> None:
     points = np.array([[0.0, 0, 0], [1, 0, 0], [1e-9, 1, 0], [0, 0, 1]])
-    stiffness = assemble_stiffness(points, np.array([[0, 1, 2, 3]]), 1.0).toarray()
+    stiffness = stiffness_matrix(points, np.array([[0, 1, 2, 3]]), 1.0).toarray()
     assert stiffness[1, 2] == pytest.approx(-1e-9 / 6.0, rel=1e-5)
     assert stiffness[1, 3] == stiffness[2, 3] == 0.0
 
@@ -233,7 +224,7 @@ def test_connected_bodies_have_connected_matrices() -> None:
         ends = tets[:, [[0, 1], [0, 2], [0, 3]]].reshape(-1, 2)
         links = sparse.coo_matrix((np.ones(len(ends)), ends.T), shape=(len(points),) * 2)
         by_edges, number = sparse.csgraph.connected_components(links, directed=False)
-        by_stiffness, same = sparse.csgraph.connected_components(assemble_stiffness(points, tets, 1.0), directed=False)
+        by_stiffness, same = sparse.csgraph.connected_components(stiffness_matrix(points, tets, 1.0), directed=False)
         assert by_edges == by_stiffness
         np.testing.assert_array_equal(number, same)
 
@@ -245,8 +236,8 @@ def test_numbering_does_not_matter() -> None:
     old = np.argsort(new)
     even = np.array([[0, 1, 2, 3], [1, 2, 0, 3], [3, 2, 1, 0]])[rng.integers(0, 3, len(tets))]
     mixed = new[np.take_along_axis(tets, even, axis=1)][rng.permutation(len(tets))]
-    expected = assemble_stiffness(points, tets, 1.7).toarray()
-    stiffness = assemble_stiffness(points[old], mixed, 1.7).toarray()
+    expected = stiffness_matrix(points, tets, 1.7).toarray()
+    stiffness = stiffness_matrix(points[old], mixed, 1.7).toarray()
     np.testing.assert_allclose(stiffness[np.ix_(new, new)], expected, atol=1e-13 * np.abs(expected).max())
 
 
@@ -254,11 +245,11 @@ def test_numbering_does_not_matter() -> None:
 def test_scale(scale: float) -> None:
     """K grows with the size of a body, its mass with the cube; neither over- nor underflows on the way."""
     points, tets = bcc_mesh()
-    stiffness, (_, mass) = assemble_stiffness(points, tets, 1.7), assemble_mass(points, tets, 2e6)
-    scaled = assemble_stiffness(scale * points, tets, 1.7)
+    stiffness, (_, mass) = stiffness_matrix(points, tets, 1.7), mass_matrix(points, tets, 2e6)
+    scaled = stiffness_matrix(scale * points, tets, 1.7)
     assert scaled.nnz == stiffness.nnz
     np.testing.assert_allclose(scaled.data, scale * stiffness.data, rtol=1e-12)
-    np.testing.assert_allclose(assemble_mass(scale * points, tets, 2e6)[1], scale**3 * mass, rtol=1e-12)
+    np.testing.assert_allclose(mass_matrix(scale * points, tets, 2e6)[1], scale**3 * mass, rtol=1e-12)
 
 
 def test_two_layers_in_series() -> None:
@@ -267,7 +258,7 @@ def test_two_layers_in_series() -> None:
     corners, tets = kuhn_tets(np.ones((8, 2, 2), bool))
     points = 0.05 * corners
     conductivity = np.where(points[tets].mean(axis=1)[:, 0] < 0.15, 1e3, 1e-3)
-    stiffness = assemble_stiffness(points, tets, conductivity)
+    stiffness = stiffness_matrix(points, tets, conductivity)
     cold, hot = points[:, 0] < 1e-9, points[:, 0] > 0.4 - 1e-9
     free = ~(cold | hot)
     solved = np.where(hot, 1.0, 0.0)
@@ -281,7 +272,7 @@ def test_two_layers_in_series() -> None:
 
 def test_layout_of_the_arrays_does_not_matter() -> None:
     points, tets = random_mesh()
-    expected = assemble_stiffness(points, tets, 1.7).toarray()
+    expected = stiffness_matrix(points, tets, 1.7).toarray()
     read_only = points.copy()
     read_only.flags.writeable = False
     for given, numbers in (
@@ -289,7 +280,7 @@ def test_layout_of_the_arrays_does_not_matter() -> None:
         (read_only, np.asfortranarray(tets)),
         (np.repeat(points, 2, axis=0)[::2], tets[::-1][::-1]),
     ):
-        np.testing.assert_array_equal(assemble_stiffness(given, numbers, 1.7).toarray(), expected)
+        np.testing.assert_array_equal(stiffness_matrix(given, numbers, 1.7).toarray(), expected)
 
 
 TET = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
@@ -297,7 +288,7 @@ ONE = np.array([[0, 1, 2, 3]])
 FLAT = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 1e-13]])
 
 
-@pytest.mark.parametrize("assembled", [assemble_stiffness, assemble_mass])
+@pytest.mark.parametrize("assembled", [stiffness_matrix, mass_matrix])
 @pytest.mark.parametrize(
     ("points", "tets", "value", "message"),
     [
@@ -325,14 +316,59 @@ def test_flat_and_inverted_tetrahedra_are_counted() -> None:
     points, tets = random_mesh()
     tets[::7] = tets[::7][:, [1, 0, 2, 3]]
     with pytest.raises(HeatError, match=f"got {len(tets[::7])} of {len(tets)} flat or inverted"):
-        assemble_stiffness(points, tets, 1.0)
+        stiffness_matrix(points, tets, 1.0)
     thin = np.vstack([TET[:3], [0.3, 0.3, 1e-11]])
-    assert np.all(np.isfinite(assemble_stiffness(thin, ONE, 1.0).data))
+    assert np.all(np.isfinite(stiffness_matrix(thin, ONE, 1.0).data))
 
 
-def test_lumped_and_consistent_matrices_of_a_mesh(random_body, concrete) -> None:
-    lumped, consistent = assemble(random_body, concrete), assemble(random_body, concrete, lumped=False)
-    assert isinstance(lumped, HeatMatrices)
-    np.testing.assert_array_equal(lumped.stiffness_w_k.toarray(), consistent.stiffness_w_k.toarray())
-    np.testing.assert_array_equal(lumped.nodal_mass_j_k, consistent.nodal_mass_j_k)
-    assert lumped.mass_j_k.nnz == len(random_body.points_m) < consistent.mass_j_k.nnz
+def pairs(edges: MeshEdges) -> np.ndarray:
+    return np.column_stack([edges.smaller_nodes(), edges.other])
+
+
+def all_pairs(tets: np.ndarray) -> np.ndarray:
+    """Every edge of every tetrahedron, by brute force."""
+    ends = tets[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]].reshape(-1, 2)
+    return np.unique(np.sort(ends, axis=1), axis=0)
+
+
+def random_tets(num_tets: int, num_nodes: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.stack([rng.choice(num_nodes, 4, replace=False) for _ in range(num_tets)])
+
+
+def test_every_edge_once_and_in_order() -> None:
+    tets = random_tets(300, 60)
+    np.testing.assert_array_equal(pairs(mesh_edges(tets, 60)), all_pairs(tets))
+
+
+def test_a_node_with_very_many_neighbours() -> None:
+    """Tetrahedra around one axis, numbered at random: buckets are far larger than in any regular mesh."""
+    count = 3000
+    ring = np.random.default_rng(1).permutation(count) + 2
+    tets = np.column_stack([np.zeros(count, int), np.ones(count, int), ring, np.roll(ring, -1)])
+    edges = mesh_edges(tets, count + 2)
+    np.testing.assert_array_equal(pairs(edges), all_pairs(tets))
+    assert np.diff(edges.first)[0] == count + 1
+
+
+def test_nodes_without_edges_and_no_tets_at_all() -> None:
+    tets = np.array([[2, 5, 3, 7]])
+    edges = mesh_edges(tets, 10)
+    assert edges.num_nodes == 10
+    np.testing.assert_array_equal(pairs(edges), [[2, 3], [2, 5], [2, 7], [3, 5], [3, 7], [5, 7]])
+    assert pairs(mesh_edges(np.zeros((0, 4), int), 3)).shape == (0, 2)
+
+
+@pytest.mark.parametrize("bad", [-1, 4])
+def test_node_numbers_out_of_range_are_refused(bad: int) -> None:
+    with pytest.raises(HeatError, match="mesh tets: expected node numbers from 0 to 3"):
+        mesh_edges(np.array([[0, 1, 2, bad]]), 4)
+
+
+def test_product_and_its_bound() -> None:
+    matrix = sparse.random(50, 50, 0.2, "csr", random_state=3)
+    matrix.data -= 0.5
+    vector = np.random.default_rng(3).normal(size=50)
+    product, bound = product_and_bound(matrix, vector)
+    np.testing.assert_allclose(product, matrix.toarray() @ vector, rtol=0, atol=1e-15 * bound.max())
+    np.testing.assert_allclose(bound, np.abs(matrix.toarray()) @ np.abs(vector), rtol=1e-14)

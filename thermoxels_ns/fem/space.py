@@ -1,0 +1,240 @@
+"""The unknown temperatures of a body: linear (P1) or quadratic (P2) in each tetrahedron."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+from skfem import Basis, BilinearForm, Dofs, ElementTetP1, ElementTetP2, ElementTriP1, ElementTriP2, MeshTet, MeshTri
+from skfem.helpers import dot, grad
+from skfem.quadrature import get_quadrature
+from skfem.refdom import RefTet
+
+from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.fem.p1_kernels import (
+    FACET_EDGES,
+    TET_EDGES,
+    MeshEdges,
+    lumped_mass,
+    mass_matrix,
+    mesh_edges,
+    stiffness_matrix,
+)
+from thermoxels_ns.fem.quantities import Places
+from thermoxels_ns.fem.selection import Selection
+
+Vector = npt.NDArray[np.float64]
+Numbers = npt.NDArray[np.int64]
+
+_CORNERS = (np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), np.full(3, 1.0 / 6.0))
+"""Quadrature at the corners of the reference triangle."""
+_EXACT = 4
+"""Degree up to which integrals over triangles are exact otherwise: products of quadratic functions."""
+_BLOCK = 10_000
+"""Tetrahedra that scikit-fem sees at a time: its arrays then fit into a processor's cache."""
+
+
+@BilinearForm
+def conduction(u, v, w):
+    """k grad u . grad v, [W / K]."""
+    return w.conductivity * dot(grad(u), grad(v))
+
+
+@BilinearForm
+def storage(u, v, w):
+    """rho c u v, [J / K]."""
+    return w.heat_capacity * u * v
+
+
+class Space:
+    """Unknowns at the mesh's nodes and, of quadratic tetrahedra, at the middles of its edges after them.
+
+    Matrices come from scikit-fem, of linear tetrahedra from the compiled loops of `p1_kernels` instead. Quadratic
+    tetrahedra are for steady states: lumping their mass would give the corners negative masses, and with the
+    consistent mass temperatures leave their range in steps below about h^2 / diffusivity.
+    """
+
+    def __init__(
+        self, selection: Selection, *, order: int = 1, lumped: bool = True, lumped_boundary: bool | None = None
+    ) -> None:
+        """Choose the elements and how masses and boundary exchange are integrated.
+
+        Args:
+            selection: The mesh and its parts.
+            order: 1 for linear tetrahedra, 2 for quadratic ones.
+            lumped: Put each node's mass on the diagonal; of linear tetrahedra only.
+            lumped_boundary: Evaluate boundary exchange at the nodes, which makes its matrices diagonal; False:
+                integrate it over each triangle; None: at the nodes of linear tetrahedra.
+
+        Raises:
+            HeatError: The order is another one, or quadratic tetrahedra are to be lumped.
+        """
+        if order not in (1, 2):
+            remedy = "Use 1 for linear tetrahedra or 2 for quadratic ones."
+            raise HeatError("order", expected="1 or 2", got=repr(order), remedy=remedy)
+        if order == 2 and (lumped or lumped_boundary):
+            got = "lumped=True" if lumped else "lumped_boundary=True"
+            remedy = "Leave it out: lumped, a quadratic tetrahedron would have negative masses at its corners."
+            raise HeatError("order 2", expected="integrals that are not lumped", got=got, remedy=remedy)
+        self.selection, self.order, self.lumped = selection, order, lumped
+        self.lumped_boundary: bool = order == 1 if lumped_boundary is None else lumped_boundary
+        self.element = ElementTetP1() if order == 1 else ElementTetP2()
+
+    @cached_property
+    def edges(self) -> MeshEdges:
+        """The edges of the mesh."""
+        return mesh_edges(self.selection.mesh.tets, len(self.selection.mesh.points_m))
+
+    @property
+    def num_nodes(self) -> int:
+        """Number of unknowns."""
+        return len(self.selection.mesh.points_m) + (len(self.edges.other) if self.order == 2 else 0)
+
+    @property
+    def points_m(self) -> Vector:
+        """Positions of the unknowns, shape (n, 3), [m]."""
+        return self.from_mesh_nodes(self.selection.mesh.points_m)
+
+    def from_mesh_nodes(self, nodal: Vector) -> Vector:
+        """Give unknowns what is linear between the mesh's nodes, shape (n, ...)."""
+        return nodal if self.order == 1 else np.concatenate([nodal, self.edges.midpoints(nodal)])
+
+    def prolongation(self) -> sparse.csr_matrix:
+        """Give `from_mesh_nodes` as a matrix, shape (n, v)."""
+        corners = len(self.selection.mesh.points_m)
+        ends = np.stack([self.edges.smaller_nodes(), self.edges.other], axis=1)
+        edges = sparse.csr_matrix(
+            (np.full(ends.size, 0.5), ends.ravel(), 2 * np.arange(len(ends) + 1)), shape=(len(ends), corners)
+        )
+        return sparse.csr_matrix(sparse.vstack([sparse.identity(corners, format="csr"), edges]))
+
+    def tet_nodes(self) -> Numbers:
+        """Nodes of each tetrahedron, corners first, then the middles of `TET_EDGES`, shape (t, m)."""
+        return self._element_nodes(self.selection.mesh.tets, TET_EDGES)
+
+    def facet_nodes(self, facets: Numbers) -> Numbers:
+        """Nodes of boundary triangles, corners first, then the middles of `FACET_EDGES`, shape (k, m)."""
+        return self._element_nodes(self.selection.mesh.facets[facets], FACET_EDGES)
+
+    def _element_nodes(self, corners: Numbers, ends: Numbers) -> Numbers:
+        if self.order == 1:
+            return corners
+        return np.concatenate([corners, len(self.selection.mesh.points_m) + self.edges.numbers(corners, ends)], axis=1)
+
+    def stiffness(self, conductivity_w_mk: float | Vector) -> sparse.csr_matrix:
+        """K, entries integral(k grad phi_i . grad phi_j), shape (n, n), [W / K]."""
+        mesh = self.selection.mesh
+        if self.order == 1:
+            return stiffness_matrix(mesh.points_m, mesh.tets, conductivity_w_mk, edges=self.edges)
+        return self.assembled(conduction, conductivity=conductivity_w_mk)
+
+    def mass(self, heat_capacity_j_m3k: float | Vector) -> tuple[sparse.csr_matrix | None, Vector]:
+        """M, entries integral(rho c phi_i phi_j), None if lumped, and its row sums, shapes (n, n) and (n,), [J / K]."""
+        mesh = self.selection.mesh
+        if self.lumped:
+            return None, lumped_mass(mesh.points_m, mesh.tets, heat_capacity_j_m3k)
+        if self.order == 1:
+            return mass_matrix(mesh.points_m, mesh.tets, heat_capacity_j_m3k, edges=self.edges)
+        matrix = self.assembled(storage, heat_capacity=heat_capacity_j_m3k)
+        return matrix, matrix @ np.ones(self.num_nodes)
+
+    def assembled(self, form: BilinearForm, **tet_values: float | Vector) -> sparse.csr_matrix:
+        """Assemble a form by scikit-fem, symmetric bit for bit.
+
+        Args:
+            form: What is integrated.
+            tet_values: Its parameters by name, one for all or one per tetrahedron, shape (t,).
+        """
+        points_m, tets, num_tets = self.selection.mesh.points_m, self.selection.mesh.tets, len(self.selection.mesh.tets)
+        mesh = MeshTet(np.ascontiguousarray(points_m.T), np.ascontiguousarray(tets.T), validate=False)
+        dofs = _dofs(mesh, ElementTetP1(), self.tet_nodes(), self.num_nodes)
+        values = {name: np.broadcast_to(value, num_tets) for name, value in tet_values.items()}
+        parts = []
+        for begin in range(0, num_tets, _BLOCK):
+            block = np.arange(begin, min(begin + _BLOCK, num_tets))
+            basis = Basis(mesh, self.element, elements=block, dofs=dofs, disable_doflocs=True)
+            shape = basis.dx.shape
+            parameters = {name: np.broadcast_to(value[block, None], shape) for name, value in values.items()}
+            parts.append(form.coo_data(basis, **parameters).tocsr().tocoo())
+        rows, columns, data = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("row", "col", "data")
+        )
+        matrix = sparse.csr_matrix((data, (rows, columns)), shape=(self.num_nodes, self.num_nodes))
+        return sparse.csr_matrix(0.5 * (matrix + matrix.T))
+
+    def surface(self, facets: Numbers) -> Basis:
+        """Boundary triangles as a scikit-fem basis whose unknowns are the body's.
+
+        Only values are integrated over it, never gradients. So each triangle may lie in a plane of its own, as a right
+        triangle of the area that it stands for.
+        """
+        leg = np.sqrt(2.0 * np.maximum(self.selection.facet_area_m2[facets], np.finfo(np.float64).tiny))
+        none = np.zeros_like(leg)
+        points = np.stack([np.stack([none, leg, none], axis=1), np.stack([none, none, leg], axis=1)]).reshape(2, -1)
+        mesh = MeshTri(points, np.arange(3 * len(facets)).reshape(-1, 3).T.copy(), validate=False)
+        element = ElementTriP1() if self.order == 1 else ElementTriP2()
+        dofs = _dofs(mesh, ElementTriP1(), self.facet_nodes(facets), self.num_nodes)
+        rule = {"quadrature": _CORNERS} if self.lumped_boundary else {"intorder": _EXACT}
+        return Basis(mesh, element, dofs=dofs, disable_doflocs=True, **rule)
+
+    def source_points(self, tets: Numbers) -> tuple[Places, Vector]:
+        """Places where sources in tetrahedra are asked, those of one after the other, and the volume of each, [m3]."""
+        points, weights = self._source_rule
+        barycentric = np.concatenate([1.0 - points.sum(axis=0, keepdims=True), points])
+        corners = self.selection.mesh.points_m[self.selection.mesh.tets[tets]]
+        places = np.einsum("aq,tai->tqi", barycentric, corners).reshape(-1, 3)
+        volumes = (6.0 * self.tet_volumes_m3(tets)[:, None] * weights).ravel()
+        return Places(places, np.zeros_like(places), self.selection.up), volumes
+
+    def source_load(self, tets: Numbers, point_w: Vector) -> Vector:
+        """Spread heat at the points of `source_points` over the nodes, shape (n,), [W]."""
+        points, weights = self._source_rule
+        nodes = self.tet_nodes()[tets].T
+        shapes = np.stack([self.element.lbasis(points, i)[0] * np.ones(len(weights)) for i in range(len(nodes))])
+        shares = np.einsum("tq,aq->at", point_w.reshape(-1, len(weights)), shapes)
+        return sums_by_number(nodes.ravel(), shares.ravel(), self.num_nodes)
+
+    @property
+    def _source_rule(self) -> tuple[Vector, Vector]:
+        """Points and weights that integrate polynomials of the elements' degree exactly."""
+        return get_quadrature(RefTet, self.order)
+
+    def tet_volumes_m3(self, tets: Numbers) -> Vector:
+        """Volumes of tetrahedra, shape (k,), [m3]."""
+        corner = self.selection.mesh.points_m[self.selection.mesh.tets[tets]]
+        side = corner[:, 1:] - corner[:, :1]
+        return np.einsum("ti,ti->t", side[:, 0], np.cross(side[:, 1], side[:, 2])) / 6.0
+
+    def node_places(self, nodes: Numbers) -> Places:
+        """Give the positions of nodes, with the mean normal of the boundary around them."""
+        total = self._normals[nodes]
+        length = np.sqrt(np.einsum("ki,ki->k", total, total))[:, None]
+        normals = np.divide(total, length, out=np.zeros_like(total), where=length > 0.0)
+        return Places(self.points_m[nodes], normals, self.selection.up)
+
+    @cached_property
+    def _normals(self) -> Vector:
+        """Sums of the normals around each node by area, shape (n, 3), [m2]."""
+        selection = self.selection
+        owners = self.facet_nodes(np.arange(len(selection.mesh.facets)))
+        weighted = np.repeat(selection.facet_normal * selection.facet_area_m2[:, None], owners.shape[1], axis=0)
+        return np.stack([sums_by_number(owners.ravel(), part, self.num_nodes) for part in weighted.T], axis=1)
+
+
+def _dofs(mesh: MeshTet | MeshTri, linear: ElementTetP1 | ElementTriP1, nodes: Numbers, count: int) -> Dofs:
+    """Numbers of unknowns in scikit-fem's terms, but ours: its own search for edges takes ten times as long."""
+    dofs = Dofs(mesh, linear)
+    dofs.element_dofs, dofs.N = np.ascontiguousarray(nodes.T, dtype=np.int32), count
+    return dofs
+
+
+def sums_by_number(numbers: Numbers, values: npt.NDArray, count: int) -> Vector:
+    """Add up values that have the same number; the sums of the numbers 0 to count - 1.
+
+    >>> sums_by_number(np.array([2, 0, 2]), np.array([1.0, 5.0, 3.0]), 4).tolist()
+    [5.0, 0.0, 4.0, 0.0]
+    """
+    # Without values, numpy counts in whole numbers.
+    return np.bincount(numbers, values, count).astype(np.float64, copy=False)
