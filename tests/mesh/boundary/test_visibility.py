@@ -8,7 +8,7 @@ import pytest
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.mesh.boundary.facet_normals import true_surface
+from thermoxels_ns.mesh.boundary.tags import voxel_surface as surface_of_voxels
 from thermoxels_ns.mesh.boundary.visibility import _EmptySpace, seen_facets
 from thermoxels_ns.mesh.quality.checks import facet_normals
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets, voxel_facets
@@ -59,7 +59,7 @@ def test_a_sphere_is_seen_up_to_its_horizon() -> None:
     cells, camera = distance < 0.0, MIDDLE + np.array([12.0, 3.0, -2.0])
     points = kuhn_tets(cells)[0]
     facets = voxel_facets(cells)
-    normals, _ = true_surface(np.clip(-distance, -1, 1), points, facets)
+    normals, _ = surface_of_voxels(np.clip(-distance, -1, 1), points, facets)
     centroids = LATTICE.index_to_world(points[facets].mean(axis=1))
     seen = seen_facets(cells, views(camera), LATTICE, centroids, normals)
 

@@ -1,0 +1,182 @@
+"""Normals and areas that voxel faces stand for, against shapes that are known exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.core.errors import MeshError
+from thermoxels_ns.mesh.boundary.tags import LEAST_AREA_FACTOR, voxel_surface
+from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
+from thermoxels_ns.mesh.solid.level_set import level_of
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX
+from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, voxel_facets
+
+ACROSS = 48
+OFF_CENTRE = np.array([0.3, -0.21, 0.1])
+"""Where shapes lie between voxels. At 45 degrees a whole layer of a slab, and the area of its rim, depend on it."""
+DENSITIES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "ramp": lambda distance: np.exp(np.clip(-distance, -8.0, 8.0)),
+    "jump": lambda distance: np.where(distance < 0.0, 10.0, 0.01),
+}
+
+
+def centres(n: int) -> np.ndarray:
+    """Voxel centres around the middle of n^3 voxels, [voxels]."""
+    return np.stack(np.meshgrid(*[np.arange(n) + 0.5] * 3, indexing="ij"), axis=-1) - 0.5 * n
+
+
+def box_distance(points: np.ndarray, half: np.ndarray) -> np.ndarray:
+    beyond = np.abs(points) - half
+    return np.linalg.norm(np.maximum(beyond, 0.0), axis=-1) + np.minimum(beyond.max(axis=-1), 0.0)
+
+
+def turn(axis: str, degrees: float) -> np.ndarray:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    matrix = {"y": [[c, 0, s], [0, 1, 0], [-s, 0, c]], "z": [[c, -s, 0], [s, c, 0], [0, 0, 1]]}[axis]
+    return np.array(matrix, dtype=float)
+
+
+@cache
+def shape(name: str) -> tuple[np.ndarray, float]:
+    """Signed distance at the voxel centres and exact area, [voxels] and [voxel faces]."""
+    half = 0.5 * ACROSS
+    points = centres(ACROSS + 6) - OFF_CENTRE
+    radial = np.hypot(points[..., 0], points[..., 1])
+    if name == "sphere":
+        return np.linalg.norm(points, axis=-1) - half, 4.0 * np.pi * half**2
+    if name == "torus":
+        ring, tube = 2.0 * half / 3.0, half / 3.0
+        return np.hypot(radial - ring, points[..., 2]) - tube, 4.0 * np.pi**2 * ring * tube
+    if name == "cylinder":
+        beyond = np.stack([radial - half, np.abs(points[..., 2]) - half])
+        outside, inside = np.linalg.norm(np.maximum(beyond, 0.0), axis=0), np.minimum(beyond.max(axis=0), 0.0)
+        return outside + inside, 2.0 * np.pi * half * (2.0 * half + half)
+    kind, degrees = name.rsplit(" ", 1)
+    sides = half * np.array({"box": [1.0, 0.75, 0.5], "slab": [1.0, 1.0, 0.25]}[kind])
+    tilted = points if degrees == "0" else centres(ACROSS + ACROSS // 2) - OFF_CENTRE
+    rotation = turn("z" if kind == "box" else "y", float(degrees))
+    area = 8.0 * (sides[0] * sides[1] + sides[1] * sides[2] + sides[2] * sides[0])
+    return box_distance(tilted @ rotation, sides), area
+
+
+def surface(level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corner indices of the nodes and boundary triangles of the voxel mesh of a level function."""
+    return kuhn_tets(level > 0.0)[0], voxel_facets(level > 0.0)
+
+
+def exported(distance: np.ndarray, kind: str) -> np.ndarray:
+    """The level that an export makes of an exact field."""
+    density = DENSITIES[kind](distance)
+    return level_of(density, 1.0, density >= 1.0, density >= 1.0, makes_up_volume=False)
+
+
+@pytest.mark.parametrize(("kind", "bound"), [("ramp", 0.03), ("jump", 0.04)])
+@pytest.mark.parametrize("name", ["sphere", "torus", "cylinder", "slab 30", "slab 45", "box 0", "box 30", "box 45"])
+def test_area_is_within_three_or_four_percent(name: str, kind: str, bound: float) -> None:
+    distance, exact = shape(name)
+    level = exported(distance, kind)
+    points, facets = surface(level)
+    own = facet_areas(points.astype(float), facets)
+    if name != "box 0":
+        assert own.sum() > 1.15 * exact  # what there is to correct
+    assert own @ voxel_surface(level, points, facets)[1] == pytest.approx(exact, rel=bound)
+
+
+@pytest.mark.parametrize("kind", DENSITIES)
+def test_flat_sides_of_a_box_are_exact(kind: str) -> None:
+    level = exported(shape("box 0")[0], kind)
+    points, facets = surface(level)
+    normals, factors = voxel_surface(level, points, facets)
+    own = facet_normals(points.astype(float), facets)
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle = points[facets].mean(axis=1)
+    from_edges = np.sort(np.minimum(middle - low, high - middle), axis=1)[:, 1]
+    inner = from_edges > 4.0
+    assert np.count_nonzero(inner) > 5000
+    assert factors[inner] == pytest.approx(1.0, abs=1e-6)
+    assert normals[inner] == pytest.approx(own[inner], abs=1e-3)
+
+
+@pytest.mark.parametrize(("kind", "mean", "most"), [("ramp", 1.5, 9.0), ("jump", 4.0, 18.0)])
+def test_normals_of_a_sphere(kind: str, mean: float, most: float) -> None:
+    level = exported(shape("sphere")[0], kind)
+    points, facets = surface(level)
+    normals, _ = voxel_surface(level, points, facets)
+    exact = points[facets].mean(axis=1) - 0.5 * (ACROSS + 6) - OFF_CENTRE
+    exact /= np.linalg.norm(exact, axis=1, keepdims=True)
+    assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0, abs=1e-12)
+    degrees = np.degrees(np.arccos(np.clip(np.einsum("ij,ij->i", normals, exact), -1.0, 1.0)))
+    assert degrees.mean() < mean and degrees.max() < most
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_plane_has_its_normal_and_its_area(seed: int) -> None:
+    """The factor is the cosine between the face and the plane, up to where the plane leaves the lattice."""
+    random = np.random.default_rng(seed)
+    normal = random.normal(size=3)
+    normal /= np.linalg.norm(normal)
+    level = -0.02 * (centres(24) @ normal - random.uniform(-2.0, 2.0))
+    points, facets = surface(level)
+    steps = boundary_tags(facets, points, (25, 25, 25)) != FACET_BOX
+    normals, factors = voxel_surface(level, points, facets)
+    assert np.count_nonzero(steps) > 300
+    assert normals[steps] == pytest.approx(np.broadcast_to(normal, normals[steps].shape), abs=1e-9)
+    own = np.abs(facet_normals(points.astype(float), facets)[steps] @ normal)
+    assert factors[steps] == pytest.approx(np.maximum(own, LEAST_AREA_FACTOR), abs=1e-9)
+
+
+def test_where_the_scene_box_cuts_the_normal_is_that_of_the_box() -> None:
+    level = np.clip(-(centres(12) @ [0.6, 0.0, 0.8]), -1.0, 1.0)
+    points, facets = surface(level)
+    cut = boundary_tags(facets, points, (13, 13, 13)) == FACET_BOX
+    assert np.count_nonzero(cut) > 100
+    normals, factors = voxel_surface(level, points, facets)
+    assert np.array_equal(normals[cut], facet_normals(points.astype(float), facets)[cut])
+    assert np.all(factors[cut] == 1.0)
+
+
+def test_halves_of_a_face_agree_and_their_order_does_not_matter() -> None:
+    level = np.clip(5.0 - np.linalg.norm(centres(14) - OFF_CENTRE, axis=-1), -1.0, 1.0)
+    points, facets = surface(level)
+    normals, factors = voxel_surface(level, points, facets)
+    assert np.array_equal(normals[0::2], normals[1::2])  # the halves follow each other
+    assert np.array_equal(factors[0::2], factors[1::2])
+    shuffled = np.random.default_rng(0).permutation(len(facets))
+    other_normals, other_factors = voxel_surface(level, points, facets[shuffled][:, ::-1])
+    assert np.array_equal(other_normals, normals[shuffled])
+    assert np.array_equal(other_factors, factors[shuffled])
+
+
+@pytest.mark.parametrize("least", [1e-6, 0.02, 1.0])
+def test_noise_has_bounded_factors_and_normals_that_point_outwards(least: float) -> None:
+    level = np.where(np.random.default_rng(0).random((9, 8, 7)) < 0.5, least, -1.0)
+    level[::2, ::2, ::2], level[1::2, ::2, ::2] = least, -least
+    points, facets = surface(level)
+    normals, factors = voxel_surface(level, points, facets)
+    assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0, abs=1e-9)
+    assert np.einsum("ij,ij->i", normals, facet_normals(points.astype(float), facets)).min() > 0.0
+    assert factors.min() >= LEAST_AREA_FACTOR and factors.max() <= 1.0
+
+
+def test_nothing_in_nothing_out() -> None:
+    none = np.zeros((0, 3), dtype=np.int64)
+    normals, factors = voxel_surface(np.ones((2, 2, 2)), none, none)
+    assert normals.shape == (0, 3) and factors.shape == (0,)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        [[1, 1, 1], [2, 2, 1], [1, 2, 2]],
+        [[1, 1, 1], [1, 3, 1], [1, 3, 3]],
+        [[5, 1, 1], [5, 2, 1], [5, 2, 2]],
+        [[-1, 1, 1], [-1, 2, 1], [-1, 2, 2]],
+    ],
+)
+def test_what_is_no_boundary_of_voxels_is_refused(points: list) -> None:
+    with pytest.raises(MeshError, match="expected halves of the faces of 4 x 4 x 4 voxels, got 1 other triangles"):
+        voxel_surface(np.ones((4, 4, 4)), np.array(points), np.array([[0, 1, 2]]))
