@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.node_values import interpolate_corners
+from thermoxels_ns.mesh.temperature import interpolate_corners
 
 SHAPE = (4, 5, 3)
 

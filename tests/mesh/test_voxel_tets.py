@@ -7,11 +7,11 @@ import pytest
 
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas, signed_volumes
+from thermoxels_ns.mesh.quality.face_count import count_faces
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
 from thermoxels_ns.mesh.voxel_tets import (
     boundary_facets,
     boundary_tags,
-    count_facets,
     kuhn_tets,
     lattice_edges,
     voxel_facets,
@@ -143,7 +143,7 @@ def test_divergence_theorem_on_a_carved_block(mesh_of_cells, random_cells):
 
 def test_interior_faces_are_shared_by_two():
     _, tets = kuhn_tets(pattern("full"))
-    _, uses = count_facets(tets)
+    _, uses = count_faces(tets)
     assert np.count_nonzero(uses == 1) == 2 * 54
     assert np.count_nonzero(uses == 2) == (4 * 6 * 27 - 2 * 54) // 2
     assert uses.max() == 2

@@ -106,7 +106,7 @@ def mesh_summary(
             "max": float(temperature.max()),
             "mean_of_nodes": float(temperature.mean()),
         },
-        "promises": {promise.name: promise.kept for promise in report.promises},
+        "promises": {criterion.name: criterion.kept for criterion in report.criteria},
     }
 
 

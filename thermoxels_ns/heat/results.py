@@ -13,7 +13,7 @@ from thermoxels_ns.fem.solution import Solution, SolutionNodes, SteadySolution, 
 from thermoxels_ns.fem.surface_heat import heat_by_part, heat_through_parts
 from thermoxels_ns.heat.effects import InternalHeat
 from thermoxels_ns.heat.materials import materials_by_region
-from thermoxels_ns.mesh.boundary.facet_owners import facet_owners
+from thermoxels_ns.mesh.quality.face_count import facet_owners
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Vector = npt.NDArray[np.float64]

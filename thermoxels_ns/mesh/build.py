@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
@@ -14,13 +16,16 @@ from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.boundary.patch_rules import PatchRules
 from thermoxels_ns.mesh.boundary.patches import apply_regions
 from thermoxels_ns.mesh.boundary.tags import BoundaryMode, tag_boundary
-from thermoxels_ns.mesh.components import node_parts, renumbered
-from thermoxels_ns.mesh.node_values import interpolate_corners
 from thermoxels_ns.mesh.solid.morphology import bounding_box, connected, face_connected
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, select_solid
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 from thermoxels_ns.mesh.stuffing.sharp_edges import sharpen
-from thermoxels_ns.mesh.temperature import MIN_OBSERVED_WEIGHT, extend_harmonically, tet_conductances
+from thermoxels_ns.mesh.temperature import (
+    MIN_OBSERVED_WEIGHT,
+    extend_harmonically,
+    interpolate_corners,
+    tet_conductances,
+)
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, lattice_edges, voxel_facets
 
@@ -287,3 +292,27 @@ def check_similarity(name: str, matrix: npt.ArrayLike) -> npt.NDArray[np.float64
 def apply_transform(matrix: npt.NDArray[np.float64], points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Map points (n, 3) by a 4x4 that acts on homogeneous column vectors."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def node_parts(tets: npt.NDArray[np.int64], num_nodes: int) -> npt.NDArray[np.int64]:
+    """Number of the connected part of each node, shape (n,), from 0; parts share no node.
+
+    >>> node_parts(np.array([[0, 1, 2, 3], [3, 4, 5, 6], [7, 8, 9, 10]]), 11).tolist()
+    [0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1]
+    """
+    start, end = tets[:, :3].ravel(), tets[:, 1:].ravel()
+    links = sparse.coo_array((np.ones(len(start), np.int8), (start, end)), shape=(num_nodes, num_nodes))
+    return connected_components(links, directed=False)[1].astype(np.int64)
+
+
+def renumbered(
+    keep: npt.NDArray[np.bool_],
+) -> npt.NDArray[np.int64]:
+    """New number of each node when only some stay, -1 for the others, shape (n,).
+
+    >>> renumbered(np.array([True, False, True])).tolist()
+    [0, -1, 1]
+    """
+    number = np.cumsum(keep, dtype=np.int64) - 1
+    number[~keep] = -1
+    return number

@@ -9,10 +9,9 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
+from thermoxels_ns.mesh.quality.face_count import count_faces
+from thermoxels_ns.mesh.solid.morphology import bounding_box
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
-
-OUTWARD_FACES: npt.NDArray[np.int64] = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
-"""Faces of a positively oriented tetrahedron; face f lies opposite node f, its right-hand normal points outwards."""
 
 
 def _kuhn_pattern() -> npt.NDArray[np.int64]:
@@ -118,53 +117,33 @@ def voxel_facets(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
 
 
 def boundary_facets(tets: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Triangles that belong to exactly one tetrahedron, right-hand normal outwards.
+    """Triangles that belong to exactly one tetrahedron, outwards, shape (f, 3), ordered by their sorted node numbers.
 
     Args:
         tets: Node indices of positively oriented tetrahedra, shape (t, 4).
-
-    Returns:
-        Node indices, shape (f, 3), ordered by their sorted node numbers.
     """
-    faces, uses = count_facets(tets)
+    faces, uses = count_faces(tets)
     return faces[uses == 1]
 
 
-def count_facets(tets: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """All different triangles of a mesh, and how many tetrahedra own each.
-
-    Returns:
-        faces: Node indices, shape (f, 3), oriented outwards from one owner, ordered by their sorted node numbers.
-        uses: Number of owners, shape (f,); 1 on the boundary, 2 inside a conforming mesh.
-    """
-    faces = np.asarray(tets, dtype=np.int64)[:, OUTWARD_FACES].reshape(-1, 3)
-    if len(faces) == 0:
-        return faces, np.zeros(0, dtype=np.int64)
-    key = np.sort(faces, axis=1)
-    order = np.lexsort((key[:, 2], key[:, 1], key[:, 0]))
-    key = key[order]
-    first = np.flatnonzero(np.concatenate([[True], np.any(key[1:] != key[:-1], axis=1)]))
-    return faces[order[first]], np.diff(np.append(first, len(key)))
-
-
 def boundary_tags(
-    facets: npt.NDArray[np.int64], corner_indices: npt.NDArray[np.int64], lattice_shape: tuple[int, int, int]
+    facets: npt.NDArray[np.int64], points_index: npt.NDArray, lattice_shape: tuple[int, ...]
 ) -> npt.NDArray[np.int64]:
     """Tell triangles where the scene box cuts the solid from the solid's own surface.
 
     Args:
         facets: Boundary triangles, shape (f, 3).
-        corner_indices: Lattice index of each node, shape (n, 3).
+        points_index: Corner index of each node, whole or fractional, shape (n, 3).
         lattice_shape: Number of corners along x, y, z.
 
     Returns:
         `FACET_BOX` where all three nodes lie on one side of the lattice, else `FACET_SURFACE`; shape (f,).
     """
     # One bit per side of the lattice; a triangle lies on the sides that its nodes have in common.
-    sides = np.zeros(len(corner_indices), dtype=np.uint8)
+    sides = np.zeros(len(points_index), dtype=np.uint8)
     for axis, count in enumerate(lattice_shape):
-        sides |= (corner_indices[:, axis] == 0).astype(np.uint8) << (2 * axis)
-        sides |= (corner_indices[:, axis] == count - 1).astype(np.uint8) << (2 * axis + 1)
+        sides |= (points_index[:, axis] == 0).astype(np.uint8) << (2 * axis)
+        sides |= (points_index[:, axis] == count - 1).astype(np.uint8) << (2 * axis + 1)
     common = sides[facets[:, 0]] & sides[facets[:, 1]] & sides[facets[:, 2]]
     return np.where(common > 0, FACET_BOX, FACET_SURFACE).astype(np.int64)
 
@@ -182,14 +161,9 @@ def _as_cells(cells: npt.NDArray) -> npt.NDArray[np.bool_]:
 
 
 def _cropped(cells: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
-    """The box of voxels that holds all solid ones, and the index of its first: empty space around it costs one look."""
-    spans = []
-    for axis in range(3):
-        used = np.flatnonzero(cells.any(axis=tuple({0, 1, 2} - {axis})))
-        spans.append((int(used[0]), int(used[-1]) + 1))
-        # What is left to look at gets smaller.
-        cells = cells[(slice(None),) * axis + (slice(*spans[-1]),)]
-    return np.ascontiguousarray(cells), np.array([low for low, _ in spans], dtype=np.int64)
+    """The box of voxels that holds all solid ones, and the index of its first."""
+    box = bounding_box(cells)
+    return np.ascontiguousarray(cells[box]), np.array([part.start for part in box], dtype=np.int64)
 
 
 def _node_numbers(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.boundary.surface import surface_of
+from thermoxels_ns.mesh.files.content import surface_of
 from thermoxels_ns.mesh.files.gltf import write_glb
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 

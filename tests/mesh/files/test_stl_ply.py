@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.boundary.surface import surface_of
+from thermoxels_ns.mesh.files.content import surface_of
 from thermoxels_ns.mesh.files.formats import check_format, write_mesh
 from thermoxels_ns.mesh.files.stl_ply import write_ply, write_stl
 from thermoxels_ns.mesh.quality.checks import facet_normals

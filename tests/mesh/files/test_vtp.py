@@ -9,7 +9,7 @@ import pytest
 import pyvista as pv
 
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.files.vtp import write_boundary_vtp
+from thermoxels_ns.mesh.files.vtu import write_boundary_vtp
 from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX
 

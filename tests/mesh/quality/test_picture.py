@@ -51,7 +51,7 @@ def good(tmp_path_factory) -> Drawn:
 
 @pytest.fixture(scope="module")
 def damaged(tmp_path_factory) -> Drawn:
-    """A mesh that breaks three promises of five, in numbers that take much room."""
+    """A mesh that misses three criteria of five, in numbers that take much room."""
     mesh = box_mesh()
     moved = mesh.points_m + np.random.default_rng(0).normal(size=mesh.points_m.shape) * 0.4
     mesh = replace(mesh, points_m=moved, facets=mesh.facets[:-9], facet_tags=mesh.facet_tags[:-9])
@@ -74,10 +74,10 @@ def test_picture_is_one_png_and_nothing_else(good):
     assert [p.name for p in good.path.parent.iterdir()] == ["quality.png"]
 
 
-def test_it_says_which_promises_are_broken(good, damaged):
+def test_it_says_which_criteria_are_met(good, damaged):
     kept, broken = words_in(good.figure), words_in(damaged.figure)
-    assert kept.count("yes") == 7 and "Promises of a voxel boundary: 7 of 7 kept" in kept and "45°" in kept
-    assert broken.count("no") == len(damaged.report.broken) == 3 and "164.8°" in broken
+    assert kept.count("yes") == 7 and "Criteria of a voxel boundary: 7 of 7 met" in kept and "45°" in kept
+    assert broken.count("no") == len(damaged.report.unmet) == 3 and "164.8°" in broken
     assert "3 m³" in kept and "1; 1" in kept
     assert damaged.figure.get_suptitle() == "A title" and "voxel" in good.figure.get_suptitle()
 

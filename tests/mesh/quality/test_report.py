@@ -1,4 +1,4 @@
-"""The quality report measures what is there, and each promise breaks for its own reason only."""
+"""The quality report measures what is there, and each criterion fails for its own reason only."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from skfem.models.poisson import laplace
 
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import check_mesh
-from thermoxels_ns.mesh.quality.criteria import DIHEDRAL_BOUNDS_DEG, BoundaryMode, Evidence, angle_bins, judge
+from thermoxels_ns.mesh.quality.criteria import DIHEDRAL_BOUNDS_DEG, BoundaryMode, Figures, angle_bins, judge
 from thermoxels_ns.mesh.quality.report import QualityReport, quality_report
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
@@ -35,13 +35,13 @@ def mesh_from(points: np.ndarray, tets: np.ndarray) -> TetMesh:
 
 
 def figure_of(report: QualityReport, name: str) -> float:
-    return next(promise.figure for promise in report.promises if promise.name == name)
+    return next(criterion.figure for criterion in report.criteria if criterion.name == name)
 
 
-def test_a_voxel_mesh_keeps_every_promise(box_mesh):
+def test_a_voxel_mesh_meets_every_criterion(box_mesh):
     report = quality_report(box_mesh, "voxel")
-    assert tuple(promise.name for promise in report.promises) == VOXEL_NAMES
-    assert report.broken == ()
+    assert tuple(criterion.name for criterion in report.criteria) == VOXEL_NAMES
+    assert report.unmet == ()
     # Edges of voxels, diagonals of their faces, diagonals of voxels.
     assert (report.num_nodes, report.num_tets, report.num_edges) == (60, 144, 133 + 98 + 24)
     assert report.volume_m3 == pytest.approx(3.0) and report.area_m2 == pytest.approx(13.0)
@@ -75,7 +75,7 @@ def test_the_regular_tetrahedron_is_in_the_last_bin():
     report = quality_report(mesh_from(points, np.array([[0, 1, 2, 3]])), "conforming")
     assert report.radius_ratio_counts[-1] == 1 and report.radius_ratio_mean == pytest.approx(1.0)
     assert report.dihedral_counts[bin_of(70.53, "conforming")] == 6
-    assert report.broken == ()
+    assert report.unmet == ()
 
 
 def test_figures_agree_with_the_mesh_check(mesh_of_cells, random_cells):
@@ -85,7 +85,7 @@ def test_figures_agree_with_the_mesh_check(mesh_of_cells, random_cells):
         assert report.num_non_manifold_edges == quality.num_non_manifold_edges
         assert report.dihedral_range_deg == (quality.min_dihedral_deg, quality.max_dihedral_deg)
         assert (report.volume_m3, report.area_m2) == (quality.volume_m3, quality.area_m2)
-        assert report.broken == ()
+        assert report.unmet == ()
 
 
 def test_true_area_is_area_times_factor(box_mesh):
@@ -97,11 +97,11 @@ def test_true_area_is_area_times_factor(box_mesh):
     assert report.area_m2 == pytest.approx(13.0)
 
 
-def test_turned_over_tetrahedron_breaks_its_promises(box_mesh):
+def test_turned_over_tetrahedron_fails_its_criteria(box_mesh):
     tets = box_mesh.tets.copy()
     tets[5] = tets[5, [1, 0, 2, 3]]
     report = quality_report(replace(box_mesh, tets=tets), "voxel")
-    assert "volumes_positive" in report.broken and "conforming" not in report.broken
+    assert "volumes_positive" in report.unmet and "conforming" not in report.unmet
     assert figure_of(report, "volumes_positive") == pytest.approx(-(0.5**3) / 6)
     assert report.radius_ratio_range[0] == 0.0
 
@@ -113,24 +113,24 @@ def test_crack_twin_nodes_and_third_owner_are_not_conforming():
     points = corners.astype(float)
     crossed = np.vstack([tets[:6], mirrored[:, [0, 2, 1, 3]]])
     report = quality_report(mesh_from(points, crossed), "voxel")
-    assert "conforming" in report.broken and "volumes_positive" not in report.broken
+    assert "conforming" in report.unmet and "volumes_positive" not in report.unmet
     apart = tets.copy()
     apart[6:] += len(points)
     report = quality_report(mesh_from(np.vstack([points, points]), apart), "voxel")
     # The two bodies have four positions in common, and lists of nodes that the other body uses.
-    assert report.broken == ("conforming",) and figure_of(report, "conforming") == len(points)
+    assert report.unmet == ("conforming",) and figure_of(report, "conforming") == len(points)
     third = np.vstack([tets, tets[:1]])
-    assert "conforming" in quality_report(mesh_from(points, third), "voxel").broken
+    assert "conforming" in quality_report(mesh_from(points, third), "voxel").unmet
 
 
 def test_missing_boundary_triangle_breaks_closedness(box_mesh):
     fewer = replace(box_mesh, facets=box_mesh.facets[1:], facet_tags=box_mesh.facet_tags[1:])
     report = quality_report(fewer, "voxel")
-    assert report.broken == ("boundary_closed",)
+    assert report.unmet == ("boundary_closed",)
     assert figure_of(report, "boundary_closed") == 3 + 1  # open edges, wrong triangles
     assert report.genus is None
     none = replace(box_mesh, facets=box_mesh.facets[:0], facet_tags=box_mesh.facet_tags[:0])
-    assert quality_report(none, "voxel").broken == ("boundary_closed",)
+    assert quality_report(none, "voxel").unmet == ("boundary_closed",)
 
 
 @pytest.mark.parametrize(("degrees", "broken"), [(10.8, False), (10.6, True)])
@@ -142,8 +142,8 @@ def test_dihedral_bounds_depend_on_the_mode(degrees, broken):
     report = quality_report(mesh, "conforming")
     assert report.dihedral_range_deg[0] == pytest.approx(degrees)
     assert figure_of(report, "dihedral_within_bounds") == pytest.approx(degrees - 10.7)
-    assert ("dihedral_within_bounds" in report.broken) == broken
-    assert "dihedral_within_bounds" in quality_report(mesh, "voxel").broken
+    assert ("dihedral_within_bounds" in report.unmet) == broken
+    assert "dihedral_within_bounds" in quality_report(mesh, "voxel").unmet
     assert report.share_obtuse == 0.0
 
 
@@ -153,11 +153,11 @@ def test_temperatures_outside_the_observed_range(box_mesh):
         warm = np.full(60, 20.0)
         warm[unseen] += change
         report = quality_report(replace(box_mesh, temperature_c=warm), "voxel")
-        assert report.broken == ("temperatures_in_range",)
+        assert report.unmet == ("temperatures_in_range",)
         assert figure_of(report, "temperatures_in_range") == excess
         wider = quality_report(replace(box_mesh, temperature_c=warm), "voxel", observed_range_c=(-40.0, 60.0))
-        assert wider.broken == ()
-    assert quality_report(box_mesh, "voxel", observed_range_c=(20.0, 20.5)).broken == ("temperatures_in_range",)
+        assert wider.unmet == ()
+    assert quality_report(box_mesh, "voxel", observed_range_c=(20.0, 20.5)).unmet == ("temperatures_in_range",)
 
 
 def test_obtuse_angles_break_the_maximum_principle_only_where_an_edge_sums_above_zero():
@@ -166,7 +166,7 @@ def test_obtuse_angles_break_the_maximum_principle_only_where_an_edge_sums_above
     report = quality_report(mesh_from(flat, np.array([[0, 1, 2, 3]])), "conforming")
     assert (report.share_obtuse, report.share_positive_edges) == (1.0, pytest.approx(2 / 6))
     as_voxels = quality_report(mesh_from(flat, np.array([[0, 1, 2, 3]])), "voxel")
-    assert {"non_obtuse", "stiffness_monotone"} <= set(as_voxels.broken)
+    assert {"non_obtuse", "stiffness_monotone"} <= set(as_voxels.unmet)
     # A voxel mesh whose inner node is moved a little: every tetrahedron around it, half of all, becomes obtuse, but
     # at few edges do the neighbours not make up for it.
     corners, tets = kuhn_tets(np.ones((2, 2, 2), dtype=bool))
@@ -184,22 +184,22 @@ def test_right_angles_are_not_obtuse_wherever_the_mesh_lies(box_mesh):
     turn, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
     turn *= np.sign(np.linalg.det(turn))
     report = quality_report(replace(box_mesh, points_m=box_mesh.points_m @ turn.T * 0.37 + 11.0), "voxel")
-    assert report.broken == ()
+    assert report.unmet == ()
     assert (report.share_obtuse, report.share_positive_edges) == (0.0, 0.0)
     assert np.count_nonzero(report.dihedral_counts) == 3
 
 
 @pytest.mark.parametrize("size", [1.0, 1e-3])
-def test_a_voxel_mesh_keeps_its_promises_in_national_coordinates(box_mesh, size):
+def test_a_voxel_mesh_meets_its_criteria_in_national_coordinates(box_mesh, size):
     """Five million metres from the origin nodes have steps of a nanometre, which is no obtuse angle."""
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
     turn *= np.sign(np.linalg.det(turn))
     points = size * 0.05 * box_mesh.points_m @ turn.T + [450_000.3, 5_200_000.4, 300.0]
     report = quality_report(replace(box_mesh, points_m=points), "voxel")
-    assert report.broken == () and report.share_obtuse == 0.0 and report.share_positive_edges == 0.0
+    assert report.unmet == () and report.share_obtuse == 0.0 and report.share_positive_edges == 0.0
     # A node that is off by a tenth of a voxel is no rounding.
     points[len(points) // 2] += 0.1 * size * 0.05
-    assert "non_obtuse" in quality_report(replace(box_mesh, points_m=points), "voxel").broken
+    assert "non_obtuse" in quality_report(replace(box_mesh, points_m=points), "voxel").unmet
 
 
 def test_bodies_that_touch_are_counted_both_ways(mesh_of_cells):
@@ -208,7 +208,7 @@ def test_bodies_that_touch_are_counted_both_ways(mesh_of_cells):
     report = quality_report(mesh_of_cells(cells), "voxel")
     assert (report.bodies_by_node, report.bodies_by_face) == (2, 3)
     assert (report.num_non_manifold_edges, report.num_non_manifold_vertices) == (0, 1)
-    assert report.broken == ()
+    assert report.unmet == ()
     assert (report.genus, len(report.components)) == (0, 3)
 
 
@@ -252,7 +252,7 @@ def test_mapping_is_json_and_complete(mesh_of_cells):
     assert angles["first_centre"] == pytest.approx(2.25, abs=1e-4)
     assert mapping["dihedral_range_deg"] == {"min": 45.0, "max": 90.0}
     assert mapping["length_unit"] == "input unit"
-    assert [promise["name"] for promise in mapping["promises"]] == list(VOXEL_NAMES)
+    assert [criterion["name"] for criterion in mapping["promises"]] == list(VOXEL_NAMES)
     assert set(mapping["promises"][0]) == {"name", "sentence", "kept", "figure", "found"}
     assert "input unit³" in mapping["promises"][0]["found"]
 
@@ -260,7 +260,7 @@ def test_mapping_is_json_and_complete(mesh_of_cells):
 def test_degenerate_mesh_is_reported_without_nan():
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 0]])
     report = quality_report(mesh_from(points, np.array([[0, 1, 2, 3]])), "conforming")
-    assert {"volumes_positive", "dihedral_within_bounds"} <= set(report.broken)
+    assert {"volumes_positive", "dihedral_within_bounds"} <= set(report.unmet)
     json.dumps(report.as_mapping(), allow_nan=False)
 
 
@@ -275,14 +275,14 @@ def test_bad_input_is_refused(box_mesh):
     blind = replace(box_mesh, observed=np.zeros(60, dtype=bool))
     with pytest.raises(MeshError, match="at least one node that a thermal ray saw"):
         quality_report(blind, "voxel")
-    assert quality_report(blind, "voxel", observed_range_c=(0.0, 50.0)).broken == ()
+    assert quality_report(blind, "voxel", observed_range_c=(0.0, 50.0)).unmet == ()
 
 
 def test_shares_in_words_do_not_look_like_none_or_all():
-    evidence = Evidence(1.0, 0, 0, 0, 0, (45.0, 90.0), -1.0, 1e-9, 1.0 - 1e-9)
-    found = {promise.name: promise.found for promise in judge(evidence, "voxel")}
+    figures = Figures(1.0, 0, 0, 0, 0, (45.0, 90.0), -1.0, 1e-9, 1.0 - 1e-9)
+    found = {criterion.name: criterion.found for criterion in judge(figures, "voxel")}
     assert found["non_obtuse"].startswith("< 0.01 %") and found["stiffness_monotone"].startswith("99.99 %")
-    assert {p.name for p in judge(evidence, "voxel") if not p.kept} == {"non_obtuse", "stiffness_monotone"}
+    assert {p.name for p in judge(figures, "voxel") if not p.kept} == {"non_obtuse", "stiffness_monotone"}
 
 
 @pytest.mark.parametrize(
@@ -297,17 +297,19 @@ def test_shares_in_words_do_not_look_like_none_or_all():
     ],
 )
 def test_both_dihedral_bounds_count(mode, angles, margin):
-    promises = {p.name: p for p in judge(Evidence(1.0, 0, 0, 0, 0, angles, 0.0, 0.0, 0.0), mode)}
-    promise = promises["dihedral_within_bounds"]
-    assert promise.figure == pytest.approx(margin, abs=1e-12)
-    assert promise.kept == (margin > -1e-6)
+    criteria = {p.name: p for p in judge(Figures(1.0, 0, 0, 0, 0, angles, 0.0, 0.0, 0.0), mode)}
+    criterion = criteria["dihedral_within_bounds"]
+    assert criterion.figure == pytest.approx(margin, abs=1e-12)
+    assert criterion.kept == (margin > -1e-6)
 
 
-def test_a_mode_is_judged_by_its_own_promises_only():
-    obtuse = Evidence(1.0, 0, 0, 0, 0, (45.0, 90.0), 0.0, 0.2, 0.1)
+def test_a_mode_is_judged_by_its_own_criteria_only():
+    obtuse = Figures(1.0, 0, 0, 0, 0, (45.0, 90.0), 0.0, 0.2, 0.1)
     conforming, voxel = judge(obtuse, "conforming"), judge(obtuse, "voxel")
-    assert tuple(promise.name for promise in conforming) == NAMES and all(promise.kept for promise in conforming)
-    assert tuple(promise.name for promise in voxel if not promise.kept) == ("non_obtuse", "stiffness_monotone")
+    assert tuple(criterion.name for criterion in conforming) == NAMES and all(
+        criterion.kept for criterion in conforming
+    )
+    assert tuple(criterion.name for criterion in voxel if not criterion.kept) == ("non_obtuse", "stiffness_monotone")
 
 
 @pytest.mark.parametrize("mode", ["voxel", "conforming"])

@@ -10,7 +10,7 @@ import pytest
 from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.mesh.solid.wall_thickness import wall_behind
+from thermoxels_ns.mesh.solid.interior import wall_behind
 
 N = 24
 LATTICE = Lattice((0.0, 0.0, 0.0), 0.5, (N + 1, N + 1, N + 1))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from thermoxels_ns.mesh.stuffing.octree import balanced_octree, eroded, split_in_eight
+from thermoxels_ns.mesh.stuffing.interior import balanced_octree, eroded, split_in_eight
 
 
 def edges_of_cubes(cells: np.ndarray, largest: int) -> np.ndarray:

@@ -15,9 +15,9 @@ import numpy.typing as npt
 from thermoxels_ns.core.checks import check_positive, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import HeatError, MeshError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.mesh.boundary.facet_owners import facet_owners
 from thermoxels_ns.mesh.files.content import FileContent, check_suffix, file_content
 from thermoxels_ns.mesh.quality.checks import facet_area_vectors
+from thermoxels_ns.mesh.quality.face_count import facet_owners
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8
@@ -60,7 +60,11 @@ class HeatStep:
 
 
 def write_inp(
-    path: Path | str, mesh: TetMesh, heat_step: HeatStep, *, temperature_c: npt.NDArray[np.floating] | None = None
+    path: Path | str,
+    mesh: TetMesh,
+    heat_step: HeatStep | None,
+    *,
+    temperature_c: npt.NDArray[np.floating] | None = None,
 ) -> None:
     """Write a mesh as an input file of CalculiX and Abaqus that runs as it is: ``ccx NAME`` for ``NAME.inp``.
 
@@ -87,10 +91,17 @@ def write_inp(
         temperature_c: Temperatures at the start in place of the mesh's own, shape (n,), [degrees Celsius].
 
     Raises:
-        MeshError: An array does not fit the mesh or is not finite, or two names become one.
+        MeshError: There is no heat step, an array does not fit the mesh or is not finite, or two names become one.
         OutputError: The file cannot be written.
     """
     path = check_suffix(path, ".inp")
+    if heat_step is None:
+        raise MeshError(
+            "heat_step",
+            expected="material and times, which an .inp file runs with",
+            got=None,
+            remedy="Pass heat_step=HeatStep(...), or choose another format.",
+        )
     content = file_content(mesh, temperature_c)
     regions = _set_names("region_names", content.region_names)
     patches = _set_names("boundary.patch_names", content.patch_names)

@@ -9,108 +9,62 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import MeshError, OutputError
-from thermoxels_ns.mesh.boundary.surface import Colouring
+from thermoxels_ns.core.errors import OutputError
 from thermoxels_ns.mesh.files.abaqus import HeatStep, write_inp
+from thermoxels_ns.mesh.files.content import Colouring
 from thermoxels_ns.mesh.files.gltf import write_glb
 from thermoxels_ns.mesh.files.gmsh import write_msh
 from thermoxels_ns.mesh.files.stl_ply import check_stl, write_ply, write_stl
-from thermoxels_ns.mesh.files.vtp import boundary_path, write_boundary_vtp
-from thermoxels_ns.mesh.files.vtu import write_vtu
+from thermoxels_ns.mesh.files.vtu import boundary_path, write_boundary_vtp, write_vtu
 from thermoxels_ns.mesh.files.xdmf import heavy_data_path, write_xdmf
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-
-
-@dataclass(frozen=True)
-class _Request:
-    """What `write_mesh` was asked for."""
-
-    path: Path
-    mesh: TetMesh
-    temperature_c: npt.NDArray[np.floating] | None
-    heat_step: HeatStep | None
-    colouring: Colouring | None
-    up: Sequence[float]
 
 
 @dataclass(frozen=True)
 class MeshFormat:
     """A way to write a mesh."""
 
-    suffix: str
-    """Ending of the file's name, with its dot."""
     description: str
     """What it holds and who reads it, in one line."""
-    write: Callable[[_Request], None]
-    """Writes the files."""
+    write: Callable[..., None]
+    """Writes the files; takes the path, the mesh and `options`."""
+    options: tuple[str, ...] = ("temperature_c",)
+    """Arguments of `write_mesh` that it looks at."""
     companion: Callable[[Path], Path] | None = None
     """Names the second file, if the format takes two."""
     refuse: Callable[[TetMesh], None] | None = None
     """Raises if the format cannot hold a mesh that others can; so an export knows before anything slow runs."""
 
 
-def _vtu(request: _Request) -> None:
-    write_boundary_vtp(boundary_path(request.path), request.mesh, temperature_c=request.temperature_c)
-    write_vtu(request.path, request.mesh, temperature_c=request.temperature_c)
-
-
-def _inp(request: _Request) -> None:
-    if request.heat_step is None:
-        raise MeshError(
-            "heat_step",
-            expected="material and times, which an .inp file runs with",
-            got=None,
-            remedy="Pass heat_step=HeatStep(...), or choose another format.",
-        )
-    write_inp(request.path, request.mesh, request.heat_step, temperature_c=request.temperature_c)
+def _write_body_and_boundary(path: Path, mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None) -> None:
+    write_boundary_vtp(boundary_path(path), mesh, temperature_c=temperature_c)
+    write_vtu(path, mesh, temperature_c=temperature_c)
 
 
 MESH_FORMATS: dict[str, MeshFormat] = {
-    entry.suffix: entry
-    for entry in (
-        MeshFormat(
-            ".vtu",
-            "body, and its tagged boundary as NAME-boundary.vtp: ParaView, pyvista",
-            _vtu,
-            boundary_path,
-        ),
-        MeshFormat(
-            ".xdmf",
-            "body and boundary with tags, data in NAME.h5: FEniCSx, ParaView",
-            lambda request: write_xdmf(request.path, request.mesh, temperature_c=request.temperature_c),
-            heavy_data_path,
-        ),
-        MeshFormat(
-            ".msh",
-            "body and boundary as physical groups, MSH 4.1: Gmsh and what reads its files",
-            lambda request: write_msh(request.path, request.mesh, temperature_c=request.temperature_c),
-        ),
-        MeshFormat(".inp", "sets, surfaces and a heat transfer step that runs: CalculiX, Abaqus", _inp),
-        MeshFormat(
-            ".stl",
-            "surface, shape only: CAD and 3D printing",
-            lambda request: write_stl(request.path, request.mesh),
-            refuse=check_stl,
-        ),
-        MeshFormat(
-            ".ply",
-            "surface with colours and temperatures: MeshLab, CloudCompare, Blender",
-            lambda request: write_ply(
-                request.path, request.mesh, temperature_c=request.temperature_c, colouring=request.colouring
-            ),
-        ),
-        MeshFormat(
-            ".glb",
-            "surface coloured by temperature or by the photographs (glTF): browsers, phones, office programs",
-            lambda request: write_glb(
-                request.path,
-                request.mesh,
-                temperature_c=request.temperature_c,
-                colouring=request.colouring or "temperature",
-                up=request.up,
-            ),
-        ),
-    )
+    ".vtu": MeshFormat(
+        "body, and its tagged boundary as NAME-boundary.vtp: ParaView, pyvista",
+        _write_body_and_boundary,
+        companion=boundary_path,
+    ),
+    ".xdmf": MeshFormat(
+        "body and boundary with tags, data in NAME.h5: FEniCSx, ParaView", write_xdmf, companion=heavy_data_path
+    ),
+    ".msh": MeshFormat("body and boundary as physical groups, MSH 4.1: Gmsh and what reads its files", write_msh),
+    ".inp": MeshFormat(
+        "sets, surfaces and a heat transfer step that runs: CalculiX, Abaqus", write_inp, ("temperature_c", "heat_step")
+    ),
+    ".stl": MeshFormat("surface, shape only: CAD and 3D printing", write_stl, (), refuse=check_stl),
+    ".ply": MeshFormat(
+        "surface with colours and temperatures: MeshLab, CloudCompare, Blender",
+        write_ply,
+        ("temperature_c", "colouring"),
+    ),
+    ".glb": MeshFormat(
+        "surface coloured by temperature or by the photographs (glTF): browsers, phones, office programs",
+        write_glb,
+        ("temperature_c", "colouring", "up"),
+    ),
 }
 """All formats by suffix, those of solvers first."""
 
@@ -188,5 +142,7 @@ def write_mesh(
         OutputError: No format has this ending, or a file cannot be written.
     """
     path = Path(path)
-    mesh_format(path).write(_Request(path, mesh, temperature_c, heat_step, colouring, up))
+    given = {"temperature_c": temperature_c, "heat_step": heat_step, "colouring": colouring, "up": up}
+    chosen = mesh_format(path)
+    chosen.write(path, mesh, **{name: given[name] for name in chosen.options})
     return mesh_file_paths(path)

@@ -11,10 +11,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.checks import replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.boundary.surface import Colouring, far_origin, surface_colours, surface_of, surface_range_c
-from thermoxels_ns.mesh.files.content import check_suffix, file_content
+from thermoxels_ns.mesh.files.content import (
+    Colouring,
+    check_suffix,
+    far_origin,
+    file_content,
+    surface_colours,
+    surface_of,
+    surface_range_c,
+    write_bytes,
+)
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _MAGIC, _VERSION, _JSON_CHUNK, _BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
@@ -27,7 +34,7 @@ def write_glb(
     mesh: TetMesh,
     *,
     temperature_c: npt.NDArray[np.floating] | None = None,
-    colouring: Colouring = "temperature",
+    colouring: Colouring | None = None,
     up: Sequence[float] = (0.0, 0.0, 1.0),
 ) -> None:
     """Write the boundary as binary glTF 2.0 with a colour per node; lengths are metres.
@@ -44,7 +51,7 @@ def write_glb(
         path: File to write, ending in .glb; its folder is made if need be.
         mesh: The mesh.
         temperature_c: Temperatures to show in place of the mesh's own, shape (n,), [degrees Celsius].
-        colouring: What the colours show.
+        colouring: What the colours show; None: temperatures.
         up: Direction that points up, in mesh coordinates.
 
     Raises:
@@ -53,6 +60,7 @@ def write_glb(
         OutputError: The file cannot be written.
     """
     path = check_suffix(path, ".glb")
+    colouring = colouring or "temperature"
     content = file_content(mesh, temperature_c)
     surface = surface_of(content.points_m, content.facets)
     if not len(surface.triangles):
@@ -115,10 +123,9 @@ def _write(path: Path, text: bytes, data: bytes) -> None:
     text += b" " * (-len(text) % 4)
     data += b"\0" * (-len(data) % 4)
     header = np.array([_MAGIC, _VERSION, 12 + 8 + len(text) + 8 + len(data)], dtype="<u4").tobytes()
-    writable_folder(path.parent)
-    with replace_when_done(path) as temporary, open(temporary, "wb") as file:
-        file.writelines([header, np.array([len(text), _JSON_CHUNK], dtype="<u4").tobytes(), text])
-        file.writelines([np.array([len(data), _BINARY_CHUNK], dtype="<u4").tobytes(), data])
+    chunks = ((text, _JSON_CHUNK), (data, _BINARY_CHUNK))
+    sizes = [np.array([len(chunk), kind], dtype="<u4").tobytes() for chunk, kind in chunks]
+    write_bytes(path, [header, sizes[0], text, sizes[1], data])
 
 
 def _linear(colours: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.files.vtp import boundary_path
+from thermoxels_ns.mesh.files.vtu import boundary_path
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, Boundary, TetMesh
 
 _REMEDY = "Export the mesh again with ns-export thermoxels-mesh."

@@ -7,11 +7,20 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.checks import replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.boundary.surface import COLOUR_MAP, Colouring, surface_colours, surface_of, surface_range_c
-from thermoxels_ns.mesh.files.content import check_suffix, colour_bytes, file_content
-from thermoxels_ns.mesh.quality.checks import facet_area_vectors, facet_areas
+from thermoxels_ns.mesh.files.content import (
+    COLOUR_MAP,
+    Colouring,
+    check_suffix,
+    colour_bytes,
+    file_content,
+    normals_of,
+    surface_colours,
+    surface_of,
+    surface_range_c,
+    write_bytes,
+)
+from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _STL_HEADER = b"Surface of a tetrahedral mesh, metres".ljust(80)
@@ -34,12 +43,10 @@ def write_stl(path: Path | str, mesh: TetMesh) -> None:
     path = check_suffix(path, ".stl")
     content = file_content(mesh)
     check_stl(mesh)
-    vectors = facet_area_vectors(content.points_m, content.facets)
-    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
     triangles = np.zeros(len(content.facets), dtype=_STL_TRIANGLE)
-    triangles["normal"] = vectors / np.where(lengths > 0.0, lengths, 1.0)
+    triangles["normal"] = normals_of(content.points_m, content.facets)
     triangles["corners"] = content.points_m[content.facets]
-    _write(path, _STL_HEADER, np.uint32(len(triangles)).astype("<u4").tobytes(), triangles.tobytes())
+    write_bytes(path, [_STL_HEADER, np.array(len(triangles), "<u4").tobytes(), triangles.tobytes()])
 
 
 def check_stl(mesh: TetMesh) -> None:
@@ -122,10 +129,4 @@ def write_ply(
         "property list uchar int vertex_indices",
         "end_header\n",
     ]
-    _write(path, "\n".join(header).encode("ascii"), vertices.tobytes(), faces.tobytes())
-
-
-def _write(path: Path, *parts: bytes) -> None:
-    writable_folder(path.parent)
-    with replace_when_done(path) as temporary, open(temporary, "wb") as file:
-        file.writelines(parts)
+    write_bytes(path, ["\n".join(header).encode("ascii"), vertices.tobytes(), faces.tobytes()])

@@ -1,4 +1,4 @@
-"""What a mesh keeps so that solvers and people can rely on it, each with the figure that says whether it does."""
+"""Quality criteria of a mesh, each with the figure that decides whether it is met."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ TEMPERATURE_TOLERANCE_K = 1e-6
 
 
 @dataclass(frozen=True)
-class Promise:
-    """One thing that the mesher promises, and whether this mesh keeps it."""
+class Criterion:
+    """One quality criterion, and whether a mesh meets it."""
 
     name: str
     """Short name, the same for every mesh."""
     sentence: str
-    """What is promised."""
+    """What it asks for."""
     kept: bool
-    """Whether it holds."""
+    """Whether the mesh meets it."""
     figure: float
     """The number that decides."""
     found: str
@@ -36,8 +36,8 @@ class Promise:
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """What decides about the promises."""
+class Figures:
+    """Figures that decide about the criteria."""
 
     min_volume_m3: float
     """Smallest signed volume of a tetrahedron, [m^3]."""
@@ -63,7 +63,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class AngleBins:
-    """Bins of one width for a histogram of angles from 0 to 180 degrees; both bounds of the promise are edges."""
+    """Bins of one width for a histogram of angles from 0 to 180 degrees; both bounds of the criterion are edges."""
 
     first_centre_deg: float
     """Centre of the first bin, [degrees]; the bin may begin below 0."""
@@ -88,75 +88,70 @@ def angle_bins(boundary_mode: BoundaryMode) -> AngleBins:
     return AngleBins(low - (below - 0.5) * width, width, below + within + above)
 
 
-def judge(evidence: Evidence, boundary_mode: BoundaryMode, length_unit: str = "m") -> tuple[Promise, ...]:
-    """Hold the promises that a boundary mode makes against the evidence; the unit of lengths is only named.
+def judge(figures: Figures, boundary_mode: BoundaryMode, length_unit: str = "m") -> tuple[Criterion, ...]:
+    """Hold a mesh's figures against the criteria of its boundary mode; the unit of lengths is only named.
 
-    That no angle is obtuse is promised of voxel meshes alone: no cut along a level set can keep it. That a boundary
-    nowhere touches itself is promised of none, because bodies may.
+    Criteria on obtuse angles are for voxel meshes alone: no cut along a level set can meet them. None asks that a
+    boundary nowhere touches itself, because bodies may.
     """
-    smallest, largest = evidence.dihedral_range_deg
+    smallest, largest = figures.dihedral_range_deg
     low, high = DIHEDRAL_BOUNDS_DEG[boundary_mode]
     inside = min(smallest - low, high - largest)
-    open_or_wrong = evidence.num_open_edges + evidence.num_wrong_facets
-    excess = max(evidence.temperature_excess_k, 0.0)
-    promises = (
-        Promise(
+    open_or_wrong = figures.num_open_edges + figures.num_wrong_facets
+    excess = max(figures.temperature_excess_k, 0.0)
+    worst_volume = f"smallest {figures.min_volume_m3:.3g} {length_unit}³"
+    criteria = (
+        Criterion(
             "volumes_positive",
             "Every tetrahedron has a volume above 0.",
-            evidence.num_non_positive == 0,
-            evidence.min_volume_m3,
-            f"{evidence.num_non_positive:,} at or below 0"
-            if evidence.num_non_positive
-            else f"smallest {evidence.min_volume_m3:.3g} {length_unit}³",
+            figures.num_non_positive == 0,
+            figures.min_volume_m3,
+            f"{figures.num_non_positive:,} at or below 0" if figures.num_non_positive else worst_volume,
         ),
-        Promise(
+        Criterion(
             "conforming",
             "Neighbours share whole faces: no crack, no face with three owners, no nodes at one place.",
-            evidence.num_mismatches == 0,
-            float(evidence.num_mismatches),
-            f"{evidence.num_mismatches:,} mismatches",
+            figures.num_mismatches == 0,
+            float(figures.num_mismatches),
+            f"{figures.num_mismatches:,} mismatches",
         ),
-        Promise(
+        Criterion(
             "boundary_closed",
             "The boundary is closed: just the faces with one owner, normals outwards.",
             open_or_wrong == 0,
             float(open_or_wrong),
-            f"{evidence.num_open_edges:,} open edges, {evidence.num_wrong_facets:,} triangles wrong",
+            f"{figures.num_open_edges:,} open edges, {figures.num_wrong_facets:,} triangles wrong",
         ),
-        Promise(
+        Criterion(
             "dihedral_within_bounds",
             f"Angles between two faces of a tetrahedron lie within {low:g} to {high:g} degrees.",
-            inside >= -(ANGLE_TOLERANCE_DEG + evidence.angle_rounding_deg),
+            inside >= -(ANGLE_TOLERANCE_DEG + figures.angle_rounding_deg),
             inside,
             f"{smallest:.2f}° to {largest:.2f}°",
         ),
-        Promise(
+        Criterion(
             "temperatures_in_range",
             "No node is colder than the coldest or hotter than the hottest observation.",
             excess <= TEMPERATURE_TOLERANCE_K,
             excess,
             f"{excess:.2g} K outside" if excess > TEMPERATURE_TOLERANCE_K else "none outside",
         ),
-    )
-    if boundary_mode == "conforming":
-        return promises
-    return (
-        *promises,
-        Promise(
+        Criterion(
             "non_obtuse",
             "No obtuse angle between faces: heat with lumped mass keeps the maximum principle.",
-            evidence.share_obtuse == 0.0,
-            evidence.share_obtuse,
-            f"{in_percent(evidence.share_obtuse)} of tetrahedra obtuse",
+            figures.share_obtuse == 0.0,
+            figures.share_obtuse,
+            f"{in_percent(figures.share_obtuse)} of tetrahedra obtuse",
         ),
-        Promise(
+        Criterion(
             "stiffness_monotone",
             "No stiffness entry of an edge is positive: all that the maximum principle needs.",
-            evidence.share_positive_edges == 0.0,
-            evidence.share_positive_edges,
-            f"{in_percent(evidence.share_positive_edges)} of edges positive",
+            figures.share_positive_edges == 0.0,
+            figures.share_positive_edges,
+            f"{in_percent(figures.share_positive_edges)} of edges positive",
         ),
     )
+    return criteria if boundary_mode == "voxel" else criteria[:5]
 
 
 def in_percent(share: float) -> str:

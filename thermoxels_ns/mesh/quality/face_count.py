@@ -1,9 +1,4 @@
-"""Which faces and edges a tetrahedral mesh has, and which tetrahedra share them.
-
-Rows of node numbers are matched in two stages, both linear in memory: a counting sort by the smallest node (turning a
-sparse row into columns), then a sort of the few rows that share it. On a million tetrahedra this is several times
-faster than one sort of all rows.
-"""
+"""Faces and edges of a tetrahedral mesh, and which tetrahedra share them."""
 
 from __future__ import annotations
 
@@ -12,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
+
+from thermoxels_ns.core.errors import MeshError
 
 IntArray = npt.NDArray[np.int64]
 
@@ -54,6 +51,9 @@ class Groups:
 
 def group_pairs(first: IntArray, second: IntArray) -> Groups:
     """Find the rows in which a pair of whole numbers of at least 0 is the same.
+
+    Two stages, both linear in memory: a counting sort by the first number (a sparse row turned into columns), then a
+    sort of the few rows that share it. On a million tetrahedra this is several times faster than one sort of all rows.
 
     Args:
         first: First numbers, shape (rows,); the work space grows with the largest of them.
@@ -134,3 +134,57 @@ def _sorted_four(values: list[IntArray]) -> tuple[IntArray, IntArray, IntArray, 
     c, d = np.minimum(values[2], values[3]), np.maximum(values[2], values[3])
     m, n = np.maximum(a, c), np.minimum(b, d)
     return np.minimum(a, c), np.minimum(m, n), np.maximum(m, n), np.maximum(b, d)
+
+
+def facet_owners(
+    tets: npt.NDArray[np.int64], facets: npt.NDArray[np.int64]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Find the tetrahedron of every boundary triangle, and which of its faces the triangle is.
+
+    Only faces whose nodes all lie on the boundary are looked at, so the sort follows the surface, not the volume.
+
+    Args:
+        tets: Node indices, shape (t, 4).
+        facets: Boundary triangles, shape (f, 3).
+
+    Returns:
+        owner: Index of the tetrahedron, shape (f,).
+        opposite: Which of the tetrahedron's four nodes the triangle lies opposite to, 0 to 3, shape (f,).
+
+    Raises:
+        MeshError: A triangle is listed twice, is no face of a tetrahedron, or lies between two.
+
+    >>> facet_owners(np.array([[0, 1, 2, 3]]), np.array([[0, 2, 1], [1, 2, 3]]))
+    (array([0, 0]), array([3, 0]))
+    """
+    if not len(facets):
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    on_boundary = np.zeros(max(int(tets.max()), int(facets.max())) + 1, dtype=bool)
+    on_boundary[facets.ravel()] = True
+    flags = on_boundary[tets]
+    num_flagged = flags.sum(axis=1)
+    # A face is flagged if the only node that is not is the one opposite, or none is not.
+    flagged_face = (num_flagged[:, None] - flags) == 3
+    candidate_tet, candidate_face = np.nonzero(flagged_face)
+    faces = tets[candidate_tet[:, None], OUTWARD_FACES[candidate_face]]
+
+    low, middle, high = np.sort(np.concatenate([facets, faces]).astype(np.int64), axis=1).T
+    # Two keys sort faster than three; node numbers are far below 2^31. The sort is stable: triangles come first.
+    key = low * len(on_boundary) + middle
+    order = np.lexsort((high, key))
+    key, high = key[order], high[order]
+    first = np.flatnonzero(np.concatenate([[True], (key[1:] != key[:-1]) | (high[1:] != high[:-1])]))
+    uses = np.diff(np.append(first, len(order)))
+    asked = order[first] < len(facets)
+    first, uses = first[asked], uses[asked]
+    second = order[np.minimum(first + 1, len(order) - 1)]
+    if len(first) != len(facets) or np.any(uses != 2) or np.any(second < len(facets)):
+        raise MeshError(
+            "facets",
+            expected="different triangles, each a face of exactly one tetrahedron",
+            got=f"{len(facets) - np.count_nonzero((uses == 2) & (second >= len(facets)))} others",
+            remedy="Build the mesh with thermoxels_ns.mesh.build.",
+        )
+    face = np.empty(len(facets), dtype=np.int64)
+    face[order[first]] = second - len(facets)
+    return candidate_tet[face], candidate_face[face]

@@ -1,4 +1,4 @@
-"""One picture of a mesh's quality: angles, radius ratios, figures and promises."""
+"""One picture of a mesh's quality: angles, radius ratios, figures and criteria."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _BARS, _BOUND, _INK, _PALE = "#4a78b0", "#b8571b", "#202020", "#606060"
-_KEPT, _BROKEN = "#2a7f3f", "#b3261e"
+_MET, _UNMET = "#2a7f3f", "#b3261e"
 
 
 def picture_of_quality(path: Path | str, report: QualityReport, title: str = "") -> None:
-    """Draw the report as a PNG: two histograms above, figures and promises below.
+    """Draw the report as a PNG: two histograms above, figures and criteria below.
 
     Counts are on a logarithmic axis, because a solver stumbles over the few worst tetrahedra.
 
@@ -46,10 +46,10 @@ def picture_of_quality(path: Path | str, report: QualityReport, title: str = "")
     grid = figure.add_gridspec(2, 2, height_ratios=(1.0, 1.05))
     _draw_angles(figure.add_subplot(grid[0, 0]), report)
     _draw_ratios(figure.add_subplot(grid[0, 1]), report)
-    sizes, promises = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
+    sizes, criteria = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
     _write_lines(sizes, "Figures", _size_lines(report))
-    _write_promises(promises, report)
-    for axis in (sizes, promises):
+    _write_criteria(criteria, report)
+    for axis in (sizes, criteria):
         axis.set_axis_off()
     folder = writable_folder(path.parent)
     with replace_when_done(folder / path.name) as temporary:
@@ -78,7 +78,7 @@ def _draw_angles(axis: Axes, report: QualityReport) -> None:
     axis.set_xticks(range(0, 181, 30))
     axis.set_xlabel(f"angle between two faces of a tetrahedron [degrees]; found {smallest:.1f} to {largest:.1f}")
     axis.set_ylabel("angles")
-    axis.set_title("Dihedral angles, and the bounds that are promised", fontsize=11)
+    axis.set_title("Dihedral angles, and their bounds", fontsize=11)
 
 
 def _draw_ratios(axis: Axes, report: QualityReport) -> None:
@@ -133,23 +133,23 @@ def _write_lines(axis: Axes, heading: str, lines: list[tuple[str, str]]) -> None
         _write(axis, 0.55, y, value, _INK)
 
 
-def _write_promises(axis: Axes, report: QualityReport) -> None:
-    kept = len(report.promises) - len(report.broken)
+def _write_criteria(axis: Axes, report: QualityReport) -> None:
+    met = len(report.criteria) - len(report.unmet)
     _write(
         axis,
         0.0,
         0.98,
-        f"Promises of a {report.boundary_mode} boundary: {kept} of {len(report.promises)} kept",
+        f"Criteria of a {report.boundary_mode} boundary: {met} of {len(report.criteria)} met",
         _INK,
         size=12.0,
         bold=True,
     )
-    for number, promise in enumerate(report.promises):
+    for number, criterion in enumerate(report.criteria):
         y = 0.89 - 0.113 * number
-        _write(axis, 0.0, y, *(("yes", _KEPT) if promise.kept else ("no", _BROKEN)), bold=True)
-        _write(axis, 0.07, y, promise.name.replace("_", " "), _INK)
-        _write(axis, 0.48, y, promise.found, _INK)
-        _write(axis, 0.07, y - 0.048, promise.sentence, _PALE, size=8.0)
+        _write(axis, 0.0, y, *(("yes", _MET) if criterion.kept else ("no", _UNMET)), bold=True)
+        _write(axis, 0.07, y, criterion.name.replace("_", " "), _INK)
+        _write(axis, 0.48, y, criterion.found, _INK)
+        _write(axis, 0.07, y - 0.048, criterion.sentence, _PALE, size=8.0)
 
 
 def _write(axis: Axes, x: float, y: float, words: str, colour: str, size: float = 10.0, bold: bool = False) -> None:

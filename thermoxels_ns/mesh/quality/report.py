@@ -1,4 +1,4 @@
-"""All figures of a mesh's quality in one report: shapes, sizes, how it hangs together, and which promises it keeps."""
+"""All figures of a mesh's quality: shapes, sizes, topology, and the criteria it meets."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from thermoxels_ns.mesh.quality.checks import (
     count_wrong_facets,
     facet_areas,
 )
-from thermoxels_ns.mesh.quality.criteria import AngleBins, BoundaryMode, Evidence, Promise, angle_bins, judge
+from thermoxels_ns.mesh.quality.criteria import AngleBins, BoundaryMode, Criterion, Figures, angle_bins, judge
 from thermoxels_ns.mesh.quality.face_count import IntArray, edges_of_rows, group_edges, group_faces
 from thermoxels_ns.mesh.quality.tet_shapes import angle_rounding, node_rounding, shapes_in_chunks
 from thermoxels_ns.mesh.quality.topology import (
@@ -38,10 +38,10 @@ _CANCELLED = 1e-9
 
 @dataclass(frozen=True)
 class QualityReport:
-    """Figures of a mesh and the promises it keeps."""
+    """Figures of a mesh and the criteria it meets."""
 
     boundary_mode: BoundaryMode
-    """How the boundary was made, by which the promises differ."""
+    """How the boundary was made, by which the criteria differ."""
     length_unit: str
     """Unit of the nodes' positions; if it is not "m", [m] below stands for it."""
     num_nodes: int
@@ -66,7 +66,7 @@ class QualityReport:
     dihedral_range_deg: tuple[float, float]
     """Smallest and largest angle between two faces of a tetrahedron, [degrees]."""
     dihedral_counts: tuple[int, ...]
-    """Number of these angles, six per tetrahedron, in the bins of `promises.angle_bins`."""
+    """Number of these angles, six per tetrahedron, in the bins of `criteria.angle_bins`."""
     radius_ratio_range: tuple[float, float]
     """Smallest and largest of 3 r / R with the radii of the inscribed and the circumscribed sphere, 1 at best; 0 where
     the volume is not above 0."""
@@ -93,8 +93,8 @@ class QualityReport:
     """Boundary edges with more than two boundary triangles."""
     num_non_manifold_vertices: int
     """Boundary vertices whose triangles are not one fan."""
-    promises: tuple[Promise, ...]
-    """What the mesher promises of such a boundary, and whether this mesh keeps it."""
+    criteria: tuple[Criterion, ...]
+    """Quality criteria of such a boundary, and whether this mesh meets them."""
 
     @property
     def num_cavities(self) -> int:
@@ -102,14 +102,14 @@ class QualityReport:
         return sum(component.is_cavity for component in self.components)
 
     @property
-    def broken(self) -> tuple[str, ...]:
-        """Names of the promises that this mesh does not keep."""
-        return tuple(promise.name for promise in self.promises if not promise.kept)
+    def unmet(self) -> tuple[str, ...]:
+        """Names of the criteria that this mesh does not meet."""
+        return tuple(criterion.name for criterion in self.criteria if not criterion.kept)
 
     def as_mapping(self) -> dict[str, Any]:
         """The report as json can hold it; of the boundary's components the 20 largest are listed."""
         mapping = asdict(self)
-        listed, promises = mapping.pop("components"), mapping.pop("promises")
+        listed, criteria = mapping.pop("components"), mapping.pop("criteria")
         angles = angle_bins(self.boundary_mode)
         bins = (
             ("dihedral_counts", angles.first_centre_deg, angles.width_deg),
@@ -123,7 +123,7 @@ class QualityReport:
         mapping["num_components"] = len(self.components)
         mapping["num_cavities"] = self.num_cavities
         mapping["largest_components"] = list(listed[:_MOST_COMPONENTS])
-        mapping["promises"] = list(promises)
+        mapping["promises"] = list(criteria)
         return mapping
 
 
@@ -133,7 +133,7 @@ def quality_report(
     observed_range_c: tuple[float, float] | None = None,
     length_unit: str = "m",
 ) -> QualityReport:
-    """Measure a mesh and hold it against what the mesher promises. A broken promise is reported, it does not raise.
+    """Measure a mesh and hold it against its quality criteria. One that is not met is reported, it does not raise.
 
     Args:
         mesh: The mesh, damaged or not.
@@ -165,7 +165,7 @@ def quality_report(
     areas = facet_areas(mesh.points_m, mesh.facets)
     overlaps = count_overlaps(mesh.points_m, mesh.facets, sides)
     temperature = mesh.temperature_c
-    evidence = Evidence(
+    figures = Figures(
         min_volume_m3=shapes.min_volume_m3,
         num_non_positive=shapes.num_non_positive,
         num_mismatches=int(np.count_nonzero(faces.sizes > 2)) + overlaps + count_twin_nodes(mesh.points_m),
@@ -203,7 +203,7 @@ def quality_report(
         components=surface.components,
         num_non_manifold_edges=surface.num_non_manifold_edges,
         num_non_manifold_vertices=surface.num_non_manifold_vertices,
-        promises=judge(evidence, boundary_mode, length_unit),
+        criteria=judge(figures, boundary_mode, length_unit),
     )
 
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
+from scipy import fft, ndimage
+from scipy.spatial import KDTree
 
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.mesh.solid.free_space import look
-from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected
-from thermoxels_ns.mesh.solid.winding_number import winding_number
+from thermoxels_ns.mesh.solid.free_space import Sight, look
+from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected, grow
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -47,7 +49,7 @@ def interior(cells: BoolArray, lattice: Lattice, views: Views | None, seal: int)
     A body is what touches once openings are sealed. Its inside are cavities of the sealed shell and, if the cameras
     are known, the space within its convex hull that they should see but do not, because the shell stands in front of
     it (see `thermoxels_ns.mesh.solid.free_space`), and that the backs of seen surfaces surround (see
-    `thermoxels_ns.mesh.solid.winding_number`). The hull bounds the shadow behind bodies seen from one side; the winding
+    `thermoxels_ns.mesh.solid.interior`). The hull bounds the shadow behind bodies seen from one side; the winding
     number tells the shadow of a body from its inside.
 
     Through holes of the shell a few cameras look past it onto what others know to be inside. Such lines of sight end
@@ -175,3 +177,128 @@ def _without_strays(body: BoolArray) -> BoolArray:
         inner = (np.cumsum(layers) > most) & (np.cumsum(layers[::-1])[::-1] > most)
         kept = kept & np.expand_dims(inner, tuple(other for other in range(3) if other != axis))
     return kept
+
+
+BoolArray = npt.NDArray[np.bool_]
+
+_fast_length = cast(Callable[[int], int], fft.next_fast_len)
+
+MARGIN = 0.25
+"""The potential is zero this share of the lattice's size beyond it, on each side."""
+
+
+def winding_number(solid: BoolArray, air: BoolArray) -> npt.NDArray[np.float32]:
+    """Find how far the voxel faces between solid and air surround each voxel, those faces taken from their back.
+
+    It is 1 within a closed surface and 0 outside of it. Where the surface has a hole, it goes from one to the other
+    smoothly, and one half is a film across the hole; before a surface that is open it may be below 0. Faces with solid
+    on both sides, or next to voxels that are neither, are no surface; the two sides of a leaf cancel from afar. For
+    surfaces given as triangles: Jacobson, Kavan and Sorkine-Hornung 2013, Robust inside-outside segmentation using
+    generalized winding numbers, equation 5. Here it is the function that jumps by one across the surface and is
+    harmonic elsewhere, solved for with sine transforms in blocks of 2^3 voxels: Lap w = div J, where J holds the jumps.
+
+    Args:
+        solid: Voxels behind the surface, shape (nx, ny, nz).
+        air: Voxels before it, of the same shape; none of them is solid.
+
+    Returns:
+        The winding number, shape (nx, ny, nz); all voxels of a block have the same.
+    """
+    shape = solid.shape
+    # Lengths for which the transforms are fast, with the lattice about in the middle.
+    blocks = [_fast_length(int(np.ceil((0.5 + MARGIN) * n)) + 3) - 1 for n in shape]
+    before = [(count - (n + 1) // 2) // 2 for count, n in zip(blocks, shape)]
+    pads = [(2 * b, 2 * count - n - 2 * b) for b, count, n in zip(before, blocks, shape)]
+    side = np.pad(solid.astype(np.int8) - air.astype(np.int8), pads)
+    sources = np.zeros(blocks, dtype=np.float32)
+    for axis in range(3):
+        jumps = _jumps(side, axis)
+        near, far = [slice(None)] * 3, [slice(None)] * 3
+        near[axis], far[axis] = slice(None, -1), slice(1, None)
+        sources += jumps
+        sources[tuple(far)] -= jumps[tuple(near)]
+    waves = np.asarray(fft.dstn(sources, type=1, overwrite_x=True), dtype=np.float32)
+    stiffness = [2.0 - 2.0 * np.cos(np.pi * np.arange(1, n + 1) / (n + 1)) for n in blocks]
+    waves /= np.add.outer(np.add.outer(stiffness[0], stiffness[1]), stiffness[2]).astype(np.float32)
+    winding = np.asarray(fft.idstn(waves, type=1, overwrite_x=True), dtype=np.float32)
+    winding = winding[tuple(slice(b, b + (n + 1) // 2) for b, n in zip(before, shape))]
+    for axis in range(3):
+        winding = np.repeat(winding, 2, axis=axis)
+    return winding[tuple(slice(n) for n in shape)]
+
+
+def _jumps(side: npt.NDArray[np.int8], axis: int) -> npt.NDArray[np.float32]:
+    """Jump from each block to the next along an axis: 1 where all faces are solid before air, -1 if air before solid.
+
+    A face in the middle of a block counts half at each of the block's ends.
+    """
+    near, far = [slice(None)] * 3, [slice(None)] * 3
+    near[axis], far[axis] = slice(None, -1), slice(1, None)
+    first, second = side[tuple(near)], side[tuple(far)]
+    jump = np.zeros_like(side)
+    jump[tuple(near)] = np.where(first * second == -1, first, 0)
+    nx, ny, nz = (n // 2 for n in side.shape)
+    others = tuple(2 * other + 1 for other in range(3) if other != axis)
+    pairs = jump.reshape(nx, 2, ny, 2, nz, 2).sum(axis=others, dtype=np.float32) * np.float32(0.25)
+    middle, end = np.moveaxis(pairs, axis + 1, 0)
+    total = end + 0.5 * middle
+    total[tuple(near)] += 0.5 * middle[tuple(far)]
+    return total
+
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+THINNEST_GROWN = 1.5
+"""A wall thinner than this has the middle of no voxel behind the seen one, so none is added, [voxels]."""
+
+
+def wall_behind(cells: BoolArray, lattice: Lattice, views: Views, thickness: float) -> BoolArray:
+    """Find the voxels that make the seen surface as thick as a wall.
+
+    Seen surface are the solid voxels that enough cameras have a free line to (see `free_space`). An
+    empty voxel joins if it lies within the thickness of them, counted from their outer faces, on the straight way
+    through space that is solid or not seen. Voxels that cameras look through never join, so a plate that is seen from
+    both sides does not grow.
+
+    Args:
+        cells: Solid voxels, shape `lattice.cell_shape`.
+        lattice: Where they are.
+        views: The training cameras.
+        thickness: Thickness of the wall, the seen voxel included, above 0, [voxels].
+
+    Returns:
+        The voxels to add, shape `lattice.cell_shape`; none of them is in `cells`.
+    """
+    sight = look(cells, lattice, views)
+    return _grown(cells, sight, thickness)
+
+
+def _grown(cells: BoolArray, sight: Sight, thickness: float) -> BoolArray:
+    added = np.zeros_like(cells)
+    # The middle of a surface voxel lies half a voxel below its face, that of the last one half a voxel before the end.
+    reach = thickness - 0.5
+    seen = sight.seen
+    surface = np.argwhere(cells & seen & grow(seen & ~cells, 1))
+    if thickness < THINNEST_GROWN or len(surface) == 0:
+        return added
+    closed = ~seen | cells
+    near = grow(_at(surface, cells.shape), int(reach)) & closed & ~cells
+    candidates = np.argwhere(near)
+    distance, nearest = KDTree(surface).query(candidates, distance_upper_bound=reach + 1e-6)
+    found = np.isfinite(distance)
+    candidates, start = candidates[found], surface[np.asarray(nearest)[found]]
+    free = np.ones(len(candidates), dtype=bool)
+    steps = int(np.ceil(2.0 * reach))
+    for step in range(1, steps):
+        share = step / steps
+        between = np.rint(start + share * (candidates - start)).astype(np.int64)
+        free &= closed[tuple(between.T)]
+    added[tuple(candidates[free].T)] = True
+    return added
+
+
+def _at(index: npt.NDArray[np.int64], shape: tuple[int, ...]) -> BoolArray:
+    cells = np.zeros(shape, dtype=bool)
+    cells[tuple(index.T)] = True
+    return cells

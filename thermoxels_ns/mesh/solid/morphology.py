@@ -18,12 +18,15 @@ def bounding_box(cells: BoolArray, margin: int = 0) -> tuple[slice, ...]:
     >>> bounding_box(np.array([[[False, False, True, True, False]]]), 1)
     (slice(0, 2, None), slice(0, 2, None), slice(1, 5, None))
     """
-    slices = []
+    spans = []
     for axis in range(3):
-        others = tuple({0, 1, 2} - {axis})
-        used = np.flatnonzero(cells.any(axis=others))
-        slices.append(slice(max(int(used[0]) - margin, 0), int(used[-1]) + 1 + margin) if len(used) else slice(0, 0))
-    return tuple(slices)
+        used = np.flatnonzero(cells.any(axis=tuple({0, 1, 2} - {axis})))
+        if len(used) == 0:
+            return (slice(0, 0),) * 3
+        spans.append((int(used[0]), int(used[-1]) + 1))
+        # What is left to look at gets smaller.
+        cells = cells[(slice(None),) * axis + (slice(*spans[-1]),)]
+    return tuple(slice(max(low - margin, 0), high + margin) for low, high in spans)
 
 
 def face_connected(cells: BoolArray) -> npt.NDArray[np.int32]:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.snapshot import GridSnapshot
-from thermoxels_ns.mesh.solid.interior import interior
+from thermoxels_ns.mesh.solid.interior import THINNEST_GROWN, interior, wall_behind
 from thermoxels_ns.mesh.solid.level_set import level_of
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, face_connected, fill_enclosed
 from thermoxels_ns.mesh.solid.threshold import (
@@ -22,7 +22,6 @@ from thermoxels_ns.mesh.solid.threshold import (
     optical_depth_threshold,
     percentile_threshold,
 )
-from thermoxels_ns.mesh.solid.wall_thickness import THINNEST_GROWN, wall_behind
 
 __all__ = [
     "InteriorKind",

@@ -1,13 +1,4 @@
-"""The body-centred cubic lattice that isosurface stuffing cuts: its points, edges and levels.
-
-It is two cubic lattices, one voxel apart each: the voxel centres and, shifted by half a voxel along every axis, the
-voxel corners. A point has 14 neighbours: six of its own lattice along the axes (long edges, 1 voxel) and eight of the
-other one along the space diagonals (short edges, sqrt(3)/2 voxels). The edges cut space into congruent tetrahedra;
-each has one long edge of each lattice, opposite each other.
-
-All points lie in one flat array: first the centres, then the corners, both padded to the same shape, so that a step
-along an edge is a constant offset of the flat index.
-"""
+"""The body-centred cubic lattice of isosurface stuffing: its points, edges and levels."""
 
 from __future__ import annotations
 
@@ -17,6 +8,8 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+
+from thermoxels_ns.mesh.solid.morphology import bounding_box
 
 _AXES = np.eye(3)[[0, 0, 1, 1, 2, 2]] * np.array([1.0, -1.0] * 3)[:, None]
 _DIAGONALS = (np.arange(8)[:, None] >> np.array([2, 1, 0]) & 1) - 0.5
@@ -34,7 +27,16 @@ _OUTSIDE = -1.0
 
 @dataclass(frozen=True)
 class BccLattice:
-    """Levels on the points of the lattice around the solid part of a voxel lattice."""
+    """Levels on the points of the lattice around the solid part of a voxel lattice.
+
+    It is two cubic lattices, one voxel apart each: the voxel centres and, shifted by half a voxel along every axis, the
+    voxel corners. A point has 14 neighbours: six of its own lattice along the axes (long edges, 1 voxel) and eight of
+    the other one along the space diagonals (short edges, sqrt(3)/2 voxels). The edges cut space into congruent
+    tetrahedra; each has one long edge of each lattice, opposite each other.
+
+    All points lie in one flat array: first the centres, then the corners, both padded to the same shape, so that a step
+    along an edge is a constant offset of the flat index.
+    """
 
     level: npt.NDArray[np.floating]
     """Level of every point: the padded centres, then the padded corners; above 0 is solid. Points above 0 have all
@@ -103,10 +105,8 @@ def bcc_lattice(level: npt.NDArray[np.floating]) -> BccLattice:
     Returns:
         The lattice around the solid voxels; what is farther than two voxels from all of them is left out.
     """
-    first, last = index_box(level > 0.0)
-    first = np.maximum(first - 2, 0)
-    last = np.minimum(last + 2, np.array(level.shape) - 1)
-    inner = level[tuple(slice(a, b + 1) for a, b in zip(first, last))]
+    box = bounding_box(level > 0.0, margin=2)
+    first, inner = np.array([part.start for part in box]), level[box]
 
     nx, ny, nz = (n + 2 for n in inner.shape)
     blocks = np.full((2, nx, ny, nz), _OUTSIDE, dtype=level.dtype)
@@ -151,13 +151,3 @@ def _keep_sheets(centres: npt.NDArray[np.floating], corners: npt.NDArray[np.floa
             square &= side * above <= 0.0
             for corner in (below, above):
                 corner[square] = 0.0
-
-
-def index_box(cells: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """First and last index along each axis where anything is True; something must be."""
-    ends = []
-    for axis in range(3):
-        others = tuple({0, 1, 2} - {axis})
-        ends.append(np.flatnonzero(cells.any(axis=others))[[0, -1]])
-    box = np.array(ends, dtype=np.int64)
-    return box[:, 0], box[:, 1]

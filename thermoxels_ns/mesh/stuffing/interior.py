@@ -1,17 +1,4 @@
-"""The inside of a stuffed solid, away from its surface: an octree of larger and larger cubes as tetrahedra.
-
-Every cube of the octree has a node at its centre and, as the voxels outside the octree have, nodes at its corners; all
-of them are points of the body-centred cubic lattice. Between two neighbours
-
-- of the same size lie four tetrahedra, one for each side of their common face, around the edge that joins the centres.
-  Where smaller cubes touch a side it has a node in the middle, and its tetrahedron is cut in two there;
-- of different sizes lies the face of the smaller, a quarter of that of the larger. The diagonal through the middle of
-  the larger face cuts it into two triangles, and each of them makes a tetrahedron with either centre.
-
-The angles are 45, 60, 90 and, in the smaller cube of the second case, 120 degrees. The other diagonal would give the
-same there, but 35.3 to 125.3 degrees in the larger one. (Labelle and Shewchuk 2007, ACM Transactions on Graphics 26(3),
-article 57, build the inside of the same pieces.)
-"""
+"""The inside of a stuffed solid: an octree of larger and larger cubes as tetrahedra."""
 
 from __future__ import annotations
 
@@ -21,8 +8,79 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.mesh.stuffing.bcc_lattice import BccLattice, index_box
-from thermoxels_ns.mesh.stuffing.octree import BoolArray, balanced_octree, eroded, split_in_eight
+from thermoxels_ns.mesh.solid.morphology import bounding_box
+from thermoxels_ns.mesh.stuffing.bcc_lattice import BccLattice
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+def eroded(cells: BoolArray, by: int) -> BoolArray:
+    """Keep the voxels with nothing but voxels of the set in the cube of 2 `by` + 1 voxels around them.
+
+    What lies beyond the array is not in the set.
+
+    >>> np.count_nonzero(eroded(np.ones((5, 5, 5), dtype=bool), 1))
+    27
+    """
+    for axis in range(3):
+        row = np.moveaxis(cells, axis, 0)
+        width, end = 1, 2 * by + 1
+        # From here on an entry stands for the `width` voxels that begin with it.
+        while width < end:
+            step = min(width, end - width)
+            row = row[:-step] & row[step:]
+            width += step
+        cells = np.zeros_like(cells)
+        np.moveaxis(cells, axis, 0)[by : by + len(row)] = row
+    return cells
+
+
+def balanced_octree(cells: BoolArray, largest: int) -> tuple[BoolArray, ...]:
+    """Join voxels into cubes of 2, 4, 8, ... voxels along an edge that only hold voxels of the set.
+
+    Cube (i, j, k) of edge s begins at voxel (i s, j s, k s). Cubes that touch, if only at a corner, differ at most by
+    a factor 2 in size; voxels outside the set, beyond the array too, count as cubes of one voxel. Under these rules
+    every cube is as large as it can be, which no choice elsewhere can change.
+
+    Args:
+        cells: The voxels that may be joined, shape (cx, cy, cz).
+        largest: No edge is longer than this, [voxels]; a power of two.
+
+    Returns:
+        Entry n is for cubes of 2^(n + 1) voxels along an edge: True where the cube is one cube or part of a larger one,
+        so that nothing in it is smaller. Its shape is half that before, rounded up. Sizes without any cube are left
+        out at the end.
+
+    >>> [np.count_nonzero(level) for level in balanced_octree(np.ones((12, 12, 12), dtype=bool), 8)]
+    [216, 1]
+    """
+    levels: list[BoolArray] = []
+    size, whole = 1, cells
+    while size < largest:
+        # A cube of one voxel touches any cube of two; larger ones need neighbours of at least half their size.
+        halves = whole if size == 1 else eroded(whole, 1)
+        whole = _all_of_eight(halves)
+        if not whole.any():
+            break
+        levels.append(whole)
+        size *= 2
+    return tuple(levels)
+
+
+def split_in_eight(level: BoolArray, shape: tuple[int, ...]) -> BoolArray:
+    """Give each of the eight halves of a cube its value, and cut the array to the shape of the level below."""
+    for axis in range(3):
+        level = np.repeat(level, 2, axis=axis)
+    return level[tuple(slice(n) for n in shape)]
+
+
+def _all_of_eight(level: BoolArray) -> BoolArray:
+    level = np.pad(level, [(0, n % 2) for n in level.shape])
+    for axis in range(3):
+        row = np.moveaxis(level, axis, 0)
+        level = np.moveaxis(row[0::2] & row[1::2], 0, axis)
+    return level
+
 
 # The sides of a face lie between its corners 0-1, 1-2, 2-3 and 3-0, counter-clockwise seen from where its axis points.
 _CORNERS = np.array([[0, 0, 0], [0, 1, 0], [0, 1, 1], [0, 0, 1]])
@@ -53,6 +111,17 @@ class CoarseInterior:
 def coarse_interior(lattice: BccLattice, largest: int) -> CoarseInterior | None:
     """Build the inside of a solid from cubes of two and more voxels.
 
+    Every cube of the octree has a node at its centre and, as the voxels outside the octree have, nodes at its corners;
+    all of them are points of the body-centred cubic lattice. Between two neighbours
+
+    - of the same size lie four tetrahedra, one for each side of their common face, around the edge that joins the
+      centres. Where smaller cubes touch a side it has a node in the middle, and its tetrahedron is cut in two there;
+    - of different sizes lies the face of the smaller, a quarter of that of the larger. The diagonal through the middle
+      of the larger face cuts it into two triangles, and each of them makes a tetrahedron with either centre.
+
+    The angles are 45, 60, 90 and, in the smaller cube of the second case, 120 degrees. The other diagonal would give
+    35.3 to 125.3 degrees in the larger one. (The inside of Labelle and Shewchuk 2007 is built of the same pieces.)
+
     The octree begins at the lowest voxel that may be joined with others, so that the place of the solid in the voxel
     lattice does not matter.
 
@@ -68,8 +137,8 @@ def coarse_interior(lattice: BccLattice, largest: int) -> CoarseInterior | None:
     deep = _far_from_surface(lattice)
     if not deep.any():
         return None
-    first, last = index_box(deep)
-    box = tuple(slice(a, b + 1) for a, b in zip(first, last))
+    box = bounding_box(deep)
+    first = np.array([part.start for part in box])
     octree = balanced_octree(deep[box], largest)
     if not octree:
         return None

@@ -21,6 +21,8 @@ from thermoxels_ns.mesh.stuffing.stencils import (
     stencil_table,
 )
 from thermoxels_ns.mesh.stuffing.warp import WarpedLattice, warp
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX
+from thermoxels_ns.mesh.voxel_tets import boundary_tags
 
 _CHUNK = 1 << 16
 
@@ -87,7 +89,8 @@ def stuff(level: npt.NDArray[np.floating], coarsest: int = 4) -> StuffedSolid:
     tets, facets = (np.concatenate(part, dtype=np.int64) for part in (tets, facets))
     on_surface = np.zeros(len(nodes.points), dtype=bool)
     on_surface[facets] = True
-    return StuffedSolid(nodes.points, tets, facets, on_surface, _on_border(nodes.points, facets, level.shape))
+    on_box = boundary_tags(facets, nodes.points, tuple(n + 1 for n in level.shape)) == FACET_BOX
+    return StuffedSolid(nodes.points, tets, facets, on_surface, on_box)
 
 
 def _check_coarsest(coarsest: int) -> None:
@@ -235,14 +238,3 @@ def _rows(
     bundle = np.repeat(np.arange(len(code)), counts)
     shift = start[code] + counts - np.cumsum(counts)
     return bundle, np.arange(len(bundle)) + shift[bundle]
-
-
-def _on_border(
-    points: npt.NDArray[np.float64], facets: npt.NDArray[np.int64], shape: tuple[int, ...]
-) -> npt.NDArray[np.bool_]:
-    """True for triangles with all nodes on the same side of the box."""
-    planes = np.zeros(len(points), dtype=np.uint8)
-    for axis in range(3):
-        planes |= (points[:, axis] == 0.0).astype(np.uint8) << (2 * axis)
-        planes |= (points[:, axis] == shape[axis]).astype(np.uint8) << (2 * axis + 1)
-    return np.bitwise_and.reduce(planes[facets], axis=1) != 0

@@ -29,7 +29,7 @@ from thermoxels_ns.mesh.stuffing.edge_planes import (
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid
 
 ANGLES_DEG = (13.0, 160.0)
-"""No move is made that leaves a dihedral angle outside this range. It is narrower than what stuffing itself promises,
+"""No move is made that leaves a dihedral angle outside this range. It is narrower than the range of stuffing itself,
 and wins back nearly as much: with 10.9 to 163.8 degrees the area of tilted boxes would be nearer by 0.05 %."""
 LONGEST_MOVE = 1.0
 """Nodes farther than this from the edge stay, [voxels]."""

@@ -1,17 +1,4 @@
-"""What fills the four tetrahedra around a voxel face, for every combination of signs at their points.
-
-The tetrahedra of the lattice come in bundles of four: around the long edge from the voxel centre below a face to the
-one above it, each with one side of the face. Points and edges of a bundle are numbered
-
-    0, 1           centre below and above the face
-    2 .. 5         the face's corners, counter-clockwise seen from above
-    6              the cut of edge 0-1
-    7 .. 10        the cuts of edges 0-2, 0-3, 0-4, 0-5
-    11 .. 14       the cuts of edges 1-2, 1-3, 1-4, 1-5
-    15 .. 18       the cuts of the face's sides 2-3, 3-4, 4-5, 5-2
-
-The same numbers serve the faces of all three axes: nothing changes when x, y, z are turned into y, z, x.
-"""
+"""What fills the four tetrahedra around a voxel face, for every combination of signs."""
 
 from __future__ import annotations
 
@@ -21,6 +8,8 @@ from itertools import permutations, product
 
 import numpy as np
 import numpy.typing as npt
+
+from thermoxels_ns.mesh.quality.face_count import OUTWARD_FACES
 
 BUNDLE_EDGES: tuple[tuple[int, int], ...] = (
     (0, 1),
@@ -40,14 +29,26 @@ NUM_BUNDLE_NODES = 19
 CODE_WEIGHTS: npt.NDArray[np.int16] = (3 ** np.arange(6)).astype(np.int16)
 """A bundle's code is the sum of (sign + 1) times these."""
 
-_FACES = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))
 _EDGE_NODE: dict[frozenset[int], int] = {frozenset(edge): 6 + e for e, edge in enumerate(BUNDLE_EDGES)}
 _Tet = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
 class StencilTable:
-    """Tetrahedra and surface triangles of every bundle code; those of code c have rows start[c] to start[c + 1]."""
+    """Tetrahedra and surface triangles of every bundle code; those of code c have rows start[c] to start[c + 1].
+
+    The tetrahedra of the lattice come in bundles of four: around the long edge from the voxel centre below a face to
+    the one above it, each with one side of the face. Points and edges of a bundle are numbered
+
+        0, 1           centre below and above the face
+        2 .. 5         the face's corners, counter-clockwise seen from above
+        6              the cut of edge 0-1
+        7 .. 10        the cuts of edges 0-2, 0-3, 0-4, 0-5
+        11 .. 14       the cuts of edges 1-2, 1-3, 1-4, 1-5
+        15 .. 18       the cuts of the face's sides 2-3, 3-4, 4-5, 5-2
+
+    The same numbers serve the faces of all three axes: nothing changes when x, y, z are turned into y, z, x.
+    """
 
     tets: npt.NDArray[np.int64]
     """Bundle numbers, positively oriented, shape (t, 4)."""
@@ -151,7 +152,7 @@ def _surface_faces(pieces: list[_Tet], side: int, signs: tuple[int, ...]) -> lis
     """Faces of the filled part of one lattice tetrahedron that lie on the surface, and what decides about them."""
     found = []
     for tet in pieces:
-        for opposite, face in enumerate(_FACES):
+        for opposite, face in enumerate(OUTWARD_FACES.tolist()):
             facet = (tet[face[0]], tet[face[1]], tet[face[2]])
             if any(v < 6 and signs[v] > 0 for v in facet):
                 continue
