@@ -25,7 +25,8 @@ from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.heat.effects import Convection
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh
-from thermoxels_ns.mesh.quality.checks import facet_areas, signed_volumes
+from thermoxels_ns.mesh.quality.checks import facet_areas
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 

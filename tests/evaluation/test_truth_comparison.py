@@ -14,7 +14,7 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, Views
 from thermoxels_ns.evaluation.truth_comparison import KnownTruth, compare_with_truth, load_known_truth
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh
-from thermoxels_ns.mesh.quality.checks import signed_volumes
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
 from thermoxels_ns.synthetic.scene_folder import make_scene, visible_surface_points, write_scene
 

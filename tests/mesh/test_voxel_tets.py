@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas, signed_volumes
+from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas
 from thermoxels_ns.mesh.quality.face_count import count_faces
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
 from thermoxels_ns.mesh.voxel_tets import (
     boundary_facets,

@@ -18,7 +18,8 @@ from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.evaluation.surface_distance import surface_distances
 from thermoxels_ns.evaluation.voxel_accuracy import MIN_VIEWS, surface_fscore
 from thermoxels_ns.mesh.build import check_similarity
-from thermoxels_ns.mesh.quality.checks import facet_areas, signed_volumes
+from thermoxels_ns.mesh.quality.checks import facet_areas
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.morphology import fill_enclosed
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.synthetic.scene_folder import load_truth, visible_surface_points

@@ -18,7 +18,7 @@ from thermoxels_ns.mesh.boundary.patches import apply_regions
 from thermoxels_ns.mesh.boundary.tags import BoundaryMode, tag_boundary
 from thermoxels_ns.mesh.solid.morphology import bounding_box, connected, face_connected
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, select_solid
-from thermoxels_ns.mesh.stuffing.isosurface import stuff
+from thermoxels_ns.mesh.stuffing.isosurface import check_coarsest, stuff
 from thermoxels_ns.mesh.stuffing.sharp_edges import sharpen
 from thermoxels_ns.mesh.temperature import (
     MIN_OBSERVED_WEIGHT,
@@ -55,14 +55,7 @@ class MeshOptions:
                 got=self.min_observed_weight,
                 remedy=f"Leave it out to use {MIN_OBSERVED_WEIGHT}.",
             )
-        coarsest = self.coarsest_cell
-        if not (isinstance(coarsest, int) and coarsest > 0 and coarsest & (coarsest - 1) == 0):
-            raise MeshError(
-                "coarsest_cell",
-                expected="1, 2, 4, 8 or another power of two, [voxels]",
-                got=repr(coarsest),
-                remedy="Pass --coarsest-cell 4.",
-            )
+        check_coarsest("coarsest_cell", self.coarsest_cell, "Pass --coarsest-cell 4.")
         if self.boundary not in ("conforming", "voxel"):
             raise MeshError("boundary", expected="conforming or voxel", got=self.boundary, remedy="Pass one of them.")
 

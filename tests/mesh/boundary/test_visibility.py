@@ -9,7 +9,7 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.boundary.tags import voxel_surface as surface_of_voxels
-from thermoxels_ns.mesh.boundary.visibility import _EmptySpace, seen_facets
+from thermoxels_ns.mesh.boundary.visibility import _EmptySpace, _is_free, seen_facets
 from thermoxels_ns.mesh.quality.checks import facet_normals
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets, voxel_facets
 
@@ -235,7 +235,8 @@ def test_lines_meet_the_voxels_that_they_cross(seed: int) -> None:
     near, far = np.fmin(near, far).max(axis=2), np.fmax(near, far).min(axis=2)
     inside = np.minimum(far, (length - 1.5)[:, None]) - np.maximum(near, 0.0)
     crossed, missed = inside.max(axis=1) > 1e-3, inside.max(axis=1) < -1e-3
-    free = _EmptySpace(cells).free_lines(start, end)
+    space = _EmptySpace(cells)
+    free = np.array([_is_free(space.block, point - space.lowest, *(end - space.lowest)) for point in start])
     assert not free[crossed].any()
     assert free[missed].all()
     assert (crossed | missed).mean() > 0.9

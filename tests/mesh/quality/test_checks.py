@@ -15,9 +15,9 @@ from thermoxels_ns.mesh.quality.checks import (
     dihedral_range_deg,
     facet_areas,
     facet_normals,
-    signed_volumes,
 )
 from thermoxels_ns.mesh.quality.face_count import group_faces
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
 

@@ -11,14 +11,8 @@ from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
-from thermoxels_ns.mesh.solid.voxels import (
-    SolidCells,
-    SolidSelection,
-    SolidStep,
-    close_gaps,
-    fill_enclosed,
-    select_solid,
-)
+from thermoxels_ns.mesh.solid.morphology import close_gaps, fill_enclosed
+from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, SolidStep, select_solid
 
 
 def step_of(solid: SolidCells, name: str) -> SolidStep:

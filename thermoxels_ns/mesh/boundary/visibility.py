@@ -11,12 +11,12 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
+from thermoxels_ns.mesh.solid.free_space import CLEAR_OF_CAMERA
+from thermoxels_ns.mesh.solid.morphology import bounding_box
 
 START_ABOVE_SURFACE = (1.0, 0.5)
 """A line of sight starts this far out along the normal, [voxels]: past the steps of a staircase, or, if something solid
 is there, half as far, as in a gap of one voxel."""
-CLEAR_OF_CAMERA = 1.5
-"""Solid voxels this close to a camera's centre do not block it, [voxels]: floaters stick to cameras."""
 
 _LARGEST_BLOCK = 5
 """Empty blocks of up to 2^5 voxels along an edge are crossed in one step."""
@@ -117,12 +117,11 @@ class _EmptySpace:
 
     def __init__(self, cells: npt.NDArray[np.bool_]) -> None:
         """Find, around each voxel, the largest aligned block of 2^k voxels along an edge that is empty."""
-        solid = np.nonzero(cells)
-        bounds = [(int(s.min()), int(s.max()) + 1) for s in solid] if len(solid[0]) else [(0, 1)] * 3
-        self.lowest = np.array([low for low, _ in bounds], dtype=np.float64)
-        self.size = np.array([high - low for low, high in bounds])
+        box = bounding_box(cells) if cells.any() else (slice(0, 1),) * 3
+        self.lowest = np.array([part.start for part in box], dtype=np.float64)
+        self.size = np.array([part.stop - part.start for part in box])
         # Lines end at the bounding box of the solid: beyond it they are free.
-        self.cells = np.ascontiguousarray(cells[tuple(slice(low, high) for low, high in bounds)])
+        self.cells = np.ascontiguousarray(cells[box])
         self.block = np.where(self.cells, -1, 0).astype(np.int8)
         occupied = self.cells
         for k in range(1, _LARGEST_BLOCK + 1):
@@ -137,11 +136,15 @@ class _EmptySpace:
 
     def solid_at(self, points: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
         """Whether points, in corner indices, are in solid voxels, shape (points,)."""
+        return self._at(points, self.cells)
+
+    def _at(self, points: npt.NDArray[np.float64], flags: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """The flag of the voxel that each point is in, False beyond the bounding box."""
         index = np.floor(points - self.lowest).astype(np.int64)
         inside = np.all((index >= 0) & (index < self.size), axis=1)
-        solid = np.zeros(len(points), dtype=bool)
-        solid[inside] = self.cells[tuple(index[inside].T)]
-        return solid
+        found = np.zeros(len(points), dtype=bool)
+        found[inside] = flags[tuple(index[inside].T)]
+        return found
 
     def enclosed_at(self, points: npt.NDArray[np.float64], cameras: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
         """Whether points lie in empty space that solid voxels cut off from the outside and from all cameras.
@@ -161,18 +164,7 @@ class _EmptySpace:
         is_open = np.zeros(int(label.max()) + 1, dtype=bool)
         for border in borders:
             is_open[border] = True
-        index = np.floor(points - self.lowest).astype(np.int64)
-        inside = np.all((index >= 0) & (index < self.size), axis=1)
-        enclosed = np.zeros(len(points), dtype=bool)
-        enclosed[inside] = ~is_open[label[tuple(index[inside].T)]]
-        return enclosed
-
-    def free_lines(self, start: npt.NDArray[np.float64], end: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-        """Whether the lines from points to a camera's centre, all in corner indices, are free, shape (points,).
-
-        The line is followed from block to block, through every voxel that it crosses by more than 0.0001 voxels.
-        """
-        return _free_lines(self.block, np.ascontiguousarray(start - self.lowest), end - self.lowest)
+        return self._at(points, ~is_open[label])
 
 
 @kernel
@@ -207,15 +199,6 @@ def _is_free(block, origin, x1, y1, z1):
         # At least a nudge, so that rounding on a block's border does not hold the line up.
         travelled = max(leave, travelled) + _NUDGE
     return True
-
-
-@kernel
-def _free_lines(block, start, end):
-    """`_is_free` for many points and one end."""
-    free = np.empty(len(start), np.bool_)
-    for p in range(len(start)):
-        free[p] = _is_free(block, start[p], end[0], end[1], end[2])
-    return free
 
 
 @kernel
@@ -270,14 +253,8 @@ def _seen_by_any(block, lowest, middle, normal, start, open_start, centres, rota
 
 def _any_of_pairs(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
     """Whether any voxel is solid in each aligned block of 2 x 2 x 2, the last ones cut off by the border."""
-    for along in range(3):
-        odd = cells.shape[along] % 2
-        if odd:
-            width = [(0, 0)] * 3
-            width[along] = (0, 1)
-            cells = np.pad(cells, width)
-        first = [slice(None)] * 3
-        second = [slice(None)] * 3
-        first[along], second[along] = slice(0, None, 2), slice(1, None, 2)
-        cells = cells[tuple(first)] | cells[tuple(second)]
+    cells = np.pad(cells, [(0, n % 2) for n in cells.shape])
+    for axis in range(3):
+        row = np.moveaxis(cells, axis, 0)
+        cells = np.moveaxis(row[0::2] | row[1::2], 0, axis)
     return cells

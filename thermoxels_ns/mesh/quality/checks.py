@@ -10,23 +10,9 @@ import numpy.typing as npt
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.face_count import Groups, IntArray, faces_of_rows, group_faces, group_pairs
-from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks, signed_volumes
+from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
 from thermoxels_ns.mesh.quality.topology import group_sides
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
-
-__all__ = [
-    "MeshQuality",
-    "check_arrays",
-    "check_mesh",
-    "count_overlaps",
-    "count_twin_nodes",
-    "count_wrong_facets",
-    "dihedral_range_deg",
-    "facet_area_vectors",
-    "facet_areas",
-    "facet_normals",
-    "signed_volumes",
-]
 
 _REMEDY = "The mesh is damaged: build it again, and report this if it persists."
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.solid.interior import THINNEST_GROWN, interior, wall_behind
 from thermoxels_ns.mesh.solid.level_set import level_of
-from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, face_connected, fill_enclosed
+from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, face_connected
 from thermoxels_ns.mesh.solid.threshold import (
     Threshold,
     automatic_threshold,
@@ -22,18 +22,6 @@ from thermoxels_ns.mesh.solid.threshold import (
     optical_depth_threshold,
     percentile_threshold,
 )
-
-__all__ = [
-    "InteriorKind",
-    "SolidCells",
-    "SolidSelection",
-    "SolidStep",
-    "close_gaps",
-    "connected",
-    "face_connected",
-    "fill_enclosed",
-    "select_solid",
-]
 
 BoolArray = npt.NDArray[np.bool_]
 InteriorKind = Literal["solid", "hollow"]
@@ -76,48 +64,38 @@ class SolidSelection:
     space that they look through. Takes the place of filling the interior. Needs metres per unit."""
 
     def __post_init__(self) -> None:
-        if self.voxel_optical_depth is not None:
-            check_positive(
-                "voxel_optical_depth", self.voxel_optical_depth, "Pass --voxel-optical-depth 0.5.", MeshError
-            )
-        for name, usual in (("close_gaps", 1), ("seal_openings", 2)):
+        for name, (kind, low, high, usual) in _BOUNDS.items():
             value = getattr(self, name)
-            if not (isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= _WIDEST):
-                remedy = f"Pass --{name.replace('_', '-')} {usual}."
-                raise MeshError(name, expected=f"a whole number from 0 to {_WIDEST}", got=repr(value), remedy=remedy)
-        if not 0.0 <= self.smallest_body <= 1.0:
-            raise MeshError(
-                "smallest_body",
-                expected="a share from 0 to 1",
-                got=self.smallest_body,
-                remedy="Pass --smallest-body 0.01.",
-            )
-        if self.density_percentile is not None and not 0.0 <= self.density_percentile <= 100.0:
-            raise MeshError(
-                "density_percentile",
-                expected="a number from 0 to 100",
-                got=self.density_percentile,
-                remedy="Pass --density-percentile 90 to keep the densest tenth of the voxels.",
-            )
-        if self.density_threshold is not None and not (
-            math.isfinite(self.density_threshold) and self.density_threshold >= 0.0
-        ):
-            raise MeshError(
-                "density_threshold",
-                expected="a finite number of at least 0, [1 / world unit]",
-                got=self.density_threshold,
-                remedy="Leave it out, and the training rays tell the threshold.",
-            )
+            if value is None and usual is None:
+                continue
+            number = isinstance(value, kind) and not isinstance(value, bool) and math.isfinite(value)
+            if not (number and low <= value <= high):
+                what = "a whole number" if kind is int else "a finite number"
+                most = "" if high == math.inf else f" to {high:g}"
+                option = f"--{name.replace('_', '-')}"
+                raise MeshError(
+                    name,
+                    expected=f"{what} from {low:g}{most}" if most else f"{what} of at least {low:g}",
+                    got=repr(value),
+                    remedy=f"Leave {option} out." if usual is None else f"Pass {option} {usual}, or leave it out.",
+                )
+        for name in ("voxel_optical_depth", "wall_thickness"):
+            value = getattr(self, name)
+            if value is not None:
+                check_positive(name, value, f"Leave --{name.replace('_', '-')} out.", MeshError)
         if self.interior not in get_args(InteriorKind):
-            raise MeshError(
-                "interior",
-                expected=" or ".join(get_args(InteriorKind)),
-                got=repr(self.interior),
-                remedy="Pass --interior solid.",
-            )
-        if self.wall_thickness is not None:
-            remedy = "Pass --wall-thickness 0.3, or leave it out to mesh what was seen."
-            check_positive("wall_thickness", self.wall_thickness, remedy, MeshError)
+            kinds = " or ".join(get_args(InteriorKind))
+            raise MeshError("interior", expected=kinds, got=repr(self.interior), remedy="Pass --interior solid.")
+
+
+_BOUNDS: dict[str, tuple[Any, float, float, float | None]] = {
+    "density_percentile": ((int, float), 0.0, 100.0, None),
+    "density_threshold": ((int, float), 0.0, math.inf, None),
+    "close_gaps": (int, 0, _WIDEST, 1),
+    "seal_openings": (int, 0, _WIDEST, 2),
+    "smallest_body": ((int, float), 0.0, 1.0, 0.01),
+}
+"""Type, least and most of options; what to pass instead, None for those that may be None."""
 
 
 @dataclass(frozen=True)

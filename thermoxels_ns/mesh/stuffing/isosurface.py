@@ -76,7 +76,7 @@ def stuff(level: npt.NDArray[np.floating], coarsest: int = 4) -> StuffedSolid:
     >>> [len(stuff(np.ones((30, 30, 30)), coarsest).tets) for coarsest in (1, 2, 4, 8)]
     [334800, 158208, 148848, 148800]
     """
-    _check_coarsest(coarsest)
+    check_coarsest("coarsest", coarsest, "Pass 4, or 1 for cells of one voxel throughout.")
     level = _checked(level)
     lattice = bcc_lattice(level)
     interior = coarse_interior(lattice, coarsest)
@@ -93,15 +93,11 @@ def stuff(level: npt.NDArray[np.floating], coarsest: int = 4) -> StuffedSolid:
     return StuffedSolid(nodes.points, tets, facets, on_surface, on_box)
 
 
-def _check_coarsest(coarsest: int) -> None:
-    whole = isinstance(coarsest, (int, np.integer)) and not isinstance(coarsest, bool)
-    if not (whole and coarsest >= 1 and coarsest & (coarsest - 1) == 0):
-        raise MeshError(
-            "coarsest",
-            expected="a power of two from 1 on, [voxels]",
-            got=repr(coarsest),
-            remedy="Pass 4, or 1 for cells of one voxel throughout.",
-        )
+def check_coarsest(name: str, value: int, remedy: str) -> None:
+    """Raise `MeshError` unless the largest edge of cells is a power of two."""
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not (whole and value >= 1 and value & (value - 1) == 0):
+        raise MeshError(name, expected="1, 2, 4, 8 or another power of two, [voxels]", got=repr(value), remedy=remedy)
 
 
 def _checked(level: npt.NDArray) -> npt.NDArray[np.floating]:
