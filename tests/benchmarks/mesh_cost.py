@@ -139,7 +139,7 @@ def measure(name: str, voxels: int, mode: str, repeats: int) -> dict:
     from thermoxels_ns.evaluation.surface_distance import sample_facets
     from thermoxels_ns.mesh.build import MeshOptions, build_mesh
     from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas
-from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
+    from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
     from thermoxels_ns.mesh.solid.voxels import SolidSelection
 
     body = BODIES[name]()

@@ -7,9 +7,9 @@ import pytest
 
 from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.mesh.solid import interior as interior_module
 from thermoxels_ns.mesh.solid.interior import interior
 from thermoxels_ns.mesh.solid.morphology import convex_hull, fill_enclosed
-from thermoxels_ns.mesh.solid.voxels import interior as interior_module
 
 N = 24
 LATTICE = Lattice((0.0, 0.0, 0.0), 1.0, (N + 1, N + 1, N + 1))

@@ -190,7 +190,7 @@ def test_buried_points_are_those_with_larger_cubes_all_around():
 @pytest.mark.parametrize("bad", [0, 3, 6, -2, 2.0, True, None, "4"])
 def test_edges_that_are_no_power_of_two(bad):
     with pytest.raises(
-        MeshError, match=r"coarsest: expected a power of two from 1 on, \[voxels\], got .* Pass 4, or 1"
+        MeshError, match=r"coarsest: expected 1, 2, 4, 8 or another power of two, \[voxels\], got .* Pass 4, or 1"
     ):
         stuff(np.ones((3, 3, 3)), coarsest=bad)
 
