@@ -9,7 +9,7 @@ from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.evaluation.voxel_accuracy import SeenScore, boundary_samples, surface_fscore
+from thermoxels_ns.evaluation.voxel_accuracy import SeenScore, surface_fscore
 
 
 class Sphere:
@@ -118,18 +118,6 @@ def test_lattice_is_mapped_into_truth_coordinates():
         surface_fscore(voxels(SPHERE), LATTICE, shape, seen, TOLERANCE, np.zeros((4, 4)))
 
 
-def test_samples_of_one_voxel():
-    cells = np.zeros((3, 3, 2), dtype=bool)
-    cells[1, 1, 1] = True
-    points, on_border = boundary_samples(cells)
-    assert len(points) == 24
-    assert np.all(points[on_border][:, 2] == 2.0)
-    assert on_border.sum() == 4
-    bottom = points[points[:, 2] == 1.0]
-    assert sorted(map(tuple, bottom[:, :2])) == [(1.25, 1.25), (1.25, 1.75), (1.75, 1.25), (1.75, 1.75)]
-    assert len(boundary_samples(cells, per_side=3)[0]) == 54
-
-
 def test_bad_input_is_refused():
     with pytest.raises(MeshError, match="cells: expected shape"):
         surface_fscore(np.ones((2, 2, 2), dtype=bool), LATTICE, SPHERE, SEEN, TOLERANCE)
@@ -192,6 +180,6 @@ def test_without_cameras_nothing_is_said_about_what_they_see():
     few = looking_at((0.0, 0.0, 0.0), [(0.0, 0.0, 6.0), (0.1, 0.0, 6.0)])  # fewer than three
     score = surface_fscore(voxels(SPHERE), LATTICE, SPHERE, SEEN, TOLERANCE, views=few)
     assert score.fscore == 1.0
-    assert score.seen == SeenScore(share=0.0, precision=0.0, recall=0.0, fscore=0.0)
+    assert score.seen == SeenScore(precision=0.0, recall=0.0, fscore=0.0, share=0.0)
     for cells in (np.zeros(LATTICE.cell_shape, bool), np.ones(LATTICE.cell_shape, bool)):
         assert surface_fscore(cells, LATTICE, SPHERE, SEEN, TOLERANCE, views=few).seen == score.seen

@@ -1,7 +1,4 @@
-"""What ns-eval says about geometry: how opaque rays are, and for a known truth how well the exported surface fits.
-
-Pictures can be right while the surface is fog. These figures stand beside PSNR and temperature errors.
-"""
+"""Geometry figures of ns-eval: opacity of rays, and agreement with a known truth."""
 
 from __future__ import annotations
 

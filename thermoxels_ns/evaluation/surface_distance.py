@@ -1,4 +1,4 @@
-"""How far a mesh's surface and a true surface are apart, and how their temperatures differ."""
+"""Distances between a mesh's surface and a true surface, and temperatures where they meet."""
 
 from __future__ import annotations
 

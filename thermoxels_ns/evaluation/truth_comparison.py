@@ -1,4 +1,4 @@
-"""How well a reconstruction agrees with a synthetic scene, whose shape and temperature are known exactly."""
+"""Comparison of a reconstruction with a synthetic scene, whose shape and temperature are known."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.build import apply_transform, check_similarity
-from thermoxels_ns.mesh.solid.free_space import look
+from thermoxels_ns.mesh.solid.free_space import count_cameras
 from thermoxels_ns.mesh.solid.morphology import fill_enclosed
 
 MIN_VIEWS = 3
@@ -36,7 +36,17 @@ class TrueShape(Protocol):
 
 
 @dataclass(frozen=True)
-class SeenScore:
+class _Score:
+    precision: float
+    """Share of the reconstructed boundary within the tolerance of the true surface, 0 to 1; 0 if there is none."""
+    recall: float
+    """Share of the true surface that cameras see within the tolerance of the reconstructed boundary, 0 to 1."""
+    fscore: float
+    """Harmonic mean of precision and recall; 0 if both are."""
+
+
+@dataclass(frozen=True)
+class SeenScore(_Score):
     """Agreement of the part of a reconstructed surface that cameras see with the true one.
 
     Against the whole surface's score it tells what photographs could have shown from what was guessed behind it.
@@ -44,24 +54,12 @@ class SeenScore:
 
     share: float
     """Share of the reconstructed boundary that at least `MIN_VIEWS` cameras see, 0 to 1."""
-    precision: float
-    """Share of that part within the tolerance of the true surface, 0 to 1; 0 if there is none."""
-    recall: float
-    """Share of the true surface that cameras see within the tolerance of that part, 0 to 1."""
-    fscore: float
-    """Harmonic mean of precision and recall; 0 if both are."""
 
 
 @dataclass(frozen=True)
-class SurfaceScore:
+class SurfaceScore(_Score):
     """Agreement of a reconstructed surface with the true one."""
 
-    precision: float
-    """Share of the reconstructed boundary within the tolerance of the true surface, 0 to 1; 0 if there is none."""
-    recall: float
-    """Share of the true surface that cameras see within the tolerance of the reconstructed boundary, 0 to 1."""
-    fscore: float
-    """Harmonic mean of precision and recall; 0 if both are."""
     mean_distance: float | None
     """Mean distance of the reconstructed boundary to the true surface, [truth units]; None without a boundary."""
     seen: SeenScore | None = None
@@ -115,7 +113,7 @@ def surface_fscore(
 
     solid = fill_enclosed(cells)
     faces = _boundary_faces(solid)
-    samples, on_border = _samples(faces, per_side=_PER_SIDE)
+    samples, on_border = _samples(faces)
     of_seen = None if views is None else SeenScore(share=0.0, precision=0.0, recall=0.0, fscore=0.0)
     if len(samples) == 0:
         return SurfaceScore(precision=0.0, recall=0.0, fscore=0.0, mean_distance=None, seen=of_seen)
@@ -127,7 +125,7 @@ def surface_fscore(
     distance = np.abs(truth.signed_distance(inner))
     precision = float(np.mean(distance <= tolerance))
     if views is not None and len(views.focal):
-        free = look(solid, lattice, views).free >= MIN_VIEWS
+        free = count_cameras(solid, lattice, views).free >= MIN_VIEWS
         shown = np.concatenate([free[tuple(f.empty[~f.on_border].T)] for f in faces]).repeat(_PER_SIDE**2)
         of_seen = _seen_score(inner[shown], distance[shown] <= tolerance, float(shown.mean()), seen, tolerance)
     return SurfaceScore(
@@ -150,28 +148,12 @@ def _seen_score(
         return SeenScore(share=0.0, precision=0.0, recall=0.0, fscore=0.0)
     precision = float(agrees.mean())
     recall = float(np.mean(KDTree(samples).query(true_points)[0] <= tolerance))
-    return SeenScore(share, precision, recall, _harmonic_mean(precision, recall))
+    return SeenScore(precision, recall, _harmonic_mean(precision, recall), share)
 
 
 def _harmonic_mean(precision: float, recall: float) -> float:
     total = precision + recall
     return 2.0 * precision * recall / total if total > 0.0 else 0.0
-
-
-def boundary_samples(
-    cells: npt.NDArray[np.bool_], per_side: int = _PER_SIDE
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
-    """Sample the voxel faces between solid and empty on a regular grid of `per_side`^2 points each.
-
-    Args:
-        cells: Solid voxels, shape (nx-1, ny-1, nz-1).
-        per_side: Points along each side of a face, at least 1.
-
-    Returns:
-        points: Fractional corner indices, shape (n, 3).
-        on_border: True where the face lies on the border of the lattice, shape (n,).
-    """
-    return _samples(_boundary_faces(np.asarray(cells, dtype=bool)), per_side)
 
 
 @dataclass(frozen=True)
@@ -201,13 +183,14 @@ def _boundary_faces(cells: npt.NDArray[np.bool_]) -> tuple[_Faces, ...]:
     return tuple(faces)
 
 
-def _samples(faces: tuple[_Faces, ...], per_side: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
-    steps = (np.arange(per_side) + 0.5) / per_side
+def _samples(faces: tuple[_Faces, ...]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+    """Corner indices of `_PER_SIDE`^2 points on a regular grid of each face, and which lie on the lattice's border."""
+    steps = (np.arange(_PER_SIDE) + 0.5) / _PER_SIDE
     points, borders = [], []
     for face in faces:
         u, v = (a for a in range(3) if a != face.axis)
-        offsets = np.zeros((per_side, per_side, 3))
+        offsets = np.zeros((_PER_SIDE, _PER_SIDE, 3))
         offsets[..., u], offsets[..., v] = steps[:, None], steps[None, :]
         points.append((face.corner[:, None, :] + offsets.reshape(1, -1, 3)).reshape(-1, 3))
-        borders.append(np.repeat(face.on_border, per_side**2))
+        borders.append(np.repeat(face.on_border, _PER_SIDE**2))
     return np.concatenate(points), np.concatenate(borders)

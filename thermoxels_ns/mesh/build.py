@@ -1,4 +1,4 @@
-"""From a trained field to a tetrahedral mesh in metres, with temperatures and a tagged boundary."""
+"""From a trained field to a tagged tetrahedral mesh with temperatures, in metres."""
 
 from __future__ import annotations
 

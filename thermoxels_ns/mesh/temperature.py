@@ -1,4 +1,4 @@
-"""Temperatures for the nodes that no thermal ray saw: the smoothest field that agrees with those it did see."""
+"""Temperatures at mesh nodes: interpolated where measured, harmonic elsewhere."""
 
 from __future__ import annotations
 
@@ -13,6 +13,15 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
 from thermoxels_ns.mesh.quality.face_count import TET_EDGES
 from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
+
+MIN_OBSERVED_WEIGHT = 0.5
+"""A node counts as measured if thermal rays, all together, gave it at least half of one fully absorbed ray.
+Less is leakage through a surface or the tail of an interpolation, and its temperature is mostly the starting value."""
+_DIRECT_SOLVE_UNKNOWNS = 4000
+_RELATIVE_RESIDUAL = 1e-7
+_MOST_ROUNDS = 100_000
+_LEAST_CONDUCTANCE = 1e-6
+"""Share of the mean conductance that every edge has at least: it keeps the matrix an M-matrix, and parts connected."""
 
 
 def interpolate_corners(
@@ -62,17 +71,6 @@ def interpolate_corners(
     assert first is not None
     divisor = np.where(weight > 0.0, weight, 1.0)[trailing]
     return first + total / divisor, weight
-
-
-MIN_OBSERVED_WEIGHT = 0.5
-"""A node counts as measured if thermal rays, all together, gave it at least half of one fully absorbed ray.
-Less is leakage through a surface or the tail of an interpolation, and its temperature is mostly the starting value."""
-
-_DIRECT_SOLVE_UNKNOWNS = 4000
-_RELATIVE_RESIDUAL = 1e-7
-_MOST_ROUNDS = 100_000
-_LEAST_CONDUCTANCE = 1e-6
-"""Share of the mean conductance that every edge has at least: it keeps the matrix an M-matrix, and parts connected."""
 
 
 def extend_harmonically(

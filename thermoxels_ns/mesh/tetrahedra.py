@@ -1,4 +1,4 @@
-"""The tetrahedral mesh that crosses the wall from the mesher to the heat solver and the file writers."""
+"""The tetrahedral mesh that the heat solver and the file writers get."""
 
 from __future__ import annotations
 

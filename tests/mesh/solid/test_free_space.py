@@ -8,7 +8,7 @@ import pytest
 from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.mesh.solid.free_space import MOST_CAMERAS, Sight, look
+from thermoxels_ns.mesh.solid.free_space import MOST_CAMERAS, CameraCounts, count_cameras
 
 LATTICE = Lattice((-1.0, -1.0, -1.0), 0.125, (17, 17, 17))
 
@@ -78,59 +78,63 @@ def test_counts_are_those_of_straight_lines_of_sight(eye):
     cells[2:5, 2:5, 10:13] = True
     views = looking_at((0.0, 0.0, 0.0), eye)
     held, free, close = sight_by_lines(cells, LATTICE, views)
-    sight = look(cells, LATTICE, views)
+    counts = count_cameras(cells, LATTICE, views)
     clear = close == 0
     assert clear.mean() > 0.5 and len(np.unique(free[clear])) == 2
-    assert np.array_equal(sight.in_image[clear], held[clear])
-    assert np.array_equal(sight.free[clear], free[clear])
-    assert np.mean(sight.free != free) < 0.05  # along edges it is a matter of a fraction of a voxel
+    assert np.array_equal(counts.in_image[clear], held[clear])
+    assert np.array_equal(counts.free[clear], free[clear])
+    assert np.mean(counts.free != free) < 0.05  # along edges it is a matter of a fraction of a voxel
 
 
 def test_every_voxel_is_counted_once_by_a_camera_on_a_diagonal_of_the_lattice():
     empty = np.zeros(LATTICE.cell_shape, dtype=bool)
     for eye in ((2.0, 2.0, 2.0), (0.0, 0.0, 0.0), (0.07, 0.07, 0.07), (-3.0, 0.0, 3.0)):
         target = (0.5, 0.0, 0.0) if not any(eye) else (0.0, 0.0, 0.0)
-        sight = look(empty, LATTICE, looking_at(target, eye, focal=1.0, size=2000))
+        counts = count_cameras(empty, LATTICE, looking_at(target, eye, focal=1.0, size=2000))
         to_voxel, ahead = LATTICE.cell_centres() - eye, np.asarray(target) - eye
         cosine = to_voxel @ ahead / (np.linalg.norm(to_voxel, axis=-1) * np.linalg.norm(ahead))
-        assert (sight.in_image[cosine > 0.2] == 1).all() and (sight.in_image[cosine < -0.2] == 0).all(), eye
-        assert sight.in_image.max() == 1
-        assert np.array_equal(sight.free, sight.in_image)
+        assert (counts.in_image[cosine > 0.2] == 1).all() and (counts.in_image[cosine < -0.2] == 0).all(), eye
+        assert counts.in_image.max() == 1
+        assert np.array_equal(counts.free, counts.in_image)
 
 
 def test_a_wall_hides_what_is_behind_it_and_is_seen_itself():
     cells = np.zeros(LATTICE.cell_shape, dtype=bool)
     cells[8] = True
-    sight = look(cells, LATTICE, looking_at((0, 0, 0), (3.0, 0.0, 0.0)))
-    assert (sight.free[8:] == 1).all() and (sight.free[:8] == 0).all()
-    assert sight.seen[8:].all() and sight.hidden[:8].all()
+    counts = count_cameras(cells, LATTICE, looking_at((0, 0, 0), (3.0, 0.0, 0.0)))
+    assert (counts.free[8:] == 1).all() and (counts.free[:8] == 0).all()
+    assert counts.seen[8:].all() and counts.hidden[:8].all()
 
 
 def test_what_no_image_holds_is_neither_seen_nor_hidden():
-    sight = look(np.zeros(LATTICE.cell_shape, dtype=bool), LATTICE, looking_at((0, 0, 0), (3.0, 0, 0), focal=2000.0))
-    outside = sight.in_image == 0
-    assert outside.mean() > 0.5 and not (sight.seen | sight.hidden)[outside].any() and sight.seen[~outside].all()
+    counts = count_cameras(
+        np.zeros(LATTICE.cell_shape, dtype=bool), LATTICE, looking_at((0, 0, 0), (3.0, 0, 0), focal=2000.0)
+    )
+    outside = counts.in_image == 0
+    assert outside.mean() > 0.5 and not (counts.seen | counts.hidden)[outside].any() and counts.seen[~outside].all()
 
 
 def test_a_floater_on_the_camera_does_not_blind_it():
     cells = np.zeros(LATTICE.cell_shape, dtype=bool)
     eye = (0.05, 0.05, 0.93)
     cells[7:10, 7:10, 14:] = True
-    sight = look(cells, LATTICE, looking_at((0, 0, 0), eye))
-    assert sight.free[8, 8, 4] == 1
+    counts = count_cameras(cells, LATTICE, looking_at((0, 0, 0), eye))
+    assert counts.free[8, 8, 4] == 1
     cells[7:10, 7:10, 12] = True
-    assert look(cells, LATTICE, looking_at((0, 0, 0), eye)).free[8, 8, 4] == 0
+    assert count_cameras(cells, LATTICE, looking_at((0, 0, 0), eye)).free[8, 8, 4] == 0
 
 
 def test_one_camera_in_ten_must_see_a_voxel():
     in_image = np.array([0, 1, 1, 10, 10, 11, 40, 40], dtype=np.uint8)
     free = np.array([0, 0, 1, 0, 1, 1, 3, 4], dtype=np.uint8)
-    sight = Sight(in_image, free)
-    assert sight.seen.tolist() == [False, False, True, False, True, False, False, True]
-    assert sight.hidden.tolist() == [False, True, False, True, False, True, True, False]
+    counts = CameraCounts(in_image, free)
+    assert counts.seen.tolist() == [False, False, True, False, True, False, False, True]
+    assert counts.hidden.tolist() == [False, True, False, True, False, True, True, False]
 
 
 def test_many_cameras_are_thinned_out():
     eyes = np.column_stack((np.full(300, 3.0), np.linspace(-1, 1, 300), np.zeros(300)))
-    sight = look(np.zeros((4, 4, 4), dtype=bool), Lattice((-1, -1, -1), 0.5, (5, 5, 5)), looking_at((0, 0, 0), eyes))
-    assert (sight.in_image == MOST_CAMERAS).all() and (sight.free == MOST_CAMERAS).all()
+    counts = count_cameras(
+        np.zeros((4, 4, 4), dtype=bool), Lattice((-1, -1, -1), 0.5, (5, 5, 5)), looking_at((0, 0, 0), eyes)
+    )
+    assert (counts.in_image == MOST_CAMERAS).all() and (counts.free == MOST_CAMERAS).all()

@@ -1,4 +1,4 @@
-"""Patches of boundary triangles and regions of tetrahedra: by where they face, and by a user's rules."""
+"""Patches of boundary triangles and regions of tetrahedra, default ones and a user's."""
 
 from __future__ import annotations
 

@@ -17,8 +17,15 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 UNTAGGED_PATCH = "boundary"
 """Name of the one patch that a mesh without tags is written with."""
-
 _REMEDY = "Build the mesh with thermoxels_ns.mesh.build."
+Colouring = Literal["temperature", "photographs"]
+"""What the colours of a surface show: temperatures through a colour map, or what the photographs saw."""
+COLOUR_MAP = "inferno"
+"""Colour map of temperatures: perceptually uniform, readable in grey."""
+_DARKEST = 0.1
+"""Share of the colour map left out at its dark end, where shading could not be told from cold."""
+_FAR_SIZES = 16.0
+"""Farther from the origin than this many times their own size, points lose in single precision what is seen of them."""
 
 
 @dataclass(frozen=True)
@@ -160,20 +167,6 @@ def _check_names(name: str, names: Sequence[str]) -> None:
             )
     if len(set(names)) != len(names) or not names:
         raise MeshError(name, expected="at least one name, all different", got=list(names), remedy="Rename them.")
-
-
-Colouring = Literal["temperature", "photographs"]
-"""What the colours of a surface show: temperatures through a colour map, or what the photographs saw."""
-
-COLOUR_MAP = "inferno"
-"""Colour map of temperatures: perceptually uniform, readable in grey."""
-
-_DARKEST = 0.1
-"""Share of the colour map left out at its dark end, where shading could not be told from cold."""
-
-
-_FAR_SIZES = 16.0
-"""Farther from the origin than this many times their own size, points lose in single precision what is seen of them."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The file formats that a mesh can be written in, by the ending of the file's name."""
+"""The mesh file formats, by the ending of the file's name."""
 
 from __future__ import annotations
 

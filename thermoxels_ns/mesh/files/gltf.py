@@ -1,4 +1,4 @@
-"""The surface of a mesh as binary glTF (.glb), which browsers, phones and office programs show."""
+"""The surface of a mesh as binary glTF (.glb), for browsers and phones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Read a mesh back from the files that an export wrote: the body (.vtu) and its tagged boundary (.vtp)."""
+"""Read a mesh back from the .vtu and .vtp files that an export wrote."""
 
 from __future__ import annotations
 

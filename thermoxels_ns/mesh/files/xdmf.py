@@ -1,4 +1,4 @@
-"""Meshes as XDMF with HDF5, which FEniCSx reads with its tags and ParaView with its temperatures."""
+"""Meshes as XDMF with HDF5 data, for FEniCSx and ParaView."""
 
 from __future__ import annotations
 

@@ -11,7 +11,6 @@ from scipy import sparse
 from thermoxels_ns.core.errors import MeshError
 
 IntArray = npt.NDArray[np.int64]
-
 OUTWARD_FACES: IntArray = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
 """Faces of a positively oriented tetrahedron; face f lies opposite node f, its right-hand normal points outwards."""
 TET_EDGES: IntArray = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]], dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Shapes of tetrahedra: volumes, angles between faces, radius ratios and what they add to the stiffness matrix."""
+"""Shapes of tetrahedra: volumes, dihedral angles, radius ratios and stiffness entries."""
 
 from __future__ import annotations
 

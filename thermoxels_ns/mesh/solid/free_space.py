@@ -1,4 +1,4 @@
-"""Which voxels the training cameras look at, and how many of them get there before something solid."""
+"""How many training cameras see each voxel."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ CLEAR_OF_CAMERA = 1.5
 
 
 @dataclass(frozen=True)
-class Sight:
-    """How cameras look at voxels."""
+class CameraCounts:
+    """How many cameras see each voxel."""
 
     in_image: npt.NDArray[np.uint8]
     """Number of cameras whose image holds the voxel's centre, shape `lattice.cell_shape`."""
@@ -41,7 +41,7 @@ class Sight:
         return (self.in_image > 0) & ~self.seen
 
 
-def look(cells: BoolArray, lattice: Lattice, views: Views) -> Sight:
+def count_cameras(cells: BoolArray, lattice: Lattice, views: Views) -> CameraCounts:
     """Count the cameras that see each voxel.
 
     Around each camera stand six pyramids, one per side of the lattice. In each of them, rays that lie one voxel apart
@@ -68,9 +68,9 @@ def look(cells: BoolArray, lattice: Lattice, views: Views) -> Sight:
         counts = np.zeros(passes.shape, dtype=np.uint16)
         for camera in cameras:
             for sign in (1, -1):
-                _look_along(passes, blocks, counts, camera, order, sign)
+                _count_along(passes, blocks, counts, camera, order, sign)
         both += counts.transpose(np.argsort(order))
-    return Sight((both % _FREE).astype(np.uint8), (both // _FREE).astype(np.uint8))
+    return CameraCounts((both % _FREE).astype(np.uint8), (both // _FREE).astype(np.uint8))
 
 
 _HELD, _FREE = np.uint16(1), np.uint16(256)
@@ -104,7 +104,7 @@ class _Camera:
         return ahead & (x >= 0) & (x <= self.size[0]) & (y >= 0) & (y <= self.size[1])
 
 
-def _look_along(
+def _count_along(
     passes: npt.NDArray[np.uint16],
     blocks: BoolArray,
     counts: npt.NDArray[np.uint16],

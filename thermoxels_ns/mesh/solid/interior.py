@@ -1,4 +1,4 @@
-"""Empty space that belongs to a solid: cavities, and what cameras cannot look into."""
+"""The inside of bodies: cavities, space that no camera sees, walls behind seen surfaces."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ from scipy.spatial import KDTree
 
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
-from thermoxels_ns.mesh.solid.free_space import Sight, look
+from thermoxels_ns.mesh.solid.free_space import count_cameras
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected, grow
 
 BoolArray = npt.NDArray[np.bool_]
-
 LARGEST_PASS = 4_000_000
 """Lattices with more voxels than this are looked at in blocks of 2^3, 4^3, ... voxels."""
 SHADOW_SURROUNDED = 0.1
@@ -25,10 +24,14 @@ SHADOW_SURROUNDED = 0.1
 behind a surface seen from one side only it is up to one half; in the shadow before a wall it is 0 or less."""
 CREVICE_SURROUNDED = 0.3
 """The same for space that only the filled inside hides: holes of the shell let cameras see it, so it needs more."""
-
 STRAY_SHARE = 0.005
 """Share of a body's solid voxels that may lie beyond each side of the box that bounds its hull: a few strays below a
 slab would make the underside that no camera sees as deep as the deepest of them."""
+_fast_length = cast(Callable[[int], int], fft.next_fast_len)
+MARGIN = 0.25
+"""The potential is zero this share of the lattice's size beyond it, on each side."""
+THINNEST_GROWN = 1.5
+"""A wall thinner than this has the middle of no voxel behind the seen one, so none is added, [voxels]."""
 
 
 @dataclass(frozen=True)
@@ -133,9 +136,9 @@ def _hidden(sealed: BoolArray, lattice: Lattice, views: Views, seal: int) -> Boo
 
 
 def _behind(cells: BoolArray, lattice: Lattice, views: Views, surrounded: float) -> BoolArray:
-    """Voxels that are not seen and that seen surfaces surround at least so far."""
-    sight = look(cells, lattice, views)
-    return sight.hidden & (winding_number(cells, sight.seen & ~cells) >= surrounded)
+    """Voxels that are not seen and whose winding number in the seen surfaces is at least `surrounded`."""
+    counts = count_cameras(cells, lattice, views)
+    return counts.hidden & (winding_number(cells, counts.seen & ~cells) >= surrounded)
 
 
 def _hidden_in_blocks(sealed: BoolArray, lattice: Lattice, views: Views, seal: int, block: int) -> BoolArray:
@@ -177,14 +180,6 @@ def _without_strays(body: BoolArray) -> BoolArray:
         inner = (np.cumsum(layers) > most) & (np.cumsum(layers[::-1])[::-1] > most)
         kept = kept & np.expand_dims(inner, tuple(other for other in range(3) if other != axis))
     return kept
-
-
-BoolArray = npt.NDArray[np.bool_]
-
-_fast_length = cast(Callable[[int], int], fft.next_fast_len)
-
-MARGIN = 0.25
-"""The potential is zero this share of the lattice's size beyond it, on each side."""
 
 
 def winding_number(solid: BoolArray, air: BoolArray) -> npt.NDArray[np.float32]:
@@ -246,13 +241,6 @@ def _jumps(side: npt.NDArray[np.int8], axis: int) -> npt.NDArray[np.float32]:
     return total
 
 
-BoolArray = npt.NDArray[np.bool_]
-
-
-THINNEST_GROWN = 1.5
-"""A wall thinner than this has the middle of no voxel behind the seen one, so none is added, [voxels]."""
-
-
 def wall_behind(cells: BoolArray, lattice: Lattice, views: Views, thickness: float) -> BoolArray:
     """Find the voxels that make the seen surface as thick as a wall.
 
@@ -270,21 +258,17 @@ def wall_behind(cells: BoolArray, lattice: Lattice, views: Views, thickness: flo
     Returns:
         The voxels to add, shape `lattice.cell_shape`; none of them is in `cells`.
     """
-    sight = look(cells, lattice, views)
-    return _grown(cells, sight, thickness)
-
-
-def _grown(cells: BoolArray, sight: Sight, thickness: float) -> BoolArray:
     added = np.zeros_like(cells)
     # The middle of a surface voxel lies half a voxel below its face, that of the last one half a voxel before the end.
     reach = thickness - 0.5
-    seen = sight.seen
+    seen = count_cameras(cells, lattice, views).seen
     surface = np.argwhere(cells & seen & grow(seen & ~cells, 1))
     if thickness < THINNEST_GROWN or len(surface) == 0:
         return added
     closed = ~seen | cells
-    near = grow(_at(surface, cells.shape), int(reach)) & closed & ~cells
-    candidates = np.argwhere(near)
+    near = np.zeros_like(cells)
+    near[tuple(surface.T)] = True
+    candidates = np.argwhere(grow(near, int(reach)) & closed & ~cells)
     distance, nearest = KDTree(surface).query(candidates, distance_upper_bound=reach + 1e-6)
     found = np.isfinite(distance)
     candidates, start = candidates[found], surface[np.asarray(nearest)[found]]
@@ -296,9 +280,3 @@ def _grown(cells: BoolArray, sight: Sight, thickness: float) -> BoolArray:
         free &= closed[tuple(between.T)]
     added[tuple(candidates[free].T)] = True
     return added
-
-
-def _at(index: npt.NDArray[np.int64], shape: tuple[int, ...]) -> BoolArray:
-    cells = np.zeros(shape, dtype=bool)
-    cells[tuple(index.T)] = True
-    return cells

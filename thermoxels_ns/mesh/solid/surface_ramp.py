@@ -1,9 +1,4 @@
-"""Where density falls smoothly across the surface, it says to a fraction of a voxel where that is.
-
-On its way from inside to outside density passes the threshold. If it does so along a smooth ramp over a few voxels, a
-function of it that is linear in the distance is a level that needs no smoothing, and smoothing only rounds edges and
-shifts curved surfaces. If it jumps from one voxel to the next, or is noisy, there is no such function.
-"""
+"""A level that is linear in the distance, where density falls smoothly across the surface."""
 
 from __future__ import annotations
 
@@ -59,6 +54,9 @@ def surface_ramp(
     density: npt.NDArray[np.floating], threshold: float, deep_ratio: float, dense: BoolArray, cells: BoolArray
 ) -> SurfaceRamp | None:
     """Look for a smooth ramp of density across the surface.
+
+    Where density passes the threshold along a smooth ramp over a few voxels, a function of it that is linear in the
+    distance is a level that needs no smoothing. Where it jumps, or is noisy, there is no such function.
 
     Two functions of the density are tried: its logarithm, linear where density is exponential in the distance, and
     density itself, linear where it falls off evenly or is a blurred step whose half is the threshold. The one that

@@ -1,4 +1,4 @@
-"""From which density on a voxel is solid: four rules, each of which says what it chose and why."""
+"""Density thresholds that tell solid voxels from empty ones: four rules."""
 
 from __future__ import annotations
 

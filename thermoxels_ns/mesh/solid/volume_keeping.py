@@ -1,8 +1,4 @@
-"""Smoothing that keeps volume: thin and small bodies would shrink, narrow gaps would close.
-
-A level of -1 and 1 smoothed over three voxels has its zero where it should be on flat walls, but moves inwards at
-convex edges; of a bar one voxel thick a third would be left. What is missing around is made up by a shift of the level.
-"""
+"""Smoothing that keeps the volume of thin and small bodies and of narrow gaps."""
 
 from __future__ import annotations
 
@@ -52,6 +48,9 @@ _WINDOW = np.array([0.25, 0.5, 0.25], dtype=np.float32)[_AROUND + 1].prod(axis=1
 
 def keep_volume(level: FloatArray, sharp: FloatArray, least: FloatArray, cells: BoolArray) -> FloatArray:
     """Shift a smoothed level until around every voxel about as much is solid as the level before smoothing has it.
+
+    A level of -1 and 1 smoothed over three voxels has its zero where it should be on flat walls, but inside it at
+    convex edges; of a bar one voxel thick a third would be left.
 
     Of each voxel near the surface, the solid share is taken from the trilinear level, and from where the sharp level
     changes its sign along the axes. Their differences, averaged with weights 1 4 6 4 1 along each axis and divided by

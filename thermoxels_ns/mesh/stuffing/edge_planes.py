@@ -1,4 +1,4 @@
-"""The planes that a surface has beside the chamfers that isosurface stuffing makes of sharp edges."""
+"""The planes of a surface beside the chamfers that isosurface stuffing leaves at edges."""
 
 from __future__ import annotations
 

@@ -8,10 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.mesh.solid.morphology import bounding_box
+from thermoxels_ns.mesh.solid.morphology import bounding_box, grow
 from thermoxels_ns.mesh.stuffing.bcc_lattice import BccLattice
 
 BoolArray = npt.NDArray[np.bool_]
+# The sides of a face lie between its corners 0-1, 1-2, 2-3 and 3-0, counter-clockwise seen from where its axis points.
+_CORNERS = np.array([[0, 0, 0], [0, 1, 0], [0, 1, 1], [0, 0, 1]])
+_OUTWARD = np.array([[0, 0, -1], [0, 1, 0], [0, 0, 1], [0, -1, 0]])
 
 
 def eroded(cells: BoolArray, by: int) -> BoolArray:
@@ -22,17 +25,8 @@ def eroded(cells: BoolArray, by: int) -> BoolArray:
     >>> np.count_nonzero(eroded(np.ones((5, 5, 5), dtype=bool), 1))
     27
     """
-    for axis in range(3):
-        row = np.moveaxis(cells, axis, 0)
-        width, end = 1, 2 * by + 1
-        # From here on an entry stands for the `width` voxels that begin with it.
-        while width < end:
-            step = min(width, end - width)
-            row = row[:-step] & row[step:]
-            width += step
-        cells = np.zeros_like(cells)
-        np.moveaxis(cells, axis, 0)[by : by + len(row)] = row
-    return cells
+    grown = grow(np.pad(~cells, by, constant_values=True), by)
+    return ~grown[by:-by, by:-by, by:-by]
 
 
 def balanced_octree(cells: BoolArray, largest: int) -> tuple[BoolArray, ...]:
@@ -80,11 +74,6 @@ def _all_of_eight(level: BoolArray) -> BoolArray:
         row = np.moveaxis(level, axis, 0)
         level = np.moveaxis(row[0::2] & row[1::2], 0, axis)
     return level
-
-
-# The sides of a face lie between its corners 0-1, 1-2, 2-3 and 3-0, counter-clockwise seen from where its axis points.
-_CORNERS = np.array([[0, 0, 0], [0, 1, 0], [0, 1, 1], [0, 0, 1]])
-_OUTWARD = np.array([[0, 0, -1], [0, 1, 0], [0, 0, 1], [0, -1, 0]])
 
 
 @dataclass(frozen=True)

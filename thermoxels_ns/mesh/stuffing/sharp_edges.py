@@ -1,9 +1,4 @@
-"""Win back the sharp edges that isosurface stuffing cuts off.
-
-Stuffing sees the level at lattice points only, so where two planes of the surface meet it leaves a chamfer about half
-a voxel wide. A voxel away the planes are right again: nodes of the chamfer move to where they meet. Only positions of
-surface nodes change.
-"""
+"""Moves the nodes of chamfers back to the sharp edges that isosurface stuffing cuts off."""
 
 from __future__ import annotations
 
@@ -48,6 +43,9 @@ _ONE_CORNER = 0.5
 
 def sharpen(solid: StuffedSolid, shape: tuple[int, ...]) -> StuffedSolid:
     """Move nodes of chamfers to the edge or corner where the planes of the surface beside them meet.
+
+    Stuffing sees the level at lattice points only, so where two planes of the surface meet it leaves a chamfer about
+    half a voxel wide. A voxel away the planes are right again. Only positions of surface nodes change.
 
     Planes come from the flat parts of the surface within three voxels, never from the chamfer: the triangles there
     are sorted by their normals into at most three planes. Where it is not clear that there are two or three of them,
