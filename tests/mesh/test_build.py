@@ -111,15 +111,6 @@ def test_extension_conducts_like_the_voxels_do(snapshot_of):
     assert thin == pytest.approx(4 * wide, rel=1e-6)
 
 
-def test_weight_zero_is_never_a_measurement(snapshot_of):
-    weight = np.ones((3, 3, 3))
-    weight[1, 1, 1] = 0.0
-    mesh = build_mesh(
-        snapshot_of(np.ones((3, 3, 3)), 20.0, weight), DENSE, np.eye(4), MeshOptions("voxel", min_observed_weight=0.0)
-    ).mesh
-    assert mesh.observed.sum() == 26
-
-
 def test_body_no_thermal_ray_saw_is_refused(snapshot_of):
     with pytest.raises(MeshError, match="at least one node seen by a thermal ray"):
         build_mesh(snapshot_of(np.ones((3, 3, 3)), 20.0, 0.0), DENSE, np.eye(4))
@@ -168,13 +159,6 @@ def test_rules_without_effect_are_named(snapshot_of, mode):
     built = build_mesh(carved(snapshot_of), DENSE, np.eye(4), MeshOptions(mode, rules=rules))
     assert built.idle_rules == ("patch typo (entry 2)", "region pipe (entry 1)")
     assert build_mesh(carved(snapshot_of), DENSE, np.eye(4), MeshOptions(mode)).idle_rules == ()
-
-
-def test_solid_that_touches_the_border_is_tagged(snapshot_of):
-    mesh = build_mesh(carved(snapshot_of), DENSE, similarity(1.0, rotation(4)), VOXEL).mesh
-    quality = check_mesh(mesh)
-    assert 0 < quality.num_box_facets < quality.num_facets
-    assert np.count_nonzero(mesh.facet_tags == FACET_BOX) == quality.num_box_facets
 
 
 @pytest.mark.parametrize(

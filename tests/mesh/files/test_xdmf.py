@@ -52,12 +52,6 @@ def test_tags_come_first_and_their_names_are_in_the_file(tmp_path, tagged_mesh):
     assert grids[FACET_GRID].find("Information").get("Value") == names
 
 
-def test_other_temperatures_replace_the_meshs_own(tmp_path, box_mesh):
-    write_xdmf(tmp_path / "box.xdmf", box_mesh, temperature_c=box_mesh.temperature_c - 5.0)
-    grids = read_grids(tmp_path / "box.xdmf")
-    assert np.array_equal(grids[BODY_GRID].point_data["temperature_c"], box_mesh.temperature_c - 5.0)
-
-
 def test_the_data_file_holds_no_times_of_day(tmp_path, box_mesh):
     """They would make two files of one mesh differ."""
     write_xdmf(tmp_path / "box.xdmf", box_mesh)

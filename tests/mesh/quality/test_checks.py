@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -10,14 +11,14 @@ import pytest
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import (
     check_mesh,
+    count_overlaps,
     count_twin_nodes,
-    count_wrong_facets,
     dihedral_range_deg,
     facet_areas,
     facet_normals,
 )
-from thermoxels_ns.mesh.quality.face_count import group_faces
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
+from thermoxels_ns.mesh.quality.topology import group_sides
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
 
@@ -131,30 +132,6 @@ def test_numbers_out_of_range_nan_shapes_and_emptiness(box_mesh):
         check_mesh(replace(box_mesh, tets=box_mesh.tets[:0], region=box_mesh.region[:0]))
 
 
-def test_facets_with_node_numbers_out_of_range(box_mesh):
-    for shift in (-1, 1000):
-        bad = box_mesh.facets.copy()
-        bad[2, 1] += shift * len(box_mesh.points_m)
-        with pytest.raises(MeshError, match="mesh facets: expected node numbers from 0 to 59"):
-            check_mesh(replace(box_mesh, facets=bad))
-
-
-def test_wrong_facets_are_counted(box_mesh):
-    faces = group_faces(box_mesh.tets)
-    facets = box_mesh.facets
-    flipped = facets.copy()
-    flipped[3] = flipped[3, ::-1]
-    cases = (
-        (facets, 0),
-        (facets[2:], 2),
-        (flipped, 2),
-        (np.vstack([facets, facets[:3]]), 3),
-        (facets[:0], len(facets)),
-    )
-    for changed, expected in cases:
-        assert count_wrong_facets(replace(box_mesh, facets=changed), faces) == expected
-
-
 def test_twin_nodes_are_counted():
     random = np.random.default_rng(0)
     points = random.integers(0, 4, size=(500, 3)).astype(float)
@@ -169,3 +146,21 @@ def test_a_spherical_fan_of_thin_tetrahedra_is_no_crack():
     points = np.array([[0.0, 0, 0], [0, 0, 1], [1, 0, 0], [np.cos(angle), np.sin(angle), 0]])
     tets = np.array([[0, 2, 3, 1]])
     assert check_mesh(mesh_from(points, tets)).min_dihedral_deg == pytest.approx(1.0)
+
+
+POINTS = np.array(
+    [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.3, 0.7, 0.0], [0.5, -1.0, 1.0], [0.5, -1.0, -1.0]]
+)
+"""An edge along x; two points on one side of it in one plane, and two in planes of their own."""
+
+
+@pytest.mark.parametrize("order", itertools.permutations(range(4)))
+def test_two_of_four_triangles_at_an_edge_that_lie_on_each_other_are_found_in_any_order(order) -> None:
+    facets = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4], [0, 1, 5]])[list(order)]
+    assert count_overlaps(POINTS, facets, group_sides(facets)) == 1
+
+
+@pytest.mark.parametrize("order", itertools.permutations(range(3)))
+def test_triangles_that_only_meet_at_an_edge_do_not_count(order) -> None:
+    facets = np.array([[0, 1, 2], [0, 1, 4], [1, 0, 5]])[list(order)]
+    assert count_overlaps(POINTS, facets, group_sides(facets)) == 0

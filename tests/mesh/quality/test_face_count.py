@@ -12,8 +12,6 @@ from thermoxels_ns.mesh.quality.face_count import (
     edges_of_rows,
     facet_owners,
     group_edges,
-    group_faces,
-    group_pairs,
 )
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
@@ -69,22 +67,6 @@ def test_edges_of_random_voxels(random_cells, seed):
     expected, counts = np.unique(pairs, axis=0, return_counts=True)
     np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(groups.sizes, counts)
-
-
-def test_groups_number_their_rows_and_add_up_their_values():
-    first, second = np.array([4, 0, 4, 4, 0]), np.array([2, 10**17, 2, 1, 10**17])
-    groups = group_pairs(first, second)
-    assert groups.of_row.tolist() == [2, 0, 2, 1, 0]
-    assert groups.first.tolist() == [1, 3, 0]
-    assert groups.sums(np.array([1.0, 10.0, 100.0, 1000.0, 10000.0])).tolist() == [10010.0, 1000.0, 101.0]
-
-
-def test_rows_of_a_group_are_the_faces_of_its_tetrahedra():
-    groups = group_faces(np.array([[0, 1, 2, 3], [1, 3, 2, 4]]))
-    shared = np.flatnonzero(groups.sizes == 2)
-    assert len(shared) == 1
-    rows = groups.order[groups.start[shared[0]] :][:2]
-    assert sorted(rows.tolist()) == [0, 4 + 3]  # opposite node 0 of the first, opposite node 3 of the second
 
 
 @pytest.mark.parametrize("seed", range(6))

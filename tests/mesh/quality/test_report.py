@@ -303,15 +303,6 @@ def test_both_dihedral_bounds_count(mode, angles, margin):
     assert criterion.kept == (margin > -1e-6)
 
 
-def test_a_mode_is_judged_by_its_own_criteria_only():
-    obtuse = Figures(1.0, 0, 0, 0, 0, (45.0, 90.0), 0.0, 0.2, 0.1)
-    conforming, voxel = judge(obtuse, "conforming"), judge(obtuse, "voxel")
-    assert tuple(criterion.name for criterion in conforming) == NAMES and all(
-        criterion.kept for criterion in conforming
-    )
-    assert tuple(criterion.name for criterion in voxel if not criterion.kept) == ("non_obtuse", "stiffness_monotone")
-
-
 @pytest.mark.parametrize("mode", ["voxel", "conforming"])
 def test_no_bin_of_angles_lies_on_both_sides_of_a_bound(mode):
     bins = angle_bins(mode)

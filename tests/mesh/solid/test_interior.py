@@ -117,18 +117,6 @@ def test_a_few_strays_below_an_open_underside_do_not_make_it_deeper():
     assert convex_hull(strays, of_centres=True)[:, :, 3:5].sum() > 10  # what would be filled
 
 
-def test_strays_are_the_outermost_layers_of_at_most_half_a_percent():
-    body = np.zeros((30, 20, 10), dtype=bool)
-    body[5:25, 5:15] = True  # 20 x 10 x 10
-    body[25, 5, 0:9] = body[26, 5, 0] = True  # 10 of 2010
-    body[5, 4, 0:8] = body[5, 15, 0:8] = True
-    kept = interior_module._without_strays(body)
-    assert not kept[25:].any() and not kept[:, 4].any() and not kept[:, 15].any()
-    assert np.array_equal(kept[5:25, 5:15], body[5:25, 5:15])
-    body[25, 6, 0:9] = True
-    assert np.array_equal(interior_module._without_strays(body)[25, 5:7], body[25, 5:7])  # too many: a part of the body
-
-
 def test_what_cameras_look_into_is_not_inside():
     cells, inside = cup()
     from_below = looking_at(MIDDLE, around(height=-60.0))
@@ -217,16 +205,6 @@ def test_crevices_that_a_few_cameras_see_through_holes_of_the_shell_are_filled()
     found = interior(cells, LATTICE, looking_at(MIDDLE, eyes), 1)
     assert not (found.hidden | found.enclosed)[~box(5, 19)].any()
     assert (cells | found.hidden)[box(5, 19)].mean() > 0.88
-
-
-@pytest.mark.parametrize("rule", ["SHADOW_SURROUNDED", "CREVICE_SURROUNDED"])
-def test_both_looks_are_needed_for_crevices(monkeypatch, rule):
-    cells, eyes = with_holes_far_away()
-    views = looking_at(MIDDLE, eyes)
-    whole = interior(cells, LATTICE, views, 1).hidden
-    monkeypatch.setattr(interior_module, rule, 2.0)  # no place is surrounded twice
-    part = interior(cells, LATTICE, views, 1).hidden
-    assert not part[~whole].any() and part.sum() < 0.92 * whole.sum()
 
 
 def test_a_wide_hole_that_no_camera_sees_is_closed_flush_with_the_wall():

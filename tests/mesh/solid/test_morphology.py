@@ -35,12 +35,6 @@ def test_closing_fills_what_a_cube_of_empty_voxels_does_not_reach(share):
     assert np.array_equal(closed[inner], expected[inner])
 
 
-def test_closing_twice_changes_nothing_more():
-    cells = np.random.default_rng(1).random((15, 15, 15)) < 0.1
-    once = close_gaps(cells, 1)
-    assert once.sum() > cells.sum() and np.array_equal(close_gaps(once, 1), once)
-
-
 def test_bodies_touch_by_faces_or_by_anything():
     cells = np.zeros((3, 3, 3), dtype=bool)
     cells[0, 0, 0] = cells[1, 1, 0] = cells[2, 2, 1] = True

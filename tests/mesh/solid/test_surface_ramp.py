@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermoxels_ns.mesh.solid.surface_ramp import REACH, SurfaceRamp, near_surface, surface_ramp
+from thermoxels_ns.mesh.solid.surface_ramp import REACH, SurfaceRamp, surface_ramp
 
 
 def depth(*, radius: float = 8.0, voxels: int = 24) -> np.ndarray:
@@ -84,15 +84,3 @@ def test_filled_voxels_are_not_judged_by_their_density():
     ramp = surface_ramp(np.exp(d), 1.0, 100.0, dense, cells)
     assert ramp is not None
     assert np.all(ramp.belief[cells & ~dense] == 0.0) and np.all(ramp.level[cells & ~dense] == 1.0)
-
-
-def test_full_and_tiny_lattices_have_no_ramp():
-    for shape in ((1, 1, 1), (2, 5, 3), (6, 6, 6)):
-        assert ramp_of(np.ones(shape), 0.5) is None
-
-
-def test_near_the_surface_is_what_has_both_kinds_around():
-    cells = np.zeros((7, 7, 7), dtype=bool)
-    cells[:, :, :3] = True
-    assert np.flatnonzero(near_surface(cells)[3, 3]).tolist() == [2, 3]
-    assert not near_surface(np.ones((4, 4, 4), dtype=bool)).any()

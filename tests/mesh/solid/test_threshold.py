@@ -18,7 +18,6 @@ from thermoxels_ns.mesh.solid.threshold import (
     SHARE_THAT_ENDS,
     automatic_threshold,
     optical_depth_threshold,
-    percentile_threshold,
 )
 from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
 
@@ -161,14 +160,3 @@ def test_a_threshold_of_the_user_goes_before_the_automatic_one():
         snapshot.centre_density(), 99.5
     )
     assert select_solid(snapshot, SolidSelection()).threshold == 2.0
-
-
-def test_percentile_says_what_it_kept():
-    density = np.random.default_rng(0).random((10, 10, 10))
-    chosen = percentile_threshold(density, 90.0)
-    assert chosen.cells.sum() == 100
-    assert "densest 10 % of all voxels" in chosen.explanation and "at least" in chosen.explanation
-    density[:] = 1.0
-    density[0, 0, 0] = 2.0
-    tied = percentile_threshold(density, 90.0)
-    assert tied.cells.sum() == 1 and "more than density 1." in tied.explanation

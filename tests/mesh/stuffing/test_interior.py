@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from itertools import product
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import check_mesh, dihedral_range_deg
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.stuffing.bcc_lattice import bcc_lattice
-from thermoxels_ns.mesh.stuffing.interior import coarse_interior
+from thermoxels_ns.mesh.stuffing.interior import balanced_octree, coarse_interior, split_in_eight
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
 
 
@@ -142,18 +143,6 @@ def test_place_in_the_lattice_does_not_matter():
     assert np.allclose(here.points, moved.points - np.array([5, 1, 0]), rtol=0.0, atol=1e-13)
 
 
-def test_turning_the_axes_turns_the_mesh():
-    level = ball(30, 13.0, (0.3, 0.2, 0.1))
-    here, turned = stuff(level), stuff(level.transpose(1, 2, 0))
-    assert len(here.tets) == len(turned.tets)
-
-    def ordered(points: np.ndarray) -> np.ndarray:
-        points = points.round(9)
-        return points[np.lexsort(points.T)]
-
-    assert np.allclose(ordered(here.points[:, [1, 2, 0]]), ordered(turned.points), rtol=0.0, atol=1e-8)
-
-
 @pytest.mark.parametrize("level", [ball(23, 10.0), np.ones((15, 16, 17))], ids=["ball", "box"])
 def test_linear_temperature_is_reproduced(level):
     """Steady conduction between nodes of the surface at linear temperatures: the patch test of conforming elements."""
@@ -164,27 +153,6 @@ def test_linear_temperature_is_reproduced(level):
     free, fixed = np.flatnonzero(~solid.on_surface), np.flatnonzero(solid.on_surface)
     found = spsolve(matrix[free][:, free].tocsc(), -matrix[free][:, fixed] @ exact[fixed])
     assert np.abs(found - exact[free]).max() < 1e-10
-
-
-def test_coarse_cells_only_where_nothing_is_cut_or_moved():
-    level = pinholes(np.random.default_rng(4), (30, 30, 30))
-    uniform, graded = stuff(level, coarsest=1), stuff(level)
-    off_lattice = [np.any(solid.points * 2 % 1 != 0, axis=1) for solid in (uniform, graded)]
-    assert np.array_equal(uniform.points[off_lattice[0]], graded.points[off_lattice[1]])
-    assert np.count_nonzero(off_lattice[0]) > 100 and len(graded.tets) < len(uniform.tets)
-
-
-def test_buried_points_are_those_with_larger_cubes_all_around():
-    lattice = bcc_lattice(pinholes(np.random.default_rng(6), (28, 29, 30)))
-    interior = coarse_interior(lattice, 4)
-    assert interior is not None
-    buried = interior.buried(lattice)
-    points = np.flatnonzero(lattice.level > 0.0)
-    # A corner touches the voxels of its eight diagonal neighbours, a centre only its own.
-    around = np.where(lattice.is_corner(points)[:, None] == 1, lattice.neighbours(points)[:, 6:], points[:, None])
-    assert np.array_equal(buried[points], interior.covered[around].all(axis=1))
-    assert buried.sum() == buried[points].sum() > 1000
-    assert np.all(lattice.level[lattice.neighbours(np.flatnonzero(buried))] > 0.0)
 
 
 @pytest.mark.parametrize("bad", [0, 3, 6, -2, 2.0, True, None, "4"])
@@ -199,3 +167,55 @@ def test_no_edge_is_too_large():
     level = ball(30, 13.0)
     assert np.array_equal(stuff(level, coarsest=2**40).tets, stuff(level, coarsest=64).tets)
     assert np.array_equal(stuff(level, coarsest=np.int64(4)).tets, stuff(level).tets)
+
+
+def edges_of_cubes(cells: np.ndarray, largest: int) -> np.ndarray:
+    """Edge of the cube that each voxel is in, [voxels]."""
+    edges = np.ones(cells.shape, dtype=np.int64)
+    for number, level in enumerate(balanced_octree(cells, largest)):
+        whole = level
+        for below in range(number, -1, -1):
+            half = tuple(-(-n // 2**below) for n in cells.shape)
+            whole = split_in_eight(whole, half)
+        edges[whole] = 2 ** (number + 1)
+    return edges
+
+
+def edges_from_above(cells: np.ndarray, largest: int) -> np.ndarray:
+    """The same by splitting: the largest cubes that hold nothing else, halved until all neighbours fit."""
+    edges = np.ones(cells.shape, dtype=np.int64)
+    size = 2
+    while size <= largest:
+        for corner in product(*(range(0, n - size + 1, size) for n in cells.shape)):
+            cube = tuple(slice(c, c + size) for c in corner)
+            if cells[cube].all():
+                edges[cube] = size
+        size *= 2
+    while True:
+        smallest = ndimage.minimum_filter(edges, size=3, mode="constant", cval=1)
+        wrong = edges > 2 * smallest
+        if not wrong.any():
+            return edges
+        for size in np.unique(edges[wrong]):
+            lowest = np.argwhere(wrong & (edges == size)) // size * size
+            for corner in np.unique(lowest, axis=0):
+                edges[tuple(slice(c, c + size) for c in corner)] = size // 2
+
+
+@pytest.mark.parametrize("largest", [1, 2, 4, 16, 2**40])
+@pytest.mark.parametrize("seed", range(4))
+def test_every_cube_is_as_large_as_balance_allows(seed, largest):
+    random = np.random.default_rng(seed)
+    shape = tuple(random.integers(20, 40, size=3))
+    cells = random.random(shape) > 10.0 ** -random.uniform(2, 4.5)
+    found = edges_of_cubes(cells, largest)
+    assert np.array_equal(found, edges_from_above(cells, min(largest, 64)))
+    assert found.max() <= largest and np.all(found[~cells] == 1)
+
+
+def test_sizes_in_a_large_cube():
+    edges = edges_of_cubes(np.ones((62, 62, 62), dtype=bool), 64)
+    middle = edges[31, 31]
+    # One layer of every size, as far as where the sizes begin allows: 2, 4, 8 and so on from either side.
+    assert middle[:32].tolist() == [2] * 4 + [4] * 4 + [8] * 8 + [16] * 16
+    assert middle[32:].tolist() == [16] * 16 + [8] * 8 + [4] * 4 + [2] * 2

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, centres, euler_characteristic, num_bodies, tet_mesh
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import check_mesh, dihedral_range_deg
-from thermoxels_ns.mesh.stuffing.bcc_lattice import DIRECTIONS, LENGTHS, OPPOSITE, bcc_lattice
+from thermoxels_ns.mesh.stuffing.bcc_lattice import DIRECTIONS, bcc_lattice
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 from thermoxels_ns.mesh.stuffing.stencils import BUNDLE_EDGES, BUNDLE_POINTS, CODE_WEIGHTS, stencil_table
 from thermoxels_ns.mesh.stuffing.warp import ALPHA_INSIDE, ALPHA_OUTSIDE, warp
@@ -54,24 +54,6 @@ def test_binary_half_space_ends_on_the_voxel_faces():
     assert np.all(surface[..., 0] == 3.0)
 
 
-def test_level_at_corners_is_trilinear():
-    level = np.random.default_rng(3).normal(size=(4, 5, 6)).clip(-0.4)
-    level += 0.5
-    lattice = bcc_lattice(level)
-    corners = lattice.level[lattice.num_centres :].reshape(lattice.shape)
-    mean = np.mean([level[i : i + 3, j : j + 4, k : k + 5] for i, j, k in product((0, 1), repeat=3)], axis=0)
-    assert np.allclose(corners[1:4, 1:5, 1:6], mean, rtol=1e-14, atol=0.0)
-
-
-def test_directions_and_offsets_agree():
-    lattice = bcc_lattice(np.ones((2, 3, 4)))
-    assert np.array_equal(DIRECTIONS[OPPOSITE], -DIRECTIONS)
-    inner = np.flatnonzero(lattice.level > 0.0)
-    assert set(lattice.is_corner(inner)) == {0, 1}
-    steps = lattice.positions(lattice.neighbours(inner).ravel()).reshape(-1, 14, 3) - lattice.positions(inner)[:, None]
-    assert np.array_equal(steps, np.broadcast_to(DIRECTIONS, steps.shape))
-
-
 def test_only_ratios_of_levels_matter():
     level = SHAPES["torus"].level(16)
     first, second = stuff(level), stuff(level * 2.0**900)
@@ -80,26 +62,12 @@ def test_only_ratios_of_levels_matter():
     assert np.array_equal(single.tets, stuff(level.astype(np.float32).astype(np.float64)).tets)
 
 
-def test_place_in_the_lattice_does_not_matter():
-    level = SHAPES["torus"].level(16)
-    moved = stuff(np.pad(level, ((5, 0), (1, 7), (0, 3)), constant_values=-1.0))
-    here = stuff(level)
-    assert np.array_equal(here.tets, moved.tets) and np.array_equal(here.facets, moved.facets)
-    assert np.allclose(here.points, moved.points - np.array([5, 1, 0]), rtol=0.0, atol=1e-13)
-
-
 def test_axes_are_alike():
     level = SHAPES["torus"].level(16)
     here, turned, mirrored = stuff(level), stuff(level.transpose(1, 2, 0)), stuff(level[::-1])
     for points, other in ((here.points[:, [1, 2, 0]], turned), (np.abs([16, 0, 0] - here.points), mirrored)):
         assert len(points) == len(other.points) and len(here.tets) == len(other.tets)
         assert KDTree(points).query(other.points)[0].max() < 1e-12
-
-
-def test_memory_order_does_not_matter():
-    level = np.random.default_rng(5).normal(size=(7, 8, 9))
-    first, second = stuff(level), stuff(np.asfortranarray(level))
-    assert all(np.array_equal(getattr(first, name), getattr(second, name)) for name in vars(first))
 
 
 def test_tags_of_nodes_and_triangles():
@@ -193,23 +161,6 @@ def test_angles_of_every_stencil_at_the_ends_of_all_ranges(signs):
         assert low > 10.94 and high < 163.75
 
 
-def test_tetrahedra_of_a_full_bundle_fill_it():
-    table = stencil_table()
-    full = len(table.tet_start) - 2
-    tets = table.tets[table.tet_start[full] :]
-    assert len(tets) == 4 and np.allclose(_tet_volumes(BUNDLE_POINTS[tets]), 0.5)
-    assert table.tet_start[1] == 0 and table.facet_start[1] == 0
-
-
-def test_cuts_keep_their_distance_from_all_points():
-    warped = warp(bcc_lattice(np.random.default_rng(2).normal(size=(12, 12, 12))))
-    cut = np.isfinite(warped.cuts)
-    assert cut.any(axis=1).all()
-    low, high = np.broadcast_to(ALPHA_INSIDE, cut.shape)[cut], 1.0 - np.broadcast_to(ALPHA_OUTSIDE, cut.shape)[cut]
-    assert np.all((warped.cuts[cut] >= low) & (warped.cuts[cut] <= high))
-    assert np.all(warped.sign[warped.moved] == 0) and np.all(warped.sign[warped.inner] == 1)
-
-
 def test_smooth_surface_moves_every_near_point():
     """Holding cuts back costs accuracy: it must not happen where the solid is thick."""
     for name in ("sphere", "torus"):
@@ -220,16 +171,6 @@ def test_smooth_surface_moves_every_near_point():
         cut = np.isfinite(warped.cuts)
         assert len(warped.moved) > 1000
         assert np.allclose(warped.cuts[cut], (own / (own - neighbour))[cut], rtol=1e-12), name
-
-
-def test_near_points_move_the_shortest_way():
-    level = np.full((5, 5, 5), -1.0)
-    level[:, :, :3] = 1.0
-    # The centre is 0.2 below its zero on the axis; all other edges are cut farther away.
-    level[2, 2, 2] = 0.25
-    warped = warp(bcc_lattice(level))
-    assert np.any(np.all(np.isclose(warped.moved_to, [2.5, 2.5, 2.7]), axis=1))
-    assert np.all(LENGTHS[:6] == 1.0) and np.allclose(LENGTHS[6:], np.sqrt(0.75))
 
 
 @pytest.mark.parametrize("cells", [(2, 3, 4), (1, 1, 1)])
@@ -255,13 +196,3 @@ def test_levels_that_are_not_finite(bad):
 def test_nothing_solid(level):
     with pytest.raises(MeshError, match="level: expected solid voxels, with levels above 0, got none"):
         stuff(level)
-
-
-def test_wrong_number_of_axes():
-    with pytest.raises(MeshError, match=r"level: expected shape \(n, n, n\), got \(4, 4\)"):
-        stuff(np.ones((4, 4)))
-
-
-def test_whole_numbers_are_levels_too():
-    level = np.where(np.random.default_rng(8).random((5, 5, 5)) < 0.5, 1, -1)
-    assert np.array_equal(stuff(level).points, stuff(level.astype(float)).points)
