@@ -44,7 +44,6 @@ def picture_of_mesh(
     up: Sequence[float] = (0.0, 0.0, 1.0),
     view_direction: Sequence[float] | None = None,
     grey_unobserved: bool = False,
-    show_edges: bool = False,
     length_unit: str = "m",
     colour_map: str = "inferno",
     bar_title: str = BAR_TITLE,
@@ -67,7 +66,6 @@ def picture_of_mesh(
         up: Direction that points up in the picture, in mesh coordinates.
         view_direction: Direction from the camera to the mesh; obliquely from above if left out.
         grey_unobserved: Draw triangles with a node that no thermal ray saw in grey.
-        show_edges: Draw the triangles' edges.
         length_unit: Name of the unit of the node positions, written below the picture.
         colour_map: Name of a colour map of matplotlib, such as "coolwarm" for changes to both sides of 0.
         bar_title: Quantity and unit, written beside the colour bar.
@@ -105,7 +103,6 @@ def picture_of_mesh(
             plotter.renderer.set_background("white")
             _add_lights(plotter, right, true_up, towards_camera)
             font = _font_file()
-            edges = {"show_edges": show_edges, "edge_color": _INK, "line_width": 0.5, "edge_opacity": 0.4}
             matter = {"ambient": 0.62, "diffuse": 0.45, "specular": 0.0, "smooth_shading": False}
             if not unseen.all():
                 surface = pv.PolyData.from_regular_faces(mesh.points_m, mesh.facets[~unseen])
@@ -116,13 +113,12 @@ def picture_of_mesh(
                     cmap=_colour_map(colour_map),
                     clim=(low, high),
                     show_scalar_bar=False,
-                    **edges,
                     **matter,
                 )
                 _add_colour_bar(plotter, font, bar_title, high - low)
             if unseen.any():
                 surface = pv.PolyData.from_regular_faces(mesh.points_m, mesh.facets[unseen])
-                plotter.add_mesh(surface, color=_GREY, **edges, **matter)
+                plotter.add_mesh(surface, color=_GREY, **matter)
             _add_words(plotter, mesh, title, font, length_unit, note, unseen=bool(unseen.any()), extremes=extremes)
             _frame(plotter, mesh.points_m[np.unique(mesh.facets)], right, true_up, towards_camera)
             plotter.screenshot(str(temporary), return_img=False)

@@ -84,15 +84,7 @@ def write_inp(
     Names are in capitals; what is neither letter, digit nor underscore becomes an underscore. Empty regions and
     patches are left out, because an empty set stops a solver.
 
-    Args:
-        path: File to write, ending in .inp; its folder is made if need be.
-        mesh: The mesh.
-        heat_step: Material and times.
-        temperature_c: Temperatures at the start in place of the mesh's own, shape (n,), [degrees Celsius].
-
-    Raises:
-        MeshError: There is no heat step, an array does not fit the mesh or is not finite, or two names become one.
-        OutputError: The file cannot be written.
+    Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
     """
     path = check_suffix(path, ".inp")
     if heat_step is None:

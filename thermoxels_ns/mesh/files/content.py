@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_finite, check_shape, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
+from thermoxels_ns.core.units import celsius_to_kelvin
 from thermoxels_ns.mesh.quality.checks import facet_area_vectors
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -113,6 +114,18 @@ def file_content(mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None =
         normal=normal,
         area_factor=factor,
     )
+
+
+def node_arrays(mesh: TetMesh, content: FileContent) -> dict[str, npt.NDArray]:
+    """Values per node that files of the body hold, colours only if the mesh has them."""
+    arrays: dict[str, npt.NDArray] = {
+        "temperature_c": content.temperature_c,
+        "temperature_k": celsius_to_kelvin(content.temperature_c),
+        "observed": mesh.observed.astype(np.uint8),
+    }
+    if mesh.colour is not None:
+        arrays["colour"] = colour_bytes(mesh.colour)
+    return arrays
 
 
 def normals_of(points_m: npt.NDArray[np.float64], facets: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:

@@ -138,7 +138,8 @@ def write_mesh(
         All files written, `path` first.
 
     Raises:
-        MeshError: An array does not fit the mesh or is not finite, or the format needs what is not there.
+        MeshError: An array does not fit the mesh or is not finite, or the format needs what is not there: material and
+            times, colours, an up direction, coordinates near the origin, or short and different names.
         OutputError: No format has this ending, or a file cannot be written.
     """
     path = Path(path)

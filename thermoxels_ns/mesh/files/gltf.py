@@ -47,17 +47,7 @@ def write_glb(
 
     Layout: glTF 2.0 specification, Khronos Group (ISO/IEC 12113:2022).
 
-    Args:
-        path: File to write, ending in .glb; its folder is made if need be.
-        mesh: The mesh.
-        temperature_c: Temperatures to show in place of the mesh's own, shape (n,), [degrees Celsius].
-        colouring: What the colours show; None: temperatures.
-        up: Direction that points up, in mesh coordinates.
-
-    Raises:
-        MeshError: An array does not fit the mesh or is not finite, `up` is no direction, or the mesh has no colours
-            from photographs.
-        OutputError: The file cannot be written.
+    Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
     """
     path = check_suffix(path, ".glb")
     colouring = colouring or "temperature"

@@ -39,14 +39,7 @@ def write_msh(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
 
     Layout: "MSH file format", Gmsh reference manual, version 4.1 of the format.
 
-    Args:
-        path: File to write, ending in .msh; its folder is made if need be.
-        mesh: The mesh.
-        temperature_c: Temperatures to write in place of the mesh's own, shape (n,), [degrees Celsius].
-
-    Raises:
-        MeshError: An array does not fit the mesh or is not finite, or a name is longer than 127 bytes.
-        OutputError: The file cannot be written.
+    Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
     """
     path = check_suffix(path, ".msh")
     content = file_content(mesh, temperature_c)

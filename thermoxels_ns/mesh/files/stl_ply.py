@@ -32,13 +32,7 @@ _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("at
 def write_stl(path: Path | str, mesh: TetMesh) -> None:
     """Write the boundary triangles as binary STL, which knows nothing but shapes; lengths are metres.
 
-    Args:
-        path: File to write, ending in .stl; its folder is made if need be.
-        mesh: The mesh.
-
-    Raises:
-        MeshError: An array does not fit the mesh or is not finite, or `check_stl` refuses the mesh.
-        OutputError: The file cannot be written.
+    Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
     """
     path = check_suffix(path, ".stl")
     content = file_content(mesh)
@@ -81,15 +75,7 @@ def write_ply(
     Vertex properties: x, y, z [m], red, green, blue, `temperature_c` [degrees Celsius] and `observed` (1: measured,
     0: extended). A comment says what the colours show.
 
-    Args:
-        path: File to write, ending in .ply; its folder is made if need be.
-        mesh: The mesh.
-        temperature_c: Temperatures to write in place of the mesh's own, shape (n,), [degrees Celsius].
-        colouring: What the colours show; None: the photographs if the mesh has their colours, else temperatures.
-
-    Raises:
-        MeshError: An array does not fit the mesh or is not finite, or the mesh has no colours from photographs.
-        OutputError: The file cannot be written.
+    Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
     """
     path = check_suffix(path, ".ply")
     content = file_content(mesh, temperature_c)

@@ -13,8 +13,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_finite, check_shape, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
-from thermoxels_ns.core.units import celsius_to_kelvin
-from thermoxels_ns.mesh.files.content import check_suffix, colour_bytes, file_content, surface_of
+from thermoxels_ns.mesh.files.content import check_suffix, colour_bytes, file_content, node_arrays, surface_of
 from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 
@@ -51,13 +50,7 @@ def write_vtu(
     content = file_content(mesh, temperature_c)
     num_nodes = len(content.points_m)
     remedy = "Pass one finite value per mesh node."
-    arrays = {
-        "temperature_c": content.temperature_c,
-        "temperature_k": celsius_to_kelvin(content.temperature_c),
-        "observed": mesh.observed.astype(np.uint8),
-    }
-    if mesh.colour is not None:
-        arrays["colour"] = colour_bytes(mesh.colour)
+    arrays = node_arrays(mesh, content)
     for name, values in (point_data or {}).items():
         values = np.asarray(values)
         if name in _OWN_ARRAYS:
@@ -178,14 +171,7 @@ def write_boundary_vtp(
     A mesh without boundary tags is written with the triangles' own normals and areas, one patch "boundary", and
     without `seen`, which nobody knows.
 
-    Args:
-        path: File to write, ending in .vtp; its folder is made if need be.
-        mesh: The mesh.
-        temperature_c: Temperatures to write in place of the mesh's own, shape (n,), [degrees Celsius].
-
-    Raises:
-        MeshError: An array does not fit the mesh or is not finite.
-        OutputError: The file cannot be written.
+    Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
     """
     import pyvista as pv
     from vtkmodules.vtkCommonCore import vtkStringArray

@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
-from thermoxels_ns.core.units import celsius_to_kelvin
-from thermoxels_ns.mesh.files.content import FileContent, check_suffix, colour_bytes, file_content
+from thermoxels_ns.mesh.files.content import FileContent, check_suffix, file_content, node_arrays
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 BODY_GRID = "mesh"
@@ -48,14 +47,7 @@ def write_xdmf(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np
 
     The .h5 comes first and the .xdmf, which points at it, last; in between there is no .xdmf.
 
-    Args:
-        path: File to write, ending in .xdmf; its folder is made if need be.
-        mesh: The mesh.
-        temperature_c: Temperatures to write in place of the mesh's own, shape (n,), [degrees Celsius].
-
-    Raises:
-        MeshError: An array does not fit the mesh or is not finite.
-        OutputError: A file cannot be written.
+    Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
     """
     import h5py
 
@@ -69,12 +61,8 @@ def write_xdmf(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np
         "patch": content.patch.astype(np.int32),
         "area_factor": content.area_factor,
         "normal": content.normal,
-        "temperature_c": content.temperature_c,
-        "temperature_k": celsius_to_kelvin(content.temperature_c),
-        "observed": mesh.observed.astype(np.uint8),
+        **node_arrays(mesh, content),
     }
-    if mesh.colour is not None:
-        arrays["colour"] = colour_bytes(mesh.colour)
     data_file = heavy_data_path(path)
     text = _index(content, arrays, data_file.name)
 

@@ -65,29 +65,18 @@ def level_of(
     """
     level = np.full(cells.shape, -1.0, dtype=np.float32)
     near = bounding_box(cells, MARGIN)
-    level[near] = _level_nearby(
-        density[near], threshold, _deep_ratio(density[dense], threshold), dense[near], cells[near], makes_up_volume
-    )
-    return level
-
-
-def _level_nearby(
-    density: npt.NDArray[np.floating],
-    threshold: float,
-    deep_ratio: float,
-    dense: BoolArray,
-    cells: BoolArray,
-    makes_up_volume: bool,
-) -> FloatArray:
-    """The level in a part of the lattice; `deep_ratio` is that of the whole."""
-    ramp = surface_ramp(density, threshold, deep_ratio, dense, cells) if threshold > 0.0 else None
+    deep_ratio = _deep_ratio(density[dense], threshold)
+    around = density[near], threshold, deep_ratio, dense[near], cells[near]
+    ramp = surface_ramp(*around) if threshold > 0.0 else None
     if ramp is None:
-        return _smoothed(density, threshold, deep_ratio, dense, cells, makes_up_volume)
-    level = ramp.level
+        level[near] = _smoothed(*around, makes_up_volume)
+        return level
+    found = ramp.level
     if ramp.belief.min() < 1.0:
-        smoothed = _smoothed(density, threshold, deep_ratio, dense, cells, makes_up_volume)
-        level = smoothed + ramp.belief * (level - smoothed)
-    return _signed(level, np.float32(LEAST_SMOOTH_LEVEL), cells)
+        smoothed = _smoothed(*around, makes_up_volume)
+        found = smoothed + ramp.belief * (found - smoothed)
+    level[near] = _signed(found, np.float32(LEAST_SMOOTH_LEVEL), cells[near])
+    return level
 
 
 def _smoothed(
