@@ -136,7 +136,7 @@ def ring_of_views(centre: Vector, reach: float, count: int) -> Views:
 
 def measure(name: str, voxels: int, mode: str, repeats: int) -> dict:
     """One case; runs in a process of its own."""
-    from thermoxels_ns.evaluation.surface_distance import sample_facets
+    from thermoxels_ns.evaluation.truth_comparison import sample_facets
     from thermoxels_ns.mesh.build import MeshOptions, build_mesh
     from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas
     from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes

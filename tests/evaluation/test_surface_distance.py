@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.evaluation.surface_distance import sample_facets, surface_distances
+from thermoxels_ns.evaluation.truth_comparison import sample_facets, surface_distances
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 
 
