@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.support.heat_meshes import box_mesh
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Scheme, theta_scheme
 from thermoxels_ns.fem.stepping import solve_heat
@@ -77,3 +77,16 @@ def test_adaptive_steps_pay_the_third_root_of_the_tolerance() -> None:
         solve_heat(problem("wind"), AdaptiveSteps(DURATION_S, tolerance, outputs=1)).steps for tolerance in (1.0, 1e-3)
     ]
     assert 5.0 < steps[1] / steps[0] < 15.0, steps
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_steps_of_an_adaptive_computation_can_be_repeated_and_halved(name) -> None:
+    """All steps halved leave a quarter of the error."""
+    given = problem(name)
+    adaptive = solve_heat(given, AdaptiveSteps(DURATION_S, 1.0, outputs=2))
+    steps = GivenSteps(DURATION_S, adaptive.step_lengths_s, 1.0)
+    again, halved = solve_heat(given, steps), solve_heat(given, steps.halved())
+    np.testing.assert_array_equal(again.temperature_c, adaptive.temperature_c)
+    assert halved.steps == 2 * again.steps == 2 * adaptive.steps
+    errors = [float(np.abs(found.temperature_c[-1] - reference(name)).max()) for found in (again, halved)]
+    assert 0.18 < errors[1] / errors[0] < 0.36, errors
