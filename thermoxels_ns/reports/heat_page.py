@@ -90,12 +90,8 @@ def _figures(run: HeatRun) -> tuple[tuple[str, str], ...]:
     if run.wall is not None:
         cards.append((f"{run.wall.u_value_w_m2k:.3f} {unit_signs('W/(m2 K)')}", "mean U-value of the inner surface"))
         cards.append((f"{run.wall.temperature_factor:.3f}", "surface temperature factor f_Rsi"))
-    cards.append(
-        (f"{degrees(results.coldest.temperature_c)} \N{DEGREE SIGN}C", f"coldest spot {_place(results.coldest)}")
-    )
-    cards.append(
-        (f"{degrees(results.hottest.temperature_c)} \N{DEGREE SIGN}C", f"hottest spot {_place(results.hottest)}")
-    )
+    cards.append((f"{degrees(results.coldest.temperature_c)} °C", f"coldest spot {_place(results.coldest)}"))
+    cards.append((f"{degrees(results.hottest.temperature_c)} °C", f"hottest spot {_place(results.hottest)}"))
     cards += _accuracy_card(run.accuracy)
     return tuple(cards)
 
@@ -105,7 +101,7 @@ def _results(run: HeatRun) -> Section:
     flow = "W" if steady else "mean W"
     last = () if steady else ("last interval W",)
     effects = Table(
-        ("What acts", "area m\N{SUPERSCRIPT TWO}", flow, "W/m\N{SUPERSCRIPT TWO}", *last),
+        ("What acts", "area m²", flow, "W/m²", *last),
         tuple(
             (
                 effect.effect,
@@ -120,8 +116,8 @@ def _results(run: HeatRun) -> Section:
     )
     patches = Table(
         (
-            *("Patch", "area m\N{SUPERSCRIPT TWO}", flow, "W/m\N{SUPERSCRIPT TWO}", *last),
-            *("mean \N{DEGREE SIGN}C", "coldest \N{DEGREE SIGN}C", "hottest \N{DEGREE SIGN}C"),
+            *("Patch", "area m²", flow, "W/m²", *last),
+            *("mean °C", "coldest °C", "hottest °C"),
         ),
         tuple(
             (
@@ -137,8 +133,8 @@ def _results(run: HeatRun) -> Section:
     )
     regions = Table(
         (
-            *("Region", "material", "volume m\N{SUPERSCRIPT THREE}", "surface m\N{SUPERSCRIPT TWO}", "W"),
-            *("W/m\N{SUPERSCRIPT TWO}", "mean \N{DEGREE SIGN}C", "from \N{DEGREE SIGN}C", "to \N{DEGREE SIGN}C"),
+            *("Region", "material", "volume m³", "surface m²", "W"),
+            *("W/m²", "mean °C", "from °C", "to °C"),
         ),
         tuple(
             (
@@ -159,14 +155,14 @@ def _wall(run: HeatRun) -> list[Section]:
         return [Section("As a wall", words=(run.no_wall,))] if run.no_wall else []
     wall = run.wall
     words = (
-        f"Between {wall.inside_c:g} \N{DEGREE SIGN}C inside and {wall.outside_c:g} \N{DEGREE SIGN}C outside, "
-        f"{_figure(wall.heat_w)} W flow into the inner surface of {_figure(wall.area_m2)} m\N{SUPERSCRIPT TWO}: a "
+        f"Between {wall.inside_c:g} °C inside and {wall.outside_c:g} °C outside, "
+        f"{_figure(wall.heat_w)} W flow into the inner surface of {_figure(wall.area_m2)} m²: a "
         f"thermal coupling of {_figure(wall.coupling_w_k)} W/K. The inner surface is worst at "
-        f"{degrees(wall.coldest.temperature_c)} \N{DEGREE SIGN}C {_place(wall.coldest)}, which is a temperature factor "
+        f"{degrees(wall.coldest.temperature_c)} °C {_place(wall.coldest)}, which is a temperature factor "
         f"of {wall.temperature_factor:.3f} (1: as warm as the air inside). For the risk of mould ISO 13788 asks for "
-        "it with a resistance of the inner surface of 0.25 m\N{SUPERSCRIPT TWO} K/W, coefficient_w_m2k: 4.",
+        "it with a resistance of the inner surface of 0.25 m² K/W, coefficient_w_m2k: 4.",
     )
-    columns = ("Inner surface", "area m\N{SUPERSCRIPT TWO}", "W", "U-value W/(m\N{SUPERSCRIPT TWO} K)")
+    columns = ("Inner surface", "area m²", "W", "U-value W/(m² K)")
     rows = [(p.name, _figure(p.area_m2), _figure(p.heat_w), f"{p.u_value_w_m2k:.4f}") for p in wall.patches]
     if len(wall.regions) > 1:
         rows += [
@@ -182,12 +178,12 @@ def _probes(run: HeatRun) -> list[Section]:
     names, values = _probe_names(run), run.probes_c
     if len(values) == 1:
         rows = tuple((name, f"{value:.3f}") for name, value in zip(names, values[0]))
-        return [Section("Probes", tables=(Table(("Point", "\N{DEGREE SIGN}C"), rows),))]
+        return [Section("Probes", tables=(Table(("Point", "°C"), rows),))]
     rows = tuple(
         (name, *(f"{value:.3f}" for value in (column[0], column[-1], column.min(), column.max())))
         for name, column in zip(names, values.T)
     )
-    columns = ("Point", "start \N{DEGREE SIGN}C", "end \N{DEGREE SIGN}C", "lowest", "highest")
+    columns = ("Point", "start °C", "end °C", "lowest", "highest")
     return [Section("Probes", tables=(Table(columns, rows, note="All times stand in series.csv."),))]
 
 
@@ -208,7 +204,7 @@ def _balance(run: HeatRun) -> Section:
 
 def _asked(run: HeatRun, mesh_name: str) -> Section:
     mesh, scene, time = run.problem.mesh, run.scene, run.scene.time
-    start = "the photographs" if scene.initial_c is None else f"{scene.initial_c:g} \N{DEGREE SIGN}C everywhere"
+    start = "the photographs" if scene.initial_c is None else f"{scene.initial_c:g} °C everywhere"
     how = _how_time_was_followed(time, run.accuracy)
     general = Table(
         ("", ""),
@@ -225,7 +221,7 @@ def _asked(run: HeatRun, mesh_name: str) -> Section:
     for name, what in materials_by_region(run.problem).items():
         figures = (what.conductivity_w_mk, what.density_kg_m3, what.specific_heat_j_kgk)
         rows.append((name, what.name, *(f"{figure:g}" for figure in figures)))
-    columns = ("Region", "material", "W/(m K)", "kg/m\N{SUPERSCRIPT THREE}", "J/(kg K)")
+    columns = ("Region", "material", "W/(m K)", "kg/m³", "J/(kg K)")
     materials = Table(columns, tuple(rows), figures_from=2)
     selection = Selection(mesh, run.problem.up)
     effects = Table(
@@ -301,7 +297,7 @@ def _values(effect: Effect, selection: Selection) -> list[str]:
             continue
         value, unit = getattr(effect, field.name), effect.bounds[field.name].unit
         name = field.name.rsplit("_w_m", 1)[0].removesuffix("_c").removesuffix("_m2k").replace("_", " ")
-        unit = {"1": "", "degrees Celsius": " \N{DEGREE SIGN}C"}.get(unit, f" {unit_signs(unit)}")
+        unit = {"1": "", "degrees Celsius": " °C"}.get(unit, f" {unit_signs(unit)}")
         if not isinstance(value, Varying):
             shown.append(f"{name} {value:g}{unit}")
         elif isinstance(effect, FixedTemperature):

@@ -142,7 +142,7 @@ def plot_over_time(solution: HeatSolution, mean_c: Vector, probes_c: Vector, pro
         [("mean of the volume", mean_c), *probes],
         ("coldest to hottest", states.min(axis=1), states.max(axis=1)),
         [*flows, ("all together: stored", solution.heat_w)],
-        ("temperature [\N{DEGREE SIGN}C]", "heat flow into the body [W]"),
+        ("temperature [°C]", "heat flow into the body [W]"),
     )
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _STAGE = (0.04, 0.16, 0.80, 0.90)
 _GREY = "#b8b8b8"
 _INK = "#202020"
-BAR_TITLE = "temperature [\N{DEGREE SIGN}C]"
+BAR_TITLE = "temperature [°C]"
 """What a colour bar says unless told otherwise."""
 _LEAST_CHANGE_K = 1e-3
 """Half the span of the smallest scale of changes, [K]."""
