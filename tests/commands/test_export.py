@@ -310,7 +310,7 @@ def test_failed_export_leaves_the_earlier_one_untouched(ball, tmp_path, monkeypa
 
 @pytest.mark.parametrize(
     "broken",
-    ["mesh.files.formats.write_mesh", "heat.vtk_series.write_heat_series", "reports.export_pictures.draw_heat"],
+    ["mesh.files.formats.write_mesh", "heat.vtk_series.write_heat_series", "reports.mesh_pictures.draw_heat"],
 )
 def test_export_interrupted_while_writing_leaves_no_summary(ball, tmp_path, monkeypatch, broken) -> None:
     """So a folder with a summary is never a mixture."""

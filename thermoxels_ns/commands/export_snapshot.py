@@ -101,7 +101,7 @@ def export_snapshot(
     from thermoxels_ns.mesh.quality.checks import check_mesh
     from thermoxels_ns.mesh.quality.picture import picture_of_quality
     from thermoxels_ns.mesh.quality.report import quality_report
-    from thermoxels_ns.reports.export_pictures import draw_heat, draw_mesh
+    from thermoxels_ns.reports.mesh_pictures import draw_heat, draw_mesh
 
     checked = check_options(options)
     scale = scale_of(options, checked, scene_file)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Sequence
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,8 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 if TYPE_CHECKING:
     import pyvista as pv
     from matplotlib.colors import ListedColormap
+
+    from thermoxels_ns.fem.solution import HeatSolution
 
 # The part of the picture that the mesh may fill, as (left, bottom, right, top) shares of width and height: the title
 # is above, the colour bar to the right, the axes and the size below.
@@ -325,3 +328,58 @@ def _quiet_vtk() -> Iterator[None]:
         yield
     finally:
         vtkLogger.SetStderrVerbosity(before)
+
+
+def draw_mesh(paths: Sequence[Path], mesh: TetMesh, look: Mapping[str, Any], length_unit: str) -> None:
+    """Draw the mesh twice: all temperatures, and with grey where no thermal ray measured one.
+
+    Args:
+        paths: The two files, each ending in .png.
+        mesh: The mesh.
+        look: Arguments `up` and `view_direction` of `picture_of_mesh`.
+        length_unit: Name of the unit of the node positions.
+    """
+    every, measured = paths
+    picture_of_mesh(every, mesh, title="Surface temperature", length_unit=length_unit, **look)
+    title = "Measured surface temperature"
+    picture_of_mesh(measured, mesh, title=title, grey_unobserved=True, length_unit=length_unit, **look)
+
+
+def draw_heat(path: Path, mesh: TetMesh, solution: HeatSolution, look: Mapping[str, Any]) -> None:
+    """Draw the temperatures before and after in one range of colours, and beside them the change in its own.
+
+    Args:
+        path: The file, ending in .png.
+        mesh: The mesh, nodes in metres.
+        solution: Temperatures on its nodes.
+        look: Arguments `up` and `view_direction` of `picture_of_mesh`.
+    """
+    from PIL import Image
+
+    shown = np.unique(mesh.facets)
+    before, after = solution.temperature_c[0], solution.temperature_c[-1]
+    change = after - before
+    ends = np.concatenate([before[shown], after[shown]])
+    diverging, note = change_colours(change[shown])
+    first, last = f"{solution.times_s[0]:g} s", f"{solution.times_s[-1]:g} s"
+    same: Any = {"clim": (float(ends.min()), float(ends.max()))}
+    panels = []
+    with tempfile.TemporaryDirectory() as scratch:
+        for number, (title, values, colours) in enumerate(
+            (
+                (f"Surface temperature at {first}", before, same),
+                (f"Surface temperature at {last}", after, same),
+                (f"Change from {first} to {last}", change, {**diverging, "note": note}),
+            )
+        ):
+            panel_path = Path(scratch) / f"{number}.png"
+            picture_of_mesh(panel_path, mesh, values, title=title, **colours, **look)
+            with Image.open(panel_path) as image:
+                panels.append(image.convert("RGB"))
+    picture = Image.new("RGB", (sum(p.width for p in panels), max(p.height for p in panels)), "white")
+    left = 0
+    for panel in panels:
+        picture.paste(panel, (left, 0))
+        left += panel.width
+    with replace_when_done(path) as temporary:
+        picture.save(temporary)
