@@ -54,9 +54,6 @@ class StepSpeed:
     """Steps per median."""
     reference_up_to: int = 128
     """Finest lattice on which the reference is timed too."""
-    start: Literal["plain", "photographs", "auto"] = "plain"
-    """How the training begins, see --pipeline.model.start; only auto runs trials first.
-    Lines of sight are left out: rays are those of photographs and thermal images alone."""
     threads: int | None = None
     """Threads of the compiled kernels; default: one per processor."""
     clock: Literal["wall", "processor"] = "wall"
@@ -102,7 +99,7 @@ class StepSpeed:
         rays: Any = {"train_num_rays_per_batch": self.rays, "thermal_num_rays_per_batch": self.rays}
         pipeline = {
             "datamanager": rays,
-            "model": {"start": self.start, "photo_depth": "off"},
+            "model": {"photo_depth": "off"},  # rays of photographs and thermal images alone
             "cpu_threads": self.threads,
         }
         run = TrainingRun(scene, schedule, {"pipeline": pipeline})

@@ -1,7 +1,7 @@
 """The default training on scenes from seeds, on which nobody tuned anything: how many reach the quality promised.
 
     python tests/benchmarks/unseen_scenes.py --output RUNS
-    python tests/benchmarks/unseen_scenes.py --output RUNS --seeds 3 17 --options --pipeline.model.start plain
+    python tests/benchmarks/unseen_scenes.py --output RUNS --seeds 3 17 --options --pipeline.model.photo-depth off
 
 Each scene is written, trained and evaluated by the commands that a user types (`ns-train thermoxels`, `ns-eval`), with
 their defaults; what follows `--options`, which comes last, is handed to `ns-train`. Logs and results stay in the output

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.multiview.test_photo_consistency import EYES, LATTICE, PLANE, SIZE, photographs
+from tests.support.plane_photographs import EYES, LATTICE, PLANE, SIZE, photographs
 from tests.support.short_training import train
 from thermoxels_ns.core.feature_rays import Sightlines
 from thermoxels_ns.core.lattice import Lattice
@@ -34,7 +34,7 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def untrained(scene):
-    return train(scene, 0, {"start": "plain"})
+    return train(scene, 0, {})
 
 
 def test_lines_run_from_each_camera_to_what_its_sure_pixels_show():
@@ -87,7 +87,7 @@ def test_most_lines_of_a_scene_end_at_its_surface(untrained):
 
 
 def test_without_photographs_in_training_nothing_is_asked(scene, untrained):
-    pipeline = train(scene, 0, {"start": "plain", "sh_degree": None, "thermal_density_gradient": True})
+    pipeline = train(scene, 0, {"sh_degree": None, "thermal_density_gradient": True})
     assert find_lines(pipeline.model, pipeline.datamanager) is None
     data = SimpleNamespace(config=SimpleNamespace(streams="thermal"), train_dataset=untrained.datamanager.train_dataset)
     assert find_lines(untrained.model, data) is None
@@ -150,11 +150,11 @@ def test_when_photographs_are_asked(monkeypatch, wanted, steps, tracks, weight, 
     assert lines_for_training(model, attributes) == ("asked" if asked else None)
 
 
-def test_a_training_follows_depths_and_needs_no_trial(scene, capsys):
-    course = {"resolutions": [8, 16], "refine_at": [3], "start": "auto", "photo_depth": "on"}
+def test_a_training_follows_depths(scene, capsys):
+    course = {"resolutions": [8, 16], "refine_at": [3], "photo_depth": "on"}
     followed = train(scene, 6, course).model
     said = " ".join(capsys.readouterr().out.split())
-    assert said.count("photographs agree about") == 1 and "start: plain, as depths tell where surfaces are" in said
+    assert said.count("photographs agree about") == 1
     alone = train(scene, 6, {**course, "photo_depth": "off"}).model
     assert "depths:" not in capsys.readouterr().out
     assert followed.track_rays is not None and alone.track_rays is None
@@ -179,7 +179,7 @@ def test_depths_are_followed_beside_tracks_where_that_is_asked_for(scene, monkey
     monkeypatch.setattr(ThermoxelsModel, "populate_modules", with_tracks)
     monkeypatch.setattr(photo_depth, "find_lines", lambda model, datamanager: some(2, 0.1))
     monkeypatch.setattr(course, "TrackRays", lambda lines, light: followed.append(lines) or TrackRays(lines, light))
-    train(scene, 1, {"start": "plain", "carve": "off", "photo_depth": "on"})
+    train(scene, 1, {"carve": "off", "photo_depth": "on"})
     assert len(followed) == 1 and followed[0].points[:, 0].tolist() == [0.2] * 3 + [0.1] * 2
 
 
@@ -199,5 +199,5 @@ def test_light_may_pass_depths_but_not_tracks_while_the_lattice_is_coarse(scene,
 
     monkeypatch.setattr(ThermoxelsModel, "populate_modules", with_tracks)
     monkeypatch.setattr("thermoxels_ns.training.model.track_loss", recorded)
-    train(scene, 6, {"resolutions": [8, 16], "refine_at": [4], "start": "plain", "photo_depth": depths})
+    train(scene, 6, {"resolutions": [8, 16], "refine_at": [4], "photo_depth": depths})
     assert asked == [light] * 4 + [0.0] * 2

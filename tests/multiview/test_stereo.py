@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.multiview.test_photo_consistency import EYES, FOCAL, PLANE, SIZE, photographs, texture
+from tests.support.plane_photographs import EYES, FOCAL, PLANE, SIZE, photographs, texture
 from thermoxels_ns.core.threads import set_num_threads
 from thermoxels_ns.multiview import stereo as plane_sweep
 from thermoxels_ns.multiview.depth_supervision import lines_to_depths
-from thermoxels_ns.multiview.photo_consistency import Photographs
+from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo import (
     ANGLES_DEG,
     FEWEST_AROUND,

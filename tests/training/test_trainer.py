@@ -33,7 +33,7 @@ def one_writer_at_a_time(monkeypatch) -> None:
 
 def trainer(scene: Path, folder: Path, *options: str) -> ThermoxelsTrainer:
     """The trainer that ns-train would make."""
-    fixed = ["--vis", "tensorboard", "--pipeline.model.start", "plain", "--machine.device-type", "cpu"]
+    fixed = ["--vis", "tensorboard", "--machine.device-type", "cpu"]
     fixed += ["--output-dir", str(folder), "--experiment-name", "e", "--timestamp", "run", "--data", str(scene)]
     before = deepcopy(thermoxels.config)
     settings = (tyro.conf.FlagConversionOff,)

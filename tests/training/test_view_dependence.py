@@ -26,7 +26,7 @@ RISES = 9
 STEPS = 14
 COURSE = {"resolutions": [8, 16], "refine_at": [4], "prune_at": [6], "thin_at": [RISES], "distortion_ramp": [2, 4]}
 COURSE |= {"start_density": 3.0, "prune_threshold": 0.02, "thin_threshold": 0.04, "prune_dilation": 0}
-COURSE |= {"view_dependence_from": RISES, "start": "plain"}
+COURSE |= {"view_dependence_from": RISES}
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,7 @@ def differing(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> l
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"sh_degree": 1}, {"backend": "reference"}, {"start": "photographs"}, {"recipe": "paper"}],
+    [{}, {"sh_degree": 1}, {"backend": "reference"}, {"recipe": "paper"}],
     ids=lambda options: "-".join(map(str, options.values())) or "default",
 )
 def test_a_training_ends_with_the_bits_of_one_that_stores_everything(scene, request, options):
@@ -189,10 +189,7 @@ def test_a_checkpoint_of_another_degree_is_refused(scene, options, columns, expe
         ({"view_dependence_from": 0, "sh_degree": 1}, 1),
         ({"sh_degree": None}, None),
         ({"sh_degree": 0, "view_dependence_from": 0}, 0),
-        # Nothing raises the degree within trials of the start.
-        ({"view_dependence_from": 250, "start": "auto", "trial_steps": 250}, 2),
-        ({"view_dependence_from": 251, "start": "auto", "trial_steps": 250}, 0),
-        ({"view_dependence_from": 1, "start": "photographs"}, 0),
+        ({"view_dependence_from": 1}, 0),
     ],
 )
 def test_degree_at_the_beginning(options, degree):
@@ -202,10 +199,9 @@ def test_degree_at_the_beginning(options, degree):
 def test_memory_is_predicted_for_the_columns_that_a_lattice_will_have():
     """Only lattices that give way before colour depends on the direction stay narrow; the last one never does."""
     course: dict[str, Any] = {"resolutions": (8, 16, 32, 64), "refine_at": (10, 20, 30), "view_dependence_from": 20}
-    config = ThermoxelsModelConfig(start="plain", **course)
+    config = ThermoxelsModelConfig(**course)
     assert [config.row_channels(resolution) for resolution in config.resolutions] == [5, 5, 29, 29]
     assert ThermoxelsModelConfig(view_dependence_from=0).row_channels(32) == 29
-    assert ThermoxelsModelConfig(**course).row_channels(8) == 29, "trials of 250 steps store everything"
     assert ThermoxelsModelConfig(sh_degree=None, temperature_degree=2).row_channels(128) == 10
 
 

@@ -22,10 +22,6 @@ from thermoxels_ns.multiview.stereo import Depths, depths_of
 if TYPE_CHECKING:
     from thermoxels_ns.training.model import ThermoxelsModel
 
-LONGEST_SIDE = 160
-"""Pixels along the longer side of the photographs that are compared."""
-MOST_PHOTOGRAPHS = 64
-"""Photographs compared; of more, that many are taken at equal distances in the list."""
 SHORTEST_RUN = 400
 """Steps that a run must have under auto: a shorter one would spend most of its time on depths."""
 LEAST_SHARE = 0.01
@@ -91,7 +87,7 @@ def find_lines(model: ThermoxelsModel, datamanager: Any) -> Sightlines | None:
     if model.grid.sh is None or datamanager.config.streams == "thermal":
         return None
     near = model.config.near_plane * model.unit
-    photographs = read_photographs(datamanager.train_dataset, near, (), MOST_PHOTOGRAPHS, LONGEST_SIDE)
+    photographs = read_photographs(datamanager.train_dataset, near)
     if photographs is None:
         return None
     box = model.scene_box.aabb.double().numpy()

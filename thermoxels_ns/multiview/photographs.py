@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -12,27 +11,42 @@ import numpy.typing as npt
 from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.multiview.photo_consistency import Photographs
 
-MOST_PHOTOGRAPHS = 32
+MOST_PHOTOGRAPHS = 64
 """Photographs compared; of more, that many are taken at equal distances in the list."""
-LONGEST_SIDE = 400
+LONGEST_SIDE = 160
 """Pixels along the longer side at which photographs are compared; larger ones are averaged down."""
 
 
+@dataclass(frozen=True, eq=False)
+class Photographs:
+    """Pinhole photographs in one array, for the kernels."""
+
+    matrices: npt.NDArray[np.float64]
+    """World to homogeneous pixels, depth positive in front, shape (photographs, 3, 4)."""
+    centres: npt.NDArray[np.float64]
+    """Camera centres, [world units], shape (photographs, 3)."""
+    sizes: npt.NDArray[np.int64]
+    """Width and height, [pixels], shape (photographs, 2)."""
+    firsts: npt.NDArray[np.int64]
+    """Row of `colours` with each photograph's upper left pixel, shape (photographs,)."""
+    colours: npt.NDArray[np.float32]
+    """Channels in [0, 1], photograph after photograph, row after row, shape (pixels, 3); NaN where masked."""
+    near: float = 0.0
+    """Depth up to which a photograph shows nothing, [world units]."""
+
+    def __len__(self) -> int:
+        return len(self.matrices)
+
+
 def read_photographs(
-    dataset: Any,
-    near: float = 0.0,
-    left_out: Collection[int] = (),
-    most: int = MOST_PHOTOGRAPHS,
-    longest_side: int = LONGEST_SIDE,
+    dataset: Any, near: float = 0.0, most: int = MOST_PHOTOGRAPHS, longest_side: int = LONGEST_SIDE
 ) -> Photographs | None:
     """Read a selection of photographs as small pinhole pictures.
 
     Args:
         dataset: A `ThermalDataset` (any with cameras, get_image_uint8 and get_mask).
         near: Depth up to which they show nothing, [world units].
-        left_out: Numbers of photographs that are not read.
         most: Photographs read; of more, that many are taken at equal distances in the list.
         longest_side: Pixels along the longer side; larger photographs are averaged down.
 
@@ -41,7 +55,6 @@ def read_photographs(
     """
     cameras = dataset.cameras.to("cpu")
     usable = np.flatnonzero(cameras.camera_type.numpy().reshape(-1) == CameraType.PERSPECTIVE.value)
-    usable = usable[~np.isin(usable, list(left_out))]
     if len(usable) > most:
         usable = usable[np.linspace(0, len(usable) - 1, most).round().astype(int)]
     if not len(usable):

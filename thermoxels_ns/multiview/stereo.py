@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.threads import run_ranges
-from thermoxels_ns.multiview.photo_consistency import Photographs
+from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo_kernels import OUTSIDE, agreeing_views, correlate, weigh_patches
 
 FloatArray = npt.NDArray[np.float64]

@@ -37,20 +37,14 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     """The callbacks of one training run, in the order in which they act at a step."""
     # They load compiled kernels, which importing the configuration must not.
     from thermoxels_ns.multiview.depth_supervision import lines_for_training
-    from thermoxels_ns.training.photo_start import find_start, hold_density, set_density
-    from thermoxels_ns.training.start_choice import decide_start
 
     before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
     depths = lines_for_training(model, attributes)
     if depths is not None:
         given = model.sightlines
         model.track_rays = TrackRays(depths if given is None else given.and_those_of(depths), COARSE_LIGHT)
-    verdict = decide_start(model, attributes, depths is not None)
     factors = model.config.refinements()
     steps = {*factors, *model.config.prune_at, *model.config.thin_at}
-    from_photographs = verdict.start == "photographs"
-    for step in model.config.skipped_refinements() if from_photographs else ():
-        del factors[step]  # pruning stays at these steps
     end = None
     if attributes.trainer is not None:
         end = attributes.trainer._start_step + attributes.trainer.config.max_num_iterations
@@ -69,21 +63,6 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         change = carve_air(model)
         if change is not None:
             follow(old, change)
-
-    def start(step: int) -> None:
-        """Set the density at the first step of a training, not at the first of a resumed one."""
-        assert attributes.pipeline is not None
-        found = verdict.found or find_start(model, attributes.pipeline.datamanager)
-        old = model.grid.row_parameters()
-        change = model.split(model.config.skipped_factor())
-        if change is not None:
-            follow(old, change)
-        carve(step)
-        set_density(model, found)
-
-    def hold(step: int) -> None:
-        assert attributes.optimizers is not None
-        hold_density(attributes.optimizers.optimizers["density"], step, model.config.hold_density)
 
     def follow(old: dict[str, Parameter], change: RowChange) -> None:
         """Point the optimisers to the rows that took the place of `old`; their state changes as the rows did."""
@@ -126,11 +105,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
 
     return [
         TrainingCallback(before, count),
-        *(
-            [TrainingCallback(before, start, iters=(0,)), TrainingCallback(before, hold)]
-            if from_photographs
-            else [TrainingCallback(before, carve, iters=(0,))]
-        ),
+        TrainingCallback(before, carve, iters=(0,)),
         TrainingCallback(before, change_lattice, iters=tuple(sorted(steps | decisions))),
         TrainingCallback(before, widen),
     ]

@@ -44,7 +44,6 @@ class ThermoxelsModel(Model):
     temperature_bounds_c: Tensor
     backdrop_on: Tensor
     trained_steps: Tensor
-    start_index: Tensor
 
     def populate_modules(self) -> None:
         """Build the field, the background and what belongs to single images."""
@@ -87,8 +86,6 @@ class ThermoxelsModel(Model):
         self.thermal_offset = nn.Parameter(torch.zeros(self.num_train_data)) if config.per_image_offset else None
         # How far training got; part of the checkpoint, because view-dependence begins at some step.
         self.register_buffer("trained_steps", torch.tensor(0))
-        # Which start the training took, a place in `start_choice.STARTS`; a resumed training goes on with its course.
-        self.register_buffer("start_index", torch.tensor(0))
         self.step = 0
         # What training photographs see of the tracks of structure from motion.
         self.sightlines: Sightlines | None = (self.kwargs.get("metadata") or {}).get("sightlines")

@@ -16,8 +16,6 @@ from thermoxels_ns.render.renderers import Backend
 from thermoxels_ns.training.schedule import QUALITIES, schedule_for
 
 _STANDARD = schedule_for(*QUALITIES["standard"])
-FINEST_START = 64
-"""Voxels along the longest side of the finest lattice on which a training begins from photographs."""
 
 
 @dataclass(frozen=True)
@@ -109,16 +107,6 @@ class ThermoxelsModelConfig(ModelConfig):
     """Maps interpolated values to density: relu is the paper's; exp and softplus hold a sharp surface in one voxel."""
     start_density: float = 0.1
     """Density everywhere at the start, per world unit in a scene of size 2: near-transparent, or floaters form."""
-    start: Literal["auto", "plain", "photographs"] = "auto"
-    """Density at the start. plain: the same everywhere; photographs: denser where the photographs that see a point
-    agree about its colour, thinner where they do not, from the finest lattice of at most 64 voxels on. auto: both are
-    tried for trial-steps, some photographs held back, and that which shows those better is taken; the log gives both
-    figures. It costs the time of the trials. Needs 16 photographs and a run of at least three trials, else plain; plain
-    too where photo-depth finds depths."""
-    trial_steps: int = 250
-    """Steps of each trial of the start auto; half of them where one start leads clearly."""
-    hold_density: int = 20
-    """First steps in which the density stands after a start from photographs, while colours find their values."""
     carve: Literal["auto", "off"] = "auto"
     """Drop voxels that are air because structure from motion saw points through them. auto: where the scene has tracks
     (of thermoxels capture or of a COLMAP model, see the dataparser's tracks), at the start and after every
@@ -127,7 +115,7 @@ class ThermoxelsModelConfig(ModelConfig):
     """Ask how far away is what photographs show, by comparing each with its neighbours (plane sweep), and make lines of
     sight end there, as those to points of structure from motion do. It keeps fog from closing before walls of little
     texture. auto: where the scene has no tracks and the run at least 400 steps; on: always, beside tracks too. It needs
-    a loss weight tracks above 0. Where photographs say something, the start auto is plain, without trials."""
+    a loss weight tracks above 0."""
     track_rays: int = 512
     """Lines of sight that each step looks at."""
     thermal_density_gradient: bool = False
@@ -194,8 +182,6 @@ class ThermoxelsModelConfig(ModelConfig):
             "thin_threshold": (0.0, 1.0, "from 0 to 1"),
             "prune_dilation": (0, 100, "from 0 to 100"),
             "temperature_degree": (0, 2, "0, 1 or 2"),
-            "hold_density": (0, 1e9, "0 or more"),
-            "trial_steps": (1, 1e9, "at least 1"),
             "track_rays": (1, 1e9, "at least 1"),
             "start_density": (1e-30, 1e30, "a finite number above 0"),
             "steps_per_voxel": (0.1, 1000.0, "from 0.1 to 1000"),
@@ -241,20 +227,9 @@ class ThermoxelsModelConfig(ModelConfig):
             )
         return {step: b // a for step, (a, b) in zip(self.refine_at, pairs)}
 
-    def skipped_refinements(self) -> tuple[int, ...]:
-        """Steps of refinements that come before the first step of a start from photographs.
-
-        Where photographs agree is too thin for coarse lattices, so it begins on the finest one of at most 64 voxels.
-        """
-        return tuple(step for step, voxels in zip(self.refine_at, self.resolutions[1:]) if voxels <= FINEST_START)
-
     def first_sh_degree(self) -> int | None:
-        """Degree of colour that a training stores at its beginning: 0 until colour depends on the direction.
-
-        Trials of a start have no callbacks that could raise it, so it is not lower than what they need.
-        """
-        flat_until = self.view_dependence_from - (self.trial_steps if self.start == "auto" else 0)
-        return 0 if self.sh_degree is not None and flat_until > 0 else self.sh_degree
+        """Degree of colour that a training stores at its beginning: 0 until colour depends on the direction."""
+        return 0 if self.sh_degree is not None and self.view_dependence_from > 0 else self.sh_degree
 
     def row_channels(self, resolution: int) -> int:
         """Most channels that a row of the lattice of a resolution gets: all, if it is there when colour needs them."""
@@ -275,10 +250,6 @@ class ThermoxelsModelConfig(ModelConfig):
         if self.sh_degree is not None:
             columns["sh"] = tuple(dict.fromkeys((3, 3 * num_coefficients(self.sh_degree))))
         return columns
-
-    def skipped_factor(self) -> int:
-        """Factor by which a start from photographs splits voxels before the first step."""
-        return self.resolutions[len(self.skipped_refinements())] // self.resolutions[0]
 
 
 def _model_class() -> type:

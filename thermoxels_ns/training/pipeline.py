@@ -22,7 +22,6 @@ from thermoxels_ns.training.warm_up import compile_kernels
 
 _GRID = "_model.field.grid."
 _ACTIVATION = "_model.field.grid.activation_index"
-_START = "_model.start_index"
 
 
 @dataclass
@@ -91,9 +90,7 @@ class ThermoxelsPipeline(VanillaPipeline):
                 else "no voxel grid: the checkpoint of another method",
                 remedy="Load it with the config.yml that was written beside it.",
             )
-        own = self.state_dict()
-        state.setdefault(_START, own[_START])  # of a training from before there was a choice
-        self._check_settings(own, state)
+        self._check_settings(self.state_dict(), state)
         super().load_pipeline(state, step)
 
     def _check_settings(self, own: dict[str, Any], state: dict[str, Any]) -> None:

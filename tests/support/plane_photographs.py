@@ -1,0 +1,40 @@
+"""Photographs of a textured plane whose place is known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.multiview.photographs import Photographs
+
+LATTICE = Lattice((-0.5, -0.5, -0.5), 1.0 / 16, (17, 17, 17))
+PLANE = -0.125
+"""Height of the plane: a layer of corners, with others above and below."""
+SIZE, FOCAL = 96, 110.0
+EYES = [(x, y, 1.6) for x in (-0.8, -0.2, 0.4, 0.9) for y in (-0.7, 0.0, 0.8)]
+
+
+def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Colours of the plane: waves that do not repeat within the box."""
+    waves = [np.sin(17 * x + 5 * y), np.sin(23 * y - 11 * x + 1), np.sin(13 * x * y + 19 * x - 7 * y)]
+    return 0.5 + 0.3 * np.stack(waves, -1)
+
+
+def photographs(eyes=EYES, gains: np.ndarray | None = None) -> Photographs:
+    """Photographs of the plane from above, all looking straight down."""
+    turned = np.diag([1.0, -1.0, -1.0])  # x right, y down, z forward of a camera that looks along -z
+    intrinsics = np.array([[FOCAL, 0.0, SIZE / 2], [0.0, FOCAL, SIZE / 2], [0.0, 0.0, 1.0]])
+    column, row = np.meshgrid(*[(np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL] * 2)
+    matrices, pictures = [], []
+    for number, eye in enumerate(np.asarray(eyes, dtype=float)):
+        height = eye[2] - PLANE
+        picture = texture(eye[0] + column * height, eye[1] - row * height)
+        pictures.append(picture * (1.0 if gains is None else gains[number]))
+        matrices.append(intrinsics @ np.column_stack((turned, -turned @ eye)))
+    return Photographs(
+        np.stack(matrices),
+        np.asarray(eyes, dtype=float),
+        np.full((len(eyes), 2), SIZE),
+        np.arange(len(eyes)) * SIZE * SIZE,
+        np.concatenate(pictures).reshape(-1, 3).astype(np.float32),
+    )
