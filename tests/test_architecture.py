@@ -187,7 +187,7 @@ def test_a_circle_is_seen() -> None:
         ("core.lattice", "from thermoxels_ns import cli"),
         ("data.splits", "import thermoxels_ns.field.refine"),
         ("synthetic.solids", "from thermoxels_ns.data.scene_file import read_scene"),
-        ("render.march", "from ..training import losses"),
+        ("render.renderers", "from ..training import losses"),
         ("training.model", "def f():\n    from thermoxels_ns.mesh import build"),
         ("training.pipeline", "def f():\n    from thermoxels_ns.commands import export"),
         ("training.losses", "import skfem"),

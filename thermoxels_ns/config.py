@@ -15,11 +15,12 @@ from thermoxels_ns.data.datamanager import ThermalDataManagerConfig
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig
 from thermoxels_ns.training.optimizers import FusedAdamConfig, RowAdamConfig, RowRMSpropConfig
-from thermoxels_ns.training.pipeline import ThermoxelsPipelineConfig
+from thermoxels_ns.training.pipeline import ThermoxelsPipeline, ThermoxelsPipelineConfig
 from thermoxels_ns.training.schedule import QUALITIES
 from thermoxels_ns.training.trainer import ThermoxelsTrainerConfig
 
 nerfstudio_bridge.install()
+ThermoxelsPipeline.compare_with_truth = nerfstudio_bridge.compare_with_truth
 
 ITERATIONS = QUALITIES["standard"][1]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 import warnings
 from types import ModuleType, TracebackType
-from typing import Annotated, Any, Union, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Union, get_args
 
 import numpy as np
 import torch
@@ -16,6 +16,9 @@ import tyro
 
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.option_help import join_help_lines
+
+if TYPE_CHECKING:
+    from thermoxels_ns.training.pipeline import ThermoxelsPipeline
 
 _EXPORTER = "nerfstudio.scripts.exporter"
 _SUBCOMMAND = "thermoxels-mesh"
@@ -113,3 +116,26 @@ def _with_mesh_export(commands: Any) -> Any:
     members = get_args(get_args(commands)[0] if markers else commands)
     extended = Union[(*members, ours)]
     return Annotated[(extended, *markers)] if markers else extended
+
+
+def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
+    """How well a trained surface agrees with the exact scene, see `evaluation.geometry_metrics`; empty if unknown.
+
+    It stands here because `training` knows no evaluation.
+    """
+    from nerfstudio.utils.rich_utils import CONSOLE
+    from rich.markup import escape
+
+    from thermoxels_ns.core.lattice import input_from_world
+    from thermoxels_ns.evaluation.geometry_metrics import geometry_metrics, has_truth
+
+    def say(line: str) -> None:
+        CONSOLE.print(escape(line))
+
+    datamanager: Any = pipeline.datamanager
+    if not has_truth(datamanager.get_datapath(), say):
+        return {}
+    outputs = datamanager.train_dataparser_outputs
+    world_to_input = input_from_world(outputs.dataparser_transform.numpy(), float(outputs.dataparser_scale))
+    # With the rays' evidence and the cameras, as an export has them: they decide what is solid.
+    return geometry_metrics(pipeline.grid_snapshot(), world_to_input, datamanager.get_datapath(), say)

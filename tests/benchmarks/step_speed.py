@@ -33,7 +33,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from training_run import TrainingRun
 
 from thermoxels_ns.core.threads import num_threads
-from thermoxels_ns.field.widen import widen_colour
+from thermoxels_ns.field.refine import widen_colour
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 from thermoxels_ns.training.schedule import schedule_for
 

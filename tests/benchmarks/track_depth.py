@@ -143,7 +143,7 @@ def measure(scene: Path, tracks: SparseTracks, judged: npt.NDArray[np.bool_], co
     lattice = model.grid.lattice
     views = np.bincount(tracks.sighting_point, minlength=len(tracks.points))
     judged = judged & (views >= _FEWEST_VIEWS) & (tracks.point_error_px < _MOST_ERROR_PX)
-    lines = outputs.metadata["sightlines"]
+    lines = outputs.metadata["feature_rays"]
     trained = KDTree(lines.points[np.unique(lines.point)])
     parts = []
     for frame in read_scene_file(scene).frames:

@@ -124,7 +124,7 @@ def test_tracks_say_which_training_photograph_sees_which_point(scene, tmp_path):
     assert np.array_equal(tracks.sighting_point, scene.model.sighting_point)
     seen = np.bincount(scene.model.sighting_frame, minlength=COUNT)
     train = [number for number, name in enumerate(tracks.frames) if "train" in name]
-    lines = outputs.metadata["sightlines"]
+    lines = outputs.metadata["feature_rays"]
     assert len(lines.origins) == pytest.approx(seen[train].sum(), rel=0.05)
     assert len(lines.origins) <= seen[train].sum()
 

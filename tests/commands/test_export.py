@@ -21,14 +21,13 @@ from tests.support.looking_cameras import looking_at
 from thermoxels_ns.commands.export import (
     ExportThermoxelsMesh,
     _check_config,
-    input_from_world,
     scene_json,
     viewpoint_of_cameras,
 )
 from thermoxels_ns.commands.export_options import ExportOptions, Viewpoint, check_options
 from thermoxels_ns.commands.export_snapshot import export_snapshot, volume_in_words
 from thermoxels_ns.core.errors import CheckpointError, HeatError, MeshError, OutputError, SceneError, ThermoxelsError
-from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.lattice import Lattice, input_from_world
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.fem.problem import TimeSteps
 from thermoxels_ns.mesh.solid.voxels import SolidSelection

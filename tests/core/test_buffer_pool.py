@@ -8,7 +8,7 @@ import torch
 
 from tests.reference.two_renderers import random_grid, random_request
 from thermoxels_ns.core import buffer_pool as scratch
-from thermoxels_ns.core.buffer_pool import PATIENCE, SMALLEST, Scratch, rounded_size
+from thermoxels_ns.core.buffer_pool import PATIENCE, SMALLEST, BufferPool, rounded_size
 from thermoxels_ns.field.refine import refine
 from thermoxels_ns.render.ray_render import RenderOptions
 from thermoxels_ns.render.renderers import fused_render
@@ -21,7 +21,7 @@ def address(array: np.ndarray) -> int:
 
 
 def test_memory_comes_back_when_the_last_view_of_it_is_gone():
-    pool = Scratch()
+    pool = BufferPool()
     array = pool.empty((LARGE // 8, 2), np.float32)
     assert array.shape == (LARGE // 8, 2) and array.dtype == np.float32
     where, view, tensor = address(array), array[3:], torch.from_numpy(array)[1:]
@@ -35,7 +35,7 @@ def test_memory_comes_back_when_the_last_view_of_it_is_gone():
 
 
 def test_two_arrays_in_use_never_share_memory():
-    pool = Scratch()
+    pool = BufferPool()
     arrays = [pool.empty(LARGE, np.uint8) for _ in range(5)]
     for number, array in enumerate(arrays):
         array.fill(number)
@@ -43,14 +43,14 @@ def test_two_arrays_in_use_never_share_memory():
 
 
 def test_zeros_are_zeros_also_in_memory_that_was_used():
-    pool = Scratch()
+    pool = BufferPool()
     pool.empty(LARGE, np.float32).fill(7.0)
     assert pool.held_bytes() > 0
     assert not pool.zeros(LARGE, np.float32).any()
 
 
 def test_small_arrays_are_not_kept():
-    pool = Scratch()
+    pool = BufferPool()
     small = pool.empty(SMALLEST - 1, np.uint8)
     assert small.base is None
     del small
@@ -59,7 +59,7 @@ def test_small_arrays_are_not_kept():
 
 @pytest.mark.parametrize("shape", [0, (0, 27), (5, 0)])
 def test_empty_arrays(shape):
-    assert Scratch().empty(shape, np.float32).size == 0
+    assert BufferPool().empty(shape, np.float32).size == 0
 
 
 @pytest.mark.parametrize("size", [1, 3, 1023, 1024, 1025, 99_999, 2**20 + 1])
@@ -69,7 +69,7 @@ def test_rounding_adds_at_most_a_quarter(size):
 
 
 def test_what_nobody_asks_for_is_given_back():
-    pool = Scratch()
+    pool = BufferPool()
     del [pool.empty(LARGE, np.uint8)][0]
     assert pool.held_bytes() == LARGE
     for _ in range(2 * PATIENCE):
@@ -78,7 +78,7 @@ def test_what_nobody_asks_for_is_given_back():
 
 
 def test_release_gives_back_what_is_not_lent():
-    pool = Scratch()
+    pool = BufferPool()
     kept = pool.zeros(LARGE, np.uint8)
     pool.empty(LARGE, np.uint8)
     pool.release()
@@ -129,6 +129,6 @@ def test_a_new_lattice_gives_back_what_the_old_one_needed():
     grid = random_grid(2, density=0.0)
     rendered(grid, random_request(grid, 2000)).backward()
     grid.zero_grad(set_to_none=True)
-    assert scratch.SCRATCH.held_bytes() > 0
+    assert scratch.BUFFERS.held_bytes() > 0
     refine(grid, 2)
-    assert scratch.SCRATCH.held_bytes() == 0
+    assert scratch.BUFFERS.held_bytes() == 0

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 import thermoxels_ns.core.feature_rays as module
-from thermoxels_ns.core.feature_rays import FEWEST_NEIGHBOURS, Sightlines, agrees_with_neighbours
+from thermoxels_ns.core.feature_rays import FEWEST_NEIGHBOURS, FeatureRays, agrees_with_neighbours
 
 CAMERAS = np.random.default_rng(9).uniform(-0.6, 0.6, (6, 3)) + np.array([0.0, 0.0, 2.0])
 
 
-def seen_by_all(points: np.ndarray, uncertainty: float = 0.0) -> Sightlines:
+def seen_by_all(points: np.ndarray, uncertainty: float = 0.0) -> FeatureRays:
     """Every camera sees every point."""
     number = np.repeat(np.arange(len(points)), len(CAMERAS))
-    return Sightlines(np.tile(CAMERAS, (len(points), 1)), number, points, np.full(len(number), uncertainty))
+    return FeatureRays(np.tile(CAMERAS, (len(points), 1)), number, points, np.full(len(number), uncertainty))
 
 
 def floor(count: int = 600, seed: int = 0, slope: float = 0.0) -> np.ndarray:
@@ -95,21 +95,21 @@ def test_photographs_do_not_vouch_for_what_others_see() -> None:
     lines = seen_by_all(points)
     first_half = np.tile(np.arange(len(CAMERAS)) < 3, len(points))
     own = first_half == (lines.point < 300)
-    halves = Sightlines(lines.origins[own], lines.point[own], points, lines.uncertainty[own])
+    halves = FeatureRays(lines.origins[own], lines.point[own], points, lines.uncertainty[own])
     assert agrees_with_neighbours(halves).mean() > 0.99
     assert agrees_with_neighbours(lines).mean() < 0.9
 
 
 def test_points_without_lines_are_not_doubted_and_nothing_is_made_of_nothing() -> None:
-    nothing = Sightlines(np.zeros((0, 3)), np.zeros(0, dtype=np.int64), floor(4), np.zeros(0))
+    nothing = FeatureRays(np.zeros((0, 3)), np.zeros(0, dtype=np.int64), floor(4), np.zeros(0))
     assert agrees_with_neighbours(nothing).tolist() == [True] * 4
-    none = Sightlines(nothing.origins, nothing.point, np.zeros((0, 3)), nothing.uncertainty)
+    none = FeatureRays(nothing.origins, nothing.point, np.zeros((0, 3)), nothing.uncertainty)
     assert agrees_with_neighbours(none).shape == (0,)
 
 
 def test_without_their_lines_points_keep_their_places_and_numbers() -> None:
     lines = seen_by_all(floor(5), uncertainty=0.1)
-    some = lines.with_lines_of(np.array([True, False, True, False, False]))
+    some = lines.of_points(np.array([True, False, True, False, False]))
     assert some.points is lines.points
     assert some.point.tolist() == [0] * 6 + [2] * 6
     assert np.array_equal(some.origins, np.tile(CAMERAS, (2, 1))) and len(some.uncertainty) == 12

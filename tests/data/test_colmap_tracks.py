@@ -91,12 +91,12 @@ def test_points_come_in_the_worlds_of_the_json_and_of_training(scene, where, tex
     assert np.sort(tracks.points, axis=0) == pytest.approx(np.sort(POINTS, axis=0), abs=1e-6)
     assert len(tracks.sighting_frame) == 6 * 30
     outputs = lines_of(scene)
-    lines = outputs.metadata["sightlines"]
+    lines = outputs.metadata["feature_rays"]
     centres = outputs.cameras.camera_to_worlds[:, :, 3].double().numpy()
     nearest = np.linalg.norm(lines.origins[:, None] - centres, axis=2)
     assert len(lines.points) == 30 and len(lines.origins) == 5 * 30  # the one that evaluates is left out
     assert nearest.min(axis=1).max() < 1e-5
-    assert lines_of(scene, "val").metadata["sightlines"] is None
+    assert lines_of(scene, "val").metadata["feature_rays"] is None
 
 
 @pytest.mark.parametrize("where", COLMAP_FOLDERS)
@@ -122,11 +122,11 @@ def test_a_cut_off_model_gives_no_box(scene):
 
 
 def test_without_a_model_and_switched_off_there_are_no_lines(scene):
-    assert lines_of(scene).metadata["sightlines"] is None
+    assert lines_of(scene).metadata["feature_rays"] is None
     add_model(scene)
-    assert lines_of(scene).metadata["sightlines"] is not None
-    assert lines_of(scene, tracks="given").metadata["sightlines"] is None
-    assert lines_of(scene, tracks="off").metadata["sightlines"] is None
+    assert lines_of(scene).metadata["feature_rays"] is not None
+    assert lines_of(scene, tracks="given").metadata["feature_rays"] is None
+    assert lines_of(scene, tracks="off").metadata["feature_rays"] is None
 
 
 def test_the_file_that_the_json_names_comes_first(scene):
@@ -140,8 +140,8 @@ def test_the_file_that_the_json_names_comes_first(scene):
     write_tracks(scene.path / "tracks.npz", some)
     scene.meta[TRACKS_KEY] = "tracks.npz"
     scene.rewrite()
-    assert len(lines_of(scene).metadata["sightlines"].points) == 7
-    assert lines_of(scene, tracks="off").metadata["sightlines"] is None
+    assert len(lines_of(scene).metadata["feature_rays"].points) == 7
+    assert lines_of(scene, tracks="off").metadata["feature_rays"] is None
 
 
 def test_some_wrong_poses_are_left_out_and_named_and_move_nothing(scene, capsys):
@@ -160,24 +160,24 @@ def test_some_wrong_poses_are_left_out_and_named_and_move_nothing(scene, capsys)
 def test_a_model_of_other_poses_is_not_used_and_a_warning_says_so(scene, capsys):
     frames = frames_of(scene)
     add_model(scene, frames=frames[3:] + frames[:3], names=[one.image.name for one in frames])
-    assert lines_of(scene).metadata["sightlines"] is None
+    assert lines_of(scene).metadata["feature_rays"] is None
     said = " ".join(capsys.readouterr().out.split())
     assert "colmap/sparse/0 is not used" in said and "poses are others" in said
 
 
 def test_a_model_of_other_photographs_or_unreadable_is_not_used(scene, capsys):
     add_model(scene, names=[f"other_{n}.jpg" for n in range(6)])
-    assert lines_of(scene).metadata["sightlines"] is None
+    assert lines_of(scene).metadata["feature_rays"] is None
     assert "no photograph of this scene" in " ".join(capsys.readouterr().out.split())
     (scene.path / "colmap/sparse/0/images.bin").write_bytes(b"\x07")
-    assert lines_of(scene).metadata["sightlines"] is None
+    assert lines_of(scene).metadata["feature_rays"] is None
     assert "cannot be read" in " ".join(capsys.readouterr().out.split())
 
 
 def test_two_photographs_in_common_are_too_few(scene, capsys):
     frames = frames_of(scene)
     add_model(scene, frames=frames[:2])
-    assert lines_of(scene).metadata["sightlines"] is None
+    assert lines_of(scene).metadata["feature_rays"] is None
     assert "too few" in " ".join(capsys.readouterr().out.split())
 
 
@@ -186,7 +186,7 @@ def test_a_model_outside_the_scene_is_not_used(scene, tmp_path, capsys):
     outside = tmp_path / "outside"
     shutil.move(scene.path / "colmap", outside)
     (scene.path / "colmap").symlink_to(outside)
-    assert lines_of(scene).metadata["sightlines"] is None
+    assert lines_of(scene).metadata["feature_rays"] is None
     assert "a file inside" in " ".join(capsys.readouterr().out.split())
 
 
@@ -252,7 +252,7 @@ def test_a_cut_off_model_is_not_used_and_a_warning_names_the_file(scene, capsys)
     add_model(scene)
     path = scene.path / "colmap/sparse/0/points3D.bin"
     path.write_bytes(path.read_bytes()[:-1])
-    assert lines_of(scene).metadata["sightlines"] is None
+    assert lines_of(scene).metadata["feature_rays"] is None
     assert "points3D.bin ends before its last entry" in " ".join(capsys.readouterr().out.split())
 
 
@@ -260,7 +260,7 @@ def test_a_camera_without_pixels_is_refused(scene, capsys):
     add_model(scene, text=True)
     path = scene.path / "colmap/sparse/0/cameras.txt"
     path.write_text(path.read_text().replace("PINHOLE 24 18", "PINHOLE 0 0"))
-    assert lines_of(scene).metadata["sightlines"] is None
+    assert lines_of(scene).metadata["feature_rays"] is None
     assert "0 pixels wide" in " ".join(capsys.readouterr().out.split())
 
 
@@ -270,6 +270,6 @@ def test_a_model_of_photographs_that_do_not_train_advises_nothing_about_a_file_o
     scene.meta |= {key: [f"images/{n}" for n in names[:3]] for key in ("val_filenames", "test_filenames")}
     scene.rewrite()
     add_model(scene, frames=frames_of(scene)[:3])
-    assert lines_of(scene, eval_mode="lists").metadata["sightlines"] is None
+    assert lines_of(scene, eval_mode="lists").metadata["feature_rays"] is None
     said = " ".join(capsys.readouterr().out.split())
     assert "expected photographs of this scene" in said and "or move it away" in said and TRACKS_KEY not in said

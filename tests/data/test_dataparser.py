@@ -11,8 +11,8 @@ import pytest
 import torch
 from PIL import Image
 
-from thermoxels_ns.commands.export import input_from_world
 from thermoxels_ns.core.errors import SceneError, ThermalFileError
+from thermoxels_ns.core.lattice import input_from_world
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.dataset import ThermalDataset

@@ -14,8 +14,8 @@ from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.data.sparse_tracks import (
     TRACKS_KEY,
     SparseTracks,
+    feature_rays,
     read_tracks,
-    sightlines,
     write_tracks,
 )
 
@@ -52,7 +52,7 @@ def test_what_is_written_is_read(scene):
 def test_lines_begin_at_training_cameras_only_and_end_at_the_points_of_the_new_world(scene):
     folder, tracks = scene
     outputs = lines_of(folder, scale_factor=0.5)
-    lines = outputs.metadata["sightlines"]
+    lines = outputs.metadata["feature_rays"]
     centres = outputs.cameras.camera_to_worlds[:, :, 3].double().numpy()
     assert len(lines.origins) == 5 * 30
     nearest = np.linalg.norm(lines.origins[:, None] - centres, axis=2)
@@ -62,7 +62,7 @@ def test_lines_begin_at_training_cameras_only_and_end_at_the_points_of_the_new_w
     moved = outputs.dataparser_scale * (tracks.points @ transform[:, :3].T + transform[:, 3])
     assert lines.points == pytest.approx(moved, abs=1e-6)
     assert (np.diff(lines.point) >= 0).all()
-    assert lines_of(folder, "val").metadata["sightlines"] is None
+    assert lines_of(folder, "val").metadata["feature_rays"] is None
 
 
 def test_points_that_only_evaluation_sees_a_third_time_are_left_out(scene):
@@ -72,7 +72,7 @@ def test_points_that_only_evaluation_sees_a_third_time_are_left_out(scene):
     few = np.isin(tracks.sighting_frame, [of_eval, *others]) | (tracks.sighting_point >= 3)
     tracks = replace(tracks, sighting_frame=tracks.sighting_frame[few], sighting_point=tracks.sighting_point[few])
     write_tracks(folder.path / "tracks.npz", tracks)
-    assert len(lines_of(folder).metadata["sightlines"].points) == 27
+    assert len(lines_of(folder).metadata["feature_rays"].points) == 27
 
 
 def test_a_point_that_its_neighbours_contradict_is_listed_without_lines(scene):
@@ -83,11 +83,11 @@ def test_a_point_that_its_neighbours_contradict_is_listed_without_lines(scene):
     frame, point = (a.reshape(-1) for a in np.meshgrid(np.flatnonzero(centres[:, 0] > 0), range(300), indexing="ij"))
     tracks = SparseTracks(points, np.full(300, 0.5), tracks.frames, frame, point)
     write_tracks(folder.path / "tracks.npz", tracks)
-    assert np.bincount(lines_of(folder).metadata["sightlines"].point).tolist() == [3] * 300
+    assert np.bincount(lines_of(folder).metadata["feature_rays"].point).tolist() == [3] * 300
     middle = int(np.argmin(np.abs(points).sum(axis=1)))
     points[middle] += 0.1 * (centres[centres[:, 0] > 0].mean(axis=0) - points[middle])
     write_tracks(folder.path / "tracks.npz", tracks)
-    lines = lines_of(folder).metadata["sightlines"]
+    lines = lines_of(folder).metadata["feature_rays"]
     assert len(lines.points) == 300
     assert sorted(set(range(300)) - set(lines.point.tolist())) == [middle]
 
@@ -99,11 +99,11 @@ def test_badly_known_points_are_left_out(scene):
     points = tracks.points.copy()
     points[4] = np.nan
     frames = [frame for frame in read_scene_file(folder.path).frames if "train" in frame.name]
-    lines = sightlines(replace(tracks, point_error_px=error, points=points), frames)
+    lines = feature_rays(replace(tracks, point_error_px=error, points=points), frames)
     assert np.array_equal(lines.points, tracks.points[5:])
     # Cameras at one place know no distances.
     together = [replace(frame, pose=frames[0].pose) for frame in frames]
-    assert len(sightlines(tracks, together).points) == 0
+    assert len(feature_rays(tracks, together).points) == 0
 
 
 def test_sightings_given_twice_count_once(scene):
@@ -114,8 +114,8 @@ def test_sightings_given_twice_count_once(scene):
         sighting_frame=np.tile(tracks.sighting_frame, 3),
         sighting_point=np.tile(tracks.sighting_point, 3),
     )
-    assert len(sightlines(twice, frames).origins) == len(sightlines(tracks, frames).origins) == 5 * 30
-    assert len(sightlines(twice, frames[:2]).points) == 0  # two photographs are not six
+    assert len(feature_rays(twice, frames).origins) == len(feature_rays(tracks, frames).origins) == 5 * 30
+    assert len(feature_rays(twice, frames[:2]).points) == 0  # two photographs are not six
 
 
 def test_an_error_that_was_not_computed_is_no_error_and_none_is_not_believed(scene):
@@ -123,7 +123,7 @@ def test_an_error_that_was_not_computed_is_no_error_and_none_is_not_believed(sce
     frames = [frame for frame in read_scene_file(folder.path).frames if "train" in frame.name]
     error = tracks.point_error_px.copy()
     error[:3], error[3], error[4] = -1.0, np.nan, 0.0
-    lines = sightlines(replace(tracks, point_error_px=error), frames)
+    lines = feature_rays(replace(tracks, point_error_px=error), frames)
     assert np.array_equal(lines.points, tracks.points[4:])
     assert (lines.uncertainty > 0.0).all()
 
@@ -131,10 +131,10 @@ def test_an_error_that_was_not_computed_is_no_error_and_none_is_not_believed(sce
 def test_one_camera_and_points_behind_it(scene):
     folder, tracks = scene
     frames = [frame for frame in read_scene_file(folder.path).frames if "train" in frame.name]
-    assert len(sightlines(tracks, frames[:1]).points) == 0
+    assert len(feature_rays(tracks, frames[:1]).points) == 0
     points = tracks.points.copy()
     points[0] = frames[0].pose[:3, 3] + 50.0 * frames[0].pose[:3, 2]  # behind one camera, and so seen by nobody
-    lines = sightlines(replace(tracks, points=points), frames)
+    lines = feature_rays(replace(tracks, points=points), frames)
     axis = np.stack([-frame.pose[:3, 2] for frame in frames])
     camera = np.linalg.norm(lines.origins[:, None] - np.stack([f.pose[:3, 3] for f in frames]), axis=2).argmin(axis=1)
     assert ((lines.points[lines.point] - lines.origins) * axis[camera]).sum(axis=1).min() > 0.0
@@ -149,14 +149,14 @@ def test_the_error_of_a_length_is_that_of_a_triangulation(scene):
         pose[:3, 3] = (x, 0.0, 2.0)
         frames.append(replace(frame, name=str(number), pose=pose))
     one = SparseTracks(np.zeros((1, 3)), np.ones(1), ("0", "1", "2"), np.arange(3), np.zeros(3, dtype=np.int64))
-    lines = sightlines(one, frames)
+    lines = feature_rays(one, frames)
     angle = 2.0 * np.arctan2(1.0, 2.0)
     expected = 1.0 / frame.intrinsics.fl_x / np.sin(angle) * np.sqrt([5.0, 4.0, 5.0])
     assert lines.uncertainty == pytest.approx(expected)
 
 
 def test_without_tracks_there_are_no_lines(scene_folder):
-    assert lines_of(scene_folder()).metadata["sightlines"] is None
+    assert lines_of(scene_folder()).metadata["feature_rays"] is None
 
 
 def test_tracks_of_other_photographs_or_poses_are_refused(scene):

@@ -11,9 +11,10 @@ import torch
 from tests.support.short_training import train
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
-from thermoxels_ns.evaluation.geometry_metrics import geometry_metrics, half_transparent_share
+from thermoxels_ns.evaluation.geometry_metrics import geometry_metrics
 from thermoxels_ns.evaluation.truth_comparison import KnownTruth, compare_with_truth
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.training.image_metrics import half_transparent_share
 
 IDENTITY = np.eye(4)
 SCORES = ("fscore", "precision", "recall")
@@ -130,7 +131,7 @@ def test_evaluation_has_the_share_of_half_transparent_rays(pipeline):
 
 def test_ns_eval_compares_the_trained_density_with_the_scene(pipeline, monkeypatch):
     """A field that holds the exact scene, in the trained world's own coordinates, scores full."""
-    from thermoxels_ns.commands.export import input_from_world
+    from thermoxels_ns.core.lattice import input_from_world
     from thermoxels_ns.evaluation.truth_comparison import load_known_truth
 
     outputs = pipeline.datamanager.train_dataparser_outputs

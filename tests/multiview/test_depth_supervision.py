@@ -11,18 +11,17 @@ import torch
 
 from tests.support.plane_photographs import EYES, LATTICE, PLANE, SIZE, photographs
 from tests.support.short_training import train
-from thermoxels_ns.core.feature_rays import Sightlines
-from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.feature_rays import FeatureRays
+from thermoxels_ns.field.refine import refine
 from thermoxels_ns.multiview.depth_supervision import (
     ERROR_PLANES,
-    SHORTEST_RUN,
-    find_lines,
-    lines_for_training,
-    lines_to_depths,
+    feature_rays_of_photographs,
+    feature_rays_to_depths,
 )
 from thermoxels_ns.multiview.stereo import Depths, depths_of
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
-from thermoxels_ns.training.track_loss import COARSE_LIGHT, TrackRays, track_loss
+from thermoxels_ns.training.callbacks import SHORTEST_RUN_WITH_DEPTHS, follow_depths
+from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler, feature_ray_loss
 
 
 @pytest.fixture(scope="module")
@@ -37,12 +36,17 @@ def untrained(scene):
     return train(scene, 0, {})
 
 
+def rays_of(pipeline, say=print) -> FeatureRays | None:
+    lattice = pipeline.model.grid.lattice
+    return feature_rays_of_photographs(pipeline.datamanager.train_dataset, 0.0, lattice.lo, lattice.hi, say)
+
+
 def test_lines_run_from_each_camera_to_what_its_sure_pixels_show():
     seen = photographs()
     depth = np.full(len(seen.colours), np.nan, np.float32)
     sure = np.array([5, SIZE * SIZE - 1, 3 * SIZE * SIZE, len(depth) - 1])
     depth[sure] = [1.5, 1.6, 1.7, 1.8]
-    lines = lines_to_depths(Depths(seen, depth, np.full(len(depth), 0.02, np.float32)))
+    lines = feature_rays_to_depths(Depths(seen, depth, np.full(len(depth), 0.02, np.float32)))
     number = [0, 0, 3, len(EYES) - 1]
     assert np.array_equal(lines.origins, seen.centres[number]) and np.array_equal(lines.point, np.arange(4))
     for pixel, camera, point, error in zip(sure, number, lines.points, lines.uncertainty):
@@ -55,19 +59,19 @@ def test_lines_run_from_each_camera_to_what_its_sure_pixels_show():
 
 
 def test_lines_end_at_the_plane_that_the_photographs_show():
-    lines = lines_to_depths(depths_of(photographs(), LATTICE.lo, LATTICE.hi))
+    lines = feature_rays_to_depths(depths_of(photographs(), LATTICE.lo, LATTICE.hi))
     off = np.abs(lines.points[:, 2] - PLANE)
     assert len(off) > 10_000 and np.quantile(off, 0.95) < 0.02
 
 
 def test_lines_of_two_kinds_stay_with_their_points():
-    def some(count: int, points: int, seed: int) -> Sightlines:
+    def some(count: int, points: int, seed: int) -> FeatureRays:
         draw = np.random.default_rng(seed)
         order = np.sort(draw.integers(0, points, count))
-        return Sightlines(draw.random((count, 3)), order, draw.random((points, 3)), draw.random(count))
+        return FeatureRays(draw.random((count, 3)), order, draw.random((points, 3)), draw.random(count))
 
     one, two = some(7, 3, 0), some(5, 4, 1)
-    both = one.and_those_of(two)
+    both = one.joined_with(two)
     assert np.array_equal(both.points[both.point], np.concatenate((one.points[one.point], two.points[two.point])))
     assert np.array_equal(both.origins, np.concatenate((one.origins, two.origins)))
     assert np.array_equal(both.uncertainty, np.concatenate((one.uncertainty, two.uncertainty)))
@@ -75,9 +79,9 @@ def test_lines_of_two_kinds_stay_with_their_points():
 
 
 def test_most_lines_of_a_scene_end_at_its_surface(untrained):
-    lines = find_lines(untrained.model, untrained.datamanager)
+    lines = rays_of(untrained)
     assert lines is not None and len(lines.points) > 200
-    from thermoxels_ns.commands.export import input_from_world
+    from thermoxels_ns.core.lattice import input_from_world
 
     outputs: Any = untrained.datamanager.train_dataparser_outputs
     to_input = input_from_world(outputs.dataparser_transform.numpy(), float(outputs.dataparser_scale))
@@ -86,68 +90,72 @@ def test_most_lines_of_a_scene_end_at_its_surface(untrained):
     assert np.median(off) < 0.02 and np.quantile(off, 0.9) < 0.06, np.quantile(off, [0.5, 0.9])
 
 
-def test_without_photographs_in_training_nothing_is_asked(scene, untrained):
-    pipeline = train(scene, 0, {"sh_degree": None, "thermal_density_gradient": True})
-    assert find_lines(pipeline.model, pipeline.datamanager) is None
-    data = SimpleNamespace(config=SimpleNamespace(streams="thermal"), train_dataset=untrained.datamanager.train_dataset)
-    assert find_lines(untrained.model, data) is None
-
-
-def test_depths_are_looked_for_in_the_box_of_the_scene_however_the_lattice_was_refined(untrained, monkeypatch):
-    from thermoxels_ns.multiview import depth_supervision as photo_depth
-
-    boxes = []
-
-    def recorded(seen, lo, hi):
-        boxes.append((lo, hi))
-        return Depths(seen, np.full(len(seen.colours), np.nan, np.float32), np.zeros(len(seen.colours), np.float32))
-
-    monkeypatch.setattr(photo_depth, "depths_of", recorded)
-    known = untrained.model
-    find_lines(known, untrained.datamanager)
-    # Refining moves a lattice's far corner, on some boxes, in the last bit; here by much.
-    moved = SimpleNamespace(sh=known.grid.sh, lattice=Lattice.covering((0, 0, 0), (9, 9, 9), 8))
-    refined: Any = SimpleNamespace(grid=moved, config=known.config, unit=known.unit, scene_box=known.scene_box)
-    find_lines(refined, untrained.datamanager)
-    assert boxes[0] == boxes[1] == (known.grid.lattice.lo, known.grid.lattice.hi)
-
-
-def test_photographs_that_agree_about_nothing_give_no_lines(untrained, monkeypatch, capsys):
-    from thermoxels_ns.multiview import depth_supervision as photo_depth
-
+def test_photographs_that_agree_about_nothing_give_no_lines(untrained, monkeypatch):
     def unsure(seen, lo, hi):
         nothing = np.full(len(seen.colours), np.nan, np.float32)
         return Depths(seen, nothing, nothing)
 
-    monkeypatch.setattr(photo_depth, "depths_of", unsure)
-    assert find_lines(untrained.model, untrained.datamanager) is None
-    assert "too few to tell anything" in capsys.readouterr().out
+    monkeypatch.setattr("thermoxels_ns.multiview.depth_supervision.depths_of", unsure)
+    said: list[str] = []
+    assert rays_of(untrained, said.append) is None
+    assert "too few to tell anything" in said[0]
+
+
+def asked_boxes(monkeypatch, found=None) -> list:
+    """The boxes in which a training looks for depths, which are then `found`."""
+    boxes: list[Any] = []
+
+    def recorded(dataset, near, lo, hi, say):
+        boxes.append((lo, hi))
+        return found
+
+    monkeypatch.setattr("thermoxels_ns.training.callbacks.feature_rays_of_photographs", recorded)
+    return boxes
+
+
+def attributes_of(datamanager: Any, steps: int = SHORTEST_RUN_WITH_DEPTHS) -> Any:
+    first = steps // 2  # of a resumed training the steps before count too
+    trainer = SimpleNamespace(_start_step=first, config=SimpleNamespace(max_num_iterations=steps - first))
+    return SimpleNamespace(pipeline=SimpleNamespace(datamanager=datamanager), trainer=trainer)
+
+
+def test_without_photographs_in_training_nothing_is_asked(scene, untrained, monkeypatch):
+    pipeline = train(scene, 0, {"sh_degree": None, "thermal_density_gradient": True})
+    boxes = asked_boxes(monkeypatch)
+    follow_depths(pipeline.model, attributes_of(pipeline.datamanager))
+    data = SimpleNamespace(config=SimpleNamespace(streams="thermal"), train_dataset=untrained.datamanager.train_dataset)
+    follow_depths(untrained.model, attributes_of(data))
+    assert boxes == []
+
+
+def test_depths_are_looked_for_in_the_box_of_the_scene_however_the_lattice_was_refined(scene, monkeypatch):
+    boxes = asked_boxes(monkeypatch)
+    pipeline = train(scene, 0)
+    first = pipeline.model.grid.lattice
+    follow_depths(pipeline.model, attributes_of(pipeline.datamanager))
+    refine(pipeline.model.grid, 2)
+    follow_depths(pipeline.model, attributes_of(pipeline.datamanager))
+    assert boxes[0] == boxes[1] == (first.lo, first.hi)
 
 
 @pytest.mark.parametrize(
     ("wanted", "steps", "tracks", "weight", "asked"),
     [
-        ("auto", SHORTEST_RUN, False, 0.05, True),
-        ("auto", SHORTEST_RUN - 1, False, 0.05, False),
-        ("auto", SHORTEST_RUN, True, 0.05, False),
-        ("auto", SHORTEST_RUN, False, 0.0, False),
+        ("auto", SHORTEST_RUN_WITH_DEPTHS, False, 0.05, True),
+        ("auto", SHORTEST_RUN_WITH_DEPTHS - 1, False, 0.05, False),
+        ("auto", SHORTEST_RUN_WITH_DEPTHS, True, 0.05, False),
+        ("auto", SHORTEST_RUN_WITH_DEPTHS, False, 0.0, False),
         ("on", 1, True, 0.05, True),
-        ("off", SHORTEST_RUN, False, 0.05, False),
+        ("off", SHORTEST_RUN_WITH_DEPTHS, False, 0.05, False),
     ],
 )
-def test_when_photographs_are_asked(monkeypatch, wanted, steps, tracks, weight, asked):
-    from thermoxels_ns.multiview import depth_supervision as photo_depth
-
-    monkeypatch.setattr(photo_depth, "find_lines", lambda model, datamanager: "asked")
-    model: Any = SimpleNamespace(
-        config=SimpleNamespace(photo_depth=wanted),
-        loss_weights=SimpleNamespace(tracks=weight),
-        track_rays=object() if tracks else None,
-    )
-    first = steps // 2  # of a resumed training the steps before count too
-    trainer = SimpleNamespace(_start_step=first, config=SimpleNamespace(max_num_iterations=steps - first))
-    attributes: Any = SimpleNamespace(pipeline=SimpleNamespace(datamanager=None), trainer=trainer)
-    assert lines_for_training(model, attributes) == ("asked" if asked else None)
+def test_when_photographs_are_asked(scene, monkeypatch, wanted, steps, tracks, weight, asked):
+    boxes = asked_boxes(monkeypatch)
+    pipeline = train(scene, 0, {"photo_depth": wanted, "loss_overrides": {"tracks": weight}})
+    pipeline.model.feature_ray_sampler = object() if tracks else None  # type: ignore[assignment]
+    boxes.clear()
+    follow_depths(pipeline.model, attributes_of(pipeline.datamanager, steps))
+    assert len(boxes) == asked
 
 
 def test_a_training_follows_depths(scene, capsys):
@@ -157,28 +165,29 @@ def test_a_training_follows_depths(scene, capsys):
     assert said.count("photographs agree about") == 1
     alone = train(scene, 6, {**course, "photo_depth": "off"}).model
     assert "depths:" not in capsys.readouterr().out
-    assert followed.track_rays is not None and alone.track_rays is None
+    assert followed.feature_ray_sampler is not None and alone.feature_ray_sampler is None
     assert not torch.equal(followed.grid.density, alone.grid.density)
 
 
 def test_depths_are_followed_beside_tracks_where_that_is_asked_for(scene, monkeypatch):
-    import thermoxels_ns.multiview.depth_supervision as photo_depth
     import thermoxels_ns.training.callbacks as course
     from thermoxels_ns.training.model import ThermoxelsModel
 
-    def some(count: int, at: float) -> Sightlines:
-        return Sightlines(np.zeros((count, 3)), np.arange(count), np.full((count, 3), at), np.full(count, 0.1))
+    def some(count: int, at: float) -> FeatureRays:
+        return FeatureRays(np.zeros((count, 3)), np.arange(count), np.full((count, 3), at), np.full(count, 0.1))
 
     populate, followed = ThermoxelsModel.populate_modules, []
 
     def with_tracks(model):
         populate(model)
-        model.sightlines = some(3, 0.2)
-        model.track_rays = TrackRays(model.sightlines)
+        model.feature_rays = some(3, 0.2)
+        model.feature_ray_sampler = FeatureRaySampler(model.feature_rays)
 
     monkeypatch.setattr(ThermoxelsModel, "populate_modules", with_tracks)
-    monkeypatch.setattr(photo_depth, "find_lines", lambda model, datamanager: some(2, 0.1))
-    monkeypatch.setattr(course, "TrackRays", lambda lines, light: followed.append(lines) or TrackRays(lines, light))
+    asked_boxes(monkeypatch, some(2, 0.1))
+    monkeypatch.setattr(
+        course, "FeatureRaySampler", lambda lines, light: followed.append(lines) or FeatureRaySampler(lines, light)
+    )
     train(scene, 1, {"carve": "off", "photo_depth": "on"})
     assert len(followed) == 1 and followed[0].points[:, 0].tolist() == [0.2] * 3 + [0.1] * 2
 
@@ -191,13 +200,15 @@ def test_light_may_pass_depths_but_not_tracks_while_the_lattice_is_coarse(scene,
 
     def with_tracks(model):
         populate(model)
-        model.track_rays = TrackRays(Sightlines(np.zeros((1, 3)), np.zeros(1, int), np.ones((1, 3)), np.zeros(1)))
+        model.feature_ray_sampler = FeatureRaySampler(
+            FeatureRays(np.zeros((1, 3)), np.zeros(1, int), np.ones((1, 3)), np.zeros(1))
+        )
 
     def recorded(accumulation, transmittance, tolerated):
         asked.append(tolerated)
-        return track_loss(accumulation, transmittance, tolerated)
+        return feature_ray_loss(accumulation, transmittance, tolerated)
 
     monkeypatch.setattr(ThermoxelsModel, "populate_modules", with_tracks)
-    monkeypatch.setattr("thermoxels_ns.training.model.track_loss", recorded)
+    monkeypatch.setattr("thermoxels_ns.training.losses.feature_ray_loss", recorded)
     train(scene, 6, {"resolutions": [8, 16], "refine_at": [4], "photo_depth": depths})
     assert asked == [light] * 4 + [0.0] * 2

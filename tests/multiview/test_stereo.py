@@ -10,7 +10,7 @@ import pytest
 from tests.support.plane_photographs import EYES, FOCAL, PLANE, SIZE, photographs, texture
 from thermoxels_ns.core.threads import set_num_threads
 from thermoxels_ns.multiview import stereo as plane_sweep
-from thermoxels_ns.multiview.depth_supervision import lines_to_depths
+from thermoxels_ns.multiview.depth_supervision import feature_rays_to_depths
 from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo import (
     ANGLES_DEG,
@@ -301,7 +301,7 @@ def test_depths_of_a_room_from_within_lie_on_its_walls():
     seen, half = room()
     found = depths_of(seen, (-half, -half, -half), (half, half, half))
     sure = np.flatnonzero(np.isfinite(found.depth))
-    lines = lines_to_depths(found)
+    lines = feature_rays_to_depths(found)
     off = np.abs(np.abs(lines.points).max(1) - half)
     assert len(sure) > 500
     assert np.quantile(off, 0.9) < 0.05, np.quantile(off, [0.5, 0.9])

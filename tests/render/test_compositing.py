@@ -9,7 +9,7 @@ import torch
 
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.render.compositing import composite, ray_weights
-from thermoxels_ns.render.march import march
+from thermoxels_ns.render.renderers import march
 from thermoxels_ns.render.sampling import RaySteps
 
 

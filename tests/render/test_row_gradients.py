@@ -17,11 +17,13 @@ from tests.reference.two_renderers import (
     random_request,
     see,
 )
-from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.threads import num_threads, set_num_threads
 from thermoxels_ns.render import fused, row_gradients
 from thermoxels_ns.render.kernels import AHEAD, Records
 from thermoxels_ns.render.kernels_rows import Order, first_voxel, order_records
+from thermoxels_ns.render.ray_render import RenderOptions
+from thermoxels_ns.render.renderers import fused_render
+from thermoxels_ns.training.optimizers import touched_rows
 
 
 @pytest.fixture
@@ -99,8 +101,6 @@ def test_rows_of_total_variation_alone_have_a_gradient_and_no_others():
 
 
 def fused_render_variation(grid, options) -> torch.Tensor:
-    from thermoxels_ns.render.renderers import fused_render
-
     return fused_render(grid, random_request(grid, 10), options).variation["sh"]
 
 
@@ -118,18 +118,16 @@ def test_a_batch_that_needs_more_room_than_the_last_one_is_complete(monkeypatch)
         assert all(torch.equal(found.values[name], value) for name, value in expected.values.items())
 
 
-def test_models_that_take_turns_march_each_batch_once(monkeypatch):
-    """What one needed is not forgotten while another is at it; of many lattices only the last ones are remembered."""
-    grids = [random_grid(1, density=-3.0, lattice=Lattice.covering((-1, -1, -1), (1, 1, 1), n)) for n in (24, 32)]
-    monkeypatch.setattr(fused, "FEWEST_SAMPLES", 1)
-    monkeypatch.setattr(fused, "_room", {rows: 1 for rows in range(fused.MOST_ROOMS)})
-    marches = []
-    march = fused.kernels.march_forward
-    monkeypatch.setattr(fused.kernels, "march_forward", lambda *a: marches.append(len(a[3].density)) or march(*a))
-    for grid in grids:
-        see("fused", grid, random_request(grid, 50))
-    assert all(marches.count(len(grid.density)) > 1 for grid in grids) and len(fused._room) == fused.MOST_ROOMS
-    marches.clear()
-    for grid in grids * 2:
-        see("fused", grid, random_request(grid, 50))
-    assert marches == [len(grid.density) for grid in grids * 2]
+@pytest.mark.parametrize("renders", [1, 2])
+def test_gradients_of_renders_in_one_step_are_summed_in_the_order_of_rows(renders):
+    """Torch puts one list of rows behind the other, which the optimisers must find and put in order."""
+    grid, flat = random_grid(1, kept=0.5), RenderOptions(sh_degree=1)
+    dense = []
+    for seed in range(renders):
+        request = random_request(grid, 80, seed)
+        dense.append(torch.autograd.grad(fused_render(grid, request, flat).rgb.sum(), grid.sh)[0].to_dense())
+        fused_render(grid, request, flat).rgb.sum().backward()
+    assert not grid.sh.grad.is_coalesced()
+    rows, values = touched_rows(grid.sh.grad)
+    assert bool((rows[1:] > rows[:-1]).all())
+    torch.testing.assert_close(torch.zeros_like(grid.sh).index_add(0, rows, values).detach(), sum(dense))

@@ -14,13 +14,13 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 
 from thermoxels_ns.core.errors import MemoryBudgetError, PruningError
-from thermoxels_ns.core.feature_rays import Sightlines
+from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.units import TemperatureRange
-from thermoxels_ns.training.callbacks import prune_by_rays
+from thermoxels_ns.training.callbacks import coarse_to_fine_callbacks, prune_by_rays
+from thermoxels_ns.training.free_space_carving import empty_voxels
 from thermoxels_ns.training.model import ThermoxelsModel
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig
 from thermoxels_ns.training.optimizers import RowAdam
-from thermoxels_ns.training.track_carving import empty_voxels
 
 
 def model_of(**options) -> ThermoxelsModel:
@@ -112,7 +112,7 @@ def test_optimisers_follow_the_schedule():
     """At each change of the lattice every optimiser holds the new parameters, with state of as many rows."""
     model = model_of(resolutions=(8, 16), refine_at=(3,), prune_at=(5,), thin_at=(7,), prune_dilation=1)
     given = attributes(model, 10)
-    callbacks = model.get_training_callbacks(given)
+    callbacks = coarse_to_fine_callbacks(model, given)
     sizes = []
     for step in range(10):
         for callback in callbacks:
@@ -137,11 +137,11 @@ def test_air_is_carved_at_the_start_and_after_a_refinement_and_optimisers_follow
     side = np.linspace(-0.6, 0.6, 13)
     points = np.stack(np.meshgrid([0.93], side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     count = len(points)
-    lines = Sightlines(np.tile([-0.99, 0.01, 0.01], (count, 1)), np.arange(count), points, np.zeros(count))
+    lines = FeatureRays(np.tile([-0.99, 0.01, 0.01], (count, 1)), np.arange(count), points, np.zeros(count))
     model = model_of(resolutions=(8, 16), refine_at=(3,), prune_at=(), thin_at=(), prune_threshold=0.0, carve=carve)
-    model.sightlines = lines
+    model.feature_rays = lines
     given = attributes(model, 10)
-    callbacks = model.get_training_callbacks(given)
+    callbacks = coarse_to_fine_callbacks(model, given)
     for step in range(4):
         for callback in callbacks:
             callback.run_callback(step)
@@ -157,7 +157,7 @@ def test_air_is_carved_at_the_start_and_after_a_refinement_and_optimisers_follow
 
 def test_a_refinement_beyond_the_budget_leaves_the_lattice_as_it_is():
     model = model_of(resolutions=(8, 32), refine_at=(2,), memory_budget_gb=0.001, prune_threshold=0.0)
-    callbacks = model.get_training_callbacks(attributes(model, 4))
+    callbacks = coarse_to_fine_callbacks(model, attributes(model, 4))
     for step in range(2):
         for callback in callbacks:
             callback.run_callback(step)
@@ -170,6 +170,6 @@ def test_a_refinement_beyond_the_budget_leaves_the_lattice_as_it_is():
 def test_what_lies_behind_the_end_of_the_run_does_not_happen():
     model = model_of(resolutions=(8, 16), refine_at=(3,), prune_at=(5,))
     for step in range(3):
-        for callback in model.get_training_callbacks(attributes(model, 3)):
+        for callback in coarse_to_fine_callbacks(model, attributes(model, 3)):
             callback.run_callback(step)
     assert model.grid.lattice.cell_shape == (8, 8, 8) and model.grid.voxels.all_kept

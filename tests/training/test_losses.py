@@ -6,6 +6,8 @@ import torch
 
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.kept_voxels import KeptVoxels
+from thermoxels_ns.render.compositing import ray_distortion, ray_sparsity
+from thermoxels_ns.render.renderers import total_variation
 from thermoxels_ns.training import losses
 
 
@@ -25,10 +27,10 @@ def test_total_variation_of_a_ramp_is_its_slope():
     x, y, z = torch.as_tensor(lattice.corner_positions(), dtype=torch.float32).reshape(-1, 3).unbind(-1)
     ramp = torch.stack((3 * x - 4 * y, 2 * x + y - 2 * z), -1)
     corners = voxel_corners(lattice)
-    assert float(losses.total_variation(ramp, corners)) == pytest.approx((5.0 + 3.0) / 2)
-    assert float(losses.total_variation(ramp[:, :1], corners[7:20])) == pytest.approx(5.0)
+    assert float(total_variation(ramp, corners)) == pytest.approx((5.0 + 3.0) / 2)
+    assert float(total_variation(ramp[:, :1], corners[7:20])) == pytest.approx(5.0)
     flat = torch.ones(len(ramp), 1, requires_grad=True)
-    losses.total_variation(flat, corners).backward()
+    total_variation(flat, corners).backward()
     assert flat.grad is not None and torch.isfinite(flat.grad).all()
 
 
@@ -37,7 +39,7 @@ def test_total_variation_looks_at_kept_voxels_alone():
     lattice = Lattice((0.0, 0.0, 0.0), 1.0, (5, 2, 2))
     voxels = KeptVoxels(lattice, [0, 3])
     rows = torch.from_numpy(np.where(voxels.corner_index()[:, :1] < 2, 1.0, 50.0))
-    assert float(losses.total_variation(rows, voxel_corners(lattice, [0, 3]))) == pytest.approx(1e-5)
+    assert float(total_variation(rows, voxel_corners(lattice, [0, 3]))) == pytest.approx(1e-5)
 
 
 def test_random_block_is_contiguous_and_pure_in_its_seed():
@@ -61,8 +63,8 @@ def test_distortion_matches_the_double_sum():
     d = torch.rand(4, 30, generator=generator, dtype=torch.float64)
     t = torch.cumsum(d, -1) - d / 2
     expected = [brute_force_distortion(w[r].tolist(), t[r].tolist(), d[r].tolist()) for r in range(4)]
-    np.testing.assert_allclose(losses.ray_distortion(w, t, d, scale=1.0).numpy(), expected, rtol=1e-12)
-    np.testing.assert_allclose(2.0 * losses.ray_distortion(w, t, d, scale=2.0).numpy(), expected, rtol=1e-12)
+    np.testing.assert_allclose(ray_distortion(w, t, d, scale=1.0).numpy(), expected, rtol=1e-12)
+    np.testing.assert_allclose(2.0 * ray_distortion(w, t, d, scale=2.0).numpy(), expected, rtol=1e-12)
 
 
 def test_all_terms_have_exact_gradients():
@@ -72,10 +74,10 @@ def test_all_terms_have_exact_gradients():
     lattice = Lattice((0.0, 0.0, 0.0), 1.0, (3, 3, 3))
     rows = torch.rand(lattice.num_corners, 2, dtype=torch.float64, requires_grad=True)
     corners = voxel_corners(lattice)
-    assert torch.autograd.gradcheck(lambda x: losses.ray_distortion(x, t, d, 2.0), (w,))
-    assert torch.autograd.gradcheck(lambda x: losses.ray_sparsity(x, d), (w,))
+    assert torch.autograd.gradcheck(lambda x: ray_distortion(x, t, d, 2.0), (w,))
+    assert torch.autograd.gradcheck(lambda x: ray_sparsity(x, d), (w,))
     assert torch.autograd.gradcheck(lambda x: losses.beta_loss(x[:, 0]), (w,))
-    assert torch.autograd.gradcheck(lambda x: losses.total_variation(x, corners), (rows,))
+    assert torch.autograd.gradcheck(lambda x: total_variation(x, corners), (rows,))
 
 
 def test_beta_is_nil_for_decided_rays_and_dearest_at_one_half():
@@ -87,6 +89,6 @@ def test_beta_is_nil_for_decided_rays_and_dearest_at_one_half():
 
 def test_sparsity_ignores_padding_and_stays_finite():
     density = torch.tensor([[1.0, float("inf")], [2.0, 0.0]])
-    found = losses.ray_sparsity(density, torch.tensor([[0.1, 0.0], [0.1, 0.1]]))
+    found = ray_sparsity(density, torch.tensor([[0.1, 0.0], [0.1, 0.1]]))
     np.testing.assert_allclose(found.numpy(), np.log([3.0, 9.0]), rtol=1e-6)
-    assert torch.isfinite(losses.ray_sparsity(density, torch.full((2, 2), 0.1))).all()
+    assert torch.isfinite(ray_sparsity(density, torch.full((2, 2), 0.1))).all()

@@ -9,7 +9,7 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
 
 from thermoxels_ns.core.errors import MemoryBudgetError, SceneError, ThermoxelsError
-from thermoxels_ns.core.feature_rays import Sightlines
+from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.core.units import TemperatureRange
@@ -21,12 +21,12 @@ from thermoxels_ns.training.model_config import LOSS_RECIPES, ThermoxelsModelCon
 BOX = SceneBox(aabb=torch.tensor([[-1.0, -1.0, -0.5], [1.0, 1.0, 0.5]]))
 
 
-LINES = Sightlines(np.array([[0.0, 0.0, 3.0]]), np.array([0]), np.array([[0.1, 0.2, 0.0]]), np.array([0.01]))
+LINES = FeatureRays(np.array([[0.0, 0.0, 3.0]]), np.array([0]), np.array([[0.1, 0.2, 0.0]]), np.array([0.01]))
 
 
-def make(sightlines: Sightlines | None = None, **options) -> ThermoxelsModel:
+def make(feature_rays: FeatureRays | None = None, **options) -> ThermoxelsModel:
     config = ThermoxelsModelConfig(**{"resolutions": (8,), "refine_at": (), "prune_at": (), **options})
-    metadata = {"temperature_range": TemperatureRange(10.0, 30.0), "sightlines": sightlines}
+    metadata = {"temperature_range": TemperatureRange(10.0, 30.0), "feature_rays": feature_rays}
     return config.setup(scene_box=BOX, num_train_data=4, metadata=metadata)
 
 
@@ -69,9 +69,9 @@ def test_only_terms_of_non_zero_weight_are_computed(recipe):
     assert set(model.get_loss_dict(model(rays()), targets())) == {"rgb_loss"}
 
 
-@pytest.mark.parametrize("sightlines, options", [(None, {}), (LINES, {"sh_degree": None})])
-def test_without_tracks_or_photographs_their_term_has_nothing_to_say(sightlines, options):
-    model = make(sightlines, **options).train()
+@pytest.mark.parametrize("feature_rays, options", [(None, {}), (LINES, {"sh_degree": None})])
+def test_without_tracks_or_photographs_their_term_has_nothing_to_say(feature_rays, options):
+    model = make(feature_rays, **options).train()
     outputs = model(rays(stream=THERMAL_STREAM))
     assert "tracks_loss" not in model.get_loss_dict(outputs, targets())
     again = make(LINES).train()

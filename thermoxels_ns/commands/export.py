@@ -19,8 +19,8 @@ from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.commands.export_options import ExportOptions, Viewpoint, check_options, scale_of, up_of
 from thermoxels_ns.commands.export_snapshot import export_snapshot, prepare_folder
-from thermoxels_ns.core.checks import check_shape
 from thermoxels_ns.core.errors import CheckpointError, ThermoxelsError
+from thermoxels_ns.core.lattice import input_from_world
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
@@ -222,38 +222,6 @@ def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.Ar
         level /= np.linalg.norm(level)
         direction = tuple(float(v) for v in level + 0.35 * np.cross(up, level) - 0.35 * up)
     return Viewpoint(tuple(float(v) for v in up), source, direction)  # type: ignore[arg-type]
-
-
-def input_from_world(transform: npt.ArrayLike, scale: float) -> npt.NDArray[np.float64]:
-    """Undo a nerfstudio dataparser's recentring, rotation and scaling.
-
-    The dataparser maps poses by p_world = scale * (R p_input + t); this is the inverse.
-
-    Args:
-        transform: [R | t], shape (3, 4), R orthonormal.
-        scale: Above 0.
-
-    Returns:
-        The 4x4 that takes homogeneous column vectors of the trained scene to the coordinates of the input poses.
-
-    >>> input_from_world([[1, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]], 2.0) @ [12, 0, 4, 1]
-    array([1., 0., 2., 1.])
-    """
-    remedy = "The checkpoint's dataparser is damaged; train again."
-    matrix = check_shape("dataparser_transform", np.asarray(transform, np.float64), (3, 4), remedy, CheckpointError)
-    rotation, shift = matrix[:, :3], matrix[:, 3]
-    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
-    if not (orthonormal and np.all(np.isfinite(shift)) and np.isfinite(scale) and scale > 0):
-        raise CheckpointError(
-            "dataparser_transform",
-            expected="a rotation, a finite shift and a scale above 0",
-            got=f"{matrix.tolist()}, scale {scale}",
-            remedy=remedy,
-        )
-    inverse = np.eye(4)
-    inverse[:3, :3] = np.linalg.inv(rotation) / scale
-    inverse[:3, 3] = -np.linalg.inv(rotation) @ shift
-    return inverse
 
 
 def _scene_folder(config: TrainerConfig) -> Path:

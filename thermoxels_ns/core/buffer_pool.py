@@ -1,4 +1,4 @@
-"""Memory that is used again: arrays as large as a batch, without asking the system for pages at every step.
+"""A buffer pool: large arrays whose memory is used again by the next training step.
 
 A page that a program touches for the first time costs several times what filling it costs, and a training step needs
 the same tens of megabytes as the step before.
@@ -19,7 +19,7 @@ PATIENCE = 2048
 """Loans after which memory that nobody asked for is given back to the system."""
 
 
-class Scratch:
+class BufferPool:
     """Lends arrays; the memory of one comes back when nothing refers to it or to a view of it any more."""
 
     def __init__(self) -> None:
@@ -77,12 +77,12 @@ class Scratch:
 class _Loan:
     """Owner of a block while arrays look at it."""
 
-    def __init__(self, scratch: Scratch, block: npt.NDArray[np.uint8]):
-        self._scratch, self._block = scratch, block
+    def __init__(self, pool: BufferPool, block: npt.NDArray[np.uint8]):
+        self._pool, self._block = pool, block
         self.__array_interface__ = block.__array_interface__
 
     def __del__(self) -> None:
-        self._scratch._take_back(self._block)
+        self._pool._take_back(self._block)
 
 
 def rounded_size(size: int) -> int:
@@ -95,5 +95,5 @@ def rounded_size(size: int) -> int:
     return -(-size // quarter) * quarter
 
 
-SCRATCH = Scratch()
+BUFFERS = BufferPool()
 """What the compiled renderer lends from."""

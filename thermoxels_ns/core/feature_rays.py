@@ -1,4 +1,4 @@
-"""Lines of sight from cameras to points that they see: what dataparser and model share."""
+"""Feature rays: straight lines from cameras to points that their photographs see."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LINES_AT_ONCE = 1 << 18
 
 
 @dataclass(frozen=True, eq=False)
-class Sightlines:
+class FeatureRays:
     """Straight lines from cameras to points that they see: what lies between is air. World units."""
 
     origins: FloatArray
@@ -36,38 +36,38 @@ class Sightlines:
     uncertainty: FloatArray
     """Standard error of each line's length, shape (s,)."""
 
-    def moved(self, rotation: FloatArray, translation: FloatArray, scale: float) -> Sightlines:
+    def moved(self, rotation: FloatArray, translation: FloatArray, scale: float) -> FeatureRays:
         """The same lines in another world: scale (rotation p + translation)."""
         origins, points = (scale * (p @ rotation.T + translation) for p in (self.origins, self.points))
-        return Sightlines(origins, self.point, points, scale * self.uncertainty)
+        return FeatureRays(origins, self.point, points, scale * self.uncertainty)
 
-    def and_those_of(self, others: Sightlines) -> Sightlines:
+    def joined_with(self, others: FeatureRays) -> FeatureRays:
         """These lines, and others after them."""
         point = np.concatenate((self.point, len(self.points) + others.point))
-        return Sightlines(
+        return FeatureRays(
             np.concatenate((self.origins, others.origins)),
             point,
             np.concatenate((self.points, others.points)),
             np.concatenate((self.uncertainty, others.uncertainty)),
         )
 
-    def with_lines_of(self, chosen: npt.NDArray[np.bool_]) -> Sightlines:
+    def of_points(self, chosen: npt.NDArray[np.bool_]) -> FeatureRays:
         """Only the lines to some points, one boolean per point; all points stay, with their numbers."""
         kept = chosen[self.point]
-        return Sightlines(self.origins[kept], self.point[kept], self.points, self.uncertainty[kept])
+        return FeatureRays(self.origins[kept], self.point[kept], self.points, self.uncertainty[kept])
 
 
-def agrees_with_neighbours(lines: Sightlines) -> npt.NDArray[np.bool_]:
+def agrees_with_neighbours(lines: FeatureRays) -> npt.NDArray[np.bool_]:
     """Which points lie where the points around them in the photographs do: wrong matches put theirs anywhere.
 
     A photograph vouches for a point if at least half of the `NEIGHBOURS` points that it sees nearest to it are as far
-    away, give or take the largest of three lengths: `STEEPEST` times how far apart the two are across the line of
-    sight, the share `LEAST_TOLERANCE` of the distance, and `TOLERANCE_ERRORS` standard errors. So in plain regions,
-    where neighbours are few and far, much may differ, and among many little. Points agree that half of their
-    photographs vouch for. A point on something thin before other things may fail; it is then unknown, not wrong.
+    away, give or take the largest of three lengths: `STEEPEST` times how far apart the two are across the ray, the
+    share `LEAST_TOLERANCE` of the distance, and `TOLERANCE_ERRORS` standard errors. So where neighbours are few and
+    far, much may differ, and among many little. Points agree that half of their photographs vouch for. A point on
+    something thin before other things may fail; it is then unknown, not wrong.
 
     Args:
-        lines: Lines of sight; lines with one origin are one photograph's.
+        lines: Feature rays; those with one origin are one photograph's.
 
     Returns:
         One boolean per point; True for a point without lines, or which too few others are near to say.

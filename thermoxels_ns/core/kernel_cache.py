@@ -28,7 +28,8 @@ def kernel(function: Callable | None = None, **options: Any) -> Any:
     from numba import njit
 
     def compiled(function: Callable) -> Any:
-        dispatcher = njit(**{"nogil": True, "cache": True, "error_model": "numpy", **options})(function)
+        settings: dict[str, Any] = {"nogil": True, "cache": True, "error_model": "numpy", **options}
+        dispatcher = njit(**settings)(function)
         source, cached = Path(function.__code__.co_filename), dispatcher.stats.cache_path
         if cached and _PACKAGE in source.parents:
             # Before the first call, which loads what was compiled earlier.

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.checks import check_shape
+from thermoxels_ns.core.errors import CheckpointError, ThermoxelsError
 
 CORNER_OFFSETS: npt.NDArray[np.int64] = np.array(
     [[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1], [1, 0, 0], [1, 0, 1], [1, 1, 0], [1, 1, 1]], dtype=np.int64
@@ -120,3 +121,35 @@ class Lattice:
             nx, ny, nz = self.cell_shape
             total += values[dx : dx + nx, dy : dy + ny, dz : dz + nz]
         return total / 8.0
+
+
+def input_from_world(transform: npt.ArrayLike, scale: float) -> npt.NDArray[np.float64]:
+    """Undo a nerfstudio dataparser's recentring, rotation and scaling.
+
+    The dataparser maps poses by p_world = scale * (R p_input + t); this is the inverse.
+
+    Args:
+        transform: [R | t], shape (3, 4), R orthonormal.
+        scale: Above 0.
+
+    Returns:
+        The 4x4 that takes homogeneous column vectors of the trained scene to the coordinates of the input poses.
+
+    >>> input_from_world([[1, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]], 2.0) @ [12, 0, 4, 1]
+    array([1., 0., 2., 1.])
+    """
+    remedy = "The checkpoint's dataparser is damaged; train again."
+    matrix = check_shape("dataparser_transform", np.asarray(transform, np.float64), (3, 4), remedy, CheckpointError)
+    rotation, shift = matrix[:, :3], matrix[:, 3]
+    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
+    if not (orthonormal and np.all(np.isfinite(shift)) and np.isfinite(scale) and scale > 0):
+        raise CheckpointError(
+            "dataparser_transform",
+            expected="a rotation, a finite shift and a scale above 0",
+            got=f"{matrix.tolist()}, scale {scale}",
+            remedy=remedy,
+        )
+    inverse = np.eye(4)
+    inverse[:3, :3] = np.linalg.inv(rotation) / scale
+    inverse[:3, 3] = -np.linalg.inv(rotation) @ shift
+    return inverse

@@ -11,10 +11,10 @@ import numpy as np
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.core.feature_rays import FloatArray, IntArray, Sightlines
+from thermoxels_ns.core.feature_rays import FeatureRays, FloatArray, IntArray
 from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, read_model
 from thermoxels_ns.data.scene_file import Frame, SceneFile
-from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, SparseTracks, read_tracks, sightlines
+from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, SparseTracks, feature_rays, read_tracks
 from thermoxels_ns.data.transforms_json import path_inside
 
 MOST_OFF_PX = 2.0
@@ -33,7 +33,7 @@ _STRAY = 5.0
 TrackSource = Literal["auto", "given", "off"]
 
 
-def find_sightlines(scene: SceneFile, training: Sequence[int], source: TrackSource = "auto") -> Sightlines | None:
+def find_feature_rays(scene: SceneFile, training: Sequence[int], source: TrackSource = "auto") -> FeatureRays | None:
     """The lines of sight of the photographs that train, if the scene has tracks.
 
     Args:
@@ -54,12 +54,12 @@ def find_sightlines(scene: SceneFile, training: Sequence[int], source: TrackSour
         return None
     if TRACKS_KEY in scene.meta:
         path = path_inside(scene.folder, str(scene.meta[TRACKS_KEY]), f"transforms.json: {TRACKS_KEY}")
-        return sightlines(read_tracks(path), frames, path.name)
+        return feature_rays(read_tracks(path), frames, path.name)
     found = read_colmap_tracks(scene) if source == "auto" else None
     if found is None:
         return None
     try:
-        return sightlines(
+        return feature_rays(
             found, frames, "its tracks", "Give it the photographs and poses of the json, or move it away."
         )
     except SceneError as problem:

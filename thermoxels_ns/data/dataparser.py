@@ -18,9 +18,9 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError, ThermalFileError
-from thermoxels_ns.core.feature_rays import Sightlines
+from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.units import TemperatureRange
-from thermoxels_ns.data.colmap_tracks import TrackSource, find_sightlines
+from thermoxels_ns.data.colmap_tracks import TrackSource, find_feature_rays
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
 from thermoxels_ns.data.splits import Split, split_frames
@@ -121,7 +121,7 @@ class _Scene:
     survey: ThermalSurvey
     world: _World
     box: SceneBox
-    sightlines: Sightlines | None
+    feature_rays: FeatureRays | None
     """What the training photographs see of the tracks; nerfstudio's world."""
 
 
@@ -131,7 +131,7 @@ class ThermalDataParser(DataParser):
     The outputs' metadata hold: ``temperature_range`` (`TemperatureRange`), ``thermal_filenames``, ``thermal_cameras``
     (`Cameras` of the split, or None where a pair shares camera and resolution), ``thermal_unit``, ``valid_range_c``,
     ``thermal_dead_pixels`` (a mask per resolution), ``image_scale`` (1 / downscale_factor), ``scene_name`` and, for
-    train, ``sightlines`` (`Sightlines`, or None where the scene has no tracks).
+    train, ``feature_rays`` (`FeatureRays`, or None where the scene has no tracks).
     """
 
     config: ThermalDataParserConfig
@@ -176,7 +176,7 @@ class ThermalDataParser(DataParser):
                 "valid_range_c": tuple(self.config.valid_range_c),
                 "thermal_dead_pixels": scene.survey.dead_pixels,
                 "scene_name": scene.file.folder.resolve().name,
-                "sightlines": scene.sightlines if split == "train" else None,
+                "feature_rays": scene.feature_rays if split == "train" else None,
             },
         )
 
@@ -213,7 +213,7 @@ class ThermalDataParser(DataParser):
         )
         if file.left_out:
             CONSOLE.print(f"Left out, no pair: {', '.join(file.left_out)}", style="bold yellow")
-        lines = find_sightlines(file, split.train, config.tracks)
+        lines = find_feature_rays(file, split.train, config.tracks)
         if lines is not None:
             lines = lines.moved(world.rotation, world.translation, world.scale)
         return _Scene(file, split, survey, world, box, lines)

@@ -12,7 +12,7 @@ import numpy as np
 
 from thermoxels_ns.core.checks import replace_when_done
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.core.feature_rays import FloatArray, IntArray, Sightlines, agrees_with_neighbours
+from thermoxels_ns.core.feature_rays import FeatureRays, FloatArray, IntArray, agrees_with_neighbours
 from thermoxels_ns.data.scene_file import Frame
 
 TRACKS_KEY = "tracks_file_path"
@@ -105,9 +105,9 @@ def read_tracks(path: Path) -> SparseTracks:
     )
 
 
-def sightlines(
+def feature_rays(
     tracks: SparseTracks, frames: Sequence[Frame], name: str = "tracks", remedy: str = _REMEDY
-) -> Sightlines:
+) -> FeatureRays:
     """Lines from frames to the points that they see and that are well known.
 
     A point counts if at least `FEWEST_VIEWS` of the frames see it, more than `LEAST_PARALLAX_DEG` apart, with a mean
@@ -164,8 +164,8 @@ def sightlines(
         / focal[frame]
         / np.sin(np.minimum(angle[point], np.pi / 2))
     )
-    found = Sightlines(poses[frame, :3, 3], renumbered[point], tracks.points[good], error * length)
-    return found.with_lines_of(agrees_with_neighbours(found))
+    found = FeatureRays(poses[frame, :3, 3], renumbered[point], tracks.points[good], error * length)
+    return found.of_points(agrees_with_neighbours(found))
 
 
 def _parallax(directions: FloatArray, point: IntArray, count: int) -> FloatArray:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from torch import Tensor
 
 from thermoxels_ns.core.errors import MeshError, ThermoxelsError
 from thermoxels_ns.core.snapshot import GridSnapshot
@@ -16,20 +15,8 @@ from thermoxels_ns.evaluation.voxel_accuracy import surface_fscore
 from thermoxels_ns.mesh.build import check_similarity
 from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
 
-HALF_TRANSPARENT = (0.1, 0.9)
-"""A ray whose accumulation lies strictly between these is neither through nor stopped."""
 COMMON_RESOLUTION = 128
 """Voxels along the longest side of the lattice whose voxel size `fscore_128` is measured with."""
-
-
-def half_transparent_share(accumulation: Tensor) -> float:
-    """Share of rays that are neither through nor stopped, 0 to 1: fog, or the edge of something.
-
-    Args:
-        accumulation: Opacity of rays, 0 to 1, any shape, at least one.
-    """
-    low, high = HALF_TRANSPARENT
-    return float(((accumulation > low) & (accumulation < high)).double().mean())
 
 
 def has_truth(scene_folder: Path | str, say: Callable[[str], None] = print) -> bool:

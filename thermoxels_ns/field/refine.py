@@ -1,7 +1,6 @@
-"""Coarse to fine: split voxels, and drop those that no ray gives weight to.
+"""Change what a voxel grid stores: split voxels, drop voxels, and add colour harmonics.
 
-Both change which corners have rows. What else has one row per corner (optimiser state) follows through the
-`RowChange` they return.
+Optimiser state follows through the `RowChange` or `ColumnChange` that each change returns.
 """
 
 from __future__ import annotations
@@ -11,17 +10,18 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from thermoxels_ns.core.buffer_pool import SCRATCH
+from thermoxels_ns.core.buffer_pool import BUFFERS
+from thermoxels_ns.field.harmonics import num_coefficients
 from thermoxels_ns.field.interpolation import TrilinearPoints, interpolate
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 
 RowChange = Callable[[Tensor], Tensor]
 """Maps values of the old rows, shape (old rows, channels), to values of the new ones."""
-
-
+ColumnChange = Callable[[Tensor], Tensor]
+"""Maps values with the old columns, shape (rows, old columns), to values with the new ones."""
 ROWS_AT_ONCE = 1 << 17
 """Rows interpolated at once: corner numbers and weights take more memory than the values."""
 
@@ -70,7 +70,7 @@ def refine(grid: VoxelGrid, factor: int = 2) -> RowChange:
     Returns:
         How values of rows change: trilinear interpolation; old corners keep theirs exactly.
     """
-    SCRATCH.release()  # rows are there twice for a moment; what steps on the old lattice needed makes room
+    BUFFERS.release()  # rows are there twice for a moment; what steps on the old lattice needed makes room
     new = split_voxels(grid.voxels, factor)
     at = parents_of_corners(grid.voxels, new, factor)
 
@@ -97,7 +97,7 @@ def prune(grid: VoxelGrid, keep: npt.NDArray[np.bool_]) -> RowChange:
     Returns:
         How values of rows change: those of corners that stay are copied.
     """
-    SCRATCH.release()
+    BUFFERS.release()
     voxels = grid.voxels
     new = KeptVoxels(voxels.lattice, voxels.cells[keep])
     stay: npt.NDArray[np.int64] = np.searchsorted(voxels.corners, new.corners)
@@ -106,4 +106,31 @@ def prune(grid: VoxelGrid, keep: npt.NDArray[np.bool_]) -> RowChange:
         return rows[torch.from_numpy(stay).to(rows.device)]
 
     grid.replace_voxels(new, {name: change(p.data) for name, p in grid.row_parameters().items()})
+    return change
+
+
+@torch.no_grad()
+def widen_colour(grid: VoxelGrid, degree: int) -> ColumnChange:
+    """Store colour up to a higher degree without changing the field.
+
+    While colour is the same from all sides its further harmonics are 0 and no gradient moves them, so they need not be
+    stored, nor passed over by optimisers, total variation, refinement, pruning and checkpoints.
+
+    Args:
+        grid: A grid with colour of a lower degree; it gets a new parameter.
+        degree: The new degree.
+
+    Returns:
+        How values of columns change: harmonics keep theirs, those that were not stored are 0.
+    """
+    assert grid.sh is not None and grid.sh_degree is not None and grid.sh_degree < degree
+    BUFFERS.release()  # what steps on the narrow rows needed makes room for the wide ones
+    few, many = num_coefficients(grid.sh_degree), num_coefficients(degree)
+
+    def change(values: Tensor) -> Tensor:
+        wide = values.new_zeros((len(values), 3, many))
+        wide[..., :few] = values.view(len(values), 3, few)
+        return wide.view(len(values), 3 * many)
+
+    grid.sh = nn.Parameter(change(grid.sh.data))
     return change

@@ -58,7 +58,7 @@ class VoxelGrid(nn.Module):
 
     Args:
         lattice: Start lattice; all its voxels are kept at first.
-        sh_degree: Degree of the colour harmonics that are stored; None: no colour. `widen.py` raises it.
+        sh_degree: Degree of the colour harmonics that are stored; None: no colour. `refine.widen_colour` raises it.
         temperature_degree: Degree of the temperature harmonics; 0: the same from all directions (the paper).
         start_density: Start density everywhere, [1 / world unit]; near-transparent.
         activation: Density activation.

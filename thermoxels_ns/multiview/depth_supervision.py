@@ -1,36 +1,25 @@
-"""Lines of sight to where photographs agree that something is: for scenes without tracks of structure from motion.
-
-Before walls of little texture a training can close fog that no picture gives away: light that fog has stopped says
-nothing of what lies behind. Depths that photographs find by being compared with each other do (see `plane_sweep`): each
-sure one is a line of sight that has to end at its point (see `track_loss`).
-"""
+"""Depth supervision: feature rays to depths that several photographs agree about."""
 
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from nerfstudio.engine.callbacks import TrainingCallbackAttributes
-from nerfstudio.utils.rich_utils import CONSOLE
+import numpy.typing as npt
 
-from thermoxels_ns.core.feature_rays import Sightlines
-from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.multiview.photographs import read_photographs
 from thermoxels_ns.multiview.stereo import Depths, depths_of
 
-if TYPE_CHECKING:
-    from thermoxels_ns.training.model import ThermoxelsModel
-
-SHORTEST_RUN = 400
-"""Steps that a run must have under auto: a shorter one would spend most of its time on depths."""
 LEAST_SHARE = 0.01
 """Share of the pixels whose depth must be sure; less is chance."""
 ERROR_PLANES = 0.25
 """Standard error of a depth, in planes of the sweep."""
 
 
-def lines_to_depths(depths: Depths) -> Sightlines:
+def feature_rays_to_depths(depths: Depths) -> FeatureRays:
     """One line of sight per sure pixel, to a point of its own.
 
     Args:
@@ -50,52 +39,32 @@ def lines_to_depths(depths: Depths) -> Sightlines:
     origins = photographs.centres[number]
     points = origins + depths.depth[sure, None].astype(np.float64) * along
     error = ERROR_PLANES * depths.error[sure].astype(np.float64) * np.linalg.norm(along, axis=1)
-    return Sightlines(origins, np.arange(len(sure)), points, error)
+    return FeatureRays(origins, np.arange(len(sure)), points, error)
 
 
-def lines_for_training(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> Sightlines | None:
-    """Lines of sight that a training is to follow beside those of structure from motion.
-
-    Args:
-        model: The model.
-        attributes: What nerfstudio gives callbacks.
-
-    Returns:
-        Lines of sight; None where the training does without, see `ThermoxelsModelConfig.photo_depth`.
-    """
-    config, pipeline, trainer = model.config, attributes.pipeline, attributes.trainer
-    if config.photo_depth == "off" or not model.loss_weights.tracks or pipeline is None:
-        return None
-    if config.photo_depth == "auto":
-        steps = 0 if trainer is None else trainer._start_step + trainer.config.max_num_iterations
-        if model.track_rays is not None or steps < SHORTEST_RUN:
-            return None
-    return find_lines(model, pipeline.datamanager)
-
-
-def find_lines(model: ThermoxelsModel, datamanager: Any) -> Sightlines | None:
-    """Ask the training photographs how far away is what they show, and say what was found.
+def feature_rays_of_photographs(
+    dataset: Any, near: float, lo: npt.ArrayLike, hi: npt.ArrayLike, say: Callable[[str], None]
+) -> FeatureRays | None:
+    """Find how far away is what training photographs show, and say what was found.
 
     Args:
-        model: The model; its box says where to look.
-        datamanager: Has the photographs.
+        dataset: The training photographs, see `read_photographs`.
+        near: Depth up to which they show nothing, [world units].
+        lo: Lower corner of the box in which depths are looked for, [world units].
+        hi: Upper corner.
+        say: Told what was found.
 
     Returns:
-        Lines of sight; None where the photographs say too little, or no photographs train.
+        A ray to each depth that several photographs agree about; None where they say too little.
     """
     began = time.perf_counter()
-    if model.grid.sh is None or datamanager.config.streams == "thermal":
-        return None
-    near = model.config.near_plane * model.unit
-    photographs = read_photographs(datamanager.train_dataset, near)
+    photographs = read_photographs(dataset, near)
     if photographs is None:
         return None
-    box = model.scene_box.aabb.double().numpy()
-    lattice = Lattice.covering(box[0], box[1], model.config.resolutions[0])  # the same in a resumed training
-    depths = depths_of(photographs, lattice.lo, lattice.hi)
+    depths = depths_of(photographs, lo, hi)
     few = "" if depths.share >= LEAST_SHARE else ", too few to tell anything"
-    CONSOLE.log(
+    say(
         f"depths: {len(photographs)} photographs agree about {depths.share:.1%} of their pixels{few}; "
         f"{time.perf_counter() - began:.1f} s"
     )
-    return None if few else lines_to_depths(depths)
+    return None if few else feature_rays_to_depths(depths)

@@ -147,3 +147,34 @@ def _sum_rows(
         behind = left[:, None] * background
         total = total + (behind if rays is None else behind * rays[:, None])
     return total
+
+
+def ray_sparsity(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> Float[Tensor, " rays"]:
+    """Cauchy sparsity of each ray: sum_i log(1 + 2 s_i^2) over real steps (Plenoxels, eq. 5; SNeRG)."""
+    terms = torch.log1p(2.0 * density.clamp(max=1e9) ** 2)
+    return torch.sum(torch.where(deltas > 0, terms, torch.zeros_like(terms)), -1)
+
+
+def ray_distortion(
+    weights: Float[Tensor, "rays steps"],
+    t: Float[Tensor, "rays steps"],
+    deltas: Float[Tensor, "rays steps"],
+    scale: float,
+) -> Float[Tensor, " rays"]:
+    """How far each ray's weight is spread (mip-NeRF 360, eq. 15, in the O(n) form of DVGOv2, eq. 6-7).
+
+    sum_ij w_i w_j |t_i - t_j| + 1/3 sum_i w_i^2 d_i, lengths divided by `scale`; its mean gathers the weight of rays
+    in one short interval.
+
+    Args:
+        weights: Weights of the steps.
+        t: Step middles, ascending along each ray.
+        deltas: Step lengths.
+        scale: Length that counts as 1, world units (the diagonal of the box).
+    """
+    t, deltas = t / scale, deltas / scale
+    moment = weights * t
+    weight_before = torch.cumsum(weights, -1) - weights
+    moment_before = torch.cumsum(moment, -1) - moment
+    between = 2.0 * torch.sum(weights * (t * weight_before - moment_before), -1)
+    return between + torch.sum(weights**2 * deltas, -1) / 3.0

@@ -16,12 +16,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from thermoxels_ns.core.buffer_pool import SCRATCH
+from thermoxels_ns.core.buffer_pool import BUFFERS
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.threads import run_ranges, run_tasks
+from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.render import kernels, kernels_backward, kernels_rows, kernels_shading
-from thermoxels_ns.render.kernels import Rays, Records, Settings, Sums, Volume
+from thermoxels_ns.render.kernels import Marched, Rays, Records, Settings, Sums, Volume
 from thermoxels_ns.render.kernels_backward import RayGradients
 from thermoxels_ns.render.kernels_rows import Blocks
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions, near_and_far
@@ -37,36 +37,13 @@ FEWEST_SAMPLES = 24
 """Samples per ray that a batch has room for at first, on average over a range."""
 SPARE = 1.25
 """Room made when that was too little, over what the rays so far took."""
-MOST_ROOMS = 16
-"""Numbers of rows whose room is remembered."""
 _room: dict[int, int] = {}
-"""Samples per ray that batches had room for, by the number of rows: two models that take turns keep theirs."""
+"""Samples per ray that batches of the last lattice had room for, by its number of rows."""
 NAMES = ("density", "sh", "temperature")
 
 
-@dataclass(frozen=True)
-class VoxelArrays:
-    """Kept voxels as plain arrays; the rule of each is that of `field.kept_voxels.KeptVoxels`."""
-
-    lattice: Lattice
-    voxel_rows: np.ndarray
-    block_slot: np.ndarray
-    voxel_number: np.ndarray
-
-
-@dataclass(frozen=True)
-class Marched:
-    """Samples of a batch of rays: `records` and how to read them."""
-
-    rays: Rays
-    volume: Volume
-    settings: Settings
-    records: Records
-    sums: Sums
-
-
 def march(
-    voxels: VoxelArrays,
+    voxels: KeptVoxels,
     density: Tensor,
     sh: Tensor | None,
     temperature: Tensor,
@@ -90,7 +67,7 @@ def march(
 
 
 def _march(
-    voxels: VoxelArrays,
+    voxels: KeptVoxels,
     density: Tensor,
     sh: Tensor | None,
     temperature: Tensor,
@@ -165,12 +142,10 @@ def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple
         if min(wrong, default=0) >= 0:
             break
         short = [per_ray for _, number, per_ray in found if number < 0]
-        _room.pop(rows, None)
-        if len(_room) >= MOST_ROOMS:
-            del _room[next(iter(_room))]
+        _room.clear()
         _room[rows] = max(room + 1, int(SPARE * max(short)))
         del records, work  # what was too small is given back before more is taken
-        SCRATCH.release()
+        BUFFERS.release()
     if sum(wrong):
         raise ThermoxelsError(
             "density",
@@ -186,20 +161,20 @@ def _empty_records(rays: int, total: int, volume: Volume) -> Records:
     return Records(
         np.zeros(rays, dtype=np.int64),
         np.zeros(rays, dtype=np.int64),
-        SCRATCH.empty(total, np.int32),
-        SCRATCH.empty(total, np.int32),
-        SCRATCH.empty((total, 3), dtype),
-        SCRATCH.empty(total, dtype),
-        SCRATCH.empty(total, dtype),
-        SCRATCH.empty(total, dtype),
-        SCRATCH.empty((total if volume.sh.shape[1] else 0, 3), dtype),
-        SCRATCH.empty(total, dtype),
-        SCRATCH.empty(total, np.uint8),
+        BUFFERS.empty(total, np.int32),
+        BUFFERS.empty(total, np.int32),
+        BUFFERS.empty((total, 3), dtype),
+        BUFFERS.empty(total, dtype),
+        BUFFERS.empty(total, dtype),
+        BUFFERS.empty(total, dtype),
+        BUFFERS.empty((total if volume.sh.shape[1] else 0, 3), dtype),
+        BUFFERS.empty(total, dtype),
+        BUFFERS.empty(total, np.uint8),
     )
 
 
 def render(
-    voxels: VoxelArrays,
+    voxels: KeptVoxels,
     density: Tensor,
     sh: Tensor | None,
     temperature: Tensor,
@@ -242,7 +217,7 @@ def render(
 
 @dataclass
 class _Context:
-    voxels: VoxelArrays
+    voxels: KeptVoxels
     activation: str
     request: RayRequest
     options: RenderOptions

@@ -7,6 +7,7 @@ the same place. Geometry and sums are in double precision whatever the parameter
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -120,6 +121,17 @@ class Sums(NamedTuple):
     depth: Floats
     distortion: Floats
     sparsity: Floats
+
+
+@dataclass(frozen=True)
+class Marched:
+    """Samples of a batch of rays: `records` and how to read them."""
+
+    rays: Rays
+    volume: Volume
+    settings: Settings
+    records: Records
+    sums: Sums
 
 
 @kernel

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -10,12 +12,12 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.interpolation import TrilinearPoints
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.render.compositing import composite
-from thermoxels_ns.render.march import March, march
+from thermoxels_ns.render.compositing import RayWeights, composite, ray_distortion, ray_sparsity, ray_weights
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
-from thermoxels_ns.training import losses
+from thermoxels_ns.render.sampling import RaySteps, sample_box
 
 Backend = Literal["auto", "reference", "fused"]
 
@@ -44,6 +46,67 @@ def render_rays(grid: VoxelGrid, request: RayRequest, options: RenderOptions, ba
     if choose_backend(backend, grid.density.device) == "fused":
         return fused_render(grid, request, options)
     return reference_render(grid, request, options)
+
+
+@dataclass(frozen=True)
+class March:
+    """Rays marched through the box."""
+
+    steps: RaySteps
+    density: Float[Tensor, "rays steps"]
+    """Density at the samples, 0 where nothing was asked, [1 / world unit]."""
+    along: RayWeights
+    active: Int64[Tensor, " n"]
+    """Flat indices (into rays x steps) of the samples whose density was asked for, ascending."""
+    positions: Float[Tensor, "n 3"]
+    """World positions of the active samples."""
+
+    def active_index(self, flat: Int64[Tensor, " m"]) -> Int64[Tensor, " m"]:
+        """Where the samples `flat` (all active) stand in `active`."""
+        return torch.searchsorted(self.active, flat)
+
+    def rays_of(self, flat: Int64[Tensor, " m"]) -> Int64[Tensor, " m"]:
+        """The ray each sample belongs to."""
+        return flat // self.steps.t.shape[1]
+
+
+def march(
+    origins: Float[Tensor, "rays 3"],
+    directions: Float[Tensor, "rays 3"],
+    lattice: Lattice,
+    density_at: Callable[[Tensor], Tensor],
+    keep: Callable[[Tensor], Tensor] | None = None,
+    steps_per_voxel: float = 2.0,
+    near: float | Float[Tensor, " rays"] = 0.0,
+    far: Float[Tensor, " rays"] | None = None,
+) -> March:
+    """Sample rays inside the lattice and turn density into weights.
+
+    Args:
+        origins: Ray origins, world units.
+        directions: Unit directions.
+        lattice: Gives the box and the step: a voxel over `steps_per_voxel` (the paper: half a voxel).
+        density_at: Maps positions (n, 3) to densities (n,), [1 / world unit].
+        keep: Maps positions to booleans: samples it refuses have density 0 without being asked; None: ask all.
+        steps_per_voxel: Samples per voxel edge.
+        near: Distance in front of the camera where sampling starts, world units.
+        far: Distance where it ends; None: at the box.
+
+    Returns:
+        Samples, densities and weights.
+    """
+    lo = torch.tensor(lattice.lo, dtype=origins.dtype, device=origins.device)
+    hi = torch.tensor(lattice.hi, dtype=origins.dtype, device=origins.device)
+    steps = sample_box(origins, directions, lo, hi, lattice.voxel_size / steps_per_voxel, near, far)
+    active = (steps.deltas > 0).flatten().nonzero()[:, 0]
+    rays = active // steps.t.shape[1]
+    positions = origins[rays] + directions[rays] * steps.t.flatten()[active][:, None]
+    if keep is not None:
+        kept = keep(positions)
+        active, positions = active[kept], positions[kept]
+    asked = density_at(positions)
+    density = torch.zeros_like(steps.t).flatten().index_put((active,), asked).view_as(steps.t)
+    return March(steps, density, ray_weights(density, steps.deltas), active, positions)
 
 
 def march_grid(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> March:
@@ -88,13 +151,13 @@ def reference_render(grid: VoxelGrid, request: RayRequest, options: RenderOption
     steps = marched.steps
     distortion = sparsity = None
     if options.distortion_scale:
-        distortion = losses.ray_distortion(marched.along.weights, steps.t, steps.deltas, options.distortion_scale)
+        distortion = ray_distortion(marched.along.weights, steps.t, steps.deltas, options.distortion_scale)
     if options.sparsity:
-        sparsity = losses.ray_sparsity(marched.density, steps.deltas)
+        sparsity = ray_sparsity(marched.density, steps.deltas)
     corners = grid.voxels.tables(grid.density.device)[0]
     parameters = grid.row_parameters()
     variation = {
-        name: losses.total_variation(
+        name: total_variation(
             parameters[name], corners[first:last], channels=options.colour_channels if name == "sh" else None
         )
         for name, (first, last) in options.variation.items()
@@ -111,11 +174,33 @@ def reference_render(grid: VoxelGrid, request: RayRequest, options: RenderOption
     )
 
 
+def total_variation(
+    rows: Float[Tensor, "rows c"],
+    corners: Int64[Tensor, "voxels 8"],
+    smallest: float = 1e-10,
+    channels: int | None = None,
+) -> Float[Tensor, ""]:
+    """Mean over voxels and channels of sqrt(dx^2 + dy^2 + dz^2), differences from corner 0 (Plenoxels, eq. 4).
+
+    Args:
+        rows: Corner values.
+        corners: Rows of the corners of the voxels to look at, in the order of `lattice.CORNER_OFFSETS`.
+        smallest: Added under the root so that its gradient is finite where the field is flat.
+        channels: Channels of which the mean is taken, those without a column being 0; None: the columns.
+    """
+    columns = rows.shape[1]
+    channels = columns if channels is None else channels
+    here = rows[corners[:, 0]]
+    dz, dy, dx = rows[corners[:, 1]] - here, rows[corners[:, 2]] - here, rows[corners[:, 4]] - here
+    total = torch.sum(torch.sqrt(dx * dx + dy * dy + dz * dz + smallest)) / (len(corners) * channels)
+    return total + (1.0 - columns / channels) * math.sqrt(smallest)
+
+
 def fused_render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayRender:
     """Render rays with the compiled kernels."""
     from thermoxels_ns.render.fused import render
 
-    return render(_arrays(grid), grid.density, grid.sh, grid.temperature, grid.activation, request, options)
+    return render(grid.voxels, grid.density, grid.sh, grid.temperature, grid.activation, request, options)
 
 
 @dataclass(frozen=True)
@@ -142,7 +227,7 @@ def sample_rays(grid: VoxelGrid, request: RayRequest, options: RenderOptions, ba
 
         nothing = torch.zeros(len(request.origins), dtype=torch.bool)
         request = RayRequest(request.origins, request.directions, request.near, request.far, nothing, nothing)
-        marched = fused_march(_arrays(grid), grid.density, None, grid.temperature, grid.activation, request, options)
+        marched = fused_march(grid.voxels, grid.density, None, grid.temperature, grid.activation, request, options)
         records = marched.records
         offset, used = torch.from_numpy(records.offset), torch.from_numpy(records.used)
         ray = torch.repeat_interleave(torch.arange(len(used)), offset.diff())
@@ -163,10 +248,3 @@ def sample_rays(grid: VoxelGrid, request: RayRequest, options: RenderOptions, ba
         before.flatten()[marched.active],
         marched.along.transmittance,
     )
-
-
-def _arrays(grid: VoxelGrid):
-    from thermoxels_ns.render.fused import VoxelArrays
-
-    voxels = grid.voxels
-    return VoxelArrays(voxels.lattice, voxels.voxel_rows, voxels.block_slot, voxels.voxel_number)

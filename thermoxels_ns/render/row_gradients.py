@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from thermoxels_ns.core.buffer_pool import SCRATCH
+from thermoxels_ns.core.buffer_pool import BUFFERS
 from thermoxels_ns.core.threads import num_threads, run_tasks
 from thermoxels_ns.render import kernels_rows
+from thermoxels_ns.render.kernels import Marched
 from thermoxels_ns.render.kernels_rows import Blocks, Order, RowGradients
-from thermoxels_ns.render.ordered_rows import remember_order
-
-if TYPE_CHECKING:
-    from thermoxels_ns.render.fused import Marched
 
 MOST_GROUPS = 1 << 12
 """Groups of voxels that samples are put in order by."""
@@ -37,20 +34,20 @@ def row_gradients(marched: Marched, blocks: Blocks) -> list[Tensor | None]:
     order = _ordered(marched)
     bounds = _row_ranges(volume.voxel_rows, len(volume.density), order, blocks, [p.shape[1] for p in parameters])
     ranges = list(itertools.pairwise(bounds))
-    uses = SCRATCH.empty(len(volume.density), np.uint8)
+    uses = BUFFERS.empty(len(volume.density), np.uint8)
     counts: Any = run_tasks(
         [lambda a=a, b=b: kernels_rows.use_rows(a, b, volume, records, order, blocks, uses) for a, b in ranges]
     )
     places = np.concatenate((np.zeros((1, 3), np.int64), np.cumsum(np.asarray(counts).reshape(-1, 3), axis=0)))
-    lists = [SCRATCH.empty(int(total), np.int64) for total in places[-1]]
+    lists = [BUFFERS.empty(int(total), np.int64) for total in places[-1]]
     values = [
-        SCRATCH.empty((int(total), parameter.shape[1]), parameter.dtype)
+        BUFFERS.empty((int(total), parameter.shape[1]), parameter.dtype)
         for total, parameter in zip(places[-1], parameters)
     ]
-    place = SCRATCH.empty((len(uses), 3), np.int32)
+    place = BUFFERS.empty((len(uses), 3), np.int32)
     active = min(3 * marched.settings.sh_active, volume.sh.shape[1])
     narrow = active < volume.sh.shape[1]
-    sums = SCRATCH.empty((len(values[1]), active), volume.sh.dtype) if narrow else values[1]
+    sums = BUFFERS.empty((len(values[1]), active), volume.sh.dtype) if narrow else values[1]
     rows = RowGradients(uses, place, lists[0], values[0], lists[1], values[1], sums, lists[2], values[2])
 
     def add(first: int, last: int, start: np.ndarray, stop: np.ndarray) -> None:
@@ -63,8 +60,6 @@ def row_gradients(marched: Marched, blocks: Blocks) -> list[Tensor | None]:
 
     steps = zip(ranges, itertools.pairwise(places))
     run_tasks([lambda a=a, b=b, start=start, stop=stop: add(a, b, start, stop) for (a, b), (start, stop) in steps])
-    for touched in lists:
-        remember_order(touched)
     return [
         torch.sparse_coo_tensor(
             torch.from_numpy(touched)[None],
@@ -84,7 +79,7 @@ def _ordered(marched: Marched) -> Order:
     voxels, total = len(marched.volume.voxel_rows), int(marched.records.used.sum())
     shift = max(0, (voxels - 1).bit_length() - MOST_GROUPS.bit_length() + 1)
     groups = (voxels >> shift) + 1
-    order = Order(shift, np.zeros(groups + 1, np.int64), SCRATCH.empty(total, np.int32), SCRATCH.empty(total, np.int32))
+    order = Order(shift, np.zeros(groups + 1, np.int64), BUFFERS.empty(total, np.int32), BUFFERS.empty(total, np.int32))
     kernels_rows.order_records(marched.records, order)
     return order
 

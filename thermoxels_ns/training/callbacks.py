@@ -1,10 +1,10 @@
-"""Training callbacks: start, refine, prune, widen colour, and decide what stands behind the box."""
+"""The course of a training as callbacks: carve, refine, prune, widen colour, decide on backgrounds."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
@@ -12,14 +12,14 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch.nn import Parameter
 
 from thermoxels_ns.core.errors import PruningError
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.field.refine import RowChange, prune
+from thermoxels_ns.multiview.depth_supervision import feature_rays_of_photographs
+from thermoxels_ns.training.free_space_carving import carve_free_space
+from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler
+from thermoxels_ns.training.model import ThermoxelsModel
 from thermoxels_ns.training.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
-from thermoxels_ns.training.track_carving import carve_air
-from thermoxels_ns.training.track_loss import COARSE_LIGHT, TrackRays
-
-if TYPE_CHECKING:
-    from thermoxels_ns.training.model import ThermoxelsModel
 
 FEWEST_OPEN_RAYS = 0.002
 """Share of rays that must leave the box unsaturated for a background to be worth its cost."""
@@ -31,18 +31,14 @@ PRUNING_ATTEMPTS = 4
 """Thresholds tried before pruning fails."""
 RAYS_PER_IMAGE = 4096
 """Training rays per image that statistics look at."""
+SHORTEST_RUN_WITH_DEPTHS = 400
+"""Steps that a run must have for photo_depth auto: a shorter one would spend most of its time on depths."""
 
 
 def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
     """The callbacks of one training run, in the order in which they act at a step."""
-    # They load compiled kernels, which importing the configuration must not.
-    from thermoxels_ns.multiview.depth_supervision import lines_for_training
-
     before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
-    depths = lines_for_training(model, attributes)
-    if depths is not None:
-        given = model.sightlines
-        model.track_rays = TrackRays(depths if given is None else given.and_those_of(depths), COARSE_LIGHT)
+    follow_depths(model, attributes)
     factors = model.config.refinements()
     steps = {*factors, *model.config.prune_at, *model.config.thin_at}
     end = None
@@ -59,8 +55,10 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
 
     def carve(step: int) -> None:
         """Drop what lines of sight show to be air; at the first step of a training, not of a resumed one."""
+        if model.config.carve == "off" or model.feature_rays is None:
+            return
         old = model.grid.row_parameters()
-        change = carve_air(model)
+        change = carve_free_space(model.grid, model.feature_rays)
         if change is not None:
             follow(old, change)
 
@@ -109,6 +107,30 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         TrainingCallback(before, change_lattice, iters=tuple(sorted(steps | decisions))),
         TrainingCallback(before, widen),
     ]
+
+
+def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> None:
+    """Give the model feature rays to depths of photographs, beside those of tracks, where it is to have them.
+
+    See `ThermoxelsModelConfig.photo_depth`. Without photographs in training there are none.
+    """
+    config, pipeline, trainer = model.config, attributes.pipeline, attributes.trainer
+    if config.photo_depth == "off" or not model.loss_weights.tracks or pipeline is None:
+        return
+    if config.photo_depth == "auto":
+        steps = 0 if trainer is None else trainer._start_step + trainer.config.max_num_iterations
+        if model.feature_ray_sampler is not None or steps < SHORTEST_RUN_WITH_DEPTHS:
+            return
+    datamanager: Any = pipeline.datamanager
+    if model.grid.sh is None or datamanager.config.streams == "thermal":
+        return
+    box = model.scene_box.aabb.double().numpy()
+    lattice = Lattice.covering(box[0], box[1], config.resolutions[0])  # the same in a resumed training
+    near = config.near_plane * model.unit
+    depths = feature_rays_of_photographs(datamanager.train_dataset, near, lattice.lo, lattice.hi, CONSOLE.log)
+    if depths is not None:
+        rays = depths if model.feature_rays is None else model.feature_rays.joined_with(depths)
+        model.feature_ray_sampler = FeatureRaySampler(rays, COARSE_LIGHT)
 
 
 @dataclass(frozen=True)

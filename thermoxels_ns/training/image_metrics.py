@@ -15,6 +15,8 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 _SMALLEST_MSE = 1e-10
 _HSSIM_WINDOW = 4
 _HSSIM_C2 = 9e-4  # (0.03 x data range 1)^2
+HALF_TRANSPARENT = (0.1, 0.9)
+"""A ray whose accumulation lies strictly between these is neither through nor stopped."""
 
 
 def psnr(predicted: Tensor, target: Tensor, valid: Tensor | None = None) -> float:
@@ -131,3 +133,13 @@ def lpips(predicted: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> 
         lpips.network = package.LPIPS(net="alex", verbose=False)  # type: ignore[attr-defined]
     with torch.no_grad():
         return float(lpips.network(prepare(predicted), prepare(target)))  # type: ignore[attr-defined]
+
+
+def half_transparent_share(accumulation: Tensor) -> float:
+    """Share of rays that are neither through nor stopped, 0 to 1: semi-transparent volume, or edges.
+
+    Args:
+        accumulation: Opacity of rays, 0 to 1, any shape, at least one.
+    """
+    low, high = HALF_TRANSPARENT
+    return float(((accumulation > low) & (accumulation < high)).double().mean())

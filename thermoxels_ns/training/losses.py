@@ -1,16 +1,25 @@
-"""Loss terms: the paper's eq. 3 and 4, Plenoxels' sparsity and beta terms, and distortion. All plain torch.
-
-Each is a mean, so weights mean the same for every batch size and resolution. The model computes only those whose
-weight is not 0.
-"""
+"""Loss terms of colour, temperature, opacity and feature rays, each a mean, in plain torch."""
 
 from __future__ import annotations
 
 import math
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor
+
+from thermoxels_ns.core.feature_rays import FeatureRays
+from thermoxels_ns.render.ray_render import RayRequest
+
+MARGIN_VOXELS = 1.5
+"""Voxels before and behind a point between which the surface may lie."""
+MARGIN_ERRORS = 2.0
+"""Standard errors of a ray's length by which that is widened."""
+
+COARSE_LIGHT = 0.5
+"""Share of the light that may pass a depth of photographs while the lattice is coarse: a coarse voxel that is opaque
+reaches beyond the surface in it, and hides what lies beside that. Through tracks of structure from motion none may
+pass: they are fewer, and rooms would keep more floaters."""
 
 
 def rgb_loss(predicted: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
@@ -26,28 +35,6 @@ def thermal_loss(
     return l2_share * torch.mean(error**2) + (1.0 - l2_share) * torch.mean(error.abs())
 
 
-def total_variation(
-    rows: Float[Tensor, "rows c"],
-    corners: Int64[Tensor, "voxels 8"],
-    smallest: float = 1e-10,
-    channels: int | None = None,
-) -> Float[Tensor, ""]:
-    """Mean over voxels and channels of sqrt(dx^2 + dy^2 + dz^2), differences from corner 0 (Plenoxels, eq. 4).
-
-    Args:
-        rows: Corner values.
-        corners: Rows of the corners of the voxels to look at, in the order of `lattice.CORNER_OFFSETS`.
-        smallest: Added under the root so that its gradient is finite where the field is flat.
-        channels: Channels of which the mean is taken, those without a column being 0; None: the columns.
-    """
-    columns = rows.shape[1]
-    channels = columns if channels is None else channels
-    here = rows[corners[:, 0]]
-    dz, dy, dx = rows[corners[:, 1]] - here, rows[corners[:, 2]] - here, rows[corners[:, 4]] - here
-    total = torch.sum(torch.sqrt(dx * dx + dy * dy + dz * dz + smallest)) / (len(corners) * channels)
-    return total + (1.0 - columns / channels) * math.sqrt(smallest)
-
-
 def random_block(voxels: int, share: float, generator: torch.Generator) -> tuple[int, int]:
     """A contiguous part of a list of `voxels` kept voxels, about `share` of it, at a random place: first, behind last.
 
@@ -56,12 +43,6 @@ def random_block(voxels: int, share: float, generator: torch.Generator) -> tuple
     length = min(voxels, max(1, math.ceil(share * voxels)))
     first = int(torch.randint(voxels - length + 1, (), generator=generator))
     return first, first + length
-
-
-def ray_sparsity(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> Float[Tensor, " rays"]:
-    """Cauchy sparsity of each ray: sum_i log(1 + 2 s_i^2) over real steps (Plenoxels, eq. 5; SNeRG)."""
-    terms = torch.log1p(2.0 * density.clamp(max=1e9) ** 2)
-    return torch.sum(torch.where(deltas > 0, terms, torch.zeros_like(terms)), -1)
 
 
 def beta_loss(accumulation: Float[Tensor, " rays"], guard: float = 1e-3) -> Float[Tensor, ""]:
@@ -73,26 +54,60 @@ def beta_loss(accumulation: Float[Tensor, " rays"], guard: float = 1e-3) -> Floa
     return torch.mean(torch.log(accumulation + guard) + torch.log(1.0 - accumulation + guard)) - decided
 
 
-def ray_distortion(
-    weights: Float[Tensor, "rays steps"],
-    t: Float[Tensor, "rays steps"],
-    deltas: Float[Tensor, "rays steps"],
-    scale: float,
-) -> Float[Tensor, " rays"]:
-    """How far each ray's weight is spread (mip-NeRF 360, eq. 15, in the O(n) form of DVGOv2, eq. 6-7).
-
-    sum_ij w_i w_j |t_i - t_j| + 1/3 sum_i w_i^2 d_i, lengths divided by `scale`; its mean gathers the weight of rays
-    in one short interval.
+class FeatureRaySampler:
+    """Rays to points that photographs see, for the loss that asks whether the surface lies there.
 
     Args:
-        weights: Weights of the steps.
-        t: Step middles, ascending along each ray.
-        deltas: Step lengths.
-        scale: Length that counts as 1, world units (the diagonal of the box).
+        rays: Feature rays, world units; at least one.
+        coarse_light: Share of the light that may pass a point while the lattice is coarse.
     """
-    t, deltas = t / scale, deltas / scale
-    moment = weights * t
-    weight_before = torch.cumsum(weights, -1) - weights
-    moment_before = torch.cumsum(moment, -1) - moment
-    between = 2.0 * torch.sum(weights * (t * weight_before - moment_before), -1)
-    return between + torch.sum(weights**2 * deltas, -1) / 3.0
+
+    def __init__(self, rays: FeatureRays, coarse_light: float = 0.0) -> None:
+        self.coarse_light = coarse_light
+        along = torch.from_numpy(rays.points[rays.point] - rays.origins)
+        self._length = torch.linalg.norm(along, dim=-1)
+        self._directions = (along / self._length[:, None].clamp(min=1e-12)).float()
+        self._origins = torch.from_numpy(rays.origins).float()
+        self._uncertainty = torch.from_numpy(rays.uncertainty)
+
+    def request(
+        self, count: int, near: float, voxel_size: float, generator: torch.Generator, device: torch.device
+    ) -> RayRequest:
+        """Choose feature rays at random and make two of each, that before the point and that through it.
+
+        Args:
+            count: Number of rays.
+            near: Distance where sampling starts, [world units].
+            voxel_size: Of the lattice, [world units].
+            generator: On the CPU.
+            device: Where the rays are wanted.
+
+        Returns:
+            2 `count` rays without colour and temperature: first those that end before their points.
+        """
+        chosen = torch.randint(len(self._length), (count,), generator=generator)
+        margin = MARGIN_VOXELS * voxel_size + MARGIN_ERRORS * self._uncertainty[chosen]
+        length = self._length[chosen]
+        far = torch.cat(((length - margin).clamp(min=0.0), length + margin)).float()
+        nothing = torch.zeros(2 * count, dtype=torch.bool, device=device)
+        origins, directions = (v[chosen].repeat(2, 1).to(device) for v in (self._origins, self._directions))
+        return RayRequest(origins, directions, near, far.to(device), nothing, nothing)
+
+
+def feature_ray_loss(accumulation: Tensor, transmittance: Tensor, tolerated: float = 0.0) -> Tensor:
+    """Mean share of light that a feature ray loses before its point, plus that which passes the point.
+
+    Both are 0 where the surface lies at the point.
+
+    Args:
+        accumulation: Of the rays of `FeatureRaySampler.request`, shape (2 n,).
+        transmittance: Of the same rays, shape (2 n,).
+        tolerated: Share of the light that may pass without counting.
+
+    >>> float(feature_ray_loss(torch.tensor([0.25, 0.9]), torch.tensor([0.75, 0.1])))
+    0.3499999940395355
+    >>> float(feature_ray_loss(torch.tensor([0.25, 0.3]), torch.tensor([0.75, 0.7]), tolerated=0.5))
+    0.44999998807907104
+    """
+    count = len(accumulation) // 2
+    return accumulation[:count].mean() + (transmittance[count:] - tolerated).clamp(min=0.0).mean()

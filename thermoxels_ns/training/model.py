@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 from nerfstudio.cameras.rays import RayBundle
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.models.base_model import Model
 from nerfstudio.utils import colormaps
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.core.feature_rays import Sightlines
+from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
@@ -25,16 +24,13 @@ from thermoxels_ns.field.background import SkyTemperature, SphereImage, seen_beh
 from thermoxels_ns.field.field import VoxelField
 from thermoxels_ns.field.harmonics import harmonics, num_coefficients
 from thermoxels_ns.field.memory import check_memory
-from thermoxels_ns.field.refine import RowChange, refine
-from thermoxels_ns.field.widen import ColumnChange, widen_colour
+from thermoxels_ns.field.refine import ColumnChange, RowChange, refine, widen_colour
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
 from thermoxels_ns.render.renderers import GridSamples, render_rays, sample_rays
 from thermoxels_ns.training import losses
-from thermoxels_ns.training.callbacks import coarse_to_fine_callbacks
 from thermoxels_ns.training.image_metrics import lpips, lpips_available, psnr, ssim, thermal_metrics
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig
 from thermoxels_ns.training.ray_statistics import FieldEvidence, field_evidence
-from thermoxels_ns.training.track_loss import TrackRays, track_loss
 
 
 class ThermoxelsModel(Model):
@@ -88,9 +84,11 @@ class ThermoxelsModel(Model):
         self.register_buffer("trained_steps", torch.tensor(0))
         self.step = 0
         # What training photographs see of the tracks of structure from motion.
-        self.sightlines: Sightlines | None = (self.kwargs.get("metadata") or {}).get("sightlines")
-        seen = self.sightlines is not None and len(self.sightlines.point) and config.sh_degree is not None
-        self.track_rays = TrackRays(self.sightlines) if self.sightlines is not None and seen else None
+        self.feature_rays: FeatureRays | None = (self.kwargs.get("metadata") or {}).get("feature_rays")
+        seen = self.feature_rays is not None and len(self.feature_rays.point) and config.sh_degree is not None
+        self.feature_ray_sampler = (
+            losses.FeatureRaySampler(self.feature_rays) if self.feature_rays is not None and seen else None
+        )
 
     @property
     def grid(self):
@@ -112,12 +110,6 @@ class ThermoxelsModel(Model):
         if self.thermal_offset is not None:
             groups["thermal_offset"] = [self.thermal_offset]
         return groups
-
-    def get_training_callbacks(
-        self, training_callback_attributes: TrainingCallbackAttributes
-    ) -> list[TrainingCallback]:
-        """Refinement, pruning and the decision about the background."""
-        return coarse_to_fine_callbacks(self, training_callback_attributes)
 
     def split(self, factor: int) -> RowChange | None:
         """Split every kept voxel into factor^3, and return how values of rows change; None where the factor is 1.
@@ -217,7 +209,7 @@ class ThermoxelsModel(Model):
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
         """Render rays: rgb, thermal (normalised), temperature_c, depth, accumulation.
 
-        Rays of a batch carry their stream (see `streams.py`). In training only what it needs is rendered, and the
+        Rays of a batch carry their stream (see `core.ray_streams`). In training only what it needs is rendered, and the
         outputs are those that losses are made of. A crop that the viewer sets (nears, fars) is kept.
         """
         request = self._request(ray_bundle.origins, ray_bundle.directions, ray_bundle.nears, ray_bundle.fars)
@@ -284,18 +276,18 @@ class ThermoxelsModel(Model):
             terms["beta_loss"] = weights.beta * losses.beta_loss(render.accumulation)
         if render.distortion is not None:
             terms["distortion_loss"] = self._distortion_weight() * render.distortion.mean()
-        if weights.tracks and self.track_rays is not None:
-            terms["tracks_loss"] = weights.tracks * self._track_loss(self.track_rays)
+        if weights.tracks and self.feature_ray_sampler is not None:
+            terms["tracks_loss"] = weights.tracks * self._feature_ray_loss(self.feature_ray_sampler)
         return terms
 
-    def _track_loss(self, rays: TrackRays) -> Tensor:
+    def _feature_ray_loss(self, rays: losses.FeatureRaySampler) -> Tensor:
         """How far this step's lines of sight are from ending at their points; coarse lattices may let light pass."""
         config, near, lattice = self.config, self.config.near_plane * self.unit, self.grid.lattice
         generator = torch.Generator().manual_seed((config.seed + 1) * 2_000_003 + self.step)
         request = rays.request(config.track_rays, near, lattice.voxel_size, generator, self.device)
         seen = render_rays(self.grid, request, self._options(), config.backend)
         last = max(lattice.cell_shape) >= config.resolutions[-1]
-        return track_loss(seen.accumulation, seen.transmittance, 0.0 if last else rays.coarse_light)
+        return losses.feature_ray_loss(seen.accumulation, seen.transmittance, 0.0 if last else rays.coarse_light)
 
     def _distortion_weight(self) -> float:
         """Weight of the distortion term at this step: it grows over its ramp."""
@@ -396,3 +388,6 @@ class ThermoxelsModel(Model):
         constant = harmonics(grid.sh.new_tensor([[0.0, 0.0, 1.0]]), 0)  # the same in all directions
         mean = grid.sh.view(len(grid.sh), 3, num_coefficients(grid.sh_degree))[..., 0] * constant
         return torch.stack([grid.corner_values(rows, 0.5) for rows in torch.sigmoid(mean).float().unbind(-1)], -1)
+
+
+ThermoxelsModelConfig.model_class = ThermoxelsModel

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Literal
+from typing import ClassVar, Literal
 
 from nerfstudio.models.base_model import ModelConfig
 
@@ -39,8 +39,7 @@ class LossWeights:
     distortion: float
     """Gather each ray's weight in one short interval."""
     tracks: float = 0.0
-    """Lines of sight end at the points that they were drawn to: tracks of structure from motion, depths on which
-    photographs agree."""
+    """Feature rays end at their points: tracks of structure from motion, depths on which photographs agree."""
 
 
 LOSS_RECIPES: Mapping[str, LossWeights] = {
@@ -74,7 +73,9 @@ LOSS_RECIPES: Mapping[str, LossWeights] = {
 class ThermoxelsModelConfig(ModelConfig):
     """Settings of the voxel model."""
 
-    _target: type = field(default_factory=lambda: _model_class())
+    model_class: ClassVar[type] = ModelConfig
+    """The model that these settings make; `training.model` puts itself here."""
+    _target: type = field(default_factory=lambda: ThermoxelsModelConfig.model_class)
     enable_collider: bool = False
     """Rays are cut by the lattice itself; nerfstudio's collider is not used."""
     eval_num_rays_per_chunk: int = 8192
@@ -91,7 +92,7 @@ class ThermoxelsModelConfig(ModelConfig):
     prune_dilation: int = 1
     """Voxels kept around those, so that surfaces can still move."""
     thin_at: tuple[int, ...] = _STANDARD.thin_at
-    """Steps at which surfaces are thinned: fog before them and what shines through from behind them goes."""
+    """Steps at which surfaces are thinned: half-transparent voxels before and behind them go."""
     thin_threshold: float = 0.05
     """At those steps a voxel stays only if some training ray gave it more than this share of a pixel, or spent half of
     its light there. 0 switches thinning off."""
@@ -112,12 +113,12 @@ class ThermoxelsModelConfig(ModelConfig):
     (of thermoxels capture or of a COLMAP model, see the dataparser's tracks), at the start and after every
     refinement."""
     photo_depth: Literal["auto", "off", "on"] = "auto"
-    """Ask how far away is what photographs show, by comparing each with its neighbours (plane sweep), and make lines of
-    sight end there, as those to points of structure from motion do. It keeps fog from closing before walls of little
-    texture. auto: where the scene has no tracks and the run at least 400 steps; on: always, beside tracks too. It needs
-    a loss weight tracks above 0."""
+    """Depth supervision: find depths by comparing each photograph with its neighbours (multi-view stereo, plane sweep),
+    and ask rays to end there, as at points of structure from motion. It keeps opaque floaters from forming before walls
+    of little texture. auto: where the scene has no tracks and the run at least 400 steps; on: always, beside them
+    too. It needs a loss weight tracks above 0."""
     track_rays: int = 512
-    """Lines of sight that each step looks at."""
+    """Feature rays (to depths or to points of structure from motion) that each step follows."""
     thermal_density_gradient: bool = False
     """Let thermal images move the geometry (off: temperature is painted on what the RGB images show)."""
     steps_per_voxel: float = 2.0
@@ -250,9 +251,3 @@ class ThermoxelsModelConfig(ModelConfig):
         if self.sh_degree is not None:
             columns["sh"] = tuple(dict.fromkeys((3, 3 * num_coefficients(self.sh_degree))))
         return columns
-
-
-def _model_class() -> type:
-    from thermoxels_ns.training.model import ThermoxelsModel
-
-    return ThermoxelsModel

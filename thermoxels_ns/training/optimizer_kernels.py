@@ -1,4 +1,4 @@
-"""Compiled row updates of the optimisers; the plain twins stand in `optim`."""
+"""Compiled row updates of the optimisers; the plain twins stand in `optimizers`."""
 
 from __future__ import annotations
 

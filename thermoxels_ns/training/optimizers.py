@@ -17,9 +17,7 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig, OptimizerConfig
 from torch import Tensor
 
 from thermoxels_ns.core.threads import run_ranges
-from thermoxels_ns.field.refine import RowChange
-from thermoxels_ns.field.widen import ColumnChange
-from thermoxels_ns.render.ordered_rows import in_order
+from thermoxels_ns.field.refine import ColumnChange, RowChange
 
 
 class RowOptimizer(torch.optim.Optimizer):
@@ -92,7 +90,7 @@ def touched_rows(gradient: Tensor) -> tuple[Tensor, Tensor]:
     if gradient.is_sparse:
         rows = gradient._indices()[0]
         # Accumulation into `grad` forgets that a tensor is coalesced; finding out is quicker than doing it again.
-        if not gradient.is_coalesced() and not in_order(rows):
+        if not gradient.is_coalesced() and not bool((rows[1:] > rows[:-1]).all()):
             gradient = gradient.coalesce()
         values = gradient._values()
         return gradient._indices()[0], values.view(len(values), -1)

@@ -4,23 +4,31 @@ from __future__ import annotations
 
 import math
 import os
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
-from rich.markup import escape
 
 from thermoxels_ns.core.errors import CheckpointError, SceneError
+from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.core.threads import set_num_threads
-from thermoxels_ns.render.renderers import choose_backend
+from thermoxels_ns.field.voxel_grid import VoxelGrid
+from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
+from thermoxels_ns.render.renderers import choose_backend, fused_render
+from thermoxels_ns.training.image_metrics import half_transparent_share
 from thermoxels_ns.training.model import ThermoxelsModel
-from thermoxels_ns.training.warm_up import compile_kernels
+from thermoxels_ns.training.optimizers import RowAdam
 
 _GRID = "_model.field.grid."
+SILENT_SECONDS = 1.0
+"""Loading kernels that were compiled before takes less."""
 _ACTIVATION = "_model.field.grid.activation_index"
 
 
@@ -42,6 +50,8 @@ class ThermoxelsPipeline(VanillaPipeline):
         """The voxel model."""
         return super().model  # type: ignore[return-value]
 
+    compare_with_truth: ClassVar[Callable[[Any], dict[str, float]] | None] = None
+    """What measures the surface in `geometry_metrics`; `config.py` sets it, as training knows no evaluation."""
     world_from_input: torch.Tensor
 
     def __init__(self, config: ThermoxelsPipelineConfig, *args: Any, **kwargs: Any) -> None:
@@ -67,6 +77,16 @@ class ThermoxelsPipeline(VanillaPipeline):
             (outputs.dataparser_transform.double() * outputs.dataparser_scale, outputs.scene_box.aabb.T), 1
         )
         self.register_buffer("world_from_input", placed)
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Nerfstudio's own, and the course of the training."""
+        # The course loads compiled kernels, which importing the configuration must not.
+        from thermoxels_ns.training.callbacks import coarse_to_fine_callbacks
+
+        stock = super().get_training_callbacks(training_callback_attributes)
+        return stock + coarse_to_fine_callbacks(self.model, training_callback_attributes)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint.
@@ -145,25 +165,15 @@ class ThermoxelsPipeline(VanillaPipeline):
         return averages
 
     def geometry_metrics(self) -> dict[str, float]:
-        """How well the surface agrees with the exact scene, see `evaluation.geometry_metrics`; empty if unknown."""
-        from thermoxels_ns.commands.export import input_from_world
-        from thermoxels_ns.evaluation.geometry_metrics import geometry_metrics, has_truth
-
-        datamanager: Any = self.datamanager
-        if not has_truth(datamanager.get_datapath(), _say):
-            return {}
-        outputs = datamanager.train_dataparser_outputs
-        world_to_input = input_from_world(outputs.dataparser_transform.numpy(), float(outputs.dataparser_scale))
-        # With the rays' evidence and the cameras, as an export has them: they decide what is solid.
-        return geometry_metrics(self.grid_snapshot(), world_to_input, datamanager.get_datapath(), _say)
+        """How well the surface agrees with the exact scene; empty if it is not known."""
+        compare = type(self).compare_with_truth
+        return {} if compare is None else compare(self)
 
     def get_average_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
         """Average metrics over images; an image where a metric has no pixel does not count for it.
 
         ``half_transparent``, the share of rays that are neither through nor stopped, joins the metrics of the model.
         """
-        from thermoxels_ns.evaluation.geometry_metrics import half_transparent_share
-
         rows: list[dict[str, float]] = []
         one_image = self.model.get_image_metrics_and_images
 
@@ -198,5 +208,26 @@ def _columns(grid: dict[str, tuple[int, ...]]) -> str:
     return ", ".join(f"{name.removeprefix(_GRID)} {' or '.join(map(str, n))}" for name, n in sorted(grid.items()))
 
 
-def _say(line: str) -> None:
-    CONSOLE.print(escape(line))
+def compile_kernels(say: Callable[[str], None]) -> None:
+    """Run every kernel once on a few rays; numba keeps the compiled result.
+
+    Args:
+        say: Told what is going on if it takes longer than `SILENT_SECONDS`.
+    """
+    notice = threading.Timer(
+        SILENT_SECONDS, say, ("compiling the kernels for this processor: 10 to 30 s, the first time",)
+    )
+    notice.daemon = True
+    notice.start()
+    try:
+        grid = VoxelGrid(Lattice((-1.0, -1.0, -1.0), 1.0, (3, 3, 3)))
+        generator = torch.Generator().manual_seed(0)
+        origins = 3.0 * torch.nn.functional.normalize(torch.randn(4, 3, generator=generator), dim=-1)
+        request = RayRequest(origins, torch.nn.functional.normalize(-origins, dim=-1))
+        variation = {name: (0, 2) for name in grid.row_parameters()}
+        seen = fused_render(grid, request, RenderOptions(distortion_scale=1.0, sparsity=True, variation=variation))
+        assert seen.rgb is not None
+        (seen.rgb.sum() + seen.thermal.sum() + sum(seen.variation.values())).backward()
+        RowAdam(list(grid.parameters())).step()
+    finally:
+        notice.cancel()

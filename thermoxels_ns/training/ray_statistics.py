@@ -68,7 +68,7 @@ def _half_way(samples: GridSamples) -> Int64[Tensor, " ends"]:
 def share_of_rays_opened(model: RaySampler, rays: Iterable[RayBundle], keep: Bool[Tensor, " voxels"]) -> float:
     """Share of the rays that end on something (opacity above one half) of whose weight more than half would go.
 
-    Fog that goes makes no ray see through; a body that goes does.
+    Removing thin, half-transparent voxels lets no ray through; removing a body does.
 
     Args:
         model: The field.

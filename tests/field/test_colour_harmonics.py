@@ -11,9 +11,9 @@ import torch
 from tests.reference.two_renderers import EVERYTHING, RENDERERS, random_grid, random_request, see
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.field.harmonics import num_coefficients
+from thermoxels_ns.field.refine import widen_colour
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.field.widen import widen_colour
-from thermoxels_ns.training import losses
+from thermoxels_ns.render.renderers import total_variation
 from thermoxels_ns.training.optimizers import RowAdam, RowRMSprop
 
 STEPS = [(0, 1), (0, 2), (1, 2)]
@@ -75,9 +75,9 @@ def test_narrow_rows_render_and_differentiate_like_wide_ones_with_zeros(renderer
 def test_variation_of_columns_that_are_not_stored_is_that_of_zeros():
     rows, corners = torch.randn(20, 3), torch.arange(16).view(2, 8)
     padded = torch.cat((rows, torch.zeros(20, 24)), 1)
-    found = losses.total_variation(rows, corners, channels=27)
-    assert float(found) == pytest.approx(float(losses.total_variation(padded, corners)), rel=1e-6)
-    assert float(found) < 0.2 * float(losses.total_variation(rows, corners))
+    found = total_variation(rows, corners, channels=27)
+    assert float(found) == pytest.approx(float(total_variation(padded, corners)), rel=1e-6)
+    assert float(found) < 0.2 * float(total_variation(rows, corners))
 
 
 @pytest.mark.parametrize("make", [RowAdam, RowRMSprop])

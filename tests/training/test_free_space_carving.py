@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-import thermoxels_ns.training.track_carving as track_carving
-from thermoxels_ns.core.feature_rays import Sightlines, agrees_with_neighbours
+import thermoxels_ns.training.free_space_carving as free_space_carving
+from thermoxels_ns.core.feature_rays import FeatureRays, agrees_with_neighbours
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.training.track_carving import MARGIN_VOXELS, carve_air, empty_voxels
+from thermoxels_ns.training.free_space_carving import MARGIN_VOXELS, carve_free_space, empty_voxels
 
 BOX = Lattice.covering((-1, -1, -1), (1, 1, 1), 20)
 
 
-def lines(origins, points, uncertainty=0.0) -> Sightlines:
+def lines(origins, points, uncertainty=0.0) -> FeatureRays:
     """Every camera sees every point."""
     origins, points = np.atleast_2d(origins).astype(float), np.atleast_2d(points).astype(float)
     number = np.repeat(np.arange(len(points)), len(origins))
-    return Sightlines(
+    return FeatureRays(
         np.tile(origins, (len(points), 1)), number, points, np.full(len(number), uncertainty, dtype=float)
     )
 
 
-def room(count: int = 4000, seed: int = 0) -> tuple[Sightlines, np.ndarray]:
+def room(count: int = 4000, seed: int = 0) -> tuple[FeatureRays, np.ndarray]:
     """A room with walls at +-0.65 seen from inside, and the voxels that are free: nothing of a wall in them."""
     random = np.random.default_rng(seed)
     points = random.uniform(-0.65, 0.65, (count, 3))
@@ -57,7 +56,7 @@ def test_no_voxel_that_holds_a_point_is_carved(resolution: int) -> None:
 def test_a_point_without_lines_keeps_its_voxel() -> None:
     sight = lines([-0.95, 0.05, 0.05], [[0.87, 0.05, 0.05], [0.88, 0.05, 0.05]])
     assert empty_voxels(BOX, sight)[8, 10, 10]
-    doubted = Sightlines(
+    doubted = FeatureRays(
         sight.origins, sight.point, np.concatenate((sight.points, [[-0.15, 0.05, 0.05]])), sight.uncertainty
     )
     assert not empty_voxels(BOX, doubted)[8, 10, 10]
@@ -79,7 +78,7 @@ def test_what_is_carved_ends_before_the_points_by_the_margin_and_the_uncertainty
     assert limit - BOX.voxel_size < ends <= limit + 1e-9
 
 
-def ground(wrong: float, per_voxel: int = 4, seed: int = 0) -> tuple[Sightlines, np.ndarray, np.ndarray]:
+def ground(wrong: float, per_voxel: int = 4, seed: int = 0) -> tuple[FeatureRays, np.ndarray, np.ndarray]:
     """A floor at z = -0.48, a fifth of a voxel above faces of voxels, seen from above; some points lie below it.
 
     Returns:
@@ -97,7 +96,7 @@ def ground(wrong: float, per_voxel: int = 4, seed: int = 0) -> tuple[Sightlines,
 def test_without_the_lines_that_neighbours_contradict_wrong_points_carve_little_of_the_ground() -> None:
     sight, holds, above = ground(0.2)
     below = BOX.cell_centres()[..., 2] < -0.55
-    believed = sight.with_lines_of(agrees_with_neighbours(sight))
+    believed = sight.of_points(agrees_with_neighbours(sight))
     eaten, after = empty_voxels(BOX, sight), empty_voxels(BOX, believed)
     assert after[holds].mean() < 0.1 * eaten[holds].mean()
     assert after[below].mean() < 0.1 * eaten[below].mean()
@@ -115,17 +114,17 @@ def test_lines_along_faces_and_from_outside_count_as_any() -> None:
 def test_how_lines_are_cut_into_pieces_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     sight, _ = room(300)
     whole = empty_voxels(BOX, sight)
-    monkeypatch.setattr(track_carving, "_SAMPLES_AT_ONCE", 50)
+    monkeypatch.setattr(free_space_carving, "_SAMPLES_AT_ONCE", 50)
     assert np.array_equal(empty_voxels(BOX, sight), whole)
 
 
 def test_of_very_many_lines_some_are_looked_at_and_all_points_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     sight, free = room()
     whole = empty_voxels(BOX, sight)
-    monkeypatch.setattr(track_carving, "MOST_LINES", -(-len(sight.origins) // 3))
+    monkeypatch.setattr(free_space_carving, "MOST_LINES", -(-len(sight.origins) // 3))
     seen = []
-    crossings = track_carving._crossings
-    monkeypatch.setattr(track_carving, "_crossings", lambda box, some: seen.append(some) or crossings(box, some))
+    crossings = free_space_carving._crossings
+    monkeypatch.setattr(free_space_carving, "_crossings", lambda box, some: seen.append(some) or crossings(box, some))
     some = empty_voxels(BOX, sight)
     assert len(seen[0].origins) <= len(sight.origins) // 3 + 5
     assert np.array_equal(seen[0].points, sight.points[::3])
@@ -135,21 +134,19 @@ def test_of_very_many_lines_some_are_looked_at_and_all_points_are_kept(monkeypat
     assert some.sum() > 0.9 * whole.sum()
 
 
-def carved_model(sight: Sightlines | None, carve: str = "auto") -> tuple[Any, Any]:
-    model: Any = SimpleNamespace(
-        sightlines=sight, config=SimpleNamespace(carve=carve), grid=VoxelGrid(BOX, sh_degree=0)
-    )
-    return model, carve_air(model)
+def carved_grid(sight: FeatureRays) -> tuple[VoxelGrid, Any]:
+    grid = VoxelGrid(BOX, sh_degree=0)
+    return grid, carve_free_space(grid, sight)
 
 
 def test_carved_voxels_are_no_longer_stored_and_rows_follow() -> None:
     sight, _ = room()
-    model, change = carved_model(sight)
-    kept = model.grid.kept.numpy()
+    grid, change = carved_grid(sight)
+    kept = grid.kept.numpy()
     assert np.array_equal(kept, ~empty_voxels(BOX, sight))
     rows = torch.arange(BOX.num_corners)[:, None]
     assert change is not None
-    assert torch.equal(change(rows)[:, 0], torch.from_numpy(model.grid.voxels.corners))
+    assert torch.equal(change(rows)[:, 0], torch.from_numpy(grid.voxels.corners))
 
 
 @pytest.mark.parametrize("doubted", [0, 7])
@@ -157,14 +154,8 @@ def test_the_log_tells_points_with_lines_from_those_that_are_doubted(
     doubted: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said: list[str] = []
-    monkeypatch.setattr(track_carving.CONSOLE, "log", said.append)
+    monkeypatch.setattr(free_space_carving.CONSOLE, "log", said.append)
     sight, _ = room(300)
-    carved_model(sight.with_lines_of(np.arange(300) >= doubted))
+    carved_grid(sight.of_points(np.arange(300) >= doubted))
     assert f"to {300 - doubted} points" in said[0]
     assert ("; 7 others do not" in said[0]) == (doubted == 7)
-
-
-def test_without_tracks_and_switched_off_nothing_changes() -> None:
-    for model, change in (carved_model(None), carved_model(room()[0], "off")):
-        assert change is None
-        assert bool(model.grid.kept.all())

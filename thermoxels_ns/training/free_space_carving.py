@@ -1,24 +1,17 @@
-"""Which voxels are air, from the lines between cameras and the points that they see.
-
-Photographs of plain walls leave training free to paint them on fog right before the cameras. Structure from motion
-knows better: from where a photograph sees a point, nothing stands in between (space carving along the rays of tracks).
-"""
+"""Space carving: drop voxels that feature rays of structure from motion cross on the way to their points."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from thermoxels_ns.core.feature_rays import FloatArray, IntArray, Sightlines
+from thermoxels_ns.core.feature_rays import FeatureRays, FloatArray, IntArray
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.refine import RowChange, prune
-
-if TYPE_CHECKING:
-    from thermoxels_ns.training.model import ThermoxelsModel
+from thermoxels_ns.field.voxel_grid import VoxelGrid
 
 FEWEST_POINTS = 2
 """Different points whose lines must cross a voxel: a single one may be wrong."""
@@ -32,16 +25,13 @@ _STEPS_PER_VOXEL = 2.0
 _SAMPLES_AT_ONCE = 1 << 20
 
 
-def carve_air(model: ThermoxelsModel) -> RowChange | None:
-    """Drop the kept voxels of a model's grid that lines of sight show to be air, and say how many.
+def carve_free_space(grid: VoxelGrid, lines: FeatureRays) -> RowChange | None:
+    """Drop the kept voxels of a grid that feature rays show to be air, and say how many.
 
     Returns:
-        How values of rows change; None where nothing changes: without tracks, or switched off.
+        How values of rows change; None where nothing changes.
     """
-    lines = model.sightlines
-    if model.config.carve == "off" or lines is None:
-        return None
-    voxels = model.grid.voxels
+    voxels = grid.voxels
     empty = empty_voxels(voxels.lattice, lines).reshape(-1)[voxels.cells]
     carved = int(empty.sum())
     if carved in (0, len(empty)):
@@ -50,12 +40,12 @@ def carve_air(model: ThermoxelsModel) -> RowChange | None:
     doubted = f"; {len(lines.points) - believed:,} others do not lie where their neighbours do"
     CONSOLE.log(
         f"tracks: {carved:,} of {len(empty):,} voxels are air ({carved / len(empty):.1%}), crossed by the "
-        f"{len(lines.origins):,} lines of sight to {believed:,} points{doubted if believed < len(lines.points) else ''}"
+        f"{len(lines.origins):,} feature rays to {believed:,} points{doubted if believed < len(lines.points) else ''}"
     )
-    return prune(model.grid, ~empty)
+    return prune(grid, ~empty)
 
 
-def empty_voxels(lattice: Lattice, lines: Sightlines) -> npt.NDArray[np.bool_]:
+def empty_voxels(lattice: Lattice, lines: FeatureRays) -> npt.NDArray[np.bool_]:
     """Find the voxels that are air.
 
     A voxel is air if the lines to at least `FEWEST_POINTS` points cross it and leave it `MARGIN_VOXELS` voxels and
@@ -63,7 +53,7 @@ def empty_voxels(lattice: Lattice, lines: Sightlines) -> npt.NDArray[np.bool_]:
 
     Args:
         lattice: The voxels.
-        lines: Lines of sight, world units.
+        lines: Feature rays, world units.
 
     Returns:
         One boolean per voxel, shape of the lattice's voxels.
@@ -79,10 +69,10 @@ def empty_voxels(lattice: Lattice, lines: Sightlines) -> npt.NDArray[np.bool_]:
     return empty & (_points_in(lattice, lines.points) == 0)
 
 
-def _every(step: int, lines: Sightlines) -> Sightlines:
+def _every(step: int, lines: FeatureRays) -> FeatureRays:
     """The lines to every `step`-th point."""
     kept = lines.point % step == 0
-    return Sightlines(lines.origins[kept], lines.point[kept] // step, lines.points[::step], lines.uncertainty[kept])
+    return FeatureRays(lines.origins[kept], lines.point[kept] // step, lines.points[::step], lines.uncertainty[kept])
 
 
 def _points_in(lattice: Lattice, points: FloatArray) -> IntArray:
@@ -94,7 +84,7 @@ def _points_in(lattice: Lattice, points: FloatArray) -> IntArray:
     return count
 
 
-def _crossings(lattice: Lattice, lines: Sightlines) -> Iterator[tuple[IntArray, IntArray]]:
+def _crossings(lattice: Lattice, lines: FeatureRays) -> Iterator[tuple[IntArray, IntArray]]:
     """Points and flat voxels that lines to them cross, all lines of a point in one piece."""
     shape = np.asarray(lattice.cell_shape)
     origin = lattice.world_to_index(lines.origins)

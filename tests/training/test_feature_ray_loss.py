@@ -6,24 +6,24 @@ import numpy as np
 import pytest
 import torch
 
-from thermoxels_ns.core.feature_rays import Sightlines
+from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.ray_render import RenderOptions
 from thermoxels_ns.render.renderers import render_rays
-from thermoxels_ns.training.track_loss import MARGIN_ERRORS, MARGIN_VOXELS, TrackRays, track_loss
+from thermoxels_ns.training.losses import MARGIN_ERRORS, MARGIN_VOXELS, FeatureRaySampler, feature_ray_loss
 
 CPU = torch.device("cpu")
 LATTICE = Lattice.covering((-1, -1, -1), (1, 1, 1), 20)
 
 
-def track_rays(uncertainty: float = 0.0, count: int = 40) -> tuple[TrackRays, Sightlines]:
+def track_rays(uncertainty: float = 0.0, count: int = 40) -> tuple[FeatureRaySampler, FeatureRays]:
     """Lines along x from 0.9 before the middle to a wall at x = 0.2."""
     side = np.random.default_rng(0).uniform(-0.8, 0.8, (count, 2))
     origins = np.column_stack((np.full(count, -0.9), side))
     points = np.column_stack((np.full(count, 0.2), side))
-    lines = Sightlines(origins, np.arange(count), points, np.full(count, uncertainty))
-    return TrackRays(lines), lines
+    lines = FeatureRays(origins, np.arange(count), points, np.full(count, uncertainty))
+    return FeatureRaySampler(lines), lines
 
 
 def wall(at: float, backend: str) -> float:
@@ -34,7 +34,7 @@ def wall(at: float, backend: str) -> float:
         grid.density.copy_(torch.where(x > at, 1e3, 0.0))
     request = track_rays()[0].request(32, 0.0, LATTICE.voxel_size, torch.Generator().manual_seed(0), CPU)
     seen = render_rays(grid, request, RenderOptions(), backend)  # type: ignore[arg-type]
-    return float(track_loss(seen.accumulation, seen.transmittance).detach())
+    return float(feature_ray_loss(seen.accumulation, seen.transmittance).detach())
 
 
 def test_rays_end_before_and_behind_their_points_by_margin_and_uncertainty() -> None:
@@ -68,7 +68,7 @@ def test_the_gradient_thins_what_is_before_the_points_and_thickens_what_is_at_th
     grid = VoxelGrid(LATTICE, sh_degree=0, activation="relu", start_density=0.5)
     request = track_rays()[0].request(32, 0.0, LATTICE.voxel_size, torch.Generator().manual_seed(0), CPU)
     seen = render_rays(grid, request, RenderOptions(), "reference")
-    track_loss(seen.accumulation, seen.transmittance).backward()
+    feature_ray_loss(seen.accumulation, seen.transmittance).backward()
     gradient = grid.density.grad
     assert gradient is not None
     by_x = gradient.to_dense().view(LATTICE.shape).sum(dim=(1, 2))
