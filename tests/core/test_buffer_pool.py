@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from tests.reference.two_renderers import random_grid, random_request
-from thermoxels_ns.core import buffer_pool as scratch
-from thermoxels_ns.core.buffer_pool import PATIENCE, SMALLEST, BufferPool, rounded_size
+from thermoxels_ns.core.buffer_pool import BUFFERS, PATIENCE, SMALLEST, BufferPool, rounded_size
 from thermoxels_ns.field.refine import refine
 from thermoxels_ns.render.ray_render import RenderOptions
 from thermoxels_ns.render.renderers import fused_render
@@ -129,6 +128,6 @@ def test_a_new_lattice_gives_back_what_the_old_one_needed():
     grid = random_grid(2, density=0.0)
     rendered(grid, random_request(grid, 2000)).backward()
     grid.zero_grad(set_to_none=True)
-    assert scratch.BUFFERS.held_bytes() > 0
+    assert BUFFERS.held_bytes() > 0
     refine(grid, 2)
-    assert scratch.BUFFERS.held_bytes() == 0
+    assert BUFFERS.held_bytes() == 0

@@ -9,19 +9,12 @@ import pytest
 
 from tests.support.plane_photographs import EYES, FOCAL, PLANE, SIZE, photographs, texture
 from thermoxels_ns.core.threads import set_num_threads
-from thermoxels_ns.multiview import stereo as plane_sweep
+from thermoxels_ns.multiview import stereo
 from thermoxels_ns.multiview.depth_supervision import feature_rays_to_depths
 from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo import (
-    ANGLES_DEG,
-    FEWEST_AROUND,
     FEWEST_VIEWS,
-    NEIGHBOURS,
     Depths,
-    _backed,
-    _drawn,
-    _neighbours,
-    _View,
     depths_of,
 )
 from thermoxels_ns.multiview.stereo_kernels import agreeing_views, correlate, weigh_patches
@@ -108,18 +101,6 @@ def test_too_few_photographs_or_all_from_one_place_say_nothing(chosen):
 def test_a_camera_that_looks_away_from_the_box_has_no_depths():
     away = depths_of(photographs(), (-0.5, -0.5, 2.0), (0.5, 0.5, 3.0))
     assert away.share == 0.0
-
-
-def test_neighbours_see_the_same_from_directions_that_differ():
-    seen = photographs()
-    views = [_View.of(seen, number) for number in range(len(seen))]
-    near, far = 1.1, 2.1
-    chosen = _neighbours(4, views, near, far)
-    assert len(chosen) == NEIGHBOURS and all(view is not views[4] for view in chosen)
-    middle = np.array([seen.centres[4][0], seen.centres[4][1], PLANE])
-    towards = [(view.centre - middle) / np.linalg.norm(view.centre - middle) for view in (views[4], *chosen)]
-    angles = np.degrees(np.arccos([towards[0] @ other for other in towards[1:]]))
-    assert np.all((angles > ANGLES_DEG[0]) & (angles < ANGLES_DEG[1])), angles
 
 
 def agreement(seen: Photographs, depth: np.ndarray, tolerance: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
@@ -216,17 +197,6 @@ def test_correlation_is_that_of_the_weighted_patches_and_the_best_count():
         assert result[0, 0] == -1.0
 
 
-def test_a_depth_needs_neighbours_of_its_own_kind():
-    depth, error = np.full((7, 7), np.nan, np.float32), np.full((7, 7), 0.1, np.float32)
-    depth[1:6, 1:6] = 2.0
-    depth[3, 5] = 2.5
-    backed = _backed(depth, error)
-    assert FEWEST_AROUND == 6
-    expected = np.zeros((7, 7), dtype=bool)
-    expected[2:5, 2:5] = True  # whole surroundings, or but for the one that differs
-    assert np.array_equal(backed, expected)
-
-
 def test_a_texture_widens_what_belongs_to_a_pixel_and_an_outline_does_not():
     draw = np.random.default_rng(2)
     colours = (0.5 + 0.2 * draw.random((9, 9, 3))).astype(np.float32)
@@ -259,7 +229,7 @@ def test_what_many_look_through_is_not_sure_however_few_agree(monkeypatch, liars
             depth[(np.abs(x) < 0.12) & (np.abs(y) < 0.12)] = 1.4
         return depth.ravel(), np.ones(SIZE * SIZE, np.float32), np.full(SIZE * SIZE, 0.01, np.float32)
 
-    monkeypatch.setattr(plane_sweep, "_sweep", sweep)
+    monkeypatch.setattr(stereo, "_sweep", sweep)
     found = depths(seen).depth
     assert bool((found == np.float32(1.4)).any()) == sure
     assert np.mean(found == np.float32(TRUE_DEPTH)) > 0.3
@@ -305,15 +275,3 @@ def test_depths_of_a_room_from_within_lie_on_its_walls():
     off = np.abs(np.abs(lines.points).max(1) - half)
     assert len(sure) > 500
     assert np.quantile(off, 0.9) < 0.05, np.quantile(off, [0.5, 0.9])
-
-
-def test_nothing_is_drawn_of_what_lies_behind_a_photograph():
-    seen = photographs()
-    views = [_View.of(seen, number) for number in range(2)]
-    turned = replace(seen, matrices=seen.matrices.copy())
-    flip = np.diag([1.0, -1.0, -1.0])  # looks up, away from the plane
-    turned.matrices[1, :, :3] = turned.matrices[1, :, :3] @ flip
-    turned.matrices[1, :, 3] = -turned.matrices[1, :, :3] @ seen.centres[1]
-    away = _View.of(turned, 1)
-    assert (_drawn(views[1], views[0], TRUE_DEPTH) >= 0.0).any()
-    assert (_drawn(away, views[0], TRUE_DEPTH) < 0.0).all()

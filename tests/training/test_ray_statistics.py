@@ -227,15 +227,6 @@ def test_rays_of_photographs_are_evidence_but_measure_no_temperature(backend):
     assert torch.equal(half.voxel_weight, colour.voxel_weight)
 
 
-def test_evidence_lies_in_kept_voxels_in_their_order(backend):
-    scene = slab(backend)
-    prune(scene.grid, scene.grid.voxels.cells % 6 < 3)
-    evidence = field_evidence(scene, rays_along_minus_x())
-    weight = evidence.voxel_weight.view(6, 6, 3)
-    assert float(weight[3].sum()) > 0.99 * 800 and float(weight.sum()) == pytest.approx(800, rel=1e-4)
-    assert evidence.half_depth_density.tolist() == [250.0] * 800
-
-
 def test_without_rays_there_is_no_evidence():
     scene = slab()
     evidence = field_evidence(scene, ())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from copy import deepcopy
 from pathlib import Path
-from typing import Any
 
 import pytest
 import tyro
@@ -129,14 +128,3 @@ def test_folders_without_checkpoints(scene, checkpoints, tmp_path, where):
 def test_a_file_that_is_not_there(scene, tmp_path):
     with pytest.raises(CheckpointError, match=r"got no file .*absent\.ckpt"):
         trainer(scene, tmp_path, "--load-checkpoint", str(tmp_path / "absent.ckpt")).setup()
-
-
-def test_a_start_on_a_finer_lattice_is_no_hindrance(scene, tmp_path):
-    """A training from photographs begins on a lattice that the options have later."""
-    first: Any = trainer(scene, tmp_path, *DRAFT)
-    first.setup()
-    first.pipeline.model.split(2)
-    first.save_checkpoint(20)
-    again: Any = trainer(scene, tmp_path / "again", *DRAFT, "--load-dir", str(first.checkpoint_dir))
-    again.setup()
-    assert max(again.pipeline.model.grid.lattice.cell_shape) == 64 and again._start_step == 21

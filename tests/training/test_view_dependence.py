@@ -136,17 +136,6 @@ def test_a_training_resumed_at_any_step_ends_with_the_same_bits(scene, stop):
     assert differing(resumed.advance(STEPS).tensors(), straight.tensors()) == []
 
 
-@pytest.mark.parametrize("stop", [5, RISES, RISES + 2])
-def test_checkpoints_of_versions_that_stored_everything_are_resumed(scene, stop, monkeypatch):
-    straight = Training(scene).advance(STEPS)
-    with monkeypatch.context() as earlier:
-        earlier.setattr(ThermoxelsModelConfig, "first_sh_degree", lambda config: config.sh_degree)
-        saved = Training(scene).advance(stop).save()
-    resumed = Training(scene, saved=saved)
-    assert resumed.columns == 27
-    assert differing(resumed.advance(STEPS).tensors(), straight.tensors()) == []
-
-
 def test_a_resumed_training_may_let_colour_depend_on_the_direction_earlier(scene):
     saved = Training(scene).advance(6).save()
     resumed = Training(scene, {"view_dependence_from": 2}, saved)

@@ -241,8 +241,7 @@ class ThermoxelsModelConfig(ModelConfig):
     def checkpoint_columns(self) -> dict[str, tuple[int, ...]]:
         """Columns that each parameter of the grid may have in a checkpoint.
 
-        Colour has one per channel until it depends on the direction. Trainings of earlier versions, and those in
-        which it does from the start, have all of them throughout.
+        Colour has one per channel until it depends on the direction, and all of them then.
         """
         columns: dict[str, tuple[int, ...]] = {
             "density": (1,),
