@@ -12,7 +12,7 @@ from tests.support.camera_card import counts, jpeg_bytes, photograph
 from tests.support.flir_file import FlirFile
 from thermoxels_ns.capture.frames import CaptureFrames, read_frames
 from thermoxels_ns.capture.pairs import Pair
-from thermoxels_ns.core.errors import ThermalFileError, ThermoxelsError
+from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.radiometry.camera_file import RadiometryOptions
 
 RADIOMETRY = RadiometryOptions()
@@ -106,11 +106,6 @@ def test_the_rest_goes_on_without_damaged_files(tmp_path):
 def test_nothing_but_damaged_files_is_an_error_even_when_they_may_be_skipped(tmp_path):
     with pytest.raises(ThermoxelsError, match="at least one pair"):
         read(list(bad_files(tmp_path / "card").values()), tmp_path, skip_bad=True)
-
-
-def test_a_palette_picture_is_refused_as_such(tmp_path):
-    with pytest.raises(ThermalFileError, match="palette"):
-        read([bad_files(tmp_path / "card")["palette"]], tmp_path)
 
 
 def test_a_frame_of_another_thermal_camera_is_dropped_by_name(tmp_path):

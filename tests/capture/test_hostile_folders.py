@@ -13,8 +13,8 @@ from tests.support.flir_file import picture_bytes, segment
 from thermoxels_ns.capture.camera_files import files_below, natural_key, scan_folder, shown_name
 from thermoxels_ns.capture.pairs import find_pairs
 from thermoxels_ns.capture.results import load_pairs, save_pairs
-from thermoxels_ns.capture.run import run_capture
 from thermoxels_ns.capture.settings import CaptureSettings
+from thermoxels_ns.commands.capture import capture_folder
 from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
 
 
@@ -26,8 +26,15 @@ def dji_thermal(path: Path) -> Path:
     return path
 
 
+def three_pairs(card: Path) -> Path:
+    for name in "abc":
+        photograph(card / f"{name}-visible.jpg")
+        counts(card / f"{name}-radiometric.tiff")
+    return card
+
+
 def capture(card: Path, **more: object) -> None:
-    run_capture(card, card.parent / "scene", CaptureSettings(**more))  # type: ignore[arg-type]
+    capture_folder(card, card.parent / "scene", CaptureSettings(**more))  # type: ignore[arg-type]
 
 
 def no_pairs_said(card: Path, **more: object) -> str:
@@ -36,33 +43,35 @@ def no_pairs_said(card: Path, **more: object) -> str:
     return str(caught.value)
 
 
-def test_a_folder_without_camera_files_says_what_is_in_it(tmp_path):
+@pytest.mark.parametrize(
+    ("photographs", "thermal", "said"),
+    [
+        ((), (), ("no photographs, no thermal images, 1 file of other kinds", "memory card")),
+        (
+            ("a0", "a1", "a2"),
+            (),
+            ("3 photographs, no thermal images", "Copy the thermal files as the camera wrote them"),
+        ),
+        (
+            ("0-thermal", "1-thermal"),
+            (),
+            ("2 pictures for the eye, named thermal, without temperatures", "Copy the thermal files as the camera"),
+        ),
+        ((), ("a",), ("no photographs, 1 thermal image (a.tiff", "Copy the photographs")),
+        (("a",), ("b",), ("1 photograph, 1 thermal image", "--pairs", "--clock-offset-s")),
+    ],
+)
+def test_a_folder_without_pairs_says_what_is_in_it_and_what_helps(tmp_path, photographs, thermal, said):
     card = tmp_path / "card"
     card.mkdir()
     (card / "film.mp4").write_bytes(b"1")
-    said = no_pairs_said(card)
-    assert "no photographs, no thermal images, 1 file of other kinds" in said and "memory card" in said
-
-
-def test_photographs_alone_lack_the_thermal_files(tmp_path):
-    for number in range(3):
-        photograph(tmp_path / "card" / f"a{number}.jpg")
-    said = no_pairs_said(tmp_path / "card")
-    assert "3 photographs, no thermal images" in said and "Copy the thermal files as the camera wrote them" in said
-
-
-def test_pictures_for_the_eye_alone_have_no_temperatures(tmp_path):
-    for number in range(2):
-        photograph(tmp_path / "card" / f"{number}-thermal.jpg")
-    said = no_pairs_said(tmp_path / "card")
-    assert "2 pictures for the eye, named thermal, without temperatures" in said
-    assert "Copy the thermal files as the camera wrote them" in said
-
-
-def test_thermal_files_alone_lack_the_photographs(tmp_path):
-    counts(tmp_path / "card" / "a.tiff")
-    said = no_pairs_said(tmp_path / "card")
-    assert "no photographs, 1 thermal image (a.tiff" in said and "Copy the photographs" in said and "DJI" not in said
+    for name in photographs:
+        photograph(card / f"{name}.jpg")
+    for name in thermal:
+        counts(card / f"{name}.tiff")
+    message = no_pairs_said(card)
+    assert all(words in message for words in said)
+    assert "--dji-library" not in message and "DJI names them" not in message
 
 
 def test_a_lone_dji_file_lacks_its_partner_and_djis_library(tmp_path):
@@ -71,20 +80,6 @@ def test_a_lone_dji_file_lacks_its_partner_and_djis_library(tmp_path):
     for words in ("DJI_0001_T.JPG: no partner", "_V or _W in place of _T", "--dji-library"):
         assert words in said
     assert "--dji-library" not in no_pairs_said(tmp_path / "card", dji_library=tmp_path / "libdirp.so")
-
-
-def test_photographs_and_thermal_files_of_other_shots_are_to_be_paired_by_hand(tmp_path):
-    photograph(tmp_path / "card" / "a.jpg")
-    counts(tmp_path / "card" / "b.tiff")
-    said = no_pairs_said(tmp_path / "card")
-    assert "1 photograph, 1 thermal image" in said and "--pairs" in said and "--clock-offset-s" in said
-
-
-def test_one_pair_is_too_few_for_poses(tmp_path):
-    photograph(tmp_path / "card" / "a-visible.jpg")
-    counts(tmp_path / "card" / "a-radiometric.tiff")
-    with pytest.raises(SceneError, match=r"at least 3 photographs, got 1\..*--poses"):
-        capture(tmp_path / "card")
 
 
 def test_what_is_not_looked_at_is_named(tmp_path):
@@ -182,7 +177,7 @@ def test_an_input_inside_the_output_is_not_touched(tmp_path):
     counts(scene / "images" / "a-radiometric.tiff")
     for source in (scene / "images", scene):
         with pytest.raises(SceneError, match="output: expected another folder"):
-            run_capture(source, scene, CaptureSettings())
+            capture_folder(source, scene, CaptureSettings())
     assert kept.is_file()
 
 
@@ -197,9 +192,7 @@ def test_an_output_inside_the_input_is_no_part_of_it(tmp_path):
 
 
 def test_a_full_disk_is_no_bad_file_and_says_so(tmp_path, monkeypatch):
-    for name in "abc":
-        photograph(tmp_path / "card" / f"{name}-visible.jpg")
-        counts(tmp_path / "card" / f"{name}-radiometric.tiff")
+    three_pairs(tmp_path / "card")
 
     def full(path, *_):
         raise OSError(28, "No space left on device", str(path))
@@ -210,9 +203,7 @@ def test_a_full_disk_is_no_bad_file_and_says_so(tmp_path, monkeypatch):
 
 
 def test_too_little_space_for_features_is_said_before_colmap_starts(tmp_path, monkeypatch):
-    for name in "abc":
-        photograph(tmp_path / "card" / f"{name}-visible.jpg")
-        counts(tmp_path / "card" / f"{name}-radiometric.tiff")
+    three_pairs(tmp_path / "card")
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1_000_000))
     with pytest.raises(OutputError, match=r"up to 4 MB free for features and matches, got 1 MB.*--max-features"):
@@ -220,9 +211,7 @@ def test_too_little_space_for_features_is_said_before_colmap_starts(tmp_path, mo
 
 
 def test_what_colmap_cannot_open_says_how_to_begin_anew(tmp_path):
-    for name in "abc":
-        photograph(tmp_path / "card" / f"{name}-visible.jpg")
-        counts(tmp_path / "card" / f"{name}-radiometric.tiff")
+    three_pairs(tmp_path / "card")
     with pytest.raises(SceneError):  # grey photographs have no features; what is left is that of an interrupted stage
         capture(tmp_path / "card")
     (tmp_path / "scene" / ".capture" / "poses" / "features.db").write_bytes(b"no database" * 500)

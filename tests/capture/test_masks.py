@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -38,21 +40,16 @@ def test_text_and_a_scale_bar_are_masked(tmp_path):
     assert use[far].all()
 
 
-def test_photographs_without_an_overlay_are_not_masked(tmp_path):
-    assert find_overlay([write(tmp_path, n, pixels) for n, pixels in enumerate(scenes())]) is None
-
-
-def test_a_still_camera_is_no_overlay(tmp_path):
+def test_what_the_scene_shows_is_no_overlay(tmp_path):
+    """Nothing drawn; a still camera; too few photographs; a still patch that looks like its surroundings."""
     still = next(scenes(1))
-    assert find_overlay([write(tmp_path, n, still) for n in range(8)]) is None
-
-
-def test_few_photographs_cannot_tell(tmp_path):
-    paths = []
-    for number, pixels in enumerate(scenes(4)):
+    few, patch = list(scenes(4)), list(scenes(16))
+    for pixels in few:
         pixels[20:40, 20:60] = 255
-        paths.append(write(tmp_path, number, pixels))
-    assert find_overlay(paths) is None
+    for pixels in patch:
+        pixels[100:130, 100:150] = 127
+    for pictures in (scenes(), [still] * 8, few, patch):
+        assert find_overlay([write(tmp_path, n, pixels) for n, pixels in enumerate(pictures)]) is None
 
 
 def test_the_users_mask_and_the_overlay_both_count(tmp_path):
@@ -76,9 +73,38 @@ def test_a_mask_of_another_size_is_refused(tmp_path):
         mask_files(tmp_path / "nowhere")
 
 
-def test_a_still_patch_that_looks_like_its_surroundings_is_left_alone(tmp_path):
-    paths = []
-    for number, pixels in enumerate(scenes(16)):
-        pixels[100:130, 100:150] = 127
-        paths.append(write(tmp_path, number, pixels))
-    assert find_overlay(paths) is None
+def pictures(folder: Path, draw, sizes: tuple[tuple[int, int], ...] = ((320, 240),)) -> list[Path]:
+    """Ten different smooth pictures with something drawn over all of them."""
+    rng, paths = np.random.default_rng(0), []
+    for number in range(10):
+        size = sizes[number % len(sizes)]
+        grey = cv2.resize(rng.integers(0, 255, (6, 8), dtype=np.uint8), size, interpolation=cv2.INTER_CUBIC)
+        draw(grey)
+        paths.append(folder / f"{number}.png")
+        Image.fromarray(grey).save(paths[-1])
+    return paths
+
+
+def test_dead_pixels_are_no_overlay(tmp_path) -> None:
+    def dead(grey: np.ndarray) -> None:
+        grey[20::50, 20::60] = 255
+
+    assert find_overlay(pictures(tmp_path, dead)) is None
+
+
+@pytest.mark.parametrize(("width", "found"), [(320, False), (32, True)])
+def test_what_covers_much_of_the_picture_is_no_overlay(tmp_path, width, found) -> None:
+    """Stripes, as of a fence that the camera stands behind."""
+
+    def stripes(grey: np.ndarray) -> None:
+        grey[:, :width][:, np.arange(width) // 8 % 2 == 0] = 255
+
+    assert (find_overlay(pictures(tmp_path, stripes)) is not None) == found
+
+
+def test_pictures_of_two_sizes_are_not_laid_upon_each_other(tmp_path) -> None:
+    def bar(grey: np.ndarray) -> None:
+        grey[60:70, 20:120] = 255
+
+    assert find_overlay(pictures(tmp_path, bar)) is not None
+    assert find_overlay(pictures(tmp_path, bar, ((320, 240), (400, 300)))) is None

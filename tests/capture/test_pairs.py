@@ -165,12 +165,6 @@ def test_a_plain_jpeg_that_is_named_thermal_is_no_photograph(tmp_path):
     }
 
 
-def test_links_that_lead_out_of_the_folder_are_passed_over(card, tmp_path):
-    outside = photograph(tmp_path / "elsewhere" / "7-visible.jpg")
-    (card / "7-visible.jpg").symlink_to(outside)
-    assert "7-visible.jpg" not in {file.path.name for file in scan_folder(card).files}
-
-
 def test_a_list_of_pairs_goes_before_names(card, tmp_path):
     listed = tmp_path / "pairs.csv"
     listed.write_text("photograph,thermal\n1-visible.jpg,1-radiometric.tiff\n")
@@ -201,3 +195,26 @@ def test_a_wrong_list_of_pairs_says_where(card, tmp_path, text, words):
     listed.write_text(text)
     with pytest.raises(SceneError, match=words):
         read_pair_list(listed, card)
+
+
+def test_a_thermal_image_goes_with_the_nearest_photograph_only() -> None:
+    search = of(("p.jpg", "photograph", 0.0), ("q.jpg", "photograph", 1.3), ("hot.npy", "thermal", 0.2))
+    assert [(pair.photograph.name, pair.thermal.name) for pair in search.pairs] == [("p.jpg", "hot.npy")]
+    assert search.unpaired[ROOT / "q.jpg"] == "hot.npy, the nearest in time, is nearer to another"
+
+
+def test_a_photograph_between_two_thermal_images_of_one_number_goes_with_neither() -> None:
+    search = of(
+        ("DJI_20240501120001_0001_V.JPG", "photograph"),
+        *((f"DJI_2024050112000{second}_0001_T.JPG", "thermal") for second in (0, 2)),
+    )
+    assert search.pairs == () and len(search.unpaired) == 3
+
+
+def test_times_in_names_go_on_over_midnight() -> None:
+    search = of(
+        ("DJI_20240501235959_0001_T.JPG", "thermal"),
+        ("DJI_20240502000000_0001_V.JPG", "photograph"),
+        ("DJI_20240503000000_0001_V.JPG", "photograph"),
+    )
+    assert [pair.photograph.name for pair in search.pairs] == ["DJI_20240502000000_0001_V.JPG"]

@@ -15,12 +15,12 @@ from tests.support.board_pictures import BOARD, board_pairs, write_board_folder
 from tests.support.camera_card import photograph
 from tests.support.textured_room import RIG, THERMAL, VISIBLE, alignment, poses, write_card
 from thermoxels_ns import cli
-from thermoxels_ns.capture.run import run_capture
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.feature_matching import LensModel, Matching
-from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.commands.capture import capture_folder
+from thermoxels_ns.core.errors import OutputError, SceneError
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
-from thermoxels_ns.radiometry.known_cameras import COUNT_SCALES
+from thermoxels_ns.radiometry.stored_temperatures import COUNT_SCALES
 
 COUNT = 6
 DRIFT_K = 0.6
@@ -41,7 +41,7 @@ def capture(tmp_path_factory):
     (card / "shot9-visible.jpg").write_bytes(b"")
     before = files_of(folder)
     said = []
-    result = run_capture(card, folder / "scene", settings(skip_bad=True), said.append)
+    result = capture_folder(card, folder / "scene", settings(skip_bad=True), said.append)
     after = {path: changed for path, changed in files_of(folder).items() if not path.is_relative_to(folder / "scene")}
     return card, folder / "scene", result, (before, after)
 
@@ -64,7 +64,7 @@ def test_what_is_left_out_is_named_with_its_reason(capture):
     dropped = capture[2].dropped
     assert set(dropped) == {f"shot{COUNT}", "lonely.jpg", "shot9-visible.jpg"}
     assert "zero bytes" in dropped["shot9-visible.jpg"]
-    assert (capture[2].pairs, capture[2].frames) == (COUNT + 1, COUNT)
+    assert (len(capture[2].pairs), len(capture[2].scene.frames)) == (COUNT + 1, COUNT)
 
 
 def test_the_scene_has_the_cameras_of_the_truth(capture):
@@ -79,7 +79,7 @@ def test_the_scene_has_the_cameras_of_the_truth(capture):
 
 
 def test_the_rig_that_was_found_projects_as_the_true_one(capture):
-    rig = capture[2].rig
+    rig = capture[2].scene.rig
     assert rig.determined, rig.explanation
     scale = alignment(
         np.array([e["transform_matrix"] for e in sorted(content(capture[1])["frames"], key=lambda e: e["source"])]),
@@ -94,7 +94,7 @@ def test_the_rig_that_was_found_projects_as_the_true_one(capture):
 
 
 def test_drift_is_found(capture):
-    drift = capture[2].drift
+    drift = capture[2].scene.drift
     assert drift.used, drift.explanation
     assert drift.offsets_k == pytest.approx([DRIFT_K * (-1) ** n for n in range(COUNT)], abs=0.1)
     assert drift.after_k < 0.5 * drift.before_k
@@ -133,13 +133,13 @@ def test_a_second_run_takes_everything_from_the_first(capture):
     card, scene, first, _ = capture
     before = (scene / "transforms.json").stat().st_mtime_ns
     said = []
-    again = run_capture(card, scene, settings(skip_bad=True), said.append)
+    again = capture_folder(card, scene, settings(skip_bad=True), said.append)
     assert [line for line in said if "as before" not in line] == ["5/9 board: left out, no --board-photos"]
     assert [line[:3] for line in said] == [f"{number}/9" for number in range(1, 10)]
     assert (scene / "transforms.json").stat().st_mtime_ns == before
     assert again.dropped == first.dropped
-    assert np.array_equal(again.rig.visible_to_thermal, first.rig.visible_to_thermal)
-    assert np.array_equal(again.drift.offsets_k, first.drift.offsets_k)
+    assert np.array_equal(again.scene.rig.visible_to_thermal, first.scene.rig.visible_to_thermal)
+    assert np.array_equal(again.scene.drift.offsets_k, first.scene.drift.offsets_k)
 
 
 def test_tracks_that_someone_deleted_are_written_again_and_nothing_else_is_done(capture, tmp_path):
@@ -148,7 +148,7 @@ def test_tracks_that_someone_deleted_are_written_again_and_nothing_else_is_done(
     shutil.copytree(earlier, scene)
     before = {path: path.read_bytes() for path in scene.rglob("*") if ".capture" not in path.parts and path.is_file()}
     (scene / "sparse_tracks.npz").unlink()
-    run_capture(card, scene, settings(skip_bad=True), said.append)
+    capture_folder(card, scene, settings(skip_bad=True), said.append)
     ran = [line for line in said if re.match(r"\d/9", line) and not re.search("as before|left out", line)]
     assert ran == ["8/9 scene"]
     assert len(before[scene / "sparse_tracks.npz"]) > 1000
@@ -162,17 +162,17 @@ def test_another_scale_runs_only_what_depends_on_it_and_so_does_from_stage(captu
     said = []
     more = {"skip_bad": True, "drift": "off", "rig": earlier / "transforms.json"}
     more["known_distance"] = ("shot2-visible.jpg", 100.0, 100.0, 380.0, 120.0, 2.0)
-    result = run_capture(card, scene, settings(**more), said.append)
+    result = capture_folder(card, scene, settings(**more), said.append)
     assert [line.split(":")[0] for line in said if "as before" in line] == [
         "1/9 pairs",
         "2/9 temperatures",
         "3/9 poses",
     ]
-    assert result.scale is not None
-    assert content(scene)["metres_per_unit"] == result.scale.metres_per_unit
-    assert not result.drift.used
+    assert result.scene.scale is not None
+    assert content(scene)["metres_per_unit"] == result.scene.scale.metres_per_unit
+    assert not result.scene.drift.used
     said.clear()
-    run_capture(card, scene, settings(from_stage="scene", **more), said.append)
+    capture_folder(card, scene, settings(from_stage="scene", **more), said.append)
     ran = [line for line in said if re.match(r"\d/9", line) and not re.search("as before|left out", line)]
     assert ran == ["8/9 scene", "9/9 page"]
 
@@ -184,22 +184,22 @@ def test_a_board_gives_the_rig_and_a_scale_is_needed_for_it(capture, tmp_path):
     pictures = write_board_folder(tmp_path / "board", board_pairs(VISIBLE, THERMAL, RIG))
     more = {"skip_bad": True, "board_photos": pictures, "board": "7x5", "board_square_m": BOARD.square_m}
     with pytest.raises(SceneError, match=r"known scale.*--known-distance"):
-        run_capture(card, scene, settings(**more), [].append)
+        capture_folder(card, scene, settings(**more), [].append)
     more["known_distance"] = ("shot2-visible.jpg", 100.0, 100.0, 380.0, 120.0, 2.0)
-    result = run_capture(card, scene, settings(**more), [].append)
-    assert "checker board" in result.rig.explanation
-    assert result.scale is not None
-    shift_m = result.rig.visible_to_thermal[:3, 3] * result.scale.metres_per_unit
+    result = capture_folder(card, scene, settings(**more), [].append)
+    assert "checker board" in result.scene.rig.explanation
+    assert result.scene.scale is not None
+    shift_m = result.scene.rig.visible_to_thermal[:3, 3] * result.scene.scale.metres_per_unit
     assert np.allclose(shift_m, RIG[:3, 3], atol=0.02)
-    assert result.rig.thermal_camera.fl_x == pytest.approx(THERMAL.fl_x, rel=0.02)
+    assert result.scene.rig.thermal_camera.fl_x == pytest.approx(THERMAL.fl_x, rel=0.02)
     said = []
-    run_capture(card, scene, settings(**more), said.append)
+    capture_folder(card, scene, settings(**more), said.append)
     assert "5/9 board: as before" in said
 
 
 def test_a_bad_file_stops_the_capture_and_is_named(capture, tmp_path):
     with pytest.raises(SceneError, match=r"shot9-visible\.jpg.*--skip-bad True"):
-        run_capture(capture[0], tmp_path / "scene", settings())
+        capture_folder(capture[0], tmp_path / "scene", settings())
 
 
 def test_given_poses_and_a_given_rig_are_kept(capture, tmp_path):
@@ -209,13 +209,14 @@ def test_given_poses_and_a_given_rig_are_kept(capture, tmp_path):
     given = {**meta, "frames": [{**entry, "file_path": entry["source"]} for entry in meta["frames"]]}
     file = tmp_path / "transforms.json"
     file.write_text(json.dumps(given))
-    result = run_capture(card, tmp_path / "scene", settings(skip_bad=True, poses=file, rig=scene / "transforms.json"))
+    more = {"skip_bad": True, "poses": file, "rig": scene / "transforms.json"}
+    result = capture_folder(card, tmp_path / "scene", settings(**more))
     new = content(tmp_path / "scene")
     before = {entry["source"]: entry["transform_matrix"] for entry in meta["frames"]}
     assert {entry["source"]: entry["transform_matrix"] for entry in new["frames"]} == before
     assert new["rig"] == meta["rig"] and new["thermal_camera"] == meta["thermal_camera"]
     assert f"shot{COUNT}" in result.dropped and "no pose" in result.dropped[f"shot{COUNT}"]
-    assert result.drift.used
+    assert result.scene.drift.used
 
 
 @pytest.mark.parametrize("output", ["card", "full"])
@@ -225,16 +226,8 @@ def test_folders_that_are_not_ours_are_not_written_to(capture, tmp_path, output)
     folder = capture[0] if output == "card" else tmp_path / "full"
     before = sorted(folder.iterdir())
     with pytest.raises((OutputError, SceneError), match="output"):
-        run_capture(capture[0], folder, settings())
+        capture_folder(capture[0], folder, settings())
     assert sorted(folder.iterdir()) == before
-
-
-def test_a_folder_without_pairs_says_what_was_found(tmp_path):
-    photograph(tmp_path / "card" / "a.jpg")
-    with pytest.raises(ThermoxelsError, match=r"1 photograph, no thermal images \(a\.jpg: no partner"):
-        run_capture(tmp_path / "card", tmp_path / "scene", settings())
-    with pytest.raises(ThermoxelsError, match="nothing at"):
-        run_capture(tmp_path / "nowhere", tmp_path / "scene", settings())
 
 
 def test_the_command(capture, tmp_path, capsys):

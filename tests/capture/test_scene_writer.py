@@ -13,18 +13,19 @@ from tests.support.camera_card import photograph
 from tests.support.posed_model import CAMERA, ring_model
 from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.masks import PhotographMasks
+from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.scene_writer import TRACKS_NAME, Scene, scene_names, write_scene_folder
 from thermoxels_ns.capture.sfm.gravity import Up
 from thermoxels_ns.capture.sfm.metric_scale import MetricScale
-from thermoxels_ns.capture.stage_types import CameraModel, DriftEstimate, RigEstimate
-from thermoxels_ns.capture.stages import prepare_output
+from thermoxels_ns.capture.stage_cache import prepare_output
 from thermoxels_ns.commands.scene_scale import scale_from_scene_file, up_from_scene_file
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_file import read_scene_file
 from thermoxels_ns.data.sparse_tracks import read_tracks
-from thermoxels_ns.radiometry.thermal_files import read_temperature_c
+from thermoxels_ns.radiometry.thermal_files import read_thermal_file
 
-THERMAL = CameraModel(40, 30, 50.0, 50.0, 20.5, 14.5, k1=0.01)
+THERMAL = Camera(40, 30, 50.0, 50.0, 20.5, 14.5, k1=0.01)
 COUNT = 6
 
 
@@ -42,7 +43,7 @@ def scene(tmp_path):
     rig = np.eye(4)
     rig[:3, :3] = Rotation.from_euler("xyz", [1, -2, 0.5], degrees=True).as_matrix()
     rig[:3, 3] = (0.1, 0.02, -0.01)
-    estimate = RigEstimate(THERMAL, rig, ("rx",), np.eye(1) * 1e-4, True, "Found.", 0.1, 0.4, 0.3)
+    estimate = RigEstimate(THERMAL, rig, True, "Found.", ("rx",), np.eye(1) * 1e-4, 0.1, 0.4, 0.3)
     offsets = np.linspace(-1, 1, COUNT)
     drift = DriftEstimate(offsets, (0.5,), 1.0, 0.1, True, "Corrected.")
     up = Up(np.array([0.0, 0.6, 0.8]), "Measured.", 0.1)
@@ -91,7 +92,7 @@ def test_numbers_come_back_as_they_went_in(scene, tmp_path):
         in_thermal = (point - thermal_pose[:3, 3]) @ thermal_pose[:3, :3] * (1, -1, -1)
         rig = scene.rig.visible_to_thermal
         assert in_thermal == pytest.approx(in_visible @ rig[:3, :3].T + rig[:3, 3])
-        written = read_temperature_c(output / entry["thermal_file_path"], read.unit)
+        written = read_thermal_file(output / entry["thermal_file_path"], read.unit).temperature_c
         expected = np.load(frame.thermal) - scene.drift.offsets_k[number] - scene.drift.radial_k(40, 30)
         assert np.isnan(written[0, 0]) and np.isnan(written).sum() == 1
         assert written[1:] == pytest.approx(expected[1:], abs=1e-5)
@@ -164,7 +165,7 @@ def test_an_interrupted_writing_leaves_the_old_scene_whole(scene, tmp_path, monk
 
 
 def test_the_json_has_no_nan(scene, tmp_path):
-    unknown = RigEstimate(THERMAL, np.eye(4), (), np.zeros((0, 0)), False, "Kept.", np.nan, np.nan, np.nan)
+    unknown = RigEstimate(THERMAL, np.eye(4), False, "Kept.")
     output = prepare_output(tmp_path / "scene")
     write_scene_folder(Scene(**{**scene.__dict__, "rig": unknown, "scale": None}), output)
     content = json.loads((output / "transforms.json").read_text(), parse_constant=lambda name: pytest.fail(name))

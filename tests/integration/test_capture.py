@@ -12,7 +12,7 @@ from PIL import Image
 from tests.integration.commands import run
 from tests.support.camera_card import COUNTS_PER_K, ZERO_C, counts
 from tests.support.textured_room import alignment
-from thermoxels_ns.capture.stage_types import CameraModel
+from thermoxels_ns.core.camera import Camera
 
 FRAMES = slice(4, 14)
 HALF = 2
@@ -41,10 +41,10 @@ def scene(card, tmp_path_factory):
     return folder
 
 
-def lens(entries: dict, factor: float = 1.0) -> CameraModel:
+def lens(entries: dict, factor: float = 1.0) -> Camera:
     names = ("fl_x", "fl_y", "cx", "cy")
     scaled = {name: entries[name] * factor for name in names}
-    return CameraModel(int(entries["w"] * factor), int(entries["h"] * factor), **scaled, k1=entries.get("k1", 0.0))
+    return Camera(int(entries["w"] * factor), int(entries["h"] * factor), **scaled, k1=entries.get("k1", 0.0))
 
 
 def poses_of(frames: list[dict], key: str = "transform_matrix") -> np.ndarray:
@@ -85,7 +85,7 @@ def test_the_rig_carries_pixels_to_where_the_given_one_does(scene, shared_data):
     assert np.median(np.concatenate(off)) < 3.0
 
 
-def carried(visible: CameraModel, thermal: CameraModel, rig: list, pixels: np.ndarray, depth: float) -> np.ndarray:
+def carried(visible: Camera, thermal: Camera, rig: list, pixels: np.ndarray, depth: float) -> np.ndarray:
     matrix = np.array(rig)
     return thermal.project(visible.rays(pixels) * depth @ matrix[:3, :3].T + matrix[:3, 3])
 

@@ -16,17 +16,16 @@ from PIL import Image
 
 from tests.support.camera_card import counts, photograph
 from tests.support.flir_file import FlirFile, picture_bytes, segment, smooth_counts
-from thermoxels_ns.capture.camera_files import look_at
+from thermoxels_ns.capture.camera_files import identify
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
 from thermoxels_ns.core.errors import SceneError, ThermalFileError, ThermoxelsError
 from thermoxels_ns.radiometry.camera_file import RadiometryOptions, read_thermogram
-from thermoxels_ns.radiometry.decoders import naming
+from thermoxels_ns.radiometry.decoders import LARGEST_SIDE, errors_name
 from thermoxels_ns.radiometry.flir_rjpeg import read_flir_jpeg
-from thermoxels_ns.radiometry.image_size import LARGEST_SIDE
 from thermoxels_ns.radiometry.jpeg_segments import DamagedJpegError, check_jpeg, jpeg_segments
 
 READERS: tuple[Callable[[Path], object], ...] = (
-    lambda path: look_at(path, path.parent),
+    lambda path: identify(path, path.parent),
     read_photograph_facts,
     open_photograph,
     lambda path: read_thermogram(path, RadiometryOptions(camera="workswell")),
@@ -80,7 +79,7 @@ def test_a_tag_that_cannot_be_read_is_a_damaged_file(tmp_path):
     path = tmp_path / "damaged.tiff"
     path.write_bytes(content.replace(entry, struct.pack("<HHI", 262, 3, 255)))
     with pytest.raises(SceneError, match=r"damaged\.tiff: expected a TIFF or PNG"):
-        look_at(path, tmp_path)
+        identify(path, tmp_path)
     with pytest.raises(ThermalFileError, match=r"damaged\.tiff: expected a readable TIFF"):
         read_thermogram(path, RadiometryOptions(camera="workswell"))
 
@@ -90,15 +89,15 @@ def test_a_tag_that_cannot_be_read_is_a_damaged_file(tmp_path):
 )
 def test_whatever_a_decoder_raises_names_the_file(problem):
     said = r"x\.jpg: expected a picture, got .+\. Copy it\."
-    with pytest.raises(SceneError, match=said), naming("x.jpg", "a picture", "Copy it."):
+    with pytest.raises(SceneError, match=said), errors_name("x.jpg", "a picture", "Copy it."):
         raise problem
 
 
 def test_a_file_that_may_not_be_read_is_not_called_damaged():
     said = r"x\.jpg: .*Permission denied\. Check its permissions"
-    with pytest.raises(ThermalFileError, match=said), naming("x.jpg", "a picture", "Damaged.", ThermalFileError):
+    with pytest.raises(ThermalFileError, match=said), errors_name("x.jpg", "a picture", "Damaged.", ThermalFileError):
         raise PermissionError(13, "Permission denied")
-    with pytest.raises(ThermalFileError, match="ours"), naming("x.jpg", "a picture"):
+    with pytest.raises(ThermalFileError, match="ours"), errors_name("x.jpg", "a picture"):
         raise ThermalFileError("ours")
 
 
@@ -113,7 +112,7 @@ def test_a_picture_larger_than_the_decoder_opens_is_refused_by_its_size(tmp_path
     (tmp_path / "wide.jpg").write_bytes(jpeg[:at] + struct.pack(">HH", 15000, 20000) + jpeg[at + 4 :])
     for name in ("wide.png", "wide.jpg"):
         with pytest.raises(SceneError, match=rf"{name}: .*300000000 pixels.*Reduce the picture"):
-            look_at(tmp_path / name, tmp_path)
+            identify(tmp_path / name, tmp_path)
 
 
 def test_tags_that_point_at_themselves_end(tmp_path):
@@ -126,7 +125,7 @@ def test_tags_that_point_at_themselves_end(tmp_path):
     path = tmp_path / "loop.jpg"
     path.write_bytes(plain[:2] + segment(0xE1, b"Exif\0\0" + tags) + plain[2:])
     assert read_photograph_facts(path).orientation == 6
-    assert look_at(path, tmp_path).role == "photograph"
+    assert identify(path, tmp_path).role == "photograph"
 
 
 def test_fill_bytes_before_a_marker_are_passed(tmp_path):
@@ -146,7 +145,7 @@ def test_a_million_segments_are_read_one_by_one(tmp_path):
     path.write_bytes(plain[:2] + segment(0xE5, b"") * 200_000 + plain[2:])
     with pytest.raises(ThermalFileError, match=r"many\.jpg.*plain JPEG"):
         read_thermogram(path)
-    assert look_at(path, tmp_path).role == "photograph"
+    assert identify(path, tmp_path).role == "photograph"
 
 
 def test_records_that_overlap_are_not_copied(tmp_path):

@@ -13,12 +13,13 @@ from scipy.integrate import quad
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.radiometry.conditions import ConditionOverrides, Conditions
 from thermoxels_ns.radiometry.measurement_model import (
+    LONG_WAVE,
     AirConstants,
+    PlanckBand,
     PlanckConstants,
     RadiometricModel,
     corrected_temperature_c,
 )
-from thermoxels_ns.radiometry.planck_band import LONG_WAVE, PlanckBand
 
 E60 = PlanckConstants(r1=14985.93, r2=0.0112832, b=1398.1, f=1.0, o=-6233.0)
 I7 = PlanckConstants(r1=16327.72, r2=0.0231583, b=1424.8, f=1.35, o=-6872.0)

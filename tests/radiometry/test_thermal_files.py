@@ -12,7 +12,7 @@ from PIL import Image
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.data.dataparser import survey_thermal_files
 from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
-from thermoxels_ns.radiometry.thermal_files import ThermalUnit, read_temperature_c, read_thermal_file
+from thermoxels_ns.radiometry.thermal_files import ThermalUnit, read_thermal_file
 
 BOUNDS = ThermalUnit.bounds(-10.0, 40.0)
 COUNTS = ThermalUnit.linear(0.025, -100.0)
@@ -27,7 +27,7 @@ def save(path: Path, pixels: np.ndarray) -> Path:
 @pytest.mark.parametrize("suffix", [".png", ".tiff"])
 def test_sixteen_bit_bounds_keep_every_step(tmp_path, suffix):
     counts = np.arange(65536, dtype=np.uint16).reshape(256, 256)
-    got = read_temperature_c(save(tmp_path / f"a{suffix}", counts), BOUNDS)
+    got = read_thermal_file(save(tmp_path / f"a{suffix}", counts), BOUNDS).temperature_c
     assert got.dtype == np.float32
     np.testing.assert_allclose(got, -10.0 + counts / 65535.0 * 50.0, atol=4e-6)
     assert len(np.unique(got)) == 65536
@@ -35,12 +35,12 @@ def test_sixteen_bit_bounds_keep_every_step(tmp_path, suffix):
 
 def test_eight_bit_bounds(tmp_path):
     counts = np.arange(256, dtype=np.uint8).reshape(16, 16)
-    got = read_temperature_c(save(tmp_path / "a.png", counts), BOUNDS)
+    got = read_thermal_file(save(tmp_path / "a.png", counts), BOUNDS).temperature_c
     np.testing.assert_allclose(got, -10.0 + counts / 255.0 * 50.0, atol=4e-6)
 
 
 def test_grey_jpg_reads_as_eight_bits(tmp_path):
-    got = read_temperature_c(save(tmp_path / "a.jpg", np.full((16, 16), 51, np.uint8)), BOUNDS)
+    got = read_thermal_file(save(tmp_path / "a.jpg", np.full((16, 16), 51, np.uint8)), BOUNDS).temperature_c
     np.testing.assert_allclose(got, 0.0, atol=0.25)  # one count is 0.2 K
 
 
@@ -48,12 +48,14 @@ def test_equal_channels_count_as_grey_and_keep_sixteen_bits(tmp_path):
     counts = np.array([[0, 1, 65535], [40000, 40001, 3]], np.uint16)
     for name in ("deep.png", "deep.tiff"):
         assert cv2.imwrite(str(tmp_path / name), np.repeat(counts[..., None], 3, axis=2))
-        np.testing.assert_allclose(read_temperature_c(tmp_path / name, BOUNDS), -10 + counts / 65535.0 * 50, atol=4e-6)
-        unsaturated = read_temperature_c(tmp_path / name, COUNTS)[1]
+        np.testing.assert_allclose(
+            read_thermal_file(tmp_path / name, BOUNDS).temperature_c, -10 + counts / 65535.0 * 50, atol=4e-6
+        )
+        unsaturated = read_thermal_file(tmp_path / name, COUNTS).temperature_c[1]
         np.testing.assert_allclose(unsaturated, 0.025 * counts[1] - 100.0, atol=4e-5)
     eight = np.array([[1, 2], [3, 255]], np.uint8)
     path = save(tmp_path / "grey.png", np.repeat(eight[..., None], 3, axis=2))
-    np.testing.assert_allclose(read_temperature_c(path, BOUNDS), -10 + eight / 255.0 * 50, atol=4e-6)
+    np.testing.assert_allclose(read_thermal_file(path, BOUNDS).temperature_c, -10 + eight / 255.0 * 50, atol=4e-6)
 
 
 def test_transparent_pixels_are_no_data(tmp_path):
@@ -68,7 +70,7 @@ def test_false_colour_is_refused(tmp_path):
     pixels = np.zeros((4, 4, 3), np.uint8)
     pixels[0, 0] = (200, 10, 0)
     with pytest.raises(ThermalFileError, match="false-colour"):
-        read_temperature_c(save(tmp_path / "a.png", pixels), BOUNDS)
+        read_thermal_file(save(tmp_path / "a.png", pixels), BOUNDS)
 
 
 def test_counts_with_linear_unit_and_saturation(tmp_path):
@@ -85,11 +87,11 @@ def test_float_tiff_is_celsius_unless_linear(tmp_path):
     read = read_thermal_file(path, CELSIUS)
     np.testing.assert_array_equal(read.temperature_c, np.array([[1.25, np.nan], [np.nan, np.nan]], np.float32))
     assert (read.report.nan, read.report.out_of_range) == (2, 1)
-    np.testing.assert_array_equal(read_temperature_c(path, BOUNDS), read.temperature_c)
+    np.testing.assert_array_equal(read_thermal_file(path, BOUNDS).temperature_c, read.temperature_c)
     kelvin = ThermalUnit.linear(1.0, -273.15)
-    assert read_temperature_c(save(tmp_path / "k.tif", np.full((2, 2), 293.15, np.float32)), kelvin)[0, 0] == (
-        pytest.approx(20.0, abs=1e-4)
-    )
+    assert read_thermal_file(save(tmp_path / "k.tif", np.full((2, 2), 293.15, np.float32)), kelvin).temperature_c[
+        0, 0
+    ] == (pytest.approx(20.0, abs=1e-4))
 
 
 def test_npy_and_csv_are_celsius(tmp_path):
@@ -98,12 +100,14 @@ def test_npy_and_csv_are_celsius(tmp_path):
     (tmp_path / "comma.csv").write_text("20.5,-3.25,\n,7.0\n".replace(",\n,", "\nNaN,"))
     (tmp_path / "semicolon.csv").write_text("20,5;-3,25;\n-;7\n", encoding="utf-8-sig")
     for name in ("a.npy", "comma.csv", "semicolon.csv"):
-        np.testing.assert_array_equal(read_temperature_c(tmp_path / name, BOUNDS), values.astype(np.float32))
+        np.testing.assert_array_equal(
+            read_thermal_file(tmp_path / name, BOUNDS).temperature_c, values.astype(np.float32)
+        )
 
 
 def test_integer_npy_is_counts_with_a_linear_unit(tmp_path):
     np.save(tmp_path / "a.npy", np.full((2, 2), 4800, np.uint16))
-    assert read_temperature_c(tmp_path / "a.npy", COUNTS)[0, 0] == pytest.approx(20.0)
+    assert read_thermal_file(tmp_path / "a.npy", COUNTS).temperature_c[0, 0] == pytest.approx(20.0)
 
 
 def test_below_absolute_zero_is_masked_whatever_the_range(tmp_path):
@@ -115,7 +119,7 @@ def test_below_absolute_zero_is_masked_whatever_the_range(tmp_path):
 def test_counts_without_unit_say_what_to_give(tmp_path):
     path = save(tmp_path / "a.png", np.ones((3, 3), np.uint16))
     with pytest.raises(ThermalFileError, match=r"a\.png.*temperature_bounds\.json"):
-        read_temperature_c(path, CELSIUS)
+        read_thermal_file(path, CELSIUS)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tiff", ".npy", ".csv", ".jpg"])
@@ -137,24 +141,24 @@ def test_damaged_files_are_named(tmp_path, suffix, damage):
         if suffix != ".csv":
             path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(ThermalFileError, match="broken"):
-        read_temperature_c(path, BOUNDS)
+        read_thermal_file(path, BOUNDS)
 
 
 @pytest.mark.parametrize("shape", [(4,), (2, 3, 4), (0, 3)])
 def test_wrong_shapes_are_refused(tmp_path, shape):
     np.save(tmp_path / "a.npy", np.ones(shape))
     with pytest.raises(ThermalFileError, match="height, width"):
-        read_temperature_c(tmp_path / "a.npy", CELSIUS)
+        read_thermal_file(tmp_path / "a.npy", CELSIUS)
 
 
 def test_unknown_suffix_and_pages_are_refused(tmp_path):
     (tmp_path / "a.seq").write_bytes(b"x")
     with pytest.raises(ThermalFileError, match=r"\.npy"):
-        read_temperature_c(tmp_path / "a.seq", CELSIUS)
+        read_thermal_file(tmp_path / "a.seq", CELSIUS)
     page = Image.fromarray(np.ones((3, 3), np.uint16))
     page.save(tmp_path / "two.tiff", save_all=True, append_images=[page])
     with pytest.raises(ThermalFileError, match="2 pages"):
-        read_temperature_c(tmp_path / "two.tiff", COUNTS)
+        read_thermal_file(tmp_path / "two.tiff", COUNTS)
 
 
 def test_bad_units_are_refused():

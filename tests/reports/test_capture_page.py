@@ -1,14 +1,27 @@
-"""Overlays of the page: what they show is where the numbers say."""
+"""The page of a capture: pictures, how sure the rig is, how degrees were measured, what is missing."""
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
+import pytest
 
 from tests.support.posed_model import ring_model
-from thermoxels_ns.capture.overlays import colours, jpeg_of, spread_out, thermal_in_photograph
-from thermoxels_ns.capture.stage_types import CameraModel, RigEstimate, RigFrame
+from thermoxels_ns.capture.frames import CaptureFrame, measurement_rows
+from thermoxels_ns.capture.pairs import Pair
+from thermoxels_ns.capture.rig.parameters import PARAMETERS
+from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate, RigFrame
+from thermoxels_ns.capture.sfm.gravity import Up
+from thermoxels_ns.capture.sfm.metric_scale import MetricScale
+from thermoxels_ns.core.camera import Camera
+from thermoxels_ns.radiometry.conditions import Conditions, conditions_text
+from thermoxels_ns.reports.capture_page import CapturePage, Overlay, build_page
+from thermoxels_ns.reports.capture_pictures import colours, jpeg_of, spread_out, thermal_in_photograph
 
-THERMAL = CameraModel(80, 60, 70.0, 70.0, 41.0, 29.0)
+THERMAL = Camera(80, 60, 70.0, 70.0, 41.0, 29.0)
 
 
 def test_a_point_of_the_thermal_image_lands_where_the_scene_has_it():
@@ -18,7 +31,7 @@ def test_a_point_of_the_thermal_image_lands_where_the_scene_has_it():
     frame = RigFrame("f1", np.zeros((480, 640)), np.zeros((60, 80)), model.camera_to_world[1], model.points[seen], seen)
     rig = np.eye(4)
     rig[:3, 3] = (0.3, -0.1, 0.05)
-    estimate = RigEstimate(THERMAL, rig, (), np.zeros((0, 0)), True, "", 0.0, 0.0, 0.0)
+    estimate = RigEstimate(THERMAL, rig, True, "")
     chosen = np.argmin(np.linalg.norm(pixels - (320, 240), axis=1))
     spot = THERMAL.project(frame.points_visible()[[chosen]] @ rig[:3, :3].T + rig[:3, 3])[0]
     x, y = np.meshgrid(np.arange(80) + 0.5, np.arange(60) + 0.5)
@@ -41,3 +54,147 @@ def test_small_things():
     assert list(spread_out(2, 6)) == [0, 1]
     assert list(spread_out(0, 6)) == []
     assert jpeg_of(np.zeros((2, 2, 3), np.uint8)).startswith(b"\xff\xd8\xff")
+
+
+MODEL = ring_model(4)
+JPEG = b"\xff\xd8\xff"
+
+
+@pytest.fixture
+def page() -> CapturePage:
+    rig = RigEstimate(
+        *(Camera(80, 60, 70.0, 70.0, 41.0, 29.0), np.eye(4), True, "Found.", ("rx",), np.eye(1), 0.1, 0.4, 0.33)
+    )
+    conditions = Conditions(emissivity=0.95, reflected_c=20.0)
+    frames = [
+        CaptureFrame(name, Path(f"{name}.jpg"), Path(f"{name}.npy"), f"{name}.jpg", f"{name}.tiff", format="TIFF")
+        for name in MODEL.frames
+    ]
+    return CapturePage(
+        title="Capture of card",
+        pairs=[Pair(name, Path(f"{name}.jpg"), Path(f"{name}.tiff"), "equal names") for name in MODEL.frames],
+        dropped={},
+        frames=[replace(frame, conditions=conditions) for frame in frames],
+        scene_names=[f"frame_{name}" for name in MODEL.frames],
+        model=MODEL,
+        rig=rig,
+        start=rig,
+        drift=DriftEstimate(np.array([0.5, -0.5, 0.1, -0.1]), (), 1.553, 0.111, True, "Corrected."),
+        scale=None,
+        scale_missing="no photograph has a GPS position",
+        up=Up(np.array([-1e-9, -1e-12, 1.0]), "Assumed.", None),
+        overlays=[Overlay("a", JPEG, JPEG, JPEG, (12.34, 20.06))],
+        temperatures_c=np.linspace(10, 20, 100, dtype=np.float32),
+        masked_share=0.0,
+        dead_pixels=0,
+        poses_source="Given.",
+        overlay_share=None,
+        seconds=[("pairs", 1.0)],
+    )
+
+
+def words(page: CapturePage) -> str:
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", build_page(page)))
+
+
+def test_how_the_degrees_were_measured(page):
+    assert "thermal files TIFF" in words(page)
+    assert "computed with emissivity 0.95, reflected temperature 20 °C" in words(page)
+
+
+def test_how_sure_the_rig_is(page):
+    assert "a point&#39;s place is known to 0.33 thermal pixels" in words(page)
+    assert "Rig known" in words(replace(page, rig=replace(page.rig, projection_sigma_px=np.nan)))
+    unsure = words(replace(page, rig=replace(page.rig, determined=False, explanation="Too flat.")))
+    assert "not determined: the start value is kept" in unsure and "Too flat." in unsure
+
+
+def test_numbers_of_the_rig_have_their_errors_and_an_unsure_turn_its_reason(page):
+    errors = {"rx": 0.003, "ry": 0.004, "rz": 0.012, "log_focal": 0.01, "cx": 0.42, "cy": 0.57}
+    covariance = np.diag([errors.get(name, 0.0) ** 2 for name in PARAMETERS])
+    rig = replace(page.rig, parameters=PARAMETERS, covariance=covariance)
+    said = words(replace(page, rig=rig))
+    assert "principal point, pixels 320.0, 240.0 41.0, 29.0 41.0 ± 0.4, 29.0 ± 0.6 " in said
+    assert "focal length, pixels 500.0 70.0 70.0 ± 0.7 " in said
+    assert "turned by 0.00 ± 0.74 degrees" in said
+    assert "how sure the turn is The turn is sure to 0.74 degrees only" in said
+    given = words(replace(page, rig=replace(rig, parameters=(), covariance=np.zeros((0, 0)))))
+    assert "41.0, 29.0 41.0, 29.0 " in given and "how sure the turn is" not in given
+
+
+def test_what_the_correction_of_drift_changed(page):
+    assert "corrected: two frames of one point differ by 1.55 K before, 0.11 K after" in words(page)
+    assert "not corrected: two frames of one point differ by 1.55 K" in words(
+        replace(page, drift=replace(page.drift, used=False))
+    )
+    off = replace(page.drift, used=False, before_k=np.nan, after_k=np.nan)
+    assert "Drift and vignetting not corrected Scale" in words(replace(page, drift=off))
+
+
+def test_a_scale_that_is_missing_says_what_it_costs(page):
+    said = words(page)
+    assert "unknown (no photograph has a GPS position); give a length when you export the mesh" in said
+    known = words(replace(page, scale=MetricScale(0.5, 0.01, "GPS.")))
+    assert "0.5 ± 0.01 (2.0 %) m per unit" in known and "unknown" not in known
+
+
+def test_colours_say_their_degrees(page):
+    assert "12.3 °C and less are black, 20.1 °C and more are bright yellow" in words(page)
+
+
+def test_zeros_have_no_sign(page):
+    assert "up, as x, y, z 0.000, 0.000, 1.000. Assumed." in words(page)
+
+
+def test_stuck_pixels_that_were_not_looked_for_are_not_counted_as_none(page):
+    assert "stuck pixels of the sensor not looked for in fewer than 5 frames" in words(page)
+    more = replace(page, frames=[*page.frames, *page.frames])
+    assert "stuck pixels of the sensor 0" in words(more)
+
+
+def test_names_of_files_are_no_markup(page):
+    evil = "<script>alert(1)</script>"
+    frames = [replace(frame, camera=evil) for frame in page.frames]
+    pairs = [Pair("a", Path(f"{evil}.jpg"), Path("a.tiff"), evil)]
+    text = build_page(replace(page, title=evil, dropped={evil: evil}, frames=frames, pairs=pairs, scale_missing=evil))
+    assert "<script" not in text
+    assert text.count("&lt;script&gt;") >= 6
+
+
+def frame(**more) -> CaptureFrame:
+    return CaptureFrame("a", Path("a.jpg"), Path("a.npy"), "a.jpg", "a.tiff", **more)
+
+
+def test_settings_that_all_frames_share_are_said_once():
+    conditions = Conditions(emissivity=0.95, reflected_c=21.0, distance_m=4.0, air_c=19.5)
+    rows = dict(measurement_rows([frame(format="FLIR R-JPEG", conditions=conditions)] * 3))
+    assert rows["thermal files"] == "FLIR R-JPEG"
+    assert rows["computed with"] == (
+        "emissivity 0.95, reflected temperature 21 °C, 4 m of air of 50 % humidity and 19.5 °C"
+    )
+
+
+def test_settings_that_differ_are_counted_the_most_frequent_first():
+    kinds = [Conditions(emissivity=e, reflected_c=20.0) for e in (0.9, 0.8, 0.8, 0.7, 0.6, 0.5)]
+    rows = dict(measurement_rows([frame(format="TIFF", celsius_per_count=0.025, conditions=kind) for kind in kinds]))
+    assert rows["thermal files"] == "TIFF with 0.025 K per count"
+    said = rows["computed with"]
+    assert said.startswith("emissivity 0.8, reflected temperature 20 °C (2 frames); emissivity 0.9")
+    assert said.endswith("; 1 more kinds")
+
+
+def test_what_no_file_says_is_not_said():
+    assert measurement_rows([frame()]) == []
+
+
+@pytest.mark.parametrize(
+    ("conditions", "said"),
+    [
+        (Conditions(), "apparent temperatures"),
+        (Conditions(distance_m=2.0, air_c=10.0), "emissivity 1, 2 m of air"),
+        (Conditions(window_transmission=0.9, window_c=20.0), "a window that passes 90 %"),
+    ],
+)
+def test_what_lies_between_is_said(conditions, said):
+    assert said in conditions_text(conditions)
+    assert ("apparent" in conditions_text(conditions)) == (conditions == Conditions())

@@ -8,8 +8,8 @@ import numpy as np
 
 from tests.support.camera_card import photograph
 from tests.support.known_rig import turned
-from thermoxels_ns.capture.rig.board_rig import CheckerBoard
-from thermoxels_ns.capture.stage_types import CameraModel
+from thermoxels_ns.capture.rig.board import CheckerBoard
+from thermoxels_ns.core.camera import Camera
 
 BOARD = CheckerBoard(7, 5, 0.06)
 _PLACES = (
@@ -22,7 +22,7 @@ _PLACES = (
 """Turns about x, y, z [degrees] and the board's middle [m], in the visible camera's OpenCV axes."""
 
 
-def picture(camera: CameraModel, board_to_camera: np.ndarray, samples: int = 4) -> np.ndarray:
+def picture(camera: Camera, board_to_camera: np.ndarray, samples: int = 4) -> np.ndarray:
     """The board seen by a camera: 1 on light squares, 0 on dark ones, 0.5 around, mean over samples^2 rays."""
     across = (np.arange(camera.width * samples) + 0.5) / samples
     down = (np.arange(camera.height * samples) + 0.5) / samples
@@ -37,7 +37,7 @@ def picture(camera: CameraModel, board_to_camera: np.ndarray, samples: int = 4) 
     return value.reshape(camera.height, samples, camera.width, samples).mean(axis=(1, 3))
 
 
-def board_pairs(visible: CameraModel, thermal: CameraModel, rig: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def board_pairs(visible: Camera, thermal: Camera, rig: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Photographs (grey, 0 to 255) and temperatures; what is dark in the one is warm in the other."""
     draw = np.random.default_rng(0)
     result = []

@@ -8,14 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.stage_types import (
-    OPENGL_FROM_OPENCV,
-    CameraModel,
-    RigEstimate,
-    RigFrame,
-    RigStart,
-    radius_squared,
-)
+from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV, RigEstimate, RigFrame, RigStart, radius_squared
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.synthetic.raycast import render_view
 from thermoxels_ns.synthetic.scene_folder import make_scene
@@ -28,8 +21,8 @@ class KnownCapture:
     """Frames and the truth behind them."""
 
     frames: list[RigFrame]
-    visible: CameraModel
-    thermal: CameraModel
+    visible: Camera
+    thermal: Camera
     visible_to_thermal: FloatArray
     offsets_k: FloatArray
     radial: tuple[float, float]
@@ -61,7 +54,7 @@ class KnownCapture:
         )
 
 
-def changes_between(start: RigStart, camera: CameraModel, transform: FloatArray) -> FloatArray:
+def changes_between(start: RigStart, camera: Camera, transform: FloatArray) -> FloatArray:
     """The ten changes (`rig_parameters.PARAMETERS`) that make a rig of a start that is not turned, shape (10,)."""
     turn, before = transform[:3, :3], start.thermal_camera
     angles = np.arctan2(turn[2, 1], turn[2, 2]), -np.arcsin(turn[2, 0]), np.arctan2(turn[1, 0], turn[0, 0])
@@ -72,7 +65,7 @@ def changes_between(start: RigStart, camera: CameraModel, transform: FloatArray)
 
 
 def projection_difference_px(
-    frames: list[RigFrame], first: tuple[CameraModel, FloatArray], second: tuple[CameraModel, FloatArray]
+    frames: list[RigFrame], first: tuple[Camera, FloatArray], second: tuple[Camera, FloatArray]
 ) -> float:
     """Median distance between where two rigs (camera, visible to thermal) put the frames' points [pixels]."""
     points = np.concatenate([frame.points_visible() for frame in frames])
@@ -115,8 +108,8 @@ def known_capture(
     focal = small.fl_x * zoom
     cx, cy = small.cx + centre_px[0], small.cy + centre_px[1]
     pinhole = Camera(small.width, small.height, focal, focal, cx, cy)
-    visible = CameraModel(plain.width, plain.height, plain.fl_x, plain.fl_y, plain.cx, plain.cy)
-    thermal = CameraModel(small.width, small.height, focal, focal, cx, cy)
+    visible = Camera(plain.width, plain.height, plain.fl_x, plain.fl_y, plain.cx, plain.cy)
+    thermal = Camera(small.width, small.height, focal, focal, cx, cy)
     rig = np.eye(4)
     rig[:3, :3], rig[:3, 3] = turned(*turn_deg), baseline_m
     to_visible = OPENGL_FROM_OPENCV @ np.linalg.inv(rig) @ OPENGL_FROM_OPENCV
@@ -179,7 +172,7 @@ def drawn_capture(
     )
     width, height = capture.thermal.width, capture.thermal.height
     focal = capture.thermal.fl_x * (1.0 + draw.uniform(-0.05, 0.05))
-    return capture, RigStart(CameraModel(width, height, focal, focal, width / 2, height / 2))
+    return capture, RigStart(Camera(width, height, focal, focal, width / 2, height / 2))
 
 
 def painted_sky(
@@ -193,11 +186,11 @@ def painted_sky(
     """Two cameras in one place look at random blobs: no parallax, no outlines, so only the comparison of edges errs."""
     draw = np.random.default_rng(seed)
     focal = 0.86 * photograph_width
-    visible = CameraModel(
+    visible = Camera(
         photograph_width, photograph_width * 3 // 4, focal, focal, photograph_width / 2, photograph_width * 3 / 8
     )
     focal = 0.86 * thermal_width * zoom
-    thermal = CameraModel(thermal_width, thermal_width * 4 // 5, focal, focal, thermal_width / 2, thermal_width * 0.4)
+    thermal = Camera(thermal_width, thermal_width * 4 // 5, focal, focal, thermal_width / 2, thermal_width * 0.4)
     rig = np.eye(4)
     rig[:3, :3] = turned(*turn_deg)
     frames = []
@@ -213,7 +206,7 @@ def painted_sky(
     return KnownCapture(frames, visible, thermal, rig, np.zeros(views), (0.0, 0.0))
 
 
-def _seen(paint: npt.NDArray[np.float32], camera: CameraModel, turn: FloatArray, samples: int) -> npt.NDArray:
+def _seen(paint: npt.NDArray[np.float32], camera: Camera, turn: FloatArray, samples: int) -> npt.NDArray:
     """Image of a painting far away; every pixel is the mean of samples^2 rays."""
     across = (np.arange(camera.width * samples) + 0.5) / samples
     down = (np.arange(camera.height * samples) + 0.5) / samples

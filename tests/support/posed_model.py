@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from thermoxels_ns.capture.sfm.model import SfmModel
-from thermoxels_ns.capture.stage_types import CameraModel
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.synthetic.camera_rings import look_at
 
-CAMERA = CameraModel(640, 480, 500.0, 500.0, 320.0, 240.0, k1=0.02)
+CAMERA = Camera(640, 480, 500.0, 500.0, 320.0, 240.0, k1=0.02)
 
 
 def ring_model(count: int = 8, points: int = 300, seed: int = 0, unit_m: float = 1.0) -> SfmModel:

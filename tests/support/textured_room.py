@@ -9,11 +9,12 @@ import numpy as np
 from PIL import Image
 
 from tests.support.camera_card import counts
-from thermoxels_ns.capture.stage_types import OPENGL_FROM_OPENCV, CameraModel
+from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.synthetic.camera_rings import look_at
 
-VISIBLE = CameraModel(480, 360, 420.0, 420.0, 240.0, 180.0)
-THERMAL = CameraModel(160, 128, 150.0, 150.0, 81.0, 63.0)
+VISIBLE = Camera(480, 360, 420.0, 420.0, 240.0, 180.0)
+THERMAL = Camera(160, 128, 150.0, 150.0, 81.0, 63.0)
 RIG = np.eye(4)
 RIG[:3, 3] = (0.06, 0.01, 0.0)
 SIDE_M, TEXELS = 4.0, 1024
@@ -34,7 +35,7 @@ def textures(seed: int = 0) -> list[np.ndarray]:
     return made
 
 
-def view(camera: CameraModel, pose: np.ndarray, pictures: list[np.ndarray]) -> np.ndarray:
+def view(camera: Camera, pose: np.ndarray, pictures: list[np.ndarray]) -> np.ndarray:
     """What a camera sees of the corner, shape (height, width)."""
     grid = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), -1).reshape(-1, 2)
     rays = camera.rays(grid) * (1, -1, -1) @ pose[:3, :3].T

@@ -1,1 +1,1 @@
-"""From camera files to a scene: pairs, poses, scale, rig, drift, and the folder that the dataparser reads."""
+"""From camera files to a scene that the dataparser reads."""

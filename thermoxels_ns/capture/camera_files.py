@@ -1,4 +1,4 @@
-"""What a folder from a memory card holds: photographs, thermal images, files with both, and what cannot be read."""
+"""Tells the files of a memory card apart: photographs, thermal images, unreadable ones."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ from PIL import Image
 
 from thermoxels_ns.capture.photograph import read_photograph_facts
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
-from thermoxels_ns.radiometry.decoders import naming
+from thermoxels_ns.radiometry.decoders import check_file_size, check_thermal_size, errors_name
 from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg
 from thermoxels_ns.radiometry.exif import read_exif_facts
 from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
-from thermoxels_ns.radiometry.image_size import check_file_size, check_thermal_size
 
 Role = Literal["photograph", "thermal", "both", "thermal picture"]
 """thermal picture: its name says thermal, but it holds colours and no temperatures."""
@@ -115,7 +114,7 @@ def scan_folder(
             continue
         try:
             _check_name(path.relative_to(folder))
-            files.append(look_at(path, folder))
+            files.append(identify(path, folder))
         except ThermoxelsError as problem:
             unreadable[path] = str(problem)
         if (number + 1) % 100 == 0:
@@ -182,17 +181,17 @@ def _check_name(name: Path) -> None:
         )
 
 
-def look_at(path: Path, folder: Path) -> CameraFile:
+def identify(path: Path, folder: Path) -> CameraFile:
     """Tell by content what a file is; its name only tells a thermal picture from a photograph.
 
     Raises:
         SceneError, ThermalFileError: It is empty, damaged or no picture.
     """
-    with naming(path, "a camera file"):
-        return _look_at(path, folder)
+    with errors_name(path, "a camera file"):
+        return _identify(path, folder)
 
 
-def _look_at(path: Path, folder: Path) -> CameraFile:
+def _identify(path: Path, folder: Path) -> CameraFile:
     check_file_size(path)
     suffix = path.suffix.lower()
     if suffix in (".npy", ".csv"):
@@ -208,7 +207,7 @@ def _look_at(path: Path, folder: Path) -> CameraFile:
         if is_dji_rjpeg(head) or is_dji_rjpeg(path.read_bytes()):
             return CameraFile(path, "thermal", read_photograph_facts(path).taken_at, dji=True)
     else:
-        with naming(path, "a TIFF or PNG that can be decoded"):
+        with errors_name(path, "a TIFF or PNG that can be decoded"):
             found = _count_image(path)
         if found is not None:
             return found

@@ -1,4 +1,4 @@
-"""The pairs after reading: photographs that can be decoded, temperatures, and what their files say."""
+"""The pairs after reading: photographs, temperatures and what their files say."""
 
 from __future__ import annotations
 
@@ -11,18 +11,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.masks import read_mask
 from thermoxels_ns.capture.pairs import Pair
-from thermoxels_ns.capture.photograph import GpsFix, open_photograph, read_photograph_facts
-from thermoxels_ns.capture.stages import read_json, write_json
+from thermoxels_ns.capture.photograph import GpsFix, open_photograph, read_mask, read_photograph_facts
+from thermoxels_ns.capture.results import load_json
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
+from thermoxels_ns.core.json_values import write_json
 from thermoxels_ns.radiometry.camera_file import RadiometryOptions, read_thermogram
-from thermoxels_ns.radiometry.conditions import Conditions
+from thermoxels_ns.radiometry.conditions import Conditions, conditions_text
 from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
 from thermoxels_ns.radiometry.flir_records import PictureInPicture
 from thermoxels_ns.radiometry.flir_rjpeg import read_flir_jpeg
 
 _LIST = "frames.json"
+_MOST_LISTED = 4
+"""Kinds of measurements that are described."""
 _MOST_FOR_DEAD_PIXELS = 60
 """Frames that stuck pixels are looked for in: more need memory and say nothing new."""
 
@@ -90,7 +92,7 @@ class CaptureFrames:
     @classmethod
     def load(cls, folder: Path, root: Path) -> CaptureFrames:
         """Read the list of frames from a folder, for a capture in `root`."""
-        content = read_json(folder / _LIST)
+        content = load_json(folder / _LIST)
         for row in content["frames"]:
             for name in ("photograph", "thermal"):
                 inside, relative = row[name]
@@ -241,13 +243,40 @@ def _without_stuck_pixels(
 
 
 def _frame_of(row: dict[str, Any]) -> CaptureFrame:
-    row = dict(row)
-    if row["gps"] is not None:
-        row["gps"] = GpsFix(**row["gps"])
-    if row["gimbal_deg"] is not None:
-        row["gimbal_deg"] = (row["gimbal_deg"][0], row["gimbal_deg"][1])
-    if row["picture_in_picture"] is not None:
-        row["picture_in_picture"] = PictureInPicture(**row["picture_in_picture"])
-    if row.get("conditions") is not None:
-        row["conditions"] = Conditions(**row["conditions"])
+    for name, kind in (("gps", GpsFix), ("picture_in_picture", PictureInPicture), ("conditions", Conditions)):
+        row[name] = None if row[name] is None else kind(**row[name])
+    row["gimbal_deg"] = None if row["gimbal_deg"] is None else tuple(row["gimbal_deg"])
     return CaptureFrame(**row)
+
+
+def measurement_rows(frames: Sequence[CaptureFrame]) -> list[tuple[str, str]]:
+    """Describe file formats and the settings that degrees were computed with.
+
+    Args:
+        frames: Those of the scene.
+
+    Returns:
+        Names and texts; where frames differ, each kind with the number of its frames, the most frequent first.
+    """
+    rows = []
+    formats = [_format(frame) for frame in frames if frame.format]
+    if formats:
+        rows.append(("thermal files", _counted(formats)))
+    conditions = [conditions_text(frame.conditions) for frame in frames if frame.conditions]
+    if conditions:
+        rows.append(("computed with", _counted(conditions)))
+    return rows
+
+
+def _format(frame: CaptureFrame) -> str:
+    step = "" if frame.celsius_per_count is None else f" with {frame.celsius_per_count:.4g} K per count"
+    return f"{frame.format}{step}"
+
+
+def _counted(texts: Sequence[str]) -> str:
+    counted = Counter(texts).most_common()
+    if len(counted) == 1:
+        return counted[0][0]
+    listed = [f"{text} ({count} frames)" for text, count in counted[:_MOST_LISTED]]
+    more = len(counted) - len(listed)
+    return "; ".join(listed) + (f"; {more} more kinds" if more else "")

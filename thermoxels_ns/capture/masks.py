@@ -1,4 +1,4 @@
-"""Parts of images that are no picture of the scene: text and logos that the camera drew, fingers, sky."""
+"""Masks of photographs: what the user shuts out, and what the camera drew over them."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from thermoxels_ns.capture.photograph import open_photograph
+from thermoxels_ns.capture.frames import CaptureFrame
+from thermoxels_ns.capture.photograph import open_photograph, read_mask, read_photograph_facts
 from thermoxels_ns.core.errors import SceneError
 
 MIN_FRAMES = 8
 """Fewer photographs cannot tell what is drawn over them from what they all happen to show."""
+_LOOKED_AT = 40
+"""Photographs that overlays are looked for in."""
 _SIDE = 800
 """Longest side at which overlays are looked for, [pixels]."""
 _STILL = 10.0
@@ -57,6 +60,55 @@ class PhotographMasks:
         return use & read_mask(self.files[frame], width, height) if frame in self.files else use
 
 
+def find_masks(frames: Sequence[CaptureFrame], folder: Path | None, look_for_overlays: bool) -> PhotographMasks:
+    """Masks for photographs of the size that most of them have.
+
+    Args:
+        frames: At least one.
+        folder: The user's masks; None: there are none.
+        look_for_overlays: Whether to look for what the camera drew.
+
+    Raises:
+        SceneError: The user's masks are not named like photographs, or a photograph cannot be read.
+    """
+    sizes = []
+    for frame in frames:
+        facts = read_photograph_facts(frame.photograph)
+        sizes.append((facts.width, facts.height))
+    size = max(dict.fromkeys(sizes), key=sizes.count)
+    same = [frame for frame, own in zip(frames, sizes) if own == size]
+    drawn = None
+    if look_for_overlays:
+        some = np.linspace(0, len(same) - 1, min(len(same), _LOOKED_AT)).round().astype(int)
+        drawn = find_overlay([same[i].photograph for i in np.unique(some)])
+    return PhotographMasks(size, drawn, user_masks(same, folder))
+
+
+def user_masks(frames: Sequence[CaptureFrame], folder: Path | None) -> dict[str, Path]:
+    """The user's masks by frame: those named like a photograph, or like a frame.
+
+    Raises:
+        SceneError: None of them is.
+    """
+    if folder is None:
+        return {}
+    files = mask_files(folder)
+    found = {}
+    for frame in frames:
+        names = (Path(frame.photograph_source).stem.lower(), frame.name.lower())
+        own = next((files[name] for name in names if name in files), None)
+        if own is not None:
+            found[frame.name] = own
+    if not found:
+        raise SceneError(
+            "masks",
+            expected="masks named like photographs",
+            got=f"{len(files)} pictures in {folder}, none of them named so",
+            remedy=f"Name them like {Path(frames[0].photograph_source).stem}.png.",
+        )
+    return found
+
+
 def find_overlay(photographs: Sequence[Path]) -> npt.NDArray[np.bool_] | None:
     """Find what the camera drew over all photographs: text, scales and logos, at the same place in each.
 
@@ -92,23 +144,6 @@ def find_overlay(photographs: Sequence[Path]) -> npt.NDArray[np.bool_] | None:
         return None
     grown = cv2.dilate(drawn.astype(np.uint8), np.ones((9, 9), np.uint8))
     return cv2.resize(grown, size, interpolation=cv2.INTER_NEAREST) == 0
-
-
-def read_mask(path: Path, width: int, height: int) -> npt.NDArray[np.bool_]:
-    """Read a mask: white (128 and more) where the image may be used.
-
-    Raises:
-        SceneError: It cannot be read, or has another size than the images.
-    """
-    mask = np.asarray(open_photograph(path).convert("L")) >= 128
-    if mask.shape != (height, width):
-        raise SceneError(
-            str(path),
-            expected=f"a mask of {width} x {height} pixels, as the images have",
-            got=f"{mask.shape[1]} x {mask.shape[0]}",
-            remedy="Draw it on one of the images: white where they may be used, black elsewhere.",
-        )
-    return mask
 
 
 def mask_files(folder: Path) -> dict[str, Path]:

@@ -1,8 +1,7 @@
-"""What a photograph's file says besides its pixels: when, where, with which lens, and how the camera was held."""
+"""Photographs and what their headers say of time, place, lens and orientation."""
 
 from __future__ import annotations
 
-import io
 import math
 import re
 from collections.abc import Mapping
@@ -11,10 +10,12 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from PIL import Image
 
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.radiometry.decoders import naming
+from thermoxels_ns.radiometry.decoders import errors_name
 from thermoxels_ns.radiometry.exif import ExifFacts, read_exif_facts
 
 LARGEST_SIDE = 30000
@@ -61,22 +62,19 @@ class PhotographFacts:
     """Pitch (0 level, -90 straight down) and roll of the camera against gravity, [degrees]."""
 
 
-def read_photograph_facts(path: Path, content: bytes | None = None) -> PhotographFacts:
+def read_photograph_facts(path: Path) -> PhotographFacts:
     """Read a photograph's header.
-
-    Args:
-        path: The file, or the one that `content` was cut from.
-        content: The photograph's bytes, where it lies inside another file.
 
     Raises:
         SceneError: It is no picture that can be read, or a header claims an absurd size.
     """
-    with naming(path, _EXPECTED, _REMEDY), Image.open(io.BytesIO(content) if content is not None else path) as image:
+    with errors_name(path, _EXPECTED, _REMEDY), Image.open(path) as image:
         width, height = image.size
         facts = read_exif_facts(image)
         exif = image.getexif()
         tags, gps = {**exif, **exif.get_ifd(_EXIF)}, exif.get_ifd(_GPS)
-        head = content if content is not None else _head(path)
+        with path.open("rb") as stream:
+            head = stream.read(2**18)
     check_photograph_size(path, width, height)
     orientation = tags.get(_ORIENTATION, 1)
     return PhotographFacts(
@@ -102,20 +100,32 @@ def check_photograph_size(path: Path, width: int, height: int) -> None:
         )
 
 
-def open_photograph(path: Path, content: bytes | None = None) -> Image.Image:
+def open_photograph(path: Path) -> Image.Image:
     """Decode a photograph as red, green and blue, as its pixels are stored (EXIF's orientation is not applied).
 
     Raises:
         SceneError: It is no picture, is cut off, or claims an absurd size.
     """
-    with naming(path, _EXPECTED, _REMEDY), Image.open(io.BytesIO(content) if content is not None else path) as image:
+    with errors_name(path, _EXPECTED, _REMEDY), Image.open(path) as image:
         check_photograph_size(path, *image.size)
         return image.convert("RGB")
 
 
-def _head(path: Path) -> bytes:
-    with path.open("rb") as stream:
-        return stream.read(2**18)
+def read_mask(path: Path, width: int, height: int) -> npt.NDArray[np.bool_]:
+    """Read a mask: white (128 and more) where the image may be used.
+
+    Raises:
+        SceneError: It cannot be read, or has another size than the images.
+    """
+    mask = np.asarray(open_photograph(path).convert("L")) >= 128
+    if mask.shape != (height, width):
+        raise SceneError(
+            str(path),
+            expected=f"a mask of {width} x {height} pixels, as the images have",
+            got=f"{mask.shape[1]} x {mask.shape[0]}",
+            remedy="Draw it on one of the images: white where they may be used, black elsewhere.",
+        )
+    return mask
 
 
 def _number(value: object) -> float | None:

@@ -1,51 +1,96 @@
-"""All stages of a capture in order: from a folder of camera files to a scene and a page about it."""
+"""All stages of a capture: from a folder of camera files to a scene."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import TypeVar
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
-from thermoxels_ns.capture.camera_files import scan_folder
-from thermoxels_ns.capture.file_stages import pair_stage, temperature_stage
-from thermoxels_ns.capture.job import PAGE_NAME, CaptureJob
-from thermoxels_ns.capture.output_lock import only_capture
-from thermoxels_ns.capture.pose_stages import photograph_masks, pose_stage, scale_stage
-from thermoxels_ns.capture.report import Findings, report_page
-from thermoxels_ns.capture.rig.board_photos import board_of
-from thermoxels_ns.capture.scene_writer import JSON_NAME, SCENE_CONTENT, Scene, write_scene_folder
+from thermoxels_ns.capture import results
+from thermoxels_ns.capture.camera_files import SUFFIXES, files_below, scan_folder, shown_name
+from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames
+from thermoxels_ns.capture.masks import PhotographMasks, find_masks, mask_files, user_masks
+from thermoxels_ns.capture.pairs import Pair, PairOptions, PairSearch, find_pairs, no_pairs, read_pair_list
+from thermoxels_ns.capture.rig.board import CheckerBoard, board_of, in_scene_units, rig_from_board_photos
+from thermoxels_ns.capture.rig.drift import estimate_drift
+from thermoxels_ns.capture.rig.explanation import rig_lines
+from thermoxels_ns.capture.rig.search import estimate_rig
+from thermoxels_ns.capture.rig.start import kept_start, read_rig, rig_frames, rig_start
+from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
+from thermoxels_ns.capture.scene_writer import SCENE_CONTENT, Scene, write_scene_folder
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.metric_scale import MetricScale
-from thermoxels_ns.capture.stage_types import DriftEstimate, RigEstimate
-from thermoxels_ns.capture.stages import StageCache, prepare_output
-from thermoxels_ns.capture.thermal_stages import board_stage, drift_stage, rig_stage
+from thermoxels_ns.capture.sfm.feature_matching import PoseOptions
+from thermoxels_ns.capture.sfm.given_poses import fitted_to_photographs, read_given_poses, reordered
+from thermoxels_ns.capture.sfm.gravity import Up, find_up, level_rotation
+from thermoxels_ns.capture.sfm.metric_scale import (
+    MeasuredDistance,
+    MetricScale,
+    scale_from_distance,
+    scale_from_gps,
+    scale_from_markers,
+)
+from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.sfm.poses import add_points, find_poses
+from thermoxels_ns.capture.stage_cache import (
+    CACHE_FOLDER,
+    StageCache,
+    files_of,
+    fingerprint,
+    given_fingerprints,
+    locked,
+    prepare_output,
+)
 from thermoxels_ns.core.checks import remove_stale_temporaries
 from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.core.json_values import write_json
+from thermoxels_ns.radiometry.camera_file import RadiometryOptions
+
+PAGE_NAME = "capture.html"
+"""Of the page, in the output folder."""
+_MOST_NAMED = 10
+"""Files left out that are named while the command runs."""
+_LEAST_SIGHTINGS = 50
+"""Sightings of scene points below which thermal images and photographs cannot be compared."""
+_OVERLAY_FILE = "overlay.npy"
+
+_Options = TypeVar("_Options")
 
 
 @dataclass(frozen=True)
 class CaptureResult:
-    """What a capture wrote, and the figures to judge it by."""
+    """What a capture found; the scene is in the output folder."""
 
-    scene: Path
-    """transforms.json."""
-    page: Path
-    pairs: int
-    frames: int
-    """In the scene."""
+    source: Path
+    output: Path
+    pairs: Sequence[Pair]
     dropped: dict[str, str]
-    """Files and frames that are not in it, and why."""
-    rig: RigEstimate
-    drift: DriftEstimate
-    scale: MetricScale | None
+    """Files and frames that are not in the scene, and why."""
+    read: CaptureFrames
+    scene: Scene
+    start: RigEstimate
+    """Where the search for the rig began."""
     scale_missing: str
     """Why there is no scale, where there is none."""
+    poses_source: str
+    seconds: Sequence[tuple[str, float]]
+    """Stages and the time each took, [s]."""
+
+    @property
+    def page(self) -> Path:
+        """The page about the capture."""
+        return self.output / PAGE_NAME
 
 
 def run_capture(
-    source: Path, output: Path, settings: CaptureSettings, say: Callable[[str], None] = lambda _: None
+    source: Path,
+    output: Path,
+    settings: CaptureSettings,
+    write_page: Callable[[CaptureResult], None],
+    say: Callable[[str], None] = lambda _: None,
 ) -> CaptureResult:
     """Turn a folder of camera files into a scene.
 
@@ -53,6 +98,7 @@ def run_capture(
         source: The folder; nothing is written to it, unless the output lies in it.
         output: For the scene, the page and the stages' results.
         settings: How.
+        write_page: Writes the page; the last stage.
         say: Told how far it is, one line at a time.
 
     Raises:
@@ -74,10 +120,10 @@ def run_capture(
     folder = prepare_output(output)
     try:
         # Inverses and sums of BLAS depend on the number of its threads; one thread is no slower here.
-        with only_capture(folder, say), threadpool_limits(1, "blas"):
+        with locked(folder, say), threadpool_limits(1, "blas"):
             remove_stale_temporaries(folder, [PAGE_NAME])
             cache = StageCache(folder, settings.from_stage, say)
-            return _run_stages(CaptureJob(source, folder, settings, cache, say, board))
+            return _Capture(source, folder, settings, cache, say, board).run(write_page)
     except ThermoxelsError:
         raise
     except OSError as problem:
@@ -89,46 +135,276 @@ def run_capture(
         ) from problem
 
 
-def _run_stages(job: CaptureJob) -> CaptureResult:
-    pairs = pair_stage(job)
-    read = temperature_stage(job, pairs)
-    found = pose_stage(job, read)
-    model, scale, scale_missing, up = scale_stage(job, found, read)
-    by_name = {frame.name: frame for frame in read.frames}
-    frames = [by_name[name] for name in model.frames]
-    board = board_stage(job, model, read)
-    rig, start = rig_stage(job, model, frames, read, scale, scale_missing, board)
-    drift = drift_stage(job, model, frames, rig)
-    scene = Scene(frames, model, rig, drift, scale, up, photograph_masks(job, frames, model))
-    written = [job.output / name for name in SCENE_CONTENT]
-    job.cache.run("scene", {}, lambda _: write_scene_folder(scene, job.output, job.say), written)
-    findings = Findings(
-        source=job.source,
-        pairs=pairs,
-        dropped=job.dropped,
-        read=read,
-        scene=scene,
-        start=start,
-        scale_missing=scale_missing,
-        poses_source=_poses_source(job),
-        seconds=job.cache.seconds,
-    )
-    page = job.output / PAGE_NAME
-    job.cache.run("page", {}, lambda _: report_page(findings, page), [page])
-    return CaptureResult(
-        scene=job.output / JSON_NAME,
-        page=page,
-        pairs=len(pairs),
-        frames=len(frames),
-        dropped=job.dropped,
-        rig=rig,
-        drift=drift,
-        scale=scale,
-        scale_missing=scale_missing,
-    )
+@dataclass
+class _Capture:
+    """One capture that is being made; a method for each stage."""
 
+    source: Path
+    output: Path
+    settings: CaptureSettings
+    cache: StageCache
+    say: Callable[[str], None]
+    board: CheckerBoard | None = None
+    """What the user's pictures of a checker board show."""
+    dropped: dict[str, str] = field(default_factory=dict)
+    """Files and frames that are left out, and why; stages add to it."""
 
-def _poses_source(job: CaptureJob) -> str:
-    if job.settings.poses is not None:
-        return f"Given in {job.settings.poses.name}."
-    return "Structure from motion on the photographs (COLMAP)."
+    def run(self, write_page: Callable[[CaptureResult], None]) -> CaptureResult:
+        """Run all stages."""
+        pairs = self.pairs()
+        read = self.temperatures(pairs)
+        found = self.poses(read)
+        model, scale, scale_missing, up = self.scale(found, read)
+        by_name = {frame.name: frame for frame in read.frames}
+        frames = [by_name[name] for name in model.frames]
+        board = self.board_rig(model, read)
+        rig, start = self.rig(model, frames, read, scale, scale_missing, board)
+        drift = self.drift(model, frames, rig)
+        scene = Scene(frames, model, rig, drift, scale, up, self.photograph_masks(frames, model))
+        written = [self.output / name for name in SCENE_CONTENT]
+        self.cache.run("scene", {}, lambda _: write_scene_folder(scene, self.output, self.say), written)
+        given = self.settings.poses
+        result = CaptureResult(
+            source=self.source,
+            output=self.output,
+            pairs=pairs,
+            dropped=self.dropped,
+            read=read,
+            scene=scene,
+            start=start,
+            scale_missing=scale_missing,
+            poses_source=f"Given in {given.name}." if given else "Structure from motion on the photographs (COLMAP).",
+            seconds=self.cache.seconds,
+        )
+        self.cache.run("page", {}, lambda _: write_page(result), [result.page])
+        return result
+
+    def options(self, kind: type[_Options]) -> _Options:
+        """Those of the user's settings that a dataclass of options has fields for."""
+        settings = vars(self.settings)
+        return kind(**{each.name: settings[each.name] for each in fields(kind) if each.name in settings})  # type: ignore[arg-type]
+
+    def pairs(self) -> tuple[Pair, ...]:
+        """Find which photograph belongs to which thermal image."""
+        settings, options = self.settings, self.options(PairOptions)
+        inside, passed_over = files_below(self.source, [self.output])
+        if settings.pairs is None:
+            inside = [path for path in inside if path.suffix.lower() in SUFFIXES]
+        depends = {
+            "options": options,
+            "files": fingerprint(inside, self.source),
+            "passed_over": sorted(map(str, passed_over)),
+            "list": given_fingerprints([settings.pairs]),
+            "skip_bad": settings.skip_bad,
+        }
+
+        def work(folder: Path) -> None:
+            search, unreadable = self._searched_pairs(options)
+            results.save_pairs(folder, search, self.source)
+            write_json(folder / "unreadable.json", {shown_name(path): why for path, why in unreadable.items()})
+            self.say(f"pairs: {len(search.pairs)}, files without a partner: {len(search.unpaired)}")
+            left_out = [(shown_name(path), why) for path, why in (unreadable | search.unpaired).items()]
+            for name, why in left_out[:_MOST_NAMED]:
+                self.say(f"left out: {name}: {why}")
+            if len(left_out) > _MOST_NAMED:
+                self.say(f"left out: {len(left_out) - _MOST_NAMED} more; {PAGE_NAME} names all")
+
+        folder = self.cache.run("pairs", depends, work)
+        pairs, unpaired = results.load_pairs(folder, self.source)
+        self.dropped |= results.load_json(folder / "unreadable.json") | unpaired
+        return pairs
+
+    def _searched_pairs(self, options: PairOptions) -> tuple[PairSearch, dict[Path, str]]:
+        """The pairs as listed or found, and why some files cannot be read."""
+        settings = self.settings
+        if settings.pairs is not None:
+            return read_pair_list(settings.pairs, self.source), {}
+        found = scan_folder(self.source, [self.output], self.say)
+        search = find_pairs(found, options)
+        if found.unreadable and not settings.skip_bad:
+            first = next(iter(found.unreadable.values()))
+            more = f" {len(found.unreadable) - 1} more cannot be read." if len(found.unreadable) > 1 else ""
+            remedy = "" if "--skip-bad" in first else " To go on without such files, pass --skip-bad True."
+            raise SceneError(f"{first}{more}{remedy}")
+        if not search.pairs:
+            raise no_pairs(found, search.unpaired, settings.dji_library is not None)
+        return search, found.unreadable
+
+    def temperatures(self, pairs: tuple[Pair, ...]) -> CaptureFrames:
+        """Read the pairs: degrees from thermal files, photographs out of files that hold both."""
+        settings, options = self.settings, self.options(RadiometryOptions)
+        library = settings.dji_library if settings.dji_library and settings.dji_library.is_file() else None
+        depends = {
+            "options": options,
+            "library": given_fingerprints([library]),
+            "skip_bad": settings.skip_bad,
+            "mask": given_fingerprints([settings.thermal_mask]),
+        }
+
+        def work(folder: Path) -> None:
+            read = read_frames(pairs, self.source, folder, options, settings.skip_bad, settings.thermal_mask, self.say)
+            width, height = read.thermal_size
+            self.say(f"temperatures: {len(read.frames)} thermal images of {width} x {height} pixels")
+
+        read = CaptureFrames.load(self.cache.run("temperatures", depends, work), self.source)
+        self.dropped |= read.dropped
+        return read
+
+    def poses(self, read: CaptureFrames) -> SfmModel:
+        """Find camera, poses and scene points, or take those that the user gives."""
+        settings, options = self.settings, self.options(PoseOptions)
+        depends = {
+            "options": options,
+            "poses": given_fingerprints([] if settings.poses is None else files_of(settings.poses)),
+            "masks": given_fingerprints([] if settings.masks is None else list(mask_files(settings.masks).values())),
+            "overlays": settings.find_overlays,
+        }
+
+        def work(folder: Path) -> None:
+            photographs = {frame.name: frame.photograph for frame in read.frames}
+            masks = find_masks(read.frames, settings.masks, settings.find_overlays)
+            if masks.overlay is not None:
+                np.save(folder / _OVERLAY_FILE, masks.overlay)
+                self.say(f"masks: {100 * (1 - masks.overlay.mean()):.1f} % of every photograph is drawn over")
+            if settings.poses is None:
+                focal = [frame.focal_px for frame in read.frames if frame.focal_px]
+                middle = float(np.median(focal)) if focal else None
+                poses = find_poses(photographs, folder, middle, masks, options, self.say)
+                order = {name: number for number, name in enumerate(photographs)}
+                model = reordered(poses.model, lambda name: order[name])
+            else:
+                given = read_given_poses(settings.poses, {f.name: f.photograph_source for f in read.frames})
+                poses = fitted_to_photographs(given, photographs)
+                model = poses.model
+                if not len(model.points):
+                    model = add_points(model, photographs, folder, masks, options, self.say)
+            results.save(folder / "model.npz", model)
+            write_json(folder / "dropped.json", dict(poses.dropped))
+            self.say(f"poses: {len(model.frames)} of {len(read.frames)} frames, {len(model.points)} points")
+
+        folder = self.cache.run("poses", depends, work)
+        self.dropped |= results.load_json(folder / "dropped.json")
+        return results.load(folder / "model.npz", SfmModel)
+
+    def photograph_masks(self, frames: list[CaptureFrame], model: SfmModel) -> PhotographMasks:
+        """What the stage of the poses found drawn over the photographs, and the user's masks."""
+        size = (model.camera.width, model.camera.height)
+        file = self.output / CACHE_FOLDER / "poses" / _OVERLAY_FILE
+        drawn = np.load(file) if file.is_file() else None
+        if drawn is not None and drawn.shape != (size[1], size[0]):
+            drawn = None
+        return PhotographMasks(size, drawn, user_masks(frames, self.settings.masks))
+
+    def scale(self, found: SfmModel, read: CaptureFrames) -> tuple[SfmModel, MetricScale | None, str, Up]:
+        """Find metres per unit and up; turn a model that was found here upright, keep one that was given."""
+        settings = self.settings
+        depends = {
+            "known": [settings.known_distance, settings.known_distance_error_m],
+            "markers": [settings.marker_side_m, settings.marker_error_m],
+        }
+        by_name = {frame.name: frame for frame in read.frames}
+        frames = [by_name[name] for name in found.frames]
+
+        def work(folder: Path) -> None:
+            scale, missing = self._metric_scale(found, frames)
+            up = find_up(
+                found.camera_to_world, [frame.gimbal_deg for frame in frames], [frame.orientation for frame in frames]
+            )
+            model = found
+            if settings.poses is None:
+                rotation = level_rotation(up.direction, -found.camera_to_world[:, :3, 2].mean(axis=0))
+                origin = np.median(found.points, axis=0) if len(found.points) else found.centres.mean(axis=0)
+                model = found.moved(rotation, origin)
+                up = Up(rotation @ up.direction, up.source, up.spread_deg)
+            results.save(folder / "model.npz", model)
+            results.save_scale(folder, scale, missing, up)
+            self.say(f"scale: {missing}" if scale is None else f"scale: {scale.metres_per_unit:.5g} m per unit")
+
+        folder = self.cache.run("scale", depends, work)
+        return results.load(folder / "model.npz", SfmModel), *results.load_scale(folder)
+
+    def _metric_scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[MetricScale | None, str]:
+        """Metres per unit from the surest source that there is; where there is none, why."""
+        settings = self.settings
+        if settings.known_distance is not None:
+            name, x0, y0, x1, y1, metres = settings.known_distance
+            measured = MeasuredDistance(name, (x0, y0), (x1, y1), metres, settings.known_distance_error_m)
+            return scale_from_distance(model, measured, {f.name: f.photograph_source for f in frames}), ""
+        if settings.marker_side_m is not None:
+            photographs = {frame.name: frame.photograph for frame in frames}
+            return scale_from_markers(model, photographs, settings.marker_side_m, settings.marker_error_m)
+        return scale_from_gps(model.centres, [frame.gps for frame in frames])
+
+    def board_rig(self, model: SfmModel, read: CaptureFrames) -> RigEstimate | None:
+        """Find the rig in metres where the user has pictures of a checker board; None: there are none."""
+        board, pictures, settings = self.board, self.settings.board_photos, self.settings
+        if board is None or pictures is None:
+            self.cache.leave_out("board", "no --board-photos")
+            return None
+        depends = {
+            "board": board,
+            "files": fingerprint(files_of(pictures), pictures),
+            "angle": settings.thermal_field_of_view_deg,
+        }
+
+        def work(folder: Path) -> None:
+            radiometry = self.options(RadiometryOptions)
+            rig = rig_from_board_photos(
+                pictures, board, model.camera, read.thermal_size, folder, settings, radiometry, self.say
+            )
+            results.save(folder / "rig.npz", rig)
+
+        return results.load(self.cache.run("board", depends, work) / "rig.npz", RigEstimate)
+
+    def rig(
+        self,
+        model: SfmModel,
+        frames: list[CaptureFrame],
+        read: CaptureFrames,
+        scale: MetricScale | None,
+        scale_missing: str,
+        board: RigEstimate | None,
+    ) -> tuple[RigEstimate, RigEstimate]:
+        """Find the rig, or take the one that the user or a checker board gives."""
+        settings = self.settings
+        depends = {"angle": settings.thermal_field_of_view_deg, "rig": given_fingerprints([settings.rig])}
+
+        def work(folder: Path) -> None:
+            metres = None if scale is None else scale.metres_per_unit
+            begin = rig_start(frames, model.camera, read.thermal_size, settings.thermal_field_of_view_deg, metres)
+            results.save(folder / "start.npz", kept_start(begin, "Where the search begins."))
+            if settings.rig is not None:
+                rig = read_rig(settings.rig, read.thermal_size, metres)
+            elif board is not None:
+                rig = in_scene_units(board, scale, scale_missing)
+            elif len(model.sighting_frame) < _LEAST_SIGHTINGS:
+                rig = kept_start(begin, "There are no scene points to compare the images at.")
+            else:
+                rig = estimate_rig(
+                    rig_frames(model, frames),
+                    model.camera,
+                    begin,
+                    lambda message, share: self.say(f"rig: {message} ({100 * share:.0f} %)"),
+                )
+            results.save(folder / "rig.npz", rig)
+            for line in rig_lines(rig, metres):
+                self.say(f"rig: {line}")
+
+        folder = self.cache.run("rig", depends, work)
+        rig, start = (results.load(folder / f"{name}.npz", RigEstimate) for name in ("rig", "start"))
+        return rig, start
+
+    def drift(self, model: SfmModel, frames: list[CaptureFrame], rig: RigEstimate) -> DriftEstimate:
+        """Find how far each thermal image reads too high, unless the user switched that off."""
+
+        def work(folder: Path) -> None:
+            if self.settings.drift == "off" or len(model.sighting_frame) < _LEAST_SIGHTINGS:
+                why = "Switched off." if self.settings.drift == "off" else "There are no scene points to compare at."
+                drift = DriftEstimate(np.zeros(len(frames)), (), np.nan, np.nan, False, why)
+            else:
+                drift = estimate_drift(rig_frames(model, frames), rig.thermal_camera, rig.visible_to_thermal)
+            results.save(folder / "drift.npz", drift)
+            self.say(f"drift: {drift.explanation}")
+
+        folder = self.cache.run("drift", {"drift": self.settings.drift}, work)
+        return results.load(folder / "drift.npz", DriftEstimate)

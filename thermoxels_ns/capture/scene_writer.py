@@ -15,12 +15,14 @@ from PIL import Image
 from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.photograph import open_photograph
+from thermoxels_ns.capture.rig_types import DriftEstimate, FloatArray, RigEstimate
 from thermoxels_ns.capture.sfm.gravity import Up
 from thermoxels_ns.capture.sfm.metric_scale import MetricScale
 from thermoxels_ns.capture.sfm.model import SfmModel
-from thermoxels_ns.capture.stage_types import CameraModel, DriftEstimate, FloatArray, RigEstimate
-from thermoxels_ns.capture.stages import CACHE_FOLDER, write_json
+from thermoxels_ns.capture.stage_cache import CACHE_FOLDER
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.json_values import write_json
 from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, SparseTracks, write_tracks
 
 JSON_NAME = "transforms.json"
@@ -106,7 +108,7 @@ def write_points(path: Path, points: FloatArray, colours: npt.NDArray[np.uint8])
         temporary.write_bytes(("\n".join([*lines, "end_header"]) + "\n").encode("ascii") + rows.tobytes())
 
 
-def camera_entries(camera: CameraModel) -> dict[str, Any]:
+def camera_entries(camera: Camera) -> dict[str, Any]:
     """A camera as transforms.json has it."""
     names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
     values = {name: getattr(camera, name) for name in names}

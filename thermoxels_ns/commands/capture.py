@@ -1,11 +1,9 @@
-"""The command ``thermoxels capture``: from the folder of a memory card to a scene that can be trained.
-
-Only light imports at the top, so that ``thermoxels --help`` answers at once.
-"""
+"""The command ``thermoxels capture``; only light imports at the top, for its help."""
 
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,13 +39,21 @@ class Capture(CaptureSettings):
         """
         from rich.console import Console
 
-        from thermoxels_ns.capture.run import run_capture
-
         console = Console(highlight=False)
-        result = run_capture(
+        result = capture_folder(
             self.source, self.output, self, lambda line: console.print(line, markup=False, soft_wrap=True)
         )
         _print_result(result, self.output, console)
+
+
+def capture_folder(
+    source: Path, output: Path, settings: CaptureSettings, say: Callable[[str], None] = lambda _: None
+) -> CaptureResult:
+    """Turn a folder of camera files into a scene and write the page about it; raises what `run_capture` does."""
+    from thermoxels_ns.capture.run import run_capture
+    from thermoxels_ns.reports.capture_pictures import write_capture_page
+
+    return run_capture(source, output, settings, write_capture_page, say)
 
 
 def _print_result(result: CaptureResult, folder: Path, console: Console) -> None:
@@ -56,16 +62,16 @@ def _print_result(result: CaptureResult, folder: Path, console: Console) -> None
     def say(line: str, style: str | None = None) -> None:
         console.print(line, style=style, markup=False, soft_wrap=True)
 
-    say(f"{result.frames} frames of {result.pairs} pairs are in the scene.")
+    say(f"{len(result.scene.frames)} frames of {len(result.pairs)} pairs are in the scene.")
     if result.dropped:
         say(f"Left out: {len(result.dropped)}", "bold yellow")
         for name, why in list(result.dropped.items())[:_LISTED]:
             say(f"  {name}: {why}")
         if len(result.dropped) > _LISTED:
             say(f"  and {len(result.dropped) - _LISTED} more, listed in {result.page}")
-    if not result.rig.determined:
-        say(f"The rig was not determined. {result.rig.explanation}", "bold yellow")
-    if result.scale is None:
+    if not result.scene.rig.determined:
+        say(f"The rig was not determined. {result.scene.rig.explanation}", "bold yellow")
+    if result.scene.scale is None:
         say(f"The scale is unknown: {result.scale_missing}. Give a length when you export.", "bold yellow")
     say(f"What was found, with pictures to judge it by: {result.page}")
     say(f"Train with: ns-train thermoxels --data {shlex.quote(str(folder))}")

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from thermoxels_ns.core.checks import read_json_object
 from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.json_values import read_json_object
 
 _ENERGY_UNITS = ("J", "kJ", "MJ", "GJ", "TJ", "PJ")
 """Each a thousand of the one before."""

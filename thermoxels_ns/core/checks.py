@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
@@ -10,7 +9,6 @@ import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -94,17 +92,6 @@ def replace_when_done(path: Path | str) -> Iterator[Path]:
         # The error that kept it from being renamed says more than that it cannot be removed either.
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-
-
-def read_json_object(path: Path, remedy: str, error: type[ThermoxelsError] = ThermoxelsError) -> dict[str, Any]:
-    """Return what a json file holds if that is an object, else raise `error`."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError, RecursionError) as problem:
-        raise error(str(path), expected="a readable json file", got=str(problem), remedy=remedy) from problem
-    if not isinstance(content, dict):
-        raise error(str(path), expected="a json object", got=type(content).__name__, remedy=remedy)
-    return content
 
 
 def remove_file(path: Path | str) -> None:

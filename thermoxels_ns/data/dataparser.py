@@ -25,7 +25,7 @@ from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
 from thermoxels_ns.data.splits import Split, split_frames
 from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
-from thermoxels_ns.radiometry.thermal_files import ThermalUnit, read_temperature_c
+from thermoxels_ns.radiometry.thermal_files import ThermalUnit, read_thermal_file
 
 SCENE_SIZE = 2.0
 """Longest side of the scene box in nerfstudio's world; learning rates of the field rely on it."""
@@ -295,7 +295,7 @@ def survey_thermal_files(
     # Counted among the training files: every other file of all may be an evaluation's.
     step = -(-sum(trains) // _MOST_FRAMES)
     for path, is_training in zip(paths, trains):
-        temperature_c = read_temperature_c(path, unit, valid_range_c)
+        temperature_c = read_thermal_file(path, unit, valid_range_c).temperature_c
         height, width = temperature_c.shape
         shapes[path] = (height, width)
         if not np.isfinite(temperature_c).any():
@@ -314,7 +314,7 @@ def survey_thermal_files(
     dead = {shape: mask for shape, mask in dead.items() if mask.any()}
     for path in extremes:
         if shapes[path] in dead:  # the extremes of these files may be a stuck pixel's
-            live = read_temperature_c(path, unit, valid_range_c)[~dead[shapes[path]]]
+            live = read_thermal_file(path, unit, valid_range_c).temperature_c[~dead[shapes[path]]]
             if np.isfinite(live).any():
                 extremes[path] = (float(np.nanmin(live)), float(np.nanmax(live)))
     lows, highs = zip(*extremes.values())

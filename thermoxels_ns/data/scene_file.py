@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.checks import read_json_object
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.data.transforms_json import read_intrinsics, read_pose
 from thermoxels_ns.radiometry.thermal_files import THERMAL_SUFFIXES, ThermalUnit
 

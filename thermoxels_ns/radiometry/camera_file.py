@@ -1,36 +1,80 @@
-"""Camera files to degrees: one function reads them all, the format found by content and not by name.
-
-| format | degrees by |
-|---|---|
-| FLIR R-JPEG | the counts and the Planck constants in the file |
-| DJI R-JPEG | DJI's own library, where the user has it |
-| TIFF, 16-bit PNG | a camera preset or the user's scale; floats are degrees C |
-| NPY, CSV | degrees C; whole numbers in NPY need a scale |
-
-A picture (palette JPEG, 8-bit PNG) is refused: its colours cannot be turned back into temperatures.
-"""
+"""Reads all thermal camera files as degrees; the format is found by content."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
 
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.radiometry.conditions import ConditionOverrides, Conditions
+from thermoxels_ns.radiometry.decoders import check_file_size, errors_name
 from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg, read_dji_rjpeg
+from thermoxels_ns.radiometry.flir_records import PictureInPicture
 from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
-from thermoxels_ns.radiometry.image_size import check_file_size
-from thermoxels_ns.radiometry.jpeg_segments import JPEG_START, DamagedJpegError, check_jpeg
-from thermoxels_ns.radiometry.known_cameras import COUNT_SCALES, CameraName
+from thermoxels_ns.radiometry.jpeg_segments import JPEG_START, check_jpeg
 from thermoxels_ns.radiometry.measurement_model import corrected_temperature_c
-from thermoxels_ns.radiometry.radiometric_tiff import read_count_image
-from thermoxels_ns.radiometry.tables import NPY_START, looks_like_csv, read_csv, read_npy
-from thermoxels_ns.radiometry.thermal_files import ThermalImage, ThermalUnit
-from thermoxels_ns.radiometry.thermogram import Thermogram, ThermogramFormat, ThermogramMetadata, masked_image
+from thermoxels_ns.radiometry.stored_temperatures import (
+    COUNT_SCALES,
+    NPY_START,
+    CameraName,
+    looks_like_csv,
+    read_count_image,
+    read_npy,
+)
+from thermoxels_ns.radiometry.thermal_files import (
+    PixelReport,
+    ThermalImage,
+    ThermalUnit,
+    masked_image,
+    read_thermal_file,
+)
+
+ThermogramFormat = Literal["FLIR R-JPEG", "DJI R-JPEG", "TIFF", "PNG", "NPY", "CSV"]
 
 _HEAD_BYTES = 4096
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+
+@dataclass(frozen=True)
+class ThermogramMetadata:
+    """What a thermal file says besides its temperatures; None: it does not say."""
+
+    format: ThermogramFormat
+    """By content, not by name."""
+    camera: str | None = None
+    """Maker and model."""
+    serial: str | None = None
+    """Of the camera."""
+    lens: str | None = None
+    taken_at: datetime | None = None
+    """When; with a time zone where the file has one."""
+    field_of_view_deg: float | None = None
+    """Horizontal, of the thermal lens, as the camera states it; some state nonsense such as 180."""
+    camera_conditions: Conditions | None = None
+    """Emissivity and the rest that the camera was set to."""
+    conditions: Conditions | None = None
+    """Those that the temperatures were computed with: the camera's, with the user's in their place."""
+    picture_in_picture: PictureInPicture | None = None
+    """Factory alignment of photograph and thermal image."""
+    celsius_per_count: float | None = None
+    """Step of the file's counts, [K], where they are linear in temperature."""
+
+
+@dataclass(frozen=True)
+class Thermogram:
+    """One thermal image in degrees."""
+
+    temperature_c: npt.NDArray[np.float32]
+    """Shape (height, width), [degrees C], NaN where the camera measured nothing."""
+    metadata: ThermogramMetadata
+    report: PixelReport
+    """How many pixels are NaN and why."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +122,15 @@ class RadiometryOptions(ConditionOverrides):
 
 def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> Thermogram:
     """Read a thermal camera file as degrees C.
+
+    | format | degrees by |
+    |---|---|
+    | FLIR R-JPEG | the counts and the Planck constants in the file |
+    | DJI R-JPEG | DJI's own library, where the user has it |
+    | TIFF, 16-bit PNG | a camera preset or the user's scale; floats are degrees C |
+    | NPY, CSV | degrees C; whole numbers in NPY need a scale |
+
+    A picture (palette JPEG, 8-bit PNG) is refused: its colours cannot be turned back into temperatures.
 
     Args:
         path: The file; its name may end as it likes.
@@ -145,15 +198,8 @@ def _jpeg_format(path: Path) -> ThermogramFormat:
     content = path.read_bytes()
     if is_dji_rjpeg(content):
         return "DJI R-JPEG"
-    try:
+    with errors_name(path, "a whole radiometric JPEG", "Copy the file from the camera again.", ThermalFileError):
         check_jpeg(content)
-    except DamagedJpegError as problem:
-        raise ThermalFileError(
-            str(path),
-            expected="a whole radiometric JPEG",
-            got=str(problem),
-            remedy="Copy the file from the camera again.",
-        ) from problem
     raise ThermalFileError(
         str(path),
         expected="a radiometric JPEG: counts and calibration beside the picture",
@@ -212,7 +258,7 @@ def _read_stored(path: Path, found: ThermogramFormat, options: RadiometryOptions
     elif found == "NPY":
         image = read_npy(path, options.given_unit, options.valid_range_c)
     else:
-        image = read_csv(path, options.valid_range_c)
+        image = read_thermal_file(path, ThermalUnit.celsius(), options.valid_range_c, ".csv")
     if before != after:
         image = _corrected(image, before, after, options.valid_range_c)
     return Thermogram(image.temperature_c, metadata, image.report)

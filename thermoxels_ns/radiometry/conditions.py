@@ -1,4 +1,4 @@
-"""What a temperature measurement assumes: how the object shines, what it mirrors, and the air between."""
+"""What a temperature measurement assumes: emissivity, reflections and the air between."""
 
 from __future__ import annotations
 
@@ -87,6 +87,28 @@ class ConditionOverrides:
         0.9
         """
         return replace(conditions, **self.given())
+
+
+def conditions_text(conditions: Conditions) -> str:
+    """Say what a temperature was computed with.
+
+    >>> conditions_text(Conditions(emissivity=0.95, reflected_c=20.0))
+    'emissivity 0.95, reflected temperature 20 °C'
+    >>> conditions_text(Conditions())
+    'emissivity 1 and no air between: apparent temperatures, which are too near that of the surroundings'
+    """
+    parts = [f"emissivity {conditions.emissivity:.4g}"]
+    if conditions.emissivity < 1 and conditions.reflected_c is not None:
+        parts.append(f"reflected temperature {conditions.reflected_c:.4g} °C")
+    if conditions.distance_m > 0:
+        parts.append(f"{conditions.distance_m:.4g} m of air of {100 * conditions.relative_humidity:.3g} % humidity")
+        if conditions.air_c is not None:
+            parts[-1] += f" and {conditions.air_c:.4g} °C"
+    if conditions.window_transmission < 1:
+        parts.append(f"a window that passes {100 * conditions.window_transmission:.4g} %")
+    if len(parts) == 1 and conditions.emissivity == 1:
+        return "emissivity 1 and no air between: apparent temperatures, which are too near that of the surroundings"
+    return ", ".join(parts)
 
 
 def check_between(name: str, value: float, low: float, high: float, expected: str, *, zero: bool = True) -> None:

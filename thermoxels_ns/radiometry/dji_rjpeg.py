@@ -1,8 +1,4 @@
-"""DJI's radiometric JPEG, through DJI's own library.
-
-How DJI's counts become degrees is not public: the Thermal SDK's `libdirp` does it, may not be passed on with other
-programs, and is free to download. So the user names the library; without it the file is refused and says what to do.
-"""
+"""DJI's radiometric JPEG, read through DJI's own library."""
 
 from __future__ import annotations
 
@@ -19,9 +15,8 @@ from PIL import Image
 
 from thermoxels_ns.core.errors import ThermalFileError, ThermoxelsError
 from thermoxels_ns.radiometry.conditions import ConditionOverrides, Conditions
-from thermoxels_ns.radiometry.decoders import naming
+from thermoxels_ns.radiometry.decoders import check_thermal_size, errors_name
 from thermoxels_ns.radiometry.exif import ExifFacts, read_exif_facts
-from thermoxels_ns.radiometry.image_size import check_thermal_size
 from thermoxels_ns.radiometry.jpeg_segments import APP1, APP3, JPEG_START, DamagedJpegError, check_jpeg, jpeg_segments
 
 _SDK = "the DJI Thermal SDK (www.dji.com/downloads/softwares/dji-thermal-sdk)"
@@ -38,6 +33,14 @@ _STATUS = {
     -10: "a wrong input format",
     -11: "a wrong output format",
 }
+_FUNCTIONS = (
+    "dirp_create_from_rjpeg",
+    "dirp_get_rjpeg_resolution",
+    "dirp_get_measurement_params",
+    "dirp_set_measurement_params",
+    "dirp_measure_ex",
+    "dirp_destroy",
+)
 _SPARE_FLOATS = 12
 _LIMITS = "DJI's library takes distances of 1 to 25 m, humidities of 0.2 to 1 and emissivities of 0.1 to 1."
 
@@ -85,6 +88,10 @@ def is_dji_rjpeg(content: bytes) -> bool:
 def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrides) -> DjiImage:
     """Read a DJI R-JPEG with `libdirp`.
 
+    How DJI's counts become degrees is not public: the Thermal SDK's `libdirp` does it, may not be passed on with other
+    programs, and is free to download. So the user names the library; without it the file is refused and says what to
+    do.
+
     Args:
         path: The file.
         library: Where `libdirp.so` or `libdirp.dll` is, in its folder of the SDK.
@@ -95,15 +102,9 @@ def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrid
             parameters.
     """
     content = path.read_bytes()
-    try:
+    whole = "a whole DJI R-JPEG, as the drone wrote it"
+    with errors_name(path, whole, "Copy the file from the drone again.", ThermalFileError):
         check_jpeg(content)  # before a library in another language takes it
-    except DamagedJpegError as problem:
-        raise ThermalFileError(
-            str(path),
-            expected="a whole DJI R-JPEG, as the drone wrote it",
-            got=str(problem),
-            remedy="Copy the file from the drone again.",
-        ) from problem
     if library is None:
         raise ThermalFileError(
             str(path),
@@ -175,38 +176,27 @@ def _measure(path: Path, call: Callable[..., None], handle: ctypes.c_void_p, ove
     pointer = temperature_c.ctypes.data_as(ctypes.POINTER(ctypes.c_float))
     call("dirp_measure_ex", handle, pointer, ctypes.c_int32(temperature_c.nbytes))
     with (
-        naming(path, "a JPEG with readable tags", error=ThermalFileError),
+        errors_name(path, "a JPEG with readable tags", error=ThermalFileError),
         Image.open(path, formats=("JPEG", "MPO")) as image,
     ):
         return DjiImage(temperature_c, before, after, read_exif_facts(image))
 
 
 def _load(library: Path) -> ctypes.CDLL:
-    wrong: object = None
-    dirp = None
-    if not library.is_file():
-        wrong = "nothing there"
-    else:
+    wrong = "nothing there"
+    if library.is_file():
         try:
             dirp = ctypes.CDLL(str(library.resolve()))
-            for name in (
-                "dirp_create_from_rjpeg",
-                "dirp_get_rjpeg_resolution",
-                "dirp_get_measurement_params",
-                "dirp_set_measurement_params",
-                "dirp_measure_ex",
-                "dirp_destroy",
-            ):
+            for name in _FUNCTIONS:
                 getattr(dirp, name).restype = ctypes.c_int32
+            return dirp
         except OSError as problem:
             wrong = f"a file that cannot be loaded ({problem})"
         except AttributeError as problem:
             wrong = f"another library ({problem})"
-    if dirp is None or wrong is not None:
-        raise ThermalFileError(
-            "dji_library",
-            expected=f"DJI's libdirp for this computer at {library}",
-            got=wrong,
-            remedy=f"Pass --dji-library with the path of the file in {_SDK}, and leave the libraries beside it.",
-        )
-    return dirp
+    raise ThermalFileError(
+        "dji_library",
+        expected=f"DJI's libdirp for this computer at {library}",
+        got=wrong,
+        remedy=f"Pass --dji-library with the path of the file in {_SDK}, and leave the libraries beside it.",
+    )

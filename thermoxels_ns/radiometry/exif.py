@@ -1,4 +1,4 @@
-"""Who took a picture and when, as the tags of a TIFF, PNG or JPEG say."""
+"""Who took a picture and when, from its EXIF tags."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""The records inside a FLIR file (FFF): raw counts, calibration and settings, as numbers.
-
-An R-JPEG carries one FFF block in its APP1 segments. Layout and field offsets are those of the public tag tables of
-ExifTool (FLIR tags); every record says its own byte order.
-"""
+"""Records inside a FLIR file (FFF): counts, calibration and settings."""
 
 from __future__ import annotations
 
@@ -20,7 +16,7 @@ from PIL import Image
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.units import kelvin_to_celsius
 from thermoxels_ns.radiometry.conditions import Conditions
-from thermoxels_ns.radiometry.image_size import check_thermal_size
+from thermoxels_ns.radiometry.decoders import check_thermal_size
 from thermoxels_ns.radiometry.measurement_model import AirConstants, PlanckConstants
 
 RAW_DATA, EMBEDDED_PICTURE, CAMERA_INFO, PICTURE_IN_PICTURE = 0x01, 0x0E, 0x20, 0x2A
@@ -100,6 +96,9 @@ class CameraInfo:
 
 def fff_records(fff: bytes) -> Iterator[tuple[int, memoryview]]:
     """Yield type and content of every record that an FFF block lists; the content is a view into the block.
+
+    An R-JPEG carries one FFF block in its APP1 segments. Layout and field offsets are those of the public tag tables of
+    ExifTool (FLIR tags); every record says its own byte order.
 
     Raises:
         DamagedRecordError: The block or a record of it is cut off.

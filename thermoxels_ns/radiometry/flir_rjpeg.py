@@ -1,8 +1,4 @@
-"""FLIR's radiometric JPEG: the counts and the calibration behind the picture.
-
-Read here and not through a library: the one that exists (flyr) is under the EUPL, a copyleft licence, and what is
-needed are five records whose layout is public; so the formats of most users work without an extra to install.
-"""
+"""FLIR's radiometric JPEG: counts and calibration behind the picture."""
 
 from __future__ import annotations
 
@@ -15,6 +11,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.radiometry.conditions import Conditions
+from thermoxels_ns.radiometry.decoders import errors_name
 from thermoxels_ns.radiometry.flir_records import (
     CAMERA_INFO,
     EMBEDDED_PICTURE,
@@ -33,6 +30,7 @@ from thermoxels_ns.radiometry.jpeg_segments import APP1, JPEG_START, DamagedJpeg
 from thermoxels_ns.radiometry.measurement_model import RadiometricModel
 
 _WANTED = (RAW_DATA, CAMERA_INFO, PICTURE_IN_PICTURE, EMBEDDED_PICTURE)
+_REMEDY = "Copy the file from the camera again; programs that edit pictures drop its thermal part."
 _FLIR_MARK = b"FLIR\0"
 _FLIR_HEADER_BYTES = 8
 _FIRST_SEGMENT = re.compile(rb"\xff\xe1..FLIR\0", re.DOTALL)
@@ -81,10 +79,13 @@ def is_flir_jpeg(path: Path) -> bool:
 def read_flir_jpeg(path: Path) -> FlirImage:
     """Read a FLIR R-JPEG.
 
+    Read here and not through a library: the one that exists (flyr) is under the EUPL, a copyleft licence, and what is
+    needed are five records whose layout is public; so the formats of most users work without an extra to install.
+
     Raises:
         ThermalFileError: The file is cut off, a record is missing or damaged, or its size cannot be.
     """
-    try:
+    with errors_name(path, "a whole FLIR R-JPEG, as the camera wrote it", _REMEDY, ThermalFileError):
         records = dict[int, bytes]()
         for kind, content in fff_records(_flir_block(path.read_bytes())):
             # Records may overlap: a thousand of them that each claim the whole block are not copied.
@@ -101,13 +102,6 @@ def read_flir_jpeg(path: Path) -> FlirImage:
             picture_in_picture=None if pip is None else read_picture_in_picture(pip),
             visible=None if picture is None else read_embedded_picture(picture),
         )
-    except (DamagedJpegError, DamagedRecordError) as problem:
-        raise ThermalFileError(
-            str(path),
-            expected="a whole FLIR R-JPEG, as the camera wrote it",
-            got=str(problem),
-            remedy="Copy the file from the camera again; programs that edit pictures drop its thermal part.",
-        ) from problem
 
 
 def _flir_block(content: bytes) -> bytes:

@@ -1,19 +1,10 @@
-"""What a thermal camera measures: object, reflections and air, from counts to degrees and back.
-
-A sensor's signal for a black body of temperature T is the Planck curve of its calibration,
-``S(T) = R1 / (R2 (exp(B / T) - F)) - O``. In front of a real object it sees (FLIR's measurement formula, printed in
-the manuals of its cameras; Minkina and Dudzik, Infrared Thermography, 2009, equation 2.18)
-
-    S_total = emissivity tau S(T_object) + (1 - emissivity) tau S(T_reflected) + (1 - tau) S(T_air)
-
-with tau the transmission of the air. The weights add up to one, so a correction of temperatures does not depend on the
-offset and the scale of S: where a camera hides its constants, the shape of Planck's law in its band will do.
-"""
+"""The measurement formula of thermal cameras, from counts to degrees and back."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -23,10 +14,15 @@ from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.units import celsius_to_kelvin, kelvin_to_celsius
 from thermoxels_ns.radiometry.conditions import Conditions, check_between
-from thermoxels_ns.radiometry.planck_band import LONG_WAVE
 
 _LARGEST_ATTENUATION, _LARGEST_WEIGHT = 1.0, 10.0
 _LARGEST_EXPONENT = 700.0
+FIRST_RADIATION_W_UM4_M2_SR = 1.191042972e8
+"""2 h c^2 (exact constants of the SI, rounded), [W um^4 / (m2 sr)]."""
+SECOND_RADIATION_UM_K = 14387.76877
+"""h c / k (exact constants of the SI, rounded), [um K]."""
+_COLDEST_K, _HOTTEST_K = 50.0, 6000.0
+_STEPS = 8192
 
 Floats = npt.NDArray[np.floating]
 
@@ -99,6 +95,67 @@ class PlanckConstants:
 
 
 @dataclass(frozen=True)
+class PlanckBand:
+    """Planck's law integrated over a band, for cameras that say degrees but not how they got them.
+
+    The curve is tabled: the logarithm of the radiance is nearly a straight line over 1 / T, and the table's straight
+    pieces can be read both ways, so there and back again is exact.
+    """
+
+    shortest_um: float = 7.5
+    """Lower end of the band, [micrometres]."""
+    longest_um: float = 13.0
+    """Upper end of the band, [micrometres]."""
+
+    @cached_property
+    def _table(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """1 / T rising, and the logarithm of the radiance, [W / (m2 sr)]."""
+        inverse_k = np.linspace(1.0 / _HOTTEST_K, 1.0 / _COLDEST_K, _STEPS)
+        nodes, weights = np.polynomial.legendre.leggauss(48)
+        half = 0.5 * (self.longest_um - self.shortest_um)
+        wavelengths = self.shortest_um + half * (nodes + 1.0)
+        spectral = FIRST_RADIATION_W_UM4_M2_SR / wavelengths**5
+        radiance = np.zeros(_STEPS)
+        for wavelength, strength in zip(wavelengths, half * weights * spectral):
+            radiance += strength / np.expm1(SECOND_RADIATION_UM_K / wavelength * inverse_k)
+        return inverse_k, np.log(radiance)
+
+    def signal(self, temperature_k: npt.ArrayLike) -> Floats:
+        """Radiance of a black body in the band, [W / (m2 sr)].
+
+        Args:
+            temperature_k: Any shape, [K], from 50 to 6000.
+
+        Returns:
+            Same shape, float64.
+
+        >>> round(float(PlanckBand().signal(300.0)), 2)
+        51.48
+        """
+        inverse_k, logarithm = self._table
+        return np.exp(np.interp(1.0 / np.asarray(temperature_k, dtype=np.float64), inverse_k, logarithm))
+
+    def temperature_k(self, signal: npt.ArrayLike) -> Floats:
+        """Temperature of a black body with this radiance, [K]; NaN where it is below that of 50 K or not above 0.
+
+        Args:
+            signal: Radiance, [W / (m2 sr)], any shape.
+
+        Returns:
+            Same shape, float64.
+        """
+        inverse_k, logarithm = self._table
+        radiance = np.asarray(signal, dtype=np.float64)
+        known = radiance >= np.exp(logarithm[-1])
+        falling = np.log(np.where(known, radiance, 1.0))
+        return np.where(known, 1.0 / np.interp(falling, logarithm[::-1], inverse_k[::-1]), np.nan)
+
+
+LONG_WAVE = PlanckBand()
+"""7.5 to 13 micrometres, the band of microbolometer cameras."""
+
+
+@dataclass(frozen=True)
 class AirConstants:
     """Transmission of humid air in the sensor's band; the defaults are those that FLIR's files of all cameras hold."""
 
@@ -144,7 +201,17 @@ class AirConstants:
 
 @dataclass(frozen=True)
 class RadiometricModel:
-    """A sensor, the air in front of it, and the conditions of a measurement."""
+    """A sensor, the air in front of it, and the conditions of a measurement.
+
+    A sensor's signal for a black body of temperature T is the Planck curve of its calibration,
+    ``S(T) = R1 / (R2 (exp(B / T) - F)) - O``. In front of a real object it sees (FLIR's measurement formula, printed in
+    the manuals of its cameras; Minkina and Dudzik, Infrared Thermography, 2009, equation 2.18)
+
+        S_total = emissivity tau S(T_object) + (1 - emissivity) tau S(T_reflected) + (1 - tau) S(T_air)
+
+    with tau the transmission of the air. The weights add up to one, so a correction of temperatures does not depend on
+    the offset and the scale of S: where a camera hides its constants, the shape of Planck's law in its band will do.
+    """
 
     conditions: Conditions
     sensor: SensorCurve = LONG_WAVE

@@ -1,10 +1,10 @@
-"""Thermal files to degrees Celsius: one file in, one float32 array out, NaN where the camera measured nothing."""
+"""Thermal files to degrees Celsius, NaN where the camera measured nothing."""
 
 from __future__ import annotations
 
 import csv
 import struct
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,14 +15,17 @@ from PIL import Image
 
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.radiometry.decoders import quiet_decoders
+from thermoxels_ns.radiometry.decoders import check_thermal_size, errors_name
 from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
-from thermoxels_ns.radiometry.image_size import check_thermal_size
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 THERMAL_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".csv")
 """File types that `read_thermal_file` knows."""
 
+_LONGEST_LINE = 2**20
+"""More characters in a line are no row of a thermal image: 8192 numbers of 30 characters are a quarter of it."""
+_EXPECTED = "a readable thermal file"
+_REMEDY = "The file is damaged or not what its suffix says; copy it again or remove its frame."
 _UNIT_REMEDY = (
     "Give temperature_bounds.json (absolute_min_temperature, absolute_max_temperature) or, in transforms.json, "
     '"thermal_unit": {"celsius_per_count": ..., "celsius_offset": ...}.'
@@ -82,13 +85,7 @@ class PixelReport:
     """Valid by themselves, but stuck at one value over the whole scene."""
 
     def __add__(self, other: PixelReport) -> PixelReport:
-        return PixelReport(
-            self.pixels + other.pixels,
-            self.nan + other.nan,
-            self.saturated + other.saturated,
-            self.out_of_range + other.out_of_range,
-            self.dead + other.dead,
-        )
+        return PixelReport(*map(sum, zip(astuple(self), astuple(other))))
 
     @property
     def masked(self) -> int:
@@ -122,13 +119,6 @@ class _RawPixels:
     """Whether they are degrees whatever the unit says."""
 
 
-def read_temperature_c(
-    path: Path, unit: ThermalUnit, valid_range_c: tuple[float, float] = (-100.0, 2000.0)
-) -> npt.NDArray[np.float32]:
-    """Read a thermal file as `read_thermal_file` does and return only the temperatures, shape (height, width)."""
-    return read_thermal_file(path, unit, valid_range_c).temperature_c
-
-
 def read_thermal_file(
     path: Path,
     unit: ThermalUnit,
@@ -155,13 +145,8 @@ def read_thermal_file(
         ThermalFileError: The file is missing, damaged, a colour picture, or its counts have no unit.
     """
     suffix = (suffix or path.suffix).lower()
-    try:
-        with quiet_decoders():
-            raw = _read_raw(path, suffix)
-    except ThermalFileError:
-        raise
-    except Exception as problem:  # decoders raise OSError, SyntaxError, ValueError, struct.error, EOFError, ...
-        raise _damaged(path, problem) from problem
+    with errors_name(path, _EXPECTED, _REMEDY, ThermalFileError):
+        raw = _read_raw(path, suffix)
     if raw.values.ndim != 2 or 0 in raw.values.shape:
         raise ThermalFileError(
             str(path),
@@ -194,16 +179,33 @@ def _to_celsius(
             got=f"{values.dtype} counts and the unit '{unit.kind}'",
             remedy=_UNIT_REMEDY,
         )
-    nan = ~np.isfinite(celsius)
     if raw.no_data is not None:
-        nan |= raw.no_data
-    saturated &= ~nan
-    low = max(valid_range_c[0], -ZERO_CELSIUS_K)
+        celsius[raw.no_data] = np.nan
+    saturated &= np.isfinite(celsius)
+    return masked_image(celsius, (max(valid_range_c[0], -ZERO_CELSIUS_K), valid_range_c[1]), saturated)
+
+
+def masked_image(
+    temperature_c: npt.NDArray[np.floating],
+    valid_range_c: tuple[float, float],
+    saturated: npt.NDArray[np.bool_] | None = None,
+) -> ThermalImage:
+    """Mask temperatures that are none and count them.
+
+    Args:
+        temperature_c: Shape (height, width), [degrees C].
+        valid_range_c: Temperatures outside are masked, [degrees C].
+        saturated: Pixels beyond the sensor's calibration, same shape; None: none.
+    """
+    if saturated is None:
+        saturated = np.zeros(temperature_c.shape, dtype=bool)
+    nan = ~np.isfinite(temperature_c) & ~saturated
     with np.errstate(invalid="ignore"):
-        outside = ((celsius < low) | (celsius > valid_range_c[1])) & ~nan & ~saturated
-    celsius[nan | saturated | outside] = np.nan
-    report = PixelReport(values.size, int(nan.sum()), int(saturated.sum()), int(outside.sum()))
-    return ThermalImage(celsius.astype(np.float32), report)
+        inside = (temperature_c >= valid_range_c[0]) & (temperature_c <= valid_range_c[1])
+    outside = ~inside & ~nan & ~saturated
+    masked = np.where(nan | saturated | outside, np.nan, temperature_c).astype(np.float32)
+    report = PixelReport(masked.size, int(nan.sum()), int(saturated.sum()), int(outside.sum()))
+    return ThermalImage(masked, report)
 
 
 def _read_raw(path: Path, suffix: str) -> _RawPixels:
@@ -240,6 +242,7 @@ def _read_raw(path: Path, suffix: str) -> _RawPixels:
 
 def _read_csv(path: Path) -> npt.NDArray[np.float64]:
     """Read rows of numbers split by commas or semicolons; empty cells and nan, NA, null, - are NaN."""
+    _check_table_size(path)
     text = path.read_text(encoding="utf-8-sig")
     semicolons = ";" in text
     rows = []
@@ -253,6 +256,22 @@ def _read_csv(path: Path) -> npt.NDArray[np.float64]:
     if not rows or len({len(row) for row in rows}) != 1:
         raise _damaged(path, f"rows of lengths {sorted({len(row) for row in rows})}")
     return np.array(rows, dtype=np.float64)
+
+
+def _check_table_size(path: Path) -> None:
+    """Refuse a table larger than a thermal image, line by line."""
+    width = height = 0
+    with path.open(encoding="latin-1") as stream:  # counts alone, whatever the file's own encoding
+        while line := stream.readline(_LONGEST_LINE):
+            width, height = max(width, 1 + max(line.count(","), line.count(";"))), height + 1
+            if len(line) == _LONGEST_LINE:
+                raise ThermalFileError(
+                    str(path),
+                    expected=f"a table with lines below {_LONGEST_LINE} characters",
+                    got=f"a longer one, line {height}",
+                    remedy="The file is damaged or no table; write one row of the image per line.",
+                )
+            check_thermal_size(path, width, height)
 
 
 def _number(cell: str) -> float:
@@ -327,9 +346,4 @@ def _one_channel(path: Path, pixels: npt.NDArray[Any], has_alpha: bool) -> _RawP
 
 
 def _damaged(path: Path, problem: object) -> ThermalFileError:
-    return ThermalFileError(
-        str(path),
-        expected="a readable thermal file",
-        got=str(problem) or type(problem).__name__,
-        remedy="The file is damaged or not what its suffix says; copy it again or remove its frame.",
-    )
+    return ThermalFileError(str(path), expected=_EXPECTED, got=problem, remedy=_REMEDY)

@@ -9,14 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.frames import CaptureFrame
-from thermoxels_ns.capture.measurement import measurement_rows
+from thermoxels_ns.capture.frames import CaptureFrame, measurement_rows
 from thermoxels_ns.capture.pairs import Pair
-from thermoxels_ns.capture.rig.summary import turn_deg, turn_error_deg, why_turn_is_unsure, with_error
+from thermoxels_ns.capture.rig.explanation import turn_deg, turn_error_deg, why_turn_is_unsure, with_error
+from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
 from thermoxels_ns.capture.sfm.gravity import Up
 from thermoxels_ns.capture.sfm.metric_scale import MetricScale
 from thermoxels_ns.capture.sfm.model import SfmModel
-from thermoxels_ns.capture.stage_types import CameraModel, DriftEstimate, RigEstimate
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.radiometry.dead_pixels import MIN_FRAMES
 from thermoxels_ns.reports.charts import bars, histogram
 from thermoxels_ns.reports.page import Gallery, Page, Picture, Section, Table
@@ -206,13 +206,13 @@ def _cameras(page: CapturePage) -> Section:
     return Section("Cameras", tables=(cameras, _rows(extra)))
 
 
-def _principal_point(camera: CameraModel, errors: Mapping[str, float]) -> str:
+def _principal_point(camera: Camera, errors: Mapping[str, float]) -> str:
     return ", ".join(
         with_error(value, errors.get(name, math.nan), 1) for name, value in (("cx", camera.cx), ("cy", camera.cy))
     )
 
 
-def _angle(camera: CameraModel) -> float:
+def _angle(camera: Camera) -> float:
     return float(2 * np.degrees(np.arctan(camera.width / (2 * camera.fl_x))))
 
 

@@ -12,8 +12,9 @@ from PIL import Image
 from rich.progress import track
 
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.checks import read_json_object, remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.synthetic.catalogue import SCENE_NAMES, make_scene
 from thermoxels_ns.synthetic.raycast import RenderedView, render_view, visible_surface_points
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from tests.support.known_rig import KnownCapture, known_capture, painted_sky
-from thermoxels_ns.capture.rig.image_pyramid import prepare_frames
+from thermoxels_ns.capture.rig.images import prepare_frames
 from thermoxels_ns.capture.rig.parameters import RigModel, prior_sigmas
 from thermoxels_ns.capture.rig.search import estimate_rig
-from thermoxels_ns.capture.stage_types import CameraModel, RigFrame, RigStart
+from thermoxels_ns.capture.rig_types import RigFrame, RigStart
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 
 
@@ -55,7 +56,7 @@ def test_dark_for_warm_is_the_same_as_light_for_warm(sky: KnownCapture) -> None:
 
 def test_without_a_ruler_points_fall_in_place_and_the_error_says_what_is_unsure(house: KnownCapture) -> None:
     angle = 2 * np.degrees(np.arctan(0.5 * house.thermal.width / (0.94 * house.thermal.fl_x)))
-    start = RigStart(CameraModel.from_field_of_view(house.thermal.width, house.thermal.height, angle))
+    start = RigStart(Camera.from_field_of_view(house.thermal.width, house.thermal.height, angle))
     found = estimate_rig(house.frames, house.visible, start)
     assert found.determined, found.explanation
     assert house.projection_error_px(found) < 0.6
@@ -154,7 +155,7 @@ def test_errors_name_the_frame_and_what_to_do(sky: KnownCapture, tmp_path: Path)
 
 
 def test_camera_rays_undo_project() -> None:
-    camera = CameraModel(640, 480, 500.0, 510.0, 322.0, 236.0, k1=-0.12, k2=0.03, p1=0.001, p2=-0.002)
+    camera = Camera(640, 480, 500.0, 510.0, 322.0, 236.0, k1=-0.12, k2=0.03, p1=0.001, p2=-0.002)
     pixels = np.random.default_rng(0).uniform((0, 0), (640, 480), (200, 2))
     assert np.allclose(camera.project(3.0 * camera.rays(pixels)), pixels, atol=1e-6)
     assert np.isnan(camera.project([[0.0, 0.0, -1.0]])).all()

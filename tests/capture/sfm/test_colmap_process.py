@@ -16,12 +16,10 @@ import pytest
 
 from tests.support.camera_card import counts, photograph
 from tests.support.posed_model import ring_model
-from thermoxels_ns.capture.run import run_capture
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm import disk_space
-from thermoxels_ns.capture.sfm.colmap_process import run_apart
-from thermoxels_ns.capture.sfm.disk_space import check_free_space, disk_of
+from thermoxels_ns.capture.sfm.colmap_process import check_free_space, disk_of, run_in_process
 from thermoxels_ns.capture.sfm.poses import add_points
+from thermoxels_ns.commands.capture import capture_folder
 from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
 
 FULL = shutil.disk_usage(os.sep)._replace(free=4096)
@@ -78,7 +76,7 @@ def work(tmp_path, monkeypatch):
 
 def test_it_is_another_process_and_says_how_far_it_is(tmp_path, work):
     said = []
-    run_apart(work.count_to, (3, tmp_path), tmp_path, said.append)
+    run_in_process(work.count_to, (3, tmp_path), tmp_path, said.append)
     assert said == ["0 ä", "1 ä", "2 ä"]
     assert int((tmp_path / "counted").read_text()) != os.getpid()
 
@@ -86,20 +84,20 @@ def test_it_is_another_process_and_says_how_far_it_is(tmp_path, work):
 def test_what_it_returns_arrives_and_its_blas_has_one_thread(work, tmp_path, monkeypatch):
     """Sums by COLMAP's own BLAS depend on its threads."""
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
-    assert run_apart(work.threads_of_blas, (), tmp_path) == ("1", ["ä"] * 100_000)
-    assert run_apart(work.count_to, (0, tmp_path), tmp_path) is None
+    assert run_in_process(work.threads_of_blas, (), tmp_path) == ("1", ["ä"] * 100_000)
+    assert run_in_process(work.count_to, (0, tmp_path), tmp_path) is None
 
 
 def test_a_part_of_an_answer_is_none(work, tmp_path):
     with pytest.raises(ThermoxelsError, match="COLMAP: expected to end"):
-        run_apart(work.end_within_its_answer, (), tmp_path)
+        run_in_process(work.end_within_its_answer, (), tmp_path)
 
 
 @pytest.mark.parametrize("problem", [SceneError("frame 3: no."), OSError(28, "No space left on device", "pairs.txt")])
 def test_errors_arrive_as_they_were_raised(tmp_path, work, problem):
     said = []
     with pytest.raises(type(problem)) as raised:
-        run_apart(work.raise_one, (problem,), tmp_path, said.append)
+        run_in_process(work.raise_one, (problem,), tmp_path, said.append)
     assert type(raised.value) is type(problem) and str(raised.value) == str(problem)
     assert said == ["before"]
 
@@ -107,18 +105,18 @@ def test_errors_arrive_as_they_were_raised(tmp_path, work, problem):
 def test_an_abort_is_an_error_with_its_reason(tmp_path, work):
     words = "E1 thread.cc] SQLite error: disk I/O error\n*** Check failure stack trace: ***\n    @ 0x7f\n"
     with pytest.raises(ThermoxelsError, match=r"COLMAP: expected to end.*SQLite error: disk I/O error.*--from-stage"):
-        run_apart(work.abort_as_colmap, (words,), tmp_path)
+        run_in_process(work.abort_as_colmap, (words,), tmp_path)
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
 def test_a_lack_of_memory_is_named(tmp_path, work):
     with pytest.raises(ThermoxelsError, match=r"killed.*memory runs out.*--max-features"):
-        run_apart(work.killed, (), tmp_path)
+        run_in_process(work.killed, (), tmp_path)
 
 
 def test_a_mistake_of_ours_is_not_silent(tmp_path, work):
     with pytest.raises(ThermoxelsError, match=r"exit status 1 \(.*ZeroDivisionError"):
-        run_apart(work.raise_one, (ZeroDivisionError("zero"),), tmp_path)
+        run_in_process(work.raise_one, (ZeroDivisionError("zero"),), tmp_path)
 
 
 @pytest.mark.parametrize("says_so", [True, False])
@@ -126,9 +124,9 @@ def test_a_full_disk_is_named_whatever_colmap_says(tmp_path, work, monkeypatch, 
     """The disk may have room again when it is looked at: then COLMAP's words tell."""
     words = "[database_sqlite.cc:1262] SQLite error: database or disk is full\n" if says_so else "stack trace\n"
     if not says_so:
-        monkeypatch.setattr(disk_space.shutil, "disk_usage", lambda _: FULL)
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: FULL)
     with pytest.raises(OutputError, match=r"free space for features, matches and poses.*finished stages are kept") as e:
-        run_apart(work.abort_as_colmap, (words,), tmp_path)
+        run_in_process(work.abort_as_colmap, (words,), tmp_path)
     assert str(e.value).startswith(f"disk at {disk_of(tmp_path)}: ")
 
 
@@ -138,13 +136,13 @@ def test_a_disk_that_fills_during_a_capture_is_named(tmp_path, monkeypatch):
         photograph(tmp_path / "card" / f"{name}-visible.jpg")
         counts(tmp_path / "card" / f"{name}-radiometric.tiff")
     usage = [shutil.disk_usage(tmp_path), FULL]
-    monkeypatch.setattr(disk_space.shutil, "disk_usage", lambda _: usage.pop(0) if len(usage) > 1 else usage[0])
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage.pop(0) if len(usage) > 1 else usage[0])
     monkeypatch.setattr("thermoxels_ns.capture.sfm.feature_matching._find_and_match", _abort_in_the_middle)
     with pytest.raises(OutputError, match=rf"disk at {disk_of(tmp_path)}: .*got 0 MB.*\.capture"):
-        run_capture(tmp_path / "card", tmp_path / "scene", CaptureSettings())
+        capture_folder(tmp_path / "card", tmp_path / "scene", CaptureSettings())
     monkeypatch.undo()
     with pytest.raises(SceneError, match="photographs that fit together"):  # grey ones: it got past the features
-        run_capture(tmp_path / "card", tmp_path / "scene", CaptureSettings())
+        capture_folder(tmp_path / "card", tmp_path / "scene", CaptureSettings())
 
 
 def test_a_mapping_that_aborts_is_an_error_and_the_capture_goes_on_behind_its_features(tmp_path, monkeypatch):
@@ -154,11 +152,11 @@ def test_a_mapping_that_aborts_is_an_error_and_the_capture_goes_on_behind_its_fe
     said: list[str] = []
     monkeypatch.setattr("thermoxels_ns.capture.sfm.mapping._map", _abort_in_the_middle)
     with pytest.raises(ThermoxelsError, match=r"COLMAP: expected to end, got exit status.*--from-stage poses"):
-        run_capture(tmp_path / "card", tmp_path / "scene", CaptureSettings(), said.append)
+        capture_folder(tmp_path / "card", tmp_path / "scene", CaptureSettings(), said.append)
     assert said[-1].startswith("matches: 3 of 3")
     monkeypatch.undo()
     with pytest.raises(SceneError, match="photographs that fit together"):  # grey ones: it got past the mapping
-        run_capture(tmp_path / "card", tmp_path / "scene", CaptureSettings())
+        capture_folder(tmp_path / "card", tmp_path / "scene", CaptureSettings())
 
 
 def test_points_for_given_poses_that_abort_are_an_error(tmp_path, monkeypatch):
@@ -188,8 +186,8 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from capture_apart import wait_for_ever
-from thermoxels_ns.capture.sfm.colmap_process import run_apart
-run_apart(wait_for_ever, (Path(sys.argv[1]),), Path(sys.argv[1]), lambda line: print(line, flush=True))
+from thermoxels_ns.capture.sfm.colmap_process import run_in_process
+run_in_process(wait_for_ever, (Path(sys.argv[1]),), Path(sys.argv[1]), lambda line: print(line, flush=True))
 """
 
 

@@ -9,9 +9,9 @@ import pytest
 from PIL import Image
 
 from tests.support.posed_model import CAMERA, ring_model
-from thermoxels_ns.capture.sfm.colmap_log import quiet_colmap
 from thermoxels_ns.capture.sfm.colmap_model import camera_of_colmap, model_of_colmap, read_colmap
-from thermoxels_ns.capture.sfm.given_poses import fitted_to_photographs, in_order, read_given_poses
+from thermoxels_ns.capture.sfm.colmap_process import quiet_colmap
+from thermoxels_ns.capture.sfm.given_poses import fitted_to_photographs, read_given_poses, reordered
 from thermoxels_ns.capture.sfm.poses import Poses, add_points
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 
@@ -213,7 +213,7 @@ def test_a_lens_that_ours_cannot_be_is_refused(tmp_path):
 
 
 def test_sorting_frames_keeps_sightings_with_their_frames():
-    turned = in_order(MODEL, lambda name: -int(name[1:]))
+    turned = reordered(MODEL, lambda name: -int(name[1:]))
     assert turned.frames == MODEL.frames[::-1]
     assert turned.sighting_error_px().max() == pytest.approx(MODEL.sighting_error_px().max())
     for index, name in enumerate(turned.frames):

@@ -104,3 +104,21 @@ def test_levelling_turns_up_to_z_and_ahead_to_y():
 def test_levelling_when_the_cameras_look_straight_down():
     rotation = level_rotation([0, 0, 1], [0, 0, -1])
     assert rotation @ [0, 0, 1] == pytest.approx([0, 0, 1])
+
+
+def test_cameras_that_look_straight_down_do_not_say_that_up_is_where_they_look_from() -> None:
+    """Their sides are level however they turn; the tops of their pictures all point north, which is what they show."""
+    turns = np.linspace(-20.0, 20.0, 20)
+    poses = np.tile(np.eye(4), (len(turns), 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("z", turns[:, None], degrees=True).as_matrix()
+    up = find_up(poses, [None] * len(poses), [1] * len(poses))
+    assert "mean of the photographs' upward directions" in up.source
+    assert up.direction == pytest.approx([0.0, 1.0, 0.0], abs=0.05)
+
+
+def test_photographs_whose_levels_are_wrong_are_outvoted() -> None:
+    """Eight say the same; three that say otherwise do not move it at all."""
+    level = np.array([look_at((0.0, 0.0, 0.0), (np.cos(a), np.sin(a), 0.0)) for a in np.linspace(0.0, 3.0, 11)])
+    angles = [(0.0, 0.0)] * 8 + [(0.0, 60.0), (0.0, 70.0), (50.0, 0.0)]
+    up = find_up(level, angles, [1] * 11)
+    assert up.direction == pytest.approx([0.0, 0.0, 1.0], abs=1e-9)

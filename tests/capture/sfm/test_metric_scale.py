@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from thermoxels_ns.capture.sfm.metric_scale import (
     scale_from_gps,
     scale_from_markers,
 )
+from thermoxels_ns.capture.sfm.model import SfmModel
 from thermoxels_ns.core.errors import ThermoxelsError
 
 UNIT_M = 0.37
@@ -110,25 +113,28 @@ def test_a_wrong_length_is_refused(measured, words):
         scale_from_distance(ring_model(), measured, {})
 
 
-@pytest.fixture
-def marker_photographs(tmp_path):
-    """Photographs of a wall with an ArUco marker of 0.4 m."""
-    model = ring_model(count=4, unit_m=UNIT_M)
+def wall_photographs(model: SfmModel, places: list[float], folder: Path, unit_m: float = 1.0) -> dict[str, Path]:
+    """Photographs of a wall with an ArUco marker of 0.4 m, whose middle is at x as given in each of them."""
     marker = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 240)
     texture = cv2.copyMakeBorder(marker, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
+    pixel = np.stack(np.meshgrid(np.arange(640) + 0.5, np.arange(480) + 0.5), -1).reshape(-1, 2)
     files = {}
-    for index, name in enumerate(model.frames):
-        pixel = np.stack(np.meshgrid(np.arange(640) + 0.5, np.arange(480) + 0.5), -1).reshape(-1, 2)
-        pose = model.camera_to_world[index]
+    for name, pose, place in zip(model.frames, model.camera_to_world, places):
         rays = CAMERA.rays(pixel) * (1, -1, -1) @ pose[:3, :3].T
-        centre = pose[:3, 3] * UNIT_M
+        centre = pose[:3, 3] * unit_m
         hit = centre + rays * ((1.0 - centre[1]) / rays[:, 1])[:, None]
-        x = ((hit[:, 0] + 0.3) / 0.6 * 360 - 0.5).astype(np.float32).reshape(480, 640)
+        x = ((hit[:, 0] - place + 0.3) / 0.6 * 360 - 0.5).astype(np.float32).reshape(480, 640)
         y = ((1.3 - hit[:, 2]) / 0.6 * 360 - 0.5).astype(np.float32).reshape(480, 640)
         seen = cv2.remap(texture, x, y, cv2.INTER_AREA, borderMode=cv2.BORDER_CONSTANT, borderValue=(128,))
-        files[name] = tmp_path / f"{name}.png"
+        files[name] = folder / f"{name}.png"
         Image.fromarray(seen).save(files[name])
-    return model, files
+    return files
+
+
+@pytest.fixture
+def marker_photographs(tmp_path):
+    model = ring_model(count=4, unit_m=UNIT_M)
+    return model, wall_photographs(model, [0.0] * 4, tmp_path, UNIT_M)
 
 
 def test_a_marker_gives_the_scale(marker_photographs):
@@ -146,3 +152,41 @@ def test_photographs_without_a_marker_say_so(marker_photographs, tmp_path):
     scale, why = scale_from_markers(model, dict.fromkeys(files, tmp_path / "grey.png"), 0.4)
     assert scale is None
     assert "no photograph shows" in why
+
+
+def test_places_that_are_a_mirror_image_of_the_path_are_no_scale() -> None:
+    """No turn and no stretching makes a left hand a right one."""
+    metres = np.random.default_rng(0).uniform(-30.0, 30.0, (40, 3))
+    fixes = [GpsFix(48.0 + n / 111_200.6, 11.0 + e / 74_627.7, 500.0 + u) for e, n, u in metres]
+    found, why = scale_from_gps(metres * 2.0, fixes)
+    assert found is not None and found.metres_per_unit == pytest.approx(0.5, rel=1e-3), why
+    mirrored, _ = scale_from_gps(metres * (-2.0, 2.0, 2.0), fixes)
+    assert mirrored is None or mirrored.metres_per_unit < 0.8 * 0.5
+
+
+@pytest.mark.parametrize(("places", "believed"), [([0.0] * 4, True), ([-0.3, 0.3, -0.3, 0.3], False)])
+def test_a_marker_that_moved_between_photographs_is_no_ruler(tmp_path, places, believed) -> None:
+    model = ring_model(count=4)
+    found, why = scale_from_markers(model, wall_photographs(model, places, tmp_path), 0.4)
+    assert (found is not None) == believed
+    assert believed or "[7] are in one photograph only, or moved between photographs" in why
+
+
+def test_a_few_points_far_from_the_wall_do_not_bend_it() -> None:
+    """One in eight points around the ends stands at half the depth."""
+    model = ring_model()
+    ends = np.array([[-0.8, 1.0, 0.6], [0.9, 1.0, 1.4]])
+    pixels = CAMERA.project(model.in_camera(3, ends))
+    measured = MeasuredDistance("f3", tuple(pixels[0]), tuple(pixels[1]), float(np.linalg.norm(ends[1] - ends[0])))
+    centre = model.camera_to_world[3, :3, 3]
+    points = model.points.copy()
+    points[::8] = centre + 0.5 * (points[::8] - centre)  # where the photograph shows them, and nearer
+    found = scale_from_distance(
+        SfmModel(
+            *(model.frames, model.camera, model.camera_to_world, points, model.colours, model.point_error_px),
+            *(model.sighting_frame, model.sighting_point, model.sighting_pixel),
+        ),
+        measured,
+        {},
+    )
+    assert found.metres_per_unit == pytest.approx(1.0, rel=0.01)

@@ -1,4 +1,4 @@
-"""The coarse search for a rig: direction, roll and focal length over the whole range that the start allows."""
+"""Coarse search for a rig over all directions, rolls and focal lengths."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy.typing as npt
 from scipy import fft
 
 from thermoxels_ns.capture.rig.score import EdgePoints, RigScore
+from thermoxels_ns.capture.rig_types import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 _Spectra = tuple[npt.NDArray, ...]
 
 _REACH_SIGMAS = 2.5
@@ -25,7 +25,7 @@ _CHANCE_DRAWS = 3
 
 
 @dataclass(frozen=True, eq=False)
-class RoughRig:
+class CoarseRig:
     """One place where the coarse search found agreement."""
 
     change: FloatArray
@@ -33,7 +33,7 @@ class RoughRig:
     score: float
 
 
-class RoughSearch:
+class CoarseSearch:
     """Compares all shifts of the photographs' edges at once, for a range of focal lengths and rolls.
 
     A small turn of the thermal camera shifts its image; so for one focal length and roll the scores of all turns are
@@ -45,7 +45,7 @@ class RoughSearch:
 
         Args:
             score: Score at the coarsest size.
-            sigmas: Standard deviations of the ten changes (`rig_parameters.prior_sigmas`); they set the range.
+            sigmas: Standard deviations of the ten changes (`parameters.prior_sigmas`); they set the range.
             median_depth: Of the scene points, to tell how far a shift of the camera moves its image [world units].
         """
         camera = score.rig.camera
@@ -62,15 +62,15 @@ class RoughSearch:
         self._focals = _steps(_REACH_SIGMAS * float(sigmas[6]), _STEP_PX / (0.5 * camera.width))
         self._rolls = _steps(_REACH_SIGMAS * float(sigmas[2]), _STEP_PX / corner_px)
 
-    def best(self) -> list[RoughRig]:
+    def best(self) -> list[CoarseRig]:
         """Find the best few places that differ, best first."""
         found = self._found([self._spectra(edges.field, edges.weight) for edges in self._thermal])
-        found.sort(key=lambda rough: -rough.score)
-        kept: list[RoughRig] = []
-        for rough in found:
-            apart = [np.abs((rough.change - other.change)[:2]).max() * self._rig.camera.fl_x for other in kept]
+        found.sort(key=lambda rig: -rig.score)
+        kept: list[CoarseRig] = []
+        for rig in found:
+            apart = [np.abs((rig.change - other.change)[:2]).max() * self._rig.camera.fl_x for other in kept]
             if not apart or min(apart) >= _APART_PX:
-                kept.append(rough)
+                kept.append(rig)
             if len(kept) == _CANDIDATES:
                 break
         return kept
@@ -89,7 +89,7 @@ class RoughSearch:
                 phases = np.exp(2j * np.pi * draw.random(edges.field.shape))
                 noise = np.asarray(fft.ifft2(np.asarray(fft.fft2(edges.field)) * phases))
                 spectra.append(self._spectra(noise, edges.weight))
-            highest = max(highest, *(rough.score for rough in self._found(spectra)))
+            highest = max(highest, *(rig.score for rig in self._found(spectra)))
         return highest
 
     def _spectra(self, field: npt.NDArray, weight: npt.NDArray) -> _Spectra:
@@ -98,8 +98,8 @@ class RoughSearch:
         planes = weight, (np.abs(field) ** 2 * weight).astype(np.float32)
         return (np.asarray(weighted), *(np.asarray(fft.rfft2(plane, s=self._shape)) for plane in planes))
 
-    def _found(self, spectra: Sequence[_Spectra]) -> list[RoughRig]:
-        found: list[RoughRig] = []
+    def _found(self, spectra: Sequence[_Spectra]) -> list[CoarseRig]:
+        found: list[CoarseRig] = []
         for log_focal in self._focals:
             for roll in self._rolls:
                 change = np.zeros(10)
@@ -139,7 +139,7 @@ class RoughSearch:
         )
         return real + np.complex64(1j) * imaginary, power, count
 
-    def _best_shifts(self, surface: FloatArray, change: FloatArray) -> list[RoughRig]:
+    def _best_shifts(self, surface: FloatArray, change: FloatArray) -> list[CoarseRig]:
         """The highest places of one surface within reach, as turns of the camera."""
         across, down = (int(np.ceil(reach)) for reach in self._reach_px)
         window = np.roll(surface, (down, across), axis=(0, 1))[: 2 * down + 1, : 2 * across + 1]
@@ -149,7 +149,7 @@ class RoughSearch:
             row, column = divmod(int(place), window.shape[1])
             shifted = change.copy()
             shifted[:2] = -(row - down) / focal[1], (column - across) / focal[0]
-            found.append(RoughRig(shifted, float(window[row, column])))
+            found.append(CoarseRig(shifted, float(window[row, column])))
         return found
 
 

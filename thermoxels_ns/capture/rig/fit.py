@@ -1,4 +1,4 @@
-"""Climb the rig score from a start value, held by what was known before, and say how well the top is determined."""
+"""Maximises a score of rigs under a prior, and finds the covariance of the maximum."""
 
 from __future__ import annotations
 
@@ -6,20 +6,18 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import minimize
 
 from thermoxels_ns.capture.rig.parameters import RigModel
-
-FloatArray = npt.NDArray[np.float64]
+from thermoxels_ns.capture.rig_types import FloatArray
 
 _DIFFERENCE_PX = 0.05
 _MOST_STEPS = 20
 _GRADIENT_TOLERANCE = 3e-2
 
 
-class Climbed(Protocol):
-    """What can be climbed: a score of rigs that knows its derivative."""
+class RigObjective(Protocol):
+    """A score of rigs that knows its derivative."""
 
     rig: RigModel
     """What changes count from."""
@@ -29,13 +27,13 @@ class Climbed(Protocol):
         ...
 
     def slopes(self, change: FloatArray) -> tuple[float, FloatArray]:
-        """What is climbed, and its derivative split by the parts that it comes from, shape (parts, 10)."""
+        """What is maximised, and its derivative split by the parts that it comes from, shape (parts, 10)."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class RigFit:
-    """A top of the score."""
+    """A maximum of the score."""
 
     change: FloatArray
     """The ten changes."""
@@ -44,20 +42,21 @@ class RigFit:
     """Score times its weight less half the squared distance from the start in standard deviations."""
 
 
-class RigClimber:
+class RigMaximizer:
     """Maximises weight * score - 0.5 * sum((change / sigma)^2) over the changes whose sigma is above 0.
 
     The weight makes the score's curvature H the information that it carries: with G the scatter of the frames'
-    contributions to the slope, the covariance of the top alone is H^-1 G H^-1 (the sandwich of M-estimators, Huber
+    contributions to the slope, the covariance of the maximum alone is H^-1 G H^-1 (the sandwich of M-estimators, Huber
     1967, frames taken as independent), which (weight * H)^-1 equals if weight * G = H. The median over H's principal
     directions is taken, because those that the images hardly determine have no reliable ratio.
 
-    Parts that show the same things err alike: where `alike` of them do, the scatter counts that many times.
+    Errors of parts that show the same things are correlated: where `correlated` of them are, their scatter counts that
+    many times.
     """
 
-    def __init__(self, score: Climbed, sigmas: FloatArray, median_depth: float, alike: float = 1.0) -> None:
-        """Take a score, the prior standard deviations, the scene's median depth and how many parts err alike."""
-        self._alike = alike
+    def __init__(self, score: RigObjective, sigmas: FloatArray, median_depth: float, correlated: float = 1.0) -> None:
+        """Take a score, the prior standard deviations, the scene's median depth and how many parts are correlated."""
+        self._correlated = correlated
         self._score = score
         self._sigmas = sigmas
         self._free = np.flatnonzero(sigmas > 0.0)
@@ -67,8 +66,8 @@ class RigClimber:
         per_pixel = np.array([1 / focal] * 3 + [median_depth / focal] * 3 + [1 / reach] + [1.0] * 2 + [0.2])
         self._step = _DIFFERENCE_PX * per_pixel[self._free] / self._scale
 
-    def climb(self, change: FloatArray) -> RigFit:
-        """Go up from `change`."""
+    def maximize(self, change: FloatArray) -> RigFit:
+        """Maximise from `change` on (BFGS)."""
         z = change[self._free] / self._scale
         weight, information, _ = self._information(z)
         root = np.linalg.cholesky(np.linalg.inv(weight * information + np.eye(len(z))))
@@ -86,7 +85,7 @@ class RigClimber:
         return RigFit(change, self._score.value(change), -float(best.fun))
 
     def covariance(self, change: FloatArray) -> FloatArray:
-        """Covariance of the ten changes at a top, shape (10, 10); 0 for those that are kept fixed."""
+        """Covariance of the ten changes at a maximum, shape (10, 10); 0 for those that are kept fixed."""
         weight, information, scatter = self._information(change[self._free] / self._scale)
         posterior = np.linalg.inv(weight * information + np.eye(len(self._free)))
         spread = posterior @ (weight**2 * scatter + np.eye(len(self._free))) @ posterior
@@ -105,7 +104,7 @@ class RigClimber:
         own = slopes[:, self._free] * self._scale
         total, frames = own.sum(axis=0), len(own)
         centred = own - own.mean(axis=0)
-        scatter: FloatArray = centred.T @ centred * (self._alike * frames / max(frames - 1, 1))
+        scatter: FloatArray = centred.T @ centred * (self._correlated * frames / max(frames - 1, 1))
         curvature: FloatArray = np.empty((len(z), len(z)))
         for number, step in enumerate(self._step):
             moved = z.copy()

@@ -1,19 +1,13 @@
-"""The numbers that a rig is made of, and how the projection of a scene point follows from them.
-
-A rig is a start value and ten small changes p = (rx, ry, rz, tx, ty, tz, log focal, cx, cy, k1):
-x_thermal = Rz Ry Rx R_start x_visible + t_start + t, then the pinhole camera with radial distortion.
-"""
+"""The ten parameters of a rig and the projection that follows from them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from thermoxels_ns.capture.stage_types import CameraModel, RigStart
-
-FloatArray = npt.NDArray[np.float64]
+from thermoxels_ns.capture.rig_types import FloatArray, RigStart
+from thermoxels_ns.core.camera import Camera
 
 PARAMETERS = ("rx", "ry", "rz", "tx", "ty", "tz", "log_focal", "cx", "cy", "k1")
 """Radians, world units, natural logarithm, thermal pixels at full size, and OpenCV's k1."""
@@ -35,9 +29,13 @@ def prior_sigmas(start: RigStart, median_depth: float) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class RigModel:
-    """The start value that the changes are counted from, at some size of the thermal image."""
+    """The start value that the changes are counted from, at some size of the thermal image.
 
-    camera: CameraModel
+    A rig is a start value and ten small changes p = (rx, ry, rz, tx, ty, tz, log focal, cx, cy, k1):
+    x_thermal = Rz Ry Rx R_start x_visible + t_start + t, then the pinhole camera with radial distortion.
+    """
+
+    camera: Camera
     """Thermal camera of the start, resized to the level's pixels."""
     transform: FloatArray
     """Visible to thermal, shape (4, 4), OpenCV axes."""
@@ -49,7 +47,7 @@ class RigModel:
         share = width / self.camera.width * self.pixel_share
         return RigModel(self.camera.resized(width, height), self.transform, share)
 
-    def changed(self, change: FloatArray) -> tuple[CameraModel, FloatArray]:
+    def changed(self, change: FloatArray) -> tuple[Camera, FloatArray]:
         """Thermal camera and transform with the ten changes applied."""
         rotation, _ = _rotation(change[:3])
         transform = self.transform.copy()

@@ -1,11 +1,4 @@
-"""How well small pieces of the thermal images follow the photographs, for the last tenths of a pixel of the rig.
-
-In a window of about three thermal pixels a photograph mostly shows two materials, and so does the thermal image: there
-the temperature is t = a + b x + c y + d p of the photograph's brightness p, seen as blurred as the thermal camera sees
-it. With R2 the share of the temperature's variance about a + b x + c y that d p explains, the likelihood of a rig is
-sum(-n / 2 log(1 - R2)) over the windows. Gains d are free in every window, so warm may be bright or dark; a window
-that shows more than two materials fits badly, and where it is left out it pulls the rig nowhere.
-"""
+"""Likelihood of a rig from small windows of photographs and thermal images."""
 
 from __future__ import annotations
 
@@ -18,8 +11,8 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from thermoxels_ns.capture.rig.parameters import RigModel
+from thermoxels_ns.capture.rig_types import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
 FloatImage = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int64]
 
@@ -110,7 +103,15 @@ class SmoothThermal:
 
 
 class PatchScore:
-    """The log likelihood of rigs, from the windows of all frames."""
+    """The log likelihood of rigs, from the windows of all frames.
+
+    In a window of about three thermal pixels a photograph mostly shows two materials, and so does the thermal image:
+    there the temperature is t = a + b x + c y + d p of the photograph's brightness p, seen as blurred as the thermal
+    camera sees it. With R2 the share of the temperature's variance about a + b x + c y that d p explains, the
+    likelihood of a rig is sum(-n / 2 log(1 - R2)) over the windows. Gains d are free in every window, so warm may be
+    bright or dark; a window that shows more than two materials fits badly, and where it is left out it pulls the rig
+    nowhere.
+    """
 
     def __init__(self, designs: Sequence[PatchDesign], thermal: Sequence[SmoothThermal], rig: RigModel) -> None:
         """Take windows of photographs, thermal images of the same frames and what changes count from."""
@@ -245,9 +246,9 @@ def _contrast(photograph: FloatImage, near: npt.NDArray[np.bool_], plain: FloatA
 
 def _noise(image: FloatArray) -> float:
     """Standard deviation of the noise, from second differences along both axes at once (Immerkaer 1996)."""
-    rough = ndimage.convolve(image, _NOISE_KERNEL, mode="nearest")
-    rough = np.abs(rough[np.isfinite(rough)])
-    return float(np.median(rough)) / _NOISE_TO_MEDIAN if len(rough) else 0.0
+    curved = ndimage.convolve(image, _NOISE_KERNEL, mode="nearest")
+    curved = np.abs(curved[np.isfinite(curved)])
+    return float(np.median(curved)) / _NOISE_TO_MEDIAN if len(curved) else 0.0
 
 
 def _sampled(spline: FloatArray, pixels: FloatArray) -> FloatArray:

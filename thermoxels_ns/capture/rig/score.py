@@ -1,14 +1,4 @@
-"""How well the edges of photographs, carried into the thermal images, agree with the thermal edges.
-
-Every photograph becomes a set of points in front of its camera, where its edges are, each with an edge value a
-(`edge_structure`). The rig says where they fall in the thermal image, whose edge value there is b. The score is
-sum(w Re a* b) / sqrt(sum(w |a|^2) sum(w |b|^2)) over the points of all frames: 1 if all edges agree, 0 by chance.
-
-What is climbed is the sum(w Re a* b) alone, with weights w that fall to 0 at the border of the thermal image and do
-not follow the rig. The points lie only where photographs have edges, so the last factor is no constant of the thermal
-images, and points at the border come and go: with either of them it pays to move points to where b is small, and the
-focal length comes out half a percent too long.
-"""
+"""Score of a rig: how well photographs' edges agree with the thermal edges."""
 
 from __future__ import annotations
 
@@ -19,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.capture.rig.parameters import RigModel
-
-FloatArray = npt.NDArray[np.float64]
+from thermoxels_ns.capture.rig_types import FloatArray
 
 _BORDER_PX = 2.0
 _BORDER_SHARE = 0.05
@@ -66,7 +55,17 @@ class ThermalEdges:
 
 
 class RigScore:
-    """The score of all frames at one size of the thermal images."""
+    """The score of all frames at one size of the thermal images.
+
+    Every photograph becomes a set of points in front of its camera, where its edges are, each with an edge value a
+    (`images`). The rig says where they fall in the thermal image, whose edge value there is b. The score is
+    sum(w Re a* b) / sqrt(sum(w |a|^2) sum(w |b|^2)) over the points of all frames: 1 if all edges agree, 0 by chance.
+
+    What is maximised is the sum(w Re a* b) alone, with weights w that fall to 0 at the border of the thermal image and
+    do not follow the rig. The points lie only where photographs have edges, so the last factor is no constant of the
+    thermal images, and points at the border come and go: with either of them it pays to move points to where b is
+    small, and the focal length comes out half a percent too long.
+    """
 
     def __init__(
         self, edges: Sequence[EdgePoints], thermal: Sequence[ThermalEdges], rig: RigModel, around: FloatArray
@@ -103,7 +102,7 @@ class RigScore:
         return product, other
 
     def slopes(self, change: FloatArray) -> tuple[float, FloatArray]:
-        """What is climbed, and its derivative split by the frames that it comes from, shape (frames, 10)."""
+        """What is maximised, and its derivative split by the frames that it comes from, shape (frames, 10)."""
         total, rows = 0.0, []
         for one, thermal, weight in zip(self.edges, self.thermal, self._weights):
             values = thermal.sample(self.rig.project(change, one.points))

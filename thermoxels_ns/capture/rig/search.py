@@ -1,8 +1,4 @@
-"""Where the thermal camera sits beside the visible one, and its lens: found from the images alone.
-
-The photographs' edges are carried into the thermal images through the scene points of structure from motion, and
-the rig is moved until they lie on the thermal edges, coarse to fine, over all frames together.
-"""
+"""Finds the rig (thermal lens and pose beside the visible camera) from images."""
 
 from __future__ import annotations
 
@@ -10,19 +6,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from thermoxels_ns.capture.rig.coarse_search import RoughRig, RoughSearch
-from thermoxels_ns.capture.rig.fit import RigClimber
-from thermoxels_ns.capture.rig.image_pyramid import PreparedFrames, prepare_frames
+from thermoxels_ns.capture.rig.coarse_search import CoarseRig, CoarseSearch
+from thermoxels_ns.capture.rig.explanation import uncertainty_text
+from thermoxels_ns.capture.rig.fit import RigMaximizer
+from thermoxels_ns.capture.rig.images import PreparedFrames, prepare_frames
 from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel, prior_sigmas
+from thermoxels_ns.capture.rig.refinement import refine
 from thermoxels_ns.capture.rig.score import RigScore
-from thermoxels_ns.capture.rig.subpixel import polish
-from thermoxels_ns.capture.rig.uncertainty import certainty_text
-from thermoxels_ns.capture.stage_types import CameraModel, RigEstimate, RigFrame, RigStart
+from thermoxels_ns.capture.rig_types import FloatArray, RigEstimate, RigFrame, RigStart
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
-
-FloatArray = npt.NDArray[np.float64]
 
 _FEWEST_FRAMES, _FEWEST_POINTS = 3, 12
 _MOST_FRAMES = 40
@@ -30,18 +24,21 @@ _COARSE_BLUR_PX, _FINE_BLUR_PX = 1.5, 1.0
 _ABOVE_CHANCE = 1.5
 _SEARCHED_SIZES = 2
 _FARTHEST_SIGMAS = 5.0
-_WORTH_A_CLIMB = 0.8
+_WORTH_TRYING = 0.8
 _SMALLEST_ERROR_PX, _LARGEST_ERROR_SHARE = 1.5, 0.005
 _PROBE_STEP = 1e-4
 
 
 def estimate_rig(
     frames: Sequence[RigFrame],
-    visible: CameraModel,
+    visible: Camera,
     start: RigStart,
     progress: Callable[[str, float], None] = lambda message, share: None,
 ) -> RigEstimate:
     """Find the thermal camera's intrinsics and the fixed transform from the visible to the thermal camera.
+
+    The photographs' edges are carried into the thermal images through the scene points of structure from motion, and
+    the rig is moved until they lie on the thermal edges, coarse to fine, over all frames together.
 
     Args:
         frames: Pairs with poses and scene points, in the order they were taken. Those with fewer than 12 points are
@@ -87,42 +84,42 @@ class _RigSearch:
         if len(self.prepared.frames) < _FEWEST_FRAMES:
             reason = f"{len(self.prepared.frames)} frames are too few to tell; at least {_FEWEST_FRAMES} are needed"
             return self._kept(rig, sigmas, before, reason)
-        rough: list[RoughRig] = []
+        coarse_rigs: list[CoarseRig] = []
         chance, level = 0.0, 0
         for level, size in enumerate(sizes[:_SEARCHED_SIZES]):  # small things show in the second size only
             self.progress(f"Comparing edges, all directions, {size[0]} x {size[1]} pixels", 0.1 * (1 + level))
             coarse = self.prepared.score(rig, unchanged, size, _COARSE_BLUR_PX) if level else coarse
-            search = RoughSearch(coarse, sigmas, depth)
-            rough, chance = search.best(), search.best_by_chance()
-            if rough[0].score > _ABOVE_CHANCE * chance:
+            search = CoarseSearch(coarse, sigmas, depth)
+            coarse_rigs, chance = search.best(), search.best_by_chance()
+            if coarse_rigs[0].score > _ABOVE_CHANCE * chance:
                 break
         else:
             reason = (
-                f"the thermal edges agree with those of the photographs no better ({rough[0].score:.3f}) than chance "
-                f"({chance:.3f}): the thermal images are too flat or show other things"
+                f"the thermal edges agree with those of the photographs no better ({coarse_rigs[0].score:.3f}) than "
+                f"chance ({chance:.3f}): the thermal images are too flat or show other things"
             )
             return self._kept(rig, sigmas, before, reason)
-        change = self._best_top(coarse, rough, sigmas)
+        change = self._best_maximum(coarse, coarse_rigs, sigmas)
         finer = sizes[level + 1 :] or sizes[-1:]
-        score, climber = coarse, RigClimber(coarse, sigmas, depth)
+        score, maximizer = coarse, RigMaximizer(coarse, sigmas, depth)
         for number, size in enumerate(finer):
             self.progress(f"Comparing edges, {size[0]} x {size[1]} pixels", 0.3 + 0.6 * number / len(finer))
             blur_px = _FINE_BLUR_PX if size == sizes[-1] else _COARSE_BLUR_PX
             score = self.prepared.score(rig, change, size, blur_px)
-            climber = RigClimber(score, sigmas, depth)
-            change = climber.climb(change).change
-        covariance = climber.covariance(change)
+            maximizer = RigMaximizer(score, sigmas, depth)
+            change = maximizer.maximize(change).change
+        covariance = maximizer.covariance(change)
         before, after = score.value(unchanged), score.value(change)
         error_px = self._projection_sigma(rig, change, covariance)
-        reason = self._doubt(change, sigmas, before, after, error_px)
+        reason = self._rejection(change, sigmas, before, after, error_px)
         if reason is not None:
             return self._kept(rig, sigmas, before, reason)
         self.progress("Comparing windows", 0.9)
-        better = polish(self.prepared, rig, change, sigmas)
+        better = refine(self.prepared, rig, change, sigmas)
         windows = ""
         if better is not None:
             error_px = self._projection_sigma(rig, better.change, better.covariance)
-            reason = self._doubt(better.change, sigmas, before, after, error_px)
+            reason = self._rejection(better.change, sigmas, before, after, error_px)
             if reason is None:
                 change, covariance = better.change, better.covariance
                 after = score.value(change)
@@ -135,20 +132,20 @@ class _RigSearch:
             f"Found from {len(self.prepared.frames)} frames{windows}: focal length {camera.fl_x:.1f} pixels, "
             f"{turn_deg:.2f} degrees and {np.linalg.norm(transform[:3, 3]):.3g} world units from the visible camera; "
             f"scene points fall within {error_px:.2f} thermal pixels (standard error). Start: {self.start.source}. "
-            f"{certainty_text(covariance, sigmas)}"
+            f"{uncertainty_text(covariance, sigmas)}"
         ).rstrip()
-        return RigEstimate(camera, transform, PARAMETERS, covariance, True, explanation, before, after, error_px)
+        return RigEstimate(camera, transform, True, explanation, PARAMETERS, covariance, before, after, error_px)
 
-    def _best_top(self, coarse: RigScore, rough: Sequence[RoughRig], sigmas: FloatArray) -> FloatArray:
-        """Climb from every rough place worth it; the ten changes of the top that agrees best."""
-        tops = []
-        for one in rough:
-            if one.score >= _WORTH_A_CLIMB * rough[0].score:
-                climber = RigClimber(coarse.around(one.change), sigmas, self.prepared.median_depth)
-                tops.append(climber.climb(one.change))
-        return max(tops, key=lambda top: top.score).change
+    def _best_maximum(self, coarse: RigScore, coarse_rigs: Sequence[CoarseRig], sigmas: FloatArray) -> FloatArray:
+        """Maximise from every coarse rig worth it; the ten changes of the maximum that agrees best."""
+        maxima = []
+        for one in coarse_rigs:
+            if one.score >= _WORTH_TRYING * coarse_rigs[0].score:
+                maximizer = RigMaximizer(coarse.around(one.change), sigmas, self.prepared.median_depth)
+                maxima.append(maximizer.maximize(one.change))
+        return max(maxima, key=lambda fit: fit.score).change
 
-    def _doubt(
+    def _rejection(
         self, change: FloatArray, sigmas: FloatArray, before: float, after: float, error_px: float
     ) -> str | None:
         """Why the result is not to be trusted; None if nothing speaks against it."""
@@ -169,7 +166,7 @@ class _RigSearch:
         covariance = np.diag(sigmas**2)
         error_px = self._projection_sigma(rig, np.zeros(len(sigmas)), covariance)
         text = f"Not determined, the start value is kept ({self.start.source}): {reason}."
-        return RigEstimate(rig.camera, rig.transform, PARAMETERS, covariance, False, text, score, score, error_px)
+        return RigEstimate(rig.camera, rig.transform, False, text, PARAMETERS, covariance, score, score, error_px)
 
     def _projection_sigma(self, rig: RigModel, change: FloatArray, covariance: FloatArray) -> float:
         """Median standard error of where scene points fall [thermal pixels], both axes together."""

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
 from thermoxels_ns.capture.sfm.model import SfmModel
-from thermoxels_ns.capture.stage_types import OPENGL_FROM_OPENCV, CameraModel
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 
 _FIELDS = {
@@ -22,7 +23,7 @@ _FIELDS = {
 """COLMAP's lens models that ours can hold, and the order of their numbers."""
 
 
-def camera_of_colmap(camera: Any) -> CameraModel:
+def camera_of_colmap(camera: Any) -> Camera:
     """Turn a pycolmap camera into ours.
 
     Raises:
@@ -40,7 +41,7 @@ def camera_of_colmap(camera: Any) -> CameraModel:
     focal = values.pop("f", None)
     if focal is not None:
         values |= {"fl_x": focal, "fl_y": focal}
-    return CameraModel(int(camera.width), int(camera.height), **values)
+    return Camera(int(camera.width), int(camera.height), **values)
 
 
 def model_of_colmap(

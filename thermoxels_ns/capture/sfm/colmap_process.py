@@ -1,23 +1,23 @@
-"""COLMAP in a process of its own: what ends it from inside, such as a thread that cannot write, does not end ours."""
+"""Runs COLMAP in a process of its own and says why it stopped."""
 
 from __future__ import annotations
 
 import base64
 import os
 import pickle
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from thermoxels_ns.capture.sfm.colmap_log import colmap_stopped
-from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 
 Say = Callable[[str], None]
 _Result = TypeVar("_Result")
@@ -27,16 +27,20 @@ _MARK = b"\x1e"
 _LINES_KEPT = 400
 """Of COLMAP's last words: it adds a stack of calls to the sentence that matters."""
 _KILLED = -int(getattr(signal, "SIGKILL", 9))
+_FATAL_ONLY = 3
+_FULL_BYTES = 1_000_000
+"""Free space up to which a disk is taken for the reason why a program ended: programs write whole pages."""
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1"}
 """COLMAP brings a BLAS of its own, whose sums depend on the number of its threads: one thread, same result."""
 
 
-def run_apart(
+def run_in_process(
     work: Callable[..., _Result], arguments: tuple[Any, ...], folder: Path, say: Say = lambda _: None
 ) -> _Result:
     """Call ``work(*arguments, say)`` in a new process and wait for its end.
 
-    The process ends with this one, also where this one is killed.
+    What ends COLMAP from inside, such as a thread that cannot write, then does not end this process. The new one ends
+    with this one, also where this one is killed.
 
     Args:
         work: A function at the top of a module.
@@ -102,16 +106,16 @@ class _Returned:
 
 
 def serve() -> None:
-    """Do what `run_apart` of the process that started this one asks for."""
+    """Do what `run_in_process` of the process that started this one asks for."""
     work, arguments = pickle.load(sys.stdin.buffer)
-    threading.Thread(target=_end_with_the_other, daemon=True).start()
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
     try:
         _send(_Returned(work(*arguments, _send)))
     except (ThermoxelsError, OSError) as problem:
         _send(_Raised(problem))
 
 
-def _end_with_the_other() -> None:
+def _exit_with_parent() -> None:
     os.read(sys.stdin.fileno(), 1)  # ends when the other process does
     os._exit(1)
 
@@ -128,3 +132,96 @@ def _reason(status: int, words: deque[str]) -> str:
     said = [line for line in words if line.strip()]
     telling = [line for line in said if "error" in line.lower()] or said[-1:]
     return f"exit status {status}" + (f" ({telling[0]})" if telling else "")
+
+
+@contextmanager
+def quiet_colmap(folder: Path) -> Iterator[None]:
+    """Silence COLMAP in the block; what matters comes back as results or exceptions.
+
+    Args:
+        folder: Where it writes; looked at when it fails.
+
+    Raises:
+        OutputError: COLMAP stopped because the disk is full.
+        ThermoxelsError: COLMAP stopped.
+    """
+    import pycolmap
+
+    log: Any = pycolmap.logging
+    before = log.minloglevel
+    log.minloglevel = _FATAL_ONLY
+    try:
+        yield
+    except (RuntimeError, ValueError) as problem:  # what COLMAP raises, such as for a database on a full disk
+        lines = str(problem).strip().splitlines()
+        raise colmap_stopped(lines[0] if lines else type(problem).__name__, folder) from problem
+    finally:
+        log.minloglevel = before
+
+
+def colmap_stopped(reason: str, folder: Path) -> ThermoxelsError:
+    """Build the error for a COLMAP that stopped; a full disk is named as the reason, whatever COLMAP says.
+
+    Args:
+        reason: What COLMAP said.
+        folder: Where it was writing.
+    """
+    if is_full(folder) or "disk is full" in reason:
+        return filled(folder, "features, matches and poses")
+    return ThermoxelsError(
+        "COLMAP",
+        expected="to end",
+        got=reason,
+        remedy="Check free space and memory and run the command again; if that does not help, begin anew with "
+        "--from-stage poses.",
+    )
+
+
+def check_free_space(folder: Path, needed_bytes: float, purpose: str, remedy: str) -> None:
+    """Refuse to start what may not fit.
+
+    Args:
+        folder: Where it will be written; it exists.
+        needed_bytes: How much that may be.
+        purpose: What is written, for the message.
+        remedy: What else helps besides space, for the message.
+
+    Raises:
+        OutputError: Less is free; the message names the disk.
+    """
+    free = shutil.disk_usage(folder).free
+    if free < needed_bytes:
+        raise _too_little(folder, f"up to {needed_bytes / 1e6:.0f} MB free for {purpose}", free, remedy)
+
+
+def is_full(folder: Path) -> bool:
+    """Whether the disk of a folder has no room for anything that counts."""
+    return shutil.disk_usage(folder).free < _FULL_BYTES
+
+
+def filled(folder: Path, purpose: str) -> OutputError:
+    """Build the error for a disk that became full while something was written.
+
+    Args:
+        folder: Where it was written; it exists.
+        purpose: What was written, for the message.
+    """
+    free = shutil.disk_usage(folder).free
+    return _too_little(folder, f"free space for {purpose}, to the end", free, "Make space")
+
+
+def disk_of(path: Path) -> Path:
+    """Folder at which the disk (the file system) of a path is mounted."""
+    disk = path.resolve()
+    while not os.path.ismount(disk) and disk != disk.parent:
+        disk = disk.parent
+    return disk
+
+
+def _too_little(folder: Path, expected: str, free: int, remedy: str) -> OutputError:
+    return OutputError(
+        f"disk at {disk_of(folder)}",
+        expected=expected,
+        got=f"{free / 1e6:.0f} MB",
+        remedy=f"{remedy}; finished stages are kept. It was to be written to {folder}.",
+    )

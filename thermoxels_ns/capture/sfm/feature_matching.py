@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -10,10 +10,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.sfm.colmap_log import quiet_colmap
-from thermoxels_ns.capture.sfm.colmap_process import run_apart
-from thermoxels_ns.capture.sfm.disk_space import check_free_space
-from thermoxels_ns.capture.stage_types import CameraModel
+from thermoxels_ns.capture.sfm.colmap_process import check_free_space, quiet_colmap, run_in_process
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import remove_file
 
 Matching = Literal["auto", "exhaustive", "sequential"]
@@ -35,16 +33,37 @@ _PAIR_CHUNK = 200
 
 
 @dataclass(frozen=True)
-class FeatureOptions:
-    """How many features are looked for and which photographs are compared."""
+class PoseOptions:
+    """How poses are found."""
 
-    max_features: int
-    """Per photograph."""
-    matching: Matching
-    lens: LensModel
-    seed: int
-    threads: int
+    image_size: int = 1600
+    """Longest side to which photographs are reduced for features, [pixels]."""
+    max_features: int = 4000
+    """Features per photograph."""
+    matching: Matching = "auto"
+    """Which photographs are compared."""
+    lens: LensModel = "SIMPLE_RADIAL"
+    """Lens model."""
+    seed: int = 0
+    """Of all random choices; the same one gives the same bits."""
+    threads: int = 2
     """Of features and matching."""
+
+
+@dataclass(frozen=True)
+class ReducedPhotographs:
+    """Photographs as COLMAP gets them, and the database of their features and matches."""
+
+    database: Path
+    """COLMAP's file, made where it does not exist; its folder is written to."""
+    images: Path
+    """Folder of the reduced photographs, all of one size."""
+    frame_of_image: Mapping[str, str]
+    """Frame by the name of its photograph in that folder, in the order they were taken."""
+    size: tuple[int, int]
+    """Width and height of the photographs as they are, [pixels]; those in the folder may be smaller."""
+    masks: Path | None = None
+    """Folder of pictures that are black where no feature is looked for; None: everywhere."""
 
 
 def image_pairs(count: int, matching: Matching) -> npt.NDArray[np.int64]:
@@ -77,24 +96,18 @@ def _all_pairs(count: int) -> npt.NDArray[np.int64]:
 
 
 def fill_database(
-    database: Path,
-    images: Path,
-    names: Sequence[str],
-    camera: CameraModel,
+    photographs: ReducedPhotographs,
+    camera: Camera,
     known_focal: bool,
-    masks: Path | None,
-    options: FeatureOptions,
+    options: PoseOptions,
     say: Callable[[str], None],
 ) -> None:
     """Find features in photographs and match them; what an interrupted run has done is not done again.
 
     Args:
-        database: COLMAP's file, made where it does not exist; what it may need must be free on its disk.
-        images: Folder of the photographs, all of one size.
-        names: Their names in it, in the order they were taken.
-        camera: Start value of their lens, at their size.
+        photographs: Where they are; what their database may need must be free on its disk.
+        camera: Start value of their lens, at their reduced size.
         known_focal: Whether the focal length is more than a guess.
-        masks: Folder of pictures that are black where no feature is looked for; None: everywhere.
         options: How much and what is compared.
         say: Told how far it is.
 
@@ -102,78 +115,70 @@ def fill_database(
         OutputError: There is too little free space for features and matches, or the disk becomes full.
         ThermoxelsError: COLMAP stopped.
     """
-    pairs = image_pairs(len(names), options.matching)
+    database, count = photographs.database, len(photographs.frame_of_image)
+    pairs = image_pairs(count, options.matching)
     there = database.stat().st_size if database.is_file() else 0
-    needed = _LEAST_BYTES + options.max_features * (_BYTES_PER_FEATURE * len(names) + _BYTES_PER_MATCH * len(pairs))
+    needed = _LEAST_BYTES + options.max_features * (_BYTES_PER_FEATURE * count + _BYTES_PER_MATCH * len(pairs))
     remedy = "Make space, choose another --output, or lower --max-features"
     check_free_space(database.parent, needed - there, "features and matches", remedy)
-    arguments = (database, images, list(names), camera, known_focal, masks, options, pairs)
-    run_apart(_find_and_match, arguments, database.parent, say)
+    run_in_process(_find_and_match, (photographs, camera, known_focal, options, pairs), database.parent, say)
 
 
 def _find_and_match(
-    database: Path,
-    images: Path,
-    names: Sequence[str],
-    camera: CameraModel,
+    photographs: ReducedPhotographs,
+    camera: Camera,
     known_focal: bool,
-    masks: Path | None,
-    options: FeatureOptions,
+    options: PoseOptions,
     pairs: npt.NDArray[np.int64],
     say: Callable[[str], None],
 ) -> None:
-    """Do what `fill_database` promises for these pairs of photographs (p, 2), in this process."""
-    with quiet_colmap(database.parent):
-        _add_images(database, names, camera, options.lens, known_focal)
-        _find_features(database, images, names, masks, options, say)
-        _match(database, names, pairs, options, say)
+    """`fill_database` for these pairs of photographs (p, 2), in this process."""
+    with quiet_colmap(photographs.database.parent):
+        _add_images(photographs, camera, options.lens, known_focal)
+        _find_features(photographs, options, say)
+        _match(photographs, pairs, options, say)
 
 
-def _find_features(
-    database: Path,
-    images: Path,
-    names: Sequence[str],
-    masks: Path | None,
-    options: FeatureOptions,
-    say: Callable[[str], None],
-) -> None:
+def _find_features(photographs: ReducedPhotographs, options: PoseOptions, say: Callable[[str], None]) -> None:
     import pycolmap
 
+    database, names = photographs.database, list(photographs.frame_of_image)
     reader = pycolmap.ImageReaderOptions(camera_model=options.lens, existing_camera_id=1)
-    if masks is not None:
-        reader.mask_path = str(masks)
+    if photographs.masks is not None:
+        reader.mask_path = str(photographs.masks)
     extraction = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=options.threads)
     extraction.sift.max_num_features = options.max_features
-    todo = _without_features(database, names)
+    with pycolmap.Database.open(database) as opened:
+        done = {image.name for image in opened.read_all_images() if opened.num_keypoints_for_image(image.image_id) > 0}
+    todo = [name for name in names if name not in done]
     for start in range(0, len(todo), _CHUNK):
         some = todo[start : start + _CHUNK]
-        pycolmap.extract_features(database, images, some, reader_options=reader, extraction_options=extraction)
+        pycolmap.extract_features(
+            database, photographs.images, some, reader_options=reader, extraction_options=extraction
+        )
         say(f"features: {len(names) - len(todo) + start + len(some)} of {len(names)} photographs")
 
 
 def _match(
-    database: Path,
-    names: Sequence[str],
-    pairs: npt.NDArray[np.int64],
-    options: FeatureOptions,
-    say: Callable[[str], None],
+    photographs: ReducedPhotographs, pairs: npt.NDArray[np.int64], options: PoseOptions, say: Callable[[str], None]
 ) -> None:
     import pycolmap
 
+    names = list(photographs.frame_of_image)
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=options.threads)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = options.seed
-    listed = database.with_name("pairs.txt")
+    listed = photographs.database.with_name("pairs.txt")
     for start in range(0, len(pairs), _PAIR_CHUNK):
         some = pairs[start : start + _PAIR_CHUNK]
         listed.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in some), encoding="utf-8")
         pairing: Any = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = str(listed)
-        pycolmap.match_image_pairs(database, matching, pairing, verification)
+        pycolmap.match_image_pairs(photographs.database, matching, pairing, verification)
         say(f"matches: {start + len(some)} of {len(pairs)} pairs of photographs")
 
 
-def lens_parameters(camera: CameraModel, lens: LensModel) -> list[float]:
+def lens_parameters(camera: Camera, lens: LensModel) -> list[float]:
     """The numbers of one of COLMAP's lens models."""
     if lens == "SIMPLE_RADIAL":
         return [camera.fl_x, camera.cx, camera.cy, camera.k1]
@@ -182,10 +187,11 @@ def lens_parameters(camera: CameraModel, lens: LensModel) -> list[float]:
     return [camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.k1, camera.k2, camera.p1, camera.p2]
 
 
-def _add_images(database: Path, names: Sequence[str], camera: CameraModel, lens: LensModel, known_focal: bool) -> None:
+def _add_images(photographs: ReducedPhotographs, camera: Camera, lens: LensModel, known_focal: bool) -> None:
     """Number the photographs in their order; else the threads that look for features would number them by chance."""
     import pycolmap
 
+    database, names = photographs.database, photographs.frame_of_image
     with pycolmap.Database.open(database) as opened:
         # A frame is written after its image; where there is one frame per name, no killed run left a part.
         if opened.num_images() == len(names) == opened.num_frames():
@@ -211,11 +217,3 @@ def _add_images(database: Path, names: Sequence[str], camera: CameraModel, lens:
             frame = pycolmap.Frame(frame_id=number, rig_id=1)
             frame.add_data_id(image.data_id)
             opened.write_frame(frame, use_frame_id=True)
-
-
-def _without_features(database: Path, names: Sequence[str]) -> list[str]:
-    import pycolmap
-
-    with pycolmap.Database.open(database) as opened:
-        done = {image.name for image in opened.read_all_images() if opened.num_keypoints_for_image(image.image_id) > 0}
-    return [name for name in names if name not in done]

@@ -13,8 +13,8 @@ import numpy as np
 from thermoxels_ns.capture.sfm.colmap_model import model_of_colmap, read_colmap
 from thermoxels_ns.capture.sfm.model import SfmModel
 from thermoxels_ns.capture.sfm.poses import Poses, common_size
-from thermoxels_ns.capture.stages import read_json
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.data.transforms_json import path_inside, read_intrinsics, read_pose
 
 
@@ -47,7 +47,7 @@ def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
         )
     order = {name: number for number, name in enumerate(photographs)}
     missing = {name: f"{path.name} has no pose of it" for name in photographs if name not in model.frames}
-    return Poses(in_order(model, lambda name: order[name]), missing)
+    return Poses(reordered(model, lambda name: order[name]), missing)
 
 
 def fitted_to_photographs(poses: Poses, photographs: Mapping[str, Path]) -> Poses:
@@ -90,7 +90,7 @@ def fitted_to_photographs(poses: Poses, photographs: Mapping[str, Path]) -> Pose
     return Poses(fitted, dropped)
 
 
-def in_order(model: SfmModel, key: Callable[[str], Any]) -> SfmModel:
+def reordered(model: SfmModel, key: Callable[[str], Any]) -> SfmModel:
     """Same model with its frames sorted by a key of their names."""
     order = sorted(range(len(model.frames)), key=lambda index: key(model.frames[index]))
     number = np.argsort(order)[model.sighting_frame] if len(model.sighting_frame) else model.sighting_frame

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.stage_types import FloatArray
+from thermoxels_ns.capture.rig_types import FloatArray
 
 _UP_OF_ORIENTATION = {1: (0, 1), 2: (0, 1), 3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
 """Where the upper edge of the upright picture lies in the stored one (x right, y up), by EXIF's orientation."""

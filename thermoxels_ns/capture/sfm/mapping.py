@@ -1,38 +1,22 @@
-"""Cameras and points out of matched features, by COLMAP's mapping in a process of its own."""
+"""COLMAP's mapping: cameras and points out of matched features."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.capture.sfm.colmap_log import quiet_colmap
+from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
 from thermoxels_ns.capture.sfm.colmap_model import model_of_colmap
-from thermoxels_ns.capture.sfm.colmap_process import run_apart
-from thermoxels_ns.capture.sfm.feature_matching import lens_parameters
+from thermoxels_ns.capture.sfm.colmap_process import quiet_colmap, run_in_process
+from thermoxels_ns.capture.sfm.feature_matching import ReducedPhotographs, lens_parameters
 from thermoxels_ns.capture.sfm.model import SfmModel
-from thermoxels_ns.capture.stage_types import OPENGL_FROM_OPENCV
 
 MIN_FRAMES = 3
 """Fewer photographs are no reconstruction."""
 _SAID_EVERY = 10
-
-
-@dataclass(frozen=True)
-class MatchedPhotographs:
-    """Photographs whose features are found and matched."""
-
-    database: Path
-    """COLMAP's file with features and matches; its folder is written to."""
-    images: Path
-    """Folder of the photographs that features were found in."""
-    frame_of_image: Mapping[str, str]
-    """Frame by the name of its photograph in that folder, in order."""
-    size: tuple[int, int]
-    """Width and height of the photographs as they are, [pixels]; those in the folder may be smaller."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +28,7 @@ class MappedPhotographs:
     """With how many others a frame of a smaller group fits together."""
 
 
-def map_photographs(matched: MatchedPhotographs, seed: int, say: Callable[[str], None]) -> MappedPhotographs | None:
+def map_photographs(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> MappedPhotographs | None:
     """Find camera, poses and points (incremental structure from motion).
 
     Args:
@@ -59,10 +43,10 @@ def map_photographs(matched: MatchedPhotographs, seed: int, say: Callable[[str],
         OutputError: The disk became full.
         ThermoxelsError: COLMAP stopped.
     """
-    return run_apart(_map, (matched, seed), matched.database.parent, say)
+    return run_in_process(_map, (matched, seed), matched.database.parent, say)
 
 
-def triangulate(matched: MatchedPhotographs, posed: SfmModel, seed: int, say: Callable[[str], None]) -> SfmModel:
+def triangulate(matched: ReducedPhotographs, posed: SfmModel, seed: int, say: Callable[[str], None]) -> SfmModel:
     """Find the points that photographs with known camera and poses share.
 
     Args:
@@ -78,11 +62,11 @@ def triangulate(matched: MatchedPhotographs, posed: SfmModel, seed: int, say: Ca
         OutputError: The disk became full.
         ThermoxelsError: COLMAP stopped.
     """
-    return run_apart(_triangulate, (matched, posed, seed), matched.database.parent, say)
+    return run_in_process(_triangulate, (matched, posed, seed), matched.database.parent, say)
 
 
-def _map(matched: MatchedPhotographs, seed: int, say: Callable[[str], None]) -> MappedPhotographs | None:
-    """Do what `map_photographs` promises, in this process."""
+def _map(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> MappedPhotographs | None:
+    """`map_photographs` in this process."""
     import pycolmap
 
     found = 2  # the first pair comes without a call
@@ -113,8 +97,8 @@ def _map(matched: MatchedPhotographs, seed: int, say: Callable[[str], None]) -> 
     return MappedPhotographs(model_of_colmap(largest, matched.frame_of_image, matched.size), elsewhere)
 
 
-def _triangulate(matched: MatchedPhotographs, posed: SfmModel, seed: int, say: Callable[[str], None]) -> SfmModel:
-    """Do what `triangulate` promises, in this process."""
+def _triangulate(matched: ReducedPhotographs, posed: SfmModel, seed: int, say: Callable[[str], None]) -> SfmModel:
+    """`triangulate` in this process."""
     import pycolmap
 
     say("poses: given; looking for points")

@@ -1,4 +1,4 @@
-"""How long a unit of the model is in metres: from GPS, a measured distance, or a marker of known size."""
+"""Metres per unit of a model: from GPS, a measured distance or markers."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.capture.photograph import GpsFix, open_photograph
+from thermoxels_ns.capture.rig_types import FloatArray
 from thermoxels_ns.capture.sfm.model import SfmModel
-from thermoxels_ns.capture.stage_types import FloatArray
 from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import SceneError
 

@@ -1,4 +1,4 @@
-"""What structure from motion found: one camera, where it stood in every frame, and the points that the frames share."""
+"""Result of structure from motion: one camera, its poses and scene points."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.stage_types import OPENGL_FROM_OPENCV, CameraModel, FloatArray
+from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV, FloatArray
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 
 
@@ -22,7 +23,7 @@ class SfmModel:
 
     frames: tuple[str, ...]
     """Names of the frames that have a pose, in order, all different."""
-    camera: CameraModel
+    camera: Camera
     """The photographs' lens."""
     camera_to_world: FloatArray
     """Shape (f, 4, 4), camera axes x right, y up, z back, as transforms.json has them."""

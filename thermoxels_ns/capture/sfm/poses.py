@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,32 +12,16 @@ from PIL import Image
 
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
-from thermoxels_ns.capture.sfm.feature_matching import FeatureOptions, LensModel, Matching, fill_database
-from thermoxels_ns.capture.sfm.mapping import MIN_FRAMES, MatchedPhotographs, map_photographs, triangulate
+from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, ReducedPhotographs, fill_database
+from thermoxels_ns.capture.sfm.mapping import MIN_FRAMES, map_photographs, triangulate
 from thermoxels_ns.capture.sfm.model import SfmModel
-from thermoxels_ns.capture.stage_types import CameraModel
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 
 _GUESSED_FOCAL = 1.0
 """Of the longest side, where the photograph does not say: a lens of 53 degrees."""
 _JPEG_QUALITY = 95
 _DATABASE = "features.db"
-
-
-@dataclass(frozen=True)
-class PoseOptions:
-    """How poses are found."""
-
-    image_size: int = 1600
-    """Longest side to which photographs are reduced for features, [pixels]."""
-    max_features: int = 4000
-    """Features per photograph."""
-    matching: Matching = "auto"
-    """Which photographs are compared."""
-    lens: LensModel = "SIMPLE_RADIAL"
-    """Lens model."""
-    seed: int = 0
-    threads: int = 2
 
 
 @dataclass(frozen=True)
@@ -84,15 +68,13 @@ def find_poses(
     names = [name for name in photographs if name not in dropped]
     if len(names) < MIN_FRAMES:
         raise _too_few(len(names), "photographs of one size")
-    images = _reduced(photographs, names, folder / "images", size, options.image_size)
-    mask_folder = _write_masks(masks, images, folder / "masks")
-    start = start_camera(size, focal_px).resized(*images.camera_size)
-    features = FeatureOptions(options.max_features, options.matching, options.lens, options.seed, options.threads)
-    matched = MatchedPhotographs(folder / _DATABASE, folder / "images", images.files, size)
-    fill_database(
-        matched.database, matched.images, list(images.files), start, focal_px is not None, mask_folder, features, say
-    )
-    mapped = map_photographs(matched, options.seed, say)
+    small = _reduced_size(size, options.image_size)
+    reduced = _reduced({name: photographs[name] for name in names}, folder, size, small, masks)
+    # The photographs' own focal length or a usual one, the principal point at the centre.
+    focal = focal_px or _GUESSED_FOCAL * max(size)
+    start = Camera(*size, focal, focal, size[0] / 2.0, size[1] / 2.0).resized(*small)
+    fill_database(reduced, start, focal_px is not None, options, say)
+    mapped = map_photographs(reduced, options.seed, say)
     found = 0 if mapped is None else len(mapped.model.frames)
     if mapped is None or found < MIN_FRAMES:
         raise _too_few(found, "photographs that fit together")
@@ -142,26 +124,10 @@ def add_points(
             got=f"{size[0]} x {size[1]}",
             remedy="Use the photographs that the poses were computed from.",
         )
-    images = _reduced(photographs, names, folder / "images", size, options.image_size)
-    mask_folder = _write_masks(masks, images, folder / "masks")
-    camera = given.camera.resized(*images.camera_size)
-    features = FeatureOptions(options.max_features, options.matching, "OPENCV", options.seed, options.threads)
-    matched = MatchedPhotographs(folder / _DATABASE, folder / "images", images.files, size)
-    fill_database(matched.database, matched.images, list(images.files), camera, True, mask_folder, features, say)
-    return triangulate(matched, given, options.seed, say)
-
-
-def start_camera(size: tuple[int, int], focal_px: float | None) -> CameraModel:
-    """A camera to begin with: the photographs' own focal length or a usual one, the principal point at the centre."""
-    focal = focal_px or _GUESSED_FOCAL * max(size)
-    return CameraModel(size[0], size[1], focal, focal, size[0] / 2.0, size[1] / 2.0)
-
-
-@dataclass(frozen=True)
-class _ReducedImages:
-    files: dict[str, str]
-    """Frame by the file's name, in order."""
-    camera_size: tuple[int, int]
+    small = _reduced_size(size, options.image_size)
+    reduced = _reduced({name: photographs[name] for name in names}, folder, size, small, masks)
+    fill_database(reduced, given.camera.resized(*small), True, replace(options, lens="OPENCV"), say)
+    return triangulate(reduced, given, options.seed, say)
 
 
 def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[str, tuple[int, int]]]:
@@ -181,37 +147,40 @@ def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[
     return common, {name: size for name, size in sizes.items() if size != common}
 
 
-def _reduced(
-    photographs: Mapping[str, Path], names: Sequence[str], folder: Path, size: tuple[int, int], longest: int
-) -> _ReducedImages:
-    """Write the photographs for COLMAP: smaller, and without EXIF, by which it would turn them."""
+def _reduced_size(size: tuple[int, int], longest: int) -> tuple[int, int]:
     factor = min(1.0, longest / max(size))
-    small = (max(1, round(size[0] * factor)), max(1, round(size[1] * factor)))
-    folder.mkdir(exist_ok=True)
-    digits = max(4, int(math.log10(max(len(names), 1))) + 1)
-    files = {}
-    for index, name in enumerate(names):
-        file = f"{index:0{digits}d}.jpg"
-        files[file] = name
-        if not (folder / file).is_file():
+    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
+
+
+def _reduced(
+    photographs: Mapping[str, Path],
+    folder: Path,
+    size: tuple[int, int],
+    small: tuple[int, int],
+    masks: PhotographMasks | None,
+) -> ReducedPhotographs:
+    """Write the photographs for COLMAP, smaller and without EXIF, by which it would turn them; and their masks."""
+    images, mask_folder = folder / "images", folder / "masks"
+    images.mkdir(exist_ok=True)
+    digits = max(4, int(math.log10(max(len(photographs), 1))) + 1)
+    files = {f"{index:0{digits}d}.jpg": name for index, name in enumerate(photographs)}
+    for file, name in files.items():
+        if not (images / file).is_file():
             picture = open_photograph(photographs[name])
             if small != size:
-                picture = picture.resize(small, Image.Resampling.BOX if factor < 0.5 else Image.Resampling.LANCZOS)
-            temporary = folder / f".{file}"
+                much = max(small) < 0.5 * max(size)
+                picture = picture.resize(small, Image.Resampling.BOX if much else Image.Resampling.LANCZOS)
+            temporary = images / f".{file}"
             picture.save(temporary, format="JPEG", quality=_JPEG_QUALITY)
-            temporary.replace(folder / file)
-    return _ReducedImages(files, small)
-
-
-def _write_masks(masks: PhotographMasks | None, images: _ReducedImages, folder: Path) -> Path | None:
-    """Write masks as COLMAP looks for them: the photograph's name with .png behind it."""
+            temporary.replace(images / file)
     if masks is None or not masks.any:
-        return None
-    folder.mkdir(exist_ok=True)
-    for file, frame in images.files.items():
+        return ReducedPhotographs(folder / _DATABASE, images, files, size)
+    mask_folder.mkdir(exist_ok=True)
+    for file, frame in files.items():
         use = Image.fromarray(np.where(masks.of(frame), np.uint8(255), np.uint8(0)))
-        use.resize(images.camera_size, Image.Resampling.NEAREST).save(folder / f"{file}.png")
-    return folder
+        # COLMAP looks for the photograph's name with .png behind it.
+        use.resize(small, Image.Resampling.NEAREST).save(mask_folder / f"{file}.png")
+    return ReducedPhotographs(folder / _DATABASE, images, files, size, mask_folder)
 
 
 def _too_few(got: int, what: str) -> SceneError:

@@ -1,12 +1,11 @@
-"""Depth of any pixel of a photograph from the scene points that structure from motion saw in it."""
+"""Depth of any pixel of a photograph from the scene points around it."""
 
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import KDTree
 
-FloatArray = npt.NDArray[np.float64]
+from thermoxels_ns.capture.rig_types import FloatArray
 
 _NEIGHBOURS = 12
 _NEAR_QUANTILE, _FAR_QUANTILE = 0.9, 0.1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_finite, check_shape, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
+from thermoxels_ns.core.json_values import plain_values
 from thermoxels_ns.mesh.files.content import check_suffix, colour_bytes, file_content, node_arrays, surface_of
 from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
@@ -119,33 +119,7 @@ def write_summary(path: Path | str, summary: Mapping[str, Any]) -> None:
 
 def summary_text(summary: Mapping[str, Any]) -> str:
     """Text of the file that `write_summary` writes; raises the same `MeshError`."""
-    return json.dumps(_plain("summary", summary), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def _plain(name: str, value: Any) -> Any:
-    """Turn `value` into what json knows; `name` says where it is if it cannot be."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(f"{name}.{key}", entry) for key, entry in value.items()}
-    if isinstance(value, np.ndarray):
-        return _plain(name, value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [_plain(f"{name}[{n}]", entry) for n, entry in enumerate(value)]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, float) and not math.isfinite(value):
-        raise MeshError(
-            name, expected="a finite number", got=value, remedy="Leave it out, or write None for 'unknown'."
-        )
-    if value is None or isinstance(value, (str, bool, int, float)):
-        return value
-    raise MeshError(
-        name,
-        expected="text, a number, a list, a mapping, a path or None",
-        got=type(value).__name__,
-        remedy="Convert it before writing.",
-    )
+    return json.dumps(plain_values(summary, "summary", MeshError), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def boundary_path(path: Path | str) -> Path:

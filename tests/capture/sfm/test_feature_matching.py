@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from thermoxels_ns.capture.sfm import disk_space, feature_matching
-from thermoxels_ns.capture.sfm.feature_matching import FeatureOptions, fill_database, image_pairs
-from thermoxels_ns.capture.stage_types import CameraModel
+from thermoxels_ns.capture.sfm import feature_matching
+from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, ReducedPhotographs, fill_database, image_pairs
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import OutputError
 
-CAMERA = CameraModel(width=640, height=480, fl_x=500.0, fl_y=500.0, cx=320.0, cy=240.0)
+CAMERA = Camera(width=640, height=480, fl_x=500.0, fl_y=500.0, cx=320.0, cy=240.0)
 FEATURES = 1000
 
 
@@ -20,14 +21,15 @@ FEATURES = 1000
 def started(monkeypatch) -> list[tuple]:
     """What would have run in a process of its own."""
     calls: list[tuple] = []
-    monkeypatch.setattr(feature_matching, "run_apart", lambda function, arguments, *_: calls.append(arguments))
+    monkeypatch.setattr(feature_matching, "run_in_process", lambda function, arguments, *_: calls.append(arguments))
     return calls
 
 
 def fill(folder: Path, photographs: int) -> None:
-    names = [f"{n:03d}.jpg" for n in range(photographs)]
-    options = FeatureOptions(FEATURES, "exhaustive", "SIMPLE_RADIAL", 0, 1)
-    fill_database(folder / "database.db", folder, names, CAMERA, True, None, options, lambda _: None)
+    names = {f"{n:03d}.jpg": f"{n}" for n in range(photographs)}
+    reduced = ReducedPhotographs(folder / "database.db", folder, names, (640, 480))
+    options = PoseOptions(max_features=FEATURES, matching="exhaustive")
+    fill_database(reduced, CAMERA, True, options, lambda _: None)
 
 
 def least_room(folder: Path, photographs: int, monkeypatch, started: list[tuple]) -> int:
@@ -35,7 +37,7 @@ def least_room(folder: Path, photographs: int, monkeypatch, started: list[tuple]
     low, high = 0, 10**11
     while high - low > 1:
         free = (low + high) // 2
-        monkeypatch.setattr(disk_space.shutil, "disk_usage", lambda _, free=free: SimpleNamespace(free=free))
+        monkeypatch.setattr(shutil, "disk_usage", lambda _, free=free: SimpleNamespace(free=free))
         before = len(started)
         try:
             fill(folder, photographs)
@@ -65,7 +67,7 @@ def test_what_is_there_already_needs_no_room_again(tmp_path, monkeypatch, starte
 
 
 def test_too_little_room_is_said_with_what_helps(tmp_path, monkeypatch, started) -> None:
-    monkeypatch.setattr(disk_space.shutil, "disk_usage", lambda _: SimpleNamespace(free=3_000_000))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=3_000_000))
     with pytest.raises(OutputError, match=r"free for features and matches, got 3 MB\..*--max-features"):
         fill(tmp_path, 60)
     assert started == []

@@ -1,24 +1,29 @@
-"""Stages of a capture: each keeps its result, runs again only when something it depends on has changed."""
+"""Keeps the results of stages and runs again only what has changed."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
+
+from filelock import FileLock, Timeout
 
 from thermoxels_ns import __version__
+from thermoxels_ns.capture.settings import StageName
 from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.core.errors import OutputError, SceneError
+from thermoxels_ns.core.json_values import write_json
 
-StageName = Literal["pairs", "temperatures", "poses", "scale", "board", "rig", "drift", "scene", "page"]
-"""The stages in order."""
 STAGES: tuple[StageName, ...] = get_args(StageName)
 CACHE_FOLDER = ".capture"
+LOCK_FILE = "lock"
 _KEY_FILE, _DONE_FILE = "key.txt", "done.json"
 
 
@@ -69,7 +74,7 @@ class StageCache:
         folder = self.folder / CACHE_FOLDER / name
         forced = self.from_stage is not None and STAGES.index(name) >= STAGES.index(self.from_stage)
         title = _title(name)
-        stale = forced or _read_key(folder) != key
+        stale = forced or _read(folder / _KEY_FILE) != key
         done = None if stale else _read_done(folder, self.folder, writes)
         if done is not None:
             self.say(f"{title}: as before")
@@ -148,33 +153,46 @@ def prepare_output(folder: Path) -> Path:
     return folder
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write json, whole or not at all; numbers must be finite."""
-    with replace_when_done(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1, allow_nan=False), encoding="utf-8")
+@contextmanager
+def locked(output: Path, say: Callable[[str], None] = lambda _: None) -> Iterator[None]:
+    """Hold the output folder of a capture for the block: two would write each other's stages.
 
+    The system ends the lock with the process that holds it, however that ends. Where the drive has no locks the block
+    runs all the same, and `say` is told so.
 
-def read_json(path: Path) -> Any:
-    """Read json that a stage wrote or that the user gives.
+    Args:
+        output: The output folder, made by `prepare_output`.
+        say: Told where another capture would not be noticed.
 
     Raises:
-        ThermoxelsError: The file is missing or damaged.
+        OutputError: Another capture holds the folder.
     """
+    file = output / CACHE_FOLDER / LOCK_FILE
+    lock = FileLock(file)
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as problem:
-        own = CACHE_FOLDER in path.parts
-        raise ThermoxelsError(
-            str(path),
-            expected="what an earlier stage of the capture wrote" if own else "a file of json",
-            got=str(problem),
-            remedy="Run it again with --from-stage pairs." if own else "Write it again, or pass another file.",
+        lock.acquire(blocking=False)
+        with suppress(OSError):  # the number is for the message below alone
+            file.write_text(str(os.getpid()))
+    except Timeout as problem:
+        number = _read(file) or ""
+        raise OutputError(
+            "output",
+            expected="a folder that no other capture is working in",
+            got=f"{output}, where process {number} is at work" if number.isdigit() else f"{output}, where one is",
+            remedy="Wait until it ends, or pass another folder with --output.",
         ) from problem
-
-
-def _read_key(folder: Path) -> str | None:
+    except OSError as problem:
+        drive = f"the drive of the output folder ({problem.strerror})"
+        say(f"output: {drive} does not tell whether another capture works in the folder; start one at a time")
     try:
-        return (folder / _KEY_FILE).read_text(encoding="utf-8")
+        yield
+    finally:
+        lock.release()
+
+
+def _read(file: Path) -> str | None:
+    try:
+        return file.read_text(encoding="utf-8")
     except OSError:
         return None
 

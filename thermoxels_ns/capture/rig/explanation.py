@@ -1,14 +1,14 @@
-"""What the covariance of a rig says, in words: which numbers stand for each other, and which the images do not tell."""
+"""A rig and its uncertainty in words, for console and page."""
 
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from thermoxels_ns.capture.rig.parameters import PARAMETERS
+from thermoxels_ns.capture.rig_types import FloatArray, RigEstimate
 
-FloatArray = npt.NDArray[np.float64]
-
+_FAR_LESS_SURE = 2.0
+"""Times the standard error of a point's place that the turn alone would move it, from which on that is explained."""
 _WORDS = {
     "rx": "the tilt up or down",
     "ry": "the turn left or right",
@@ -33,16 +33,85 @@ _TURN = [PARAMETERS.index(name) for name in ("rx", "ry", "rz")]
 _CENTRE = [PARAMETERS.index(name) for name in ("cx", "cy")]
 
 
-def certainty_text(covariance: FloatArray, sigmas: FloatArray) -> str:
+def turn_deg(rig: RigEstimate) -> float:
+    """Angle between the directions of the two cameras, about any axis [degrees]."""
+    trace = float(np.trace(rig.visible_to_thermal[:3, :3]))
+    return float(np.degrees(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))))
+
+
+def turn_error_deg(rig: RigEstimate) -> float:
+    """Standard error of the turn about all axes together [degrees]; NaN where it is not known."""
+    errors = rig.standard_errors
+    return float(np.degrees(np.sqrt(sum(errors.get(name, np.nan) ** 2 for name in ("rx", "ry", "rz")))))
+
+
+def found_in_images(rig: RigEstimate) -> bool:
+    """Whether the rig comes from comparing the images: neither given, nor from pictures of a board, nor the start."""
+    return rig.determined and bool(np.isfinite(rig.score_after))
+
+
+def rig_lines(rig: RigEstimate, metres_per_unit: float | None) -> tuple[str, ...]:
+    """Say in short what was found.
+
+    Args:
+        rig: The rig, lengths in units of the scene.
+        metres_per_unit: Scale of the scene; None: it has none.
+
+    Returns:
+        Two short lines; of a rig that is given or not determined its explanation.
+    """
+    if not rig.determined or not np.isfinite(rig.projection_sigma_px):
+        return (rig.explanation,)
+    focal_px = rig.thermal_camera.fl_x
+    focal = with_error(focal_px, rig.standard_errors.get("log_focal", np.nan) * focal_px, 1)
+    turn = with_error(turn_deg(rig), turn_error_deg(rig), 2)
+    return (
+        f"turned by {turn} degrees, {distance_text(rig, metres_per_unit)} apart, focal length {focal} pixels",
+        f"points fall within {rig.projection_sigma_px:.2f} thermal pixels (standard error); the page says more",
+    )
+
+
+def distance_text(rig: RigEstimate, metres_per_unit: float | None) -> str:
+    """Distance between the two lenses, in centimetres where the scale is known."""
+    distance = float(np.linalg.norm(rig.visible_to_thermal[:3, 3]))
+    if metres_per_unit is None:
+        return f"{distance:.3g} units"
+    return f"{100.0 * distance * metres_per_unit:.1f} cm"
+
+
+def why_turn_is_unsure(rig: RigEstimate) -> str:
+    """Say why the turn is less sure than the places of points; empty where it is not, or nothing was estimated."""
+    error_deg = turn_error_deg(rig)
+    alone_px = np.radians(error_deg) * rig.thermal_camera.fl_x
+    if not found_in_images(rig) or not alone_px > _FAR_LESS_SURE * rig.projection_sigma_px:
+        return ""
+    return (
+        f"The turn is sure to {error_deg:.2f} degrees only, though points fall within {rig.projection_sigma_px:.2f} "
+        "thermal pixels: without a ruler or a heated checker board (--board-photos), turn, principal point and shift "
+        "stand for each other."
+    )
+
+
+def with_error(value: float, error: float, decimals: int) -> str:
+    """Write a number with its standard error, where it has one.
+
+    >>> with_error(70.04, 0.26, 1), with_error(1.0, float("nan"), 2), with_error(1.0, 0.0, 2)
+    ('70.0 ± 0.3', '1.00', '1.00')
+    """
+    plus = f" ± {error:.{decimals}f}" if np.isfinite(error) and error > 0.0 else ""
+    return f"{value:.{decimals}f}{plus}"
+
+
+def uncertainty_text(covariance: FloatArray, sigmas: FloatArray) -> str:
     """Say which of the ten numbers of a rig are not to be trusted alone; empty where all are.
 
     Args:
         covariance: Of the ten changes, shape (10, 10).
         sigmas: Their standard deviations before the images were looked at, 0 for what is kept fixed, shape (10,).
 
-    >>> certainty_text(np.diag(np.full(10, 0.01)), np.ones(10))
+    >>> uncertainty_text(np.diag(np.full(10, 0.01)), np.ones(10))
     ''
-    >>> certainty_text(np.diag([0.01] * 9 + [0.81]), np.ones(10))
+    >>> uncertainty_text(np.diag([0.01] * 9 + [0.81]), np.ones(10))
     'The images say next to nothing about the distortion: it is as unsure as at the start.'
     """
     errors = np.sqrt(np.diag(covariance))

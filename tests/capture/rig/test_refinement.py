@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from tests.support.known_rig import KnownCapture, painted_sky
-from thermoxels_ns.capture.rig.image_pyramid import prepare_frames
+from thermoxels_ns.capture.rig.explanation import turn_errors_deg
+from thermoxels_ns.capture.rig.images import prepare_frames
 from thermoxels_ns.capture.rig.parameters import RigModel, prior_sigmas
 from thermoxels_ns.capture.rig.patches import THERMAL_BLUR_PX, PatchScore, SmoothThermal, patch_design
-from thermoxels_ns.capture.rig.subpixel import Polished, centre_doubted, polish
-from thermoxels_ns.capture.rig.uncertainty import turn_errors_deg
-from thermoxels_ns.capture.stage_types import RigStart
+from thermoxels_ns.capture.rig.refinement import RefinedRig, inflate_centre_covariance, refine
+from thermoxels_ns.capture.rig_types import RigStart
 
 NEAR = np.array([0.003, -0.004, 0.002, 0.0, 0.0, 0.0, 0.004, 0.0, 0.0, 0.0])
 """About half a pixel off."""
@@ -25,12 +25,12 @@ def sky() -> KnownCapture:
     return painted_sky(views=3)
 
 
-def polished(sky: KnownCapture, temperatures: list[np.ndarray]) -> Polished | None:
+def polished(sky: KnownCapture, temperatures: list[np.ndarray]) -> RefinedRig | None:
     frames = [replace(f, temperature_c=t.astype(np.float32)) for f, t in zip(sky.frames, temperatures)]
     prepared = prepare_frames(frames, sky.visible, sky.thermal)
     start = RigStart(sky.thermal, sky.visible_to_thermal, centre_sigma=0.0, k1_sigma=0.0, translation_sigma=1e-6)
     rig = RigModel(sky.thermal, sky.visible_to_thermal)
-    return polish(prepared, rig, NEAR, prior_sigmas(start, prepared.median_depth))
+    return refine(prepared, rig, NEAR, prior_sigmas(start, prepared.median_depth))
 
 
 def images(sky: KnownCapture) -> list[np.ndarray]:
@@ -108,7 +108,7 @@ def covariance_with_centre(variance_px: float) -> np.ndarray:
 
 def test_a_quarter_of_what_windows_say_of_the_principal_point_counts() -> None:
     covariance, sigmas = covariance_with_centre(1.0 / 9.0), np.ones(10)
-    doubted = centre_doubted(covariance, sigmas)
+    doubted = inflate_centre_covariance(covariance, sigmas)
     # Information 9, of it 1 from the start and 8 from the windows.
     assert doubted[7, 7] == pytest.approx(1.0 / 3.0)
     assert doubted[8, 8] == pytest.approx(1.0 / 3.0)
@@ -121,5 +121,5 @@ def test_a_quarter_of_what_windows_say_of_the_principal_point_counts() -> None:
 def test_a_principal_point_that_is_fixed_or_not_learnt_stays_as_sure_as_it_was() -> None:
     fixed = np.where(np.isin(np.arange(10), (7, 8)), 0.0, 1.0)
     covariance = covariance_with_centre(1.0)
-    assert np.array_equal(centre_doubted(covariance, fixed), covariance)
-    assert np.allclose(centre_doubted(covariance, np.ones(10)), covariance, rtol=0.0, atol=1e-12)
+    assert np.array_equal(inflate_centre_covariance(covariance, fixed), covariance)
+    assert np.allclose(inflate_centre_covariance(covariance, np.ones(10)), covariance, rtol=0.0, atol=1e-12)

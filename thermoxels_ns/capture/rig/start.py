@@ -1,4 +1,4 @@
-"""What the search for the rig starts from: pairs with their scene points, and what files say of the thermal camera."""
+"""Start of the search for a rig, from what the camera files say."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 
 from thermoxels_ns.capture.frames import CaptureFrame
+from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame, RigStart
 from thermoxels_ns.capture.sfm.model import SfmModel
-from thermoxels_ns.capture.stage_types import CameraModel, RigEstimate, RigFrame, RigStart
-from thermoxels_ns.capture.stages import read_json
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.core.json_values import read_json
+from thermoxels_ns.data.transforms_json import read_intrinsics
 
 _MOST_ERROR_PX = 4.0
 """Points that project farther than this from where they were seen are not used, [pixels of the photographs]."""
@@ -49,7 +51,7 @@ def rig_frames(model: SfmModel, frames: Sequence[CaptureFrame]) -> list[RigFrame
 
 def rig_start(
     frames: Sequence[CaptureFrame],
-    visible: CameraModel,
+    visible: Camera,
     thermal_size: tuple[int, int],
     field_of_view_deg: float | None = None,
     metres_per_unit: float | None = None,
@@ -70,27 +72,27 @@ def rig_start(
     angles = [frame.thermal_field_of_view_deg for frame in frames if frame.thermal_field_of_view_deg]
     angles = [angle for angle in angles if _BELIEVED_DEG[0] < angle < _BELIEVED_DEG[1]]
     if field_of_view_deg is not None:
-        camera = CameraModel.from_field_of_view(width, height, field_of_view_deg)
+        camera = Camera.from_field_of_view(width, height, field_of_view_deg)
         sigma, source = _FROM_USER, f"the angle of view that was given, {field_of_view_deg:g} degrees"
     elif lens:
         focal = median(lens)
-        camera = CameraModel(width, height, focal, focal, width / 2, height / 2)
+        camera = Camera(width, height, focal, focal, width / 2, height / 2)
         sigma, source = _FROM_LENS, f"the thermal files' focal length and pixel pitch, {focal:.1f} pixels"
     elif flir:
         ratio = median(each.real_to_thermal for each in flir)
         focal = visible.fl_x * width / visible.width * ratio
-        camera = CameraModel(width, height, focal, focal, width / 2, height / 2)
+        camera = Camera(width, height, focal, focal, width / 2, height / 2)
         x, y = (median(getattr(each, name) for each in flir) for name in ("offset_x", "offset_y"))
         # The thermal image's centre lies at the photograph's centre plus the offset.
         transform[:3, :3] = _turn(x / visible.fl_x, y / visible.fl_y)
         sigma, source = _FROM_FLIR, f"FLIR's alignment of the pictures (Real2IR {ratio:.3f}, offset {x:g}, {y:g})"
     elif angles:
         angle = median(angles)
-        camera = CameraModel.from_field_of_view(width, height, angle)
+        camera = Camera.from_field_of_view(width, height, angle)
         sigma, source = _FROM_ANGLE, f"the thermal files' angle of view, {angle:g} degrees"
     else:
         focal = visible.fl_x * width / visible.width
-        camera = CameraModel(width, height, focal, focal, width / 2, height / 2)
+        camera = Camera(width, height, focal, focal, width / 2, height / 2)
         sigma, source = _GUESSED, "a guess: the photographs' angle of view"
     return RigStart(
         thermal_camera=camera,
@@ -117,13 +119,11 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
     remedy = "Pass the transforms.json of an earlier capture with the same camera."
     try:
         entries = content["thermal_camera"]
-        names = ("fl_x", "fl_y", "cx", "cy")
-        lens = {name: float(entries.get(name, 0.0)) for name in ("k1", "k2", "p1", "p2")}
-        camera = CameraModel(
-            *(_pixels(entries, name, file) for name in ("w", "h")),
-            **{name: float(entries[name]) for name in names},
-            **lens,
-        )
+        for name in ("w", "h"):
+            if not float(entries[name]).is_integer():  # neither infinity nor NaN is one
+                where = f"{file.name}: thermal_camera.{name}"
+                raise SceneError(where, expected="a whole number of pixels", got=entries[name], remedy=remedy)
+        camera = read_intrinsics(entries, {}, None, f"{file.name}: thermal_camera")
         transform = np.array(content["rig"], dtype=np.float64)
     except (KeyError, TypeError, ValueError, AttributeError) as problem:
         if isinstance(problem, SceneError):
@@ -147,30 +147,7 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
         lengths = "its lengths converted by the two scales"
     else:
         lengths = "its lengths taken for those of this scene, because not both have a scale"
-    return RigEstimate(
-        thermal_camera=camera,
-        visible_to_thermal=transform,
-        parameters=(),
-        covariance=np.zeros((0, 0)),
-        determined=True,
-        explanation=f"Given in {file.name}, {lengths}.",
-        score_before=math.nan,
-        score_after=math.nan,
-        projection_sigma_px=math.nan,
-    )
-
-
-def _pixels(entries: Any, name: str, file: Path) -> int:
-    """Width or height of a camera in a json."""
-    number = float(entries[name])
-    if not number.is_integer():  # neither infinity nor NaN is one
-        raise SceneError(
-            f"{file.name}: thermal_camera.{name}",
-            expected="a whole number of pixels",
-            got=entries[name],
-            remedy="Pass the transforms.json of an earlier capture with the same camera.",
-        )
-    return int(number)
+    return RigEstimate(camera, transform, True, f"Given in {file.name}, {lengths}.")
 
 
 def _is_rigid(transform: np.ndarray) -> bool:
@@ -184,17 +161,8 @@ def _is_rigid(transform: np.ndarray) -> bool:
 
 def kept_start(start: RigStart, why: str) -> RigEstimate:
     """The start value as an estimate, where nothing can be compared."""
-    return RigEstimate(
-        thermal_camera=start.thermal_camera,
-        visible_to_thermal=start.visible_to_thermal,
-        parameters=(),
-        covariance=np.zeros((0, 0)),
-        determined=False,
-        explanation=f"{why} The start value is kept: {start.source}.",
-        score_before=math.nan,
-        score_after=math.nan,
-        projection_sigma_px=math.nan,
-    )
+    text = f"{why} The start value is kept: {start.source}."
+    return RigEstimate(start.thermal_camera, start.visible_to_thermal, False, text)
 
 
 def _turn(right: float, down: float) -> np.ndarray:

@@ -1,23 +1,83 @@
-"""A capture that is stopped at any moment goes on as if it had not been, and no half-made result is taken for whole."""
+"""Stages run once for the same input, again when something changed, and survive an interruption."""
 
 from __future__ import annotations
 
+import errno
 import gc
 import shutil
+import signal
 import sqlite3
+import subprocess
 import sys
 
+import filelock
 import pytest
 
 from tests.support.camera_card import counts, photograph
 from tests.support.posed_model import ring_model
 from tests.support.textured_room import VISIBLE
-from thermoxels_ns.capture.results import load_model, save_model
-from thermoxels_ns.capture.run import run_capture
+from thermoxels_ns.capture.results import load, load_json, save
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.feature_matching import FeatureOptions, fill_database
-from thermoxels_ns.capture.stages import STAGES, StageCache
-from thermoxels_ns.core.errors import OutputError, SceneError
+from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, ReducedPhotographs, fill_database
+from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.stage_cache import STAGES, StageCache, fingerprint, locked, prepare_output
+from thermoxels_ns.commands.capture import capture_folder
+from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.core.json_values import read_json
+
+
+def run_two(folder, first=1, second=1, from_stage=None):
+    """Two stages that note that they ran; returns which did."""
+    ran = []
+    cache = StageCache(folder, from_stage)
+    for name, option in (("pairs", first), ("temperatures", second)):
+        cache.run(name, {"option": option}, lambda where, name=name: ran.append(name) or (where / "x").write_text(name))
+    return ran
+
+
+def test_a_change_runs_this_stage_and_all_later_ones(tmp_path):
+    run_two(tmp_path)
+    assert run_two(tmp_path, second=2) == ["temperatures"]
+    assert run_two(tmp_path, first=2, second=2) == ["pairs", "temperatures"]
+
+
+def test_an_interrupted_stage_finds_what_it_left_and_a_changed_one_does_not(tmp_path):
+    def interrupted(where):
+        (where / "half").write_text("done")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        StageCache(tmp_path).run("poses", {"size": 1}, interrupted)
+    found = []
+    StageCache(tmp_path).run("poses", {"size": 1}, lambda where: found.append((where / "half").exists()))
+    StageCache(tmp_path).run("poses", {"size": 2}, lambda where: found.append((where / "half").exists()))
+    assert found == [True, False]
+
+
+def test_a_damaged_result_says_what_to_do(tmp_path):
+    path = tmp_path / "pairs.json"
+    for read, said in ((load_json, "--from-stage pairs"), (read_json, "pass another file")):
+        for content in ("{", "[" * 100_000, None):
+            path.unlink() if content is None else path.write_text(content)
+            with pytest.raises(ThermoxelsError, match=rf"{path.name}.*{said}"):
+                read(path)
+
+
+def test_a_file_that_was_replaced_is_noticed(tmp_path):
+    file = tmp_path / "a.jpg"
+    file.write_bytes(b"1")
+    before = fingerprint([file], tmp_path)
+    file.write_bytes(b"22")
+    assert before[0][0] == "a.jpg"
+    assert fingerprint([file], tmp_path) != before
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path):
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(OutputError, match="which holds other files"):
+        prepare_output(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+    assert prepare_output(prepare_output(tmp_path / "new")) == tmp_path / "new"
 
 
 def run_stage(folder, from_stage=None, writes=()):
@@ -100,12 +160,13 @@ def test_a_database_without_its_last_frame_is_begun_again(tmp_path):
     names = ["0000.jpg", "0001.jpg"]
     for name in names:
         Image.new("L", (VISIBLE.width, VISIBLE.height), 90).save(tmp_path / "images" / name)
-    options = FeatureOptions(50, "auto", "SIMPLE_RADIAL", 0, 1)
+    size = (VISIBLE.width, VISIBLE.height)
+    frames = {name: name for name in names}
+    photographs = ReducedPhotographs(tmp_path / "features.db", tmp_path / "images", frames, size)
 
     def fill():
-        database = tmp_path / "features.db"
-        fill_database(database, tmp_path / "images", names, VISIBLE, True, None, options, lambda _: None)
-        with sqlite3.connect(database) as opened:
+        fill_database(photographs, VISIBLE, True, PoseOptions(max_features=50, threads=1), lambda _: None)
+        with sqlite3.connect(photographs.database) as opened:
             return [opened.execute(f"select count(*) from {table}").fetchone()[0] for table in ("images", "frames")]
 
     assert fill() == [2, 2]
@@ -123,20 +184,20 @@ def test_a_result_that_does_not_fit_on_the_disk_is_one_error(tmp_path, monkeypat
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))
     try:
         with pytest.raises(OutputError, match=r"model\.npz"):
-            save_model(tmp_path, ring_model(4))
+            save(tmp_path / "model.npz", ring_model(4))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     gc.collect()
     assert later == [] and list(tmp_path.iterdir()) == []
-    save_model(tmp_path, ring_model(4))
-    assert load_model(tmp_path).frames == ring_model(4).frames
+    save(tmp_path / "model.npz", ring_model(4))
+    assert load(tmp_path / "model.npz", SfmModel).frames == ring_model(4).frames
 
 
 def stages_that_ran(card, scene, **more):
     """Titles of the stages that did not come from the cache, in a capture that ends at the poses."""
     said: list[str] = []
     with pytest.raises(SceneError, match="photographs that fit together"):
-        run_capture(card, scene, CaptureSettings(**more), said.append)
+        capture_folder(card, scene, CaptureSettings(**more), said.append)
     return [line.split()[1] for line in said if line[:2].strip("0123456789") == "/" and "as before" not in line]
 
 
@@ -204,3 +265,60 @@ def test_from_stage_runs_that_stage_and_all_after_it(tmp_path, stage):
     assert run() == list(STAGES)
     assert run(stage) == list(STAGES[STAGES.index(stage) :])
     assert run() == []
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from thermoxels_ns.capture.stage_cache import locked
+with locked(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.fixture
+def output(tmp_path):
+    return prepare_output(tmp_path / "scene")
+
+
+def test_a_second_capture_is_refused_and_changes_nothing(tmp_path, output):
+    (tmp_path / "card").mkdir()
+    half = output / ".capture.4711.part.html"
+    half.write_text("being written by the first one")
+    with locked(output):
+        before = sorted(output.rglob("*"))
+        with pytest.raises(OutputError, match=r"no other capture.*process \d+ is at work.*--output"):
+            capture_folder(tmp_path / "card", output, CaptureSettings())
+        assert sorted(output.rglob("*")) == before
+        with locked(prepare_output(tmp_path / "another")):
+            assert half.exists()
+
+
+def test_a_folder_is_free_again_after_an_error(output):
+    with pytest.raises(KeyboardInterrupt), locked(output):
+        raise KeyboardInterrupt
+    with locked(output):
+        pass
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
+def test_a_killed_process_leaves_no_lock(output):
+    with subprocess.Popen([sys.executable, "-c", HOLD, str(output)], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        with pytest.raises(OutputError, match=f"process {process.pid} is at work"), locked(output):
+            pass
+        process.kill()
+    with locked(output):
+        pass
+
+
+def test_a_drive_without_locks_says_so_and_goes_on(output, monkeypatch):
+    def refused(*_, **__):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(filelock.FileLock, "acquire", refused)
+    said = []
+    with locked(output, said.append):
+        assert len(said) == 1 and "No locks available" in said[0] and "start one at a time" in said[0]

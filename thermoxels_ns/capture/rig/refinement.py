@@ -1,13 +1,4 @@
-"""The last step of the search for a rig: windows in which the thermal images follow the photographs exactly.
-
-The comparison of edges leaves some tenths of a pixel, always to the same side, because edges in a photograph and in a
-thermal image are not of the same strength. Windows that one gain explains almost wholly do not have that error
-(`rig_patches`); they are chosen anew after each climb.
-
-Frames show the same things, so what errs in one errs in others: up to six together count as one frame in the standard
-errors and against what was known before. More frames look from other places, where the same windows err another way, so
-that thirty tell more than six. What the windows say of the principal point counts less still (`centre_doubted`).
-"""
+"""Refines a rig by windows of thermal images that follow the photographs."""
 
 from __future__ import annotations
 
@@ -17,8 +8,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.rig.fit import RigClimber
-from thermoxels_ns.capture.rig.image_pyramid import (
+from thermoxels_ns.capture.rig.fit import RigMaximizer
+from thermoxels_ns.capture.rig.images import (
     FARTHEST_FROM_POINT,
     SURE_DISTANCE,
     PreparedFrame,
@@ -26,8 +17,7 @@ from thermoxels_ns.capture.rig.image_pyramid import (
 )
 from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel
 from thermoxels_ns.capture.rig.patches import THERMAL_BLUR_PX, PatchDesign, PatchScore, SmoothThermal, patch_design
-
-FloatArray = npt.NDArray[np.float64]
+from thermoxels_ns.capture.rig_types import FloatArray
 
 _PITCH = 1.3
 """Pixels of the reduced photograph per thermal pixel."""
@@ -45,17 +35,17 @@ _FEWEST_WINDOWS = 150
 _ABOVE_CHANCE = 3.0
 _ELSEWHERE_PX = 5.0
 _MOST_SHIFT_PX = 2.0
-_ALIKE = 6
+_CORRELATED_FRAMES = 6
 """Frames that count as one. In five drawn captures of 36 frames the turn was wrong by 0.09 degrees (median) with 6, by
 0.22 where all counted as one; where none did, no better in the four that were tried."""
 _CENTRE = [PARAMETERS.index(name) for name in ("cx", "cy")]
-_CENTRE_DOUBT = 4.0
+_CENTRE_INFLATION = 4.0
 """By how much the windows' information on the principal point is divided. In drawn captures with known rigs its errors
 were one to two times what the scatter of the windows says, up to six times in one; those of the rest were not."""
 
 
 @dataclass(frozen=True, eq=False)
-class Polished:
+class RefinedRig:
     """The rig after the last step."""
 
     change: FloatArray
@@ -66,14 +56,23 @@ class Polished:
     """How many windows it rests on."""
 
 
-def polish(prepared: PreparedFrames, rig: RigModel, change: FloatArray, sigmas: FloatArray) -> Polished | None:
+def refine(prepared: PreparedFrames, rig: RigModel, change: FloatArray, sigmas: FloatArray) -> RefinedRig | None:
     """Move a rig that is right to about a pixel to where the windows agree best.
+
+    The comparison of edges leaves a bias of some tenths of a pixel, because edges in a photograph and in a thermal
+    image are not of the same strength. Windows that one gain explains almost wholly do not have that bias (`patches`);
+    they are chosen anew after each maximisation.
+
+    Frames show the same things, so their errors are correlated: up to six together count as one frame in the standard
+    errors and against the prior. More frames look from other places, where the errors of the same windows differ, so
+    that thirty tell more than six. What the windows say of the principal point counts less still
+    (`inflate_centre_covariance`).
 
     Args:
         prepared: All frames.
         rig: What changes count from, at full size.
         change: The ten changes so far.
-        sigmas: Standard deviations of the ten changes (`rig_parameters.prior_sigmas`).
+        sigmas: Standard deviations of the ten changes (`parameters.prior_sigmas`).
 
     Returns:
         The better rig; None where too few windows agree, or hardly more than by chance.
@@ -93,21 +92,21 @@ def polish(prepared: PreparedFrames, rig: RigModel, change: FloatArray, sigmas: 
     thermal = [SmoothThermal(frame.contrast) for frame in prepared.frames]
     designs = [_design(frame, prepared, view, blur_px, _MOST_WINDOWS) for frame in prepared.frames]
     score = PatchScore(designs, thermal, rig)
-    start, chosen, climber = change, score, RigClimber(score, sigmas, prepared.median_depth)
+    start, chosen, maximizer = change, score, RigMaximizer(score, sigmas, prepared.median_depth)
     for reach_px in _REACHES_PX:
         chosen = score.selected(_agreeing(score, change, reach_px))
         if chosen.windows < _FEWEST_WINDOWS:
             return None
-        climber = RigClimber(chosen, sigmas, prepared.median_depth, min(count, _ALIKE))
-        change = climber.climb(change).change
+        maximizer = RigMaximizer(chosen, sigmas, prepared.median_depth, min(count, _CORRELATED_FRAMES))
+        change = maximizer.maximize(change).change
     points = np.concatenate([design.points for design in score.designs])
     moved = np.linalg.norm(rig.project(change, points) - rig.project(start, points), axis=1)
     if not np.nanmedian(moved) < _MOST_SHIFT_PX:
         return None
-    return Polished(change, centre_doubted(climber.covariance(change), sigmas), chosen.windows)
+    return RefinedRig(change, inflate_centre_covariance(maximizer.covariance(change), sigmas), chosen.windows)
 
 
-def centre_doubted(covariance: FloatArray, sigmas: FloatArray) -> FloatArray:
+def inflate_centre_covariance(covariance: FloatArray, sigmas: FloatArray) -> FloatArray:
     """State the principal point, and what stands for it, as less sure than the windows' scatter says.
 
     Turn and principal point differ in the image only by terms of second order, some tenths of a pixel in its corners,
@@ -127,13 +126,13 @@ def centre_doubted(covariance: FloatArray, sigmas: FloatArray) -> FloatArray:
     before = np.diag(1.0 / sigmas[_CENTRE] ** 2)
     inner = covariance[np.ix_(_CENTRE, _CENTRE)]
     known = np.linalg.inv(inner)
-    gained = _not_negative(known - before)
-    added = _not_negative(np.linalg.inv(before + gained / _CENTRE_DOUBT) - inner)
+    gained = _positive_part(known - before)
+    added = _positive_part(np.linalg.inv(before + gained / _CENTRE_INFLATION) - inner)
     follow = covariance[:, _CENTRE] @ known
     return covariance + follow @ added @ follow.T
 
 
-def _not_negative(symmetric: FloatArray) -> FloatArray:
+def _positive_part(symmetric: FloatArray) -> FloatArray:
     """A symmetric matrix with its negative eigenvalues set to 0."""
     values, vectors = np.linalg.eigh(0.5 * (symmetric + symmetric.T))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T, dtype=np.float64)

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thermoxels_ns.capture.rig.edge_structure import edge_field, local_contrast, without_fixed_pattern
-from thermoxels_ns.capture.rig.image_pyramid import even_trust
+from thermoxels_ns.capture.rig.images import edge_field, edge_weights, local_contrast, without_fixed_pattern
 
 
 def step(angle_deg: float, size: int = 64) -> np.ndarray:
@@ -51,9 +50,9 @@ def test_lengths_follow_the_pixels_that_they_are_given_in() -> None:
 def test_an_edge_is_trusted_alike_on_both_sides() -> None:
     rows, columns = (axis.ravel() for axis in np.mgrid[:20, 8:13])
     distance = np.where(columns < 10, 0.001, 0.05)  # scene points on the left side only
-    trust = even_trust(rows, columns, distance, (20, 20), 1.0).reshape(20, 5)
+    trust = edge_weights(rows, columns, distance, (20, 20), 1.0).reshape(20, 5)
     assert np.allclose(trust, 1.0, atol=1e-3)
-    alone = even_trust(rows, columns, np.full(len(rows), 0.05), (20, 20), 1.0)
+    alone = edge_weights(rows, columns, np.full(len(rows), 0.05), (20, 20), 1.0)
     assert alone.max() < 0.01
 
 

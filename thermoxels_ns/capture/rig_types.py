@@ -1,19 +1,19 @@
-"""What crosses the walls between pairs, poses, rig, drift and the scene writer.
+"""Types shared by poses, rig, drift and the scene writer."""
 
-Poses are camera to world with x right, y up, z back (OpenGL), as in transforms.json. Transforms between two cameras
-and points in front of a camera have x right, y down, z ahead (OpenCV). Pixel centres lie at +0.5. Lengths are those
-of the world that structure from motion found; its scale may be unknown.
-"""
+# Poses are camera to world with x right, y up, z back (OpenGL), as in transforms.json. Transforms between two cameras
+# and points in front of a camera have x right, y down, z ahead (OpenCV). Pixel centres lie at +0.5. Lengths are those
+# of the world that structure from motion found; its scale may be unknown.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.camera import Camera as CameraModel
+from thermoxels_ns.core.camera import Camera
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -50,7 +50,7 @@ class RigFrame:
 class RigStart:
     """What is known of the rig before the images are compared, and how well: a guess with standard deviations."""
 
-    thermal_camera: CameraModel
+    thermal_camera: Camera
     """Start value of the thermal intrinsics, at the thermal images' size."""
     visible_to_thermal: FloatArray = field(default_factory=lambda: np.eye(4))
     """x_thermal = visible_to_thermal @ x_visible, shape (4, 4), OpenCV axes, lengths in world units."""
@@ -73,24 +73,24 @@ class RigStart:
 class RigEstimate:
     """The rig as found, or the start where the images cannot tell."""
 
-    thermal_camera: CameraModel
+    thermal_camera: Camera
     """Thermal intrinsics."""
     visible_to_thermal: FloatArray
     """x_thermal = visible_to_thermal @ x_visible, shape (4, 4), OpenCV axes, lengths in world units."""
-    parameters: tuple[str, ...]
-    """Names of the parameters that the covariance is of: rx, ry, rz [rad], tx, ty, tz [world units], log_focal, cx, cy
-    [thermal pixels], k1."""
-    covariance: FloatArray
-    """Covariance of the parameters, shape (n, n)."""
     determined: bool
-    """Whether the images say where the thermal camera is. False: camera and transform are those of the start."""
+    """Whether it is known where the thermal camera is. False: camera and transform are those of the start."""
     explanation: str
     """One sentence for the report: what was found, or why nothing could be."""
-    score_before: float
-    """Agreement of thermal and visible edges with the start value, -1 to 1."""
-    score_after: float
+    parameters: tuple[str, ...] = ()
+    """Names of the parameters that the covariance is of: rx, ry, rz [rad], tx, ty, tz [world units], log_focal, cx, cy
+    [thermal pixels], k1. Empty: nothing was estimated."""
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    """Covariance of the parameters, shape (n, n)."""
+    score_before: float = math.nan
+    """Agreement of thermal and visible edges with the start value, -1 to 1; NaN: not compared."""
+    score_after: float = math.nan
     """The same with the values returned."""
-    projection_sigma_px: float
+    projection_sigma_px: float = math.nan
     """Standard error of where a scene point falls in the thermal image, median over the points [thermal pixels]."""
 
     @property

@@ -1,4 +1,4 @@
-"""Thermal images laid over the photographs, for a person to judge whether they fit."""
+"""Pictures and samples for the page of a capture: thermal images laid over photographs."""
 
 from __future__ import annotations
 
@@ -10,9 +10,16 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from thermoxels_ns.capture.camera_files import shown_name
 from thermoxels_ns.capture.photograph import open_photograph
+from thermoxels_ns.capture.rig.start import rig_frames
+from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame
+from thermoxels_ns.capture.run import CaptureResult
+from thermoxels_ns.capture.scene_writer import scene_names
 from thermoxels_ns.capture.sfm.sparse_depth import SparseDepth
-from thermoxels_ns.capture.stage_types import CameraModel, RigEstimate, RigFrame
+from thermoxels_ns.core.camera import Camera
+from thermoxels_ns.reports.capture_page import CapturePage, Overlay, build_page
+from thermoxels_ns.reports.page import write_page
 
 _WIDTH = 640
 _DEPTH_STEP = 4
@@ -20,10 +27,59 @@ _DEPTH_STEP = 4
 _COLOUR_SHARE = 0.55
 """How much of the thermal colours covers the photograph."""
 _PERCENTILES = (2.0, 98.0)
+"""Of a thermal image's temperatures, for its darkest and brightest colours."""
+_SHOWN = 6
+_SAMPLED_PIXELS = 4000
+"""Of every thermal image, for the histogram."""
+
+
+def write_capture_page(result: CaptureResult) -> None:
+    """Draw the overlays and write the page of a capture, whole or not at all."""
+    scene, names = result.scene, scene_names(len(result.scene.frames))
+    paired = rig_frames(scene.model, scene.frames)
+    overlays = []
+    for index in spread_out(len(paired), _SHOWN):
+        temperature_c = scene.drift.corrected(index, np.load(scene.frames[index].thermal))
+        drawn_over = [
+            jpeg_of(overlay(paired[index], temperature_c, scene.model.camera, rig)) for rig in (result.start, scene.rig)
+        ]
+        known = temperature_c[np.isfinite(temperature_c)]
+        low, high = (float(each) for each in np.percentile(known, _PERCENTILES)) if known.size else (0.0, 1.0)
+        alone = jpeg_of(colours(temperature_c, (low, high)).astype(np.uint8))
+        title = f"{names[index]}: {scene.frames[index].photograph_source}"
+        overlays.append(Overlay(title, *drawn_over, alone, (low, high) if known.size else None))
+    samples, masked, pixels = [], 0, 0
+    for index, frame in enumerate(scene.frames):
+        temperature_c = scene.drift.corrected(index, np.load(frame.thermal)).ravel()
+        samples.append(temperature_c[:: max(1, len(temperature_c) // _SAMPLED_PIXELS)])
+        masked, pixels = masked + frame.masked, pixels + len(temperature_c)
+    drawn = scene.masks.overlay
+    page = CapturePage(
+        title=f"Capture of {shown_name(result.source.resolve())}",
+        pairs=result.pairs,
+        dropped=result.dropped,
+        frames=scene.frames,
+        scene_names=names,
+        model=scene.model,
+        rig=scene.rig,
+        start=result.start,
+        drift=scene.drift,
+        scale=scene.scale,
+        scale_missing=result.scale_missing,
+        up=scene.up,
+        overlays=overlays,
+        temperatures_c=np.concatenate(samples),
+        masked_share=masked / max(pixels, 1),
+        dead_pixels=result.read.dead_pixels,
+        poses_source=result.poses_source,
+        overlay_share=None if drawn is None else float(1.0 - drawn.mean()),
+        seconds=list(result.seconds),
+    )
+    write_page(result.page, build_page(page))
 
 
 def thermal_in_photograph(
-    frame: RigFrame, temperature_c: npt.NDArray, visible: CameraModel, rig: RigEstimate, width: int = _WIDTH
+    frame: RigFrame, temperature_c: npt.NDArray, visible: Camera, rig: RigEstimate, width: int = _WIDTH
 ) -> npt.NDArray[np.float32]:
     """Carry a thermal image into the photograph's view, through the depth of the scene points.
 
@@ -56,13 +112,13 @@ def thermal_in_photograph(
     )
 
 
-def _grid_rays(camera: CameraModel, width: int, height: int) -> npt.NDArray[np.float64]:
+def _grid_rays(camera: Camera, width: int, height: int) -> npt.NDArray[np.float64]:
     """Rays of depth 1 through the pixels of a reduced photograph, row by row, shape (width * height, 3)."""
     grid = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
     return camera.resized(width, height).rays(grid)
 
 
-def overlay(frame: RigFrame, temperature_c: npt.NDArray, visible: CameraModel, rig: RigEstimate) -> npt.NDArray:
+def overlay(frame: RigFrame, temperature_c: npt.NDArray, visible: Camera, rig: RigEstimate) -> npt.NDArray:
     """Photograph in grey with its edges, thermal image in colours over it, shape (height, width, 3) of uint8."""
     carried = thermal_in_photograph(frame, temperature_c, visible, rig)
     height, width = carried.shape

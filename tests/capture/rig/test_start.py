@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from thermoxels_ns.capture.rig.inputs import read_rig
+from thermoxels_ns.capture.rig.start import read_rig
 from thermoxels_ns.core.errors import SceneError
 
 CAMERA = {"w": 64, "h": 48, "fl_x": 70.0, "fl_y": 70.0, "cx": 32.0, "cy": 24.0}

@@ -1,0 +1,116 @@
+"""A rig and its covariance in words: errors beside numbers, what is exchanged, what is unknown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.capture.rig.explanation import (
+    rig_lines,
+    turn_error_deg,
+    turn_errors_deg,
+    uncertainty_text,
+    why_turn_is_unsure,
+)
+from thermoxels_ns.capture.rig.parameters import PARAMETERS
+from thermoxels_ns.capture.rig_types import RigEstimate
+from thermoxels_ns.core.camera import Camera
+
+ERRORS = {"rx": 0.003, "ry": 0.004, "rz": 0.012, "log_focal": 0.01, "cx": 0.42, "cy": 0.57}
+"""Their squares add up to 0.013 rad squared, 0.745 degrees."""
+
+
+@pytest.fixture
+def rig() -> RigEstimate:
+    turn = np.radians(2.0)
+    transform = np.eye(4)
+    transform[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    transform[:3, 3] = (0.03, 0.0, -0.04)
+    covariance = np.diag([ERRORS.get(name, 0.0) ** 2 for name in PARAMETERS])
+    camera = Camera(80, 60, 70.0, 70.0, 41.0, 29.0)
+    return RigEstimate(camera, transform, True, "Found. Long words.", PARAMETERS, covariance, 0.1, 0.4, 0.08)
+
+
+def test_two_short_lines_say_what_was_found(rig):
+    first, second = rig_lines(rig, 2.0)
+    assert first == "turned by 2.00 ± 0.74 degrees, 10.0 cm apart, focal length 70.0 ± 0.7 pixels"
+    assert second.startswith("points fall within 0.08 thermal pixels")
+    assert max(len(first), len(second)) < 100
+    assert "0.05 units apart" in rig_lines(rig, None)[0]
+
+
+@pytest.mark.parametrize("change", [{"determined": False}, {"projection_sigma_px": np.nan}])
+def test_a_rig_that_was_not_estimated_says_why(rig, change):
+    assert rig_lines(replace(rig, **change), 2.0) == ("Found. Long words.",)
+
+
+def test_a_turn_that_is_less_sure_than_the_points_says_why(rig):
+    assert turn_error_deg(rig) == pytest.approx(np.degrees(0.013))
+    assert why_turn_is_unsure(rig).startswith("The turn is sure to 0.74 degrees only, though points fall within 0.08")
+    assert why_turn_is_unsure(replace(rig, projection_sigma_px=0.9)) == ""  # alone it moves a point by 0.91
+    assert why_turn_is_unsure(replace(rig, score_after=np.nan)) == ""  # from a board
+    assert why_turn_is_unsure(replace(rig, determined=False)) == ""
+    assert why_turn_is_unsure(replace(rig, parameters=(), covariance=np.zeros((0, 0)))) == ""
+
+
+RX, TY, FOCAL, CY = (PARAMETERS.index(name) for name in ("rx", "ty", "log_focal", "cy"))
+
+
+def covariance_of(first: int, second: int, correlation: float) -> np.ndarray:
+    errors = np.linspace(0.01, 0.1, 10)
+    result = np.diag(errors**2)
+    result[first, second] = result[second, first] = correlation * errors[first] * errors[second]
+    return result
+
+
+def test_a_rig_that_is_known_needs_no_words() -> None:
+    assert uncertainty_text(covariance_of(RX, CY, 0.5), np.ones(10)) == ""
+
+
+def test_what_stands_for_each_other_is_named_with_either_sign() -> None:
+    for sign in (1.0, -1.0):
+        text = uncertainty_text(covariance_of(RX, CY, 0.95 * sign), np.ones(10))
+        assert "hardly tell apart the tilt up or down and the principal point's row:" in text
+        assert "shift" not in text and "focal" not in text
+    assert "the tilt up or down and the shift up or down" in uncertainty_text(covariance_of(RX, TY, 0.9), np.ones(10))
+
+
+def test_what_is_as_unsure_as_before_is_named_and_what_is_kept_fixed_is_not() -> None:
+    covariance = covariance_of(RX, CY, 0.0)
+    sigmas = np.ones(10)
+    sigmas[[FOCAL, CY]] = np.sqrt(np.diag(covariance))[[FOCAL, CY]]
+    text = uncertainty_text(covariance, sigmas)
+    assert text.endswith("about the focal length, the principal point's row: they are as unsure as at the start.")
+    covariance[CY], covariance[:, CY], sigmas[CY] = 0.0, 0.0, 0.0
+    text = uncertainty_text(covariance, sigmas)
+    assert text == "The images say next to nothing about the focal length: it is as unsure as at the start."
+
+
+def test_the_turn_is_said_as_it_is_and_with_the_principal_point_known() -> None:
+    errors = np.full(10, 1e-6)
+    errors[[RX, CY]] = np.radians(0.5), 0.4
+    covariance = np.diag(errors**2)
+    covariance[RX, CY] = covariance[CY, RX] = -0.96 * errors[RX] * errors[CY]
+    text = uncertainty_text(covariance, np.ones(10))
+    assert "The turn is sure to 0.50 degrees; with the principal point known, " in text
+    assert "it would be to 0.14." in text  # 0.5 sqrt(1 - 0.96^2)
+    covariance[RX, CY] = covariance[CY, RX] = 0.5 * covariance[RX, CY]
+    assert "The turn is sure to" not in uncertainty_text(covariance, np.ones(10))
+
+
+def test_what_the_turn_would_be_is_the_inverse_of_the_information_on_all_but_the_principal_point() -> None:
+    draw = np.random.default_rng(0).standard_normal((10, 14))
+    information = draw @ draw.T
+    free = [number for number in range(10) if number not in (CY - 1, CY)]
+    alone = np.linalg.inv(information[np.ix_(free, free)])
+    as_it_is, known = turn_errors_deg(np.linalg.inv(information))
+    assert known == pytest.approx(np.degrees(np.sqrt(np.trace(alone[:3, :3]))), rel=1e-9)
+    assert as_it_is > known
+
+
+def test_a_principal_point_that_is_kept_fixed_changes_nothing() -> None:
+    covariance = np.diag(np.r_[np.full(7, 1e-4), 0.0, 0.0, 0.0])
+    as_it_is, known = turn_errors_deg(covariance)
+    assert as_it_is == known == pytest.approx(np.degrees(np.sqrt(3e-4)))

@@ -1,0 +1,292 @@
+"""The rig from pictures of a heated checker board that both cameras see."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import least_squares
+
+from thermoxels_ns.capture.camera_files import scan_folder
+from thermoxels_ns.capture.frames import read_frames
+from thermoxels_ns.capture.pairs import PairOptions, find_pairs
+from thermoxels_ns.capture.photograph import open_photograph
+from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel, prior_sigmas
+from thermoxels_ns.capture.rig.start import BASELINE_SIGMA_M, rig_start
+from thermoxels_ns.capture.rig_types import FloatArray, RigEstimate, RigStart
+from thermoxels_ns.capture.settings import CaptureSettings
+from thermoxels_ns.capture.sfm.metric_scale import MetricScale
+from thermoxels_ns.core.camera import Camera
+from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.radiometry.camera_file import RadiometryOptions
+
+_SIZE = re.compile(r"(\d{1,3})\s*[xX]\s*(\d{1,3})")
+_SHIFTS = slice(3, 6)
+"""Of a rig's ten parameters, those that are lengths."""
+
+_FEWEST_BOARDS = 3
+_CORNER_SIGMA_PX = 0.3
+_PERCENTILES = (1.0, 99.0)
+_SMALLEST_SIDE_PX = 480
+_LARGEST_ENLARGEMENT = 6
+
+
+@dataclass(frozen=True)
+class CheckerBoard:
+    """A board of dark and light squares."""
+
+    columns: int
+    """Inner corners along the longer side; one less than squares."""
+    rows: int
+    """Inner corners along the shorter side."""
+    square_m: float
+    """Side of a square [m]."""
+
+    def __post_init__(self) -> None:
+        if min(self.columns, self.rows) < 3 or self.columns == self.rows or not self.square_m > 0.0:
+            raise SceneError(
+                "checker board",
+                expected="at least 3 inner corners per side, not as many along both, and a square above 0 m",
+                got=f"{self.columns} x {self.rows} corners of {self.square_m} m",
+                remedy="Count the inner corners; use a board with sides that differ.",
+            )
+
+    @property
+    def corners(self) -> FloatArray:
+        """Inner corners on the board, row by row, shape (n, 3) [m]."""
+        grid = np.stack(np.meshgrid(np.arange(self.columns), np.arange(self.rows)), axis=-1).reshape(-1, 2)
+        return np.column_stack([grid * self.square_m, np.zeros(len(grid))])
+
+
+def find_board(image: npt.NDArray, board: CheckerBoard) -> FloatArray | None:
+    """Find the board's inner corners to a fraction of a pixel.
+
+    Args:
+        image: Grey values or temperatures, shape (height, width).
+        board: What to look for.
+
+    Returns:
+        Pixel positions in the order of `CheckerBoard.corners`, from one of the two ends, shape (n, 2); None: no board.
+    """
+    values = np.asarray(image, dtype=np.float32)
+    if not np.isfinite(values).any():
+        return None
+    low, high = np.nanpercentile(values, _PERCENTILES)
+    grey = np.nan_to_num((values - low) * (255.0 / max(float(high - low), 1e-6)), nan=0.0).clip(0, 255)
+    side = min(grey.shape)
+    enlarged = min(max(-(-_SMALLEST_SIDE_PX // side), 1), _LARGEST_ENLARGEMENT)
+    size = grey.shape[1] * enlarged, grey.shape[0] * enlarged
+    picture = cv2.resize(grey.astype(np.uint8), size, interpolation=cv2.INTER_CUBIC)
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
+    found, corners = cv2.findChessboardCornersSB(picture, (board.columns, board.rows), flags=flags)
+    if not found:
+        return None
+    return (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / enlarged
+
+
+def rig_from_boards(
+    pairs: Sequence[tuple[npt.NDArray, npt.NDArray]], visible: Camera, start: RigStart, board: CheckerBoard
+) -> RigEstimate:
+    """Find the rig from pictures of a checker board in different places.
+
+    The photograph and the visible camera say where the board is; robust least squares (Huber's loss) moves the thermal
+    camera until the corners fall where the thermal image shows them, held weakly by the start.
+
+    Args:
+        pairs: Photograph (grey) and temperatures of each picture.
+        visible: Intrinsics of the photographs.
+        start: First guess and how far it can be off, lengths in metres.
+        board: The board.
+
+    Returns:
+        The rig, its transform in metres. With the board in fewer than three pairs: the start, `determined` False.
+    """
+    points, seen = [], []
+    for photograph, temperature_c in pairs:
+        there, here = find_board(photograph, board), find_board(temperature_c, board)
+        if there is None or here is None:
+            continue
+        if np.dot(there[-1] - there[0], here[-1] - here[0]) < 0.0:  # warm squares may be the light ones or the dark
+            here = here[::-1]
+        points.append(_board_in_camera(there, visible, board))
+        seen.append(here)
+    depth = float(np.median(np.concatenate(points)[:, 2])) if points else 1.0
+    rig = RigModel(start.thermal_camera, np.asarray(start.visible_to_thermal, dtype=np.float64))
+    sigmas = prior_sigmas(start, depth)
+    if len(points) < _FEWEST_BOARDS:
+        reason = f"the board is seen by both cameras in {len(points)} of {len(pairs)} pairs ({_FEWEST_BOARDS} needed)"
+        text = f"Not determined, the start value is kept ({start.source}): {reason}."
+        return RigEstimate(rig.camera, rig.transform, False, text, PARAMETERS, np.diag(sigmas**2))
+    free = np.flatnonzero(sigmas > 0.0)
+    every, target = np.concatenate(points), np.concatenate(seen)
+
+    def change(z: FloatArray) -> FloatArray:
+        full = np.zeros(len(sigmas))
+        full[free] = z * sigmas[free]
+        return full
+
+    def misfit(z: FloatArray) -> FloatArray:
+        errors = np.nan_to_num(rig.project(change(z), every) - target, nan=1e3).ravel()
+        return np.concatenate([errors / _CORNER_SIGMA_PX, z])
+
+    best = least_squares(misfit, np.zeros(len(free)), loss="huber", x_scale="jac")
+    covariance = np.zeros((len(sigmas),) * 2)
+    scatter = max(float(np.mean(best.fun[: target.size] ** 2)), 1e-6)
+    inverse = np.linalg.inv(best.jac.T @ best.jac) * max(scatter, 1.0)
+    covariance[np.ix_(free, free)] = inverse * np.outer(sigmas[free], sigmas[free])
+    errors_px = np.linalg.norm(best.fun[: target.size].reshape(-1, 2), axis=1) * _CORNER_SIGMA_PX
+    camera, transform = rig.changed(change(best.x))
+    error_px = float(np.median(errors_px))
+    text = (
+        f"Found from {len(points)} pictures of a checker board: focal length {camera.fl_x:.1f} pixels, "
+        f"{np.linalg.norm(transform[:3, 3]):.3f} m from the visible camera; corners fall {error_px:.2f} thermal pixels "
+        f"from where they are seen (median)."
+    )
+    uncertain_px = float(np.sqrt(np.trace(best.jac[: target.size] @ inverse @ best.jac[: target.size].T) / len(every)))
+    sigma_px = uncertain_px * _CORNER_SIGMA_PX
+    return RigEstimate(camera, transform, True, text, PARAMETERS, covariance, projection_sigma_px=sigma_px)
+
+
+def _board_in_camera(pixels: FloatArray, camera: Camera, board: CheckerBoard) -> FloatArray:
+    """The board's corners in the camera's OpenCV axes, shape (n, 3) [m]."""
+    plane = np.ascontiguousarray(camera.rays(pixels)[:, :2])
+    _, turn, shift = cv2.solvePnP(board.corners, plane, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE)
+    return board.corners @ cv2.Rodrigues(turn)[0].T + shift.ravel()
+
+
+def board_of(settings: CaptureSettings) -> CheckerBoard | None:
+    """The board that the options describe; None where they name no pictures of one.
+
+    Raises:
+        SceneError: An option of the board is missing, or has no meaning without the others.
+    """
+    given = {
+        "--board-photos": settings.board_photos,
+        "--board": settings.board,
+        "--board-square-m": settings.board_square_m,
+    }
+    missing = [name for name, value in given.items() if value is None]
+    if len(missing) == len(given):
+        return None
+    if missing or settings.rig is not None:
+        raise SceneError(
+            "checker board",
+            expected="--board-photos, --board and --board-square-m together, and no --rig beside them",
+            got=("no " + " and no ".join(missing)) if missing else "all of them and --rig",
+            remedy="Pass --board-photos FOLDER --board 7x5 --board-square-m 0.03, or none of them.",
+        )
+    match = _SIZE.fullmatch(str(settings.board).strip())
+    if match is None:
+        raise SceneError(
+            "--board",
+            expected="inner corners along both sides, such as 7x5",
+            got=repr(settings.board),
+            remedy="Count the corners where four squares meet; one less than squares.",
+        )
+    sides = sorted(map(int, match.groups()), reverse=True)
+    assert settings.board_square_m is not None
+    return CheckerBoard(sides[0], sides[1], settings.board_square_m)
+
+
+def rig_from_board_photos(
+    source: Path,
+    board: CheckerBoard,
+    visible: Camera,
+    thermal_size: tuple[int, int],
+    folder: Path,
+    settings: CaptureSettings,
+    radiometry: RadiometryOptions,
+    say: Callable[[str], None] = lambda _: None,
+) -> RigEstimate:
+    """Find the rig from a folder with photographs and thermal images of a board.
+
+    Args:
+        source: The folder; its files are paired and read like those of the capture.
+        board: What is in the pictures.
+        visible: Camera of the capture's photographs, which took these too.
+        thermal_size: Width and height of the capture's thermal images.
+        folder: For what is read.
+        settings: How pairs are recognised, and what is known of the lens.
+        radiometry: How files become degrees.
+        say: Told how far it is.
+
+    Returns:
+        The rig, lengths in metres.
+
+    Raises:
+        SceneError: There are no pairs, they come from another camera, or fewer than three show the board to both
+            cameras; the message lists what each pair shows.
+    """
+    found = scan_folder(source)
+    if found.unreadable and not settings.skip_bad:
+        raise SceneError(next(iter(found.unreadable.values())))
+    search = find_pairs(found, PairOptions(settings.time_limit_s, settings.clock_offset_s))
+    if not search.pairs:
+        example = next((f"{path.name}: {why}" for path, why in search.unpaired.items()), "no camera files")
+        raise SceneError(
+            f"board pictures in {source}",
+            expected="photographs with thermal images",
+            got=f"none; {example}",
+            remedy="Give both of a shot the same name or time.",
+        )
+    read = read_frames(search.pairs, source, folder, radiometry, settings.skip_bad, settings.thermal_mask, say)
+    if read.thermal_size != thermal_size:
+        raise SceneError(_another_camera("thermal images", thermal_size, read.thermal_size))
+    pairs, names = [], []
+    for frame in read.frames:
+        photograph = open_photograph(frame.photograph)
+        if photograph.size != (visible.width, visible.height):
+            problem = _another_camera(frame.photograph_source, (visible.width, visible.height), photograph.size)
+            raise SceneError(problem)
+        pairs.append((np.asarray(photograph.convert("L")), np.load(frame.thermal, allow_pickle=False)))
+        names.append(frame.name)
+    start = rig_start(read.frames, visible, thermal_size, settings.thermal_field_of_view_deg)
+    estimate = rig_from_boards(pairs, visible, replace(start, translation_sigma=BASELINE_SIGMA_M), board)
+    if not estimate.determined:
+        raise SceneError(
+            f"board pictures in {source}",
+            expected=f"at least three pairs in which both cameras show the {board.columns} x {board.rows} corners",
+            got=estimate.explanation + f" Pairs: {_listed(names)}",
+            remedy="Check --board; heat the board evenly, hold it still, and let it fill a third of the picture.",
+        )
+    say(f"board: {estimate.explanation}")
+    return estimate
+
+
+def in_scene_units(rig: RigEstimate, scale: MetricScale | None, missing: str) -> RigEstimate:
+    """Turn a rig in metres into one in units of the scene.
+
+    Raises:
+        SceneError: The scene's scale is unknown.
+    """
+    if scale is None:
+        raise SceneError(
+            "scale",
+            expected="a known scale, because a board gives the distance of the lenses in metres",
+            got=f"none: {missing}",
+            remedy="Pass --known-distance or --marker-side-m; poses that were found are kept.",
+        )
+    transform, covariance = rig.visible_to_thermal.copy(), rig.covariance.copy()
+    transform[:3, 3] /= scale.metres_per_unit
+    covariance[_SHIFTS] /= scale.metres_per_unit
+    covariance[:, _SHIFTS] /= scale.metres_per_unit
+    return replace(rig, visible_to_thermal=transform, covariance=covariance)
+
+
+def _another_camera(name: str, wanted: Sequence[int], got: Sequence[int]) -> str:
+    return explain(
+        f"board pictures: {name}",
+        expected=f"{wanted[0]} x {wanted[1]} pixels, as in the capture",
+        got=f"{got[0]} x {got[1]}",
+        remedy="Photograph the board with the same cameras in the same mode.",
+    )
+
+
+def _listed(names: Sequence[str], most: int = 10) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more

@@ -1,0 +1,88 @@
+"""Results as json: one converter, one writer, one reader."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thermoxels_ns.core.checks import replace_when_done
+from thermoxels_ns.core.errors import ThermoxelsError
+
+
+def plain_values(value: Any, name: str = "value", error: type[ThermoxelsError] = ThermoxelsError) -> Any:
+    """Turn dataclasses, mappings, arrays, tuples and paths, nested as you like, into what json knows.
+
+    Args:
+        value: What to convert.
+        name: What it is called in messages.
+        error: Type to raise.
+
+    Raises:
+        ThermoxelsError: A number is NaN or infinite (json has neither), or a value has no place in json; the message
+            says where it is.
+
+    >>> plain_values({"sizes": (1, 2.5), "file": Path("a.npy")})
+    {'sizes': [1, 2.5], 'file': 'a.npy'}
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        value = {field.name: getattr(value, field.name) for field in fields(value)}
+    elif isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): plain_values(entry, f"{name}.{key}", error) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain_values(entry, f"{name}[{number}]", error) for number, entry in enumerate(value)]
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        raise error(name, expected="a finite number", got=value, remedy="Leave it out, or write None for 'unknown'.")
+    if value is None or isinstance(value, (str, bool, int, float)):
+        return value
+    raise error(
+        name,
+        expected="text, a number, a list, a mapping, a path or None",
+        got=type(value).__name__,
+        remedy="Convert it before writing.",
+    )
+
+
+def write_json(path: Path, content: Any, error: type[ThermoxelsError] = ThermoxelsError) -> None:
+    """Write json, whole or not at all; converts and refuses as `plain_values` does.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    text = json.dumps(plain_values(content, path.stem, error), indent=1, allow_nan=False)
+    with replace_when_done(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def read_json(
+    path: Path,
+    expected: str = "a file of json",
+    remedy: str = "Write it again, or pass another file.",
+    error: type[ThermoxelsError] = ThermoxelsError,
+) -> Any:
+    """Read json.
+
+    Raises:
+        ThermoxelsError: The file is missing or damaged.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError) as problem:
+        raise error(str(path), expected=expected, got=str(problem), remedy=remedy) from problem
+
+
+def read_json_object(path: Path, remedy: str, error: type[ThermoxelsError] = ThermoxelsError) -> dict[str, Any]:
+    """Return what a json file holds if that is an object, else raise `error`."""
+    content = read_json(path, "a readable json file", remedy, error)
+    if not isinstance(content, dict):
+        raise error(str(path), expected="a json object", got=type(content).__name__, remedy=remedy)
+    return content
