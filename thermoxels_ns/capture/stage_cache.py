@@ -46,11 +46,7 @@ class StageCache:
     _previous: str = ""
 
     def run(
-        self,
-        name: StageName,
-        depends_on: Mapping[str, Any],
-        work: Callable[[Path], None],
-        writes: Sequence[Path] = (),
+        self, name: StageName, depends_on: Mapping[str, Any], work: Callable[[Path], None], writes: Sequence[Path] = ()
     ) -> Path:
         """Run a stage, or take its earlier result.
 

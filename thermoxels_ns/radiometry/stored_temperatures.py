@@ -85,11 +85,7 @@ class CountImage:
 
 
 def read_count_image(
-    path: Path,
-    suffix: str,
-    camera: CameraName | None,
-    unit: ThermalUnit | None,
-    valid_range_c: tuple[float, float],
+    path: Path, suffix: str, camera: CameraName | None, unit: ThermalUnit | None, valid_range_c: tuple[float, float]
 ) -> CountImage:
     """Read a single-channel TIFF or PNG.
 

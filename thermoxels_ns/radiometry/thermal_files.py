@@ -120,10 +120,7 @@ class _RawPixels:
 
 
 def read_thermal_file(
-    path: Path,
-    unit: ThermalUnit,
-    valid_range_c: tuple[float, float] = (-100.0, 2000.0),
-    suffix: str | None = None,
+    path: Path, unit: ThermalUnit, valid_range_c: tuple[float, float] = (-100.0, 2000.0), suffix: str | None = None
 ) -> ThermalImage:
     """Read a thermal file: PNG, JPG or TIFF counts, float TIFF, FLIR R-JPEG, ``.npy`` or ``.csv``.
 

@@ -182,12 +182,7 @@ class PatchScore:
 
 
 def patch_design(
-    photograph: FloatImage,
-    rays: FloatArray,
-    usable: npt.NDArray[np.bool_],
-    pitch: float,
-    window_px: float,
-    most: int,
+    photograph: FloatImage, rays: FloatArray, usable: npt.NDArray[np.bool_], pitch: float, window_px: float, most: int
 ) -> PatchDesign:
     """Choose the windows of a photograph with most contrast; their points lie at depth 1.
 

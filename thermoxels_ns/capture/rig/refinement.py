@@ -9,12 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.capture.rig.fit import RigMaximizer
-from thermoxels_ns.capture.rig.images import (
-    FARTHEST_FROM_POINT,
-    SURE_DISTANCE,
-    PreparedFrame,
-    PreparedFrames,
-)
+from thermoxels_ns.capture.rig.images import FARTHEST_FROM_POINT, SURE_DISTANCE, PreparedFrame, PreparedFrames
 from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel
 from thermoxels_ns.capture.rig.patches import THERMAL_BLUR_PX, PatchDesign, PatchScore, SmoothThermal, patch_design
 from thermoxels_ns.capture.rig_types import FloatArray

@@ -96,11 +96,7 @@ def _all_pairs(count: int) -> npt.NDArray[np.int64]:
 
 
 def fill_database(
-    photographs: ReducedPhotographs,
-    camera: Camera,
-    known_focal: bool,
-    options: PoseOptions,
-    say: Callable[[str], None],
+    photographs: ReducedPhotographs, camera: Camera, known_focal: bool, options: PoseOptions, say: Callable[[str], None]
 ) -> None:
     """Find features in photographs and match them; what an interrupted run has done is not done again.
 

@@ -32,9 +32,7 @@ class Up:
 
 
 def find_up(
-    camera_to_world: FloatArray,
-    gimbal_deg: Sequence[tuple[float, float] | None],
-    orientation: Sequence[int],
+    camera_to_world: FloatArray, gimbal_deg: Sequence[tuple[float, float] | None], orientation: Sequence[int]
 ) -> Up:
     """Find up from the cameras' own levels, else from how cameras are usually held.
 
