@@ -5,15 +5,19 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.support.posed_model import ring_model
-from thermoxels_ns.capture.frames import CaptureFrame, measurement_rows
+from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, measurement_rows
+from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.rig.parameters import PARAMETERS
 from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate, RigFrame
+from thermoxels_ns.capture.run import CaptureResult
+from thermoxels_ns.capture.scene_writer import Scene
 from thermoxels_ns.capture.sfm.gravity import Up
 from thermoxels_ns.capture.sfm.metric_scale import MetricScale
 from thermoxels_ns.core.camera import Camera
@@ -70,27 +74,33 @@ def page() -> CapturePage:
         CaptureFrame(name, Path(f"{name}.jpg"), Path(f"{name}.npy"), f"{name}.jpg", f"{name}.tiff", format="TIFF")
         for name in MODEL.frames
     ]
-    return CapturePage(
-        title="Capture of card",
-        pairs=[Pair(name, Path(f"{name}.jpg"), Path(f"{name}.tiff"), "equal names") for name in MODEL.frames],
-        dropped={},
+    scene = Scene(
         frames=[replace(frame, conditions=conditions) for frame in frames],
-        scene_names=[f"frame_{name}" for name in MODEL.frames],
         model=MODEL,
         rig=rig,
-        start=rig,
         drift=DriftEstimate(np.array([0.5, -0.5, 0.1, -0.1]), (), 1.553, 0.111, True, "Corrected."),
         scale=None,
-        scale_missing="no photograph has a GPS position",
         up=Up(np.array([-1e-9, -1e-12, 1.0]), "Assumed.", None),
-        overlays=[Overlay("a", JPEG, JPEG, JPEG, (12.34, 20.06))],
-        temperatures_c=np.linspace(10, 20, 100, dtype=np.float32),
-        masked_share=0.0,
-        dead_pixels=0,
+        masks=PhotographMasks((640, 480)),
+    )
+    result = CaptureResult(
+        source=Path("card"),
+        output=Path("scene"),
+        pairs=[Pair(name, Path(f"{name}.jpg"), Path(f"{name}.tiff"), "equal names") for name in MODEL.frames],
+        dropped={},
+        read=CaptureFrames(tuple(frames), (80, 60), dead_pixels=0),
+        scene=scene,
+        start=rig,
+        scale_missing="no photograph has a GPS position",
         poses_source="Given.",
-        overlay_share=None,
         seconds=[("pairs", 1.0)],
     )
+    overlays = [Overlay("a", JPEG, JPEG, JPEG, (12.34, 20.06))]
+    return CapturePage(result, overlays, np.linspace(10, 20, 100, dtype=np.float32), 0.0)
+
+
+def with_scene(page: CapturePage, **changes: Any) -> CapturePage:
+    return replace(page, result=replace(page.result, scene=replace(page.scene, **changes)))
 
 
 def words(page: CapturePage) -> str:
@@ -104,37 +114,37 @@ def test_how_the_degrees_were_measured(page):
 
 def test_how_sure_the_rig_is(page):
     assert "a point&#39;s place is known to 0.33 thermal pixels" in words(page)
-    assert "Rig known" in words(replace(page, rig=replace(page.rig, projection_sigma_px=np.nan)))
-    unsure = words(replace(page, rig=replace(page.rig, determined=False, explanation="Too flat.")))
+    assert "Rig known" in words(with_scene(page, rig=replace(page.scene.rig, projection_sigma_px=np.nan)))
+    unsure = words(with_scene(page, rig=replace(page.scene.rig, determined=False, explanation="Too flat.")))
     assert "not determined: the start value is kept" in unsure and "Too flat." in unsure
 
 
 def test_numbers_of_the_rig_have_their_errors_and_an_unsure_turn_its_reason(page):
     errors = {"rx": 0.003, "ry": 0.004, "rz": 0.012, "log_focal": 0.01, "cx": 0.42, "cy": 0.57}
     covariance = np.diag([errors.get(name, 0.0) ** 2 for name in PARAMETERS])
-    rig = replace(page.rig, parameters=PARAMETERS, covariance=covariance)
-    said = words(replace(page, rig=rig))
+    rig = replace(page.scene.rig, parameters=PARAMETERS, covariance=covariance)
+    said = words(with_scene(page, rig=rig))
     assert "principal point, pixels 320.0, 240.0 41.0, 29.0 41.0 ± 0.4, 29.0 ± 0.6 " in said
     assert "focal length, pixels 500.0 70.0 70.0 ± 0.7 " in said
     assert "turned by 0.00 ± 0.74 degrees" in said
     assert "how sure the turn is The turn is sure to 0.74 degrees only" in said
-    given = words(replace(page, rig=replace(rig, parameters=(), covariance=np.zeros((0, 0)))))
+    given = words(with_scene(page, rig=replace(rig, parameters=(), covariance=np.zeros((0, 0)))))
     assert "41.0, 29.0 41.0, 29.0 " in given and "how sure the turn is" not in given
 
 
 def test_what_the_correction_of_drift_changed(page):
     assert "corrected: two frames of one point differ by 1.55 K before, 0.11 K after" in words(page)
     assert "not corrected: two frames of one point differ by 1.55 K" in words(
-        replace(page, drift=replace(page.drift, used=False))
+        with_scene(page, drift=replace(page.scene.drift, used=False))
     )
-    off = replace(page.drift, used=False, before_k=np.nan, after_k=np.nan)
-    assert "Drift and vignetting not corrected Scale" in words(replace(page, drift=off))
+    off = replace(page.scene.drift, used=False, before_k=np.nan, after_k=np.nan)
+    assert "Drift and vignetting not corrected Scale" in words(with_scene(page, drift=off))
 
 
 def test_a_scale_that_is_missing_says_what_it_costs(page):
     said = words(page)
     assert "unknown (no photograph has a GPS position); give a length when you export the mesh" in said
-    known = words(replace(page, scale=MetricScale(0.5, 0.01, "GPS.")))
+    known = words(with_scene(page, scale=MetricScale(0.5, 0.01, "GPS.")))
     assert "0.5 ± 0.01 (2.0 %) m per unit" in known and "unknown" not in known
 
 
@@ -148,15 +158,17 @@ def test_zeros_have_no_sign(page):
 
 def test_stuck_pixels_that_were_not_looked_for_are_not_counted_as_none(page):
     assert "stuck pixels of the sensor not looked for in fewer than 5 frames" in words(page)
-    more = replace(page, frames=[*page.frames, *page.frames])
+    more = with_scene(page, frames=[*page.scene.frames, *page.scene.frames])
     assert "stuck pixels of the sensor 0" in words(more)
 
 
 def test_names_of_files_are_no_markup(page):
     evil = "<script>alert(1)</script>"
-    frames = [replace(frame, camera=evil) for frame in page.frames]
+    frames = [replace(frame, camera=evil) for frame in page.scene.frames]
     pairs = [Pair("a", Path(f"{evil}.jpg"), Path("a.tiff"), evil)]
-    text = build_page(replace(page, title=evil, dropped={evil: evil}, frames=frames, pairs=pairs, scale_missing=evil))
+    changed = with_scene(page, frames=frames)
+    result = replace(changed.result, source=Path(evil), dropped={evil: evil}, pairs=pairs, scale_missing=evil)
+    text = build_page(replace(changed, result=result))
     assert "<script" not in text
     assert text.count("&lt;script&gt;") >= 6
 

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.frames import CaptureFrame, measurement_rows
-from thermoxels_ns.capture.pairs import Pair
+from thermoxels_ns.capture.camera_files import shown_name
+from thermoxels_ns.capture.frames import measurement_rows
 from thermoxels_ns.capture.rig.explanation import turn_deg, turn_error_deg, why_turn_is_unsure, with_error
 from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
-from thermoxels_ns.capture.sfm.gravity import Up
-from thermoxels_ns.capture.sfm.metric_scale import MetricScale
-from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.run import CaptureResult
+from thermoxels_ns.capture.scene_writer import Scene, scene_names
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.radiometry.dead_pixels import MIN_FRAMES
 from thermoxels_ns.reports.charts import bars, histogram
@@ -43,59 +42,46 @@ class Overlay:
 
 @dataclass(frozen=True)
 class CapturePage:
-    """Everything the page says."""
+    """What the page shows."""
 
-    title: str
-    pairs: Sequence[Pair]
-    dropped: Mapping[str, str]
-    """Why, by the frame or file."""
-    frames: Sequence[CaptureFrame]
-    """In the order of the model's frames."""
-    scene_names: Sequence[str]
-    model: SfmModel
-    rig: RigEstimate
-    start: RigEstimate
-    drift: DriftEstimate
-    scale: MetricScale | None
-    scale_missing: str
-    """Why there is no scale, where there is none."""
-    up: Up
+    result: CaptureResult
     overlays: Sequence[Overlay]
     temperatures_c: npt.NDArray[np.float32]
     """A sample of all temperatures, corrected, [degrees C]."""
     masked_share: float
     """Of all thermal pixels."""
-    dead_pixels: int
-    poses_source: str
-    overlay_share: float | None
-    """Share of the photographs that is masked as drawn over; None: nothing is."""
-    seconds: Sequence[tuple[str, float]]
+
+    @property
+    def scene(self) -> Scene:
+        """What was written."""
+        return self.result.scene
 
 
 def build_page(page: CapturePage) -> str:
     """Build the html text; it depends on `page` alone."""
     sections = (
         _overlays(page),
-        _dropped(page.dropped),
+        _dropped(page.result.dropped),
         _cameras(page),
         _poses(page),
         Section("Scale and up", tables=(_rows(_scale(page)),)),
         _temperatures(page),
         _drift(page),
         _pairs(page),
-        Section("Time", tables=(_rows([(name, f"{took:.1f} s") for name, took in page.seconds]),)),
+        Section("Time", tables=(_rows([(name, f"{took:.1f} s") for name, took in page.result.seconds]),)),
     )
-    return build_html(Page(page.title, "", (Section("In short", tables=(_rows(_summary(page)),)), *sections)))
+    title = f"Capture of {shown_name(page.result.source.resolve())}"
+    return build_html(Page(title, "", (Section("In short", tables=(_rows(_summary(page)),)), *sections)))
 
 
 def _summary(page: CapturePage) -> list[tuple[str, str]]:
-    registered, pairs = len(page.model.frames), len(page.pairs)
-    error = page.model.sighting_error_px()
+    registered, pairs = len(page.scene.model.frames), len(page.result.pairs)
+    error = page.scene.model.sighting_error_px()
     rows = [
         ("Pairs found", str(pairs)),
         ("Frames in the scene", f"{registered} of {pairs}"),
-        ("Rig", _rig_text(page.rig)),
-        ("Drift and vignetting", _drift_text(page.drift)),
+        ("Rig", _rig_text(page.scene.rig)),
+        ("Drift and vignetting", _drift_text(page.scene.drift)),
         ("Scale", _scale_text(page)),
     ]
     if len(error):
@@ -119,11 +105,13 @@ def _drift_text(drift: DriftEstimate) -> str:
 
 
 def _scale_text(page: CapturePage) -> str:
-    if page.scale is None:
-        return f"unknown ({page.scale_missing}); give a length when you export the mesh, or areas and watts are missing"
-    error = page.scale.standard_error
-    plus = "" if error is None else f" ± {error:.2g} ({100 * error / page.scale.metres_per_unit:.1f} %)"
-    return f"{page.scale.metres_per_unit:.5g}{plus} m per unit"
+    scale = page.scene.scale
+    if scale is None:
+        why = page.result.scale_missing
+        return f"unknown ({why}); give a length when you export the mesh, or areas and watts are missing"
+    error = scale.standard_error
+    plus = "" if error is None else f" ± {error:.2g} ({100 * error / scale.metres_per_unit:.1f} %)"
+    return f"{scale.metres_per_unit:.5g}{plus} m per unit"
 
 
 def _overlays(page: CapturePage) -> Section:
@@ -133,8 +121,8 @@ def _overlays(page: CapturePage) -> Section:
     words = "White lines are the photograph's edges. Warm and cold shapes should lie on them. "
     words += (
         "Left: where the search for the rig began. Middle: where it ended."
-        if page.rig.determined
-        else f"The rig was not determined: {page.rig.explanation}"
+        if page.scene.rig.determined
+        else f"The rig was not determined: {page.scene.rig.explanation}"
     )
     galleries = tuple(
         Gallery(
@@ -165,13 +153,14 @@ def _dropped(dropped: Mapping[str, str]) -> Section:
 
 
 def _cameras(page: CapturePage) -> Section:
-    found = page.rig.standard_errors
-    focal_error = found.get("log_focal", math.nan) * page.rig.thermal_camera.fl_x
+    rig, scale = page.scene.rig, page.scene.scale
+    found = rig.standard_errors
+    focal_error = found.get("log_focal", math.nan) * rig.thermal_camera.fl_x
     errors = {"focal": focal_error, **{name: found[name] for name in ("cx", "cy") if name in found}}
     columns = (
-        ("photographs", page.model.camera, {}),
-        ("thermal, start value", page.start.thermal_camera, {}),
-        ("thermal, as written", page.rig.thermal_camera, errors),
+        ("photographs", page.scene.model.camera, {}),
+        ("thermal, start value", page.result.start.thermal_camera, {}),
+        ("thermal, as written", rig.thermal_camera, errors),
     )
     cameras = Table(
         ("", *(name for name, _, _ in columns)),
@@ -187,22 +176,22 @@ def _cameras(page: CapturePage) -> Section:
         ),
         look="cameras",
     )
-    turn = with_error(turn_deg(page.rig), turn_error_deg(page.rig), 2)
-    shift = float(np.linalg.norm(page.rig.visible_to_thermal[:3, 3]))
-    metres = f" = {100 * shift * page.scale.metres_per_unit:.1f} cm" if page.scale is not None else ""
-    names = sorted({frame.camera for frame in page.frames if frame.camera})
+    turn = with_error(turn_deg(rig), turn_error_deg(rig), 2)
+    shift = float(np.linalg.norm(rig.visible_to_thermal[:3, 3]))
+    metres = f" = {100 * shift * scale.metres_per_unit:.1f} cm" if scale is not None else ""
+    names = sorted({frame.camera for frame in page.scene.frames if frame.camera})
     extra = [
         ("camera", ", ".join(names) or "the files do not say"),
         ("between the two lenses", f"turned by {turn} degrees, {shift:.4g} units{metres} apart"),
-        ("how the rig was found", page.rig.explanation),
+        ("how the rig was found", rig.explanation),
     ]
-    unsure = why_turn_is_unsure(page.rig)
+    unsure = why_turn_is_unsure(rig)
     if unsure:
         extra.append(("how sure the turn is", unsure))
-    if np.isfinite(page.rig.score_after):
-        extra.append(("agreement of edges", f"{page.rig.score_before:.3f} before, {page.rig.score_after:.3f} after"))
-    if np.isfinite(page.rig.projection_sigma_px):
-        extra.append(("standard error of a point's place", f"{page.rig.projection_sigma_px:.2f} thermal pixels"))
+    if np.isfinite(rig.score_after):
+        extra.append(("agreement of edges", f"{rig.score_before:.3f} before, {rig.score_after:.3f} after"))
+    if np.isfinite(rig.projection_sigma_px):
+        extra.append(("standard error of a point's place", f"{rig.projection_sigma_px:.2f} thermal pixels"))
     return Section("Cameras", tables=(cameras, _rows(extra)))
 
 
@@ -217,19 +206,19 @@ def _angle(camera: Camera) -> float:
 
 
 def _poses(page: CapturePage) -> Section:
-    error = page.model.sighting_error_px()
+    error = page.scene.model.sighting_error_px()
     if not len(error):
-        return Section("Poses", words=(page.poses_source,))
+        return Section("Poses", words=(page.result.poses_source,))
     limit = float(np.percentile(error, 99))
-    rows = []
-    for index, name in enumerate(page.model.frames):
-        own = error[page.model.sighting_frame == index]
+    names, rows = scene_names(len(page.scene.frames)), []
+    for index, name in enumerate(page.scene.model.frames):
+        own = error[page.scene.model.sighting_frame == index]
         median = f"{np.median(own):.2f}" if len(own) else "-"
-        rows.append((page.scene_names[index], name, str(len(own)), median))
+        rows.append((names[index], name, str(len(own)), median))
     head = ("in the scene", "frame", "points", "median error, pixels")
     figures = [
-        ("source", page.poses_source),
-        ("points", f"{len(page.model.points)}"),
+        ("source", page.result.poses_source),
+        ("points", f"{len(page.scene.model.points)}"),
         ("mean and median error", f"{error.mean():.2f} and {np.median(error):.2f} pixels"),
     ]
     return Section(
@@ -240,12 +229,13 @@ def _poses(page: CapturePage) -> Section:
 
 
 def _scale(page: CapturePage) -> list[tuple[str, str]]:
+    up = page.scene.up
     rows = [("scale", _scale_text(page))]
-    if page.scale is not None:
-        rows.append(("from", page.scale.source))
-    spread = "" if page.up.spread_deg is None else f" Single photographs differ by {page.up.spread_deg:.1f} degrees."
-    direction = ", ".join(f"{value + 0.0:.3f}" for value in np.round(page.up.direction, 3))
-    return [*rows, ("up, as x, y, z", f"{direction}. {page.up.source}{spread}")]
+    if page.scene.scale is not None:
+        rows.append(("from", page.scene.scale.source))
+    spread = "" if up.spread_deg is None else f" Single photographs differ by {up.spread_deg:.1f} degrees."
+    direction = ", ".join(f"{value + 0.0:.3f}" for value in np.round(up.direction, 3))
+    return [*rows, ("up, as x, y, z", f"{direction}. {up.source}{spread}")]
 
 
 def _temperatures(page: CapturePage) -> Section:
@@ -254,19 +244,23 @@ def _temperatures(page: CapturePage) -> Section:
         return Section("Temperatures", words=("No thermal pixel has a temperature.",))
     low, high = (float(value) for value in np.percentile(values, _PERCENTILES))
     rows = [
-        *measurement_rows(page.frames),
+        *measurement_rows(page.scene.frames),
         ("lowest, median, highest", f"{values.min():.1f}, {np.median(values):.1f}, {values.max():.1f} °C"),
         ("pixels without a temperature", f"{100 * page.masked_share:.2f} %"),
-        ("stuck pixels of the sensor", str(page.dead_pixels) if len(page.frames) >= MIN_FRAMES else _TOO_FEW),
+        (
+            "stuck pixels of the sensor",
+            str(page.result.read.dead_pixels) if len(page.scene.frames) >= MIN_FRAMES else _TOO_FEW,
+        ),
     ]
-    if page.overlay_share is not None:
-        rows.append(("photographs masked", f"{100 * page.overlay_share:.1f} %"))
+    drawn = page.scene.masks.overlay
+    if drawn is not None:
+        rows.append(("photographs masked", f"{100 * (1.0 - float(drawn.mean())):.1f} %"))
     label = "temperature, °C; how many pixels of a sample, without the coldest and hottest 0.1 %"
     return Section("Temperatures", svg=histogram(values, label, limits=(low, high)), tables=(_rows(rows),))
 
 
 def _drift(page: CapturePage) -> Section:
-    drift = page.drift
+    drift = page.scene.drift
     rows = [("result", drift.explanation)]
     if np.isfinite(drift.before_k):
         rows.append(("two frames at the same point, before", f"{drift.before_k:.3f} K"))
@@ -277,7 +271,7 @@ def _drift(page: CapturePage) -> Section:
 
 
 def _pairs(page: CapturePage) -> Section:
-    rows = tuple((pair.name, pair.photograph.name, pair.thermal.name, pair.how) for pair in page.pairs)
+    rows = tuple((pair.name, pair.photograph.name, pair.thermal.name, pair.how) for pair in page.result.pairs)
     head = ("frame", "photograph", "thermal", "how")
     return Section(f"Pairs ({len(rows)})", tables=(Table(head, rows, figures_from=4, summary="All pairs"),))
 

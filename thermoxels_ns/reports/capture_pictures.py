@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from thermoxels_ns.capture.camera_files import shown_name
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.rig.start import rig_frames
 from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame
@@ -53,28 +52,7 @@ def write_capture_page(result: CaptureResult) -> None:
         temperature_c = scene.drift.corrected(index, np.load(frame.thermal)).ravel()
         samples.append(temperature_c[:: max(1, len(temperature_c) // _SAMPLED_PIXELS)])
         masked, pixels = masked + frame.masked, pixels + len(temperature_c)
-    drawn = scene.masks.overlay
-    page = CapturePage(
-        title=f"Capture of {shown_name(result.source.resolve())}",
-        pairs=result.pairs,
-        dropped=result.dropped,
-        frames=scene.frames,
-        scene_names=names,
-        model=scene.model,
-        rig=scene.rig,
-        start=result.start,
-        drift=scene.drift,
-        scale=scene.scale,
-        scale_missing=result.scale_missing,
-        up=scene.up,
-        overlays=overlays,
-        temperatures_c=np.concatenate(samples),
-        masked_share=masked / max(pixels, 1),
-        dead_pixels=result.read.dead_pixels,
-        poses_source=result.poses_source,
-        overlay_share=None if drawn is None else float(1.0 - drawn.mean()),
-        seconds=list(result.seconds),
-    )
+    page = CapturePage(result, overlays, np.concatenate(samples), masked / max(pixels, 1))
     write_page(result.page, build_page(page))
 
 
