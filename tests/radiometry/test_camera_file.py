@@ -288,10 +288,3 @@ def test_real_workswell_files_need_no_options(shared_data):
     counts = np.frombuffer(path.read_bytes()[392 : 392 + 655360], "<u2").reshape(512, 640)
     np.testing.assert_allclose(got.temperature_c, counts * 0.025 - 100.0, atol=1e-5)
     assert got.metadata.camera == "Workswell WIRIS Pro"
-
-
-@pytest.mark.real_data
-def test_real_photographs_are_refused(shared_data):
-    path = sorted((shared_data / "arco" / "visible").glob("*.jpg"))[0]
-    with pytest.raises(ThermalFileError, match="plain JPEG"):
-        read_thermogram(path)

@@ -166,8 +166,9 @@ def colmap_stopped(reason: str, folder: Path) -> ThermoxelsError:
         reason: What COLMAP said.
         folder: Where it was writing.
     """
-    if is_full(folder) or "disk is full" in reason:
-        return filled(folder, "features, matches and poses")
+    free = shutil.disk_usage(folder).free
+    if free < _FULL_BYTES or "disk is full" in reason:
+        return _too_little(folder, "free space for features, matches and poses, to the end", free, "Make space")
     return ThermoxelsError(
         "COLMAP",
         expected="to end",
@@ -192,22 +193,6 @@ def check_free_space(folder: Path, needed_bytes: float, purpose: str, remedy: st
     free = shutil.disk_usage(folder).free
     if free < needed_bytes:
         raise _too_little(folder, f"up to {needed_bytes / 1e6:.0f} MB free for {purpose}", free, remedy)
-
-
-def is_full(folder: Path) -> bool:
-    """Whether the disk of a folder has no room for anything that counts."""
-    return shutil.disk_usage(folder).free < _FULL_BYTES
-
-
-def filled(folder: Path, purpose: str) -> OutputError:
-    """Build the error for a disk that became full while something was written.
-
-    Args:
-        folder: Where it was written; it exists.
-        purpose: What was written, for the message.
-    """
-    free = shutil.disk_usage(folder).free
-    return _too_little(folder, f"free space for {purpose}, to the end", free, "Make space")
 
 
 def disk_of(path: Path) -> Path:
