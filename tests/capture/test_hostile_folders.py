@@ -57,7 +57,7 @@ def no_pairs_said(card: Path, **more: object) -> str:
             (),
             ("2 pictures for the eye, named thermal, without temperatures", "Copy the thermal files as the camera"),
         ),
-        ((), ("a",), ("no photographs, 1 thermal image (a.tiff", "Copy the photographs")),
+        ((), ("a",), ("no photographs, 1 thermal image, 1 file of other kinds (a.tiff", "Copy the photographs")),
         (("a",), ("b",), ("1 photograph, 1 thermal image", "--pairs", "--clock-offset-s")),
     ],
 )
