@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from tests.support.stuffed_shapes import SHAPES, centres
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.boundary.tags import LEAST_AREA_FACTOR, voxel_surface
 from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
@@ -15,52 +16,21 @@ from thermoxels_ns.mesh.solid.level_set import level_of
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX
 from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, voxel_facets
 
-ACROSS = 48
-OFF_CENTRE = np.array([0.3, -0.21, 0.1])
-"""Where shapes lie between voxels. At 45 degrees a whole layer of a slab, and the area of its rim, depend on it."""
+CELLS = 80
+MIDDLE = 0.5 * CELLS * (1.0 + np.array([0.0137, -0.0071, 0.0043]))
+"""Middle of the shapes, [voxels]: between voxels, as at 45 degrees a whole layer of a slab depends on it."""
 DENSITIES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "ramp": lambda distance: np.exp(np.clip(-distance, -8.0, 8.0)),
     "jump": lambda distance: np.where(distance < 0.0, 10.0, 0.01),
 }
 
 
-def centres(n: int) -> np.ndarray:
-    """Voxel centres around the middle of n^3 voxels, [voxels]."""
-    return np.stack(np.meshgrid(*[np.arange(n) + 0.5] * 3, indexing="ij"), axis=-1) - 0.5 * n
-
-
-def box_distance(points: np.ndarray, half: np.ndarray) -> np.ndarray:
-    beyond = np.abs(points) - half
-    return np.linalg.norm(np.maximum(beyond, 0.0), axis=-1) + np.minimum(beyond.max(axis=-1), 0.0)
-
-
-def turn(axis: str, degrees: float) -> np.ndarray:
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    matrix = {"y": [[c, 0, s], [0, 1, 0], [-s, 0, c]], "z": [[c, -s, 0], [s, c, 0], [0, 0, 1]]}[axis]
-    return np.array(matrix, dtype=float)
-
-
 @cache
-def shape(name: str) -> tuple[np.ndarray, float]:
-    """Signed distance at the voxel centres and exact area, [voxels] and [voxel faces]."""
-    half = 0.5 * ACROSS
-    points = centres(ACROSS + 6) - OFF_CENTRE
-    radial = np.hypot(points[..., 0], points[..., 1])
-    if name == "sphere":
-        return np.linalg.norm(points, axis=-1) - half, 4.0 * np.pi * half**2
-    if name == "torus":
-        ring, tube = 2.0 * half / 3.0, half / 3.0
-        return np.hypot(radial - ring, points[..., 2]) - tube, 4.0 * np.pi**2 * ring * tube
-    if name == "cylinder":
-        beyond = np.stack([radial - half, np.abs(points[..., 2]) - half])
-        outside, inside = np.linalg.norm(np.maximum(beyond, 0.0), axis=0), np.minimum(beyond.max(axis=0), 0.0)
-        return outside + inside, 2.0 * np.pi * half * (2.0 * half + half)
-    kind, degrees = name.rsplit(" ", 1)
-    sides = half * np.array({"box": [1.0, 0.75, 0.5], "slab": [1.0, 1.0, 0.25]}[kind])
-    tilted = points if degrees == "0" else centres(ACROSS + ACROSS // 2) - OFF_CENTRE
-    rotation = turn("z" if kind == "box" else "y", float(degrees))
-    area = 8.0 * (sides[0] * sides[1] + sides[1] * sides[2] + sides[2] * sides[0])
-    return box_distance(tilted @ rotation, sides), area
+def exported(name: str, kind: str) -> np.ndarray:
+    """The level that an export makes of an exact field."""
+    points = (centres(CELLS, CELLS, CELLS) + 0.5 * CELLS - MIDDLE) * 2.0 / CELLS
+    density = DENSITIES[kind](SHAPES[name].distance(points) * CELLS / 2.0)
+    return level_of(density, 1.0, density >= 1.0, density >= 1.0, makes_up_volume=False)
 
 
 def surface(level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -68,27 +38,20 @@ def surface(level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return kuhn_tets(level > 0.0)[0], voxel_facets(level > 0.0)
 
 
-def exported(distance: np.ndarray, kind: str) -> np.ndarray:
-    """The level that an export makes of an exact field."""
-    density = DENSITIES[kind](distance)
-    return level_of(density, 1.0, density >= 1.0, density >= 1.0, makes_up_volume=False)
-
-
 @pytest.mark.parametrize(("kind", "bound"), [("ramp", 0.03), ("jump", 0.04)])
-@pytest.mark.parametrize("name", ["sphere", "torus", "cylinder", "slab 30", "slab 45", "box 0", "box 30", "box 45"])
+@pytest.mark.parametrize("name", SHAPES)
 def test_area_is_within_three_or_four_percent(name: str, kind: str, bound: float) -> None:
-    distance, exact = shape(name)
-    level = exported(distance, kind)
-    points, facets = surface(level)
+    points, facets = surface(exported(name, kind))
+    exact = SHAPES[name].area * (0.5 * CELLS) ** 2
     own = facet_areas(points.astype(float), facets)
-    if name != "box 0":
+    if name != "slab at 0 degrees":
         assert own.sum() > 1.15 * exact  # what there is to correct
-    assert own @ voxel_surface(level, points, facets)[1] == pytest.approx(exact, rel=bound)
+    assert own @ voxel_surface(exported(name, kind), points, facets)[1] == pytest.approx(exact, rel=bound)
 
 
 @pytest.mark.parametrize("kind", DENSITIES)
 def test_flat_sides_of_a_box_are_exact(kind: str) -> None:
-    level = exported(shape("box 0")[0], kind)
+    level = exported("slab at 0 degrees", kind)
     points, facets = surface(level)
     normals, factors = voxel_surface(level, points, facets)
     own = facet_normals(points.astype(float), facets)
@@ -96,17 +59,17 @@ def test_flat_sides_of_a_box_are_exact(kind: str) -> None:
     middle = points[facets].mean(axis=1)
     from_edges = np.sort(np.minimum(middle - low, high - middle), axis=1)[:, 1]
     inner = from_edges > 4.0
-    assert np.count_nonzero(inner) > 5000
+    assert np.count_nonzero(inner) > 2000
     assert factors[inner] == pytest.approx(1.0, abs=1e-6)
     assert normals[inner] == pytest.approx(own[inner], abs=1e-3)
 
 
 @pytest.mark.parametrize(("kind", "mean", "most"), [("ramp", 1.5, 9.0), ("jump", 4.0, 18.0)])
 def test_normals_of_a_sphere(kind: str, mean: float, most: float) -> None:
-    level = exported(shape("sphere")[0], kind)
+    level = exported("sphere", kind)
     points, facets = surface(level)
     normals, _ = voxel_surface(level, points, facets)
-    exact = points[facets].mean(axis=1) - 0.5 * (ACROSS + 6) - OFF_CENTRE
+    exact = points[facets].mean(axis=1) - MIDDLE
     exact /= np.linalg.norm(exact, axis=1, keepdims=True)
     assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0, abs=1e-12)
     degrees = np.degrees(np.arccos(np.clip(np.einsum("ij,ij->i", normals, exact), -1.0, 1.0)))
@@ -119,7 +82,7 @@ def test_a_plane_has_its_normal_and_its_area(seed: int) -> None:
     random = np.random.default_rng(seed)
     normal = random.normal(size=3)
     normal /= np.linalg.norm(normal)
-    level = -0.02 * (centres(24) @ normal - random.uniform(-2.0, 2.0))
+    level = -0.02 * (centres(24, 24, 24) @ normal - random.uniform(-2.0, 2.0))
     points, facets = surface(level)
     steps = boundary_tags(facets, points, (25, 25, 25)) != FACET_BOX
     normals, factors = voxel_surface(level, points, facets)
@@ -130,7 +93,7 @@ def test_a_plane_has_its_normal_and_its_area(seed: int) -> None:
 
 
 def test_where_the_scene_box_cuts_the_normal_is_that_of_the_box() -> None:
-    level = np.clip(-(centres(12) @ [0.6, 0.0, 0.8]), -1.0, 1.0)
+    level = np.clip(-(centres(12, 12, 12) @ [0.6, 0.0, 0.8]), -1.0, 1.0)
     points, facets = surface(level)
     cut = boundary_tags(facets, points, (13, 13, 13)) == FACET_BOX
     assert np.count_nonzero(cut) > 100
@@ -140,7 +103,7 @@ def test_where_the_scene_box_cuts_the_normal_is_that_of_the_box() -> None:
 
 
 def test_halves_of_a_face_agree_and_their_order_does_not_matter() -> None:
-    level = np.clip(5.0 - np.linalg.norm(centres(14) - OFF_CENTRE, axis=-1), -1.0, 1.0)
+    level = np.clip(5.0 - np.linalg.norm(centres(14, 14, 14) - [0.3, -0.21, 0.1], axis=-1), -1.0, 1.0)
     points, facets = surface(level)
     normals, factors = voxel_surface(level, points, facets)
     assert np.array_equal(normals[0::2], normals[1::2])  # the halves follow each other

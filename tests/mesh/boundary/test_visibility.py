@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
+
 import numpy as np
 import pytest
 
+from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
@@ -18,22 +21,12 @@ H = LATTICE.voxel_size
 MIDDLE = LATTICE.index_to_world([16.0, 16.0, 16.0])
 
 
-def looking(centre: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """A pose [R | centre] that looks at a target: x right, y up, z back."""
-    back = (centre - target) / np.linalg.norm(centre - target)
-    right = np.cross([0.0, 0.0, 1.0] if abs(back[2]) < 0.9 else [0.0, 1.0, 0.0], back)
-    right /= np.linalg.norm(right)
-    return np.column_stack([right, np.cross(back, right), back, centre])
-
-
 def views(*centres: np.ndarray, target: np.ndarray = MIDDLE, focal: float = 100.0) -> Views:
     """Cameras with images of 400 x 300 pixels, wide enough (126 degrees) unless told otherwise."""
     number = len(centres)
+    poses = looking_at(target, centres).camera_to_world if number else np.zeros((0, 3, 4))
     return Views(
-        camera_to_world=np.array([looking(np.asarray(centre), target) for centre in centres]).reshape(number, 3, 4),
-        focal=np.full((number, 2), focal),
-        centre=np.tile([200.0, 150.0], (number, 1)),
-        size=np.tile([400, 300], (number, 1)),
+        poses, np.full((number, 2), focal), np.tile([200.0, 150.0], (number, 1)), np.tile([400, 300], (number, 1))
     )
 
 
@@ -147,9 +140,9 @@ def test_a_camera_in_a_room_sees_its_walls_and_no_other() -> None:
     cells = room()
     centroids, normals = voxel_surface(cells)
     camera = LATTICE.index_to_world([10.3, 12.1, 14.2])
-    around = [looking(camera, camera + d) for d in (*np.eye(3), *-np.eye(3))]
     one = views(camera)
-    six = Views(np.array(around), np.full((6, 2), 100.0), np.tile([200.0, 150.0], (6, 1)), np.tile([400, 300], (6, 1)))
+    around = [views(camera, target=camera + d) for d in (*np.eye(3), *-np.eye(3))]
+    six = Views(*(np.concatenate(parts) for parts in zip(*map(astuple, around))))
     inner = np.abs(LATTICE.world_to_index(centroids) - 16.0).max(axis=1) < 9.5
     assert np.array_equal(seen_facets(cells, six, LATTICE, centroids, normals), inner)
     assert 0 < np.count_nonzero(seen_facets(cells, one, LATTICE, centroids, normals)) < np.count_nonzero(inner)
