@@ -173,9 +173,8 @@ def load_known_truth(scene_folder: Path | str) -> KnownTruth | None:
             for frame in content["frames"]
             if Path(frame["file_path"]).name.startswith(_TRAINING_PREFIX)
         ]
-        camera = Camera(
-            int(content["w"]), int(content["h"]), *(float(content[key]) for key in ("fl_x", "fl_y", "cx", "cy"))
-        )
+        fl_x, fl_y, cx, cy = (float(content[key]) for key in ("fl_x", "fl_y", "cx", "cy"))
+        camera = Camera(int(content["w"]), int(content["h"]), fl_x, fl_y, cx, cy)
         training_poses = np.asarray(poses, dtype=np.float64)
     except (KeyError, TypeError, ValueError, AttributeError) as problem:
         if isinstance(problem, SceneError):

@@ -65,7 +65,7 @@ class SolidSelection:
 
     def __post_init__(self) -> None:
         for name, (kind, low, high, usual) in _BOUNDS.items():
-            value = getattr(self, name)
+            value: Any = getattr(self, name)
             if value is None and usual is None:
                 continue
             number = isinstance(value, kind) and not isinstance(value, bool) and math.isfinite(value)
