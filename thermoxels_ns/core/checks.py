@@ -49,6 +49,17 @@ def check_shape(
     return array
 
 
+def check_direction(
+    name: str, vector: npt.ArrayLike, remedy: str, error: type[ThermoxelsError] = ThermoxelsError
+) -> npt.NDArray[np.float64]:
+    """Return `vector` as three numbers if it is a direction of any length above 0, else raise `error`."""
+    array = np.asarray(vector, dtype=np.float64)
+    length = float(np.linalg.norm(array)) if array.shape == (3,) else 0.0
+    if not (math.isfinite(length) and length > 0.0):
+        raise error(name, expected="three finite numbers that are not all 0", got=array.tolist(), remedy=remedy)
+    return array
+
+
 def writable_folder(path: Path | str) -> Path:
     """Make `path` a folder that can be written to, or raise `OutputError`.
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.checks import check_finite, check_shape, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import check_direction, check_finite, check_shape, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 # The part of the picture that the mesh may fill, as (left, bottom, right, top) shares of width and height: the title
 # is above, the colour bar to the right, the axes and the size below.
-_STAGE = (0.04, 0.16, 0.80, 0.90)
+_MESH_AREA = (0.04, 0.16, 0.80, 0.90)
 _GREY = "#b8b8b8"
 _INK = "#202020"
 BAR_TITLE = "temperature [°C]"
@@ -170,13 +170,8 @@ def _view_axes(
 
 
 def _unit(name: str, vector: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    array = np.asarray(vector, dtype=np.float64)
-    length = float(np.linalg.norm(array))
-    if array.shape != (3,) or not np.isfinite(length) or length == 0.0:
-        raise MeshError(
-            name, expected="three finite numbers, not all 0", got=vector, remedy="Pass for instance (0, 0, 1)."
-        )
-    return array / length
+    array = check_direction(name, vector, "Pass for instance (0, 0, 1).", MeshError)
+    return array / float(np.linalg.norm(array))
 
 
 def _without_outliers(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -289,14 +284,14 @@ def _frame(
     up: npt.NDArray,
     towards_camera: npt.NDArray,
 ) -> None:
-    """Point a parallel camera so that `points` just fill the stage."""
+    """Point a parallel camera so that `points` just fill the mesh's area."""
     width, height = plotter.window_size
-    left, bottom, stage_right, top = _STAGE
+    left, bottom, area_right, top = _MESH_AREA
     across, along = points @ right, points @ up
     depth = points @ towards_camera
-    view_height = max(np.ptp(along) / (top - bottom), np.ptp(across) / (stage_right - left) * height / width, 1e-12)
-    # The stage's centre is off the picture's centre; shift the focal point the other way.
-    shift_x = (0.5 * (left + stage_right) - 0.5) * view_height * width / height
+    view_height = max(np.ptp(along) / (top - bottom), np.ptp(across) / (area_right - left) * height / width, 1e-12)
+    # The area's centre is off the picture's centre; shift the focal point the other way.
+    shift_x = (0.5 * (left + area_right) - 0.5) * view_height * width / height
     shift_y = (0.5 * (bottom + top) - 0.5) * view_height
     focus = (
         (0.5 * (across.min() + across.max()) - shift_x) * right

@@ -48,7 +48,7 @@ def test_facing_follows_the_up_direction() -> None:
 
 @pytest.mark.parametrize("up", [(0, 0, 0), (0, float("nan"), 1), (0, 1)])
 def test_no_direction_is_refused(up: tuple) -> None:
-    with pytest.raises(MeshError, match="up: expected three numbers that are not all 0"):
+    with pytest.raises(MeshError, match="up: expected three finite numbers that are not all 0"):
         facing(np.zeros((0, 3)), up)
 
 

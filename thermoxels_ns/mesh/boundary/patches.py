@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.checks import check_direction, check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.boundary.patch_rules import DEFAULT_PATCHES, DEFAULT_REGION, FACINGS, PatchRules, Rule
 
@@ -47,16 +47,8 @@ def facing(normals: npt.NDArray[np.float64], up: npt.ArrayLike) -> npt.NDArray[n
     >>> facing(np.array([[0, 0, 1.0], [1, 0, 0], [0, 0.6, -0.8]]), up=(0, 0, 2)).tolist()
     [0, 1, 2]
     """
-    direction = np.asarray(up, dtype=np.float64)
-    length = float(np.linalg.norm(direction))
-    if direction.shape != (3,) or not (math.isfinite(length) and length > 0.0):
-        raise MeshError(
-            "up",
-            expected="three numbers that are not all 0",
-            got=direction.tolist(),
-            remedy="Pass the direction away from the ground.",
-        )
-    cosine = np.asarray(normals) @ (direction / length)
+    direction = check_direction("up", up, "Pass the direction away from the ground.", MeshError)
+    cosine = np.asarray(normals) @ (direction / float(np.linalg.norm(direction)))
     return np.where(cosine > _COS_45, 0, np.where(cosine < -_COS_45, 2, 1)).astype(np.int64)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.checks import check_direction
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.content import (
     Colouring,
@@ -138,11 +139,7 @@ def _turn_to_y(up: Sequence[float]) -> list[float]:
     >>> [round(entry, 6) for entry in _turn_to_y((0.0, 0.0, 2.0))]
     [-0.707107, 0.0, 0.0, 0.707107]
     """
-    direction = np.asarray(up, dtype=np.float64)
-    length = float(np.linalg.norm(direction)) if direction.shape == (3,) else math.nan
-    if not (math.isfinite(length) and length > 0.0):
-        raise MeshError("up", expected="three finite numbers, not all 0", got=up, remedy="Pass for instance (0, 0, 1).")
-    x, y, z = map(float, direction)
+    x, y, z = check_direction("up", up, "Pass for instance (0, 0, 1).", MeshError).tolist()
     # About up x y; about any level axis if up is +y or -y itself.
     level = math.hypot(x, z)
     axis_x, axis_z = (-z / level, x / level) if level > 0.0 else (1.0, 0.0)

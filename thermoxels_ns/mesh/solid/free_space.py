@@ -59,16 +59,16 @@ def count_cameras(cells: BoolArray, lattice: Lattice, views: Views) -> CameraCou
     chosen = np.arange(len(views.focal))
     if len(chosen) > MOST_CAMERAS:
         chosen = np.linspace(0, len(chosen) - 1, MOST_CAMERAS).round().astype(np.int64)
-    cameras = [_Camera.of(views, int(number), lattice) for number in chosen]
+    eyes = lattice.world_to_index(views.camera_to_world[:, :, 3])
     both = np.zeros(cells.shape, dtype=np.uint16)
     for order in ((0, 1, 2), (1, 0, 2), (2, 0, 1)):
         # Layers across the first of these axes are contiguous.
         passes = np.where(np.ascontiguousarray(cells.transpose(order)), _HELD, _HELD + _FREE)
         blocks = cells.any(axis=order[1:])
         counts = np.zeros(passes.shape, dtype=np.uint16)
-        for camera in cameras:
+        for camera in chosen.tolist():
             for sign in (1, -1):
-                _count_along(passes, blocks, counts, camera, order, sign)
+                _count_along(passes, blocks, counts, views, camera, eyes[camera, list(order)], order, sign)
         both += counts.transpose(np.argsort(order))
     return CameraCounts((both % _FREE).astype(np.uint8), (both // _FREE).astype(np.uint8))
 
@@ -77,43 +77,33 @@ _HELD, _FREE = np.uint16(1), np.uint16(256)
 """Both counts of a voxel stand in one number, so that one look-up serves them: the image holds it, its line is free."""
 
 
-@dataclass(frozen=True)
-class _Camera:
-    """A pinhole in fractional corner indices."""
-
-    eye: npt.NDArray[np.float64]
-    axes: npt.NDArray[np.float64]
-    focal: npt.NDArray[np.float64]
-    centre: npt.NDArray[np.float64]
-    size: npt.NDArray[np.int64]
-
-    @classmethod
-    def of(cls, views: Views, number: int, lattice: Lattice) -> _Camera:
-        pose = views.camera_to_world[number]
-        eye = lattice.world_to_index(pose[:, 3])
-        return cls(eye, pose[:, :3], views.focal[number], views.centre[number], views.size[number])
-
-    def holds(self, direction: npt.NDArray[np.float64]) -> BoolArray:
-        """Whether the image holds directions (..., 3)."""
-        local = direction @ self.axes
-        depth = -local[..., 2]
-        ahead = depth > 1e-9
-        scale = 1.0 / np.where(ahead, depth, 1.0)
-        x = self.centre[0] + self.focal[0] * local[..., 0] * scale
-        y = self.centre[1] - self.focal[1] * local[..., 1] * scale
-        return ahead & (x >= 0) & (x <= self.size[0]) & (y >= 0) & (y <= self.size[1])
+def _holds(views: Views, camera: int, direction: npt.NDArray[np.float64]) -> BoolArray:
+    """Whether a camera's image holds directions (..., 3)."""
+    local = direction @ views.camera_to_world[camera, :, :3]
+    depth = -local[..., 2]
+    ahead = depth > 1e-9
+    scale = 1.0 / np.where(ahead, depth, 1.0)
+    (focal_x, focal_y), (centre_x, centre_y), (width, height) = (
+        views.focal[camera],
+        views.centre[camera],
+        views.size[camera],
+    )
+    x = centre_x + focal_x * local[..., 0] * scale
+    y = centre_y - focal_y * local[..., 1] * scale
+    return ahead & (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
 
 
 def _count_along(
     passes: npt.NDArray[np.uint16],
     blocks: BoolArray,
     counts: npt.NDArray[np.uint16],
-    camera: _Camera,
+    views: Views,
+    camera: int,
+    eye: npt.NDArray[np.float64],
     order: tuple[int, int, int],
     sign: int,
 ) -> None:
     """Add what one camera sees in the pyramid around one half of an axis, layer after layer away from it."""
-    eye = camera.eye[list(order)]
     distance = sign * (np.arange(len(passes)) + 0.5 - eye[0])
     ahead = np.flatnonzero(distance > 0.0)[::sign]
     if len(ahead) == 0:
@@ -133,7 +123,7 @@ def _count_along(
     direction[..., order[0]] = sign
     direction[..., order[1]] = u.slopes[:, None]
     direction[..., order[2]] = v.slopes
-    held = camera.holds(direction)
+    held = _holds(views, camera, direction)
     if not held.any():
         return
     now = np.where(held, _HELD + _FREE, np.uint16(0))
