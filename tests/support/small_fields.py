@@ -47,6 +47,14 @@ def box_mesh(snapshot_of) -> TetMesh:
     return replace(build_mesh(snapshot, selection, np.eye(4), MeshOptions("voxel")).mesh, boundary=None)
 
 
+def mesh_from(points: npt.NDArray[np.float64], tets: npt.NDArray[np.int64]) -> TetMesh:
+    """A mesh of any tetrahedra at 20 degrees, with the boundary that they have."""
+    facets = boundary_facets(tets)
+    none = np.zeros(len(facets), dtype=np.int64)
+    warm = np.full(len(points), 20.0)
+    return TetMesh(points, tets, warm, warm > 0, facets, none, np.zeros(len(tets), dtype=np.int64))
+
+
 @pytest.fixture
 def mesh_of_cells() -> Callable[[npt.NDArray[np.bool_]], TetMesh]:
     """Mesh given voxels of edge 0.5 m as they are, at 20 degrees."""

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.support.small_fields import mesh_from
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import (
     check_mesh,
@@ -19,17 +20,9 @@ from thermoxels_ns.mesh.quality.checks import (
 )
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.quality.topology import group_sides
-from thermoxels_ns.mesh.tetrahedra import TetMesh
-from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
+from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 CORNER_TET = np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 4]])
-
-
-def mesh_from(points: np.ndarray, tets: np.ndarray) -> TetMesh:
-    facets = boundary_facets(tets)
-    ones = np.ones(len(points))
-    zeros = np.zeros(len(facets), dtype=np.int64)
-    return TetMesh(points, tets, ones, ones > 0, facets, zeros, np.zeros(len(tets), dtype=np.int64))
 
 
 def test_volume_area_and_normal_by_hand():

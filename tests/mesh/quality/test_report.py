@@ -10,12 +10,13 @@ import pytest
 import skfem
 from skfem.models.poisson import laplace
 
+from tests.support.small_fields import mesh_from
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import check_mesh
 from thermoxels_ns.mesh.quality.criteria import DIHEDRAL_BOUNDS_DEG, BoundaryMode, Figures, angle_bins, judge
 from thermoxels_ns.mesh.quality.report import QualityReport, quality_report
-from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
-from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
+from thermoxels_ns.mesh.tetrahedra import Boundary
+from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 NAMES = (
     "volumes_positive",
@@ -25,13 +26,6 @@ NAMES = (
     "temperatures_in_range",
 )
 VOXEL_NAMES = (*NAMES, "non_obtuse", "stiffness_monotone")
-
-
-def mesh_from(points: np.ndarray, tets: np.ndarray) -> TetMesh:
-    facets = boundary_facets(tets)
-    none = np.zeros(len(facets), dtype=np.int64)
-    warm = np.full(len(points), 20.0)
-    return TetMesh(points, tets, warm, warm > 0, facets, none, np.zeros(len(tets), dtype=np.int64))
 
 
 def figure_of(report: QualityReport, name: str) -> float:
