@@ -39,14 +39,14 @@ def write_capture_page(result: CaptureResult) -> None:
     overlays = []
     for index in spread_out(len(paired), _SHOWN):
         temperature_c = scene.drift.corrected(index, np.load(scene.frames[index].thermal))
-        drawn_over = [
+        start, found = (
             jpeg_of(overlay(paired[index], temperature_c, scene.model.camera, rig)) for rig in (result.start, scene.rig)
-        ]
+        )
         known = temperature_c[np.isfinite(temperature_c)]
         low, high = (float(each) for each in np.percentile(known, _PERCENTILES)) if known.size else (0.0, 1.0)
         alone = jpeg_of(colours(temperature_c, (low, high)).astype(np.uint8))
         title = f"{names[index]}: {scene.frames[index].photograph_source}"
-        overlays.append(Overlay(title, *drawn_over, alone, (low, high) if known.size else None))
+        overlays.append(Overlay(title, start, found, alone, (low, high) if known.size else None))
     samples, masked, pixels = [], 0, 0
     for index, frame in enumerate(scene.frames):
         temperature_c = scene.drift.corrected(index, np.load(frame.thermal)).ravel()

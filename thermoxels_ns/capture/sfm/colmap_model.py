@@ -37,7 +37,7 @@ def camera_of_colmap(camera: Any) -> Camera:
             got=name,
             remedy="Run COLMAP with --ImageReader.camera_model OPENCV, or let thermoxels capture find the poses.",
         )
-    values = dict(zip(_FIELDS[name], map(float, camera.params)))
+    values: dict[str, Any] = dict(zip(_FIELDS[name], map(float, camera.params)))
     focal = values.pop("f", None)
     if focal is not None:
         values |= {"fl_x": focal, "fl_y": focal}
