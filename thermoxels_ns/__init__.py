@@ -1,3 +1,3 @@
-"""Thermoxels: RGB and thermal photographs to a 3D model that a finite-element solver can run on."""
+"""RGB and thermal photographs to a 3D model that a finite-element solver can run on."""
 
 __version__ = "0.1.0"

@@ -1,4 +1,4 @@
-"""The methods nerfstudio finds through our entry points. Must import on any machine and load nothing heavy."""
+"""The methods that nerfstudio finds through our entry points."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
-"""The dataparser that nerfstudio finds through our entry point.
+"""The dataparser that nerfstudio finds through our entry point."""
 
-Apart from `config.py`, because nerfstudio discovers dataparsers while its own datamanagers are half imported.
-"""
-
+# Apart from `config.py`: nerfstudio discovers dataparsers while its own datamanagers are half imported.
 from __future__ import annotations
 
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification

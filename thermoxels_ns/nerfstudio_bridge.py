@@ -1,7 +1,4 @@
-"""What nerfstudio 1.1.x lacks for plugins: an exporter hook, loading its own checkpoints, errors without a traceback.
-
-This module is imported by every ``ns-*`` command, so it loads nothing heavy and never raises.
-"""
+"""What nerfstudio 1.1.x lacks for plugins; imported by every ``ns-*`` command."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""A buffer pool: large arrays whose memory is used again by the next training step.
-
-A page that a program touches for the first time costs several times what filling it costs, and a training step needs
-the same tens of megabytes as the step before.
-"""
+"""A buffer pool: large arrays whose memory the next training step uses again."""
 
 from __future__ import annotations
 
@@ -20,7 +16,10 @@ PATIENCE = 2048
 
 
 class BufferPool:
-    """Lends arrays; the memory of one comes back when nothing refers to it or to a view of it any more."""
+    """Lends arrays; the memory of one comes back when nothing refers to it or to a view of it any more.
+
+    A page of memory that a program touches for the first time costs several times what filling it costs.
+    """
 
     def __init__(self) -> None:
         self._free: dict[int, list[tuple[npt.NDArray[np.uint8], int]]] = {}

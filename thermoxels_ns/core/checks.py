@@ -1,4 +1,4 @@
-"""Checks at public boundaries; each names the caller's variable, what it expected, what it got and the remedy."""
+"""Checks at public boundaries, and files that are complete or absent."""
 
 from __future__ import annotations
 

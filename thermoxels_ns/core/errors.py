@@ -1,8 +1,4 @@
-"""Errors a user can act on.
-
-Every message says four things: the name of what is wrong, what was expected, what was got, and the
-remedy. `ThermoxelsError` is the one type a command line catches; the subclasses let code tell them apart.
-"""
+"""Errors a user can act on: name, expected, got and remedy."""
 
 
 class ThermoxelsError(Exception):

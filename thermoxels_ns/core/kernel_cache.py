@@ -1,4 +1,4 @@
-"""Compiled kernels: one decorator, and a cache that knows which files kernels inline each other from."""
+"""The decorator of compiled kernels, and the cache of what was compiled."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""The corner lattice: the one place where index <-> world is written.
-
-Values live on voxel corners. Corner (i, j, k) sits at ``lo + (i, j, k) * voxel_size``; N corners along an axis
-span N - 1 voxels. Flat corner index: ``(i * ny + j) * nz + k`` (C order), and the same rule for cells.
-"""
+"""The corner lattice: the one place where index <-> world is written."""
 
 from __future__ import annotations
 
@@ -23,7 +19,11 @@ CORNER_OFFSETS: npt.NDArray[np.int64] = np.array(
 
 @dataclass(frozen=True)
 class Lattice:
-    """A regular lattice of cubic voxels with values on their corners."""
+    """A regular lattice of cubic voxels with values on their corners.
+
+    Corner (i, j, k) sits at ``lo + (i, j, k) * voxel_size``; N corners along an axis span N - 1 voxels. Flat corner
+    index: ``(i * ny + j) * nz + k`` (C order), and the same rule for cells.
+    """
 
     lo: tuple[float, float, float]
     """World position of corner (0, 0, 0)."""

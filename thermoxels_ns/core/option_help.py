@@ -1,7 +1,4 @@
-"""Texts of options as whole paragraphs, which ``--help`` breaks at the width of the terminal and nowhere else.
-
-Tyro shows the string below a field of a dataclass, and keeps most of the line breaks that it has in the source.
-"""
+"""Texts of options as whole paragraphs, which ``--help`` breaks at the terminal's width."""
 
 from __future__ import annotations
 

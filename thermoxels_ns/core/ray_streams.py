@@ -1,8 +1,6 @@
-"""Which photographs a ray belongs to: RGB, thermal, or both where a pair shares one camera.
+"""Which photographs a ray belongs to: RGB, thermal, or both."""
 
-A training batch is one `RayBundle` whose ``metadata["stream"]`` holds these bits per ray, shape (n, 1), uint8.
-"""
-
+# A batch is one `RayBundle` whose ``metadata["stream"]`` holds these bits per ray, shape (n, 1), uint8.
 RGB_STREAM = 1
 """The ray carries a colour target."""
 THERMAL_STREAM = 2

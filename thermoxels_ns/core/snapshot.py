@@ -1,4 +1,4 @@
-"""What crosses the wall from the trained model to the mesher: plain arrays on the lattice."""
+"""The trained field as plain arrays: what training hands to the mesher."""
 
 from __future__ import annotations
 

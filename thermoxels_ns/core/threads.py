@@ -1,8 +1,4 @@
-"""Threads of the compiled kernels: ranges of work shared among a fixed number of them.
-
-The kernels release Python's lock and write to disjoint places, so a plain pool of threads is enough. How many there
-are never changes a result.
-"""
+"""A pool of threads for ranges of work of the compiled kernels."""
 
 from __future__ import annotations
 
@@ -38,6 +34,8 @@ def _executor() -> ThreadPoolExecutor:
 
 def run_ranges(work: Callable[[int, int], object], total: int, smallest: int = 64) -> list[object]:
     """Call ``work(first, last)`` on ranges that cover 0 to `total`, in parallel.
+
+    Kernels release Python's lock and write to disjoint places; how many threads there are never changes a result.
 
     Args:
         work: Called with the bounds of a range; must write nothing that another range writes.

@@ -1,4 +1,4 @@
-"""What a ray sees that leaves the box: a sphere image for colour, a low-order sky for temperature."""
+"""What a ray sees behind the box: a sphere image, a low-order sky temperature."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""Trilinear interpolation of rows stored on the corners of kept voxels, and its exact gradient.
-
-Forward is one weighted gather per point (`torch.nn.functional.embedding_bag`, which never materialises the
-points x 8 corners x channels values). Backward sorts the points by voxel, sums each voxel's contributions and
-adds eight duplicate-free sets of rows, so that the result does not depend on thread count or on a race.
-"""
+"""Trilinear interpolation of rows on the corners of kept voxels, and its gradient."""
 
 from __future__ import annotations
 
@@ -72,6 +67,9 @@ class TrilinearPoints:
 
 def interpolate(rows: Float[Tensor, "rows channels"], at: TrilinearPoints) -> Float[Tensor, "n channels"]:
     """Interpolate `rows` at points: f(p) = sum over the voxel's corners of w_c(p) rows[c].
+
+    The gradient sums each voxel's points in their order and adds rows without duplicates, so that it does not depend on
+    thread count or on a race.
 
     Args:
         rows: One row of values per stored corner.

@@ -1,10 +1,4 @@
-"""Which voxels of a lattice are kept, and in which row their corners are stored.
-
-Rows exist for corners of kept voxels only (the link table and compact rows of Plenoxels, Fridovich-Keil et al. 2022),
-in the order of their flat corner index. Corners k and k + 1 of a kept voxel then stand in neighbouring rows, so four
-row numbers per voxel find all eight. The voxel under a point is found through blocks of 8^3 voxels: an empty block
-costs one look-up and four bytes, whatever the resolution.
-"""
+"""Which voxels are kept, and in which row their corners are stored."""
 
 from __future__ import annotations
 
@@ -25,6 +19,11 @@ IntArray = npt.NDArray[np.int64]
 
 class KeptVoxels:
     """The kept voxels of a lattice and the rows of their corners.
+
+    Rows exist for corners of kept voxels only (the link table and compact rows of Plenoxels, Fridovich-Keil et al.
+    2022), in the order of their flat corner index. Corners k and k + 1 of a kept voxel then stand in neighbouring rows,
+    so four row numbers per voxel find all eight. The voxel under a point is found through blocks of 8^3 voxels: an
+    empty block costs one look-up and four bytes, whatever the resolution.
 
     Args:
         lattice: The lattice.

@@ -1,7 +1,4 @@
-"""Change what a voxel grid stores: split voxels, drop voxels, and add colour harmonics.
-
-Optimiser state follows through the `RowChange` or `ColumnChange` that each change returns.
-"""
+"""Change what a voxel grid stores: split voxels, drop voxels, add colour harmonics."""
 
 from __future__ import annotations
 

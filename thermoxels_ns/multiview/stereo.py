@@ -1,12 +1,4 @@
-"""How far away is what photographs show: depths where neighbouring photographs agree about a plane's picture.
-
-For each photograph, its neighbours are drawn onto planes parallel to it, one behind the other, and compared with it
-patch by patch (plane sweep, Collins 1996; normalised cross-correlation). The plane on which they agree best is the
-depth of a pixel. It counts where depths of other photographs, found on their own, lie in the same place.
-
-Within a patch only what has the pixel's own colour counts. Else an outline gives its depth to all that lies beside it:
-a rim of sky around every wall would seem as near as the wall, in all photographs alike.
-"""
+"""Multi-view stereo: depths of photographs by plane sweep."""
 
 from __future__ import annotations
 
@@ -80,6 +72,11 @@ class Depths:
 
 def depths_of(photographs: Photographs, lo: npt.ArrayLike, hi: npt.ArrayLike) -> Depths:
     """Find the depths of photographs within a box.
+
+    For each photograph, its neighbours are drawn onto planes parallel to it, one behind the other, and compared with it
+    patch by patch (plane sweep, Collins 1996; normalised cross-correlation). The plane on which they agree best is the
+    depth of a pixel. It counts where depths of other photographs, found on their own, lie in the same place. Within a
+    patch only pixels of the middle one's colour count: else an outline gives its depth to all that lies beside it.
 
     Args:
         photographs: Pinhole photographs, best some 160 pixels wide: cost grows with the third power of their size.

@@ -1,4 +1,4 @@
-"""The volume rendering sum of the paper (eq. 1 and 2), in plain torch: the reference for every faster version."""
+"""The volume rendering sum of the paper (eq. 1 and 2) in plain torch."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Fused rendering on a CPU: one march per ray instead of tables of samples; the twin of the torch reference.
-
-Early stop and skipped colours have a stated bound (`RenderOptions`); everything else is the reference's sum. Gradients
-come as row-sparse tensors that hold the touched rows only.
-"""
+"""Rendering by compiled kernels on the CPU, with row-sparse gradients."""
 
 from __future__ import annotations
 

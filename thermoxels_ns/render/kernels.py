@@ -1,8 +1,4 @@
-"""Compiled march: follow rays, skip empty voxels, read density and weigh; `kernels_shading` reads the rest.
-
-Plain loops for numba. Every function works on a range of rays, so that threads can share a batch: no two rays write
-the same place. Geometry and sums are in double precision whatever the parameters are.
-"""
+"""Compiled march: follow rays, skip empty voxels, read density and weigh samples."""
 
 from __future__ import annotations
 
@@ -324,6 +320,8 @@ def march_forward(
     end: int,
 ):
     """Weigh the samples of rays `first` to `last` (paper, eq. 1) and record them from `begin` to before `end`.
+
+    Ranges of rays write to places of their own, so that threads can share a batch. Sums are in double precision.
 
     Samples are found, read and weighed a few at a time: reading does not wait for weighing then, and a memory that
     answers late is asked for several of them at once.

@@ -1,7 +1,4 @@
-"""Compiled backward pass of `kernels.march_forward`: gradients of each ray's sums become those of its samples.
-
-Rays share nothing here; `kernels_rows` adds up what falls on the same rows.
-"""
+"""Compiled backward pass: gradients of each ray's sums become those of its samples."""
 
 from __future__ import annotations
 

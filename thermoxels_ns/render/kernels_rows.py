@@ -1,9 +1,4 @@
-"""Compiled sums over rows: what samples and total variation give to each row, without racing adds.
-
-Samples are put in the order of their voxels first, so that those that fall on the same rows follow each other and rows
-are passed in the order in which they lie in memory. Each thread owns a range of rows and adds, in that order, whatever
-falls there: the sums are the same bits for any number of threads.
-"""
+"""Compiled sums of what samples and total variation give to each row."""
 
 from __future__ import annotations
 
@@ -223,7 +218,11 @@ def add_samples(
     order: Order,
     rows: RowGradients,
 ):
-    """Add the gradients of samples to rows `first_row` to `last_row` and to no other."""
+    """Add the gradients of samples to rows `first_row` to `last_row` and to no other.
+
+    Each thread owns a range of rows and adds samples in the order of their voxels: no two add to the same row, and the
+    sums are the same bits for any number of threads.
+    """
     channels, thermal_channels = volume.sh.shape[1], volume.temperature.shape[1]
     active = min(channels // 3, settings.sh_active)
     dtype = volume.density.dtype

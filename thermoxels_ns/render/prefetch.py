@@ -1,4 +1,4 @@
-"""Ask for a value before it is needed, so that kernels which jump through large arrays do not wait for memory."""
+"""Load array entries into the cache before a compiled kernel needs them."""
 
 from __future__ import annotations
 

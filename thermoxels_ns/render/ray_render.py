@@ -1,4 +1,4 @@
-"""What is asked of a renderer, and what it gives: the same for the reference and for the compiled kernels."""
+"""What is asked of a renderer, and what it gives."""
 
 from __future__ import annotations
 

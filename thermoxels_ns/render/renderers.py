@@ -1,4 +1,4 @@
-"""The two renderers of a voxel grid: plain torch, the reference, and compiled kernels on the CPU."""
+"""The two renderers of a voxel grid: plain torch (reference) and compiled kernels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sum the gradients of samples and of total variation into row-sparse tensors, each thread in its own range of rows."""
+"""Gradients of samples and of total variation as row-sparse tensors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a ray meets the box and where it is sampled there: every half voxel, exactly filling its chord."""
+"""Where a ray meets the box, and where it is sampled there."""
 
 from __future__ import annotations
 

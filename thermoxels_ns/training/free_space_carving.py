@@ -1,4 +1,4 @@
-"""Space carving: drop voxels that feature rays of structure from motion cross on the way to their points."""
+"""Space carving: drop voxels that feature rays cross on the way to their points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Image metrics: how well a rendered photograph matches a held-out one, in decibels, structure and degrees."""
+"""How well a rendered photograph matches a held-out one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The nerfstudio model: a voxel field rendered for colour and temperature, with its losses and metrics."""
+"""The nerfstudio model: a voxel field with its losses and metrics."""
 
 from __future__ import annotations
 

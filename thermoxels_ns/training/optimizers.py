@@ -1,9 +1,4 @@
-"""Optimisers that touch only rows with a gradient, as nerfstudio optimizer configs.
-
-A batch of rays sees a small part of a voxel grid. Rows (entries along the first axis) without a gradient keep their
-value and their state, and each row's bias correction counts its own updates, so that a corner that is seen for the
-first time late in a training starts like all others did.
-"""
+"""Optimisers that touch only rows with a gradient, as nerfstudio optimizer configs."""
 
 from __future__ import annotations
 
@@ -22,6 +17,10 @@ from thermoxels_ns.field.refine import ColumnChange, RowChange
 
 class RowOptimizer(torch.optim.Optimizer):
     """An optimiser whose step goes over the rows of each parameter that have a gradient.
+
+    A batch of rays sees a small part of a voxel grid. Rows (entries along the first axis) without a gradient keep their
+    value and their state, and each row's bias correction counts its own updates, so that a corner that is seen for the
+    first time late in a training starts like all others did.
 
     Gradients are row-sparse tensors (`torch.sparse_coo`, one sparse dimension) or dense ones, whose rows of zeros count
     as rows without a gradient.

@@ -1,7 +1,4 @@
-"""When a training refines, prunes and thins: one rule for every resolution and number of steps.
-
-The shares of the run at which things happen were set by hand while the losses were tuned; only the whole was measured.
-"""
+"""When a training refines, prunes and thins, for every resolution and length."""
 
 from __future__ import annotations
 
@@ -13,6 +10,7 @@ from thermoxels_ns.core.errors import ThermoxelsError
 
 COARSEST = 32
 """Voxels along the longest side that a training starts with, or a few more."""
+# The shares of the run below were set by hand while the losses were tuned; only the whole was measured.
 _REFINE: Mapping[int, tuple[float, ...]] = {
     0: (),
     1: (0.25,),

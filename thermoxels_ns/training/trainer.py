@@ -1,4 +1,4 @@
-"""nerfstudio's trainer: checkpoints are complete or absent, and it says how a training goes on from one."""
+"""Nerfstudio's trainer with checkpoints that are complete or absent."""
 
 from __future__ import annotations
 
