@@ -206,16 +206,6 @@ def test_bodies_that_touch_are_counted_both_ways(mesh_of_cells):
     assert (report.genus, len(report.components)) == (0, 3)
 
 
-def test_a_ring_has_a_handle_and_a_hollow_body_a_cavity(mesh_of_cells):
-    ring = np.ones((3, 3, 1), dtype=bool)
-    ring[1, 1] = False
-    assert quality_report(mesh_of_cells(ring), "voxel").genus == 1
-    hollow = np.ones((3, 3, 3), dtype=bool)
-    hollow[1, 1, 1] = False
-    report = quality_report(mesh_of_cells(hollow), "voxel")
-    assert (report.genus, report.num_cavities, report.euler_characteristic) == (0, 1, 4)
-
-
 def test_unused_nodes_are_no_bodies(box_mesh):
     one = np.ones(1)
     mesh = replace(
