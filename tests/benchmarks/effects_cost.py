@@ -24,10 +24,9 @@ import numpy as np
 import tyro
 from scipy import sparse
 
-from tests.support.heat_matrices import assemble
 from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients, LinearSolver
 from thermoxels_ns.fem.fixed_nodes import FixedNodes
-from thermoxels_ns.fem.p1_kernels import product_and_bound
+from thermoxels_ns.fem.p1_kernels import lumped_mass, product_and_bound, stiffness_matrix
 from thermoxels_ns.fem.pieces import Pieces
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.schemes import BACKWARD_EULER
@@ -35,7 +34,6 @@ from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.stepper import Stepper
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.system import HeatSystem
-from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.scene_file import load_heat_scene
 from thermoxels_ns.heat.screening import screen
 from thermoxels_ns.mesh.boundary.patches import default_patches
@@ -121,9 +119,7 @@ class Conduction:
 
     def __init__(self, problem: HeatProblem) -> None:
         """Assemble stiffness and lumped mass."""
-        assert isinstance(problem.material, Material)
-        matrices = assemble(problem.mesh, problem.material)
-        self._stiffness, self._mass = matrices.stiffness_w_k, matrices.nodal_mass_j_k
+        self._stiffness, self._mass = stiffness_and_mass(problem)
         self.num_nodes = len(self._mass)
         self.pieces, self.fixed = Pieces(self._stiffness), FixedNodes((), self.num_nodes)
 
@@ -144,6 +140,13 @@ class Conduction:
         return LinearSolver(matrix, relative_tolerance=relative_tolerance)
 
 
+def stiffness_and_mass(problem: HeatProblem) -> tuple[sparse.csr_matrix, np.ndarray]:
+    """K and the lumped M."""
+    points, tets = problem.mesh.points_m, problem.mesh.tets
+    stiffness = stiffness_matrix(points, tets, problem.conductivity_w_mk)
+    return stiffness, lumped_mass(points, tets, problem.heat_capacity_j_m3k)
+
+
 def directly(problem: HeatProblem, steps: TimeSteps) -> np.ndarray:
     """Backward Euler by the assembly and the stepper, with no effects between."""
     start, reference = problem.start_c, 0.5 * (problem.start_c.min() + problem.start_c.max())
@@ -160,14 +163,13 @@ def directly(problem: HeatProblem, steps: TimeSteps) -> np.ndarray:
 
 def plainly(problem: HeatProblem, steps: TimeSteps) -> np.ndarray:
     """Backward Euler with the assembled matrices, conjugate gradients and nothing else."""
-    assert isinstance(problem.material, Material)
-    matrices = assemble(problem.mesh, problem.material)
-    system = sparse.csr_matrix(matrices.stiffness_w_k + matrices.mass_j_k / steps.step_seconds)
+    stiffness, mass = stiffness_and_mass(problem)
+    system = sparse.csr_matrix(stiffness + sparse.diags(mass / steps.step_seconds, format="csr"))
     solver = ConjugateGradients(system, relative_tolerance=TOLERANCE)
     states = np.empty((steps.steps + 1, len(problem.start_c)))
     states[0] = problem.start_c
     for number in range(steps.steps):
-        states[number + 1] = states[number] + solver.solve(-(matrices.stiffness_w_k @ states[number])).x
+        states[number + 1] = states[number] + solver.solve(-(stiffness @ states[number])).x
     return states
 
 

@@ -6,9 +6,9 @@ Run it on an otherwise idle machine:
 
 An insulated concrete cube of 1 m, cut into N^3 voxels of six tetrahedra, is followed through ten steps of backward
 Euler. Both sides get the nodes and tetrahedra and return the temperatures of all times; both use one core and conjugate
-gradients with the diagonal as preconditioner to a relative residual of 1e-12. The script measures it against M T / dt
-and starts from the last temperature; we measure against the heat that flows, K T, which is the stricter test. Ours
-includes all checks of the input, and everything else that `solve_heat` does.
+gradients to a relative residual of 1e-12, the script with the diagonal as preconditioner. It measures it against
+M T / dt and starts from the last temperature; we measure against the heat that flows, K T, which is the stricter test.
+Ours includes all checks of the input, and everything else that `solve_heat` does.
 
 Times are medians, the two sides taking turns in one process; compiled kernels are loaded before the first. Memory is
 that of a process for each side alone: its peak less what it needs after its imports.

@@ -165,7 +165,7 @@ def entries_per_row(matrix: sparse.csr_matrix) -> int:
 def test_stiffness_is_that_of_the_form_of_scikit_fem(mesh: str) -> None:
     points, tets = MESHES[mesh]()
     for conductivity in (1.7, 10.0 ** np.random.default_rng(9).uniform(-3.0, 3.0, len(tets))):
-        expected = space(points, tets).assembled(conduction, conductivity=conductivity).toarray()
+        expected = space(points, tets).assembled(conduction, 0, conductivity=conductivity).toarray()
         stiffness = stiffness_matrix(points, tets, conductivity)
         assert np.abs(stiffness.toarray() - expected).max() < 1e-13 * np.abs(expected).max()
 
@@ -174,7 +174,7 @@ def test_stiffness_is_that_of_the_form_of_scikit_fem(mesh: str) -> None:
 def test_mass_is_that_of_the_form_of_scikit_fem(mesh: str) -> None:
     points, tets = MESHES[mesh]()
     for capacity in (2.0e6, 10.0 ** np.random.default_rng(9).uniform(3.0, 7.0, len(tets))):
-        expected = space(points, tets).assembled(storage, heat_capacity=capacity).toarray()
+        expected = space(points, tets).assembled(storage, 2, heat_capacity=capacity).toarray()
         mass, nodal = mass_matrix(points, tets, capacity)
         assert np.abs(mass.toarray() - expected).max() < 1e-13 * np.abs(expected).max()
         np.testing.assert_allclose(nodal, expected.sum(axis=1), rtol=1e-12)

@@ -1,8 +1,4 @@
-"""Conjugate gradients with three preconditioners: sweeps through the nodes, multigrid, linear tetrahedra for quadratic.
-
-One loop serves all. A preconditioner says what the loop sees as matrix and residual; the residual of x itself decides
-whether a solution is accepted. No sum goes through BLAS, whose order of summation depends on the number of its threads.
-"""
+"""Conjugate gradients with sweeps, multigrid or linear tetrahedra as preconditioner."""
 
 from __future__ import annotations
 
@@ -86,7 +82,11 @@ class Preconditioner(Protocol):
 
 
 class ConjugateGradients:
-    """Solver for A x = b with one matrix and many right-hand sides."""
+    """Solver for A x = b with one matrix and many right-hand sides.
+
+    One loop serves all preconditioners, which say what it sees as matrix and residual. The residual of x itself decides
+    whether a solution is accepted. No sum goes through BLAS, whose order of summation depends on the number of threads.
+    """
 
     def __init__(
         self,
@@ -258,6 +258,7 @@ class Sweeps:
         self._surplus, beside = np.empty_like(root), np.zeros_like(root)
         count = _divide_and_part(first, other, values, root, self._surplus, beside)
         self._factor = first, other[:count], values[:count], beside
+        self._step, self._image = np.empty_like(root), np.empty_like(root)
 
     def residual(self, r: Vector) -> Vector:
         """(1 + L)^-1 of the scaled residual."""
@@ -271,17 +272,15 @@ class Sweeps:
 
     def solution(self, seen: Vector) -> Vector:
         """(1 + L^T)^-1, then scaled."""
-        x = np.empty_like(seen)
-        _sweep_back(*self._factor, self._surplus, seen, x, np.empty_like(seen))
-        return x / self._scale
+        _sweep_back(*self._factor, self._surplus, seen, self._step, self._image)
+        return self._step / self._scale
 
     def image(self, direction: Vector) -> Vector:
-        """Both sweeps."""
-        step, image = np.empty_like(direction), np.empty_like(direction)
-        _sweep_back(*self._factor, self._surplus, direction, step, image)
-        _sweep_forward(*self._factor, image)
-        image += step
-        return image
+        """Both sweeps; the array is used again the next time."""
+        _sweep_back(*self._factor, self._surplus, direction, self._step, self._image)
+        _sweep_forward(*self._factor, self._image)
+        self._image += self._step
+        return self._image
 
     def apply(self, seen: Vector) -> Vector:
         """Nothing is left: the factor is in the matrix that the loop sees."""

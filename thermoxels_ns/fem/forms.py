@@ -1,8 +1,4 @@
-"""Convection, radiation, fluxes, sources and fixed temperatures as vectors and matrices on a body's nodes.
-
-Temperatures come as differences from a reference, which keeps round-off relative to the differences. Every form also
-gives its heat flow per patch or region, evaluated as the equations do, so that balances close to round-off.
-"""
+"""Convection, radiation, fluxes, sources and fixed temperatures as vectors and matrices."""
 
 from __future__ import annotations
 
@@ -42,7 +38,11 @@ def inflow(v, w):
 
 
 class Form(Protocol):
-    """What all forms that heat flows through have in common."""
+    """What all forms that heat flows through have in common.
+
+    Temperatures come as differences from a reference, which keeps round-off relative to the differences. Every form
+    also gives its heat flow per patch or region, evaluated as the equations do, so that balances close to round-off.
+    """
 
     effect: str
     """Label of the effect that it comes from."""
@@ -62,6 +62,8 @@ class _Boundary:
         self.effect = effect
         self.basis = space.surface(facets)
         self.nodes = space.facet_nodes(facets)
+        # `basis.interpolate` would find gradients, too.
+        self._shapes = np.stack([np.asarray(field)[0] for (field,) in self.basis.basis])
         self.places = selection.facet_places(facets)
         used, self.group = np.unique(selection.facet_patch[facets], return_inverse=True)
         self.groups = tuple(selection.patch_names[number] for number in used)
@@ -72,7 +74,7 @@ class _Boundary:
 
     def surface_k(self, relative_k: Vector) -> Vector:
         """Temperature at the points of integration, shape (k, q)."""
-        return np.asarray(self.basis.interpolate(relative_k))
+        return np.einsum("ka,aq->kq", relative_k[self.nodes], self._shapes)
 
     def vector(self, flux_w_m2: Vector) -> Vector:
         """Entries integral(q phi_i), [W]; q at the points or even over each triangle."""
@@ -283,7 +285,7 @@ def effect_forms(
     problem: HeatProblem,
     space: Space,
     reference_c: float,
-    bill: Assembled | None = None,
+    assembled: Assembled | None = None,
     *,
     where: Selection | None = None,
 ) -> EffectForms:
@@ -293,7 +295,7 @@ def effect_forms(
         problem: The effects.
         space: The nodes.
         reference_c: What temperatures are relative to, [degrees Celsius].
-        bill: Where fixed temperatures are counted, which are ready at once; None: nowhere.
+        assembled: Where fixed temperatures are counted, which are ready at once; None: nowhere.
         where: Patches and regions that effects are looked for in, if others than those that `space` adds up heat by.
 
     Raises:
@@ -317,7 +319,7 @@ def effect_forms(
             elif isinstance(term, RadiationTerm):
                 radiation.append(RadiationForm(term, space, reference_c))
             else:
-                counted: AbstractContextManager[None] = nullcontext() if bill is None else bill.form("fixed")
+                counted: AbstractContextManager[None] = nullcontext() if assembled is None else assembled.form("fixed")
                 with counted:
                     fixed.append(FixedForm(term, space, reference_c))
     return EffectForms(tuple(robin), tuple(loads), tuple(radiation), tuple(fixed))

@@ -1,4 +1,4 @@
-"""Temperatures at points inside a body, interpolated as the solver does: linear or quadratic in each tetrahedron."""
+"""Temperatures at points inside a body, interpolated as the solver does."""
 
 from __future__ import annotations
 

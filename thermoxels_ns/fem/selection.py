@@ -1,4 +1,4 @@
-"""Where effects act: patches of the boundary and regions of the body, by name, with their places."""
+"""Where effects act: named patches of the boundary and regions of the body."""
 
 from __future__ import annotations
 

@@ -29,10 +29,10 @@ LEFT_OUT = {
 class Assembled:
     """Forms that were assembled, by kind; what a problem does not call for has no entry.
 
-    >>> bill = Assembled()
-    >>> with bill.form("stiffness"):
+    >>> assembled = Assembled()
+    >>> with assembled.form("stiffness"):
     ...     pass
-    >>> bill.counts
+    >>> assembled.counts
     {'stiffness': 1}
     """
 

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 from skfem import Basis, BilinearForm, Dofs, ElementTetP1, ElementTetP2, ElementTriP1, ElementTriP2, MeshTet, MeshTri
+from skfem.element import DiscreteField
 from skfem.helpers import dot, grad
 from skfem.quadrature import get_quadrature
 from skfem.refdom import RefTet
@@ -32,8 +33,8 @@ _CORNERS = (np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), np.full(3, 1.0 / 6.0))
 """Quadrature at the corners of the reference triangle."""
 _EXACT = 4
 """Degree up to which integrals over triangles are exact otherwise: products of quadratic functions."""
-_BLOCK = 10_000
-"""Tetrahedra that scikit-fem sees at a time: its arrays then fit into a processor's cache."""
+_BLOCK = 2_000
+"""Tetrahedra that scikit-fem sees at a time: its arrays, 4 kB each, then fit into a processor's cache."""
 
 
 @BilinearForm
@@ -128,7 +129,7 @@ class Space:
         mesh = self.selection.mesh
         if self.order == 1:
             return stiffness_matrix(mesh.points_m, mesh.tets, conductivity_w_mk, edges=self.edges)
-        return self.assembled(conduction, conductivity=conductivity_w_mk)
+        return self.assembled(conduction, 2 * self.order - 2, conductivity=conductivity_w_mk)
 
     def mass(self, heat_capacity_j_m3k: float | Vector) -> tuple[sparse.csr_matrix | None, Vector]:
         """M, entries integral(rho c phi_i phi_j), None if lumped, and its row sums, shapes (n, n) and (n,), [J / K]."""
@@ -137,32 +138,36 @@ class Space:
             return None, lumped_mass(mesh.points_m, mesh.tets, heat_capacity_j_m3k)
         if self.order == 1:
             return mass_matrix(mesh.points_m, mesh.tets, heat_capacity_j_m3k, edges=self.edges)
-        matrix = self.assembled(storage, heat_capacity=heat_capacity_j_m3k)
+        matrix = self.assembled(storage, 2 * self.order, heat_capacity=heat_capacity_j_m3k)
         return matrix, matrix @ np.ones(self.num_nodes)
 
-    def assembled(self, form: BilinearForm, **tet_values: float | Vector) -> sparse.csr_matrix:
+    def assembled(self, form: BilinearForm, degree: int, **tet_values: float | Vector) -> sparse.csr_matrix:
         """Assemble a form by scikit-fem, symmetric bit for bit.
 
         Args:
             form: What is integrated.
+            degree: Of the polynomials that it is for constant parameters.
             tet_values: Its parameters by name, one for all or one per tetrahedron, shape (t,).
         """
-        points_m, tets, num_tets = self.selection.mesh.points_m, self.selection.mesh.tets, len(self.selection.mesh.tets)
-        mesh = MeshTet(np.ascontiguousarray(points_m.T), np.ascontiguousarray(tets.T), validate=False)
-        dofs = _dofs(mesh, ElementTetP1(), self.tet_nodes(), self.num_nodes)
-        values = {name: np.broadcast_to(value, num_tets) for name, value in tet_values.items()}
+        points_m, tets, nodes = self.selection.mesh.points_m, self.selection.mesh.tets, self.tet_nodes()
+        values = {name: np.broadcast_to(value, len(tets)) for name, value in tet_values.items()}
         parts = []
-        for begin in range(0, num_tets, _BLOCK):
-            block = np.arange(begin, min(begin + _BLOCK, num_tets))
-            basis = Basis(mesh, self.element, elements=block, dofs=dofs, disable_doflocs=True)
-            shape = basis.dx.shape
-            parameters = {name: np.broadcast_to(value[block, None], shape) for name, value in values.items()}
-            parts.append(form.coo_data(basis, **parameters).tocsr().tocoo())
-        rows, columns, data = (
-            np.concatenate([getattr(part, name) for part in parts]) for name in ("row", "col", "data")
-        )
-        matrix = sparse.csr_matrix((data, (rows, columns)), shape=(self.num_nodes, self.num_nodes))
-        return sparse.csr_matrix(0.5 * (matrix + matrix.T))
+        for begin in range(0, len(tets), _BLOCK):
+            block = slice(begin, begin + _BLOCK)
+            # Tetrahedra of a block share no corners in scikit-fem's mesh, but do share unknowns.
+            corners = points_m[tets[block]].reshape(-1, 3)
+            mesh = MeshTet(corners.T.copy(), np.arange(len(corners)).reshape(-1, 4).T.copy(), validate=False)
+            used, local = np.unique(nodes[block], return_inverse=True)
+            dofs = _dofs(mesh, ElementTetP1(), local.reshape(len(mesh.t.T), -1), len(used))
+            basis = Basis(mesh, self.element, dofs=dofs, intorder=degree, disable_doflocs=True)
+            parameters = {name: np.broadcast_to(value[block, None], basis.dx.shape) for name, value in values.items()}
+            part = sparse.triu(form.coo_data(basis, **parameters).tocsr(), format="coo")
+            parts.append((part.data, used[part.row].astype(np.int32), used[part.col].astype(np.int32)))
+        data, rows, columns = (np.concatenate(list(arrays)) for arrays in zip(*parts))
+        del parts
+        upper = sparse.csr_matrix((data, (rows, columns)), shape=(self.num_nodes, self.num_nodes))
+        del data, rows, columns
+        return sparse.csr_matrix(upper + sparse.triu(upper, 1, format="csr").T)
 
     def surface(self, facets: Numbers) -> Basis:
         """Boundary triangles as a scikit-fem basis whose unknowns are the body's.
@@ -177,7 +182,9 @@ class Space:
         element = ElementTriP1() if self.order == 1 else ElementTriP2()
         dofs = _dofs(mesh, ElementTriP1(), self.facet_nodes(facets), self.num_nodes)
         rule = {"quadrature": _CORNERS} if self.lumped_boundary else {"intorder": _EXACT}
-        return Basis(mesh, element, dofs=dofs, disable_doflocs=True, **rule)
+        basis = Basis(mesh, element, dofs=dofs, disable_doflocs=True, **rule)
+        basis.basis = [(DiscreteField(np.asarray(field)),) for (field,) in basis.basis]
+        return basis
 
     def source_points(self, tets: Numbers) -> tuple[Places, Vector]:
         """Places where sources in tetrahedra are asked, those of one after the other, and the volume of each, [m3]."""

@@ -1,4 +1,4 @@
-"""Heat flow through parts of the surface that no effect knows of, such as the surface of each material."""
+"""Heat flow through parts of the surface, such as that of each material."""
 
 from __future__ import annotations
 

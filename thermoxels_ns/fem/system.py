@@ -1,4 +1,4 @@
-"""The discrete heat equation: M dT/dt + (K + R) T = load + radiation(T), with some temperatures fixed."""
+"""The discrete heat equation, M dT/dt + (K + R) T = load + radiation(T)."""
 
 from __future__ import annotations
 
