@@ -68,12 +68,12 @@ class Preconditioner(Protocol):
         """Norm of the residual r of which the loop sees C^-1 r."""
         ...
 
-    def solution(self, seen: Vector) -> Vector:
-        """The solution x of which the loop sees C^T x."""
+    def image(self, direction: Vector) -> tuple[Vector, Vector]:
+        """C^-T p, by which the solution moves, and C^-1 A C^-T p, by which the residual that the loop sees does."""
         ...
 
-    def image(self, direction: Vector) -> Vector:
-        """The matrix that the loop sees times a vector, C^-1 A C^-T p."""
+    def solution(self, moved: Vector) -> Vector:
+        """The solution for the sum of all moves."""
         ...
 
     def apply(self, seen: Vector) -> Vector:
@@ -138,14 +138,13 @@ class ConjugateGradients:
         scale = float(np.max(np.abs(right_hand_side), initial=0.0)) or 1.0
         b = right_hand_side / scale
         size = norm(b)
-        x, r = np.zeros_like(b), b
+        tolerance, near = self._relative_tolerance * size, None
         if start is not None:
-            moved = b - self._matrix @ (start / scale)
-            if norm(moved) < size:
-                x, r = start / scale, moved
-        tolerance = self._relative_tolerance * size
-        change, count, stopped = self._iterate(r, tolerance)
-        x = x + change
+            left = b - self._matrix @ (start / scale)
+            near = left if norm(left) < size else None
+        x, count, stopped = self._iterate(b if near is None else near, tolerance)
+        if start is not None and near is not None:
+            x += start / scale
         # A breakdown may leave NaN, which becomes a status.
         error = norm(b - self._matrix @ x)
         residual = error / size if size > 0.0 else error
@@ -181,11 +180,11 @@ class ConjugateGradients:
             z = given.apply(seen)
             now = square if z is seen else dot(seen, z)
             _turn(direction, z, now / before)
-            image = given.image(direction)
+            step, image = given.image(direction)
             energy = dot(direction, image)
             if not energy > 0.0:
                 return given.solution(x), count, True
-            square = _advance(x, seen, direction, image, now / energy)
+            square = _advance(x, seen, step, image, now / energy)
             before, count = now, count + 1
 
 
@@ -263,24 +262,22 @@ class Sweeps:
     def residual(self, r: Vector) -> Vector:
         """(1 + L)^-1 of the scaled residual."""
         seen = r / self._scale
-        _sweep_forward(*self._factor, seen)
+        _sweep_forward(*self._factor, np.zeros_like(seen), seen)
         return seen
 
     def norm(self, seen: Vector) -> float:
         """Norm of the residual itself."""
         return _norm_below(*self._factor, self._scale, seen, np.zeros_like(seen))
 
-    def solution(self, seen: Vector) -> Vector:
-        """(1 + L^T)^-1, then scaled."""
-        _sweep_back(*self._factor, self._surplus, seen, self._step, self._image)
-        return self._step / self._scale
-
-    def image(self, direction: Vector) -> Vector:
-        """Both sweeps; the array is used again the next time."""
+    def image(self, direction: Vector) -> tuple[Vector, Vector]:
+        """Both sweeps; the arrays are used again the next time."""
         _sweep_back(*self._factor, self._surplus, direction, self._step, self._image)
-        _sweep_forward(*self._factor, self._image)
-        self._image += self._step
-        return self._image
+        _sweep_forward(*self._factor, self._step, self._image)
+        return self._step, self._image
+
+    def solution(self, moved: Vector) -> Vector:
+        """Scaled."""
+        return moved / self._scale
 
     def apply(self, seen: Vector) -> Vector:
         """Nothing is left: the factor is in the matrix that the loop sees."""
@@ -301,13 +298,13 @@ class _Plain:
         """Its norm."""
         return norm(seen)
 
-    def solution(self, seen: Vector) -> Vector:
-        """The solution as it is."""
-        return seen
+    def image(self, direction: Vector) -> tuple[Vector, Vector]:
+        """The vector itself, and A times it."""
+        return direction, self._matrix @ direction
 
-    def image(self, direction: Vector) -> Vector:
-        """A times a vector."""
-        return self._matrix @ direction
+    def solution(self, moved: Vector) -> Vector:
+        """As it is."""
+        return moved
 
 
 class Multigrid(_Plain):
@@ -431,11 +428,11 @@ def _turn(direction, z, keep):
 
 
 @kernel(fastmath={"reassoc", "contract"})
-def _advance(x, r, direction, image, along):
+def _advance(x, r, step, image, along):
     """Move x and r; returns the square of r."""
     total = 0.0
     for i in range(len(x)):
-        x[i] += along * direction[i]
+        x[i] += along * step[i]
         left = r[i] - along * image[i]
         r[i] = left
         total += left * left
@@ -514,12 +511,12 @@ def _sweep_back(first, other, values, beside, surplus, direction, step, image):
 
 
 @kernel(fastmath={"contract"})
-def _sweep_forward(first, other, values, beside, x):
-    """Sets x = (1 + L)^-1 x."""
+def _sweep_forward(first, other, values, beside, added, x):
+    """Sets x = (1 + L)^-1 x + added."""
     ahead = 0.0
     for i in range(np.uint64(len(x))):
         own = x[i] - ahead
-        x[i] = own
+        x[i] = own + added[i]
         for k in range(np.uint64(first[i]), np.uint64(first[i + 1])):
             x[np.uint64(other[k])] -= values[k] * own
         ahead = beside[i] * own
