@@ -25,7 +25,7 @@ import tyro
 from scipy import sparse
 
 from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients, LinearSolver
-from thermoxels_ns.fem.fixed_nodes import FixedNodes
+from thermoxels_ns.fem.forms import FixedNodes
 from thermoxels_ns.fem.p1_kernels import lumped_mass, product_and_bound, stiffness_matrix
 from thermoxels_ns.fem.pieces import Pieces
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, effect_labels

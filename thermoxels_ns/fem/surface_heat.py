@@ -10,8 +10,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.checks import check_shape
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.fixed_nodes import FixedNodes
-from thermoxels_ns.fem.forms import SourceForm, effect_forms
+from thermoxels_ns.fem.forms import FixedNodes, SourceForm, effect_forms
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import EffectHeat, heat_by_effect

@@ -10,8 +10,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients, LinearSolver, TwoLevel
-from thermoxels_ns.fem.fixed_nodes import FixedNodes
-from thermoxels_ns.fem.forms import FluxForm, RobinForm, SourceForm, effect_forms
+from thermoxels_ns.fem.forms import FixedNodes, FluxForm, RobinForm, SourceForm, effect_forms
 from thermoxels_ns.fem.p1_kernels import product_and_bound
 from thermoxels_ns.fem.pieces import Pieces
 from thermoxels_ns.fem.problem import HeatProblem
