@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.p1_kernels import TET_EDGES
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
@@ -35,6 +34,8 @@ a given temperature meets convection at an edge."""
 _LEAST_OF_HALF_THE_SIZE = 0.17
 """Least share of a node's error with quadratic tetrahedra that is left after the mesh size is halved: 1/8 where
 temperatures are smooth, 0.3 where two airs meet at an edge."""
+_CORNERS = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""Corners of the reference tetrahedron, shape (3, 4)."""
 _EQUAL = 1e-9
 """Temperatures that differ by less than this share of the absolute temperature are equal."""
 
@@ -170,33 +171,14 @@ def error_ratios(before_w_k: Vector, after_w_k: Vector, decrease: float | None =
 
 def _corner_gradients(problem: HeatProblem, solution: SteadySolution) -> tuple[Vector, Vector]:
     """Gradient of T at the corners of each tetrahedron, shape (t, 4, 3), [K / m], and volumes, shape (t,), [m3]."""
-    mesh, nodal_c = problem.mesh, solution.temperature_c
-    if len(nodal_c) != len(mesh.points_m):
-        raise _of_another_mesh(len(mesh.points_m), len(nodal_c))
-    corners = mesh.points_m[mesh.tets]
-    sides = corners[:, 1:] - corners[:, :1]
-    slopes = np.linalg.inv(sides).transpose(0, 2, 1)
-    slopes = np.concatenate([-slopes.sum(axis=1, keepdims=True), slopes], axis=1)
-    volumes_m3 = np.abs(np.linalg.det(sides)) / 6.0
-    corner_c = nodal_c[mesh.tets]
-    if len(solution.edge_temperature_c) == 0:
-        gradient = np.einsum("ti,tix->tx", corner_c, slopes)
-        return np.repeat(gradient[:, None], 4, axis=1), volumes_m3
-    nodal_c, space = (
-        np.concatenate([nodal_c, solution.edge_temperature_c]),
-        Space(Selection(mesh), order=2, lumped=False),
-    )
+    mesh, quadratic = problem.mesh, len(solution.edge_temperature_c) > 0
+    space = Space(Selection(mesh), order=2 if quadratic else 1, lumped=not quadratic)
+    nodal_c = np.concatenate([solution.temperature_c, solution.edge_temperature_c])
     if len(nodal_c) != space.num_nodes:
-        raise _of_another_mesh(space.num_nodes, len(nodal_c))
-    # Slopes of the quadratic functions of corners are 3 times those of linear ones at the corner itself, -1 elsewhere.
-    gradient = np.einsum("ci,ti,tix->tcx", 4.0 * np.eye(4) - 1.0, corner_c, slopes)
-    edge_c = nodal_c[space.tet_nodes()[:, 4:], None]
-    for number, (first, second) in enumerate(TET_EDGES):
-        gradient[:, first] += 4.0 * edge_c[:, number] * slopes[:, second]
-        gradient[:, second] += 4.0 * edge_c[:, number] * slopes[:, first]
-    return gradient, volumes_m3
-
-
-def _of_another_mesh(expected: int, got: int) -> HeatError:
-    remedy = "Give the problem that was solved."
-    return HeatError("solution", expected=f"{expected} temperatures", got=got, remedy=remedy)
+        expected, remedy = f"{space.num_nodes} temperatures", "Give the problem that was solved."
+        raise HeatError("solution", expected=expected, got=len(nodal_c), remedy=remedy)
+    corners, nodes = mesh.points_m[mesh.tets], space.tet_nodes()
+    sides = corners[:, 1:] - corners[:, :1]
+    slopes = [np.broadcast_to(space.element.lbasis(_CORNERS, i)[1], (3, 4)) for i in range(nodes.shape[1])]
+    local = np.einsum("ti,iac->tca", nodal_c[nodes], np.stack(slopes))
+    return local @ np.linalg.inv(sides).transpose(0, 2, 1), np.abs(np.linalg.det(sides)) / 6.0

@@ -9,13 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.floating_components import check_stored
 from thermoxels_ns.fem.heat_balance import HeatBalance
 from thermoxels_ns.fem.limiter import AllowedRange, Limiter, is_in_range
 from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, SDIRK2, Scheme
 from thermoxels_ns.fem.solution import HeatSolution
-from thermoxels_ns.fem.steady import too_cold
+from thermoxels_ns.fem.steady import check_stored, too_cold
 from thermoxels_ns.fem.stepper import Step, Stepper
 from thermoxels_ns.fem.system import HeatSystem
 
