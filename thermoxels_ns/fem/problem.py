@@ -34,14 +34,7 @@ class TimeSteps:
     """Length of a step, [s], above 0."""
 
     def __post_init__(self) -> None:
-        whole = isinstance(self.steps, numbers.Integral) and not isinstance(self.steps, bool)
-        if not whole or self.steps < 1:
-            raise HeatError(
-                "steps",
-                expected="a whole number of at least 1",
-                got=repr(self.steps),
-                remedy="Give 10, for example: steps in a scene, --steps in an export.",
-            )
+        _check_count("steps", self.steps, "Give 10, for example: steps in a scene, --steps in an export.")
         remedy = "Give 60, for example: step_seconds in a scene, --step-seconds in an export."
         seconds = check_positive("step_seconds", self.step_seconds, remedy, HeatError)
         object.__setattr__(self, "step_seconds", seconds)
@@ -88,10 +81,7 @@ class AdaptiveSteps:
     def __post_init__(self) -> None:
         for name, remedy in (("duration_s", "Give a time in seconds."), ("tolerance_k", "Give a tolerance in kelvin.")):
             object.__setattr__(self, name, check_positive(name, getattr(self, name), remedy, HeatError))
-        whole = isinstance(self.outputs, numbers.Integral) and not isinstance(self.outputs, bool)
-        if not whole or self.outputs < 1:
-            expected, remedy = "a whole number of at least 1", "Give the number of intervals, such as 10."
-            raise HeatError("outputs", expected=expected, got=repr(self.outputs), remedy=remedy)
+        _check_count("outputs", self.outputs, "Give the number of intervals, such as 10.")
 
     @property
     def num_times(self) -> int:
@@ -102,21 +92,6 @@ class AdaptiveSteps:
     def times_s(self) -> npt.NDArray[np.float64]:
         """Start, then the end of every interval, shape (outputs + 1,), [s]."""
         return np.linspace(0.0, self.duration_s, self.outputs + 1)
-
-
-@runtime_checkable
-class Conductor(Protocol):
-    """What the solver asks of a material, such as `heat.materials.Material`."""
-
-    @property
-    def conductivity_w_mk(self) -> float:
-        """Thermal conductivity, [W / (m K)], above 0."""
-        ...
-
-    @property
-    def heat_capacity_j_m3k(self) -> float:
-        """Heat that warms a cubic metre by a kelvin, rho c, [J / (m3 K)], above 0."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -149,6 +124,26 @@ class GivenSteps:
     def times_s(self) -> npt.NDArray[np.float64]:
         """Start, then the end of every interval, [s]."""
         return np.linspace(0.0, self.duration_s, self.num_times)
+
+
+def _check_count(name: str, value: int, remedy: str) -> None:
+    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
+        raise HeatError(name, expected="a whole number of at least 1", got=repr(value), remedy=remedy)
+
+
+@runtime_checkable
+class Conductor(Protocol):
+    """What the solver asks of a material, such as `heat.materials.Material`."""
+
+    @property
+    def conductivity_w_mk(self) -> float:
+        """Thermal conductivity, [W / (m K)], above 0."""
+        ...
+
+    @property
+    def heat_capacity_j_m3k(self) -> float:
+        """Heat that warms a cubic metre by a kelvin, rho c, [J / (m3 K)], above 0."""
+        ...
 
 
 @dataclass(frozen=True)
