@@ -94,14 +94,13 @@ def test_net_heat_flow_is_zero_behind_insulation(random_body, concrete) -> None:
 
 
 def test_failure_to_converge_raises_and_can_be_a_status(random_body, concrete, monkeypatch) -> None:
-    from thermoxels_ns.fem import solver_choice
+    from thermoxels_ns.fem import conjugate_gradients
 
-    class Hasty(solver_choice.ConjugateGradients):
+    class Hasty(conjugate_gradients.ConjugateGradients):
         def __init__(self, matrix, **options) -> None:
             super().__init__(matrix, **{**options, "max_iterations": 2})
 
-    monkeypatch.setattr(solver_choice, "ConjugateGradients", Hasty)
-    monkeypatch.setattr(solver_choice, "suits_sweeps", lambda matrix: False)
+    monkeypatch.setattr(conjugate_gradients, "ConjugateGradients", Hasty)
     problem = HeatProblem(random_body, concrete)
     with pytest.raises(HeatError, match=r"Step 1 of 10 failed.*stopped after 2 iterations"):
         solve_heat(problem, PAPER)
