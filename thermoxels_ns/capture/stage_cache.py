@@ -24,6 +24,8 @@ from thermoxels_ns.core.json_values import write_json
 STAGES: tuple[StageName, ...] = get_args(StageName)
 CACHE_FOLDER = ".capture"
 LOCK_FILE = "lock"
+_FORMAT = 2
+"""Of the results; raised when they are kept in another way, so that earlier ones are made again."""
 _KEY_FILE, _DONE_FILE = "key.txt", "done.json"
 
 
@@ -64,7 +66,7 @@ class StageCache:
         Raises:
             OutputError: An earlier result cannot be removed, or the new one cannot be written.
         """
-        content = json.dumps([__version__, name, self._previous, depends_on], sort_keys=True, default=str)
+        content = json.dumps([__version__, _FORMAT, name, self._previous, depends_on], sort_keys=True, default=str)
         key = hashlib.sha256(content.encode()).hexdigest()
         self._previous = key
         folder = self.folder / CACHE_FOLDER / name
