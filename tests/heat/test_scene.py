@@ -160,10 +160,10 @@ def test_every_patch_is_spoken_of() -> None:
 @pytest.mark.parametrize(
     ("name", "shown"),
     [
-        ("roof", 'patches: ["exterior-*", roof], or write adiabatic: [cut, roof].'),
-        ("a: b", '["exterior-*", "a: b"]'),
-        ("no", '["exterior-*", "no"]'),
-        ("12", '["exterior-*", "12"]'),
+        ("roof", "patches: [exterior-*, roof], or write adiabatic: [cut, roof]."),
+        ("a: b", "[exterior-*, 'a: b']"),
+        ("no", "[exterior-*, 'no']"),
+        ("12", "[exterior-*, '12']"),
     ],
 )
 def test_a_patch_with_a_name_of_its_own_is_to_be_named_beside_the_others(name: str, shown: str) -> None:

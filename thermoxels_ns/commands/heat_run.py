@@ -6,7 +6,7 @@ import csv
 import json
 import shlex
 import time as clock
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -179,8 +179,8 @@ def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> Non
     if options.pictures:
         pictures = draw_surface(folder, shown.mesh, shown.states_c, shown.times_s, run.problem.up)
     drawn = {name: (folder / name).read_bytes() for name in pictures}
-    fields = STEADY if isinstance(run.solution, SteadySolution) else THROUGH_TIME
-    files = [PAGE, ANSWERS, SERIES, fields, *pictures]
+    shown_in = STEADY if isinstance(run.solution, SteadySolution) else THROUGH_TIME
+    files = [PAGE, ANSWERS, SERIES, shown_in, *pictures]
     page = build_page(heat_page(run, drawn, options.mesh.name, command_line(options), files))
     write_page(folder / PAGE, page)
     write_summary(folder / ANSWERS, answers)
@@ -195,21 +195,13 @@ def _time_error_k(solution: Solution) -> float | None:
 
 
 def command_line(options: Heat) -> str:
-    """Write the command as it is typed."""
-    words = ["thermoxels", "heat", str(options.mesh), "--scene", options.scene, "--output-dir", str(options.output_dir)]
-    if options.probes:
-        words += ["--probes", *(repr(float(part)) for point in options.probes for part in point)]
-    for name, value in (
-        ("--tolerance", options.tolerance),
-        ("--flow-tolerance", options.flow_tolerance),
-        ("--leave-out-below-k", options.leave_out_below_k),
-    ):
-        words += [] if value is None else [name, repr(float(value))]
-    words += ["--memory-gb", repr(float(options.memory_gb))] if options.memory_gb != Heat.memory_gb else []
-    words += ["--allow-unmet", "True"] if options.allow_unmet else []
-    if options.up is not None:
-        words += ["--up", *(repr(float(part)) for part in options.up)]
-    words += [] if options.pictures else ["--pictures", "False"]
+    """Write the command as it is typed, without what is left at its default."""
+    words = ["thermoxels", "heat", str(options.mesh)]
+    for field in fields(options)[1:]:
+        value = getattr(options, field.name)
+        if value != field.default:
+            parts = np.ravel(value).tolist() if isinstance(value, tuple) else [value]
+            words += [f"--{field.name.replace('_', '-')}", *map(str, parts)]
     return shlex.join(words)
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import re
+import math
 from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 from itertools import combinations
 
 import numpy as np
+import yaml
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.selection import Selection
@@ -17,8 +17,6 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _SIDES = ("exterior-", "interior-")
 _OF_THE_MESHER = ("cut",)
-_PLAIN = re.compile(r"(?!(?:true|false|yes|no|on|off|null|y|n)$)[^\W\d](?:[\w -]*\w)?", re.IGNORECASE)
-"""Names that yaml reads as they stand, in a list too."""
 
 
 class ScenePatches:
@@ -142,7 +140,7 @@ def _what_may_act(acting: set[str], forgotten: Sequence[str]) -> str:
 
 def _yaml_list(names: Sequence[str]) -> str:
     """Names as a list of a scene file; in quotes where yaml would read more into one."""
-    return f"[{', '.join(name if _PLAIN.fullmatch(name) else json.dumps(name, ensure_ascii=False) for name in names)}]"
+    return yaml.safe_dump([*names], default_flow_style=True, allow_unicode=True, width=math.inf).strip()
 
 
 def _as_pattern(name: str) -> str:
