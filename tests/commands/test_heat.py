@@ -25,7 +25,6 @@ from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.heat.scene_file import load_heat_scene
-from thermoxels_ns.heat.solving import LEFT_OUT_SHARE
 from thermoxels_ns.mesh.files.formats import write_mesh
 from thermoxels_ns.mesh.files.read import read_mesh
 from thermoxels_ns.reports.heat_page import heat_page
@@ -262,19 +261,6 @@ def test_a_tolerance_in_time_keeps_the_scenes_times(folder, tmp_path) -> None:
     assert any(line.endswith(" at most.") and "needs about" in line for line in lines)
     assert any(line.startswith("Within 0.2 K") for line in lines)
     assert "in steps chosen by the tolerance" in (tmp_path / "report.html").read_text()
-
-
-def test_what_is_left_out_counts_against_the_tolerance(folder, tmp_path) -> None:
-    scene, mesh = str(folder / "hour.yaml"), folder / "room" / "mesh.vtu"
-    run = compute_heat(Heat(mesh, scene, tmp_path, tolerance=2.0))
-    assert run.accuracy is not None and run.screening.tolerance_k == pytest.approx(LEFT_OUT_SHARE * 2.0)
-    bound = run.screening.bound_k
-    assert bound > 0.0 and run.accuracy.left_out_k == bound
-    assert run.accuracy.estimated_k == run.accuracy.levels[-1]["error"]["temperature_k"] + bound <= 2.0
-    by_flow = compute_heat(
-        Heat(folder / "wall" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path, flow_tolerance=0.01)
-    )
-    assert by_flow.screening.tolerance_k == 0.0 and by_flow.accuracy is not None and by_flow.accuracy.met
 
 
 @pytest.mark.parametrize(
