@@ -157,7 +157,7 @@ def heat_summary(material: Material, time: TimeSteps, solution: HeatSolution) ->
         "computed": True,
         "material": asdict(material),
         "time": asdict(time),
-        "scheme": "P1 tetrahedra, lumped mass, backward Euler, conjugate gradients with Jacobi preconditioner",
+        "scheme": "P1 tetrahedra, lumped mass, backward Euler, conjugate gradients",
         "energy_before_j": float(solution.heat_content_j[0]),
         "energy_after_j": float(solution.heat_content_j[-1]),
         "energy_residual": solution.energy_residual,
