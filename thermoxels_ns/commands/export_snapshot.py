@@ -92,6 +92,7 @@ def export_snapshot(
         ThermoxelsError: An option is out of range, nothing is solid, the folder cannot be written to, or heat fails.
     """
     from thermoxels_ns.commands.export_summary import HEAT_SKIPPED, heat_summary, mesh_summary, versions
+    from thermoxels_ns.fem.solution import HeatSolution
     from thermoxels_ns.heat.solving import Goals, solve_problem
     from thermoxels_ns.heat.vtk_series import heat_series_paths, remove_heat_series, write_heat_series
     from thermoxels_ns.mesh.build import MeshOptions, build_mesh
@@ -127,11 +128,14 @@ def export_snapshot(
     _tell(built, report.volume_m3, unit, None if scale is None else voxel_size, say)
 
     scene, material, time = checked.scene, checked.material, checked.time
-    solution, truth = None, None
+    solution: HeatSolution | None = None
+    truth = None
     if scale is not None:
         say(f"Heat: {time.steps} steps of {time.step_seconds:g} s through {material.name}")
         everything = Goals(leave_out_below_k=0.0, memory_gb=None)
-        solution = solve_problem(scene.problem(mesh, up=up), time, everything, say).solution
+        found = solve_problem(scene.problem(mesh, up=up), time, everything, say).solution
+        assert isinstance(found, HeatSolution), "the scene has time steps"
+        solution = found
         say(f"Heat: {solution.status} Energy conserved to {solution.energy_residual:.1e}.")
         inner_side = options.interior == "hollow" or options.wall_thickness is not None
         truth = None if compare is None else _compared(compare, built, metres, inner_side, say)
