@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.commands.heat import Heat
+from thermoxels_ns.commands.heat_options import HeatOptions
 from thermoxels_ns.core.checks import (
     refuse_what_is_in_the_way,
     remove_file,
@@ -36,7 +36,7 @@ ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY = "answers.json", "series.csv", "rep
 """Files of a run; pictures come on top."""
 
 
-def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
+def run_heat(options: HeatOptions, say: Say = lambda _: None) -> HeatRun:
     """Compute everything, then write it; answers.json comes last, so that files beside one belong together.
 
     Args:
@@ -52,7 +52,7 @@ def run_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
     return run
 
 
-def compute_heat(options: Heat, say: Say = lambda _: None) -> HeatRun:
+def compute_heat(options: HeatOptions, say: Say = lambda _: None) -> HeatRun:
     """Do what `run_heat` does without writing anything."""
     begin = clock.perf_counter()
     scene = load_heat_scene(options.scene)
@@ -101,7 +101,7 @@ def _export_summary(mesh: Path, say: Say) -> dict[str, Any]:
     return summary
 
 
-def answers_of(options: Heat, run: HeatRun) -> dict[str, Any]:
+def answers_of(options: HeatOptions, run: HeatRun) -> dict[str, Any]:
     """Everything that answers.json says."""
     screening = run.screening
     return {
@@ -152,7 +152,7 @@ def prepared_folder(output_dir: Path) -> Path:
     return folder
 
 
-def write_heat_files(folder: Path, options: Heat, run: HeatRun, say: Say) -> None:
+def write_heat_files(folder: Path, options: HeatOptions, run: HeatRun, say: Say) -> None:
     """Write everything; answers.json comes last, so that files beside one belong together.
 
     Args:
@@ -194,7 +194,7 @@ def _time_error_k(solution: Solution) -> float | None:
     return solution.time_error_k
 
 
-def command_line(options: Heat) -> str:
+def command_line(options: HeatOptions) -> str:
     """Write the command as it is typed, without what is left at its default."""
     words = ["thermoxels", "heat", str(options.mesh)]
     for field in fields(options)[1:]:
