@@ -143,7 +143,7 @@ def test_depths_are_looked_for_in_the_box_of_the_scene_however_the_lattice_was_r
     [
         ("auto", SHORTEST_RUN_WITH_DEPTHS, False, 0.05, True),
         ("auto", SHORTEST_RUN_WITH_DEPTHS - 1, False, 0.05, False),
-        ("auto", SHORTEST_RUN_WITH_DEPTHS, True, 0.05, False),
+        ("auto", SHORTEST_RUN_WITH_DEPTHS, True, 0.05, True),
         ("auto", SHORTEST_RUN_WITH_DEPTHS, False, 0.0, False),
         ("on", 1, True, 0.05, True),
         ("off", SHORTEST_RUN_WITH_DEPTHS, False, 0.05, False),
@@ -186,7 +186,7 @@ def test_depths_are_followed_beside_tracks_where_that_is_asked_for(scene, monkey
     monkeypatch.setattr(ThermoxelsModel, "populate_modules", with_tracks)
     asked_boxes(monkeypatch, some(2, 0.1))
     monkeypatch.setattr(
-        course, "FeatureRaySampler", lambda lines, light: followed.append(lines) or FeatureRaySampler(lines, light)
+        course, "FeatureRaySampler", lambda lines, light=0.0: followed.append(lines) or FeatureRaySampler(lines, light)
     )
     train(scene, 1, {"carve": "off", "photo_depth": "on"})
     assert len(followed) == 1 and followed[0].points[:, 0].tolist() == [0.2] * 3 + [0.1] * 2

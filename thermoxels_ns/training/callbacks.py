@@ -119,7 +119,7 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
         return
     if config.photo_depth == "auto":
         steps = 0 if trainer is None else trainer._start_step + trainer.config.max_num_iterations
-        if model.feature_ray_sampler is not None or steps < SHORTEST_RUN_WITH_DEPTHS:
+        if steps < SHORTEST_RUN_WITH_DEPTHS:
             return
     datamanager: Any = pipeline.datamanager
     if model.grid.sh is None or datamanager.config.streams == "thermal":
@@ -129,8 +129,10 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
     near = config.near_plane * model.unit
     depths = feature_rays_of_photographs(datamanager.train_dataset, near, lattice.lo, lattice.hi, CONSOLE.log)
     if depths is not None:
-        rays = depths if model.feature_rays is None else model.feature_rays.joined_with(depths)
-        model.feature_ray_sampler = FeatureRaySampler(rays, COARSE_LIGHT)
+        tracks = model.feature_rays
+        model.feature_ray_sampler = (
+            FeatureRaySampler(depths, COARSE_LIGHT) if tracks is None else FeatureRaySampler(tracks.joined_with(depths))
+        )
 
 
 @dataclass(frozen=True)

@@ -115,8 +115,8 @@ class ThermoxelsModelConfig(ModelConfig):
     photo_depth: Literal["auto", "off", "on"] = "auto"
     """Depth supervision: find depths by comparing each photograph with its neighbours (multi-view stereo, plane sweep),
     and ask rays to end there, as at points of structure from motion. It keeps opaque floaters from forming before walls
-    of little texture. auto: where the scene has no tracks and the run at least 400 steps; on: always, beside them
-    too. It needs a loss weight tracks above 0."""
+    of little texture. auto: where the run has at least 400 steps; on: always. It needs a
+    loss weight tracks above 0."""
     track_rays: int = 512
     """Feature rays (to depths or to points of structure from motion) that each step follows."""
     thermal_density_gradient: bool = False
