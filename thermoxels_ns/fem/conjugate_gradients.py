@@ -360,7 +360,7 @@ class TwoLevel(_Plain):
         self._diagonal = matrix.diagonal()
         self._prolongation, self._restriction = prolongation, sparse.csr_matrix(prolongation.T)
         coarse = sparse.csr_matrix(self._restriction @ (matrix @ prolongation))
-        self._coarse = Multigrid(coarse) if coarse.shape[0] else None
+        self._coarse = Multigrid(coarse) if len(coarse.indptr) > 1 else None
 
     def apply(self, seen: Vector) -> Vector:
         """Add up both levels."""
@@ -377,10 +377,12 @@ class _CoarsestLevel:
         self._inverse: Vector | None = None
 
     def __call__(self, matrix: sparse.csr_matrix, right_hand_side: Vector) -> Vector:
-        if self._inverse is None:
+        inverse = self._inverse
+        if inverse is None:
             with threadpool_limits(1, "blas"):
-                self._inverse = np.linalg.pinv(matrix.toarray(), rcond=_ROUND_OFF_OF_COARSEST, hermitian=True)
-        return np.einsum("ij,j->i", self._inverse, np.ravel(right_hand_side)).reshape(np.shape(right_hand_side))
+                inverse = np.linalg.pinv(matrix.toarray(), rcond=_ROUND_OFF_OF_COARSEST, hermitian=True)
+            self._inverse = inverse
+        return np.einsum("ij,j->i", inverse, np.ravel(right_hand_side)).reshape(np.shape(right_hand_side))
 
 
 def is_solved(error: float, tolerance: float, right_hand_side: float, matrix_times_solution: float) -> bool:

@@ -9,9 +9,9 @@ import numpy.typing as npt
 from scipy import sparse
 from skfem import Basis, BilinearForm, Dofs, ElementTetP1, ElementTetP2, ElementTriP1, ElementTriP2, MeshTet, MeshTri
 from skfem.element import DiscreteField
-from skfem.helpers import dot, grad
+from skfem.helpers import dot
 from skfem.quadrature import get_quadrature
-from skfem.refdom import RefTet
+from skfem.refdom import RefTet, RefTri
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.p1_kernels import (
@@ -40,7 +40,7 @@ _BLOCK = 2_000
 @BilinearForm
 def conduction(u, v, w):
     """k grad u . grad v, [W / K]."""
-    return w.conductivity * dot(grad(u), grad(v))
+    return w.conductivity * dot(u.grad, v.grad)
 
 
 @BilinearForm
@@ -181,8 +181,8 @@ class Space:
         mesh = MeshTri(points, np.arange(3 * len(facets)).reshape(-1, 3).T.copy(), validate=False)
         element = ElementTriP1() if self.order == 1 else ElementTriP2()
         dofs = _dofs(mesh, ElementTriP1(), self.facet_nodes(facets), self.num_nodes)
-        rule = {"quadrature": _CORNERS} if self.lumped_boundary else {"intorder": _EXACT}
-        basis = Basis(mesh, element, dofs=dofs, disable_doflocs=True, **rule)
+        rule = _CORNERS if self.lumped_boundary else get_quadrature(RefTri, _EXACT)
+        basis = Basis(mesh, element, dofs=dofs, quadrature=rule, disable_doflocs=True)
         basis.basis = [(DiscreteField(np.asarray(field)),) for (field,) in basis.basis]
         return basis
 
