@@ -2,10 +2,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from skfem import FacetBasis, MeshTet
 
 from tests.support.heat_meshes import box_mesh, planes
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.fem.forms import exchange, inflow
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.selection import Selection
@@ -163,3 +165,20 @@ def test_a_loose_piece_is_named_in_quadratic_meshes_too() -> None:
     problem = HeatProblem(mesh, STEEL, effects=(Convection(("x0",), 5.0, 10.0),))
     with pytest.raises(HeatError, match=r"none on 1 of 2 pieces.*\(0\.3, 0, 0\) to \(0\.5,"):
         solve_steady(problem, order=2)
+
+
+@pytest.mark.parametrize("options", [{"lumped_boundary": False}, {"order": 2, "lumped": False}], ids=["P1", "P2"])
+def test_integrals_over_the_surface_are_those_of_a_basis_on_facets(options) -> None:
+    """Exchange and inflow with values per triangle, against scikit-fem's basis on the facets of the tetrahedra."""
+    mesh = crooked_box()
+    space = Space(Selection(mesh), **options)
+    tets = MeshTet(mesh.points_m.T.copy(), mesh.tets.T.copy())
+    number = {tuple(facet): index for index, facet in enumerate(tets.facets.T.tolist())}
+    facets = np.array([number[tuple(sorted(facet))] for facet in mesh.facets.tolist()])
+    ours, theirs = space.surface(np.arange(len(facets))), FacetBasis(tets, space.element, facets=facets, intorder=4)
+    value = np.random.default_rng(6).uniform(1.0, 2.0, (len(facets), 1))
+    for form, name in ((exchange, "coefficient"), (inflow, "flux")):
+        found, expected = (
+            form.assemble(basis, **{name: np.broadcast_to(value, basis.dx.shape)}) for basis in (ours, theirs)
+        )
+        assert abs(found - expected).max() < 1e-12 * abs(expected).max()
