@@ -9,7 +9,6 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.solids import Box, Hits, box_between
 
 FloatArray = npt.NDArray[np.float64]
@@ -38,22 +37,9 @@ class BoxSolid:
     """Lower and upper corners [m] of the boxes to cut out."""
 
     def __post_init__(self) -> None:
-        for name, boxes in (("boxes", self.boxes), ("removed", self.removed)):
-            for number, (lo, hi) in enumerate(boxes):
-                if not (np.isfinite([lo, hi]).all() and np.all(np.less(lo, hi))):
-                    raise SceneError(
-                        f"{name}[{number}]",
-                        expected="finite corners with lo below hi along every axis",
-                        got=f"{lo} to {hi}",
-                        remedy="Swap or correct the corners.",
-                    )
-        if not (self.boxes and self._cells.any()):
-            raise SceneError(
-                "boxes",
-                expected="a solid with a volume above 0",
-                got=f"{len(self.boxes)} boxes of which the {len(self.removed)} removed ones leave nothing",
-                remedy="Add a box or remove less.",
-            )
+        for lo, hi in (*self.boxes, *self.removed):
+            assert np.isfinite([lo, hi]).all() and np.all(np.less(lo, hi)), f"no box: {lo} to {hi}"
+        assert self.boxes and self._cells.any(), "nothing is left of the boxes"
 
     @cached_property
     def _edges(self) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -16,15 +16,15 @@ FloatArray = npt.NDArray[np.float64]
 Part = BoxSolid | Sphere | Cylinder
 
 _TOUCHING = 1e-9
+_POINTS = 2000
 
 
 @dataclass(frozen=True, eq=False)
 class SolidUnion:
-    """Solids side by side that share no volume and no face; a sphere may touch another solid in a point."""
+    """Solids side by side that share no volume and no face; round ones may touch others in a point or a line."""
 
     parts: tuple[Part, ...]
-    """The solids. Boxes that touch belong into one `BoxSolid`, which knows that the shared face is not exposed.
-    Cylinders touch nothing, and the boxes around two that cross each other are apart too."""
+    """The solids. Boxes that touch belong into one `BoxSolid`, which knows that the shared face is not exposed."""
 
     def __post_init__(self) -> None:
         for (i, first), (j, second) in combinations(enumerate(self.parts), 2):
@@ -84,40 +84,9 @@ class SolidUnion:
 
 
 def _overlap(first: Part, second: Part) -> bool:
-    """Whether two solids share more than a point where a sphere touches."""
+    """Whether points drawn on the surface of one solid lie in the other or on its surface."""
     for one, other in ((first, second), (second, first)):
-        if isinstance(one, Sphere):
-            gap = float(other.signed_distance([one.centre])[0]) - one.radius
-            return gap < -_TOUCHING * one.radius
-    for one, other in ((first, second), (second, first)):
-        if isinstance(one, Cylinder):
-            return _meets_cylinder(one, other)
-    assert isinstance(first, BoxSolid) and isinstance(second, BoxSolid)
-    (lo_a, hi_a), (lo_b, hi_b) = first.filled_boxes, second.filled_boxes
-    return not bool(_apart(lo_a[:, None], hi_a[:, None], lo_b[None], hi_b[None]).all())
-
-
-def _meets_cylinder(cylinder: Cylinder, other: Part) -> bool:
-    """Whether a cylinder touches or cuts another part; for a crossing cylinder, whether the boxes around both do."""
-    lo, hi = np.array(cylinder.bounds)
-    axis, across = cylinder.axis, [a for a in range(3) if a != cylinder.axis]
-    centre = np.asarray(cylinder.centre, dtype=np.float64)
-    if isinstance(other, Cylinder):
-        other_lo, other_hi = np.array(other.bounds)
-        if other.axis != axis:
-            return not bool(_apart(lo, hi, other_lo, other_hi))
-        beside = np.linalg.norm((centre - other.centre)[across]) - other.radius
-        other_lo, other_hi = other_lo[None], other_hi[None]
-    else:
-        assert isinstance(other, BoxSolid)
-        other_lo, other_hi = other.filled_boxes
-        nearest = np.clip(centre, other_lo, other_hi)
-        beside = np.linalg.norm((nearest - centre)[:, across], axis=1)
-    beyond = np.maximum(other_lo[:, axis] - hi[axis], lo[axis] - other_hi[:, axis])
-    slack = _TOUCHING * cylinder.radius
-    return bool(np.any((beside <= cylinder.radius + slack) & (beyond <= slack)))
-
-
-def _apart(lo_a: FloatArray, hi_a: FloatArray, lo_b: FloatArray, hi_b: FloatArray) -> npt.NDArray[np.bool_]:
-    """Whether boxes (..., 3) leave a gap along some axis."""
-    return np.any((hi_a < lo_b) | (hi_b < lo_a), axis=-1)
+        slack = _TOUCHING * float(np.subtract(other.bounds[1], other.bounds[0]).max())
+        if other.signed_distance(one.surface_points(_POINTS, seed=0)[0]).min() <= slack:
+            return True
+    return False

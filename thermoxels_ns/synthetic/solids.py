@@ -9,8 +9,6 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.errors import SceneError
-
 Vector = tuple[float, float, float]
 Box = tuple[Vector, Vector]
 FloatArray = npt.NDArray[np.float64]
@@ -83,13 +81,7 @@ class Sphere:
     """Radius [m], above 0."""
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.centre).all() and math.isfinite(self.radius) and self.radius > 0):
-            raise SceneError(
-                "sphere",
-                expected="a finite centre and a radius above 0",
-                got=f"centre {self.centre}, radius {self.radius}",
-                remedy="Correct the two.",
-            )
+        assert np.isfinite(self.centre).all() and math.isfinite(self.radius) and self.radius > 0
 
     @property
     def bounds(self) -> Box:
@@ -156,15 +148,8 @@ class Cylinder:
     """Direction of the axis: 0 for x, 1 for y, 2 for z."""
 
     def __post_init__(self) -> None:
-        sizes = (self.radius, self.length)
-        finite = np.isfinite(self.centre).all() and np.isfinite(sizes).all()
-        if not (finite and min(sizes) > 0 and self.axis in (0, 1, 2)):
-            raise SceneError(
-                "cylinder",
-                expected="a finite centre, a radius and a length above 0, and an axis of 0, 1 or 2",
-                got=f"centre {self.centre}, radius {self.radius}, length {self.length}, axis {self.axis}",
-                remedy="Correct these.",
-            )
+        finite = np.isfinite((*self.centre, self.radius, self.length)).all()
+        assert finite and min(self.radius, self.length) > 0 and self.axis in (0, 1, 2)
 
     @property
     def bounds(self) -> Box:
