@@ -25,11 +25,11 @@ def kernel(function: Callable | None = None, **options: Any) -> Any:
         function: A function in numba's subset of Python; plain use as ``@kernel``.
         options: For `numba.njit`, such as ``fastmath={"contract"}``. Division by zero gives inf or NaN, as in numpy.
     """
-    from numba import njit
+    import numba
 
     def compiled(function: Callable) -> Any:
-        settings: dict[str, Any] = {"nogil": True, "cache": True, "error_model": "numpy", **options}
-        dispatcher = njit(**settings)(function)
+        njit: Any = numba.njit
+        dispatcher = njit(**{"nogil": True, "cache": True, "error_model": "numpy", **options})(function)
         source, cached = Path(function.__code__.co_filename), dispatcher.stats.cache_path
         if cached and _PACKAGE in source.parents:
             # Before the first call, which loads what was compiled earlier.

@@ -86,8 +86,8 @@ def _pinhole(
         picture, shown = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (picture, shown))
     distortion = [0.0] * 6 if cameras.distortion_params is None else cameras.distortion_params[index].double().tolist()
     named: dict[str, Any] = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), distortion))
-    lengths = (float(getattr(cameras, name)[index, 0]) for name in ("fx", "fy", "cx", "cy"))
-    camera = Camera(width, height, *lengths, **named).resized(picture.shape[1], picture.shape[0])
+    fx, fy, cx, cy = (float(getattr(cameras, name)[index, 0]) for name in ("fx", "fy", "cx", "cy"))
+    camera = Camera(width, height, fx, fy, cx, cy, **named).resized(picture.shape[1], picture.shape[0])
     if any(camera.distortion):
         places = _distorted_places(camera)
         picture = cv2.remap(picture, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
