@@ -65,11 +65,8 @@ class SolidSelection:
 
     def __post_init__(self) -> None:
         for name, (kind, low, high, usual) in _BOUNDS.items():
-            value: Any = getattr(self, name)
-            if value is None and usual is None:
-                continue
-            number = isinstance(value, kind) and not isinstance(value, bool) and math.isfinite(value)
-            if not (number and low <= value <= high):
+            value = getattr(self, name)
+            if not (_is_within(value, kind, low, high) or (value is None and usual is None)):
                 what = "a whole number" if kind is int else "a finite number"
                 most = "" if high == math.inf else f" to {high:g}"
                 option = f"--{name.replace('_', '-')}"
@@ -86,6 +83,10 @@ class SolidSelection:
         if self.interior not in get_args(InteriorKind):
             kinds = " or ".join(get_args(InteriorKind))
             raise MeshError("interior", expected=kinds, got=repr(self.interior), remedy="Pass --interior solid.")
+
+
+def _is_within(value: Any, kind: Any, low: float, high: float) -> bool:
+    return isinstance(value, kind) and not isinstance(value, bool) and math.isfinite(value) and low <= value <= high
 
 
 _BOUNDS: dict[str, tuple[Any, float, float, float | None]] = {
