@@ -76,10 +76,6 @@ def test_a_command_draws_for_the_terminal_that_shows_it(fake_command, tmp_path, 
     assert (tmp_path / "ask.log").read_text().startswith(f"{os.environ.get('FORCE_COLOR')} ")
 
 
-def test_time_is_that_of_the_whole_command(command, tmp_path):
-    assert run_command(command("time.sleep(0.5)"), tmp_path / "log").seconds >= 0.5
-
-
 def test_memory_is_that_of_the_command(command, tmp_path):
     """400 MB more are seen, also when they are free again before the end.
 
@@ -121,11 +117,6 @@ def test_a_failing_command_is_an_error_with_its_last_lines(fake_command, tmp_pat
     assert message.splitlines()[-2:] == ["    line 39", "    no space left"]
     assert len(message.splitlines()) < 20
     assert str(tmp_path / "fail.log") in message
-
-
-def test_a_killed_command_is_told(command, tmp_path):
-    with pytest.raises(ThermoxelsError, match="got -9"):
-        run_command(command("os.kill(os.getpid(), 9)"), tmp_path / "log")
 
 
 def test_a_command_of_another_environment_is_not_used(fake_command, tmp_path, monkeypatch):

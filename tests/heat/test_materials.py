@@ -70,18 +70,12 @@ def test_a_table_of_ones_own(tmp_path) -> None:
     ("text", "message"),
     [
         ("", r"^mine\.yaml: expected key: value lines, got nothing"),
-        ("- adobe\n", r"^mine\.yaml: expected key: value lines, got \['adobe'\]"),
-        ("adobe: [1\n", r"^mine\.yaml: expected a yaml file, got"),
         (f"adobe: {ROW}\nadobe: {ROW}\n", "the key adobe twice"),
-        (f"7: {ROW}\n", r"^mine\.yaml: expected keys that are text, got 7\. Put it in quotes"),
-        (f"adobe: {ROW.replace('source: a book', 'source: 7')}\n", r"adobe: source: expected a text, got 7"),
         (f"adobe: {ROW.replace('a book', ' ')}\n", r"^mine\.yaml: adobe: source: expected a text, got nothing"),
-        (f"adobe: {ROW.replace('a book', '  '.join(chr(34) * 2))}\n", r"^mine\.yaml: adobe: source: expected a text"),
         (
             f"adobe: {ROW.replace('2000', '-1')}\n",
             r"^mine\.yaml: adobe: density_kg_m3: expected a finite number above 0",
         ),
-        (f"adobe: {ROW.replace('2000', '2e3')}\n", r"density_kg_m3: expected a number, got '2e3'. Write 2000, without"),
         (
             f"adobe: {ROW.replace('density_kg_m3', 'density_g_cm3')}\n",
             r"got density_g_cm3. Did you mean density_kg_m3\?",
@@ -94,8 +88,3 @@ def test_wrong_tables_are_refused(tmp_path, text: str, message: str) -> None:
     path.write_text(text)
     with pytest.raises(HeatError, match=message):
         load_material_table(path)
-
-
-def test_a_missing_table_is_named(tmp_path) -> None:
-    with pytest.raises(HeatError, match=r"none\.yaml: expected a yaml file, got No such file"):
-        load_material_table(tmp_path / "none.yaml")

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from tests.support.heat_meshes import SIDES, box_mesh, planes
-from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.steady import solve_steady
@@ -217,13 +216,6 @@ def test_what_fixes_temperatures_stays() -> None:
     assert screening.left_out[0].bound_k == 0.0 and screening.left_out[0].bound_w == pytest.approx(1e4)
 
 
-def test_screening_costs_nothing_where_nothing_acts(monkeypatch) -> None:
-    monkeypatch.setattr("thermoxels_ns.heat.screening._Screener", None)
-    problem = HeatProblem(slab(), CONCRETE)
-    screening = screen(problem, TimeSteps(3, 60.0), 0.1)
-    assert screening.problem is problem and screening.kept == screening.left_out == ()
-
-
 def test_a_scene_whose_radiation_does_not_matter_never_enters_newton(monkeypatch) -> None:
     def refuse(*_, **__):
         raise AssertionError("entered")
@@ -235,12 +227,6 @@ def test_a_scene_whose_radiation_does_not_matter_never_enters_newton(monkeypatch
     assert set(counts) == {"stiffness", "mass", "robin"}
     with pytest.raises(AssertionError, match="entered"):
         solve_heat(screen(problem, time, 0.0).problem, time)
-
-
-@pytest.mark.parametrize("tolerance_k", [-1.0, float("nan")])
-def test_a_tolerance_is_not_negative(tolerance_k) -> None:
-    with pytest.raises(HeatError, match=r"tolerance_k: expected a number of at least 0"):
-        screen(HeatProblem(slab(), CONCRETE), None, tolerance_k)
 
 
 def test_quantities_that_change_between_samples_are_bounded() -> None:
