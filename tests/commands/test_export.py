@@ -18,12 +18,7 @@ import tyro
 from PIL import Image
 
 from tests.support.looking_cameras import looking_at
-from thermoxels_ns.commands.export import (
-    ExportThermoxelsMesh,
-    _check_config,
-    scene_json,
-    viewpoint_of_cameras,
-)
+from thermoxels_ns.commands.export import ExportThermoxelsMesh, _check_config, scene_json, viewpoint_of_cameras
 from thermoxels_ns.commands.export_options import ExportOptions, Viewpoint, check_options
 from thermoxels_ns.commands.export_snapshot import export_snapshot
 from thermoxels_ns.core.errors import CheckpointError, HeatError, MeshError, OutputError, SceneError, ThermoxelsError
@@ -165,12 +160,7 @@ def test_mesh_lies_at_the_input_poses(ball, tmp_path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("transform", "scale"),
-    [
-        (np.eye(4)[:3] * 2.0, 1.0),
-        (np.full((3, 4), np.nan), 1.0),
-        (np.eye(4)[:3], 0.0),
-    ],
+    ("transform", "scale"), [(np.eye(4)[:3] * 2.0, 1.0), (np.full((3, 4), np.nan), 1.0), (np.eye(4)[:3], 0.0)]
 )
 def test_impossible_dataparser_transforms_are_refused(transform, scale) -> None:
     with pytest.raises(CheckpointError, match="dataparser_transform"):
@@ -261,8 +251,7 @@ def test_failed_export_leaves_the_earlier_one_untouched(ball, tmp_path, monkeypa
 
 
 @pytest.mark.parametrize(
-    "broken",
-    ["mesh.files.formats.write_mesh", "heat.vtk_series.write_heat_series", "reports.mesh_pictures.draw_heat"],
+    "broken", ["mesh.files.formats.write_mesh", "heat.vtk_series.write_heat_series", "reports.mesh_pictures.draw_heat"]
 )
 def test_export_interrupted_while_writing_leaves_no_summary(ball, tmp_path, monkeypatch, broken) -> None:
     """So a folder with a summary is never a mixture."""

@@ -158,10 +158,7 @@ def test_every_patch_is_spoken_of() -> None:
 
 @pytest.mark.parametrize(
     ("name", "shown"),
-    [
-        ("roof", "patches: [exterior-*, roof], or write adiabatic: [cut, roof]."),
-        ("no", "[exterior-*, 'no']"),
-    ],
+    [("roof", "patches: [exterior-*, roof], or write adiabatic: [cut, roof]."), ("no", "[exterior-*, 'no']")],
 )
 def test_a_patch_with_a_name_of_its_own_is_to_be_named_beside_the_others(name: str, shown: str) -> None:
     mesh = room()

@@ -92,15 +92,7 @@ def test_all_effects() -> None:
     found = load_heat_scene("all-effects")
     assert found.time == AdaptiveSteps(86400.0, 0.05, 24)
     kinds = {type(effect) for effect in found.effects(room())}
-    assert kinds == {
-        Convection,
-        Radiation,
-        AbsorbedSolar,
-        GroundContact,
-        HeatFlux,
-        InternalHeat,
-        FixedTemperature,
-    }
+    assert kinds == {Convection, Radiation, AbsorbedSolar, GroundContact, HeatFlux, InternalHeat, FixedTemperature}
     # It shows every key but one, and that one in a comment.
     written = yaml.safe_load((configs_folder() / "scene-all-effects.yaml").read_text(encoding="utf-8"))
     keys = {field.name for field in dataclasses.fields(HeatScene)} - {"initial_c"} | {"initial"}

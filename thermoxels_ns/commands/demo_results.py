@@ -110,10 +110,7 @@ def read_results(eval_json: Path, summary_json: Path) -> DemoResults:
             "Volume of the mesh",
             f"{truth.number('mesh_volume_m3'):.4g} m³ (true: {truth.number('true_volume_m3'):.4g} m³)",
         ),
-        (
-            "Surface of the mesh",
-            f"{truth.number('mesh_area_m2'):.4g} m² (true: {truth.number('true_area_m2'):.4g} m²)",
-        ),
+        ("Surface of the mesh", f"{truth.number('mesh_area_m2'):.4g} m² (true: {truth.number('true_area_m2'):.4g} m²)"),
         ("Tetrahedra", f"{mesh.number('tets'):,.0f}"),
         ("Nodes", f"{mesh.number('nodes'):,.0f}"),
         ("Nodes with a measured temperature", f"{100.0 * mesh.number('share_of_nodes_observed'):.0f} %"),

@@ -168,11 +168,7 @@ def export_snapshot(
     if solution is None:
         remove_heat_series(folder / _HEAT)
     heat_step = HeatStep(
-        material.conductivity_w_mk,
-        material.density_kg_m3,
-        material.specific_heat_j_kgk,
-        time.steps,
-        time.step_seconds,
+        material.conductivity_w_mk, material.density_kg_m3, material.specific_heat_j_kgk, time.steps, time.step_seconds
     )
     for suffix in suffixes:
         write_mesh(folder / f"{_MESH_STEM}{suffix}", mesh, heat_step=heat_step, up=up)

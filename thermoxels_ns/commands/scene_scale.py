@@ -68,10 +68,7 @@ def scale_from_option(metres_per_unit: float) -> SceneScale:
 
 
 def scale_from_known_distance(
-    point_a: npt.ArrayLike,
-    point_b: npt.ArrayLike,
-    distance_m: float,
-    standard_error_m: float | None = None,
+    point_a: npt.ArrayLike, point_b: npt.ArrayLike, distance_m: float, standard_error_m: float | None = None
 ) -> SceneScale:
     """Find the scale from two points of the scene whose distance was measured.
 
@@ -165,9 +162,7 @@ def up_from_scene_file(meta: Mapping[str, Any]) -> Vector | None:
 
 
 def choose_scale(
-    option: float | None = None,
-    known_distance: SceneScale | None = None,
-    scene_file: Mapping[str, Any] | None = None,
+    option: float | None = None, known_distance: SceneScale | None = None, scene_file: Mapping[str, Any] | None = None
 ) -> SceneScale | None:
     """Choose between what the user gives and what the scene's json says; the user goes before the json.
 

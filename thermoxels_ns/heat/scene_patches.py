@@ -54,10 +54,7 @@ class ScenePatches:
         return found
 
     def of_surfaces(
-        self,
-        surfaces: Sequence[Surface],
-        value: Callable[[Surface], float | None],
-        allowed: set[str] | None = None,
+        self, surfaces: Sequence[Surface], value: Callable[[Surface], float | None], allowed: set[str] | None = None
     ) -> list[tuple[tuple[str, ...], float]]:
         """Group the patches by a property of their surfaces.
 

@@ -158,11 +158,7 @@ def meinel_clear_sky(elevation_deg: float, distance_au: float = 1.0) -> Sunlight
 
 
 def facet_irradiance(
-    normals: npt.NDArray[np.float64],
-    up: Vector,
-    towards: Vector,
-    sunlight: Sunlight,
-    ground_reflectance: float = 0.0,
+    normals: npt.NDArray[np.float64], up: Vector, towards: Vector, sunlight: Sunlight, ground_reflectance: float = 0.0
 ) -> npt.NDArray[np.float64]:
     """Compute the sunlight that falls on facets. None shades another.
 
