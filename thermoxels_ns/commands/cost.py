@@ -137,12 +137,8 @@ def run_cost(cost: Cost, console: Console) -> None:
     if counted:
         _report(cost, folder, settings, counted, baseline, targets, console)
     if failed:
-        raise ThermoxelsError(
-            "cost",
-            expected="every run to finish",
-            got=f"{len(failed)} that did not",
-            remedy="Start the command again to repeat them. " + "\n".join(failed),
-        )
+        remedy = "Start the command again to repeat them. " + "\n".join(failed)
+        raise ThermoxelsError("cost", expected="every run to finish", got=f"{len(failed)} that did not", remedy=remedy)
 
 
 def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
@@ -298,12 +294,8 @@ def parse_setting(text: str) -> tuple[int, int]:
     """
     match = re.fullmatch(r"([1-9]\d*):([1-9]\d*)", text)
     if match is None:
-        raise ThermoxelsError(
-            "settings",
-            expected="voxels and steps, such as 64:800",
-            got=repr(text),
-            remedy="Pass --settings 64:800 128:1500.",
-        )
+        remedy = "Pass --settings 64:800 128:1500."
+        raise ThermoxelsError("settings", expected="voxels and steps, such as 64:800", got=repr(text), remedy=remedy)
     return int(match[1]), int(match[2])
 
 
@@ -358,12 +350,10 @@ def read_runs(path: Path) -> list[CostRun]:
             for row in rows
         ]
     except (OSError, KeyError, TypeError, ValueError, csv.Error) as problem:
-        raise ThermoxelsError(
-            str(path),
-            expected="the finished runs of an earlier start",
-            got=f"{type(problem).__name__}: {problem}",
-            remedy="Remove the file to measure again, or choose another --output-dir.",
-        ) from problem
+        expected = "the finished runs of an earlier start"
+        got = f"{type(problem).__name__}: {problem}"
+        remedy = "Remove the file to measure again, or choose another --output-dir."
+        raise ThermoxelsError(str(path), expected=expected, got=got, remedy=remedy) from problem
 
 
 def write_runs(path: Path, runs: Iterable[CostRun]) -> None:
@@ -465,12 +455,9 @@ def training_seconds(run_folder: Path) -> float:
     start = run_folder / "dataparser_transforms.json"
     checkpoints = sorted((run_folder / "nerfstudio_models").glob("step-*.ckpt"))
     if not (start.is_file() and checkpoints):
-        raise ThermoxelsError(
-            str(run_folder),
-            expected="dataparser_transforms.json and a checkpoint of a finished run",
-            got="a folder without them",
-            remedy="Look into the run's log.",
-        )
+        expected = "dataparser_transforms.json and a checkpoint of a finished run"
+        remedy = "Look into the run's log."
+        raise ThermoxelsError(str(run_folder), expected=expected, got="a folder without them", remedy=remedy)
     return checkpoints[-1].stat().st_mtime - start.stat().st_mtime
 
 
@@ -484,9 +471,6 @@ def read_evaluation(path: Path) -> dict[str, float]:
         results = json.loads(path.read_text(encoding="utf-8"))["results"]
         return {name: float(results.get(name, math.nan)) for name in _EVALUATED}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as problem:
-        raise ThermoxelsError(
-            str(path),
-            expected="the results of ns-eval",
-            got=f"{type(problem).__name__}: {problem}",
-            remedy="Start the command again; finished runs are kept.",
-        ) from problem
+        remedy = "Start the command again; finished runs are kept."
+        got = f"{type(problem).__name__}: {problem}"
+        raise ThermoxelsError(str(path), expected="the results of ns-eval", got=got, remedy=remedy) from problem

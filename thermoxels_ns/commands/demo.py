@@ -129,12 +129,9 @@ def prepare_folder(path: Path) -> Path:
     folder = writable_folder(path)
     marker = folder / _MARKER
     if not marker.is_file() and any(folder.iterdir()):
-        raise OutputError(
-            "output_dir",
-            expected="an empty folder or one of an earlier demo",
-            got=f"{folder}, which holds other files",
-            remedy="Pass another folder with --output-dir.",
-        )
+        remedy = "Pass another folder with --output-dir."
+        got = f"{folder}, which holds other files"
+        raise OutputError("output_dir", expected="an empty folder or one of an earlier demo", got=got, remedy=remedy)
     marker.write_text("Made by `thermoxels demo`, which replaces: " + ", ".join(_WRITTEN) + "\n")
     for name in _WRITTEN:
         old = folder / name
@@ -294,12 +291,10 @@ def _picture(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as problem:
-        raise ThermoxelsError(
-            str(path),
-            expected="a picture that the demo's commands write",
-            got=problem.strerror or str(problem),
-            remedy="Run the demo again.",
-        ) from problem
+        expected = "a picture that the demo's commands write"
+        got = problem.strerror or str(problem)
+        remedy = "Run the demo again."
+        raise ThermoxelsError(str(path), expected=expected, got=got, remedy=remedy) from problem
 
 
 def _panels(path: Path, count: int) -> list[bytes]:

@@ -138,12 +138,9 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
             trained with another method.
     """
     if not load_config.is_file():
-        raise CheckpointError(
-            "load_config",
-            expected="the config.yml of a training run",
-            got=f"no file at {load_config}",
-            remedy="Pass --load-config outputs/<scene>/thermoxels/<time>/config.yml.",
-        )
+        remedy = "Pass --load-config outputs/<scene>/thermoxels/<time>/config.yml."
+        got = f"no file at {load_config}"
+        raise CheckpointError("load_config", expected="the config.yml of a training run", got=got, remedy=remedy)
     import yaml
     from nerfstudio.utils.eval_utils import eval_setup
 
@@ -157,19 +154,15 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
     except ThermoxelsError:
         raise
     except (yaml.YAMLError, AssertionError, KeyError, UnicodeDecodeError) as problem:
-        raise CheckpointError(
-            "load_config",
-            expected="a config.yml that ns-train of this installation wrote",
-            got=f"{load_config}, which cannot be read ({_reason(load_config, problem)})",
-            remedy="Pass the config.yml of the training run.",
-        ) from problem
+        expected = "a config.yml that ns-train of this installation wrote"
+        got = f"{load_config}, which cannot be read ({_reason(load_config, problem)})"
+        remedy = "Pass the config.yml of the training run."
+        raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy) from problem
     except (RuntimeError, pickle.UnpicklingError, EOFError) as problem:
-        raise CheckpointError(
-            "checkpoint",
-            expected="the parameters of the model that config.yml describes",
-            got=f"{type(problem).__name__}: {problem}",
-            remedy="Use the config.yml and the checkpoint of one and the same training run.",
-        ) from problem
+        expected = "the parameters of the model that config.yml describes"
+        got = f"{type(problem).__name__}: {problem}"
+        remedy = "Use the config.yml and the checkpoint of one and the same training run."
+        raise CheckpointError("checkpoint", expected=expected, got=got, remedy=remedy) from problem
     pipeline_of_ours: Any = pipeline
     outputs = pipeline_of_ours.datamanager.train_dataparser_outputs
     world_to_input = input_from_world(outputs.dataparser_transform.numpy(), float(outputs.dataparser_scale))
@@ -234,18 +227,12 @@ def _check_config(config: TrainerConfig) -> TrainerConfig:
     """Refuse another method's run, or one without a checkpoint, before its photographs are loaded."""
     pipeline: Any = config.pipeline
     if not callable(getattr(pipeline._target, "grid_snapshot", None)):
-        raise CheckpointError(
-            "load_config",
-            expected="a model trained with a Thermoxels method",
-            got=f"the checkpoint of another method ({config.method_name})",
-            remedy="Train with ns-train thermoxels, or choose another subcommand of ns-export.",
-        )
+        expected = "a model trained with a Thermoxels method"
+        got = f"the checkpoint of another method ({config.method_name})"
+        remedy = "Train with ns-train thermoxels, or choose another subcommand of ns-export."
+        raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy)
     folder = config.get_checkpoint_dir()
     if not any(folder.glob("step-*.ckpt")):
-        raise CheckpointError(
-            "checkpoint",
-            expected=f"a file step-*.ckpt in {folder}",
-            got="none",
-            remedy="Run the command in the folder where ns-train ran, or train to the first checkpoint.",
-        )
+        remedy = "Run the command in the folder where ns-train ran, or train to the first checkpoint."
+        raise CheckpointError("checkpoint", expected=f"a file step-*.ckpt in {folder}", got="none", remedy=remedy)
     return config

@@ -150,20 +150,12 @@ def check_options(options: ExportOptions) -> CheckedOptions:
         first, second, length = options.known_distance[:3], options.known_distance[3:6], options.known_distance[6]
         distance = scale_from_known_distance(first, second, length, options.known_distance_error)
     elif options.known_distance_error is not None:
-        raise MeshError(
-            "known_distance_error",
-            expected="--known-distance beside it",
-            got="none",
-            remedy="Pass --known-distance x y z x y z metres, or leave the error out.",
-        )
+        remedy = "Pass --known-distance x y z x y z metres, or leave the error out."
+        raise MeshError("known_distance_error", expected="--known-distance beside it", got="none", remedy=remedy)
     choose_scale(options.metres_per_unit, distance)
     if not options.formats or len(set(options.formats)) < len(options.formats):
-        raise MeshError(
-            "formats",
-            expected="at least one format, each once",
-            got=options.formats,
-            remedy="Pass --formats vtu glb, for example.",
-        )
+        remedy = "Pass --formats vtu glb, for example."
+        raise MeshError("formats", expected="at least one format, each once", got=options.formats, remedy=remedy)
     MeshOptions(options.boundary, options.coarsest_cell)  # refuses what is out of range
     selection = SolidSelection(**{field.name: getattr(options, field.name) for field in fields(SolidSelection)})
     return CheckedOptions(
@@ -187,12 +179,9 @@ def scale_of(
     needs += ["--wall-thickness"] if options.wall_thickness is not None else []
     needs += ["--patches"] if options.patches is not None else []
     if scale is None and needs:
-        raise MeshError(
-            "scale",
-            expected=f"a scene whose scale is known, for {needs[0]}",
-            got="none in the options or in the scene's json",
-            remedy="Pass --metres-per-unit, or --known-distance.",
-        )
+        remedy = "Pass --metres-per-unit, or --known-distance."
+        got = "none in the options or in the scene's json"
+        raise MeshError("scale", expected=f"a scene whose scale is known, for {needs[0]}", got=got, remedy=remedy)
     return scale
 
 
@@ -222,12 +211,9 @@ def _heat_settings(options: ExportOptions) -> tuple[HeatScene, Material, TimeSte
     scene = load_heat_scene(options.heat_preset)
     given, *others = set(scene.materials.values())
     if others or not isinstance(scene.time, TimeSteps):
-        raise HeatError(
-            "heat_preset",
-            expected="a scene of one material, with time: {steps: 10, step_seconds: 60}",
-            got=options.heat_preset,
-            remedy="Export without it, then run thermoxels heat with that scene on the mesh.",
-        )
+        expected = "a scene of one material, with time: {steps: 10, step_seconds: 60}"
+        remedy = "Export without it, then run thermoxels heat with that scene on the mesh."
+        raise HeatError("heat_preset", expected=expected, got=options.heat_preset, remedy=remedy)
     material, time = _with_options(given, options), _with_options(scene.time, options)
     if material != given:
         material = replace(material, name=f"{material.name} (changed)")

@@ -108,12 +108,8 @@ def _installed_command(name: str) -> str:
     folder = Path(sys.executable).parent
     program = shutil.which(name, path=str(folder))
     if program is None:
-        raise ThermoxelsError(
-            name,
-            expected=f"a command in {folder}",
-            got="none",
-            remedy="Install this package and nerfstudio into the environment of this Python.",
-        )
+        remedy = "Install this package and nerfstudio into the environment of this Python."
+        raise ThermoxelsError(name, expected=f"a command in {folder}", got="none", remedy=remedy)
     return program
 
 

@@ -96,12 +96,9 @@ def scale_from_known_distance(
         )
     apart = float(np.linalg.norm(b - a))
     if not apart > 1e-12 * max(float(np.abs(a).max()), float(np.abs(b).max())):
-        raise ThermoxelsError(
-            "known distance",
-            expected="two different points",
-            got=f"{_in_words(a)} and {_in_words(b)}",
-            remedy="Pass two points far from each other, in the coordinates of transforms.json.",
-        )
+        remedy = "Pass two points far from each other, in the coordinates of transforms.json."
+        got = f"{_in_words(a)} and {_in_words(b)}"
+        raise ThermoxelsError("known distance", expected="two different points", got=got, remedy=remedy)
     error = None if standard_error_m is None else standard_error_m / apart
     source = f"From {distance_m:g} m measured between {_in_words(a)} and {_in_words(b)}, {apart:.6g} units apart."
     return SceneScale(float(distance_m) / apart, error, source)
@@ -123,12 +120,8 @@ def scale_from_scene_file(meta: Mapping[str, Any]) -> SceneScale | None:
     value, error = meta.get(_KEY), meta.get(_ERROR_KEY)
     if value is None:
         if error is not None:
-            raise SceneError(
-                f"{_FILE}: {_ERROR_KEY}",
-                expected=f"'{_KEY}' beside it",
-                got="none",
-                remedy=f"Add '{_KEY}' or remove '{_ERROR_KEY}'.",
-            )
+            remedy = f"Add '{_KEY}' or remove '{_ERROR_KEY}'."
+            raise SceneError(f"{_FILE}: {_ERROR_KEY}", expected=f"'{_KEY}' beside it", got="none", remedy=remedy)
         return None
     check_positive(f"{_FILE}: {_KEY}", value, "Correct the json, or remove the key.", SceneError)
     if error is not None:
@@ -151,12 +144,9 @@ def up_from_scene_file(meta: Mapping[str, Any]) -> Vector | None:
     numbers = isinstance(value, list | tuple) and all(_is_number(v) and math.isfinite(v) for v in value)
     length = math.hypot(*value) if numbers else 0.0
     if not numbers or len(value) != 3 or not 0.0 < length < math.inf:
-        raise SceneError(
-            f"{_FILE}: {_UP_KEY}",
-            expected="three finite numbers, not all 0",
-            got=repr(value),
-            remedy="Correct the json, for instance to [0, 0, 1], or remove the key.",
-        )
+        remedy = "Correct the json, for instance to [0, 0, 1], or remove the key."
+        got = repr(value)
+        raise SceneError(f"{_FILE}: {_UP_KEY}", expected="three finite numbers, not all 0", got=got, remedy=remedy)
     x, y, z = (float(v) / length for v in value)
     return (x, y, z)
 
@@ -178,12 +168,9 @@ def choose_scale(
         ThermoxelsError: The user gives both a scale and a distance, or a value is out of range.
     """
     if option is not None and known_distance is not None:
-        raise ThermoxelsError(
-            "scale",
-            expected="metres per unit or a known distance",
-            got=f"both: {option} m per unit, and {known_distance.metres_per_unit:g} from the distance",
-            remedy="Leave one of them out.",
-        )
+        remedy = "Leave one of them out."
+        got = f"both: {option} m per unit, and {known_distance.metres_per_unit:g} from the distance"
+        raise ThermoxelsError("scale", expected="metres per unit or a known distance", got=got, remedy=remedy)
     in_file = scale_from_scene_file(scene_file or {})
     given = known_distance if option is None else scale_from_option(option)
     if given is None:

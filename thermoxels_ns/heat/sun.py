@@ -232,12 +232,10 @@ def _later(start: datetime, time_s: float) -> datetime:
     try:
         return start + timedelta(seconds=time_s)
     except OverflowError as problem:
-        raise HeatError(
-            "time of the sun",
-            expected="a date of the years 1 to 9999",
-            got=f"{time_s:.3g} s after {start.isoformat()}",
-            remedy="Follow the body for a shorter time.",
-        ) from problem
+        expected = "a date of the years 1 to 9999"
+        got = f"{time_s:.3g} s after {start.isoformat()}"
+        remedy = "Follow the body for a shorter time."
+        raise HeatError("time of the sun", expected=expected, got=got, remedy=remedy) from problem
 
 
 def _days(moment: datetime) -> float:

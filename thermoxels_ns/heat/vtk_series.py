@@ -72,9 +72,7 @@ def remove_heat_series(pvd: Path | str) -> None:
         if folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()
     except OSError as problem:
-        raise OutputError(
-            "heat series",
-            expected=f"a folder that can be removed at {folder}",
-            got=problem.strerror or str(problem),
-            remedy="Change its permissions, or choose another folder.",
-        ) from problem
+        expected = f"a folder that can be removed at {folder}"
+        got = problem.strerror or str(problem)
+        remedy = "Change its permissions, or choose another folder."
+        raise OutputError("heat series", expected=expected, got=got, remedy=remedy) from problem
