@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -232,3 +233,13 @@ def test_importing_the_configuration_loads_nothing_heavy() -> None:
 @pytest.mark.parametrize("path", FILES, ids=_name)
 def test_names_say_something(path: Path) -> None:
     assert not NAMES_THAT_SAY_NOTHING & set(path.relative_to(PACKAGE).with_suffix("").parts)
+
+
+@pytest.mark.parametrize("page", ["docs/architecture.md", "CONTRIBUTING.md"])
+def test_the_map_names_files_that_are_there(page: str) -> None:
+    text = (PACKAGE.parent / page).read_text(encoding="utf-8")
+    named = set(re.findall(r"`((?:[a-z0-9_]+/)+[a-z0-9_]+\.py)`", text))
+    assert len(named) > 3
+    assert [
+        name for name in sorted(named) if not any((folder / name).is_file() for folder in (PACKAGE, PACKAGE.parent))
+    ] == []
