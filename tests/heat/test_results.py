@@ -16,8 +16,7 @@ from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.surface_heat import heat_by_part
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.heat.materials import Material
-from thermoxels_ns.heat.results import heat_results
-from thermoxels_ns.heat.wall_results import wall_result
+from thermoxels_ns.heat.results import heat_results, wall_result
 
 BRICK, WOOL = Material("brick", 0.7, 1600.0, 940.0), Material("wool", 0.04, 30.0, 1030.0)
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)

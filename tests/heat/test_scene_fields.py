@@ -3,10 +3,25 @@ from __future__ import annotations
 from dataclasses import fields
 from datetime import datetime, timezone
 
+import numpy as np
 import pytest
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.heat.scene_fields import Ground, InsideAir, OutsideAir, Section, Sky, Sun, Surface, field_bounds
+from thermoxels_ns.fem.quantities import Places, Varying
+from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4, Convection
+from thermoxels_ns.heat.scene_fields import (
+    Ground,
+    InsideAir,
+    OutsideAir,
+    Section,
+    Sky,
+    Sun,
+    Surface,
+    field_bounds,
+    inside_coefficient,
+    outside_coefficient,
+    radiative_coefficient,
+)
 
 SECTIONS = Section.__subclasses__()
 NOON = datetime(2025, 6, 21, 12, tzinfo=timezone.utc)
@@ -63,3 +78,59 @@ def test_sections_that_are_complete() -> None:
     assert Sky(model="swinbank").needs_air and not Sky(temperature_c=-5.0).needs_air
     assert Sun(start=NOON, **PLACE, clear_sky="meinel").diffuse_w_m2 == 0.0
     assert Sun(towards=(0.0, 0.0, 2.0), direct_w_m2=800.0, diffuse_w_m2=100.0).start is None
+
+
+Z_UP = (0.0, 0.0, 1.0)
+CEILING, WALL, FLOOR = (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+"""Outward normals of what surrounds a room."""
+
+
+def at(coefficient: Varying, *normals: tuple[float, float, float], up=Z_UP) -> list[float]:
+    places = Places(np.zeros((len(normals), 3)), np.array(normals), up)
+    return np.asarray(coefficient.function(places, 0.0)).tolist()
+
+
+@pytest.mark.parametrize(
+    ("mean_c", "published"), [(-10.0, 4.13), (0.0, 4.62), (10.0, 5.15), (20.0, 5.71), (30.0, 6.32)]
+)
+def test_radiation_made_linear(mean_c: float, published: float) -> None:
+    assert round(radiative_coefficient(mean_c, 1.0), 2) == published
+    assert radiative_coefficient(mean_c, 0.5) == 0.5 * radiative_coefficient(mean_c, 1.0)
+
+
+def test_the_linear_form_is_the_slope_of_the_fourth_power() -> None:
+    kelvin, step = 283.15, 1e-3
+    slope = STEFAN_BOLTZMANN_W_M2K4 * ((kelvin + step) ** 4 - (kelvin - step) ** 4) / (2.0 * step)
+    assert radiative_coefficient(10.0, 1.0) == pytest.approx(slope, rel=1e-9)
+
+
+def test_separate_parts_make_up_the_combined_resistances() -> None:
+    """The standard's Rsi and Rse are its separate parts, rounded: emissivity 0.9, 20 C inside, 0 C and 4 m/s out."""
+    inside = at(inside_coefficient("iso-6946-separate", mean_c=20.0, emissivity=0.9), CEILING, WALL, FLOOR)
+    assert [round(1.0 / value, 2) for value in inside] == [0.10, 0.13, 0.17]
+    assert round(1.0 / outside_coefficient("iso-6946-separate", 4.0, 0.0, 0.9), 2) == 0.04
+
+
+def test_horizontal_reaches_to_30_degrees() -> None:
+    def leaning(degrees: float) -> tuple[float, float, float]:
+        return float(np.cos(np.radians(degrees))), 0.0, float(np.sin(np.radians(degrees)))
+
+    found = at(
+        inside_coefficient("iso-6946-convection", "out-of-body"),
+        *(leaning(angle) for angle in (-31, -30, -29, 29, 30, 31)),
+    )
+    assert found == [0.7, 2.5, 2.5, 2.5, 2.5, 5.0]
+
+
+def test_up_is_where_the_scene_says() -> None:
+    assert at(inside_coefficient("iso-6946-convection"), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), up=(0.0, 1.0, 0.0)) == [
+        5.0,
+        2.5,
+    ]
+
+
+def test_they_fit_into_convection_and_are_asked_once() -> None:
+    effect = Convection(("*",), inside_coefficient("iso-6946-combined"), 20.0)
+    assert not effect.bounded("coefficient_w_m2k").in_time
+    places = Places(np.zeros((1, 3)), np.array([CEILING]), Z_UP)
+    assert effect.bounded("coefficient_w_m2k").at(places, 5.0).tolist() == [10.0]

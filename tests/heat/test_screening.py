@@ -25,8 +25,7 @@ from thermoxels_ns.heat.effects import (
     Radiation,
 )
 from thermoxels_ns.heat.materials import Material
-from thermoxels_ns.heat.nodal_heat import nodal_heats
-from thermoxels_ns.heat.screening import screen
+from thermoxels_ns.heat.screening import nodal_heats, screen
 from thermoxels_ns.heat.sun import moving_sun
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 

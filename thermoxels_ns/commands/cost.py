@@ -142,11 +142,7 @@ def run_cost(cost: Cost, console: Console) -> None:
 
 
 def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
-    """The rows of the table, and the name of the baseline among them.
-
-    Raises:
-        ThermoxelsError: Nothing is to be trained, a setting is not one, or the baseline is none of them.
-    """
+    """The rows of the table, and the name of the baseline among them."""
     for name in ("methods", "recipes"):
         if not getattr(cost, name):
             raise ThermoxelsError(
@@ -284,10 +280,7 @@ class _Display:
 
 
 def parse_setting(text: str) -> tuple[int, int]:
-    """Read ``resolution:steps``.
-
-    Raises:
-        ThermoxelsError: It is something else.
+    """Read ``resolution:steps``, or raise a `ThermoxelsError`.
 
     >>> parse_setting("64:800")
     (64, 800)
@@ -300,11 +293,7 @@ def parse_setting(text: str) -> tuple[int, int]:
 
 
 def training_options(resolution: int, steps: int) -> list[str]:
-    """Options of ns-train for a final resolution and a number of steps.
-
-    Raises:
-        ThermoxelsError: There is no schedule for them.
-    """
+    """Options of ns-train for a final resolution and a number of steps."""
     from thermoxels_ns.training.schedule import schedule_for
 
     schedule = schedule_for(resolution, steps)
@@ -328,11 +317,7 @@ def scene_fingerprint(scene: Path) -> str:
 
 
 def read_runs(path: Path) -> list[CostRun]:
-    """Read the finished runs; none if there is no file yet.
-
-    Raises:
-        ThermoxelsError: The file is not one that `write_runs` made.
-    """
+    """Read the finished runs; none if there is no file yet."""
     if not path.is_file():
         return []
     try:
@@ -370,16 +355,7 @@ class Bench:
     """Runs settings on one scene, each in a folder of its own that goes when it is done."""
 
     def __init__(self, scene: Path, folder: Path, keep_models: bool = False) -> None:
-        """Remember where things go.
-
-        Args:
-            scene: The scene folder.
-            folder: Where logs, figures and models go.
-            keep_models: Leave the trained models in ``folder/models``.
-
-        Raises:
-            SceneError: There is no such scene folder.
-        """
+        """Remember where things go; refuse a scene folder that is not there."""
         if not scene.is_dir():
             raise SceneError("scene", expected="a scene folder", got=f"none at {scene}", remedy="Correct the path.")
         self.scene = scene
@@ -392,16 +368,7 @@ class Bench:
         return CostRun(setting.name, repeat, self.fingerprint, __version__, setting.training, {})
 
     def train(self, setting: CostSetting, name: str, watch: Watch) -> tuple[Path, ProcessCost]:
-        """Train a setting anew.
-
-        Args:
-            setting: How.
-            name: Of the run's folder and log.
-            watch: Called now and then.
-
-        Returns:
-            The run's folder, as nerfstudio makes it, and what the command took.
-        """
+        """Train a setting anew; returns the run's folder, as nerfstudio makes it, and what the command took."""
         models = writable_folder(self._folder / "models")
         shutil.rmtree(models / name, ignore_errors=True)
         words = [
@@ -415,11 +382,7 @@ class Bench:
         return models / name / setting.method / "run", cost
 
     def measure(self, setting: CostSetting, repeat: int, watch: Watch) -> CostRun:
-        """Train and evaluate a setting.
-
-        Raises:
-            ThermoxelsError: A command failed, or did not write what it should.
-        """
+        """Train and evaluate a setting."""
         name = f"{setting.file_name}-{repeat}"
         try:
             run_folder, cost = self.train(setting, name, watch)
@@ -447,11 +410,7 @@ class Bench:
 
 
 def training_seconds(run_folder: Path) -> float:
-    """Seconds from the start of nerfstudio's training loop, when it writes its transform, to the last checkpoint.
-
-    Raises:
-        ThermoxelsError: The run has not written them.
-    """
+    """Seconds from the start of nerfstudio's training loop, when it writes its transform, to the last checkpoint."""
     start = run_folder / "dataparser_transforms.json"
     checkpoints = sorted((run_folder / "nerfstudio_models").glob("step-*.ckpt"))
     if not (start.is_file() and checkpoints):
@@ -462,11 +421,7 @@ def training_seconds(run_folder: Path) -> float:
 
 
 def read_evaluation(path: Path) -> dict[str, float]:
-    """The figures that ns-eval wrote; NaN for those that the scene or the method does not have.
-
-    Raises:
-        ThermoxelsError: The file is missing or not ns-eval's.
-    """
+    """The figures that ns-eval wrote; NaN for those that the scene or the method does not have."""
     try:
         results = json.loads(path.read_text(encoding="utf-8"))["results"]
         return {name: float(results.get(name, math.nan)) for name in _EVALUATED}

@@ -58,11 +58,7 @@ class DemoResults:
 
 
 def read_results(eval_json: Path, summary_json: Path) -> DemoResults:
-    """Read the figures that ``ns-eval`` and ``ns-export thermoxels-mesh`` wrote.
-
-    Args:
-        eval_json: Output of ``ns-eval`` on the held-out views.
-        summary_json: Summary of the export, with the sections ``truth`` and ``heat``.
+    """Read the figures that ``ns-eval`` (on held-out views) and ``ns-export thermoxels-mesh`` wrote.
 
     Raises:
         ThermoxelsError: A file is missing or lacks a figure.
@@ -121,10 +117,7 @@ def read_results(eval_json: Path, summary_json: Path) -> DemoResults:
 
 
 def energy_text(energy_j: float) -> str:
-    """Write an energy to four digits, in the unit in which it has one to three digits before the point.
-
-    Args:
-        energy_j: Energy [J], of either sign; NaN: it was not computed.
+    """Write an energy in the unit in which it has one to three digits before the point; NaN: it was not computed.
 
     >>> energy_text(1.003777e11), energy_text(-2.5e6), energy_text(0.0), energy_text(999.99)
     ('100.4 GJ', '-2.5 MJ', '0 J', '1 kJ')

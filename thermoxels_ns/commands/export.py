@@ -1,7 +1,5 @@
 """The command ``ns-export thermoxels-mesh``: a trained model to a mesh and its heat."""
 
-# Only light imports at the top: nerfstudio's exporter reads this module for --help of every subcommand.
-
 from __future__ import annotations
 
 # Only light imports at the top: nerfstudio's exporter reads this module for ``--help`` of every subcommand.
@@ -69,9 +67,6 @@ class ExportThermoxelsMesh(ExportOptions):
     def run(self, say: Any = print) -> dict[str, Any]:
         """Run the export and return the summary that summary.json holds.
 
-        Args:
-            say: Called with one line of progress at a time.
-
         Raises:
             ThermoxelsError: If an option, the checkpoint, the mesh or the heat problem is not usable.
         """
@@ -126,12 +121,7 @@ def scene_json(scene_folder: Path) -> dict[str, Any]:
 def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] = lambda _: None) -> TrainedScene:
     """Load a trained Thermoxels model through nerfstudio.
 
-    Args:
-        load_config: The config.yml that ns-train wrote.
-        check_scene: Called with the photographs' folder before anything slow; what it raises is raised.
-
-    Returns:
-        The trained field and where it lies.
+    `check_scene` is called with the photographs' folder before anything slow; what it raises is raised.
 
     Raises:
         CheckpointError: If the file is missing or not a nerfstudio config, if there is no checkpoint, or if it was

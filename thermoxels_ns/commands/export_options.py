@@ -1,7 +1,5 @@
 """Options of a mesh export, and how its pictures look at the mesh."""
 
-# Only light imports at the top: nerfstudio's exporter reads this module for --help of every subcommand.
-
 from __future__ import annotations
 
 # Imports at the top are light: nerfstudio's exporter reads the options for ``--help`` of every subcommand.

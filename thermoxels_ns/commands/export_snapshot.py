@@ -1,7 +1,5 @@
 """From a trained field to the files of an export."""
 
-# Only light imports at the top: the mesher, the solver and pyvista load when they run.
-
 from __future__ import annotations
 
 # Imports at the top are light; the mesher, the solver and pyvista load when they run.
@@ -36,10 +34,6 @@ _HEAT_PICTURE = "heat.png"
 
 def prepare_folder(output_dir: Path | str, *, heat: bool) -> Path:
     """Make the folder of an export, find out what is in the way, and remove what killed exports left half-written.
-
-    Args:
-        output_dir: The folder.
-        heat: Whether the heat step will be written.
 
     Raises:
         OutputError: The folder cannot be written to, or a folder has the name of a file of the export.

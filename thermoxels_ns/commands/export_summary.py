@@ -46,15 +46,7 @@ INNER_SIDE = (
 def mesh_summary(
     built: BuiltMesh, report: QualityReport, selection: SolidSelection, scale: SceneScale | None, voxel_size: float
 ) -> dict[str, Any]:
-    """Counts, sizes, and how the solid was found; lengths in the unit that the summary names.
-
-    Args:
-        built: The mesh and the solid it was made from.
-        report: Its quality.
-        selection: How the solid was selected.
-        scale: The scale; None if it is not known.
-        voxel_size: Edge of a voxel in the mesh, in its unit.
-    """
+    """Counts, sizes, and how the solid was found; lengths, and the voxel size, in the unit that the summary names."""
     mesh, solid = built.mesh, built.solid
     temperature = mesh.temperature_c
     area = report.area_m2 if report.true_area_m2 is None else report.true_area_m2

@@ -39,10 +39,6 @@ ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY = "answers.json", "series.csv", "rep
 def run_heat(options: HeatOptions, say: Say = lambda _: None) -> HeatRun:
     """Compute everything, then write it; answers.json comes last, so that files beside one belong together.
 
-    Args:
-        options: What was asked.
-        say: Called with one line of progress at a time.
-
     Raises:
         ThermoxelsError: The mesh, the scene or an option cannot be used, or the solver fails.
     """
@@ -153,13 +149,7 @@ def prepared_folder(output_dir: Path) -> Path:
 
 
 def write_heat_files(folder: Path, options: HeatOptions, run: HeatRun, say: Say) -> None:
-    """Write everything; answers.json comes last, so that files beside one belong together.
-
-    Args:
-        folder: From `prepared_folder`.
-        options: What was asked.
-        run: What was computed.
-        say: Called with one line of progress at a time.
+    """Write everything into the folder of `prepared_folder`; answers.json comes last.
 
     Raises:
         OutputError: A file cannot be written.

@@ -70,17 +70,11 @@ def scale_from_option(metres_per_unit: float) -> SceneScale:
 def scale_from_known_distance(
     point_a: npt.ArrayLike, point_b: npt.ArrayLike, distance_m: float, standard_error_m: float | None = None
 ) -> SceneScale:
-    """Find the scale from two points of the scene whose distance was measured.
+    """Find the scale from two points of the scene whose distance was measured, [input units] and [m].
 
-    scale = D / d with the measured distance D and the distance d between the points; its relative standard error is
-    that of D.
-
-    Args:
-        point_a: First point, three numbers, [input units].
-        point_b: Second point, three numbers, [input units].
-        distance_m: Their distance, above 0, [m].
-        standard_error_m: Standard error of the distance, at least 0, [m]: of measuring it, and of how far the points
-            may lie from the ends of what was measured. None: nobody knows.
+    scale = D / d with the measured distance D and the distance d between the points; its relative standard
+    error is that of D, which includes how far the points may lie from the ends of what was measured. None:
+    nobody knows.
 
     Raises:
         ThermoxelsError: A number is out of range, or the points coincide.
@@ -105,14 +99,7 @@ def scale_from_known_distance(
 
 
 def scale_from_scene_file(meta: Mapping[str, Any]) -> SceneScale | None:
-    """Read scale and standard error from a scene's json.
-
-    Args:
-        meta: The json; the keys are "metres_per_unit" (above 0) and "metres_per_unit_standard_error" (at least 0,
-            optional).
-
-    Returns:
-        The scale, or None if the json has none.
+    """Read scale and standard error from a scene's json; None if it has none.
 
     Raises:
         SceneError: A value is no such number, or there is a standard error without a scale.
@@ -156,13 +143,7 @@ def choose_scale(
 ) -> SceneScale | None:
     """Choose between what the user gives and what the scene's json says; the user goes before the json.
 
-    Args:
-        option: Metres per unit given by the user.
-        known_distance: What `scale_from_known_distance` made of a distance given by the user.
-        scene_file: The scene's json, if there is one.
-
-    Returns:
-        The scale, whose source says what it was preferred to; None if nobody gives one.
+    Returns the scale, whose source says what it was preferred to; None if nobody gives one.
 
     Raises:
         ThermoxelsError: The user gives both a scale and a distance, or a value is out of range.

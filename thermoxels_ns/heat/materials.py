@@ -71,11 +71,7 @@ class MaterialFigures:
         self.named("it")
 
     def named(self, name: str) -> Material:
-        """Make the material.
-
-        Raises:
-            HeatError: A figure is not above 0.
-        """
+        """Make the material."""
         return Material(name, self.conductivity_w_mk, self.density_kg_m3, self.specific_heat_j_kgk)
 
 
@@ -95,13 +91,7 @@ class MaterialRow(MaterialFigures):
 
 @raising(HeatError)
 def load_material_table(path: Path | str | None = None) -> dict[str, MaterialRow]:
-    """Read a table of materials.
-
-    Args:
-        path: A yaml file; None: the one that the package brings.
-
-    Returns:
-        The rows by name, in the order of the file.
+    """Read the rows of a yaml file of materials by name; without a path, of the one that the package brings.
 
     Raises:
         HeatError: There is no such file, or a row has an unknown or missing key or a figure out of range.
@@ -111,11 +101,7 @@ def load_material_table(path: Path | str | None = None) -> dict[str, MaterialRow
 
 
 def material(name: str, table: Mapping[str, MaterialRow] | None = None) -> Material:
-    """Look up a building material.
-
-    Args:
-        name: A name of the table, such as "concrete".
-        table: Other rows than those that the package brings.
+    """Look up a building material by its name, in the table of the package or another.
 
     Raises:
         HeatError: The table has no such row.

@@ -1,10 +1,11 @@
-"""The course and the result of a heat run: a scene on a mesh."""
+"""The course, warnings and result of a heat run: a scene on a mesh."""
 
 from __future__ import annotations
 
 import time as clock
 from collections.abc import Mapping
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
@@ -12,14 +13,14 @@ import numpy.typing as npt
 
 from thermoxels_ns.fem.probes import Probes, place_probes
 from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import Solution, SolutionNodes, solution_nodes
-from thermoxels_ns.heat.results import HeatResults, heat_results, volume_shares
+from thermoxels_ns.heat.results import HeatResults, WallResult, heat_results, volume_shares, wall_of_scene
 from thermoxels_ns.heat.scene import HeatScene
-from thermoxels_ns.heat.scene_warnings import patch_warnings, shell_warnings, unused_settings
+from thermoxels_ns.heat.scene_fields import INSIDE, OUTSIDE
 from thermoxels_ns.heat.screening import Screening
 from thermoxels_ns.heat.sky import Vector as Direction
 from thermoxels_ns.heat.solving import Accuracy, Goals, Say, solve_problem
-from thermoxels_ns.heat.wall_results import WallResult, wall_of_scene
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 Vector = npt.NDArray[np.float64]
@@ -122,3 +123,95 @@ def run_scene(
         probes_c=probes.at_quadratic(solved.mesh, nodes.states_c) if nodes.quadratic else probes.at(nodes.states_c),
         seconds={**seconds, "answers": clock.perf_counter() - done},
     )
+
+
+_COS_45 = float(np.sqrt(0.5))
+_LEAST_OF_A_ROOM = 0.1
+"""Share of its surface that a room has on walls and floor at least: of a cube they are five sixths."""
+_INWARDS = -0.2
+"""Mean cosine between the normals of a surface and the directions away from its middle: 0.8 to 1 for a body seen from
+around it, 0 for a plane, -0.8 to -1 for a room seen from within."""
+
+
+def patch_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str, ...]:
+    """Find what a scene's default patches mean on a mesh for which they were not meant.
+
+    Which surfaces are inside is known from what no camera saw. That is wrong for a body that was filled, of
+    which only the underside remains unseen, and for a room that was photographed from within, whose inner
+    surface is what was seen. A scene that names patches of its own is trusted.
+    """
+    selection = Selection(mesh, up)
+    inside, outside = _chosen(selection, INSIDE), _chosen(selection, OUTSIDE)
+    inside_air = scene.inside_air is not None and scene.inside_air.patches == INSIDE
+    outside_air = scene.outside_air is not None and scene.outside_air.patches == OUTSIDE
+    warnings = []
+    if (inside_air or outside_air) and _outwards(selection, outside) < _INWARDS:
+        warnings.append(
+            "The surface that photographs see faces inwards, as that of a room photographed from within. The scene's "
+            "outside air (and sun and sky) acts on surfaces that were seen, its inside air on those that were not. If "
+            "the seen surface is that of the room, give inside_air and outside_air their patches in the scene: "
+            'patches: ["exterior-*"] to the inside air, patches: ["interior-*"] to the outside air.'
+        )
+    elif inside_air and not _has_rooms(selection, inside):
+        area = float(selection.facet_area_m2[inside].sum())
+        warnings.append(
+            f"The scene names air inside, but the body has no rooms: of the {area:.4g} m² that no photograph saw, next "
+            "to nothing is walls or floor of a room. The air acts on what is left, such as the underside, and U-values "
+            "and heat losses are those of that. Export again with --interior hollow, which keeps the inside empty, or "
+            "name the inner surface with --patches."
+        )
+    return tuple(warnings)
+
+
+def unused_settings(scene: HeatScene) -> tuple[str, ...]:
+    """Say what a scene gives and its question does not ask for."""
+    if not scene.steady or scene.initial_c is None:
+        return ()
+    return (
+        f"The scene gives an initial temperature of {scene.initial_c:g} degrees Celsius, but asks for the steady "
+        "state, which does not depend on the start: initial changes nothing. Remove it, or give time in place of "
+        "steady.",
+    )
+
+
+def shell_warnings(scene: HeatScene, export: Mapping[str, Any]) -> tuple[str, ...]:
+    """Warn that the walls of a hollow export, by its summary, are as thick as photographs happened to make them."""
+    options, mesh = export.get("options"), export.get("mesh")
+    if scene.inside_air is None or not isinstance(options, dict) or not isinstance(mesh, dict):
+        return ()
+    if options.get("interior") != "hollow" or options.get("wall_thickness") is not None:
+        return ()
+    try:
+        thickness_m = 2.0 * float(mesh["volume"]) / float(mesh["area"])
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return ()
+    return (
+        f"The mesh is a shell (--interior hollow), {thickness_m:.2g} m thick on average. Photographs do not show how "
+        "thick walls are, nor what no camera saw, such as floors: heat losses and U-values are those of this shell, "
+        "with its holes and loose parts. Where you know the walls, export with --wall-thickness.",
+    )
+
+
+def _chosen(selection: Selection, patterns: tuple[str, ...]) -> npt.NDArray[np.bool_]:
+    """Mark the boundary triangles of patches that match, shape (f,)."""
+    matching = [any(fnmatchcase(name, pattern) for pattern in patterns) for name in selection.patch_names]
+    return np.array(matching, dtype=bool)[selection.facet_patch]
+
+
+def _has_rooms(selection: Selection, inside: npt.NDArray[np.bool_]) -> bool:
+    """Whether enough of a surface faces up or sideways to be that of rooms."""
+    area = selection.facet_area_m2[inside]
+    level = selection.facet_normal[inside] @ np.array(selection.up) / np.linalg.norm(selection.up)
+    return float(area[level > -_COS_45].sum()) > _LEAST_OF_A_ROOM * float(area.sum())
+
+
+def _outwards(selection: Selection, chosen: npt.NDArray[np.bool_]) -> float:
+    """Mean cosine between normals and the directions away from the middle; 0 of nothing."""
+    area = selection.facet_area_m2[chosen]
+    if not float(area.sum()) > 0.0:
+        return 0.0
+    centroid = selection.mesh.points_m[selection.mesh.facets[chosen]].mean(axis=1)
+    away = centroid - area @ centroid / area.sum()
+    length = np.linalg.norm(away, axis=1)
+    cosine = np.einsum("fi,fi->f", away, selection.facet_normal[chosen]) / np.maximum(length, np.finfo(float).tiny)
+    return float(area @ cosine / area.sum())

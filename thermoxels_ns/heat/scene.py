@@ -9,7 +9,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.heat.effects import (
@@ -33,6 +32,7 @@ from thermoxels_ns.heat.scene_fields import (
     Surface,
     check_direction,
     field_bounds,
+    unclear,
 )
 from thermoxels_ns.heat.scene_patches import ScenePatches, check_disjoint
 from thermoxels_ns.heat.sky import Vector, outdoor_radiation, swinbank_sky_c
@@ -91,7 +91,7 @@ class HeatScene:
     def __post_init__(self) -> None:
         if not self.materials:
             remedy = "Name one for all regions, as in {'*': Material(...)}."
-            raise _wrong("materials", "at least one", "none", remedy)
+            raise unclear("materials", "at least one", "none", remedy)
         check_direction("up", self.up)
         if self.initial_c is not None:
             object.__setattr__(self, "initial_c", float(field_bounds("initial_c").check(self.initial_c)))
@@ -103,14 +103,7 @@ class HeatScene:
         return self.time is None
 
     def problem(self, mesh: TetMesh, *, up: Vector | None = None) -> HeatProblem:
-        """Put the scene around a body.
-
-        Args:
-            mesh: The body.
-            up: Direction that points up in the coordinates of the mesh, if the scene does not say; None: z.
-
-        Returns:
-            The problem; the scene's `time` says how to solve it.
+        """Put the scene around a body; `up` counts if the scene does not say, None: z.
 
         Raises:
             HeatError: The mesh lacks a patch or region that the scene names, or has one that the scene says nothing
@@ -153,13 +146,13 @@ class HeatScene:
             matching = [name for name in mesh.region_names if fnmatchcase(name, pattern)]
             if not matching:
                 expected = f"names or patterns of the regions {', '.join(mesh.region_names)}"
-                raise _wrong("materials", expected, repr(pattern), "Correct the name, or use '*' for all regions.")
+                raise unclear("materials", expected, repr(pattern), "Correct the name, or use '*' for all regions.")
             chosen |= dict.fromkeys(matching, made_of)
         used = {mesh.region_names[number] for number in np.unique(mesh.region)}
         missing = sorted(used - set(chosen))
         if missing:
             expected = f"a material for each of the regions {', '.join(sorted(used))}"
-            raise _wrong("materials", expected, f"none for {', '.join(missing)}", "Add them, or '*' for all others.")
+            raise unclear("materials", expected, f"none for {', '.join(missing)}", "Add them, or '*' for all others.")
         different = {chosen[name] for name in used}
         return different.pop() if len(different) == 1 else chosen
 
@@ -193,7 +186,7 @@ class HeatScene:
     def _check_what_belongs_together(self) -> None:
         if self.sky is not None and self.sky.needs_air and self.outside_air is None:
             remedy = "Add outside_air, or give the sky's temperature_c."
-            raise _wrong("sky", "outside_air beside it, whose temperature it follows", "none", remedy)
+            raise unclear("sky", "outside_air beside it, whose temperature it follows", "none", remedy)
         radiates = self.sky is not None or (self.ground is not None and self.ground.surface_c is not None)
         for key, source, there in (
             ("emissivity", "sky, or ground with surface_c", radiates),
@@ -202,11 +195,11 @@ class HeatScene:
             has = any(getattr(surface, key) is not None for surface in self.surfaces)
             if there and not has:
                 remedy = f"Add surfaces: [{{{key}: 0.6}}], for example."
-                raise _wrong(f"surfaces: {key}", f"a number beside {source}", "none", remedy)
+                raise unclear(f"surfaces: {key}", f"a number beside {source}", "none", remedy)
             if has and not there:
-                raise _wrong(f"surfaces: {key}", f"{source} beside it", "none", f"Add it, or remove {key}.")
+                raise unclear(f"surfaces: {key}", f"{source} beside it", "none", f"Add it, or remove {key}.")
         if self.ground is not None and self.ground.reflectance is not None and self.sun is None:
-            raise _wrong("ground: reflectance", "a sun to reflect", "none", "Add sun, or remove reflectance.")
+            raise unclear("ground: reflectance", "a sun to reflect", "none", "Add sun, or remove reflectance.")
 
     def _check_counted_once(self, where: list[tuple[str, set[str]]]) -> None:
         """Refuse two kinds of air on one patch, and radiation in a coefficient beside radiation of its own."""
@@ -243,7 +236,3 @@ def _irradiance(sun: Sun, reflectance: float) -> Varying:
 def _given(value: Value | None) -> Value:
     assert value is not None, "checked when the section was made"
     return value
-
-
-def _wrong(name: str, expected: str, got: object, remedy: str) -> HeatError:
-    return HeatError(name, expected=expected, got=got, remedy=remedy)

@@ -3,22 +3,93 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from datetime import datetime
-from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
+from types import MappingProxyType
+from typing import Any, Literal, TypeAlias, cast, get_args, get_origin, get_type_hints
+
+import numpy as np
+import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.quantities import Bounds, Quantity
-from thermoxels_ns.heat.effects import Convection
+from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin
+from thermoxels_ns.fem.quantities import Bounds, Places, Quantity, Varying
+from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4, Convection
 from thermoxels_ns.heat.sky import Vector
-from thermoxels_ns.heat.surface_coefficients import (
-    HeatFlow,
-    InsideCoefficient,
-    OutsideCoefficient,
-    inside_coefficient,
-    outside_coefficient,
+
+HeatDirection: TypeAlias = Literal["up", "horizontal", "down"]
+"""Where heat flows to."""
+HeatFlow: TypeAlias = Literal["into-body", "out-of-body"]
+"""Into the body: the air is warmer than the surface, as in a heated room; out of it: the air is colder."""
+InsideCoefficient = Literal["iso-6946-combined", "iso-6946-separate", "iso-6946-convection"]
+OutsideCoefficient = Literal["iso-6946-combined", "iso-6946-separate", "iso-6946-convection", "thermoxels-original"]
+
+INSIDE_RESISTANCE_M2K_W: Mapping[HeatDirection, float] = MappingProxyType(
+    {"up": 0.10, "horizontal": 0.13, "down": 0.17}
 )
+"""Rsi, resistance between a room and its surfaces, [m2 K / W] (ISO 6946)."""
+OUTSIDE_RESISTANCE_M2K_W = 0.04
+"""Rse, resistance between a surface and the open air, [m2 K / W] (ISO 6946), for all directions."""
+INSIDE_CONVECTION_W_M2K: Mapping[HeatDirection, float] = MappingProxyType({"up": 5.0, "horizontal": 2.5, "down": 0.7})
+"""hci, convection alone inside, [W / (m2 K)] (ISO 6946)."""
+
+_HORIZONTAL = 0.5 + 1e-9  # sine of 30 degrees, which is horizontal whatever its rounding
+
+
+def inside_coefficient(
+    name: InsideCoefficient, heat_flow: HeatFlow = "into-body", mean_c: float = 20.0, emissivity: float = 0.9
+) -> Varying:
+    """Make the coefficient of surfaces in a room by their orientation, for `Convection.coefficient_w_m2k`.
+
+    ISO 6946 tells three directions of the heat flow apart, because warm air rises; "horizontal" is up to 30
+    degrees off. Combined coefficients (1 / Rsi) hold convection and radiation between surfaces of emissivity
+    0.9; hci is convection alone, to which separate ones add hr at `mean_c`, the mean temperature of surface and
+    room.
+    """
+    directions: tuple[HeatDirection, ...] = ("up", "horizontal", "down")
+    if name == "iso-6946-combined":
+        table = np.array([1.0 / INSIDE_RESISTANCE_M2K_W[direction] for direction in directions])
+    else:
+        radiative = radiative_coefficient(mean_c, emissivity) if name == "iso-6946-separate" else 0.0
+        table = np.array([INSIDE_CONVECTION_W_M2K[direction] + radiative for direction in directions])
+
+    def by_orientation(places: Places, _: float) -> npt.NDArray[np.float64]:
+        outward = places.normals @ np.array(places.up)
+        upward = -outward if heat_flow == "into-body" else outward
+        return table[np.where(upward > _HORIZONTAL, 0, np.where(upward < -_HORIZONTAL, 2, 1))]
+
+    return Varying(by_orientation, in_time=False)
+
+
+def outside_coefficient(
+    name: OutsideCoefficient, wind_m_s: float = 4.0, mean_c: float = 0.0, emissivity: float = 0.9
+) -> float:
+    """Give the coefficient of surfaces in the open air, [W / (m2 K)].
+
+    1 / Rse (combined), 4 + 4 v + hr (separate), 4 + 4 v (convection), or 18.6 v^0.605 of the original
+    Thermoxels code, which is 0 in calm air and about twice the value of ISO 6946 in wind; hr at the mean of
+    surface and surroundings.
+
+    >>> outside_coefficient("iso-6946-combined")
+    25.0
+    """
+    if name == "iso-6946-combined":
+        return 1.0 / OUTSIDE_RESISTANCE_M2K_W
+    if name == "thermoxels-original":
+        return 18.6 * wind_m_s**0.605
+    convection = 4.0 + 4.0 * wind_m_s
+    return convection + radiative_coefficient(mean_c, emissivity) if name == "iso-6946-separate" else convection
+
+
+def radiative_coefficient(mean_c: float, emissivity: float) -> float:
+    """Radiation made linear, hr = 4 eps sigma Tm^3, [W / (m2 K)] (ISO 6946).
+
+    >>> round(radiative_coefficient(10.0, 1.0), 2)
+    5.15
+    """
+    return 4.0 * emissivity * STEFAN_BOLTZMANN_W_M2K4 * celsius_to_kelvin(mean_c) ** 3
+
 
 OUTSIDE = ("exterior-*",)
 """Patches that what is outside acts on, unless others are named."""
@@ -72,9 +143,9 @@ class Section:
                 number = field_bounds(field.name).check(cast(Any, value))
                 object.__setattr__(self, field.name, float(number))
             if choices and value not in choices:
-                raise _unclear(field.name, f"one of {', '.join(choices)}", repr(value), "Correct it.")
+                raise unclear(field.name, f"one of {', '.join(choices)}", repr(value), "Correct it.")
             if field.name == "patches" and (not value or isinstance(value, str)):
-                raise _unclear("patches", "a list of names or patterns", repr(value), "Name at least one, in a list.")
+                raise unclear("patches", "a list of names or patterns", repr(value), "Name at least one, in a list.")
         self._check()
 
     def _check(self) -> None:
@@ -160,7 +231,7 @@ class Surface(Section):
 
     def _check(self) -> None:
         if self.emissivity is None and self.absorptivity is None:
-            raise _unclear("surface", "emissivity, absorptivity or both", "neither", "Give one of them.")
+            raise unclear("surface", "emissivity, absorptivity or both", "neither", "Give one of them.")
 
 
 @dataclass(frozen=True)
@@ -194,7 +265,7 @@ class Ground(Section):
 
     def _check(self) -> None:
         if self.surface_c is None and self.reflectance is None:
-            raise _unclear("ground", "surface_c, reflectance or both", "neither", "Give one of them.")
+            raise unclear("ground", "surface_c, reflectance or both", "neither", "Give one of them.")
 
 
 @dataclass(frozen=True)
@@ -228,18 +299,18 @@ class Sun(Section):
         for name in ("latitude_deg", "longitude_deg", "north"):
             given = getattr(self, name)
             if self.start is None and given is not None:
-                raise _unclear(name, "a date and time in start beside it", "none", f"Add start or remove {name}.")
+                raise unclear(name, "a date and time in start beside it", "none", f"Add start or remove {name}.")
             if self.start is not None and given is None:
-                raise _unclear("start", f"{name} beside it", "none", f"Add {name}.")
+                raise unclear("start", f"{name} beside it", "none", f"Add {name}.")
         _check_one(clear_sky=self.clear_sky, direct_w_m2=self.direct_w_m2)
         if self.clear_sky is not None and self.start is None:
-            raise _unclear("clear_sky", "a date and time in start beside it", "none", "Give direct_w_m2 instead.")
+            raise unclear("clear_sky", "a date and time in start beside it", "none", "Give direct_w_m2 instead.")
         if self.clear_sky is not None and self.diffuse_w_m2 > 0.0:
             got = f"{self.diffuse_w_m2:g}"
-            raise _unclear("diffuse_w_m2", "none beside clear_sky", got, "Remove one of the two.")
+            raise unclear("diffuse_w_m2", "none beside clear_sky", got, "Remove one of the two.")
         if self.start is not None and self.start.utcoffset() is None:
             remedy = f"Write {self.start.isoformat()}+01:00, for example, or Z at its end for universal time."
-            raise _unclear("start", "a date and time with a time zone", self.start.isoformat(), remedy)
+            raise unclear("start", "a date and time with a time zone", self.start.isoformat(), remedy)
         for name in ("north", "towards"):
             check_direction(name, getattr(self, name))
 
@@ -247,7 +318,7 @@ class Sun(Section):
 def check_direction(name: str, vector: Vector | None) -> None:
     """Refuse three numbers that are no direction."""
     if vector is not None and not 0.0 < math.hypot(*vector) < math.inf:
-        raise _unclear(name, "a direction", list(vector), "Give three numbers, such as [0, 1, 0].")
+        raise unclear(name, "a direction", list(vector), "Give three numbers, such as [0, 1, 0].")
 
 
 def _check_coefficient(named: str | None, number: float | None, emissivity: float | None) -> None:
@@ -262,15 +333,16 @@ def _check_one(**values: object) -> None:
         names = list(values)
         expected = f"one of {', '.join(names)}"
         remedy = f"Remove all but one: {', '.join(given)}." if given else f"Add {names[0]}, for example."
-        raise _unclear(" or ".join(names), expected, " and ".join(given) or "none", remedy)
+        raise unclear(" or ".join(names), expected, " and ".join(given) or "none", remedy)
 
 
 def _check_only_if(name: str, value: float | None, needed: bool, coefficient: str) -> None:
     if needed and value is None:
-        raise _unclear(name, f"a number, because {coefficient} depends on it", "none", f"Add {name}.")
+        raise unclear(name, f"a number, because {coefficient} depends on it", "none", f"Add {name}.")
     if not needed and value is not None:
-        raise _unclear(name, f"none, because {coefficient} does not depend on it", f"{value:g}", f"Remove {name}.")
+        raise unclear(name, f"none, because {coefficient} does not depend on it", f"{value:g}", f"Remove {name}.")
 
 
-def _unclear(name: str, expected: str, got: object, remedy: str) -> HeatError:
+def unclear(name: str, expected: str, got: object, remedy: str) -> HeatError:
+    """Make the error for an entry of a scene."""
     return HeatError(name, expected=expected, got=got, remedy=remedy)

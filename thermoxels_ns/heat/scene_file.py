@@ -42,18 +42,11 @@ def heat_scene_names() -> list[str]:
 
 @raising(HeatError)
 def load_heat_scene(name: Path | str) -> HeatScene:
-    """Read a heat scene.
+    """Read a heat scene from a yaml file, or by the name of one that the package brings, such as ``winter-night``.
 
-    A file has the fields of `HeatScene` as keys, with three differences: materials are names of the table or three
-    figures, the start is ``initial: photographs`` or ``initial: {temperature_c: 15}``, and a scene has either
-    ``steady: true`` or ``time:`` with the fields of `TimeSteps` or of `AdaptiveSteps`.
-
-    Args:
-        name: The path of a yaml file (recognised by its suffix), or the name of a scene that the package brings, such
-            as ``winter-night`` for ``configs/scene-winter-night.yaml``.
-
-    Returns:
-        The checked scene.
+    A file has the fields of `HeatScene` as keys, with three differences: materials are names of the table or
+    three figures, the start is ``initial: photographs`` or ``initial: {temperature_c: 15}``, and a scene has
+    either ``steady: true`` or ``time:`` with the fields of `TimeSteps` or of `AdaptiveSteps`.
 
     Raises:
         HeatError: There is no such scene, or a key is unknown, missing or twice in the file, or a value is of the wrong

@@ -23,22 +23,14 @@ class ScenePatches:
     """The patches of a mesh by name, and how much surface each has."""
 
     def __init__(self, mesh: TetMesh) -> None:
-        """Read the tags of a mesh.
-
-        Raises:
-            HeatError: They have the wrong shape or refer to what is not there.
-        """
+        """Read the tags of a mesh."""
         selection = Selection(mesh)
         area = np.bincount(selection.facet_patch, weights=selection.facet_area_m2, minlength=len(selection.patch_names))
         self.area_m2: dict[str, float] = dict(zip(selection.patch_names, area.tolist()))
         """True area of each patch by its name, [m2]."""
 
     def matching(self, name: str, patterns: Sequence[str]) -> set[str]:
-        """Give the patches that match any pattern.
-
-        Args:
-            name: The entry of the scene that names them, for messages.
-            patterns: Names or patterns.
+        """Give the patches that match any pattern; `name` is the entry that names them, for messages.
 
         Raises:
             HeatError: A pattern matches no patch.
@@ -56,18 +48,9 @@ class ScenePatches:
     def of_surfaces(
         self, surfaces: Sequence[Surface], value: Callable[[Surface], float | None], allowed: set[str] | None = None
     ) -> list[tuple[tuple[str, ...], float]]:
-        """Group the patches by a property of their surfaces.
+        """Group the patches, written as patterns, by a property of their surfaces; the last entry holds.
 
-        Args:
-            surfaces: Entries of the scene; the last one that gives a patch the property holds.
-            value: The property of a surface, None if it has none.
-            allowed: The patches that count; None: all.
-
-        Returns:
-            Names of patches, written as patterns, and the value that they have.
-
-        Raises:
-            HeatError: A surface names a patch that the mesh does not have.
+        `value` gives the property, None if a surface has none; only `allowed` patches count, None: all.
         """
         chosen: dict[str, float] = {}
         for number, surface in enumerate(surfaces, start=1):
@@ -81,15 +64,7 @@ class ScenePatches:
         return [(tuple(names), number) for number, names in groups.items()]
 
     def check_all_named(self, acting: set[str], adiabatic: Sequence[str]) -> None:
-        """Refuse a patch that a scene says nothing about: it would be insulated without anyone having said so.
-
-        Args:
-            acting: Patches on which something acts.
-            adiabatic: Names or patterns of those that no heat crosses.
-
-        Raises:
-            HeatError: There is another patch with some surface.
-        """
+        """Refuse a patch with area that a scene says nothing about: it would be insulated without a word."""
         whole = sum(self.area_m2.values())
         forgotten = [
             patch
@@ -108,16 +83,7 @@ class ScenePatches:
 
 
 def check_disjoint(what: str, entries: Sequence[tuple[str, set[str]]], remedy: str) -> None:
-    """Refuse entries of which two act on one patch.
-
-    Args:
-        what: What would be counted twice, for the message.
-        entries: Names of entries of the scene and the patches they act on.
-        remedy: What to do about it.
-
-    Raises:
-        HeatError: Two entries share a patch.
-    """
+    """Refuse entries, given by name and patches, of which two act on one patch."""
     for (first, where), (second, elsewhere) in combinations(entries, 2):
         both = sorted(where & elsewhere)
         if both:

@@ -16,12 +16,6 @@ def swinbank_sky_c(air_c: float) -> float:
 
     A cloudy sky is nearly as warm as the air.
 
-    Args:
-        air_c: Temperature of the air near the ground, [degrees Celsius].
-
-    Returns:
-        The temperature of a black sky that radiates as much, [degrees Celsius].
-
     >>> round(swinbank_sky_c(20.0), 2)
     3.91
     """
@@ -29,11 +23,7 @@ def swinbank_sky_c(air_c: float) -> float:
 
 
 def sky_view(normals: npt.NDArray[np.float64], up: Vector) -> npt.NDArray[np.float64]:
-    """Share of a surface's view that is sky if nothing but the ground hides it, (1 + cos tilt) / 2, shape (k,).
-
-    Args:
-        normals: Outward unit normals, shape (k, 3).
-        up: Unit vector that points up.
+    """Share of the view of surfaces that is sky, (1 + cos tilt) / 2, shape (k,); normals point out, shape (k, 3).
 
     >>> sky_view(np.array([[0, 0, 1.0], [1, 0, 0], [0, 0, -1]]), (0.0, 0.0, 1.0)).tolist()
     [1.0, 0.5, 0.0]
@@ -42,31 +32,17 @@ def sky_view(normals: npt.NDArray[np.float64], up: Vector) -> npt.NDArray[np.flo
 
 
 def ground_view(normals: npt.NDArray[np.float64], up: Vector) -> npt.NDArray[np.float64]:
-    """Share of a surface's view that is ground, (1 - cos tilt) / 2, shape (k,).
-
-    Args:
-        normals: Outward unit normals, shape (k, 3).
-        up: Unit vector that points up.
-    """
+    """Share of the view of surfaces that is ground, (1 - cos tilt) / 2, shape (k,)."""
     return 1.0 - sky_view(normals, up)
 
 
 def outdoor_radiation(
     emissivity: float, *, sky_c: float | None = None, ground_c: float | None = None
 ) -> tuple[Quantity, Quantity]:
-    """Make the two quantities of a `Radiation` to the sky, the ground or both.
+    """Make the emissivity and the surroundings of a `Radiation` to the sky, the ground or both, [degrees Celsius].
 
-    With both, T_s^4 = F_sky T_sky^4 + F_ground T_ground^4: one effect that is exactly the sum of two. With one alone,
-    the emissivity is multiplied by its view factor, and the rest of the view exchanges nothing.
-
-    Args:
-        emissivity: Emissivity of the surface, 0 to 1.
-        sky_c: Temperature of the sky, [degrees Celsius]; None: it is left out.
-        ground_c: Temperature of the ground's surface, [degrees Celsius]; None: it is left out.
-
-    Returns:
-        emissivity: For `Radiation.emissivity`.
-        surroundings_c: For `Radiation.surroundings_c`.
+    With both, T_s^4 = F_sky T_sky^4 + F_ground T_ground^4: one effect that is exactly the sum of two. With one
+    alone, the emissivity is multiplied by its view factor, and the rest of the view exchanges nothing.
     """
     if sky_c is not None and ground_c is not None:
         sky, ground = celsius_to_kelvin(sky_c) ** 4, celsius_to_kelvin(ground_c) ** 4

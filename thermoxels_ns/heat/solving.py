@@ -233,29 +233,17 @@ class _Progress:
 
 
 def _percent(share: float) -> str:
-    """Say a share, also a small one.
-
-    >>> [_percent(share) for share in (0.5, 0.034, 2e-5)]
-    ['50%', '3%', '0.002%']
-    """
+    """Say a share, also a small one."""
     return f"{share:.0%}" if share >= 0.01 else f"{100.0 * share:.1g}%"
 
 
 def _duration(seconds: float) -> str:
-    """Say a time in the unit that suits it.
-
-    >>> [_duration(seconds) for seconds in (90.0, 1000.0, 20000.0)]
-    ['90 s', '17 min', '5.6 h']
-    """
+    """Say a time in the unit that suits it."""
     if seconds < 120.0:
         return f"{seconds:.0f} s"
     return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
 
 
 def _bound(bound_k: float) -> str:
-    """Say a bound; far above what matters its size says nothing.
-
-    >>> [_bound(bound_k) for bound_k in (0.0341, 99.6, 4000.0)]
-    ['0.034 K', '100 K or more', '100 K or more']
-    """
+    """Say a bound; far above what matters its size says nothing."""
     return f"{bound_k:.2g} K" if bound_k < 99.5 else "100 K or more"

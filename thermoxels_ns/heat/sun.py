@@ -60,10 +60,7 @@ class Sunlight:
 def sun_coordinates(moment: datetime) -> SunCoordinates:
     """Compute the sun's coordinates by the low-precision formulae of the Astronomical Almanac (US Naval Observatory).
 
-    They are within 1 arc minute from 1800 to 2200.
-
-    Args:
-        moment: Date and time with a time zone.
+    They are within 1 arc minute from 1800 to 2200. The moment has a time zone.
     """
     days = _days(moment)
     anomaly = math.radians(357.529 + 0.98560028 * days)
@@ -76,12 +73,7 @@ def sun_coordinates(moment: datetime) -> SunCoordinates:
 
 
 def sun_position(moment: datetime, latitude_deg: float, longitude_deg: float) -> SunPosition:
-    """Compute where the sun stands, within 0.02 degrees from 1800 to 2200.
-
-    Args:
-        moment: Date and time with a time zone.
-        latitude_deg: North positive, [degrees], -90 to 90.
-        longitude_deg: East positive, [degrees], -180 to 180.
+    """Compute where the sun stands at a moment with a time zone, within 0.02 degrees from 1800 to 2200.
 
     >>> noon = sun_position(datetime(2025, 6, 21, 12, 2, tzinfo=timezone.utc), 47.0, 0.0)
     >>> round(noon.azimuth_deg), round(noon.elevation_deg, 1)
@@ -101,15 +93,7 @@ def sun_position(moment: datetime, latitude_deg: float, longitude_deg: float) ->
 
 
 def towards_sun(position: SunPosition, up: Vector, north: Vector) -> Vector:
-    """Turn a position into a direction in the coordinates of a mesh.
-
-    Args:
-        position: Where the sun stands.
-        up: Direction that points up, of any length.
-        north: Direction that points north; its part along `up` is left out.
-
-    Returns:
-        Unit vector from the mesh to the sun.
+    """Turn a position into a unit vector from the mesh to the sun; the part of `north` along `up` is left out.
 
     Raises:
         HeatError: `up` and `north` are parallel.
@@ -128,26 +112,16 @@ def towards_sun(position: SunPosition, up: Vector, north: Vector) -> Vector:
 
 
 def air_mass(elevation_deg: float) -> float:
-    """Length of the sunlight's way through the air, relative to the zenith (Kasten and Young 1989).
-
-    Args:
-        elevation_deg: Height of the sun, [degrees], 0 to 90.
-    """
+    """Length of the light's way through the air, relative to the zenith, 0 to 90 degrees (Kasten and Young 1989)."""
     return 1.0 / (math.sin(math.radians(elevation_deg)) + 0.50572 * (elevation_deg + 6.07995) ** -1.6364)
 
 
 def meinel_clear_sky(elevation_deg: float, distance_au: float = 1.0) -> Sunlight:
-    """Estimate the sunlight under a clear sky at sea level.
+    """Estimate the sunlight under a clear sky at sea level; none if the sun is below the horizon.
 
-    Direct: E0 * 0.7^(AM^0.678) with air mass AM (Meinel and Meinel 1976). Diffuse: E0 sin(h) (0.271 - 0.294 tau), tau
-    being the transmitted share of the direct light (Liu and Jordan 1960). Real clear days differ from it by a tenth.
-
-    Args:
-        elevation_deg: Height h of the sun, [degrees].
-        distance_au: Distance of the sun, [astronomical units].
-
-    Returns:
-        The sunlight; none if the sun is below the horizon.
+    Direct: E0 * 0.7^(AM^0.678) with air mass AM (Meinel and Meinel 1976). Diffuse: E0 sin(h) (0.271 - 0.294
+    tau), tau being the transmitted share of the direct light (Liu and Jordan 1960). Real clear days differ from
+    it by a tenth.
     """
     if elevation_deg <= 0.0:
         return Sunlight(0.0, 0.0)
@@ -160,20 +134,12 @@ def meinel_clear_sky(elevation_deg: float, distance_au: float = 1.0) -> Sunlight
 def facet_irradiance(
     normals: npt.NDArray[np.float64], up: Vector, towards: Vector, sunlight: Sunlight, ground_reflectance: float = 0.0
 ) -> npt.NDArray[np.float64]:
-    """Compute the sunlight that falls on facets. None shades another.
+    """Compute the sunlight that falls on facets, [W / m2] of the facet, shape (k,); none shades another.
 
-    Direct light by the cosine of its angle; diffuse light alike from all of the sky, by (1 + cos tilt) / 2; what the
-    ground reflects, alike to all sides, by (1 - cos tilt) / 2 (Liu and Jordan 1963).
-
-    Args:
-        normals: Outward unit normals, shape (k, 3).
-        up: Unit vector that points up.
-        towards: Unit vector that points to the sun.
-        sunlight: How strong it is.
-        ground_reflectance: Share of the sunlight that the ground reflects, 0 to 1.
-
-    Returns:
-        Irradiance, [W / m2] of the facet, shape (k,); 0 if the sun is below the horizon.
+    Direct light by the cosine of its angle; diffuse light alike from all of the sky, by (1 + cos tilt) / 2;
+    what the ground reflects, alike to all sides, by (1 - cos tilt) / 2 (Liu and Jordan 1963). `normals` are
+    outward unit vectors, shape (k, 3); `up` and `towards` (the sun) are unit vectors. A sun below the horizon
+    gives 0.
     """
     height = float(np.dot(up, towards))
     if height <= 0.0:
@@ -185,13 +151,7 @@ def facet_irradiance(
 
 
 def fixed_sun(towards: Vector, sunlight: Sunlight, ground_reflectance: float = 0.0) -> Varying:
-    """Make the irradiance of facets by a sun that stands still, for `AbsorbedSolar.irradiance_w_m2`.
-
-    Args:
-        towards: Direction to the sun in the coordinates of the mesh, of any length.
-        sunlight: How strong it is.
-        ground_reflectance: Share of the sunlight that the ground reflects, 0 to 1.
-    """
+    """Make the irradiance of facets by a sun that stands still in a direction, for `AbsorbedSolar.irradiance_w_m2`."""
     x, y, z = _unit(towards).tolist()
     return Varying(
         lambda places, _: facet_irradiance(places.normals, places.up, (x, y, z), sunlight, ground_reflectance),

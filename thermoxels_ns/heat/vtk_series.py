@@ -19,15 +19,7 @@ def write_heat_series(pvd: Path | str, mesh: TetMesh, solution: HeatSolution) ->
     """Write ``NAME.pvd`` and ``NAME/step-0000.vtu`` and so on, which ParaView and pyvista open as one series.
 
     The .pvd is written last, so it never lists a file that is not there. Steps left over from a longer earlier
-    series are removed.
-
-    Args:
-        pvd: Path of the index file.
-        mesh: The body.
-        solution: Temperatures on its nodes.
-
-    Returns:
-        All paths written, the .pvd first.
+    series are removed. Returns all paths, the .pvd first.
 
     Raises:
         OutputError: A file cannot be written.

@@ -8,9 +8,9 @@ import pytest
 from tests.support.scene_bodies import Z_UP, room, tagged_body, wall
 from thermoxels_ns.fem.problem import TimeSteps
 from thermoxels_ns.heat.materials import Material
+from thermoxels_ns.heat.run import patch_warnings, unused_settings
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import InsideAir, OutsideAir
-from thermoxels_ns.heat.scene_warnings import patch_warnings, unused_settings
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 CONCRETE = {"*": Material("concrete", 1.7, 2200.0, 880.0)}
