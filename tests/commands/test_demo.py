@@ -9,11 +9,9 @@ from pathlib import Path
 
 import pytest
 import tyro
-from rich.console import Console
 
 from thermoxels_ns import cli
 from thermoxels_ns.commands import demo
-from thermoxels_ns.commands.demo import Demo, run_demo
 from thermoxels_ns.commands.demo_results import Target, read_results
 from thermoxels_ns.commands.export import ExportThermoxelsMesh
 from thermoxels_ns.commands.heat import Heat
@@ -211,12 +209,3 @@ def test_a_failing_step_stops_the_demo(quick_demo, fake_command, tmp_path, capfd
     assert "checkpoint not found" in shown_text.err
     assert "4/6" not in shown_text.out
     assert not (tmp_path / "demo" / "index.html").exists()
-
-
-@pytest.mark.parametrize("iterations", [0, -5])
-def test_impossible_iterations_are_refused_before_anything_is_deleted(tmp_path, iterations) -> None:
-    (tmp_path / ".thermoxels-demo").touch()
-    (tmp_path / "index.html").write_text("earlier")
-    with pytest.raises(ThermoxelsError, match="iterations: expected 1 or more"):
-        run_demo(Demo(output_dir=tmp_path, iterations=iterations), Console())
-    assert (tmp_path / "index.html").read_text() == "earlier"

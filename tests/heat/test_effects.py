@@ -172,13 +172,6 @@ def test_functions_are_told_where_they_are(box, concrete) -> None:
     assert np.isin(np.round(places.points_m[:, 2], 12), [0.0, 0.2]).all() and len(places) == len(places.normals) == 48
 
 
-def test_sources_are_asked_at_tetrahedra(box, concrete) -> None:
-    source = Varying(lambda places, time_s: 100.0 * places.points_m[:, 0], in_time=False)
-    assert at_once(box, concrete, InternalHeat(("*",), source)).heat_w[0] == pytest.approx(
-        100.0 * 0.2 * VOLUME, rel=1e-9
-    )
-
-
 @pytest.mark.parametrize(
     ("function", "message"),
     [

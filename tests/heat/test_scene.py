@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import datetime, timezone
 
 import numpy as np
 import pytest
@@ -11,16 +10,7 @@ from tests.support.scene_bodies import room, wall
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.heat.effects import (
-    AbsorbedSolar,
-    Convection,
-    Effect,
-    FixedTemperature,
-    GroundContact,
-    HeatFlux,
-    InternalHeat,
-    Radiation,
-)
+from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, Effect, GroundContact, Radiation
 from thermoxels_ns.heat.materials import Material, material
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import Ground, InsideAir, OutsideAir, Sky, Sun, Surface
@@ -121,29 +111,6 @@ def test_sunlight_on_surfaces_that_absorb() -> None:
             np.testing.assert_allclose(effect.bounded("irradiance_w_m2").at(places, 0.0), expected)
 
 
-def test_the_sun_of_a_date_moves_and_that_of_a_direction_does_not() -> None:
-    start = datetime(2025, 6, 21, 4, tzinfo=timezone.utc)
-    moving = Sun(start=start, latitude_deg=47.0, longitude_deg=8.0, north=(0.0, 1.0, 0.0), clear_sky="meinel")
-    for sun, moves in ((moving, True), (SUN, False)):
-        (effect,) = effects(sun=sun, surfaces=(Surface(absorptivity=0.6),))
-        assert effect.bounded("irradiance_w_m2").in_time is moves
-
-
-def test_entries_are_effects_as_they_stand() -> None:
-    entries = {
-        "fixed_temperature": FixedTemperature(("cut",), 18.0),
-        "heat_flux": HeatFlux(("interior-up",), 10.0),
-        "convection": Convection(("interior-side",), 7.7, 15.0),
-        "radiation": Radiation(("interior-*",), 0.9, 20.0),
-        "absorbed_solar": AbsorbedSolar(("exterior-*",), 0.6, 1000.0),
-        "ground_contact": GroundContact(("exterior-down",), 1.5, 10.0),
-        "internal_heat": InternalHeat(("solid",), 5.0),
-    }
-    for key, effect in entries.items():
-        assert effects(**{key: (effect,)}) == (effect,)
-    assert effects(**{key: (effect,) for key, effect in entries.items()}) == tuple(entries.values())
-
-
 def test_every_patch_is_spoken_of() -> None:
     with pytest.raises(HeatError, match="nothing on interior-up") as caught:
         effects(adiabatic=("cut",), outside_air=OUTSIDE)
@@ -176,11 +143,6 @@ def test_a_patch_with_a_name_of_its_own_is_to_be_named_beside_the_others(name: s
 @pytest.mark.parametrize(
     ("named", "message"),
     [
-        (
-            {"outside_air": OUTSIDE, "sky": Sky(temperature_c=0.0), "surfaces": (Surface(emissivity=0.9),)},
-            "outside_air: expected radiation once on each patch, got sky and ground on exterior-down, .*"
-            "Set coefficient: iso-6946-convection in outside_air",
-        ),
         (
             {"inside_air": INSIDE, "radiation": (Radiation(("interior-up",), 0.9, 20.0),)},
             "inside_air: expected radiation once on each patch, got radiation entry 1 on interior-up as well",

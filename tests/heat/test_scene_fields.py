@@ -8,9 +8,8 @@ import pytest
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.quantities import Places, Varying
-from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4, Convection
+from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4
 from thermoxels_ns.heat.scene_fields import (
-    Ground,
     InsideAir,
     OutsideAir,
     Section,
@@ -47,14 +46,10 @@ def test_every_number_has_a_range_by_its_unit(section: type[Section]) -> None:
             lambda: InsideAir(20.0, "iso-6946-combined", 8.0),
             "got coefficient and coefficient_w_m2k. Remove all but one",
         ),
-        (lambda: InsideAir(20.0, "windy"), "coefficient: expected one of iso-6946-combined"),
         (lambda: InsideAir(20.0, "iso-6946-separate"), "emissivity: expected a number, because iso-6946-separate"),
-        (lambda: InsideAir(20.0, "iso-6946-combined", emissivity=0.9), "emissivity: expected none, because iso-6946-c"),
         (lambda: InsideAir(20.0, "iso-6946-combined", patches=()), "patches: expected a list of names"),
-        (lambda: OutsideAir(0.0, "iso-6946-convection", wind_m_s=-4.0), r"wind_m_s: .*\[m/s\], got -4"),
         (lambda: Surface(), "surface: expected emissivity, absorptivity or both, got neither"),
         (lambda: Sky(below_air_k=-6.0), r"below_air_k: .* at least 0 \[kelvin\]"),
-        (lambda: Ground(), "ground: expected surface_c, reflectance or both"),
         (lambda: Sun(start=NOON, clear_sky="meinel"), "start: expected latitude_deg beside it"),
         (lambda: Sun(start=NOON, **PLACE), "clear_sky or direct_w_m2: expected one of"),
         (
@@ -120,17 +115,3 @@ def test_horizontal_reaches_to_30_degrees() -> None:
         *(leaning(angle) for angle in (-31, -30, -29, 29, 30, 31)),
     )
     assert found == [0.7, 2.5, 2.5, 2.5, 2.5, 5.0]
-
-
-def test_up_is_where_the_scene_says() -> None:
-    assert at(inside_coefficient("iso-6946-convection"), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), up=(0.0, 1.0, 0.0)) == [
-        5.0,
-        2.5,
-    ]
-
-
-def test_they_fit_into_convection_and_are_asked_once() -> None:
-    effect = Convection(("*",), inside_coefficient("iso-6946-combined"), 20.0)
-    assert not effect.bounded("coefficient_w_m2k").in_time
-    places = Places(np.zeros((1, 3)), np.array([CEILING]), Z_UP)
-    assert effect.bounded("coefficient_w_m2k").at(places, 5.0).tolist() == [10.0]

@@ -139,10 +139,6 @@ SUNNY = (
     ("text", "message"),
     [
         ("steady: true\n", "mine.yaml: expected the key materials, got steady. Add materials"),
-        (
-            SMALL.replace("steady: true", "description: x"),
-            "mine.yaml: expected either steady: true or time, got neither",
-        ),
         (SMALL.replace("true", "maybe"), "mine.yaml: steady: expected true or false, got 'maybe'"),
         (SMALL.replace("concrete", "cheese"), "mine.yaml: materials: material: expected one of .*, got 'cheese'"),
         (
@@ -150,16 +146,10 @@ SUNNY = (
             r"mine.yaml: materials: \*: conductivity_w_mk: expected a finite number above 0, got 0",
         ),
         (SMALL + "initial: warm\n", "mine.yaml: initial: expected photographs, or a mapping .*, got 'warm'"),
-        (SMALL + "initial: {temperature_k: 300}\n", "initial: .* got temperature_k. Did you mean temperature_c"),
         (SMALL + "outside: {air_c: 0}\n", r"got outside. Did you mean outside_air\?"),
-        (SMALL + "steady: true\n", "mine.yaml: expected a yaml file, got .*the key steady twice"),
         (AIR.replace("air_c", "air_k"), r"mine.yaml: outside_air: .* got air_k. Did you mean air_c\?"),
-        (AIR.replace("air_c: 0", "air_c: 0 C"), "outside_air: air_c: expected a number, got '0 C'. Write it without"),
         (AIR.replace("air_c: 0", "air_c: 1e1"), "outside_air: air_c: expected a number, got '1e1'. Write 10, without"),
-        (AIR.replace("air_c: 0", "air_c: .nan"), "outside_air: air_c: expected a finite number"),
         (AIR.replace("iso-6946-combined", "windy"), "outside_air: coefficient: expected one of iso-6946-combined"),
-        (AIR.replace("air_c: 0", "air_c: 0, patches: roof"), r"patches: expected a list of names in square brackets"),
-        (SMALL + "outside_air:\n", "mine.yaml: outside_air: expected key: value lines, got nothing"),
         (
             SMALL + "heat_flux: [{patches: [cut], flux_w_m2: 1}, {patches: [cut]}]\n",
             "mine.yaml: heat_flux entry 2: expected the key flux_w_m2, got patches",
@@ -168,9 +158,7 @@ SUNNY = (
             SMALL + "ground_contact: [{patches: [cut], ground_c: 9, resistance_m2k_w: 0}]\n",
             r"mine.yaml: ground_contact entry 1: resistance_m2k_w: expected a finite number above 0 \[m2 K/W\], got 0",
         ),
-        (SMALL + "up: [0, 1]\n", r"mine.yaml: up: expected 3 numbers in square brackets, got \[0, 1\]"),
         (SUNNY.replace("2025-06-21", "2025-13-21"), "mine.yaml: expected a yaml file with dates that exist, got month"),
-        (SUNNY.replace("2025-06-21T12:00:00+02:00", "noon"), "sun: start: expected a date and a time, got 'noon'"),
         (
             SMALL.replace("steady: true", "time: {steps: 1}"),
             "mine.yaml: time: expected the key step_seconds, got steps. Add step_seconds",
@@ -181,13 +169,10 @@ SUNNY = (
             "mine.yaml: time: expected keys out of steps, step_seconds, got duration_s",
         ),
         (SMALL.replace("steady: true", "time: {hours: 1}"), "mine.yaml: time: expected keys out of .* got hours"),
-        (SMALL.replace("steady: true", "time: {steps: 1.5, step_seconds: 1}"), "time: steps: expected a whole number"),
         (
             SMALL.replace("steady: true", "time: {duration_s: 0}"),
             "mine.yaml: time: duration_s: expected a finite number",
         ),
-        (SMALL + "description: 7\n", "mine.yaml: description: expected a text, got 7"),
-        ("a: [\n", "mine.yaml: expected a yaml file"),
     ],
 )
 def test_wrong_files_are_refused(tmp_path, text: str, message: str) -> None:

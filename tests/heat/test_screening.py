@@ -255,19 +255,6 @@ def test_the_sun_is_not_left_out_because_every_look_at_it_is_at_midnight() -> No
     assert "absorbed solar" in [left.effect.split(" on ")[0] for left in night.left_out]
 
 
-@pytest.mark.parametrize("tolerance_k", [0.0, 0.01])
-@pytest.mark.parametrize("time", [None, TimeSteps(3, 60.0)])
-def test_an_effect_on_a_patch_without_triangles_does_nothing(tolerance_k: float, time: TimeSteps | None) -> None:
-    mesh = body(3)
-    assert mesh.boundary is not None
-    nowhere = Convection(("interior-side",), 5.0, 20.0)
-    patches = (*mesh.boundary.patch_names, "interior-side")
-    mesh = replace(mesh, boundary=replace(mesh.boundary, patch_names=patches))
-    problem = HeatProblem(mesh, CONCRETE, effects=(Convection(SIDES, 10.0, 5.0), nowhere))
-    screening = screen(problem, time, tolerance_k)
-    assert [(left.effect, left.bound_k) for left in screening.left_out] == [("convection on interior-side", 0.0)]
-
-
 def test_what_is_left_out_holds_nothing_any_more() -> None:
     """Convection alone would keep the flux's heat down; where both are left out, nothing does."""
     flux_w_m2, seconds = 100.0, 3600.0

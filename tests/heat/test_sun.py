@@ -142,13 +142,6 @@ def test_a_sun_that_moves() -> None:
     assert np.asarray(given.function(walls, 0.0)).tolist() == [0.0, 0.0]
 
 
-def test_steps_follow_a_sun_that_moves_and_not_one_that_stands() -> None:
-    """In an hour it goes 15 degrees, which the cosine on a wall feels; in ten it would be night."""
-    moves = moving_sun(datetime(2025, 6, 21, tzinfo=UTC), 47.0, 0.0, NORTH)
-    assert 600.0 <= moves.resolution_s <= 3600.0
-    assert fixed_sun((3.0, 0.0, 4.0), Sunlight(1000.0, 0.0)).resolution_s == np.inf
-
-
 def test_a_sun_that_stands_still() -> None:
     effect = AbsorbedSolar(("*",), 0.5, fixed_sun((3.0, 0.0, 4.0), Sunlight(1000.0, 0.0)))
     irradiance = effect.bounded("irradiance_w_m2")
@@ -160,16 +153,6 @@ def test_a_sun_that_stands_still() -> None:
 def test_north_along_up_is_refused() -> None:
     with pytest.raises(HeatError, match="a direction other than up"):
         towards_sun(SunPosition(0.0, 0.0, 1.0), Z_UP, (0.0, 0.0, 2.0))
-
-
-def test_light_of_a_clear_sky_by_its_formulas() -> None:
-    """At 30 degrees, by hand: air mass 1.9939, 0.7^(AM^0.678) = 0.56571."""
-    light = meinel_clear_sky(30.0)
-    transmitted = 0.7 ** (1.0 / (0.5 + 0.50572 * 36.07995**-1.6364)) ** 0.678
-    assert transmitted == pytest.approx(0.5657, abs=2e-4)
-    assert light.direct_w_m2 == pytest.approx(1353.0 * transmitted)
-    assert light.diffuse_w_m2 == pytest.approx(1353.0 * 0.5 * (0.271 - 0.294 * transmitted))
-    assert light.diffuse_w_m2 == pytest.approx(70.8, abs=0.1)
 
 
 def test_a_time_without_a_date_is_refused() -> None:

@@ -50,20 +50,6 @@ def test_remove_takes_only_the_series(tmp_path, random_body, solution) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_interrupted_write_leaves_the_old_index(tmp_path, random_body, solution, monkeypatch) -> None:
-    write_heat_series(tmp_path / "heat.pvd", random_body, solution)
-    before = (tmp_path / "heat.pvd").read_bytes()
-
-    def fail(*_, **__) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("xml.etree.ElementTree.ElementTree.write", fail)
-    with pytest.raises(KeyboardInterrupt):
-        write_heat_series(tmp_path / "heat.pvd", random_body, solution)
-    assert (tmp_path / "heat.pvd").read_bytes() == before
-    assert not list(tmp_path.glob(".*"))
-
-
 def test_what_is_in_the_way_is_an_output_error(tmp_path, random_body, solution) -> None:
     (tmp_path / "heat.pvd").mkdir()
     with pytest.raises(OutputError, match=r"heat\.pvd: expected a file that can be removed"):

@@ -120,14 +120,6 @@ def test_an_empty_field_is_refused(mode) -> None:
         build_mesh(trained(boxes()), AS_IT_IS, np.eye(4), MeshOptions(mode))
 
 
-def test_a_density_that_is_no_number_is_refused() -> None:
-    field = trained(boxes((3, 3, 3)))
-    density = field.density.copy()
-    density[4, 4, 4] = np.nan
-    with pytest.raises(MeshError, match="density"):
-        GridSnapshot(field.lattice, density, field.temperature_c, field.observed_weight)
-
-
 @pytest.mark.parametrize("mode", MODES)
 def test_a_small_body_in_256_cubed_voxels(mode) -> None:
     cells = np.zeros((256, 256, 256), dtype=bool)
