@@ -15,13 +15,13 @@ how much of a heat flow is round-off.
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
 import tyro
+from measuring import take_turns
 from scipy import sparse
 
 from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients, LinearSolver
@@ -30,7 +30,6 @@ from thermoxels_ns.fem.p1_kernels import lumped_mass, product_and_bound, stiffne
 from thermoxels_ns.fem.pieces import Pieces
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.schemes import BACKWARD_EULER
-from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.stepper import Stepper
 from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.system import HeatSystem
@@ -171,19 +170,6 @@ def plainly(problem: HeatProblem, steps: TimeSteps) -> np.ndarray:
     for number in range(steps.steps):
         states[number + 1] = states[number] + solver.solve(-(stiffness @ states[number])).x
     return states
-
-
-def take_turns(sides: dict[str, Callable], repeats: int) -> tuple[dict[str, list[float]], dict]:
-    """Run all sides in turns after one run that does not count; times and last results."""
-    seconds: dict[str, list[float]] = {name: [] for name in sides}
-    results: dict[str, np.ndarray | HeatSolution] = {}
-    for run in range(repeats + 1):
-        for name, side in sides.items():
-            begin = time.process_time()
-            results[name] = side()
-            if run:
-                seconds[name].append(time.process_time() - begin)
-    return seconds, results
 
 
 def room(voxels: int) -> TetMesh:

@@ -22,19 +22,20 @@ Prints all rows, and writes them to a csv file and the errors against the second
 
 from __future__ import annotations
 
-import csv
 import gc
 import statistics
 import sys
 import time
 import types
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
+from measuring import logarithmic_panels, save, write_rows
 
 if "tests" not in sys.modules:  # Another distribution may have installed a package of this name.
     sys.modules["tests"] = types.ModuleType("tests")
@@ -43,7 +44,6 @@ if "tests" not in sys.modules:  # Another distribution may have installed a pack
 from tests.support.building_corner import building_corner
 from tests.support.heat_meshes import box_mesh, planes
 from tests.support.shell_mesh import shell_mesh
-from thermoxels_ns.core.checks import replace_when_done
 from thermoxels_ns.fem.error_estimate import ErrorSize, difference_between
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
@@ -52,7 +52,7 @@ from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
-from thermoxels_ns.fem.tolerance import Tolerance, ToleratedSolution, solve_to_tolerance
+from thermoxels_ns.fem.tolerance import Tolerance, solve_to_tolerance
 from thermoxels_ns.heat.effects import Convection, FixedTemperature
 from thermoxels_ns.heat.materials import Material
 
@@ -126,21 +126,24 @@ class HeatAccuracy:
         ):
             rows += self.steady(name, problem, finest, tolerances)
         rows += self.in_time()
-        self.write(rows)
+        shown = [{k: f"{v:.4g}" if isinstance(v, float) else v for k, v in asdict(row).items()} for row in rows]
+        write_rows(self.output, shown)
         self.draw(rows)
 
     def steady(self, name: str, given: HeatProblem, finest: int, tolerances: tuple[float, ...]) -> list[Row]:
         """Rows of a steady problem; `finest` is how often the mesh is refined for the reference."""
-        problems = [given]
-        for _ in range(finest):
-            problems.append(replace(problems[-1], mesh=refine_mesh(problems[-1].mesh), initial_temperature_c=None))
-        exact = solve_steady(problems[-1], order=2, relative_tolerance=1e-9)
+        exact = solve_steady(_refined(given, finest), order=2, relative_tolerance=1e-9)
         settings = [(1, 0), (1, 1), (1, 2), (2, 0), (2, 1)] + ([(2, 2)] if finest > 2 else [])
         by_hand = [
-            Contest(f"P{order}", f"mesh size / {2**refinements}", _refined_solution(given, order, refinements))
+            Contest(
+                f"P{order}",
+                f"mesh size / {2**refinements}",
+                lambda o=order, r=refinements: solve_steady(_refined(given, r), order=o, relative_tolerance=1e-8),
+            )
             for order, refinements in settings
         ]
-        return self.contest(name, given, by_hand, tolerances, None, lambda solution: _error(given, solution, exact))
+        nodes = len(given.mesh.points_m)
+        return self.contest(name, given, by_hand, tolerances, None, lambda s: difference_between(s, exact, nodes))
 
     def in_time(self) -> list[Row]:
         """Rows of NAFEMS T3."""
@@ -158,11 +161,16 @@ class HeatAccuracy:
             missed = max(abs(float(heat.heat_w.mean()) - flows[heat.effect]) for heat in solution.effects)
             return ErrorSize(largest_k, missed / through)
 
+        def march(refinements: int, scheme: Any, steps: int) -> HeatSolution:
+            times = TimeSteps(steps, DURATION_S / steps)
+            solution = solve_heat(_refined(given, refinements), times, scheme=scheme)
+            return replace(solution, temperature_c=solution.temperature_c[:: steps // OUTPUTS])
+
         by_hand = [
             Contest(
                 scheme.name,
                 f"mesh size / {2**refinements}, step {DURATION_S / steps:g} s",
-                _refined_march(given, refinements, scheme, steps),
+                partial(march, refinements, scheme, steps),
             )
             for refinements in range(3)
             for scheme in (BACKWARD_EULER, CRANK_NICOLSON, SDIRK2)
@@ -180,7 +188,11 @@ class HeatAccuracy:
         error: Callable[[Any], ErrorSize],
     ) -> list[Row]:
         """Rows of all settings by hand and of the driver with each tolerance, which take turns."""
-        driven = [Contest("driver", f"{tolerance}", _driven(given, tolerance, duration_s)) for tolerance in tolerances]
+        options: dict[str, Any] = {"duration_s": duration_s, "outputs": OUTPUTS, "log": lambda line: None}
+        driven = [
+            Contest("driver", f"{one}", partial(solve_to_tolerance, given, Tolerance(one), **options))
+            for one in tolerances
+        ]
         self.take_turns([*by_hand, *driven])
         rows, errors = [], {}
         for one in by_hand:
@@ -188,12 +200,19 @@ class HeatAccuracy:
             unknowns = one.result.temperature_c.shape[-1]
             if isinstance(one.result, SteadySolution):
                 unknowns += len(one.result.edge_temperature_c)
-            rows.append(_row(name, one.method, one.setting, unknowns, one.median_s, true))
+            cost = unknowns, one.median_s, true.temperature_k, true.heat_flow
+            rows.append(Row(name, one.method, one.setting, *cost))
             print(rows[-1], flush=True)
         for tolerance_k, one in zip(tolerances, driven):
             good = [other for other in by_hand if errors[other.setting, other.method].temperature_k <= tolerance_k]
             over_best = max((one.over(other) for other in good), default=float("nan"))
-            rows.append(_driver_row(name, one, tolerance_k, over_best, error(one.result.solution)))
+            true, level = error(one.result.solution), one.result.settings
+            setting = f"P{level.order}, mesh size / {2**level.refinements}"
+            if level.step_tolerance_k is not None:
+                setting += f", steps to {level.step_tolerance_k:.2g} K"
+            over_true = level.error.temperature_k / true.temperature_k
+            cost = level.num_nodes, one.median_s, true.temperature_k, true.heat_flow
+            rows.append(Row(name, "driver", setting, *cost, tolerance_k, over_true, over_best))
             print(rows[-1], flush=True)
         return rows
 
@@ -211,48 +230,20 @@ class HeatAccuracy:
                 if number:
                     one.seconds.append(time.process_time() - begin)
 
-    def write(self, rows: list[Row]) -> None:
-        """Write the csv file."""
-        self.output.parent.mkdir(parents=True, exist_ok=True)
-        with replace_when_done(self.output) as path, path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, [column.name for column in fields(Row)])
-            writer.writeheader()
-            for row in rows:
-                writer.writerow({k: f"{v:.4g}" if isinstance(v, float) else v for k, v in asdict(row).items()})
-
     def draw(self, rows: list[Row]) -> None:
         """Draw errors against seconds, one panel per problem."""
-        import matplotlib
-
-        matplotlib.use("Agg")
-        from matplotlib import pyplot
-        from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
         problems = list(dict.fromkeys(row.problem for row in rows))
-        figure, panels = pyplot.subplots(1, len(problems), figsize=(4.6 * len(problems), 4.2), layout="constrained")
-        for panel, problem in zip(panels, problems):
+        figure, panels = logarithmic_panels(1, len(problems), figsize=(4.6 * len(problems), 4.2))
+        for panel, problem in zip(panels[0], problems):
             mine = [row for row in rows if row.problem == problem]
             for method in dict.fromkeys(row.method for row in mine):
                 dots = sorted((row.seconds, row.error_k) for row in mine if row.method == method)
                 line = "" if method == "driver" or problem == "NAFEMS T3" else "-"
                 marker, size, colour = ("*", 13, "black") if method == "driver" else ("o", 5, None)
                 panel.plot(*zip(*dots), marker + line, markersize=size, color=colour, label=method)
-            panel.set(
-                xscale="log",
-                yscale="log",
-                title=problem,
-                xlabel="processor seconds",
-                ylabel="largest error of a node [K]",
-            )
-            panel.grid(True, which="both", alpha=0.25)
-            for axis in (panel.xaxis, panel.yaxis):
-                axis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-                axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-                axis.set_minor_formatter(NullFormatter())
+            panel.set(title=problem, xlabel="processor seconds", ylabel="largest error of a node [K]")
             panel.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=4, columnspacing=0.8, handletextpad=0.3)
-        self.picture.parent.mkdir(parents=True, exist_ok=True)
-        with replace_when_done(self.picture) as path:
-            figure.savefig(path, dpi=110)
+        save(figure, self.picture)
 
 
 def shell() -> HeatProblem:
@@ -270,48 +261,11 @@ def rod(parts: int) -> HeatProblem:
     return HeatProblem(mesh, Material("steel", 35.0, 7200.0, 440.5), effects=effects)
 
 
-def _refined_problem(given: HeatProblem, refinements: int) -> HeatProblem:
+def _refined(given: HeatProblem, refinements: int) -> HeatProblem:
     problem = replace(given)
     for _ in range(refinements):
         problem = replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=None)
     return problem
-
-
-def _refined_solution(given: HeatProblem, order: int, refinements: int) -> Callable[[], SteadySolution]:
-    return lambda: solve_steady(_refined_problem(given, refinements), order=order, relative_tolerance=1e-8)
-
-
-def _refined_march(given: HeatProblem, refinements: int, scheme: Any, steps: int) -> Callable[[], HeatSolution]:
-    def run() -> HeatSolution:
-        solution = solve_heat(_refined_problem(given, refinements), TimeSteps(steps, DURATION_S / steps), scheme=scheme)
-        every = steps // OUTPUTS
-        return replace(solution, temperature_c=solution.temperature_c[::every])
-
-    return run
-
-
-def _driven(given: HeatProblem, tolerance_k: float, duration_s: float | None) -> Callable[[], ToleratedSolution]:
-    return lambda: solve_to_tolerance(
-        given, Tolerance(tolerance_k), duration_s=duration_s, outputs=OUTPUTS, log=lambda line: None
-    )
-
-
-def _driver_row(name: str, driven: Contest, tolerance_k: float, over_best: float, true: ErrorSize) -> Row:
-    level = driven.result.settings
-    setting = f"P{level.order}, mesh size / {2**level.refinements}"
-    if level.step_tolerance_k is not None:
-        setting += f", steps to {level.step_tolerance_k:.2g} K"
-    over_true = level.error.temperature_k / true.temperature_k
-    errors = true.temperature_k, true.heat_flow
-    return Row(name, "driver", setting, level.num_nodes, driven.median_s, *errors, tolerance_k, over_true, over_best)
-
-
-def _error(given: HeatProblem, solution: SteadySolution, exact: SteadySolution) -> ErrorSize:
-    return difference_between(solution, exact, len(given.mesh.points_m))
-
-
-def _row(name: str, method: str, setting: str, unknowns: int, seconds: float, error: ErrorSize) -> Row:
-    return Row(name, method, setting, unknowns, seconds, error.temperature_k, error.heat_flow)
 
 
 if __name__ == "__main__":

@@ -22,13 +22,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
+from measuring import take_turns
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
@@ -86,16 +86,16 @@ class HeatSpeed:
         sides = {"ours": lambda: self.ours(points, tets, start, lumped)}
         if not alone:
             sides["scikit-fem"] = lambda: self.scikit_fem(points, tets, start, lumped)
-        seconds, last = take_turns(sides, self.repeats)
+        seconds, last = take_turns(sides, self.repeats, time.perf_counter)
         with tempfile.TemporaryDirectory() as folder:
             np.save(Path(folder) / "points.npy", points)
             np.save(Path(folder) / "tets.npy", tets)
             memory = {side: self.in_own_process(side, Path(folder), lumped) for side in sides}
-        ours, ours_mb = seconds["ours"], memory["ours"]
+        ours, ours_mb = statistics.median(seconds["ours"]), memory["ours"]
         per_million = f"{1e6 * ours / len(tets):.2f} s"
         if alone:
             return f"| {len(tets):,} | | {ours:.2f} s | | {per_million} | | {ours_mb:.0f} MB | | |"
-        theirs, theirs_mb = seconds["scikit-fem"], memory["scikit-fem"]
+        theirs, theirs_mb = statistics.median(seconds["scikit-fem"]), memory["scikit-fem"]
         difference = np.abs(last["ours"] - last["scikit-fem"]).max()
         memory_ratio = f"{ours_mb / theirs_mb:.2f}" if theirs_mb > 0 else ""
         return (
@@ -181,21 +181,6 @@ def temperatures(points: np.ndarray) -> np.ndarray:
     """A gradient and a warm spot, [degrees Celsius]: no mode of the cube, which one iteration would solve."""
     spot = np.exp(-np.square(points - 0.4).sum(axis=1) / 0.05)
     return 20.0 + 5.0 * points[:, 0] + 10.0 * spot
-
-
-def take_turns(
-    sides: dict[str, Callable[[], np.ndarray]], repeats: int
-) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-    """Median seconds and last result of each side; our first call, which loads kernels, does not count."""
-    sides["ours"]()
-    seconds: dict[str, list[float]] = {side: [] for side in sides}
-    last = {}
-    for _ in range(repeats):
-        for side, run in sides.items():
-            begin = time.perf_counter()
-            last[side] = run()
-            seconds[side].append(time.perf_counter() - begin)
-    return {side: statistics.median(times) for side, times in seconds.items()}, last
 
 
 if __name__ == "__main__":

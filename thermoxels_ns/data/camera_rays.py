@@ -65,14 +65,9 @@ class CameraRays:
         return torch.searchsorted(self._first_pixel, pixels, right=True) - 1
 
     def columns(self, pixels: Int[Tensor, " n"]) -> dict[str, Tensor]:
-        """Return the rays through the centres of pixels.
+        """Return the rays through the centres of pixels, int64 numbers on the device of this object.
 
-        Args:
-            pixels: Pixel numbers, int64, on the device of this object.
-
-        Returns:
-            Fields of a `RayBundle`: origins (n, 3), unit directions (n, 3), pixel_area (n, 1) and camera_indices
-            (n, 1) int64.
+        Fields of a `RayBundle`: origins (n, 3), unit directions (n, 3), pixel_area (n, 1) and camera_indices (n, 1).
         """
         image = self.image_of(pixels)
         if self.has_table:

@@ -23,10 +23,7 @@ _LENGTH = struct.Struct("<Q")
 
 
 def read_model(folder: Path) -> Any:
-    """Read the COLMAP model in a folder.
-
-    Returns:
-        A `pycolmap.Reconstruction`.
+    """Read the COLMAP model in a folder as a `pycolmap.Reconstruction`.
 
     Raises:
         SceneError: A file ends too early or cannot be read.
@@ -42,9 +39,6 @@ def read_model(folder: Path) -> Any:
 
 def check_complete(folder: Path) -> None:
     """Refuse a model whose files end before what they announce: pycolmap would read on behind the end.
-
-    Args:
-        folder: Holds cameras, images, points3D and, of newer versions, frames; text is not looked at.
 
     Raises:
         SceneError: A file is too short; names it.

@@ -34,16 +34,10 @@ TrackSource = Literal["auto", "given", "off"]
 
 
 def find_feature_rays(scene: SceneFile, training: Sequence[int], source: TrackSource = "auto") -> FeatureRays | None:
-    """The lines of sight of the photographs that train, if the scene has tracks.
+    """The lines of sight of the photographs that train, in input coordinates; None where the scene has no tracks.
 
-    Args:
-        scene: The scene.
-        training: Numbers of its frames that train; what others see is not used.
-        source: auto: the file that the json names, else a COLMAP model in the scene's folder; given: only the file;
-            off: none.
-
-    Returns:
-        Lines in input coordinates; None where there are no tracks.
+    The source "auto" is the file that the json names, else a COLMAP model in the scene's folder; "given" only the file.
+    What photographs see that do not train is not used.
 
     Raises:
         SceneError: The file that the json names lies outside the scene, cannot be used, or does not fit the poses. A
@@ -68,18 +62,12 @@ def find_feature_rays(scene: SceneFile, training: Sequence[int], source: TrackSo
 
 
 def read_colmap_tracks(scene: SceneFile) -> SparseTracks | None:
-    """Read the tracks of the COLMAP model in a scene's folder and bring them to the scene's poses.
+    """Read the tracks of the COLMAP model in a scene's folder, if any, and bring them to the scene's poses.
 
     Photographs are matched by name. The similarity between the model's cameras and the json's poses moves the points;
     what it leaves is measured in the photographs: how far apart a point is seen from the model's pose and from the
-    given one. A model that does not agree is not used, and a warning says why.
-
-    Args:
-        scene: The scene; its `Frame.name` become the tracks' names.
-
-    Returns:
-        Tracks of the photographs that agree, in input coordinates; None without a model, or with one that cannot be
-        used.
+    given one. Photographs that do not agree are left out; without enough that do the model is not used, and a warning
+    says why.
     """
     folder = _model_folder(scene.folder)
     if folder is None:
@@ -216,15 +204,7 @@ def _off_px(
     frame: IntArray,
     point: IntArray,
 ) -> FloatArray:
-    """Median angle, times the focal length, between a frame's points as its two poses see them, shape (frames,).
-
-    Args:
-        frames: The frames.
-        model: Poses (frames, 4, 4) and points (n, 3) in COLMAP's world.
-        given: The same in the json's world.
-        frame: Frame of each sighting.
-        point: Point of each sighting.
-    """
+    """Median angle, times the focal length, between a frame's points as its two poses see them, shape (frames,)."""
     seen = []
     for poses, points in (model, given):
         line = np.einsum("sji,sj->si", poses[frame, :3, :3], points[point] - poses[frame, :3, 3])
@@ -255,18 +235,12 @@ class Similarity:
 
 
 def align_poses(source: FloatArray, target: FloatArray) -> Similarity | None:
-    """Find the similarity that brings cameras of one world to their poses in another.
+    """Find the similarity that brings cameras to world of one world, shape (n, 4, 4), to the same ones in another.
 
     The rotation is that between the cameras' axes, so that cameras on one line will do; scale and translation fit the
     centres in the least squares. The half of the cameras that fits worst is left out and the fit repeated until the
-    half stays the same (least trimmed squares), so that some wrong poses do not move the others.
-
-    Args:
-        source: Camera to world, shape (n, 4, 4).
-        target: The same cameras in the same order, with the same axes, shape (n, 4, 4).
-
-    Returns:
-        The similarity, however well it fits; None where the cameras are fewer than three or at one place.
+    half stays the same (least trimmed squares), so that some wrong poses do not move the others. None where the cameras
+    are fewer than three or at one place.
     """
     if len(source) < _FEWEST:
         return None

@@ -133,16 +133,12 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
     def training_rays(
         self, stream: int, max_rays_per_image: int | None = None, *, stride: int = 1, chunk: int = 16384
     ) -> Iterator[RayBundle]:
-        """Give a regular, always equal subset of the training rays, in order.
+        """Give a regular, always equal subset of the training rays, in order, without decoding photographs.
 
-        Works in every test_mode; decodes no photographs.
-
-        Args:
-            stream: Bits of `core.ray_streams`; thermal gives valid pixels only, both bits give every ray once. A
-                stream that does not train (see the option streams) gives nothing.
-            max_rays_per_image: Widen the stride per photograph until no more rays than this remain.
-            stride: Every n-th pixel in both directions.
-            chunk: Rays per bundle; the last one may have fewer.
+        The bits of `core.ray_streams` say which: thermal gives valid pixels only, both bits give every ray once; a
+        stream that does not train (see the option streams) gives nothing. The stride, every n-th pixel in both
+        directions, is widened per photograph until no more than `max_rays_per_image` remain. Bundles have `chunk` rays
+        or fewer.
         """
         return self.train_rays.grid(stream, stride, max_rays_per_image, chunk)
 
@@ -189,12 +185,6 @@ def views_of_cameras(cameras: Sequence[Cameras]) -> Views:
     Lens distortion is ignored, so at the border of a distorted photograph a view reaches a little too far or not far
     enough. A fisheye lens becomes a pinhole with the same focal length whose image spans the same angles along both
     axes, at most 80 degrees to each side; a panorama (equirectangular) becomes the six sides of a cube.
-
-    Args:
-        cameras: Cameras of the trained scene.
-
-    Returns:
-        The views in the coordinates of the trained scene.
     """
     parts = [_views_of_one(each.to("cpu")) for each in cameras]
     return Views(

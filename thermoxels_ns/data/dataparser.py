@@ -277,13 +277,9 @@ def survey_thermal_files(
 ) -> ThermalSurvey:
     """Read every thermal file once.
 
-    Args:
-        paths: All thermal files of the scene, training and evaluation.
-        unit: Meaning of the numbers in the files.
-        valid_range_c: Temperatures outside are masked, [degrees Celsius].
-        bounds_c: Range the scene declares, [degrees Celsius]. It is widened to the extremes of training files that hold
-            temperatures of their own; files that hold shares of the range cannot exceed it.
-        training: The files that training uses; range and stuck pixels come from them alone. None: all.
+    Range and stuck pixels come from the files in `training` alone (None: all). The range that the scene declares,
+    `bounds_c`, is widened to the extremes of training files that hold temperatures of their own; files that hold shares
+    of the range cannot exceed it. Temperatures in degrees Celsius.
 
     Raises:
         ThermalFileError: A file cannot be read or has no valid pixel at all.

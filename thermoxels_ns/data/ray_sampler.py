@@ -25,13 +25,8 @@ class RaySampler:
 
     Where a pair shares its camera, a ray through a photograph's pixel carries both targets, and the thermal target
     only where the thermal pixel is valid. Else the thermal cameras have rays of their own, drawn among valid pixels.
-    Photographs are decoded at the first draw, so that the grids (which need no colour) are cheap.
-
-    Args:
-        dataset: The photographs.
-        streams: Which targets the drawn rays carry.
-        storage: Where the tables live.
-        device: Where batches go.
+    Photographs are decoded at the first draw, so that the grids (which need no colour) are cheap. Tables live in
+    `storage`, batches go to `device`.
     """
 
     def __init__(
@@ -87,12 +82,10 @@ class RaySampler:
             _ = self.thermal_rays
 
     def draw(self, generator: torch.Generator, rgb_rays: int, thermal_rays: int) -> tuple[RayBundle, dict[str, Tensor]]:
-        """Draw rays with equal chance for every pixel, with replacement.
+        """Draw rays with equal chance for every pixel, with replacement; numbers from the CPU, so that devices agree.
 
-        Args:
-            generator: Source of the numbers, on the CPU whatever the device, so that every device sees one batch.
-            rgb_rays: Rays through photographs (with streams "thermal" and a shared camera: through thermal pixels).
-            thermal_rays: Rays of the thermal cameras where they are not the photographs'.
+        With the streams "thermal" and a shared camera `rgb_rays` go through thermal pixels; `thermal_rays` count where
+        thermal cameras are not the photographs'.
 
         Returns:
             Rays (colour first, then thermal only) and the targets ``image`` (n, 3) and ``thermal`` (n, 1), float32 and
@@ -125,15 +118,7 @@ class RaySampler:
         return self._bundle(rays, torch.cat(bits)), batch
 
     def grid(self, stream: int, stride: int, max_rays_per_image: int | None, chunk: int) -> Iterator[RayBundle]:
-        """Give the usable pixels of a stream on a regular grid, in order, `chunk` rays at a time.
-
-        Args:
-            stream: `RGB_STREAM`, `THERMAL_STREAM` or both bits (where the camera is shared a pixel then comes once).
-                A stream that does not train gives nothing.
-            stride: Every n-th pixel in both directions.
-            max_rays_per_image: Widen the stride per photograph until no more rays than this remain.
-            chunk: Rays per bundle; the last one of a stream may have fewer.
-        """
+        """Give the usable pixels of a stream on a regular grid, see `ThermalDataManager.training_rays`."""
         if not 0 < stream <= RGB_STREAM | THERMAL_STREAM or min(stride, chunk, max_rays_per_image or 1) < 1:
             raise ValueError(f"no such grid: {stream=}, {stride=}, {max_rays_per_image=}, {chunk=}")
         wanted = stream & _BITS[self.streams]

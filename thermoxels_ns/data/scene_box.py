@@ -29,18 +29,10 @@ _LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 
 def find_scene_box(
     scene: SceneFile, option: Sequence[Sequence[float]] | None, rotation: npt.NDArray[np.float64]
 ) -> tuple[Box, str]:
-    """Find the scene's box, axis-parallel after `rotation`.
+    """Find the scene's box, axis-parallel after the world's `rotation`, and say in words where it came from.
 
     In order: the option, ``scene_box`` in the json (both in input coordinates), sparse points (``ply_file_path``, or a
     COLMAP model in one of `COLMAP_FOLDERS`), the cameras.
-
-    Args:
-        scene: The scene.
-        option: Two corners from the configuration, or None.
-        rotation: Rotation of the world that the dataparser applies, shape (3, 3).
-
-    Returns:
-        The box in rotated input coordinates, and in words where it came from.
 
     Raises:
         SceneError: The box has no volume or is not finite, or none can be found.
@@ -66,11 +58,6 @@ def box_of_points(points: npt.NDArray[np.float64], frames: Sequence[Frame], rota
 
     Points that are not finite, behind every camera, or ten times farther from the median point than the median
     distance are strays of the reconstruction and do not count.
-
-    Args:
-        points: Shape (n, 3), rotated input coordinates.
-        frames: The cameras that saw them.
-        rotation: Rotation of the world, shape (3, 3).
     """
     points = points[np.isfinite(points).all(axis=1)]
     points = points[:: max(len(points) // _MOST_POINTS, 1)]
@@ -100,10 +87,6 @@ def box_of_cameras(frames: Sequence[Frame], rotation: npt.NDArray[np.float64]) -
 
     The centre is the point nearest to all optical axes (least squares). Half the side is the median over the cameras
     of distance times the tangent of half the field of view: what an average photograph shows at that distance.
-
-    Args:
-        frames: The cameras.
-        rotation: Rotation of the world, shape (3, 3).
     """
     poses = np.stack([rotation @ frame.pose[:3] for frame in frames])
     axes, origins = -poses[:, :, 2], poses[:, :, 3]

@@ -57,9 +57,7 @@ class SceneFile:
 def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "error") -> SceneFile:
     """Read a scene folder (or the json in it) and check all that can be checked without decoding images.
 
-    Args:
-        data: The scene's folder or its json.
-        missing_thermal: What to do with a frame without a thermal partner: raise, or leave it out and name it.
+    Frames without a thermal partner raise, or are left out and named (`missing_thermal`).
 
     Raises:
         SceneError: Something is missing, doubled, not finite or contradictory; the message names it.

@@ -116,12 +116,6 @@ def feature_rays(
     line's length is that of a triangulation: the error in the image, over the focal length and the sine of that angle,
     times the length.
 
-    Args:
-        tracks: Points and who sees them.
-        frames: Frames whose sightings are used, in any order.
-        name: What the tracks are called in messages.
-        remedy: What messages advise.
-
     Raises:
         SceneError: None of the frames is in the tracks, or the tracks belong to other poses.
     """

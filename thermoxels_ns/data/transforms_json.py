@@ -102,15 +102,9 @@ def _image_size(path: Path, where: str) -> tuple[int, int]:
 
 
 def path_inside(folder: Path, name: str, where: str) -> Path:
-    """Turn a file name found in a json or in metadata into a path inside a folder.
+    """Turn a file name found in a json or in metadata into a resolved path inside a folder; it need not exist.
 
-    Args:
-        folder: The folder that it must lie in.
-        name: The name as it was found, relative to `folder`, with forward or backward slashes.
-        where: What names it, for the message, such as ``transforms.json: frame 3``.
-
-    Returns:
-        The path, resolved; it need not exist.
+    `where` names its place in messages, such as ``transforms.json: frame 3``.
 
     Raises:
         SceneError: The name is empty or absolute, climbs out, has a drive, or a link on its way leads out.

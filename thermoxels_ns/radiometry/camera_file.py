@@ -132,13 +132,6 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
 
     A picture (palette JPEG, 8-bit PNG) is refused: its colours cannot be turned back into temperatures.
 
-    Args:
-        path: The file; its name may end as it likes.
-        options: Camera, scale, emissivity and the rest; None: what the file says.
-
-    Returns:
-        Temperatures with NaN where the camera measured nothing, and what the file says of the measurement.
-
     Raises:
         ThermalFileError: The file is missing, empty, damaged, absurdly large, a picture without temperatures or of no
             known format, or its counts have no known unit.

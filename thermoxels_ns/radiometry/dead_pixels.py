@@ -17,13 +17,7 @@ def find_dead_pixels(stack: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
     A stuck pixel alone is no proof: where the image border always shows the same cold sky, or in a scene of one
     temperature, live pixels are constant too. So three things must hold: the pixel has one finite value in all
     frames; fewer than half of all pixels do; and the median of the 5 x 5 pixels around it differs from its value in
-    at least half of the frames.
-
-    Args:
-        stack: Temperatures, shape (frames, height, width), NaN where invalid.
-
-    Returns:
-        Shape (height, width), True where dead; all False for fewer than 5 frames.
+    at least half of the frames. Temperatures (frames, height, width) to (height, width); fewer than 5 frames tell none.
     """
     frames, height, width = stack.shape
     constant = np.isfinite(stack[0]) & (stack == stack[:1]).all(axis=0)

@@ -35,16 +35,9 @@ def errors_name(
     remedy: str = "The file is damaged; copy it from the camera again.",
     error: type[ThermoxelsError] = SceneError,
 ) -> Iterator[None]:
-    """Turn every error of the block into one that names the file; our own errors pass as they are.
+    """Turn every error of the block into one of type `error` that names the file; our own errors pass as they are.
 
-    Args:
-        path: The file that the block reads.
-        expected: What it should be, for the message.
-        remedy: What to do if it is damaged.
-        error: Type to raise.
-
-    Raises:
-        ThermoxelsError: Of the type `error`, in place of whatever the block raised.
+    `expected` is what the file should be, `remedy` what to do if it is damaged.
     """
     try:
         with quiet_decoders():

@@ -92,11 +92,6 @@ def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrid
     programs, and is free to download. So the user names the library; without it the file is refused and says what to
     do.
 
-    Args:
-        path: The file.
-        library: Where `libdirp.so` or `libdirp.dll` is, in its folder of the SDK.
-        overrides: Measurement parameters that replace the file's.
-
     Raises:
         ThermalFileError: The file is cut off; there is no library, it is another one, or it refuses the file or the
             parameters.

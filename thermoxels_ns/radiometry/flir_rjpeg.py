@@ -56,14 +56,7 @@ class FlirImage:
         return (self.counts < low) | (self.counts > high)
 
     def temperature_c(self, conditions: Conditions | None = None) -> npt.NDArray[np.float32]:
-        """Turn the counts into degrees.
-
-        Args:
-            conditions: Emissivity and the rest; None: the camera's settings.
-
-        Returns:
-            Shape (height, width), [degrees C], NaN outside the calibrated range.
-        """
+        """Degrees C, shape (height, width), NaN outside the calibrated range; None: with the camera's settings."""
         model = RadiometricModel(conditions or self.camera.conditions, self.camera.planck, self.camera.air)
         temperature_c = model.temperature_c(self.counts)
         return np.where(self.outside_calibration, np.nan, temperature_c).astype(np.float32)

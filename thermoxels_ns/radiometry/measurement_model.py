@@ -68,26 +68,18 @@ class PlanckConstants:
             )
 
     def signal(self, temperature_k: npt.ArrayLike) -> Floats:
-        """Signal of a black body, S = R1 / (R2 (exp(B / T) - F)) - O.
+        """Counts of a black body, S = R1 / (R2 (exp(B / T) - F)) - O, any shape, float64.
 
-        Args:
-            temperature_k: Any shape, [K], above 0; below B / ln F where F is above 1 (thousands of kelvin).
-
-        Returns:
-            Counts, same shape, float64.
+        Temperatures [K] above 0, and below B / ln F where F is above 1 (thousands of kelvin).
         """
         temperature_k = np.asarray(temperature_k, dtype=np.float64)
         with np.errstate(divide="ignore", over="ignore"):  # near absolute zero: no signal but the offset
             return self.r1 / (self.r2 * (np.exp(self.b / temperature_k) - self.f)) - self.o
 
     def temperature_k(self, signal: npt.ArrayLike) -> Floats:
-        """Temperature of a black body, T = B / ln(R1 / (R2 (S + O)) + F), [K].
+        """Temperature of a black body, T = B / ln(R1 / (R2 (S + O)) + F), [K], any shape, float64.
 
-        Args:
-            signal: Counts, any shape.
-
-        Returns:
-            Same shape, float64; NaN where no temperature gives so small a signal (S + O not above 0).
+        NaN where no temperature gives so small a signal (S + O not above 0).
         """
         radiance = np.asarray(signal, dtype=np.float64) + self.o
         radiance = np.where(radiance > 0, radiance, np.nan)
@@ -121,13 +113,7 @@ class PlanckBand:
         return inverse_k, np.log(radiance)
 
     def signal(self, temperature_k: npt.ArrayLike) -> Floats:
-        """Radiance of a black body in the band, [W / (m2 sr)].
-
-        Args:
-            temperature_k: Any shape, [K], from 50 to 6000.
-
-        Returns:
-            Same shape, float64.
+        """Radiance of a black body in the band, [W / (m2 sr)], from 50 to 6000 K, any shape, float64.
 
         >>> round(float(PlanckBand().signal(300.0)), 2)
         51.48
@@ -136,14 +122,7 @@ class PlanckBand:
         return np.exp(np.interp(1.0 / np.asarray(temperature_k, dtype=np.float64), inverse_k, logarithm))
 
     def temperature_k(self, signal: npt.ArrayLike) -> Floats:
-        """Temperature of a black body with this radiance, [K]; NaN where it is below that of 50 K or not above 0.
-
-        Args:
-            signal: Radiance, [W / (m2 sr)], any shape.
-
-        Returns:
-            Same shape, float64.
-        """
+        """Temperature of a black body with this radiance, [K]; NaN where it is below that of 50 K or not above 0."""
         inverse_k, logarithm = self._table
         radiance = np.asarray(signal, dtype=np.float64)
         known = radiance >= np.exp(logarithm[-1])
@@ -176,16 +155,11 @@ class AirConstants:
             check_between(field.name, getattr(self, field.name), -limit, limit, f"from {-limit:g} to {limit:g}")
 
     def transmission(self, distance_m: float, air_c: float, relative_humidity: float) -> float:
-        """Share of the object's radiation that reaches the camera, 1 at distance 0.
+        """Share of the object's radiation that reaches the camera, 1 at distance 0 m.
 
         tau = X exp(-sqrt(d) (alpha1 + beta1 sqrt(w))) + (1 - X) exp(-sqrt(d) (alpha2 + beta2 sqrt(w))) with the water
-        content w = humidity exp(1.5587 + 0.06939 t - 2.7816e-4 t^2 + 6.8455e-7 t^3), t in degrees C (Minkina and
-        Dudzik 2009, section 2.3: the model of FLIR's cameras).
-
-        Args:
-            distance_m: Between object and camera, [m], at least 0.
-            air_c: Air temperature, [degrees C].
-            relative_humidity: 0 to 1.
+        content w = humidity exp(1.5587 + 0.06939 t - 2.7816e-4 t^2 + 6.8455e-7 t^3), t in degrees C, humidity 0 to 1
+        (Minkina and Dudzik 2009, section 2.3: the model of FLIR's cameras).
 
         >>> AirConstants().transmission(0.0, 20.0, 0.5)
         1.0
@@ -218,25 +192,14 @@ class RadiometricModel:
     air: AirConstants = AirConstants()
 
     def signal(self, temperature_c: npt.ArrayLike) -> Floats:
-        """Signal that the sensor gives in front of objects of these temperatures (the measurement formula above).
-
-        Args:
-            temperature_c: Any shape, [degrees C].
-
-        Returns:
-            Counts, same shape, float64.
-        """
+        """Counts that the sensor gives in front of objects of these temperatures, [degrees C], any shape, float64."""
         weight, background = self._weights()
         return weight * self.sensor.signal(_kelvin(temperature_c)) + background
 
     def temperature_c(self, signal: npt.ArrayLike) -> Floats:
-        """Temperature of the objects that give this signal: the inverse of `signal`.
+        """Temperature [degrees C] of the objects that give these counts, any shape: the inverse of `signal`.
 
-        Args:
-            signal: Counts, any shape.
-
-        Returns:
-            Same shape, float64, [degrees C]; NaN where reflections and air alone would give more signal than there is.
+        NaN where reflections and air alone would give more signal than there is.
         """
         weight, background = self._weights()
         object_signal = (np.asarray(signal, dtype=np.float64) - background) / weight
@@ -275,19 +238,10 @@ def corrected_temperature_c(
     sensor: SensorCurve = LONG_WAVE,
     air: AirConstants = AirConstants(),
 ) -> Floats:
-    """Temperatures as the camera would have shown them with other settings.
+    """Temperatures [degrees C] as the camera would have shown them with other settings, any shape, float64.
 
-    They are turned back into the signal that they were computed from with `before`, and read again with `after`.
-
-    Args:
-        temperature_c: Any shape, [degrees C], computed with the settings `before`.
-        before: The settings that the camera used.
-        after: The settings that are right.
-        sensor: Calibration of the sensor; its offset and scale do not matter.
-        air: Transmission of the air.
-
-    Returns:
-        Same shape, float64, [degrees C].
+    They are turned back into the signal that they were computed from with `before`, and read again with `after`. The
+    sensor's offset and scale do not matter.
     """
     if before == after:
         return np.asarray(temperature_c, dtype=np.float64)

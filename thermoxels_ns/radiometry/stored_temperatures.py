@@ -87,14 +87,9 @@ class CountImage:
 def read_count_image(
     path: Path, suffix: str, camera: CameraName | None, unit: ThermalUnit | None, valid_range_c: tuple[float, float]
 ) -> CountImage:
-    """Read a single-channel TIFF or PNG.
+    """Read a single-channel TIFF or PNG (`suffix` is what it is by content).
 
-    Args:
-        path: The file.
-        suffix: What it is by content, ``.tiff`` or ``.png``.
-        camera: Preset that the user chose; None: by what the file says, for counts.
-        unit: Meaning of the counts that the user gave; it comes before any preset.
-        valid_range_c: Temperatures outside are masked, [degrees C].
+    The unit that the user gave comes before any preset, and the user's preset before what the file says.
 
     Raises:
         ThermalFileError: The file is damaged, too large, of 8 bits or in colour, or its counts have no known unit.
@@ -151,12 +146,7 @@ def looks_like_csv(head: bytes) -> bool:
 
 
 def read_npy(path: Path, unit: ThermalUnit | None, valid_range_c: tuple[float, float]) -> ThermalImage:
-    """Read an array: degrees C where it holds fractions, else counts.
-
-    Args:
-        path: The file.
-        unit: Meaning of whole numbers; None: the user did not say.
-        valid_range_c: Temperatures outside are masked, [degrees C].
+    """Read an array: degrees C where it holds fractions, else counts of this unit.
 
     Raises:
         ThermalFileError: Whole numbers without a unit, or an array that is no image.

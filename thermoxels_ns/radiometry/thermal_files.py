@@ -127,16 +127,7 @@ def read_thermal_file(
     A FLIR R-JPEG is read by the calibration and the settings in it, whatever the unit. Counts need a unit of kind
     bounds or linear. Floating-point TIFF is in degrees Celsius unless the unit is linear.
     ``.csv`` and floating-point ``.npy`` are always in degrees Celsius; an integer ``.npy`` is counts if the unit is
-    linear. The conversion runs in float64, so 16-bit steps survive.
-
-    Args:
-        path: The file; its suffix chooses the reader.
-        unit: Meaning of the numbers.
-        valid_range_c: Temperatures outside are masked, [degrees Celsius].
-        suffix: Read the file as if its name ended so; None: as it ends.
-
-    Returns:
-        Temperatures with NaN where invalid, and the counts of what was masked.
+    linear. The conversion runs in float64, so 16-bit steps survive. `suffix` reads the file as if its name ended so.
 
     Raises:
         ThermalFileError: The file is missing, damaged, a colour picture, or its counts have no unit.
@@ -187,13 +178,7 @@ def masked_image(
     valid_range_c: tuple[float, float],
     saturated: npt.NDArray[np.bool_] | None = None,
 ) -> ThermalImage:
-    """Mask temperatures that are none and count them.
-
-    Args:
-        temperature_c: Shape (height, width), [degrees C].
-        valid_range_c: Temperatures outside are masked, [degrees C].
-        saturated: Pixels beyond the sensor's calibration, same shape; None: none.
-    """
+    """Mask temperatures (height, width) that are none, [degrees C], or beyond the calibration, and count them."""
     if saturated is None:
         saturated = np.zeros(temperature_c.shape, dtype=bool)
     nan = ~np.isfinite(temperature_c) & ~saturated

@@ -28,12 +28,7 @@ class SolidTexture:
     """
 
     def __init__(self, box: Box, seed: int) -> None:
-        """Draw the lattices.
-
-        Args:
-            box: Lower and upper corner of the scene [m].
-            seed: Seed of the pattern.
-        """
+        """Draw the lattices of a scene between two corners [m]."""
         draw = np.random.default_rng(seed)
         self._lo = np.asarray(box[0], dtype=np.float64)
         voxel = float(np.subtract(box[1], box[0]).max()) / _REFERENCE_RESOLUTION
@@ -99,16 +94,8 @@ def painted(
 ) -> RgbArray:
     """Colour of surface points: base colour plus texture, times the brightness of the light.
 
-    Args:
-        points: Positions [m], shape (n, 3).
-        normals: Outward unit normals, shape (n, 3).
-        part: Index into `paints` for each point, shape (n,).
-        paints: Colour of each part.
-        texture: Pattern in space.
-        light: Shading.
-
-    Returns:
-        Red, green, blue in [0, 1], shape (n, 3).
+    Points [m] and normals have shape (n, 3), `part` indexes `paints` for each, shape (n,); red, green, blue in [0, 1],
+    shape (n, 3).
     """
     base = np.array([p.base for p in paints], dtype=np.float32)[part]
     contrast = np.array([p.contrast for p in paints], dtype=np.float32)[part]
@@ -123,15 +110,10 @@ _GROUND_RISE_K = 2.0
 
 
 def sky_temperature_c(directions: npt.ArrayLike, horizon_c: float, drop_k: float) -> FloatArray:
-    """Apparent temperature of the sky, linear in the sine of the elevation; of the far ground below the horizon.
+    """Apparent temperature [C] of the sky, linear in the sine of the elevation; of the far ground below the horizon.
 
-    Args:
-        directions: Unit directions away from the camera, shape (n, 3).
-        horizon_c: Temperature at the horizon [C]; the ground straight below is 2 K warmer.
-        drop_k: How much colder the zenith is [K].
-
-    Returns:
-        Temperatures [C], shape (n,).
+    Unit directions (n, 3) away from the camera to (n,). The zenith is `drop_k` colder than the horizon, the ground
+    straight below 2 K warmer.
     """
     z = np.asarray(directions, dtype=np.float64)[:, 2]
     return horizon_c - drop_k * _rise(z) + _GROUND_RISE_K * _rise(-z)

@@ -201,14 +201,7 @@ class Rectangles:
         ]
 
     def distance(self, points: npt.ArrayLike) -> FloatArray:
-        """Distance from each point to the nearest rectangle.
-
-        Args:
-            points: Positions [m], shape (n, 3).
-
-        Returns:
-            Distances [m], at least 0, shape (n,).
-        """
+        """Distance from each point (n, 3) to the nearest rectangle [m], at least 0, shape (n,)."""
         points = np.asarray(points, dtype=np.float64)
         nearest = np.empty(len(points))
         step = max(_PAIRS_PER_CHUNK // len(self), 1)
@@ -235,14 +228,9 @@ def distance_to_box(points: npt.ArrayLike, lo: npt.ArrayLike, hi: npt.ArrayLike)
 
 
 def exposed_rectangles(cells: npt.NDArray[np.bool_], edges: tuple[FloatArray, FloatArray, FloatArray]) -> Rectangles:
-    """Collect the faces between filled and empty cells, merged into large rectangles.
+    """Cover the boundary between filled and empty cells (nx, ny, nz) once, by large rectangles.
 
-    Args:
-        cells: Which cells of a non-uniform grid are filled, shape (nx, ny, nz).
-        edges: Increasing coordinates of the grid planes along each axis [m], lengths nx + 1, ny + 1, nz + 1.
-
-    Returns:
-        Rectangles that cover the boundary of the filled cells once, without overlap.
+    `edges` are the increasing coordinates of the grid's planes [m], one more than cells along each axis.
     """
     padded = np.pad(cells, 1)
     corners_lo, corners_hi, axes, signs = [], [], [], []

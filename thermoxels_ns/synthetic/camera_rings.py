@@ -60,15 +60,8 @@ def ring_poses(rings: Sequence[CameraRing], num_train: int, num_eval: int) -> tu
     """Spread training cameras evenly over rings and put evaluation cameras half-way between neighbours.
 
     Cameras go to the rings in turn; each ring starts a fraction of a step later than the one before, so that
-    cameras of different rings do not stand above each other.
-
-    Args:
-        rings: At least one ring.
-        num_train: Number of training cameras, at least 1.
-        num_eval: Number of evaluation cameras; more than there are gaps share a gap evenly.
-
-    Returns:
-        Training poses (num_train, 4, 4) and evaluation poses (num_eval, 4, 4).
+    cameras of different rings do not stand above each other. More evaluation cameras than there are gaps share a gap
+    evenly. Poses have shapes (num_train, 4, 4) and (num_eval, 4, 4).
     """
     if num_train < 1 or num_eval < 0:
         raise SceneError(

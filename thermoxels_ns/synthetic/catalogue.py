@@ -200,9 +200,6 @@ SceneWord = Annotated[
 def make_scene(name: str) -> SyntheticScene:
     """Make a synthetic scene by its name, or by a seed in its name.
 
-    Args:
-        name: One of `SCENE_NAMES`, or ``random-`` and a seed without leading zeros.
-
     Raises:
         SceneError: No scene has that name; the message lists those there are.
 

@@ -108,15 +108,9 @@ class Plan:
     def recess(
         self, wall: tuple[int, int, float], along: Range, height: Range, depth: float, paint: int, warmth: float
     ) -> None:
-        """Cut an opening into a wall and put a pane at its back.
+        """Cut an opening, a stretch along a wall and in z, and put a pane as far behind the wall's plane as it is deep.
 
-        Args:
-            wall: Axis that the wall's plane is at right angles to (0 or 1), its outward sign, its coordinate.
-            along: From where to where along the wall.
-            height: From where to where in z.
-            depth: How far the pane lies behind the wall's plane.
-            paint: Number of the pane's paint.
-            warmth: Warmth of the pane.
+        The wall is the axis that its plane is at right angles to (0 or 1), its outward sign and its coordinate.
         """
         axis, sign, plane = wall
         back = plane - sign * depth

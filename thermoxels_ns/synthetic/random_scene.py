@@ -33,16 +33,10 @@ _FARTHEST_SHARE = 1.10
 def random_rings(
     draw: np.random.Generator, boxes: Sequence[Box], focal_share: float, arc_deg: tuple[float, float]
 ) -> tuple[CameraRing, ...]:
-    """Draw two or three rings, or arcs, around some boxes.
+    """Draw two or three rings, or arcs (begin and length, [degrees]), around boxes [m] that every picture shows.
 
-    Args:
-        draw: Source of the choices.
-        boxes: Lower and upper corners of what every picture shows [m].
-        focal_share: Focal length over the image width, for a 4:3 image.
-        arc_deg: Azimuth where the arcs begin and their length; 360 closes them [degrees].
-
-    Returns:
-        Rings from the lowest to the highest, at most a tenth farther than the nearest at which all boxes show.
+    The focal length is a share of the width of a 4:3 image. Rings come from the lowest to the highest, at most a tenth
+    farther than the nearest at which all boxes show.
     """
     corners = _corners(boxes)
     lo, hi = corners.min(axis=0), corners.max(axis=0)
@@ -135,13 +129,7 @@ def random_seed(name: str) -> int | None:
 
 
 def random_scene(seed: int) -> SyntheticScene:
-    """Make the scene of a seed; the same seed makes the same scene.
-
-    Args:
-        seed: At least 0.
-
-    Returns:
-        The scene, named ``random-`` and the seed.
+    """Make the scene of a seed, named ``random-`` and the seed; the same seed makes the same scene.
 
     Raises:
         SceneError: The seed is below 0.

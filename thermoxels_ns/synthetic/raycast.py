@@ -33,16 +33,10 @@ class RenderedView:
 
 
 def render_view(scene: SyntheticScene, pose: npt.ArrayLike, camera: Camera, samples_per_axis: int = 2) -> RenderedView:
-    """Render both bands of one view.
+    """Render both bands of one view from a camera to world, shape (3, 4) or (4, 4) [m].
 
-    Args:
-        scene: What to look at.
-        pose: Camera to world, x right, y up, z back, shape (3, 4) or (4, 4) [m].
-        camera: Intrinsics; pixel centres lie at +0.5.
-        samples_per_axis: Every pixel is the mean over a regular grid of this many rays along each axis.
-
-    Returns:
-        Colour and temperature averaged over the samples; depth and hit of the pixel's centre.
+    Colour and temperature are means over a grid of `samples_per_axis` rays along each axis of a pixel; depth and hit
+    are those of its centre.
 
     Raises:
         SceneError: The camera stands inside the solid.
@@ -71,20 +65,12 @@ def visible_surface_points(
     normals: npt.ArrayLike,
     min_views: int = 3,
 ) -> npt.NDArray[np.bool_]:
-    """Find the surface points that several cameras see.
+    """Find the surface points (n, 3) [m] that at least `min_views` of the cameras (c, 4, 4) see, shape (n,).
 
     A camera sees a point if the point lies in its image, faces it and is the first hit of the ray towards it.
 
-    Args:
-        scene: The scene the points belong to.
-        poses: Cameras to world, shape (c, 3, 4) or (c, 4, 4).
-        camera: Intrinsics all poses share.
-        points: Points on the surface [m], shape (n, 3).
-        normals: Outward normals at the points, shape (n, 3).
-        min_views: Cameras that must see a point.
-
-    Returns:
-        Which points enough cameras see, shape (n,).
+    Raises:
+        SceneError: A camera stands inside the solid.
     """
     points, normals = np.asarray(points, dtype=np.float64), np.asarray(normals, dtype=np.float64)
     views = np.zeros(len(points), dtype=np.int64)

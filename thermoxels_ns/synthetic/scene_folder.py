@@ -144,13 +144,7 @@ def write_scene(
 
 
 def load_truth(scene_folder: Path | str) -> SyntheticScene | None:
-    """Get the exact scene that a folder was written from.
-
-    Args:
-        scene_folder: A scene folder with a ``transforms.json``.
-
-    Returns:
-        The scene, or None for a folder of real photographs (no ``truth`` in the json).
+    """Get the exact scene that a folder was written from; None for real photographs (no ``truth`` in the json).
 
     Raises:
         SceneError: The json is missing or unreadable, or names a scene that does not exist.
