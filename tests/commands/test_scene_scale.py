@@ -19,13 +19,6 @@ from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
 
-def test_known_distance_by_hand():
-    scale = scale_from_known_distance([1, 2, 3], [1, 5, 7], 2.5, standard_error_m=0.05)
-    assert scale.metres_per_unit == 0.5
-    assert scale.standard_error == pytest.approx(0.01)  # 2 percent
-    assert "2.5 m" in scale.source and "(1, 5, 7)" in scale.source
-
-
 def test_standard_errors_are_those_of_repeated_measurements():
     random = np.random.default_rng(7)
     a, b, distance, tape = np.array([1.0, -2.0, 0.5]), np.array([3.0, 1.0, 4.0]), 8.0, 0.08
@@ -105,11 +98,6 @@ def test_choice_without_rivals():
     assert choose_scale(option=2.0) == scale_from_option(2.0)
     assert choose_scale(option=2.0, scene_file={}) == scale_from_option(2.0)
     assert choose_scale(scene_file={"metres_per_unit": 4}) == scale_from_scene_file({"metres_per_unit": 4})
-
-
-def test_two_scales_at_once_from_the_user():
-    with pytest.raises(ThermoxelsError, match="scale: expected metres per unit or a known distance, got both"):
-        choose_scale(option=1.0, known_distance=scale_from_option(2.0))
 
 
 def test_synthetic_scenes_are_in_metres_with_z_up(tmp_path):

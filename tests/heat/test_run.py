@@ -43,10 +43,6 @@ def test_a_filled_body_has_no_rooms() -> None:
     assert "of the 9 m² that no photograph saw" in warning and "--interior hollow" in warning and "--patches" in warning
 
 
-def test_without_air_inside_a_filled_body_is_fine() -> None:
-    assert patch_warnings(HeatScene(CONCRETE, outside_air=AIRS["outside_air"]), filled(), Z_UP) == ()
-
-
 def test_a_room_seen_from_within_is_inside_out() -> None:
     scene = HeatScene(CONCRETE, **AIRS)
     (warning,) = patch_warnings(scene, photographed_from_within(), Z_UP)

@@ -183,7 +183,6 @@ def test_the_sky_may_share_a_view_with_other_surroundings() -> None:
 @pytest.mark.parametrize(
     ("named", "message"),
     [
-        ({"sky": Sky(model="swinbank"), "surfaces": (Surface(emissivity=0.9),)}, "sky: expected outside_air beside it"),
         (
             {"sky": Sky(temperature_c=0.0)},
             "surfaces: emissivity: expected a number beside sky.* got none. Add surfaces",

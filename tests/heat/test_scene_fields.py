@@ -11,7 +11,6 @@ from thermoxels_ns.fem.quantities import Places, Varying
 from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4
 from thermoxels_ns.heat.scene_fields import (
     InsideAir,
-    OutsideAir,
     Section,
     Sky,
     Sun,
@@ -65,14 +64,6 @@ def test_every_number_has_a_range_by_its_unit(section: type[Section]) -> None:
 def test_sections_say_what_is_wrong(make, message: str) -> None:
     with pytest.raises(HeatError, match=message):
         make()
-
-
-def test_sections_that_are_complete() -> None:
-    assert InsideAir(20, "iso-6946-separate", emissivity=0.9).air_c == 20.0
-    assert OutsideAir(0.0, "iso-6946-separate", wind_m_s=4.0, emissivity=0.9).patches == ("exterior-*",)
-    assert Sky(model="swinbank").needs_air and not Sky(temperature_c=-5.0).needs_air
-    assert Sun(start=NOON, **PLACE, clear_sky="meinel").diffuse_w_m2 == 0.0
-    assert Sun(towards=(0.0, 0.0, 2.0), direct_w_m2=800.0, diffuse_w_m2=100.0).start is None
 
 
 Z_UP = (0.0, 0.0, 1.0)

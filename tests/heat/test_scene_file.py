@@ -73,13 +73,6 @@ def test_the_original_s_case_runs() -> None:
     assert 15.0 < solution.temperature_c[1][corner] < solution.temperature_c[2][corner] < 25.0
 
 
-def test_concrete_is_what_exports_were_always_followed_with() -> None:
-    found = load_heat_scene("concrete")
-    # 1.7 / (2200 * 880), the diffusivity that the analytic cases of the verification use.
-    assert found.materials["*"].diffusivity_m2_s == pytest.approx(8.780992e-7, rel=1e-6)
-    assert found.time == TimeSteps(10, 60.0) and found.initial_c is None and found.effects(room()) == ()
-
-
 def test_winter_night() -> None:
     found = load_heat_scene("winter-night")
     assert found.steady
@@ -97,10 +90,6 @@ def test_all_effects() -> None:
     written = yaml.safe_load((configs_folder() / "scene-all-effects.yaml").read_text(encoding="utf-8"))
     keys = {field.name for field in dataclasses.fields(HeatScene)} - {"initial_c"} | {"initial"}
     assert keys - set(written) == {"convection"}
-
-
-def test_a_small_scene_has_the_defaults(tmp_path) -> None:
-    assert scene(tmp_path, SMALL) == HeatScene({"*": material("concrete")})
 
 
 def test_what_a_file_may_say(tmp_path) -> None:

@@ -215,19 +215,6 @@ def test_what_fixes_temperatures_stays() -> None:
     assert screening.left_out[0].bound_k == 0.0 and screening.left_out[0].bound_w == pytest.approx(1e4)
 
 
-def test_a_scene_whose_radiation_does_not_matter_never_enters_newton(monkeypatch) -> None:
-    def refuse(*_, **__):
-        raise AssertionError("entered")
-
-    monkeypatch.setattr("thermoxels_ns.fem.stage.newton", refuse)
-    effects = (Convection(("x1",), 25.0, 0.0), Radiation(("y1",), 1e-7, -20.0))
-    problem, time = HeatProblem(slab(), CONCRETE, effects=effects), TimeSteps(2, 600.0)
-    counts = solve_heat(screen(problem, time, 0.01).problem, time).assembled.counts
-    assert set(counts) == {"stiffness", "mass", "robin"}
-    with pytest.raises(AssertionError, match="entered"):
-        solve_heat(screen(problem, time, 0.0).problem, time)
-
-
 def test_quantities_that_change_between_samples_are_bounded() -> None:
     """Adaptive steps ask at any time: peaks lie between the times at which the bound asks."""
     time = AdaptiveSteps(1000.0)

@@ -41,10 +41,6 @@ def said(clock: Clock, steps: list[tuple[float, float, int]]) -> list[str]:
     return lines
 
 
-def test_a_short_solution_says_nothing(clock) -> None:
-    assert said(clock, [(0.1, 0.1 * step, step) for step in range(1, 11)]) == []
-
-
 def test_the_next_solution_begins_when_the_last_one_has_ended(clock) -> None:
     """As to a tolerance, where one solution follows another."""
     first = [(0.9, 0.1 * step, step) for step in range(1, 11)]
@@ -61,13 +57,6 @@ def test_what_is_left_is_told_by_the_last_steps(clock) -> None:
         "0.1% of the time after 2 steps; about 3.1 h left.",
         "2% of the time after 3 steps; about 9 min left.",
         "20% of the time after 4 steps; about 44 s left.",
-    ]
-
-
-def test_steps_too_short_to_count_are_no_progress(clock) -> None:
-    """As those of a body without heat capacity, of which the share that is done does not change."""
-    assert said(clock, [(20.0, 0.25, step) for step in range(2, 5)]) == [
-        "25% of the time after 2 steps; about 60 s left."
     ]
 
 

@@ -52,11 +52,6 @@ def test_position_of_the_published_example() -> None:
     assert sun.distance_au == pytest.approx(0.9965422974, abs=1e-4)
 
 
-def test_the_time_zone_counts() -> None:
-    local = datetime(2025, 3, 1, 15, 0, tzinfo=timezone(timedelta(hours=5, minutes=30)))
-    assert sun_position(local, 28.6, 77.2) == sun_position(datetime(2025, 3, 1, 9, 30, tzinfo=UTC), 28.6, 77.2)
-
-
 def test_the_sun_goes_from_east_over_south_to_west_and_over_north_beyond_the_equator() -> None:
     def azimuths(latitude: float) -> list[float]:
         return [

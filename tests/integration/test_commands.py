@@ -162,3 +162,22 @@ def test_thermal_images_alone(tiny_scene, tmp_path):
     assert result.returncode == 0, result.stdout
     results = json.loads((tmp_path / "eval.json").read_text())["results"]
     assert np.isfinite(results["thermal_psnr"]) and "psnr" not in results
+
+
+@pytest.mark.real_data
+def test_real_photographs_with_a_thermal_camera_of_its_own(shared_data, tmp_path):
+    result = run(
+        *("ns-train", "thermoxels-arco", "--output-dir", str(tmp_path), "--experiment-name", "a", "--timestamp", "run"),
+        *(*SHORT_TRAINING, "--pipeline.model.prune-threshold", "0"),
+        *("thermal-data", "--data", str(shared_data / "arco"), "--downscale-factor", "8"),
+    )
+    assert result.returncode == 0, result.stdout
+    assert "35 train" in result.stdout and "thermal cameras of their own" in " ".join(result.stdout.split())
+    config = str(tmp_path / "a" / "thermoxels-arco" / "run" / "config.yml")
+    result = run(
+        *("ns-export", "thermoxels-mesh", "--load-config", config),
+        *("--output-dir", str(tmp_path / "mesh"), "--metres-per-unit", "1", "--density-percentile", "90"),
+        *("--pictures", "False", "--steps", "1"),
+    )
+    assert result.returncode == 0, result.stdout
+    assert (tmp_path / "mesh" / "heat.pvd").exists()
