@@ -6,6 +6,7 @@ import json
 import shutil
 
 import numpy as np
+import pytest
 import pyvista
 import torch
 from PIL import Image

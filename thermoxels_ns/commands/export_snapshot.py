@@ -62,25 +62,20 @@ def export_snapshot(
 ) -> dict[str, Any]:
     """Write the mesh in the formats asked for, quality.json, summary.json, and as asked pictures and the heat series.
 
-    All of it is computed before anything is written. Then the summary of an earlier export goes first and the new one
-    comes last, so the files in a folder with a summary.json belong together.
+    All of it is computed before anything is written. Then the summary of an earlier export goes first and the
+    new one comes last, so the files in a folder with a summary.json belong together; what this export does not
+    make is removed.
 
     Args:
         snapshot: The trained field.
-        world_to_input: Takes homogeneous column vectors of the trained scene to the coordinates of the input poses,
-            shape (4, 4). The scale takes those to metres.
+        world_to_input: From the trained scene to the coordinates of the input poses, shape (4, 4).
         options: What to make.
-        output_dir: Folder for the results; made if it does not exist. Files of an earlier export are replaced, or
-            removed if this one does not make them.
+        output_dir: Folder for the results; made if it does not exist.
         say: Called with one line of progress at a time.
         viewpoint: How pictures look at the mesh; its up is the mesh's unless the scene's json has one.
-        compare: Compares solid voxels and mesh (in metres; the last argument is metres per unit of the input) with the
-            truth of a scene that knows it; its answer goes into the summary under "truth", or its error if it raises a
-            `ThermoxelsError`. Asked only if the scale is known.
+        compare: Compares solid voxels and mesh in metres (last: metres per unit) with a known truth; its
+            `ThermoxelsError` goes into the summary. Asked only if the scale is known.
         scene_file: The scene's json, which may know the scale and up.
-
-    Returns:
-        The summary that summary.json holds.
 
     Raises:
         ThermoxelsError: An option is out of range, nothing is solid, the folder cannot be written to, or heat fails.
