@@ -72,10 +72,6 @@ def test_streams_that_do_not_train_have_no_views(scene_folder):
         assert set(manager(scene.path, streams=streams).training_views().size[:, 0]) == widths
 
 
-def test_thermal_images_through_the_photographs_camera_are_its_views(scene_folder):
-    assert len(manager(scene_folder().path, streams="thermal").training_views().size) == 8
-
-
 def test_distortion_is_left_out(scene_folder):
     scene = scene_folder(distortion={"k1": 0.08, "k2": -0.02, "p1": 0.003, "p2": -0.002})
     bent = manager(scene.path).training_views()

@@ -155,10 +155,6 @@ def test_the_error_of_a_length_is_that_of_a_triangulation(scene):
     assert lines.uncertainty == pytest.approx(expected)
 
 
-def test_without_tracks_there_are_no_lines(scene_folder):
-    assert lines_of(scene_folder()).metadata["feature_rays"] is None
-
-
 def test_tracks_of_other_photographs_or_poses_are_refused(scene):
     folder, tracks = scene
     path = folder.path / "tracks.npz"

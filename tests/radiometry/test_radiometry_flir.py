@@ -16,7 +16,7 @@ from PIL import Image
 from tests.support.flir_file import FlirFile, picture_bytes, smooth_counts
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.radiometry.camera_file import RadiometryOptions, read_thermogram
-from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
+from thermoxels_ns.radiometry.flir_rjpeg import read_flir_jpeg
 from thermoxels_ns.radiometry.thermal_files import ThermalUnit, read_thermal_file
 
 REAL_SHAPES = {
@@ -133,11 +133,6 @@ def test_training_reads_the_same_degrees_whatever_the_unit(tmp_path, name):
     expected = read_thermogram(path).temperature_c
     for unit in (ThermalUnit.celsius(), ThermalUnit.bounds(0.0, 1.0), ThermalUnit.linear(0.1, 0.0)):
         np.testing.assert_array_equal(read_thermal_file(path, unit).temperature_c, expected)
-
-
-def test_a_plain_jpeg_is_no_flir_file(tmp_path):
-    (tmp_path / "a.jpg").write_bytes(picture_bytes() + b"\xff\xe1\0\x20FLI")
-    assert not is_flir_jpeg(tmp_path / "a.jpg")
 
 
 def test_a_file_cut_off_anywhere_is_refused_by_name(tmp_path):

@@ -105,11 +105,6 @@ def test_npy_and_csv_are_celsius(tmp_path):
         )
 
 
-def test_integer_npy_is_counts_with_a_linear_unit(tmp_path):
-    np.save(tmp_path / "a.npy", np.full((2, 2), 4800, np.uint16))
-    assert read_thermal_file(tmp_path / "a.npy", COUNTS).temperature_c[0, 0] == pytest.approx(20.0)
-
-
 def test_below_absolute_zero_is_masked_whatever_the_range(tmp_path):
     np.save(tmp_path / "a.npy", np.array([[-273.2, -273.1]]))
     read = read_thermal_file(tmp_path / "a.npy", CELSIUS, valid_range_c=(-1e4, 1e4))

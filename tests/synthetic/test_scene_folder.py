@@ -143,13 +143,6 @@ def test_same_seed_same_bytes(tmp_path: Path) -> None:
     assert all_bytes(tmp_path / "a") != all_bytes(tmp_path / "c")
 
 
-def test_truth_comes_back_from_the_folder(tmp_path: Path) -> None:
-    write_scene(make_scene("house-corner"), tmp_path, **SMALL)
-    truth = load_truth(tmp_path)
-    assert truth is not None and truth.name == "house-corner"
-    assert truth.area_m2 == make_scene("house-corner").area_m2
-
-
 @pytest.mark.parametrize(
     ("text", "match"),
     [

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.synthetic.solids import Box, Hits, box_between
+from thermoxels_ns.synthetic.solids import Box, Hits, box_beside, box_between
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -225,6 +226,19 @@ def distance_to_box(points: npt.ArrayLike, lo: npt.ArrayLike, hi: npt.ArrayLike)
     points = np.asarray(points, dtype=np.float64)
     gap = points - np.clip(points, np.asarray(lo, dtype=np.float64), np.asarray(hi, dtype=np.float64))
     return np.sqrt(np.einsum("ij,ij->i", gap, gap))
+
+
+def recesses(openings: Sequence[tuple[Any, ...]], depth_m: float, pane_m: float) -> tuple[list[Box], list[Box]]:
+    """Boxes cut out of walls for openings, and the boxes of the panes behind them.
+
+    An opening begins with its plane's axis, outward sign and position, (along the wall from, to) and (z from, to).
+    """
+    cut, panes = [], []
+    for axis, sign, plane, along, height, *_ in openings:
+        back = plane - sign * depth_m
+        cut.append(box_beside(axis, (plane, back), along, height))
+        panes.append(box_beside(axis, (back, back - sign * pane_m), along, height))
+    return cut, panes
 
 
 def exposed_rectangles(cells: npt.NDArray[np.bool_], edges: tuple[FloatArray, FloatArray, FloatArray]) -> Rectangles:

@@ -74,9 +74,6 @@ def pipes() -> SyntheticScene:
     )
 
 
-FloatArray = npt.NDArray[np.float64]
-
-
 def _hot_object() -> SyntheticScene:
     """Build a stepped hot block and a hot ball on a table, in a room of even temperature."""
     table: Box = ((-0.5, -0.4, -0.08), (0.5, 0.4, 0.0))

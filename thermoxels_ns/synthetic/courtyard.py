@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.synthetic.appearance import Paint, SolidTexture, SunLight, painted, sky_rgb, sky_temperature_c
-from thermoxels_ns.synthetic.box_solid import BoxSolid, distance_to_box
+from thermoxels_ns.synthetic.box_solid import BoxSolid, distance_to_box, recesses
 from thermoxels_ns.synthetic.camera_rings import CameraRing
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 from thermoxels_ns.synthetic.solids import Box
@@ -69,7 +69,7 @@ def courtyard() -> SyntheticScene:
     on its other side, the chimney rises to 30 C and a flue in the east wall, 0.35 m wide, is 39.5 C hot. The sky falls
     from 2 C at the horizon to -10 C at the zenith.
     """
-    cut, panes = _recesses()
+    cut, panes = recesses(_OPENINGS, _RECESS_M, _PANE_M)
     panes_c = [opening[5] for opening in _OPENINGS]
     texture, light = SolidTexture(_BOX, seed=31), SunLight(towards=(0.5, -0.7, 0.6))
     paints = (
@@ -147,16 +147,3 @@ def courtyard() -> SyntheticScene:
         ),
         focal_share=0.79,
     )
-
-
-def _recesses() -> tuple[list[Box], list[Box]]:
-    """Boxes cut out of the walls for the openings, and the boxes of the panes behind them."""
-    cut: list[Box] = []
-    panes: list[Box] = []
-    for axis, sign, plane, along, height, _, _ in _OPENINGS:
-        back = plane - sign * _RECESS_M
-        for boxes, (near, far) in ((cut, (plane, back)), (panes, (back, back - sign * _PANE_M))):
-            through = (min(near, far), max(near, far))
-            (x0, x1), (y0, y1) = (through, along) if axis == 0 else (along, through)
-            boxes.append(((x0, y0, height[0]), (x1, y1, height[1])))
-    return cut, panes

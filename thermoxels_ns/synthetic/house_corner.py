@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.synthetic.appearance import Paint, SolidTexture, SunLight, painted, sky_rgb, sky_temperature_c
-from thermoxels_ns.synthetic.box_solid import BoxSolid, distance_to_box
+from thermoxels_ns.synthetic.box_solid import BoxSolid, distance_to_box, recesses
 from thermoxels_ns.synthetic.camera_rings import CameraRing
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 from thermoxels_ns.synthetic.solids import Box
@@ -23,44 +23,22 @@ _FRONT_Y, _SIDE_X = _BUILDING[0][1], _BUILDING[1][0]
 _RECESS_M = 0.35
 _PANE_M = 0.10
 
-# Openings in the wall plane: (along the wall from, to), (z from, to), temperature of the pane [C], paint.
 _GLASS, _DOOR = 4, 5
-_FRONT_OPENINGS = (
-    ((-2.4, -1.2), (0.9, 2.0), 14.0, _GLASS),
-    ((0.9, 2.3), (0.9, 2.0), 13.0, _GLASS),
-    ((-1.1, 0.0), (2.8, 4.5), 14.5, _GLASS),
-    ((1.6, 2.5), (3.3, 4.4), 12.0, _GLASS),
-)
-_SIDE_OPENINGS = (
-    ((-1.7, -0.6), (0.0, 2.1), 9.0, _DOOR),
-    ((0.5, 1.8), (0.9, 2.0), 13.5, _GLASS),
-    ((-1.6, 0.2), (3.2, 4.4), 14.0, _GLASS),
-    ((1.0, 1.9), (3.2, 4.4), 12.5, _GLASS),
+# Openings: plane's axis, outward sign and position; (along the wall from, to); (z from, to); pane [C]; paint.
+_OPENINGS = (
+    (1, -1, _FRONT_Y, (-2.4, -1.2), (0.9, 2.0), 14.0, _GLASS),
+    (1, -1, _FRONT_Y, (0.9, 2.3), (0.9, 2.0), 13.0, _GLASS),
+    (1, -1, _FRONT_Y, (-1.1, 0.0), (2.8, 4.5), 14.5, _GLASS),
+    (1, -1, _FRONT_Y, (1.6, 2.5), (3.3, 4.4), 12.0, _GLASS),
+    (0, +1, _SIDE_X, (-1.7, -0.6), (0.0, 2.1), 9.0, _DOOR),
+    (0, +1, _SIDE_X, (0.5, 1.8), (0.9, 2.0), 13.5, _GLASS),
+    (0, +1, _SIDE_X, (-1.6, 0.2), (3.2, 4.4), 14.0, _GLASS),
+    (0, +1, _SIDE_X, (1.0, 1.9), (3.2, 4.4), 12.5, _GLASS),
 )
 
 _WALL_C, _BRIDGE_K = 5.0, 3.0
 _BRIDGE_Z, _BRIDGE_WIDTH_M = 0.5 * (_BALCONY[0][2] + _BALCONY[1][2]), 0.35
 _AIR_C, _SKY_DROP_K = 0.0, 20.0
-
-
-def _openings() -> tuple[list[Box], list[Box], list[float], list[int]]:
-    """Boxes cut out of the walls, the panes behind them, the panes' temperatures [C] and paints."""
-    cut: list[Box] = []
-    pane: list[Box] = []
-    temperature_c, paint = [], []
-    for (a, b), (z0, z1), degrees, kind in _FRONT_OPENINGS:
-        back = _FRONT_Y + _RECESS_M
-        cut.append(((a, _FRONT_Y, z0), (b, back, z1)))
-        pane.append(((a, back, z0), (b, back + _PANE_M, z1)))
-        temperature_c.append(degrees)
-        paint.append(kind)
-    for (a, b), (z0, z1), degrees, kind in _SIDE_OPENINGS:
-        back = _SIDE_X - _RECESS_M
-        cut.append(((back, a, z0), (_SIDE_X, b, z1)))
-        pane.append(((back - _PANE_M, a, z0), (back, b, z1)))
-        temperature_c.append(degrees)
-        paint.append(kind)
-    return cut, pane, temperature_c, paint
 
 
 def house_corner() -> SyntheticScene:
@@ -70,7 +48,8 @@ def house_corner() -> SyntheticScene:
     3 K warmer, the balcony cools like a fin towards the air, and the sky falls from 0 C at the horizon to -20 C
     at the zenith.
     """
-    cut, panes, panes_c, pane_paints = _openings()
+    cut, panes = recesses(_OPENINGS, _RECESS_M, _PANE_M)
+    panes_c, pane_paints = [opening[5] for opening in _OPENINGS], [opening[6] for opening in _OPENINGS]
     texture, light = SolidTexture(_BOX, seed=7), SunLight(towards=(0.75, -0.45, 0.5))
     paints = (
         Paint((0.74, 0.64, 0.47), 0.22),  # plaster

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from thermoxels_ns.synthetic.random_plan import SMALLEST, WIDEST, Plan, Range
-from thermoxels_ns.synthetic.solids import Box
+from thermoxels_ns.synthetic.solids import Box, box_beside
 
 Wall = tuple[int, int, float]
 
@@ -241,6 +241,4 @@ def _grown(lo: tuple[float, float, float], hi: tuple[float, float, float], by: f
 def _against(wall: Wall, out: float, along: Range, height: Range) -> Box:
     """A box that stands out from a wall."""
     axis, sign, plane = wall
-    through = (min(plane, plane + sign * out), max(plane, plane + sign * out))
-    (x0, x1), (y0, y1) = (through, along) if axis == 0 else (along, through)
-    return (x0, y0, height[0]), (x1, y1, height[1])
+    return box_beside(axis, (plane, plane + sign * out), along, height)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from thermoxels_ns.synthetic.appearance import Paint
 from thermoxels_ns.synthetic.box_solid import BoxSolid, distance_to_box
 from thermoxels_ns.synthetic.solid_union import SolidUnion
-from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere, Vector
+from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere, Vector, box_beside
 
 FloatArray = npt.NDArray[np.float64]
 Shape = Box | Sphere | Cylinder
@@ -114,8 +114,8 @@ class Plan:
         """
         axis, sign, plane = wall
         back = plane - sign * depth
-        self.removed.append(_beside(axis, (plane, back), along, height))
-        pane = _beside(axis, (back, back - sign), along, height)
+        self.removed.append(box_beside(axis, (plane, back), along, height))
+        pane = box_beside(axis, (back, back - sign), along, height)
         self.pieces.append(Piece(pane, paint, warmth, np.zeros(3)))
         self.glows.append(Glow(pane, warmth, depth))
 
@@ -195,13 +195,6 @@ class Plan:
             near = np.maximum(1.0 - distance_to_box(points, *glow.core) / glow.reach, 0.0)
             warmth += (glow.warmth - warmth) * near * near * (3.0 - 2.0 * near)
         return warmth
-
-
-def _beside(axis: int, across: Range, along: Range, height: Range) -> Box:
-    """Box from its extents across a wall, along it and in z."""
-    through = (min(across), max(across))
-    (x0, x1), (y0, y1) = (through, along) if axis == 0 else (along, through)
-    return (x0, y0, height[0]), (x1, y1, height[1])
 
 
 def _bounds(shape: Shape) -> Box:

@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.synthetic.camera_rings import CameraRing, ring_poses
-from thermoxels_ns.synthetic.solids import Box, Solid
+from thermoxels_ns.synthetic.solid_union import Solid
+from thermoxels_ns.synthetic.solids import Box
 
 FloatArray = npt.NDArray[np.float64]
 RgbFunction = Callable[..., npt.NDArray[np.float32]]

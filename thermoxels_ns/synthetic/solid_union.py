@@ -90,3 +90,11 @@ def _overlap(first: Part, second: Part) -> bool:
         if other.signed_distance(one.surface_points(_POINTS, seed=0)[0]).min() <= slack:
             return True
     return False
+
+
+Solid = BoxSolid | Sphere | Cylinder | SolidUnion
+"""What every exact solid can tell, it tells without approximation and without a lattice: a closed set, lengths in m.
+
+`intersect` counts only the points where a ray passes from outside to inside, the surface's front: a ray that starts
+within the solid does not see its walls from behind. Touching an edge counts as a hit.
+"""

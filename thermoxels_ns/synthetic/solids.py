@@ -1,10 +1,9 @@
-"""Exact solids: what each can tell, spheres and cylinders."""
+"""Exact spheres and cylinders, and where rays hit them."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -30,45 +29,6 @@ class Hits:
     def hit(self) -> npt.NDArray[np.bool_]:
         """Which rays hit, shape (n,)."""
         return np.isfinite(self.distance)
-
-
-class Solid(Protocol):
-    """What every exact solid can tell, without approximation and without a lattice; it is a closed set, lengths in m.
-
-    `intersect` counts only the points where a ray passes from outside to inside, the surface's front: a ray that
-    starts within the solid does not see its walls from behind. Touching an edge counts as a hit.
-    """
-
-    @property
-    def bounds(self) -> Box:
-        """Lower and upper corner of the smallest box around the solid [m]."""
-        ...
-
-    @property
-    def volume(self) -> float:
-        """Volume [m3]."""
-        ...
-
-    @property
-    def area(self) -> float:
-        """Area of the surface [m2]."""
-        ...
-
-    def contains(self, points: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Which of the points (n, 3) lie in the solid or on its surface."""
-        ...
-
-    def signed_distance(self, points: npt.ArrayLike) -> FloatArray:
-        """Distance of the points (n, 3) to the surface [m], negative inside."""
-        ...
-
-    def intersect(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> Hits:
-        """First entry of rays: origins (n, 3) or one shared (3,), directions (n, 3)."""
-        ...
-
-    def surface_points(self, count: int, seed: int) -> tuple[FloatArray, FloatArray]:
-        """Draw points uniformly by area: positions (count, 3) and outward normals (count, 3)."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,3 +222,10 @@ def box_between(lo: npt.ArrayLike, hi: npt.ArrayLike) -> Box:
     x0, y0, z0 = (float(v) for v in np.asarray(lo))
     x1, y1, z1 = (float(v) for v in np.asarray(hi))
     return (x0, y0, z0), (x1, y1, z1)
+
+
+def box_beside(axis: int, across: tuple[float, float], along: tuple[float, float], height: tuple[float, float]) -> Box:
+    """Box from its extents across a wall (at right angles to axis 0 or 1, in any order), along it and in z."""
+    through = (min(across), max(across))
+    (x0, x1), (y0, y1) = (through, along) if axis == 0 else (along, through)
+    return (x0, y0, height[0]), (x1, y1, height[1])
