@@ -6,9 +6,8 @@ Run it on an otherwise idle machine:
 
 A synthetic house with a thermal camera of its own is trained to the middle of its last stage; then single steps with
 4096 RGB and 4096 thermal rays are timed on one and the same state, and a view of 320 x 240 is rendered. Colour is the
-same from all sides there, as it is for the first four fifths of a training. The training begins with the same density
-everywhere, so that no time goes into the trials of the two starts, of which nothing is timed; `--start auto` lets them
-choose. On a busy machine, `--threads 1 --clock processor` counts the time that this process had.
+same from all sides there, as it is for the first four fifths of a training. On a busy machine, `--threads 1 --clock
+processor` counts the time that this process had.
 
 Every figure is a median; ratios are against the named baseline of the same run. There are two: the reference (plain
 torch on the same sparse lattice, skipping what is empty), and once a dense step (plain torch on the whole lattice,

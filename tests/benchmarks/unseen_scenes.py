@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import sys
 import time
 from collections.abc import Sequence
@@ -32,7 +31,6 @@ from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 _TARGETS = {"psnr": (">=", 30.0), "thermal_mae_c": ("<=", 0.4), "fscore": (">=", 0.85)}
 _VIEWS = (42, 6)
-_STARTED = re.compile(r"\bstart: (plain|photographs)\b")
 
 
 @dataclass(frozen=True)
@@ -45,8 +43,6 @@ class Outcome:
     """Kind of arrangement."""
     seconds: float
     """Wall time of `ns-train`."""
-    start: str
-    """Start that the training chose, or was told."""
     figures: dict[str, float]
     """What `ns-eval` reports."""
 
@@ -65,7 +61,6 @@ class Outcome:
             *(self.scene.name, self.family, f"{self.seconds:.0f}", f"{hottest - coldest:.0f} K"),
             *((shown | bold).get(name, "none") for name in (*_TARGETS, "precision", "recall")),
             f"{self.figures.get('half_transparent', math.nan):.1%}",
-            self.start,
         ]
         return f"| {' | '.join(cells)} |"
 
@@ -81,8 +76,8 @@ class UnseenScenes:
 
     def main(self, options: Sequence[str]) -> None:
         """Print a line per scene as it is done, then how many meet the targets."""
-        print("| scene | shows | seconds | range | PSNR, dB | MAE, °C | F-score | precision | recall | half | start |")
-        print("|---|---|---|---|---|---|---|---|---|---|---|", flush=True)
+        print("| scene | shows | seconds | range | PSNR, dB | MAE, °C | F-score | precision | recall | half |")
+        print("|---|---|---|---|---|---|---|---|---|---|", flush=True)
         outcomes = []
         for seed in self.seeds:
             outcomes.append(self.measure(seed, options))
@@ -116,12 +111,9 @@ class UnseenScenes:
             folder / "eval.log",
             quiet,
         )
-        starts = _STARTED.findall((folder / "train.log").read_text(encoding="utf-8", errors="replace"))
         figures: dict[str, Any] = json.loads(results.read_text(encoding="utf-8"))["results"]
         numbers = {name: float(value) for name, value in figures.items() if value is not None}
-        return Outcome(
-            scene, FAMILIES[seed % len(FAMILIES)].name, seconds, starts[-1] if starts else "as told", numbers
-        )
+        return Outcome(scene, FAMILIES[seed % len(FAMILIES)].name, seconds, numbers)
 
 
 def _is_written(scene: SyntheticScene, folder: Path) -> bool:

@@ -44,8 +44,7 @@ class CameraRays:
         self._origins = poses[:, :, 3].contiguous().to(self.device)
 
         models = self._models()
-        unique, first, self_model = np.unique(models, axis=0, return_index=True, return_inverse=True)
-        del unique
+        _, first, self_model = np.unique(models, axis=0, return_index=True, return_inverse=True)
         model_sizes = sizes[torch.from_numpy(first)]
         self.has_table = int(model_sizes.sum()) * _BYTES_PER_PIXEL <= table_limit_bytes
         if self.has_table:

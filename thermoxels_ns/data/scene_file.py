@@ -180,9 +180,8 @@ def _read_bounds(folder: Path) -> tuple[float, float] | None:
     keys = ("absolute_min_temperature", "absolute_max_temperature")
     try:
         first, second = (float(content[key]) for key in keys)
-    except (KeyError, TypeError, ValueError) as problem:
+    except (KeyError, TypeError, ValueError):
         first = second = float("nan")
-        del problem
     if not (np.isfinite(first) and np.isfinite(second)):
         raise SceneError(
             str(path),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Callable, Sequence
@@ -18,6 +19,8 @@ from thermoxels_ns.synthetic.random_plan import Plan
 from thermoxels_ns.synthetic.random_plant import machinery, pipes_and_radiators
 from thermoxels_ns.synthetic.scene_truth import RgbFunction, SyntheticScene
 from thermoxels_ns.synthetic.solids import Box
+
+FloatArray = npt.NDArray[np.float64]
 
 _PICTURE_ASPECT = 0.75
 _RIM = 0.95
@@ -38,7 +41,7 @@ def random_rings(
     The focal length is a share of the width of a 4:3 image. Rings come from the lowest to the highest, at most a tenth
     farther than the nearest at which all boxes show.
     """
-    corners = _corners(boxes)
+    corners = np.array([corner for box in boxes for corner in itertools.product(*zip(*box))], dtype=np.float64)
     lo, hi = corners.min(axis=0), corners.max(axis=0)
     middle, aims = 0.5 * (lo + hi), np.linspace(max(lo[2], 0.0), 0.6 * hi[2], _AIMS)
     elevations = _ELEVATIONS_DEG[3 if draw.random() < 0.75 else 2]
@@ -56,13 +59,6 @@ def random_rings(
     return tuple(rings)
 
 
-def _corners(boxes: Sequence[Box]) -> FloatArray:
-    """All corners of boxes, shape (8 n, 3)."""
-    ends = np.asarray(boxes, dtype=np.float64)
-    which = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
-    return ends[:, which, np.arange(3)].reshape(-1, 3)
-
-
 def _nearest(relative: FloatArray, elevation: float, focal_share: float, arc_deg: tuple[float, float]) -> float:
     """Least distance from the origin at which an arc of cameras that look at it has all points (n, 3) in the picture.
 
@@ -77,10 +73,6 @@ def _nearest(relative: FloatArray, elevation: float, focal_share: float, arc_deg
     half = 0.5 * _RIM / focal_share
     return float((relative @ back.T + np.maximum(beside, above / _PICTURE_ASPECT) / half).max())
 
-
-__all__ = ["FAMILIES", "RANDOM_NAME", "Family", "random_scene", "random_seed"]
-
-FloatArray = npt.NDArray[np.float64]
 
 RANDOM_NAME = "random-N"
 """How the names of these scenes are written where all names are listed; N is the seed."""
