@@ -143,12 +143,7 @@ def test_evaluation_frames_never_train(scene_folder):
 
 def test_masked_pixels_are_never_drawn(scene_folder):
     scene = scene_folder()
-    mask = np.zeros((18, 24), np.uint8)
-    mask[4:9, 3:8] = 255
-    for frame in scene.meta["frames"]:
-        frame["mask_path"] = frame["file_path"].replace("images/", "mask_")
-        Image.fromarray(mask).save(scene.path / frame["mask_path"])
-    scene.rewrite()
+    mask = scene.add_masks()
     served = manager(scene.path)
     bundle, _ = served.next_train(0)
     pixels = nearest_pixel(bundle, all_rays(served.train_dataset.cameras)) % (18 * 24)

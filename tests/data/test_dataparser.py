@@ -304,12 +304,7 @@ def test_dataset_item(scene_folder):
 
 def test_masks_reach_the_item(scene_folder):
     scene = scene_folder()
-    mask = np.zeros((18, 24), np.uint8)
-    mask[4:9, 3:8] = 255
-    for frame in scene.meta["frames"]:
-        frame["mask_path"] = frame["file_path"].replace("images/", "mask_")
-        Image.fromarray(mask).save(scene.path / frame["mask_path"])
-    scene.rewrite()
+    mask = scene.add_masks()
     got = ThermalDataset(parse(scene.path))[0]["mask"]
     np.testing.assert_array_equal(got[..., 0].numpy(), mask > 0)
     del scene.meta["frames"][0]["mask_path"]

@@ -26,6 +26,16 @@ class Folder:
         """Write `meta` again after a change."""
         (self.path / "transforms.json").write_text(json.dumps(self.meta))
 
+    def add_masks(self) -> np.ndarray:
+        """Mask all but 25 pixels of every photograph of 24 x 18; returns the mask."""
+        mask = np.zeros((18, 24), np.uint8)
+        mask[4:9, 3:8] = 255
+        for frame in self.meta["frames"]:
+            frame["mask_path"] = frame["file_path"].replace("images/", "mask_")
+            Image.fromarray(mask).save(self.path / frame["mask_path"])
+        self.rewrite()
+        return mask
+
 
 def look_at_origin(angle: float, radius: float = 4.0, height: float = 1.0) -> np.ndarray:
     """Camera-to-world in OpenGL axes on a circle around the z axis."""

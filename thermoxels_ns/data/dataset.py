@@ -17,6 +17,8 @@ from torch import Tensor
 
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.units import TemperatureRange
+from thermoxels_ns.data.transforms_json import DAMAGED_PHOTOGRAPH
+from thermoxels_ns.radiometry.decoders import errors_name
 from thermoxels_ns.radiometry.thermal_files import PixelReport, read_thermal_file
 
 
@@ -52,17 +54,9 @@ class ThermalDataset(InputDataset):
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
         """Load a photograph at the resolution of its camera, shape (h, w, 3)."""
         path = self._dataparser_outputs.image_filenames[image_idx]
-        try:
-            with Image.open(path) as opened:
-                opened.load()
-                picture = opened.convert("RGBA") if opened.mode in ("P", "PA", "LA") else opened.copy()
-        except Exception as problem:  # Pillow's plugins raise many types on damaged data
-            raise SceneError(
-                str(path),
-                expected="a readable photograph",
-                got=problem,
-                remedy="The file is damaged; copy it again or remove the frame.",
-            ) from problem
+        with errors_name(path, "a readable photograph", DAMAGED_PHOTOGRAPH), Image.open(path) as opened:
+            opened.load()
+            picture = opened.convert("RGBA") if opened.mode in ("P", "PA", "LA") else opened.copy()
         if picture.mode == "RGBA":
             if picture.getchannel("A").getextrema()[0] != 255:
                 raise SceneError(
@@ -100,13 +94,8 @@ class ThermalDataset(InputDataset):
         if self._dataparser_outputs.mask_filenames is None:
             return None
         path = self._dataparser_outputs.mask_filenames[image_idx]
-        try:
-            with Image.open(path) as opened:
-                picture = opened.convert("L")
-        except Exception as problem:
-            raise SceneError(
-                str(path), expected="a readable mask", got=problem, remedy="Write the mask again."
-            ) from problem
+        with errors_name(path, "a readable mask", "Write the mask again."), Image.open(path) as opened:
+            picture = opened.convert("L")
         with Image.open(self._dataparser_outputs.image_filenames[image_idx]) as photograph:
             size = photograph.size
         if picture.size != size:

@@ -11,7 +11,9 @@ from PIL import Image
 
 from thermoxels_ns.core.camera import Camera, Lens
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.radiometry.decoders import errors_name
 
+DAMAGED_PHOTOGRAPH = "The file is damaged; copy it again or remove the frame."
 _LENS_OF_MODEL: dict[str, Lens] = {
     "SIMPLE_PINHOLE": "perspective",
     "PINHOLE": "perspective",
@@ -89,16 +91,8 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
 
 def _image_size(path: Path, where: str) -> tuple[int, int]:
     """Width and height from the file's header."""
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except Exception as problem:  # Pillow's plugins raise many types on damaged headers
-        raise SceneError(
-            f"{where}: {path.name}",
-            expected="a readable photograph",
-            got=problem,
-            remedy="The file is damaged; copy it again or remove the frame.",
-        ) from problem
+    with errors_name(f"{where}: {path.name}", "a readable photograph", DAMAGED_PHOTOGRAPH), Image.open(path) as image:
+        return image.size
 
 
 def path_inside(folder: Path, name: str, where: str) -> Path:
