@@ -32,16 +32,11 @@ def split_frames(
     offset: int | None,
     left_out: Sequence[str] = (),
 ) -> Split:
-    """Split frames into training and evaluation.
+    """Split frames, given by their sorted names, into training and evaluation.
 
-    Args:
-        names: Names of the frames, sorted.
-        meta: The scene's json, for its lists train_filenames, val_filenames, test_filenames.
-        mode: auto takes the first that the scene has: names with frame_train_ and frame_eval_, lists, every n-th.
-        interval: Every n-th frame evaluates (mode interval).
-        offset: First frame that evaluates; None: half the interval, so that the ends of the sequence, which the
-            others see least, stay in training.
-        left_out: Names that the lists may hold although they are no frames any more.
+    "auto" takes the first that the scene has: names with frame_train_ and frame_eval_, lists in the json
+    (train_filenames, val_filenames, test_filenames), every n-th frame from an offset on (None: half the interval, so
+    that the ends of the sequence, which the others see least, stay in training). Lists may hold names left out.
 
     Raises:
         SceneError: A side is empty, a frame is on both sides or a listed name is unknown.

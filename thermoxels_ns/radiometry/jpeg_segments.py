@@ -16,10 +16,7 @@ class DamagedJpegError(ValueError):
 
 
 def jpeg_segments(content: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield marker and payload of every segment before the picture's data (ITU-T T.81, annex B).
-
-    Args:
-        content: The whole file, from the start of image on.
+    """Yield marker and payload of every segment of a file before the picture's data (ITU-T T.81, annex B).
 
     Raises:
         DamagedJpegError: A segment reaches beyond the end of the file, or there is no picture after the segments.

@@ -195,7 +195,7 @@ SceneWord = Annotated[
 
 @cache
 def make_scene(name: str) -> SyntheticScene:
-    """Make a synthetic scene by its name, or by a seed in its name.
+    """Make a synthetic scene by one of `SCENE_NAMES`, or by ``random-`` and a seed without leading zeros.
 
     Raises:
         SceneError: No scene has that name; the message lists those there are.
