@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import MeshError, ThermoxelsError
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.evaluation.truth_comparison import TOLERANCE_VOXELS, KnownTruth, load_known_truth, points_seen
@@ -30,7 +30,7 @@ def has_truth(scene_folder: Path | str, say: Callable[[str], None] = print) -> b
 
 def geometry_metrics(
     snapshot: GridSnapshot,
-    world_to_input: npt.NDArray[np.float64],
+    world_to_input: FloatArray,
     truth: Path | str | KnownTruth,
     say: Callable[[str], None] = print,
 ) -> dict[str, float]:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import check_positive, check_shape
 from thermoxels_ns.core.errors import MeshError, SceneError
@@ -44,15 +44,13 @@ class SurfaceDistances:
     """Mean of both."""
     hausdorff: float
     """Largest of all these distances."""
-    closest_temperature_c: npt.NDArray[np.float64]
+    closest_temperature_c: FloatArray
     """Temperature of the mesh at its surface point closest to each true point, shape (m,), [degrees Celsius]."""
-    closest_distance: npt.NDArray[np.float64]
+    closest_distance: FloatArray
     """Distance to that point, shape (m,)."""
 
 
-def sample_facets(
-    points: npt.NDArray[np.float64], facets: npt.NDArray[np.int64], count: int
-) -> npt.NDArray[np.float64]:
+def sample_facets(points: FloatArray, facets: IntArray, count: int) -> FloatArray:
     """Points spread evenly by area over triangles, shape (count, 3); the same points every time.
 
     A low-discrepancy sequence (the golden ratio and the plastic number's R2 sequence) walks along the triangles in
@@ -77,7 +75,7 @@ def sample_facets(
 
 
 def surface_distances(
-    mesh: TetMesh, truth: TrueShape, true_points: npt.NDArray[np.float64], metres_per_unit: float = 1.0
+    mesh: TetMesh, truth: TrueShape, true_points: FloatArray, metres_per_unit: float = 1.0
 ) -> SurfaceDistances | None:
     """Measure a mesh against a body whose shape is known exactly.
 
@@ -121,7 +119,7 @@ def surface_distances(
     )
 
 
-def _barycentric(corners: npt.NDArray[np.float64], points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _barycentric(corners: FloatArray, points: FloatArray) -> FloatArray:
     """Weights of triangle corners (m, 3, 3) that give points (m, 3) in the triangles, in [0, 1] with sum 1."""
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     w = points - corners[:, 0]
@@ -140,7 +138,7 @@ class KnownTruth:
 
     scene: SyntheticScene
     """The exact scene."""
-    training_poses: npt.NDArray[np.float64]
+    training_poses: FloatArray
     """Training cameras, camera to world (OpenGL), shape (c, 4, 4), [m]."""
     camera: Camera
     """Intrinsics of all training photographs."""
@@ -188,9 +186,9 @@ def load_known_truth(scene_folder: Path | str) -> KnownTruth | None:
 
 
 def compare_with_truth(
-    cells: npt.NDArray[np.bool_],
+    cells: BoolArray,
     lattice: Lattice,
-    world_to_truth: npt.NDArray[np.float64],
+    world_to_truth: FloatArray,
     truth: Path | str | KnownTruth,
     mesh: TetMesh | None = None,
     metres_per_unit: float = 1.0,
@@ -277,7 +275,7 @@ def _scaled(name: str, value: Any, metres_per_unit: float) -> Any:
     return value if value is None or power == 0 else value * metres_per_unit**power
 
 
-def points_seen(known: KnownTruth) -> npt.NDArray[np.float64]:
+def points_seen(known: KnownTruth) -> FloatArray:
     """Points spread evenly over the part of the true surface that enough training cameras see, shape (m, 3), [m]."""
     points, normals = known.scene.surface_points(_SURFACE_POINTS, seed=0)
     seen = visible_surface_points(known.scene, known.training_poses, known.camera, points, normals, MIN_VIEWS)
@@ -291,7 +289,7 @@ def points_seen(known: KnownTruth) -> npt.NDArray[np.float64]:
     return points[seen]
 
 
-def _training_views(known: KnownTruth, world_to_truth: npt.NDArray[np.float64]) -> Views:
+def _training_views(known: KnownTruth, world_to_truth: FloatArray) -> Views:
     """The training cameras in the coordinates of the lattice."""
     scale = float(np.cbrt(abs(np.linalg.det(world_to_truth[:3, :3]))))
     poses, camera, count = known.training_poses, known.camera, len(known.training_poses)
@@ -305,18 +303,14 @@ def _training_views(known: KnownTruth, world_to_truth: npt.NDArray[np.float64]) 
     )
 
 
-def _num_faces(cells: npt.NDArray[np.bool_]) -> int:
+def _num_faces(cells: BoolArray) -> int:
     """Number of voxel faces between solid and empty, those on the lattice's border included."""
     padded = np.pad(cells, 1)
     return sum(int(np.count_nonzero(np.diff(padded, axis=axis))) for axis in range(3))
 
 
 def _mesh_errors(
-    scene: SyntheticScene,
-    mesh: TetMesh,
-    seen: npt.NDArray[np.float64],
-    voxel_m: float,
-    metres_per_unit: float,
+    scene: SyntheticScene, mesh: TetMesh, seen: FloatArray, voxel_m: float, metres_per_unit: float
 ) -> dict[str, Any]:
     """Size of the mesh, its distance to the true surface, and temperature errors where they meet."""
     area = facet_areas(mesh.points_m, mesh.facets)
@@ -351,7 +345,7 @@ def _temperature_errors(
     error_k = np.abs(mesh.temperature_c[nodes] - scene.surface_temperature_c(points))
     measured = mesh.observed[nodes]
 
-    def mean(errors: npt.NDArray[np.float64]) -> float | None:
+    def mean(errors: FloatArray) -> float | None:
         return float(errors.mean()) if len(errors) else None
 
     return {

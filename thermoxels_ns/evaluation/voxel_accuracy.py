@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import KDTree
 
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
@@ -26,11 +26,11 @@ _PER_SIDE = 2
 class TrueShape(Protocol):
     """A body whose shape is known exactly, in coordinates of its own (truth units)."""
 
-    def signed_distance(self, points: npt.NDArray[np.float64], /) -> npt.NDArray[np.float64]:
+    def signed_distance(self, points: FloatArray, /) -> FloatArray:
         """Distance of points (n, 3) to the surface, shape (n,), negative inside the body."""
         ...
 
-    def surface_points(self, n: int, seed: int, /) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    def surface_points(self, n: int, seed: int, /) -> tuple[FloatArray, FloatArray]:
         """`n` points spread evenly by area over the surface, and their outward unit normals, each (n, 3)."""
         ...
 
@@ -67,12 +67,12 @@ class SurfaceScore(_Score):
 
 
 def surface_fscore(
-    cells: npt.NDArray[np.bool_],
+    cells: BoolArray,
     lattice: Lattice,
     truth: TrueShape,
-    true_points_seen: npt.NDArray[np.float64],
+    true_points_seen: FloatArray,
     tolerance: float,
-    world_to_truth: npt.NDArray[np.float64] | None = None,
+    world_to_truth: FloatArray | None = None,
     views: Views | None = None,
 ) -> SurfaceScore:
     """Compare the boundary of the solid voxels with the true surface.
@@ -138,11 +138,7 @@ def surface_fscore(
 
 
 def _seen_score(
-    samples: npt.NDArray[np.float64],
-    agrees: npt.NDArray[np.bool_],
-    share: float,
-    true_points: npt.NDArray[np.float64],
-    tolerance: float,
+    samples: FloatArray, agrees: BoolArray, share: float, true_points: FloatArray, tolerance: float
 ) -> SeenScore:
     if len(samples) == 0:
         return SeenScore(share=0.0, precision=0.0, recall=0.0, fscore=0.0)
@@ -161,15 +157,15 @@ class _Faces:
     """Voxel faces across one axis, between solid and empty."""
 
     axis: int
-    corner: npt.NDArray[np.int64]
+    corner: IntArray
     """Corner index of each face's first corner, shape (n, 3)."""
-    empty: npt.NDArray[np.int64]
+    empty: IntArray
     """The empty voxel beside each face, shape (n, 3); outside the lattice for some faces on its border."""
-    on_border: npt.NDArray[np.bool_]
+    on_border: BoolArray
     """Faces on the border of the lattice, shape (n,)."""
 
 
-def _boundary_faces(cells: npt.NDArray[np.bool_]) -> tuple[_Faces, ...]:
+def _boundary_faces(cells: BoolArray) -> tuple[_Faces, ...]:
     faces = []
     for axis in range(3):
         width = [(0, 0)] * 3
@@ -183,7 +179,7 @@ def _boundary_faces(cells: npt.NDArray[np.bool_]) -> tuple[_Faces, ...]:
     return tuple(faces)
 
 
-def _samples(faces: tuple[_Faces, ...]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+def _samples(faces: tuple[_Faces, ...]) -> tuple[FloatArray, BoolArray]:
     """Corner indices of `_PER_SIDE`^2 points on a regular grid of each face, and which lie on the lattice's border."""
     steps = (np.arange(_PER_SIDE) + 0.5) / _PER_SIDE
     points, borders = [], []

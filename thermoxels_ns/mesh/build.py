@@ -9,6 +9,7 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
@@ -82,18 +83,15 @@ class BuiltMesh:
 class _Shape:
     """Nodes and elements before they have temperatures."""
 
-    points: npt.NDArray[np.float64]
+    points: FloatArray
     """Nodes as fractional corner indices, shape (n, 3)."""
-    tets: npt.NDArray[np.int64]
-    facets: npt.NDArray[np.int64]
-    facet_tags: npt.NDArray[np.int64]
+    tets: IntArray
+    facets: IntArray
+    facet_tags: IntArray
 
 
 def build_mesh(
-    snapshot: GridSnapshot,
-    selection: SolidSelection,
-    world_to_metres: npt.NDArray[np.float64],
-    options: MeshOptions = MeshOptions(),
+    snapshot: GridSnapshot, selection: SolidSelection, world_to_metres: FloatArray, options: MeshOptions = MeshOptions()
 ) -> BuiltMesh:
     """Cut the solid part of a trained field into tetrahedra with nodal temperatures and boundary tags.
 
@@ -171,7 +169,7 @@ def build_mesh(
     )
 
 
-def _voxel_shape(cells: npt.NDArray[np.bool_]) -> _Shape:
+def _voxel_shape(cells: BoolArray) -> _Shape:
     corners, tets = kuhn_tets(cells)
     facets = voxel_facets(cells)
     nx, ny, nz = cells.shape
@@ -185,9 +183,7 @@ def _stuffed_shape(level: npt.NDArray[np.floating], coarsest_cell: int) -> _Shap
     return _Shape(stuffed.points, stuffed.tets, stuffed.facets, tags)
 
 
-def _measured(
-    snapshot: GridSnapshot, points: npt.NDArray[np.float64], least: float
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def _measured(snapshot: GridSnapshot, points: FloatArray, least: float) -> tuple[FloatArray, FloatArray]:
     """Temperature at points given by fractional corner indices from measured corners alone, and the ray weight of these
     that reaches the point, each shape (n,).
     """
@@ -195,7 +191,7 @@ def _measured(
     return interpolate_corners(points, snapshot.temperature_c, weight)
 
 
-def _colour(snapshot: GridSnapshot, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float32] | None:
+def _colour(snapshot: GridSnapshot, points: FloatArray) -> Float32Array | None:
     """Colour at points from corners with density, grey where there is none around, shape (n, 3)."""
     if snapshot.colour is None:
         return None
@@ -203,7 +199,7 @@ def _colour(snapshot: GridSnapshot, points: npt.NDArray[np.float64]) -> npt.NDAr
     return np.where(weight[:, None] > 0.0, colour, 0.5).astype(np.float32)
 
 
-def _with_a_measurement(shape: _Shape, observed: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.bool_], int]:
+def _with_a_measurement(shape: _Shape, observed: BoolArray) -> tuple[BoolArray, int]:
     """Nodes of the parts of a mesh that have an observed node, or all if none has, and how many parts are left out.
 
     Voxels that touch by a corner only are one part as voxels, but may be two once their surface is smooth.
@@ -215,7 +211,7 @@ def _with_a_measurement(shape: _Shape, observed: npt.NDArray[np.bool_]) -> tuple
     return seen[part], int(np.count_nonzero(~seen))
 
 
-def _kept(shape: _Shape, stays: npt.NDArray[np.bool_]) -> _Shape:
+def _kept(shape: _Shape, stays: BoolArray) -> _Shape:
     """The parts of a mesh whose nodes stay."""
     number = renumbered(stays)
     facet_stays = stays[shape.facets[:, 0]]
@@ -227,7 +223,7 @@ def _kept(shape: _Shape, stays: npt.NDArray[np.bool_]) -> _Shape:
     )
 
 
-def _without_voxels_of(solid: SolidCells, points: npt.NDArray[np.float64]) -> tuple[SolidCells, int]:
+def _without_voxels_of(solid: SolidCells, points: FloatArray) -> tuple[SolidCells, int]:
     """Leave out the voxels that parts of a mesh with these nodes were made from; also their number.
 
     Centres of solid voxels near the surface are nodes, and voxels that share a face are in one part.
@@ -241,15 +237,13 @@ def _without_voxels_of(solid: SolidCells, points: npt.NDArray[np.float64]) -> tu
     return _without(solid, goes[part])
 
 
-def _without(solid: SolidCells, goes: npt.NDArray[np.bool_]) -> tuple[SolidCells, int]:
+def _without(solid: SolidCells, goes: BoolArray) -> tuple[SolidCells, int]:
     """Leave out some solid voxels; also their number."""
     level = np.where(goes, -np.abs(solid.level), solid.level)
     return replace(solid, cells=solid.cells & ~goes, level=level), int(np.count_nonzero(goes))
 
 
-def _without_unobserved_parts(
-    solid: SolidCells, observed_corners: npt.NDArray[np.bool_]
-) -> tuple[SolidCells, int, int]:
+def _without_unobserved_parts(solid: SolidCells, observed_corners: BoolArray) -> tuple[SolidCells, int, int]:
     """Leave out bodies without an observed corner, unless that is all of them; also their number and their voxels."""
     # Voxels share a node if they touch by a face, an edge or a corner.
     box = bounding_box(solid.cells)
@@ -268,7 +262,7 @@ def _without_unobserved_parts(
     return kept, int(np.count_nonzero(~seen[1:])), num_voxels
 
 
-def check_similarity(name: str, matrix: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def check_similarity(name: str, matrix: npt.ArrayLike) -> FloatArray:
     """Return `matrix` as float64 if it is a 4x4 similarity (mirrors allowed), else raise `MeshError`."""
     remedy = "Pass a 4x4 matrix made of a rotation, one scale above 0 and a shift, with last row 0 0 0 1."
     transform = check_shape(name, np.asarray(matrix, dtype=np.float64), (4, 4), remedy, MeshError)
@@ -282,12 +276,12 @@ def check_similarity(name: str, matrix: npt.ArrayLike) -> npt.NDArray[np.float64
     return transform
 
 
-def apply_transform(matrix: npt.NDArray[np.float64], points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def apply_transform(matrix: FloatArray, points: FloatArray) -> FloatArray:
     """Map points (n, 3) by a 4x4 that acts on homogeneous column vectors."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def node_parts(tets: npt.NDArray[np.int64], num_nodes: int) -> npt.NDArray[np.int64]:
+def node_parts(tets: IntArray, num_nodes: int) -> IntArray:
     """Number of the connected part of each node, shape (n,), from 0; parts share no node.
 
     >>> node_parts(np.array([[0, 1, 2, 3], [3, 4, 5, 6], [7, 8, 9, 10]]), 11).tolist()
@@ -298,9 +292,7 @@ def node_parts(tets: npt.NDArray[np.int64], num_nodes: int) -> npt.NDArray[np.in
     return connected_components(links, directed=False)[1].astype(np.int64)
 
 
-def renumbered(
-    keep: npt.NDArray[np.bool_],
-) -> npt.NDArray[np.int64]:
+def renumbered(keep: BoolArray) -> IntArray:
     """New number of each node when only some stay, -1 for the others, shape (n,).
 
     >>> renumbered(np.array([True, False, True])).tolist()

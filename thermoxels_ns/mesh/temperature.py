@@ -8,6 +8,7 @@ from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
@@ -25,8 +26,8 @@ _LEAST_CONDUCTANCE = 1e-6
 
 
 def interpolate_corners(
-    points_index: npt.NDArray[np.float64], values: npt.NDArray, weights: npt.NDArray
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    points_index: FloatArray, values: npt.NDArray, weights: npt.NDArray
+) -> tuple[FloatArray, FloatArray]:
     """Interpolate between corners that know a value, leaving out those that do not (normalised convolution).
 
     value(x) = sum_c t_c w_c v_c / sum_c t_c w_c with the trilinear weights t_c of the eight corners around x and the
@@ -55,7 +56,7 @@ def interpolate_corners(
     weight = np.zeros(len(low))
     trailing = (slice(None), *[None] * (values.ndim - 3))
     # Chosen as the origin of the sum so that equal values come out as they are.
-    first: npt.NDArray[np.float64] | None = None
+    first: FloatArray | None = None
     known = np.zeros(len(low), dtype=bool)
     for offset in CORNER_OFFSETS:
         at = ((low[:, 0] + offset[0]) * shape[1] + low[:, 1] + offset[1]) * shape[2] + low[:, 2] + offset[2]
@@ -74,11 +75,11 @@ def interpolate_corners(
 
 
 def extend_harmonically(
-    edges: npt.NDArray[np.int64],
+    edges: IntArray,
     temperature_c: npt.NDArray[np.floating],
-    observed: npt.NDArray[np.bool_],
+    observed: BoolArray,
     edge_weights: npt.NDArray | None = None,
-) -> npt.NDArray[np.float64]:
+) -> FloatArray:
     """Fill in the temperature of unobserved nodes by the graph Laplace equation.
 
     Observed nodes keep their value. Every other node i solves sum_j w_ij (T_i - T_j) = 0 over its edges: steady heat
@@ -140,9 +141,7 @@ def extend_harmonically(
     return temperature
 
 
-def tet_conductances(
-    points: npt.NDArray[np.float64], tets: npt.NDArray[np.int64]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+def tet_conductances(points: FloatArray, tets: IntArray) -> tuple[IntArray, FloatArray]:
     """What each tetrahedron adds to the conductance of its edges: minus the entries of its linear stiffness matrix.
 
     With them the extension is steady heat conduction in the mesh: a temperature that is linear in space is extended
@@ -163,7 +162,7 @@ def tet_conductances(
     return tets[:, TET_EDGES].reshape(-1, 2), conductances.ravel()
 
 
-def _parts_with_measurement(links: sparse.csr_array, observed: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+def _parts_with_measurement(links: sparse.csr_array, observed: BoolArray) -> IntArray:
     """Connected part of every node, shape (n,); raise if a part has no observed node."""
     count, parts = connected_components(links, directed=False)
     measured = np.bincount(parts[observed], minlength=count)
@@ -184,7 +183,7 @@ def _parts_with_measurement(links: sparse.csr_array, observed: npt.NDArray[np.bo
 
 def _conjugate_gradients(
     matrix: sparse.csr_array, load: npt.NDArray, degree: npt.NDArray, tolerance: float
-) -> npt.NDArray[np.float64]:
+) -> FloatArray:
     """Conjugate gradients with Jacobi, from 0 until the residual is at most `tolerance` of the load.
 
     Sums are numpy's own: those of BLAS, which scipy's solver takes, depend in the last digits on how many threads it
@@ -208,7 +207,7 @@ def _conjugate_gradients(
     return solution
 
 
-def _solve(matrix: sparse.csr_array, load: npt.NDArray, degree: npt.NDArray) -> npt.NDArray[np.float64]:
+def _solve(matrix: sparse.csr_array, load: npt.NDArray, degree: npt.NDArray) -> FloatArray:
     """Solve the symmetric positive definite system: directly if small, else conjugate gradients with Jacobi."""
     if len(load) <= _DIRECT_SOLVE_UNKNOWNS:
         solution = np.asarray(spsolve(matrix.tocsc(), load)).reshape(-1)

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 
 
 @dataclass(frozen=True)
 class Boundary:
     """What physics needs to know of every boundary triangle, in the order of `TetMesh.facets`."""
 
-    normal: npt.NDArray[np.float64]
+    normal: FloatArray
     """Outward unit normal of the true surface, shape (f, 3). On a staircase of voxel faces it is not that of the
     triangle."""
-    area_factor: npt.NDArray[np.float64]
+    area_factor: FloatArray
     """Area of true surface that a triangle stands for, over its own area, shape (f,), above 0; 1 where the mesh follows
     the surface."""
-    seen: npt.NDArray[np.bool_]
+    seen: BoolArray
     """True where some training camera has a free line of sight to the triangle, shape (f,)."""
-    patch: npt.NDArray[np.int64]
+    patch: IntArray
     """Index into `patch_names`, shape (f,)."""
     patch_names: tuple[str, ...]
     """Names of the patches, all different; some may have no triangle."""
@@ -30,25 +29,25 @@ class Boundary:
 class TetMesh:
     """A conforming tetrahedral mesh with nodal temperatures, in metres."""
 
-    points_m: npt.NDArray[np.float64]
+    points_m: FloatArray
     """Nodes, shape (n, 3), [m]."""
-    tets: npt.NDArray[np.int64]
+    tets: IntArray
     """Node indices, shape (t, 4), positively oriented: det(p1 - p0, p2 - p0, p3 - p0) > 0."""
-    temperature_c: npt.NDArray[np.float64]
+    temperature_c: FloatArray
     """Nodal temperature, shape (n,), [degrees Celsius]."""
-    observed: npt.NDArray[np.bool_]
+    observed: BoolArray
     """True where a thermal ray saw the node; elsewhere the temperature is a harmonic extension. Shape (n,)."""
-    facets: npt.NDArray[np.int64]
+    facets: IntArray
     """Boundary triangles, shape (f, 3), oriented so that the right-hand normal points out of the body."""
-    facet_tags: npt.NDArray[np.int64]
+    facet_tags: IntArray
     """One of the `FACET_*` constants per boundary triangle, shape (f,)."""
-    region: npt.NDArray[np.int64]
+    region: IntArray
     """Region number per tetrahedron, shape (t,); an index into `region_names`."""
     region_names: tuple[str, ...] = ("solid",)
     """Names of the regions, all different."""
     boundary: Boundary | None = None
     """Tags of the boundary triangles; None for a mesh that was not tagged."""
-    colour: npt.NDArray[np.float32] | None = None
+    colour: Float32Array | None = None
     """Colour of each node, red, green, blue in [0, 1], shape (n, 3); None if it is not known."""
 
 

@@ -7,6 +7,7 @@ from itertools import permutations
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, IntArray
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
 from thermoxels_ns.mesh.quality.face_count import count_faces
@@ -14,7 +15,7 @@ from thermoxels_ns.mesh.solid.morphology import bounding_box
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
 
 
-def _kuhn_pattern() -> npt.NDArray[np.int64]:
+def _kuhn_pattern() -> IntArray:
     """Voxel corners of the six tetrahedra around the main diagonal, shape (6, 4), positively oriented.
 
     Each permutation (a, b, c) of the axes is a path 000 -> e_a -> e_a + e_b -> 111 along voxel edges (Kuhn 1960,
@@ -32,7 +33,7 @@ def _kuhn_pattern() -> npt.NDArray[np.int64]:
 KUHN_PATTERN = _kuhn_pattern()
 
 
-def kuhn_tets(cells: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def kuhn_tets(cells: BoolArray) -> tuple[IntArray, IntArray]:
     """Cut every solid voxel into six tetrahedra that share its main diagonal.
 
     The diagonal has the same direction in every voxel, so the triangles on a face shared by two voxels coincide: the
@@ -57,7 +58,7 @@ def kuhn_tets(cells: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.int64], npt.
     return np.argwhere(number >= 0) + first, tets
 
 
-def lattice_edges(cells: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def lattice_edges(cells: BoolArray) -> tuple[IntArray, IntArray]:
     """Edges of the solid voxels, numbered like the nodes of `kuhn_tets`.
 
     Two used corners across an empty gap are no edge, even if they are lattice neighbours.
@@ -85,7 +86,7 @@ def lattice_edges(cells: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.int64], 
     return np.concatenate(edges), np.concatenate(counts)
 
 
-def voxel_facets(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+def voxel_facets(cells: BoolArray) -> IntArray:
     """Boundary triangles of `kuhn_tets`, taken from the voxel faces between solid and empty: cost follows these only.
 
     Kuhn's tetrahedra cut every voxel face along the diagonal from its lowest to its highest corner.
@@ -116,7 +117,7 @@ def voxel_facets(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
     return np.concatenate(facets)
 
 
-def boundary_facets(tets: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+def boundary_facets(tets: IntArray) -> IntArray:
     """Triangles that belong to exactly one tetrahedron, outwards, shape (f, 3), ordered by their sorted node numbers.
 
     Args:
@@ -126,9 +127,7 @@ def boundary_facets(tets: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     return faces[uses == 1]
 
 
-def boundary_tags(
-    facets: npt.NDArray[np.int64], points_index: npt.NDArray, lattice_shape: tuple[int, ...]
-) -> npt.NDArray[np.int64]:
+def boundary_tags(facets: IntArray, points_index: npt.NDArray, lattice_shape: tuple[int, ...]) -> IntArray:
     """Tell triangles where the scene box cuts the solid from the solid's own surface.
 
     Args:
@@ -148,7 +147,7 @@ def boundary_tags(
     return np.where(common > 0, FACET_BOX, FACET_SURFACE).astype(np.int64)
 
 
-def _as_cells(cells: npt.NDArray) -> npt.NDArray[np.bool_]:
+def _as_cells(cells: npt.NDArray) -> BoolArray:
     cells = np.asarray(cells)
     if cells.ndim != 3 or cells.dtype != np.bool_ or not cells.any():
         raise MeshError(
@@ -160,13 +159,13 @@ def _as_cells(cells: npt.NDArray) -> npt.NDArray[np.bool_]:
     return cells
 
 
-def _cropped(cells: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
+def _cropped(cells: BoolArray) -> tuple[BoolArray, IntArray]:
     """The box of voxels that holds all solid ones, and the index of its first."""
     box = bounding_box(cells)
     return np.ascontiguousarray(cells[box]), np.array([part.start for part in box], dtype=np.int64)
 
 
-def _node_numbers(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+def _node_numbers(cells: BoolArray) -> IntArray:
     """Node number of every lattice corner in C order, -1 where no solid voxel touches it; shape = cells + 1."""
     nx, ny, nz = cells.shape
     used = np.zeros((nx + 1, ny + 1, nz + 1), dtype=bool)

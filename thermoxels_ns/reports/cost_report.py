@@ -244,10 +244,7 @@ def markdown_table(rows: Sequence[CostRow], baseline: str) -> str:
     time_at = 1 + [name for _, name, _ in columns].index("seconds") if columns else 0
     heading = [heading for heading, _, _ in columns]
     heading.insert(time_at, f"time / {baseline}")
-    lines = [
-        "| setting | " + " | ".join(heading) + " | Pareto front |",
-        "|---|" + "---:|" * len(heading) + "---|",
-    ]
+    lines = ["| setting | " + " | ".join(heading) + " | Pareto front |", "|---|" + "---:|" * len(heading) + "---|"]
     for row in rows:
         cells = [_figure(row, name) for _, name, _ in columns]
         cells.insert(time_at, "-" if math.isnan(row.time_ratio) else f"{row.time_ratio:.2f}")

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import check_direction, check_finite, check_shape, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -153,7 +154,7 @@ def change_colours(change: npt.NDArray[np.floating]) -> tuple[dict[str, Any], st
 
 def _view_axes(
     up: Sequence[float], view_direction: Sequence[float] | None
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Unit vectors of the picture: right, up, and from the mesh to the camera."""
     upwards = _unit("up", up)
     if view_direction is None:
@@ -169,19 +170,19 @@ def _view_axes(
     return right, np.cross(towards_camera, right), towards_camera
 
 
-def _unit(name: str, vector: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def _unit(name: str, vector: npt.ArrayLike) -> FloatArray:
     array = check_direction(name, vector, "Pass for instance (0, 0, 1).", MeshError)
     return array / float(np.linalg.norm(array))
 
 
-def _without_outliers(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _without_outliers(values: FloatArray) -> FloatArray:
     """The values, or the middle 99 % of them where the others stretch their range to more than twice as much."""
     low, high = np.quantile(values, (0.005, 0.995))
     few = np.ptp(values) > 2.0 * (high - low) > 0.0
     return values[(values >= low) & (values <= high)] if few else values
 
 
-def _colour_limits(values: npt.NDArray[np.float64]) -> tuple[float, float]:
+def _colour_limits(values: FloatArray) -> tuple[float, float]:
     """Ends of the colour bar; a constant temperature gets 1 K around it."""
     low, high = float(values.min()), float(values.max())
     if not (np.isfinite(low) and np.isfinite(high)):
@@ -278,11 +279,7 @@ def _add_words(
 
 
 def _frame(
-    plotter: pv.Plotter,
-    points: npt.NDArray[np.float64],
-    right: npt.NDArray,
-    up: npt.NDArray,
-    towards_camera: npt.NDArray,
+    plotter: pv.Plotter, points: FloatArray, right: npt.NDArray, up: npt.NDArray, towards_camera: npt.NDArray
 ) -> None:
     """Point a parallel camera so that `points` just fill the mesh's area."""
     width, height = plotter.window_size

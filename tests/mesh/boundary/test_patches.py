@@ -9,12 +9,7 @@ import pytest
 
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.boundary.patch_rules import DEFAULT_PATCHES, PatchRules, Rule, load_patch_rules
-from thermoxels_ns.mesh.boundary.patches import (
-    apply_patches,
-    apply_regions,
-    default_patches,
-    facing,
-)
+from thermoxels_ns.mesh.boundary.patches import apply_patches, apply_regions, default_patches, facing
 
 EXAMPLE = Path(__file__).resolve().parents[3] / "configs" / "patches-example.yaml"
 UP = (0.0, 0.0, 1.0)
@@ -255,10 +250,7 @@ def test_empty_lists_are_no_rules(tmp_path: Path, text: str) -> None:
         ),
         ("regions: [{name: a, facing: up}]", "regions entry 1: expected keys out of name, box, plane, nearest_colour"),
         ("patches: [{name: a, facing: north}]", r"entry 1: facing: expected one of up, side, down, any, got 'north'"),
-        (
-            "patches: [{name: a, only: seen}]",
-            r"entry 1: only: expected one of exterior.* cut, all, got 'seen'",
-        ),
+        ("patches: [{name: a, only: seen}]", r"entry 1: only: expected one of exterior.* cut, all, got 'seen'"),
         ("patches: [{name: a, only: [cut]}]", r"only: expected one of exterior, interior, cut, all, got \['cut'\]"),
         ("patches: [{name: a, only: cut, only: all}]", "expected a yaml file, got the key only twice"),
         ("patches: [{name: a, box: {lower: [0, 0, 0]}}]", r"entry 1: box: expected the key upper, got lower"),
@@ -288,10 +280,7 @@ def test_empty_lists_are_no_rules(tmp_path: Path, text: str) -> None:
             "patches: [{name: a, plane: {point: [0, 0, .inf], normal: [0, 0, 1]}}]",
             r"plane: point and normal: expected finite numbers, .*inf",
         ),
-        (
-            "patches: [{name: a, nearest_colour: [1, 2, 3]}]",
-            "nearest_colour: expected key: value lines",
-        ),
+        ("patches: [{name: a, nearest_colour: [1, 2, 3]}]", "nearest_colour: expected key: value lines"),
         (
             "patches: [{name: a, nearest_colour: {rgb: [0, 0, 256]}}]",
             r"nearest_colour: rgb: expected three numbers from 0 to 255",

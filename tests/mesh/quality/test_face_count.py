@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.quality.face_count import (
-    OUTWARD_FACES,
-    count_faces,
-    edges_of_rows,
-    facet_owners,
-    group_edges,
-)
+from thermoxels_ns.mesh.quality.face_count import OUTWARD_FACES, count_faces, edges_of_rows, facet_owners, group_edges
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 

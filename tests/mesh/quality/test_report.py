@@ -18,13 +18,7 @@ from thermoxels_ns.mesh.quality.report import QualityReport, quality_report
 from thermoxels_ns.mesh.tetrahedra import Boundary
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
-NAMES = (
-    "volumes_positive",
-    "conforming",
-    "boundary_closed",
-    "dihedral_within_bounds",
-    "temperatures_in_range",
-)
+NAMES = ("volumes_positive", "conforming", "boundary_closed", "dihedral_within_bounds", "temperatures_in_range")
 VOXEL_NAMES = (*NAMES, "non_obtuse", "stiffness_monotone")
 
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_direction, check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.boundary.patch_rules import DEFAULT_PATCHES, DEFAULT_REGION, FACINGS, PatchRules, Rule
@@ -20,7 +21,7 @@ _COS_45 = math.sqrt(0.5) + 1e-9
 class Applied(NamedTuple):
     """What rules make of some elements."""
 
-    number: npt.NDArray[np.int64]
+    number: IntArray
     """Index of each element's patch or region, shape (n,)."""
     names: tuple[str, ...]
     """Names of all patches or regions."""
@@ -29,7 +30,7 @@ class Applied(NamedTuple):
     all that do."""
 
 
-def facing(normals: npt.NDArray[np.float64], up: npt.ArrayLike) -> npt.NDArray[np.int64]:
+def facing(normals: FloatArray, up: npt.ArrayLike) -> IntArray:
     """Where normals point: index into `FACINGS`.
 
     Up is less than 45 degrees off the up direction, down more than 135 degrees, all else is side.
@@ -53,11 +54,8 @@ def facing(normals: npt.NDArray[np.float64], up: npt.ArrayLike) -> npt.NDArray[n
 
 
 def default_patches(
-    normals: npt.NDArray[np.float64],
-    up: npt.ArrayLike,
-    seen: npt.NDArray[np.bool_],
-    on_box: npt.NDArray[np.bool_],
-) -> tuple[npt.NDArray[np.int64], tuple[str, ...]]:
+    normals: FloatArray, up: npt.ArrayLike, seen: BoolArray, on_box: BoolArray
+) -> tuple[IntArray, tuple[str, ...]]:
     """Patches that need no rules: cut by the scene box, else exterior (seen) or interior, facing up, sideways or down.
 
     Args:
@@ -79,11 +77,11 @@ def default_patches(
 def apply_patches(
     rules: PatchRules,
     *,
-    centroids_m: npt.NDArray[np.float64],
-    normals: npt.NDArray[np.float64],
+    centroids_m: FloatArray,
+    normals: FloatArray,
     up: npt.ArrayLike,
-    seen: npt.NDArray[np.bool_],
-    on_box: npt.NDArray[np.bool_],
+    seen: BoolArray,
+    on_box: BoolArray,
     colours: npt.NDArray | None = None,
 ) -> Applied:
     """Default patches with a user's rules over them.
@@ -119,9 +117,7 @@ def apply_patches(
     return _applied(rules.patches, "patch", owner, patch, names)
 
 
-def apply_regions(
-    rules: PatchRules, tet_centroids: npt.NDArray[np.float64], tet_colours: npt.NDArray | None = None
-) -> Applied:
+def apply_regions(rules: PatchRules, tet_centroids: FloatArray, tet_colours: npt.NDArray | None = None) -> Applied:
     """Regions of tetrahedra by a user's rules; what no rule claims is region 0, "solid".
 
     Args:
@@ -141,13 +137,7 @@ def apply_regions(
     return _applied(rules.regions, "region", owner, np.zeros(count, dtype=np.int64), (DEFAULT_REGION,))
 
 
-def _applied(
-    rules: Sequence[Rule],
-    kind: str,
-    owner: npt.NDArray[np.int64],
-    start: npt.NDArray[np.int64],
-    names: tuple[str, ...],
-) -> Applied:
+def _applied(rules: Sequence[Rule], kind: str, owner: IntArray, start: IntArray, names: tuple[str, ...]) -> Applied:
     """Overwrite `start` where a rule owns the element, and append the rules' names."""
     all_names = tuple(dict.fromkeys((*names, *(rule.name for rule in rules))))
     number = np.array([all_names.index(rule.name) for rule in rules], dtype=np.int64)
@@ -162,11 +152,11 @@ def _applied(
 def _rule_of_each(
     rules: Sequence[Rule],
     kind: str,
-    allowed: Sequence[npt.NDArray[np.bool_]],
+    allowed: Sequence[BoolArray],
     count: int,
-    centroids: npt.NDArray[np.float64],
+    centroids: FloatArray,
     colours: npt.NDArray | None,
-) -> npt.NDArray[np.int64]:
+) -> IntArray:
     """Number of the rule that each of `count` elements follows, -1 for none, shape (count,).
 
     `allowed` says for each rule where `only` and `facing` hold.
@@ -202,7 +192,7 @@ def _rule_of_each(
     return owner
 
 
-def _in_space(rule: Rule, centroids: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+def _in_space(rule: Rule, centroids: FloatArray) -> BoolArray:
     """Where a rule's box and plane hold, their borders included."""
     inside = np.ones(len(centroids), dtype=bool)
     if rule.box is not None:

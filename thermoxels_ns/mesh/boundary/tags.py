@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
@@ -27,11 +28,11 @@ LEAST_AREA_FACTOR = 0.05
 
 def tag_boundary(
     mesh: TetMesh,
-    points_index: npt.NDArray[np.float64],
+    points_index: FloatArray,
     solid: SolidCells,
     lattice: Lattice,
     views: Views | None,
-    world_to_metres: npt.NDArray[np.float64],
+    world_to_metres: FloatArray,
     mode: BoundaryMode,
     up: tuple[float, float, float],
     rules: PatchRules,
@@ -82,8 +83,8 @@ def tag_boundary(
 
 
 def voxel_surface(
-    level: npt.NDArray[np.floating], points_index: npt.NDArray, facets: npt.NDArray[np.int64]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    level: npt.NDArray[np.floating], points_index: npt.NDArray, facets: IntArray
+) -> tuple[FloatArray, FloatArray]:
     """Normal and area of the true surface at each boundary triangle of a voxel mesh.
 
     The normal n is minus the gradient of the level (Sobel's differences), the mean of the two voxels beside the face.

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy import ndimage
 
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.kernel_cache import kernel
@@ -26,12 +26,8 @@ _REMEDY = "Pass one centroid and one outward unit normal per boundary triangle."
 
 
 def seen_facets(
-    cells: npt.NDArray[np.bool_],
-    views: Views,
-    lattice: Lattice,
-    centroids_world: npt.NDArray[np.float64],
-    normals_world: npt.NDArray[np.float64],
-) -> npt.NDArray[np.bool_]:
+    cells: BoolArray, views: Views, lattice: Lattice, centroids_world: FloatArray, normals_world: FloatArray
+) -> BoolArray:
     """Tell which boundary triangles at least one training camera sees.
 
     A camera sees a triangle that faces it, lies in its image and has no solid voxel on the straight line between
@@ -79,8 +75,8 @@ def seen_facets(
 
 
 def _grouped(
-    centroids: npt.NDArray[np.float64], normals: npt.NDArray[np.float64], shape: tuple[int, int, int]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    centroids: FloatArray, normals: FloatArray, shape: tuple[int, int, int]
+) -> tuple[IntArray, FloatArray, FloatArray]:
     """Group triangles by voxel and main direction.
 
     Returns:
@@ -98,7 +94,7 @@ def _grouped(
     return group, np.stack(mean[:3], axis=1), normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
-def _spread(centres: npt.NDArray[np.float64]) -> list[int]:
+def _spread(centres: FloatArray) -> list[int]:
     """Order cameras so that each is as far as can be from those before it: the first few see most of a scene."""
     if len(centres) == 0:
         return []
@@ -115,7 +111,7 @@ def _spread(centres: npt.NDArray[np.float64]) -> list[int]:
 class _EmptySpace:
     """Solid voxels, arranged so that a line crosses empty space in large steps."""
 
-    def __init__(self, cells: npt.NDArray[np.bool_]) -> None:
+    def __init__(self, cells: BoolArray) -> None:
         """Find, around each voxel, the largest aligned block of 2^k voxels along an edge that is empty."""
         box = bounding_box(cells) if cells.any() else (slice(0, 1),) * 3
         self.lowest = np.array([part.start for part in box], dtype=np.float64)
@@ -134,11 +130,11 @@ class _EmptySpace:
             nx, ny, nz = self.cells.shape
             self.block[empty[:nx, :ny, :nz]] = k
 
-    def solid_at(self, points: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    def solid_at(self, points: FloatArray) -> BoolArray:
         """Whether points, in corner indices, are in solid voxels, shape (points,)."""
         return self._at(points, self.cells)
 
-    def _at(self, points: npt.NDArray[np.float64], flags: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    def _at(self, points: FloatArray, flags: BoolArray) -> BoolArray:
         """The flag of the voxel that each point is in, False beyond the bounding box."""
         index = np.floor(points - self.lowest).astype(np.int64)
         inside = np.all((index >= 0) & (index < self.size), axis=1)
@@ -146,7 +142,7 @@ class _EmptySpace:
         found[inside] = flags[tuple(index[inside].T)]
         return found
 
-    def enclosed_at(self, points: npt.NDArray[np.float64], cameras: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    def enclosed_at(self, points: FloatArray, cameras: FloatArray) -> BoolArray:
         """Whether points lie in empty space that solid voxels cut off from the outside and from all cameras.
 
         No line of sight leaves such a cavity, so it needs not be followed. Voxels that touch by a corner count as one
@@ -251,7 +247,7 @@ def _seen_by_any(block, lowest, middle, normal, start, open_start, centres, rota
     return seen
 
 
-def _any_of_pairs(cells: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+def _any_of_pairs(cells: BoolArray) -> BoolArray:
     """Whether any voxel is solid in each aligned block of 2 x 2 x 2, the last ones cut off by the border."""
     cells = np.pad(cells, [(0, n % 2) for n in cells.shape])
     for axis in range(3):

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, IntArray
 from thermoxels_ns.core.checks import check_positive, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import HeatError, MeshError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
@@ -23,7 +24,7 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8
 """Stefan-Boltzmann constant (CODATA 2018, exact to the digits given), [W / (m2 K4)]."""
 
-_FACE_OPPOSITE: npt.NDArray[np.int64] = np.array([3, 4, 2, 1], dtype=np.int64)
+_FACE_OPPOSITE: IntArray = np.array([3, 4, 2, 1], dtype=np.int64)
 """Number of the face opposite each node: S1 has the nodes 1 2 3, S2 1 4 2, S3 2 4 3 and S4 3 4 1."""
 
 _LONGEST_NAME = 60
@@ -125,7 +126,7 @@ def _set_names(name: str, names: Sequence[str]) -> list[str]:
     return written
 
 
-def _parts(index: npt.NDArray[np.int64], names: Sequence[str]) -> Iterator[tuple[str, npt.NDArray[np.int64]]]:
+def _parts(index: IntArray, names: Sequence[str]) -> Iterator[tuple[str, IntArray]]:
     """Name and members, rising, of every part that is not empty."""
     for part, name in enumerate(names):
         members = np.flatnonzero(index == part)
@@ -140,7 +141,7 @@ def _rows(row: str, *columns: npt.NDArray) -> Iterator[str]:
         yield row * len(chunk[0]) % tuple(chain.from_iterable(zip(*chunk)))
 
 
-def _number_lines(values: npt.NDArray[np.int64]) -> Iterator[str]:
+def _number_lines(values: IntArray) -> Iterator[str]:
     """Numbers of a set, 16 per line."""
     full = len(values) // _NUMBERS_PER_LINE * _NUMBERS_PER_LINE
     table = values[:full].reshape(-1, _NUMBERS_PER_LINE)
@@ -149,7 +150,7 @@ def _number_lines(values: npt.NDArray[np.int64]) -> Iterator[str]:
         yield ", ".join(map(str, values[full:].tolist())) + "\n"
 
 
-def _nodes_and_elements(content: FileContent, observed: npt.NDArray[np.bool_], regions: Sequence[str]) -> Iterator[str]:
+def _nodes_and_elements(content: FileContent, observed: BoolArray, regions: Sequence[str]) -> Iterator[str]:
     yield "*NODE, NSET=NALL\n"
     yield from _rows(f"%d, {_REAL}, {_REAL}, {_REAL}\n", np.arange(1, len(content.points_m) + 1), *content.points_m.T)
     used = list(_parts(content.region, regions))
@@ -163,9 +164,7 @@ def _nodes_and_elements(content: FileContent, observed: npt.NDArray[np.bool_], r
         yield from _number_lines(np.flatnonzero(observed) + 1)
 
 
-def _surfaces(
-    content: FileContent, patches: Sequence[str], owner: npt.NDArray[np.int64], face: npt.NDArray[np.int64]
-) -> Iterator[str]:
+def _surfaces(content: FileContent, patches: Sequence[str], owner: IntArray, face: IntArray) -> Iterator[str]:
     areas = np.linalg.norm(facet_area_vectors(content.points_m, content.facets), axis=1)
     for name, members in _parts(content.patch, patches):
         mesh_m2 = float(areas[members].sum())

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.core.units import celsius_to_kelvin
@@ -33,25 +34,25 @@ _FAR_SIZES = 16.0
 class FileContent:
     """A mesh's arrays, checked, with a temperature for every node and a name for every part."""
 
-    points_m: npt.NDArray[np.float64]
+    points_m: FloatArray
     """Nodes, shape (n, 3), [m]."""
-    tets: npt.NDArray[np.int64]
+    tets: IntArray
     """Node indices, shape (t, 4)."""
-    temperature_c: npt.NDArray[np.float64]
+    temperature_c: FloatArray
     """Nodal temperature, shape (n,), [degrees Celsius]."""
-    region: npt.NDArray[np.int64]
+    region: IntArray
     """Index into `region_names`, shape (t,)."""
     region_names: tuple[str, ...]
     """Names of the regions, all different; some may have no tetrahedron."""
-    facets: npt.NDArray[np.int64]
+    facets: IntArray
     """Boundary triangles, shape (f, 3), right-hand normals outwards."""
-    patch: npt.NDArray[np.int64]
+    patch: IntArray
     """Index into `patch_names`, shape (f,)."""
     patch_names: tuple[str, ...]
     """Names of the patches, all different; some may have no triangle."""
-    normal: npt.NDArray[np.float64]
+    normal: FloatArray
     """Outward unit normal of the true surface at each boundary triangle, shape (f, 3)."""
-    area_factor: npt.NDArray[np.float64]
+    area_factor: FloatArray
     """True area that each boundary triangle stands for, over its own, shape (f,)."""
 
 
@@ -128,7 +129,7 @@ def node_arrays(mesh: TetMesh, content: FileContent) -> dict[str, npt.NDArray]:
     return arrays
 
 
-def normals_of(points_m: npt.NDArray[np.float64], facets: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+def normals_of(points_m: FloatArray, facets: IntArray) -> FloatArray:
     """Unit normals of triangles (right-hand rule), 0 for one without area, shape (f, 3)."""
     vectors = facet_area_vectors(points_m, facets)
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -186,15 +187,15 @@ def _check_names(name: str, names: Sequence[str]) -> None:
 class Surface:
     """Triangles that use every one of their nodes."""
 
-    points_m: npt.NDArray[np.float64]
+    points_m: FloatArray
     """Nodes on the boundary, shape (m, 3), [m]."""
-    triangles: npt.NDArray[np.int64]
+    triangles: IntArray
     """Indices into `points_m`, shape (f, 3), right-hand normals outwards."""
-    nodes: npt.NDArray[np.int64]
+    nodes: IntArray
     """Number of each node in the mesh, rising, shape (m,)."""
 
 
-def surface_of(points_m: npt.NDArray[np.float64], facets: npt.NDArray[np.int64]) -> Surface:
+def surface_of(points_m: FloatArray, facets: IntArray) -> Surface:
     """Leave out the nodes that no triangle uses.
 
     >>> surface_of(np.arange(12.0).reshape(4, 3), np.array([[3, 0, 2]])).triangles.tolist()
@@ -207,7 +208,7 @@ def surface_of(points_m: npt.NDArray[np.float64], facets: npt.NDArray[np.int64])
     return Surface(points_m[nodes], number[facets], nodes)
 
 
-def far_origin(points_m: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | None:
+def far_origin(points_m: FloatArray) -> FloatArray | None:
     """Where to count positions from so that single precision can hold them.
 
     Five million metres from the origin, as in national coordinates, single precision has steps of half a metre.
@@ -226,9 +227,7 @@ def far_origin(points_m: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | N
     return np.round(0.5 * (low + high)) if far else None
 
 
-def surface_colours(
-    mesh: TetMesh, surface: Surface, temperature_c: npt.NDArray[np.float64], colouring: Colouring
-) -> npt.NDArray[np.float64]:
+def surface_colours(mesh: TetMesh, surface: Surface, temperature_c: FloatArray, colouring: Colouring) -> FloatArray:
     """Colours of a surface's nodes, red, green, blue in [0, 1] as screens show them (sRGB), shape (m, 3).
 
     The colour map spans the surface's own temperatures; a surface of one temperature gets the map's middle.
@@ -257,7 +256,7 @@ def surface_colours(
     return matplotlib.colormaps[COLOUR_MAP](_DARKEST + (1.0 - _DARKEST) * share)[:, :3]
 
 
-def surface_range_c(surface: Surface, temperature_c: npt.NDArray[np.float64]) -> tuple[float, float]:
+def surface_range_c(surface: Surface, temperature_c: FloatArray) -> tuple[float, float]:
     """Lowest and highest temperature on a surface, the ends of its colour map, [degrees Celsius]."""
     values = temperature_c[surface.nodes]
     return (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import check_direction
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.content import (
@@ -119,12 +120,12 @@ def _write(path: Path, text: bytes, data: bytes) -> None:
     write_bytes(path, [header, sizes[0], text, sizes[1], data])
 
 
-def _linear(colours: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _linear(colours: FloatArray) -> FloatArray:
     """Light intensity of screen colours (IEC 61966-2-1, sRGB), both in [0, 1]."""
     return np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
 
 
-def _moved_by(origin: npt.NDArray[np.float64] | None, rotation: list[float]) -> dict[str, list[float]]:
+def _moved_by(origin: FloatArray | None, rotation: list[float]) -> dict[str, list[float]]:
     """Translation of a node whose positions count from `origin`, which the quaternion (x, y, z, w) turns too."""
     if origin is None:
         return {}

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.content import FileContent, check_suffix, file_content
@@ -83,7 +84,7 @@ def _sizes(*values: int) -> bytes:
     return np.array(values, dtype=_SIZE).tobytes()
 
 
-def _used(index: npt.NDArray[np.int64]) -> list[int]:
+def _used(index: IntArray) -> list[int]:
     """Numbers of the parts that are not empty."""
     return np.flatnonzero(np.bincount(index)).tolist() if len(index) else []
 
@@ -94,12 +95,12 @@ def _physical_names(content: FileContent) -> bytes:
     return "\n".join(["$PhysicalNames", str(len(lines)), *lines, "$EndPhysicalNames", ""]).encode()
 
 
-def _bounds(content: FileContent, nodes: npt.NDArray[np.int64]) -> bytes:
+def _bounds(content: FileContent, nodes: IntArray) -> bytes:
     points = content.points_m[nodes.ravel()]
     return np.concatenate([points.min(axis=0), points.max(axis=0)]).astype(_DOUBLE).tobytes()
 
 
-def _entities(content: FileContent, owner: npt.NDArray[np.int64]) -> Iterator[bytes]:
+def _entities(content: FileContent, owner: IntArray) -> Iterator[bytes]:
     """One surface per patch and one volume per region, each in the physical group of its own number."""
     patches, regions = _used(content.patch), _used(content.region)
     yield _sizes(0, 0, len(patches), len(regions))
@@ -112,7 +113,7 @@ def _entities(content: FileContent, owner: npt.NDArray[np.int64]) -> Iterator[by
         yield _sizes(1) + _ints(part + 1) + _sizes(len(around)) + _ints(*(patch + 1 for patch in around))
 
 
-def _node_blocks(content: FileContent) -> list[tuple[int, int, npt.NDArray[np.int64]]]:
+def _node_blocks(content: FileContent) -> list[tuple[int, int, IntArray]]:
     """Dimension, number and nodes of every entity that nodes lie on: the first patch that uses them, else the region.
 
     Together the blocks hold every node once.
@@ -132,7 +133,7 @@ def _node_blocks(content: FileContent) -> list[tuple[int, int, npt.NDArray[np.in
     return blocks
 
 
-def _nodes(blocks: list[tuple[int, int, npt.NDArray[np.int64]]], content: FileContent) -> Iterator[bytes]:
+def _nodes(blocks: list[tuple[int, int, IntArray]], content: FileContent) -> Iterator[bytes]:
     count = len(content.points_m)
     yield _sizes(len(blocks), count, 1, count)
     first = 1
@@ -143,7 +144,7 @@ def _nodes(blocks: list[tuple[int, int, npt.NDArray[np.int64]]], content: FileCo
         first += len(nodes)
 
 
-def _elements(content: FileContent, tag: npt.NDArray[np.int64]) -> Iterator[bytes]:
+def _elements(content: FileContent, tag: IntArray) -> Iterator[bytes]:
     patches, regions = _used(content.patch), _used(content.region)
     count = len(content.tets) + len(content.facets)
     yield _sizes(len(patches) + len(regions), count, 1, count)
@@ -165,7 +166,7 @@ def _header(section: str, name: str, components: int, count: int) -> bytes:
     return f'${section}\n1\n"{name}"\n1\n0.0\n3\n0\n{components}\n{count}\n'.encode()
 
 
-def _node_data(temperature_c: npt.NDArray[np.float64]) -> Iterator[bytes]:
+def _node_data(temperature_c: FloatArray) -> Iterator[bytes]:
     """One view of temperatures in the order of the tags."""
     count = len(temperature_c)
     yield _header("NodeData", TEMPERATURE_VIEW, 1, count)
@@ -176,7 +177,7 @@ def _node_data(temperature_c: npt.NDArray[np.float64]) -> Iterator[bytes]:
     yield b"\n$EndNodeData\n"
 
 
-def _triangle_view(name: str, first_tag: int, values: npt.NDArray[np.float64]) -> Iterator[bytes]:
+def _triangle_view(name: str, first_tag: int, values: FloatArray) -> Iterator[bytes]:
     """One view of values per triangle, as values at its three nodes.
 
     ElementData would be shorter, but meshio then wants a value for every element, in the order of the file.

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.vtu import boundary_path
@@ -80,7 +81,7 @@ def _read(path: Path) -> Any:
     return data
 
 
-def _tets(body: Any, name: str) -> npt.NDArray[np.int64]:
+def _tets(body: Any, name: str) -> IntArray:
     others = np.count_nonzero(body.celltypes != _TETRAHEDRON)
     if others:
         raise _wrong(name, "tetrahedra only", f"{others} cells of other kinds", _REMEDY)
@@ -100,9 +101,7 @@ def _region_names(body: Any, name: str) -> tuple[str, ...]:
     return tuple(numbers[number] for number in range(len(numbers)))
 
 
-def _boundary(
-    surface: Any, points: npt.NDArray[np.float64], name: str
-) -> tuple[npt.NDArray[np.int64], Boundary | None]:
+def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, Boundary | None]:
     node = _array(surface.point_data, "node", name).astype(np.int64)
     if node.min() < 0 or node.max() >= len(points) or not np.array_equal(points[node], surface.points):
         raise _wrong(name, "the boundary of the mesh beside it", "that of another one", _REMEDY)
@@ -125,7 +124,7 @@ def _boundary(
     )
 
 
-def _cell_numbers(data: Any, array: str, name: str, count: int) -> npt.NDArray[np.int64]:
+def _cell_numbers(data: Any, array: str, name: str, count: int) -> IntArray:
     numbers = _array(data.cell_data, array, name).astype(np.int64)
     if numbers.min() < 0 or numbers.max() >= count:
         raise _wrong(f"{name}: {array}", f"0 to {count - 1}", f"{numbers.min()} to {numbers.max()}", _REMEDY)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.quality.face_count import Groups, IntArray, faces_of_rows, group_faces, group_pairs
+from thermoxels_ns.mesh.quality.face_count import Groups, faces_of_rows, group_faces, group_pairs
 from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
 from thermoxels_ns.mesh.quality.topology import group_sides
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
@@ -43,24 +43,24 @@ class MeshQuality:
     """Largest angle between two faces of a tetrahedron, [degrees]."""
 
 
-def facet_area_vectors(points: npt.NDArray[np.float64], facets: IntArray) -> npt.NDArray[np.float64]:
+def facet_area_vectors(points: FloatArray, facets: IntArray) -> FloatArray:
     """Area times unit normal of triangles (right-hand rule), shape (f, 3), [m^2]."""
     origin = points[facets[:, 0]]
     return 0.5 * np.cross(points[facets[:, 1]] - origin, points[facets[:, 2]] - origin)
 
 
-def facet_areas(points: npt.NDArray[np.float64], facets: IntArray) -> npt.NDArray[np.float64]:
+def facet_areas(points: FloatArray, facets: IntArray) -> FloatArray:
     """Areas of triangles, shape (f,), [m^2]."""
     return np.linalg.norm(facet_area_vectors(points, facets), axis=1)
 
 
-def facet_normals(points: npt.NDArray[np.float64], facets: IntArray) -> npt.NDArray[np.float64]:
+def facet_normals(points: FloatArray, facets: IntArray) -> FloatArray:
     """Unit normals of triangles (right-hand rule), shape (f, 3)."""
     vectors = facet_area_vectors(points, facets)
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def dihedral_range_deg(points: npt.NDArray[np.float64], tets: IntArray) -> tuple[float, float]:
+def dihedral_range_deg(points: FloatArray, tets: IntArray) -> tuple[float, float]:
     """Smallest and largest angle between two faces of a tetrahedron, [degrees]; 0 at a face without area."""
     return _volumes_and_angles(points, tets)[1:]
 
@@ -146,7 +146,7 @@ def check_arrays(mesh: TetMesh) -> None:
             _fail(name, f"node numbers from 0 to {nodes - 1}", f"{numbers.min()} to {numbers.max()}")
 
 
-def count_twin_nodes(points: npt.NDArray[np.float64]) -> int:
+def count_twin_nodes(points: FloatArray) -> int:
     """Number of nodes at the place of an earlier one."""
     # Equal points have equal sums of scrambled bits (and -0.0 + 0.0 is 0.0); only points with equal sums are compared.
     bits = (np.asarray(points, dtype=np.float64) + 0.0).view(np.uint64)
@@ -178,7 +178,7 @@ def count_wrong_facets(mesh: TetMesh, faces: Groups) -> int:
     return int(np.abs(same.sums(np.repeat([1, -1], [len(wanted), len(mesh.facets)]))).sum())
 
 
-def count_overlaps(points: npt.NDArray[np.float64], facets: IntArray, sides: Groups) -> int:
+def count_overlaps(points: FloatArray, facets: IntArray, sides: Groups) -> int:
     """Number of pairs of triangles that share an edge and lie on the same side of it in the same plane.
 
     This is how a crack looks: the faces of neighbours that do not match are boundary triangles, one upon the other.
@@ -205,9 +205,7 @@ def count_overlaps(points: npt.NDArray[np.float64], facets: IntArray, sides: Gro
     return overlaps
 
 
-def _volumes_and_angles(
-    points: npt.NDArray[np.float64], tets: IntArray
-) -> tuple[npt.NDArray[np.float64], float, float]:
+def _volumes_and_angles(points: FloatArray, tets: IntArray) -> tuple[FloatArray, float, float]:
     """Signed volumes, shape (t,), [m^3], and the smallest and largest dihedral angle, [degrees]."""
     volumes = np.empty(len(tets))
     low, high = 1.0, -1.0

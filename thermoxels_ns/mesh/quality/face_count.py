@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
+from thermoxels_ns.core.arrays import IntArray
 from thermoxels_ns.core.errors import MeshError
 
-IntArray = npt.NDArray[np.int64]
 OUTWARD_FACES: IntArray = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.int64)
 """Faces of a positively oriented tetrahedron; face f lies opposite node f, its right-hand normal points outwards."""
 TET_EDGES: IntArray = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]], dtype=np.int64)
@@ -135,9 +135,7 @@ def _sorted_four(values: list[IntArray]) -> tuple[IntArray, IntArray, IntArray, 
     return np.minimum(a, c), np.minimum(m, n), np.maximum(m, n), np.maximum(b, d)
 
 
-def facet_owners(
-    tets: npt.NDArray[np.int64], facets: npt.NDArray[np.int64]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def facet_owners(tets: IntArray, facets: IntArray) -> tuple[IntArray, IntArray]:
     """Find the tetrahedron of every boundary triangle, and which of its faces the triangle is.
 
     Only faces whose nodes all lie on the boundary are looked at, so the sort follows the surface, not the volume.

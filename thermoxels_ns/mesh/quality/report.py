@@ -6,8 +6,8 @@ from dataclasses import asdict, dataclass
 from typing import Any, get_args
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import (
     check_arrays,
@@ -17,7 +17,7 @@ from thermoxels_ns.mesh.quality.checks import (
     facet_areas,
 )
 from thermoxels_ns.mesh.quality.criteria import AngleBins, BoundaryMode, Criterion, Figures, angle_bins, judge
-from thermoxels_ns.mesh.quality.face_count import IntArray, edges_of_rows, group_edges, group_faces
+from thermoxels_ns.mesh.quality.face_count import edges_of_rows, group_edges, group_faces
 from thermoxels_ns.mesh.quality.tet_shapes import angle_rounding, node_rounding, shapes_in_chunks
 from thermoxels_ns.mesh.quality.topology import (
     SurfaceComponent,
@@ -220,7 +220,7 @@ class _Shapes:
     radius_ratio_range: tuple[float, float]
     radius_ratio_mean: float
     radius_ratio_counts: IntArray
-    stiffness: npt.NDArray[np.float64]
+    stiffness: FloatArray
     """Rows as in `face_count.group_edges`, shape (6 t,)."""
 
 
@@ -252,7 +252,7 @@ def _measure_shapes(mesh: TetMesh, bins: AngleBins) -> _Shapes:
     )
 
 
-def _histogram(bin_of: npt.NDArray[np.float64], bins: int) -> IntArray:
+def _histogram(bin_of: FloatArray, bins: int) -> IntArray:
     """Counts of numbers of at least 0 by their whole part; what lies beyond the last bin counts in it."""
     return np.bincount(np.minimum(bin_of.astype(np.int64), bins - 1), minlength=bins)
 

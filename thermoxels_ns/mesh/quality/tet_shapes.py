@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 
 _CHUNK = 1 << 14
 """Tetrahedra at a time: what is worked on stays in the processor's cache."""
@@ -120,7 +119,7 @@ def angle_rounding(rounding: float, side: float | FloatArray) -> float | FloatAr
     return _ANGLE_PER_ROUNDING * rounding / side
 
 
-def shapes_in_chunks(points: FloatArray, tets: npt.NDArray[np.int64]) -> Iterator[tuple[slice, TetShapes]]:
+def shapes_in_chunks(points: FloatArray, tets: IntArray) -> Iterator[tuple[slice, TetShapes]]:
     """Go through tetrahedra a chunk at a time, so that memory does not grow with their number.
 
     Args:
@@ -141,7 +140,7 @@ def shapes_in_chunks(points: FloatArray, tets: npt.NDArray[np.int64]) -> Iterato
         yield which, TetShapes((a, b, c), (-(one + two + three), one, two, three), _dot(a, one), rounding)
 
 
-def signed_volumes(points: FloatArray, tets: npt.NDArray[np.int64]) -> FloatArray:
+def signed_volumes(points: FloatArray, tets: IntArray) -> FloatArray:
     """Volumes det(p1 - p0, p2 - p0, p3 - p0) / 6, shape (t,), [m^3]; negative if a tetrahedron is turned over."""
     volumes = np.empty(len(tets))
     for which, shapes in shapes_in_chunks(points, tets):

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from thermoxels_ns.mesh.quality.face_count import Groups, IntArray, group_pairs
+from thermoxels_ns.core.arrays import FloatArray, IntArray
+from thermoxels_ns.mesh.quality.face_count import Groups, group_pairs
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def tets_across_faces(face_groups: Groups) -> IntArray:
     return np.stack(_neighbours(face_groups), axis=1) >> 2
 
 
-def surface_topology(points: npt.NDArray[np.float64], facets: IntArray, sides: Groups | None = None) -> SurfaceTopology:
+def surface_topology(points: FloatArray, facets: IntArray, sides: Groups | None = None) -> SurfaceTopology:
     """Count the components of a triangulated surface, their handles, and where it is no manifold.
 
     Args:
@@ -133,7 +133,7 @@ def _labels(num: int, first: IntArray, second: IntArray) -> IntArray:
     return connected_components(links, directed=False)[1].astype(np.int64)
 
 
-def _cone_volumes(points: npt.NDArray[np.float64], facets: IntArray) -> npt.NDArray[np.float64]:
+def _cone_volumes(points: FloatArray, facets: IntArray) -> FloatArray:
     """Signed volumes between triangles and the middle of the nodes, shape (f,), [m^3]."""
     corner = (points - points.mean(axis=0))[facets]
     return np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6.0

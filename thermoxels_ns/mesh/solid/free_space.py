@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
-
-BoolArray = npt.NDArray[np.bool_]
 
 MOST_CAMERAS = 128
 """More cameras than this are thinned out evenly, in their order."""
@@ -77,7 +76,7 @@ _HELD, _FREE = np.uint16(1), np.uint16(256)
 """Both counts of a voxel stand in one number, so that one look-up serves them: the image holds it, its line is free."""
 
 
-def _holds(views: Views, camera: int, direction: npt.NDArray[np.float64]) -> BoolArray:
+def _holds(views: Views, camera: int, direction: FloatArray) -> BoolArray:
     """Whether a camera's image holds directions (..., 3)."""
     local = direction @ views.camera_to_world[camera, :, :3]
     depth = -local[..., 2]
@@ -99,7 +98,7 @@ def _count_along(
     counts: npt.NDArray[np.uint16],
     views: Views,
     camera: int,
-    eye: npt.NDArray[np.float64],
+    eye: FloatArray,
     order: tuple[int, int, int],
     sign: int,
 ) -> None:
@@ -150,10 +149,10 @@ class _Rays:
     """Whether slopes of exactly 1 belong to this pyramid; else they belong to its neighbour."""
 
     @property
-    def slopes(self) -> npt.NDArray[np.float64]:
+    def slopes(self) -> FloatArray:
         return self.low + (np.arange(self.count) + 0.5) * self.step
 
-    def of_voxels(self, away: npt.NDArray[np.float64]) -> _Runs:
+    def of_voxels(self, away: FloatArray) -> _Runs:
         """For layers so far away: the voxels that lie within the pyramid, and the ray nearest to each of them."""
         slope = (np.arange(self.voxels) + 0.5 - self.eye) / away[:, None]
         number = np.clip(np.floor((slope - self.low) / self.step), -1, self.count).astype(np.int64)
@@ -163,7 +162,7 @@ class _Rays:
             number[slope == -1.0] = -1
         return _Runs.inside(number, self.count)
 
-    def at_voxels(self, away: npt.NDArray[np.float64]) -> _Runs:
+    def at_voxels(self, away: FloatArray) -> _Runs:
         """For layers so far away: the rays that lie within the layer, and the voxel that each of them meets."""
         return _Runs.inside(np.floor(self.eye + self.slopes * away[:, None]).astype(np.int64), self.voxels)
 
@@ -172,14 +171,14 @@ class _Rays:
 class _Runs:
     """In each row of ascending numbers, the run of those that lie in 0..count - 1."""
 
-    number: npt.NDArray[np.int64]
+    number: IntArray
     start: list[int]
     stop: list[int]
 
     @classmethod
-    def inside(cls, number: npt.NDArray[np.int64], count: int) -> _Runs:
+    def inside(cls, number: IntArray, count: int) -> _Runs:
         return cls(number, (number < 0).sum(axis=1).tolist(), (number < count).sum(axis=1).tolist())
 
-    def at(self, row: int) -> tuple[slice, npt.NDArray[np.int64]]:
+    def at(self, row: int) -> tuple[slice, IntArray]:
         run = slice(self.start[row], self.stop[row])
         return run, self.number[row, run]

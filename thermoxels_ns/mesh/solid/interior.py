@@ -11,12 +11,12 @@ import numpy.typing as npt
 from scipy import fft, ndimage
 from scipy.spatial import KDTree
 
+from thermoxels_ns.core.arrays import BoolArray, Float32Array
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.solid.free_space import count_cameras
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected, grow
 
-BoolArray = npt.NDArray[np.bool_]
 LARGEST_PASS = 4_000_000
 """Lattices with more voxels than this are looked at in blocks of 2^3, 4^3, ... voxels."""
 SHADOW_SURROUNDED = 0.1
@@ -182,7 +182,7 @@ def _without_strays(body: BoolArray) -> BoolArray:
     return kept
 
 
-def winding_number(solid: BoolArray, air: BoolArray) -> npt.NDArray[np.float32]:
+def winding_number(solid: BoolArray, air: BoolArray) -> Float32Array:
     """Find how far the voxel faces between solid and air surround each voxel, those faces taken from their back.
 
     It is 1 within a closed surface and 0 outside of it. Where the surface has a hole, it goes from one to the other
@@ -222,7 +222,7 @@ def winding_number(solid: BoolArray, air: BoolArray) -> npt.NDArray[np.float32]:
     return winding[tuple(slice(n) for n in shape)]
 
 
-def _jumps(side: npt.NDArray[np.int8], axis: int) -> npt.NDArray[np.float32]:
+def _jumps(side: npt.NDArray[np.int8], axis: int) -> Float32Array:
     """Jump from each block to the next along an axis: 1 where all faces are solid before air, -1 if air before solid.
 
     A face in the middle of a block counts half at each of the block's ends.

@@ -8,12 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
+from thermoxels_ns.core.arrays import BoolArray, Float32Array
 from thermoxels_ns.mesh.solid.morphology import bounding_box
 from thermoxels_ns.mesh.solid.surface_ramp import surface_ramp
 from thermoxels_ns.mesh.solid.volume_keeping import keep_volume
-
-BoolArray = npt.NDArray[np.bool_]
-FloatArray = npt.NDArray[np.float32]
 
 DEEP_QUANTILE = 0.95
 """Before smoothing, a voxel as dense as this quantile of the dense ones has level 1 ..."""
@@ -38,7 +36,7 @@ def level_of(
     cells: BoolArray,
     *,
     makes_up_volume: bool = True,
-) -> FloatArray:
+) -> Float32Array:
     """Give every voxel a level: above 0 in solid voxels, below 0 in empty ones, 0 on the surface between them.
 
     Where density falls smoothly across the surface (`surface_ramp`), the level is a function of density that is linear
@@ -86,7 +84,7 @@ def _smoothed(
     dense: BoolArray,
     cells: BoolArray,
     makes_up_volume: bool,
-) -> FloatArray:
+) -> Float32Array:
     """The level where density jumps."""
     level = np.full(cells.shape, -1.0, dtype=np.float32)
     positive = density > 0.0
@@ -119,7 +117,7 @@ def _deep_ratio(dense: npt.NDArray[np.floating], threshold: float) -> float:
     return math.exp(min(max(logarithm, low), high))
 
 
-def _signed(level: FloatArray, least: FloatArray | np.float32, cells: BoolArray) -> FloatArray:
+def _signed(level: Float32Array, least: Float32Array | np.float32, cells: BoolArray) -> Float32Array:
     """The level, raised to `least` in solid voxels and lowered to minus that in empty ones."""
     return np.where(cells, np.maximum(level, least), np.minimum(level, -least))
 

@@ -7,7 +7,7 @@ import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
-BoolArray = npt.NDArray[np.bool_]
+from thermoxels_ns.core.arrays import BoolArray
 
 _PLANES_AT_A_TIME = 64
 

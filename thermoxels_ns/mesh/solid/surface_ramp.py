@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-BoolArray = npt.NDArray[np.bool_]
-FloatArray = npt.NDArray[np.float32]
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 
 LEAST_STRAIGHTNESS = 0.5
 """Beside the surface a ramp goes on with at least this share of its slope at the surface; a jump has none of it, the
@@ -32,9 +31,9 @@ _FULLER = 0.01
 class SurfaceRamp:
     """A level taken from a smooth ramp of density, and where to believe it."""
 
-    level: FloatArray
+    level: Float32Array
     """In [-1, 1], about linear in the distance to the surface; its sign may be wrong where there is no ramp."""
-    belief: FloatArray
+    belief: Float32Array
     """From 0, where the density is rough or jumps, to 1."""
 
 
@@ -104,7 +103,7 @@ def near_surface(cells: BoolArray) -> BoolArray:
     return np.not_equal(some, every)
 
 
-def _crossings(values: npt.NDArray[np.float64], cells: BoolArray) -> _Crossings:
+def _crossings(values: FloatArray, cells: BoolArray) -> _Crossings:
     bends, straight = [np.empty(0)], [np.empty(0)]
     for axis in range(3):
         along, solid = np.moveaxis(values, axis, 0), np.moveaxis(cells, axis, 0)
@@ -124,9 +123,7 @@ def _crossings(values: npt.NDArray[np.float64], cells: BoolArray) -> _Crossings:
     return _Crossings(abs(float(np.median(bends))), float(np.median(straight)))
 
 
-def _roughness(
-    values: npt.NDArray[np.float64], near: npt.NDArray[np.int64]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def _roughness(values: FloatArray, near: IntArray) -> tuple[FloatArray, FloatArray]:
     """Noise at some voxels, as a shift of the surface, [voxels], and the slope there, [1 / voxel], each shape (n,).
 
     Third differences are 0 along straight and evenly bent ramps. Of the three stencils of four voxels that hold a
@@ -151,9 +148,7 @@ def _roughness(
     return np.sqrt(squared / 60.0) / np.maximum(slope, np.finfo(np.float64).tiny), slope
 
 
-def _belief(
-    rough: npt.NDArray[np.float64], near: npt.NDArray[np.int64], shape: tuple[int, ...]
-) -> tuple[FloatArray, BoolArray]:
+def _belief(rough: FloatArray, near: IntArray, shape: tuple[int, ...]) -> tuple[Float32Array, BoolArray]:
     """How far to believe the ramp everywhere, and which of the voxels near the surface are in places believed in."""
     low, high = ROUGHNESS
     share, count = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)

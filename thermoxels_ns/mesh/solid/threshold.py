@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
 
@@ -35,7 +35,7 @@ FEWEST_RAYS = 100
 class Threshold:
     """The voxels that are dense enough."""
 
-    cells: npt.NDArray[np.bool_]
+    cells: BoolArray
     """True where a voxel is dense enough, not empty and not ruled out by rays, shape `lattice.cell_shape`."""
     density: float
     """Density at the voxel centre from which on it is dense enough, [1 / world unit]."""
@@ -43,7 +43,7 @@ class Threshold:
     """Which rule chose it, and why, in one or two sentences."""
 
 
-def automatic_threshold(snapshot: GridSnapshot, density: npt.NDArray[np.float64]) -> Threshold:
+def automatic_threshold(snapshot: GridSnapshot, density: FloatArray) -> Threshold:
     """Choose the threshold, and the voxels that reach it, by where training rays end.
 
     A ray ends where half of its weight is spent. What it meets there is the densest voxel within half a voxel of that
@@ -94,7 +94,7 @@ def automatic_threshold(snapshot: GridSnapshot, density: npt.NDArray[np.float64]
     )
 
 
-def _leaked_into(evidence: RayEvidence, optical_depth: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+def _leaked_into(evidence: RayEvidence, optical_depth: FloatArray) -> BoolArray:
     """Voxels that rays pass through rather than end in, and that are not opaque by themselves; none if not known."""
     if evidence.voxel_ends is None:
         return np.zeros(optical_depth.shape, dtype=bool)
@@ -102,9 +102,7 @@ def _leaked_into(evidence: RayEvidence, optical_depth: npt.NDArray[np.float64]) 
     return passed & (evidence.voxel_weight >= LEAST_WEIGHT) & (optical_depth < OPAQUE_OPTICAL_DEPTH)
 
 
-def optical_depth_threshold(
-    snapshot: GridSnapshot, density: npt.NDArray[np.float64], optical_depth: float
-) -> Threshold:
+def optical_depth_threshold(snapshot: GridSnapshot, density: FloatArray, optical_depth: float) -> Threshold:
     """Choose voxels in which density times edge length is at least `optical_depth`."""
     threshold = optical_depth / snapshot.lattice.voxel_size
     lost = 1.0 - np.exp(-optical_depth)
@@ -116,13 +114,13 @@ def optical_depth_threshold(
     )
 
 
-def density_threshold(density: npt.NDArray[np.float64], threshold: float) -> Threshold:
+def density_threshold(density: FloatArray, threshold: float) -> Threshold:
     """Choose voxels of at least the given density, [1 / world unit]; a voxel without density is never solid."""
     cells = (density >= threshold) & (density > 0.0)
     return Threshold(cells, float(threshold), f"Voxels of density {threshold:g} or more are solid, as asked.")
 
 
-def percentile_threshold(density: npt.NDArray[np.float64], percentile: float) -> Threshold:
+def percentile_threshold(density: FloatArray, percentile: float) -> Threshold:
     """Choose the densest (100 - percentile) % of all voxels of the box, as in the Thermoxels paper.
 
     Where more voxels tie at the threshold than were asked for (space that training never touched keeps its starting

@@ -5,13 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, IntArray
 from thermoxels_ns.mesh.solid.surface_ramp import near_surface
-
-BoolArray = npt.NDArray[np.bool_]
-FloatArray = npt.NDArray[np.float32]
-IntArray = npt.NDArray[np.int64]
 
 UNNOTICED = 0.12
 """Up to this share of the solid (for gaps: of the empty space) within a voxel may be lost. To that much, edges of large
@@ -30,7 +26,7 @@ _CHUNK = 1 << 14
 _AROUND = np.indices((3, 3, 3)).reshape(3, 27).T - 1
 
 
-def _octant_weights() -> tuple[FloatArray, FloatArray]:
+def _octant_weights() -> tuple[Float32Array, Float32Array]:
     """Trilinear value and gradient in the middle of a voxel's octants from its own level and those of the voxels
     around, shapes (8, 27) and (3, 8, 27).
     """
@@ -46,7 +42,7 @@ _VALUES, _SLOPES = _octant_weights()
 _WINDOW = np.array([0.25, 0.5, 0.25], dtype=np.float32)[_AROUND + 1].prod(axis=1)
 
 
-def keep_volume(level: FloatArray, sharp: FloatArray, least: FloatArray, cells: BoolArray) -> FloatArray:
+def keep_volume(level: Float32Array, sharp: Float32Array, least: Float32Array, cells: BoolArray) -> Float32Array:
     """Shift a smoothed level until around every voxel about as much is solid as the level before smoothing has it.
 
     A level of -1 and 1 smoothed over three voxels has its zero where it should be on flat walls, but inside it at
@@ -103,7 +99,7 @@ def keep_volume(level: FloatArray, sharp: FloatArray, least: FloatArray, cells: 
     return np.ascontiguousarray(padded[1:-1, 1:-1, 1:-1])
 
 
-def _wanted(sharp: FloatArray, index: IntArray, strides: IntArray) -> tuple[FloatArray, FloatArray]:
+def _wanted(sharp: Float32Array, index: IntArray, strides: IntArray) -> tuple[Float32Array, Float32Array]:
     """Share of some voxels that is solid, and how many of their six neighbours are on the other side of the surface.
 
     A voxel is as wide along an axis as the surface leaves of it, from its centre at most half a voxel to either side.
@@ -126,13 +122,13 @@ def _wanted(sharp: FloatArray, index: IntArray, strides: IntArray) -> tuple[Floa
 class _Found:
     """What the trilinear level makes of some voxels, arrays of shape (n,)."""
 
-    share: FloatArray
+    share: Float32Array
     """Solid share, 0 to 1."""
-    slope: FloatArray
+    slope: Float32Array
     """Mean slope, [1 / voxel]."""
 
 
-def _found(levels: FloatArray, index: IntArray, steps: IntArray) -> _Found:
+def _found(levels: Float32Array, index: IntArray, steps: IntArray) -> _Found:
     """The level is taken for linear in each octant of a voxel: of a cube of half a voxel, cut by a plane at distance d
     from its middle, 1/2 + 2 d is inside, whatever way the plane faces (exactly so on average over directions).
     """
@@ -147,7 +143,7 @@ def _found(levels: FloatArray, index: IntArray, steps: IntArray) -> _Found:
     return _Found(share, slope)
 
 
-def _windowed(values: FloatArray, at_index: FloatArray, index: IntArray, steps: IntArray) -> FloatArray:
+def _windowed(values: Float32Array, at_index: Float32Array, index: IntArray, steps: IntArray) -> Float32Array:
     """Mean around some voxels with weights 1 4 6 4 1 along each axis, shape (n,).
 
     Args:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.snapshot import GridSnapshot
@@ -23,7 +23,6 @@ from thermoxels_ns.mesh.solid.threshold import (
     percentile_threshold,
 )
 
-BoolArray = npt.NDArray[np.bool_]
 InteriorKind = Literal["solid", "hollow"]
 
 _WIDEST = 100
@@ -119,7 +118,7 @@ class SolidCells:
 
     cells: BoolArray
     """True where a voxel is solid, shape (nx-1, ny-1, nz-1); at least one is."""
-    level: npt.NDArray[np.float32]
+    level: Float32Array
     """Above 0 in solid voxels, below 0 in empty ones, in [-1, 1]; its trilinear zero between voxel centres is the
     surface. Shape of `cells`."""
     threshold: float
@@ -128,7 +127,7 @@ class SolidCells:
     """Which rule chose the threshold, and why."""
     steps: tuple[SolidStep, ...]
     """What each step did, in order; the first is the threshold."""
-    component_sizes: npt.NDArray[np.int64]
+    component_sizes: IntArray
     """Voxels in each body once gaps are closed, largest first; they touch by nothing, or (`largest_component`) by no
     face."""
 
@@ -198,7 +197,7 @@ def select_solid(
     )
 
 
-def _threshold(snapshot: GridSnapshot, density: npt.NDArray[np.float64], selection: SolidSelection) -> Threshold:
+def _threshold(snapshot: GridSnapshot, density: FloatArray, selection: SolidSelection) -> Threshold:
     if selection.density_threshold is not None:
         return density_threshold(density, selection.density_threshold)
     if selection.density_percentile is not None:
@@ -208,7 +207,7 @@ def _threshold(snapshot: GridSnapshot, density: npt.NDArray[np.float64], selecti
     return automatic_threshold(snapshot, density)
 
 
-def _bodies(cells: BoolArray, selection: SolidSelection) -> tuple[BoolArray, npt.NDArray[np.int64], str]:
+def _bodies(cells: BoolArray, selection: SolidSelection) -> tuple[BoolArray, IntArray, str]:
     """Drop bodies that are too small; sizes of all of them, and what was done."""
     labels = face_connected(cells) if selection.largest_component else connected(cells)
     sizes = np.bincount(labels.ravel())[1:]

@@ -9,16 +9,17 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.mesh.solid.morphology import bounding_box
 
 _AXES = np.eye(3)[[0, 0, 1, 1, 2, 2]] * np.array([1.0, -1.0] * 3)[:, None]
 _DIAGONALS = (np.arange(8)[:, None] >> np.array([2, 1, 0]) & 1) - 0.5
 
-DIRECTIONS: npt.NDArray[np.float64] = np.concatenate([_AXES, _DIAGONALS])
+DIRECTIONS: FloatArray = np.concatenate([_AXES, _DIAGONALS])
 """Steps to the 14 neighbours, shape (14, 3), [voxels]: +x, -x, +y, -y, +z, -z, then the diagonals (---) to (+++)."""
-LENGTHS: npt.NDArray[np.float64] = np.linalg.norm(DIRECTIONS, axis=1)
+LENGTHS: FloatArray = np.linalg.norm(DIRECTIONS, axis=1)
 """Lengths of the 14 edges, [voxels]."""
-OPPOSITE: npt.NDArray[np.int64] = np.array([1, 0, 3, 2, 5, 4, 13, 12, 11, 10, 9, 8, 7, 6])
+OPPOSITE: IntArray = np.array([1, 0, 3, 2, 5, 4, 13, 12, 11, 10, 9, 8, 7, 6])
 """Number of the direction that points the other way, shape (14,)."""
 NUM_DIRECTIONS = 14
 
@@ -43,7 +44,7 @@ class BccLattice:
     their neighbours in the array and lie strictly inside the box."""
     shape: tuple[int, int, int]
     """Shape of each of the two padded blocks."""
-    first_cell: npt.NDArray[np.int64]
+    first_cell: IntArray
     """Index of the voxel whose centre has index (1, 1, 1) in its block."""
 
     @property
@@ -57,7 +58,7 @@ class BccLattice:
         return (self.shape[1] * self.shape[2], self.shape[2], 1)
 
     @cached_property
-    def offsets(self) -> npt.NDArray[np.int64]:
+    def offsets(self) -> IntArray:
         """Flat steps to the 14 neighbours, of a centre and of a corner, shape (2, 14)."""
         strides = np.array(self.strides)
         along = DIRECTIONS[:6].astype(np.int64) @ strides
@@ -66,26 +67,26 @@ class BccLattice:
         to_centre = np.where(_DIAGONALS > 0.0, 1, 0) @ strides - self.num_centres
         return np.stack([np.concatenate([along, to_corner]), np.concatenate([along, to_centre])])
 
-    def is_corner(self, points: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    def is_corner(self, points: IntArray) -> IntArray:
         """1 for voxel corners, 0 for voxel centres; same shape as `points`."""
         return (points >= self.num_centres).astype(np.int64)
 
-    def neighbours(self, points: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    def neighbours(self, points: IntArray) -> IntArray:
         """Flat indices of the 14 neighbours, shape (n, 14)."""
         return points[:, None] + self.offsets[self.is_corner(points)]
 
-    def each_neighbour(self, points: npt.NDArray[np.int64]) -> Iterator[npt.NDArray[np.int64]]:
+    def each_neighbour(self, points: IntArray) -> Iterator[IntArray]:
         """Flat indices of one neighbour of every point, shape (n,), for each of the 14 directions in turn."""
         corner = self.is_corner(points)
         for step in self.offsets.T:
             yield points + step[corner]
 
-    def block_index(self, points: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    def block_index(self, points: IntArray) -> IntArray:
         """Index along x, y, z within the point's block, shape (n, 3)."""
         within = points - self.is_corner(points) * self.num_centres
         return np.stack(np.unravel_index(within, self.shape), axis=-1)
 
-    def positions(self, points: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+    def positions(self, points: IntArray) -> FloatArray:
         """Fractional corner indices of the points in the whole voxel lattice, shape (n, 3)."""
         shift = self.first_cell + 0.5 * self.is_corner(points)[:, None] - 0.5
         return self.block_index(points) + shift

@@ -5,16 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import binary_dilation
 from scipy.spatial import KDTree
 
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.mesh.quality.checks import facet_area_vectors
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 LEAST_TURN_DEG = 50.0
 """Two planes make an edge if their normals differ by more than this; on a sphere of 5 voxels radius, what is within

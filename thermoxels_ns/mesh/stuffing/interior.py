@@ -6,12 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, IntArray
 from thermoxels_ns.mesh.solid.morphology import bounding_box, grow
 from thermoxels_ns.mesh.stuffing.bcc_lattice import BccLattice
 
-BoolArray = npt.NDArray[np.bool_]
 # The sides of a face lie between its corners 0-1, 1-2, 2-3 and 3-0, counter-clockwise seen from where its axis points.
 _CORNERS = np.array([[0, 0, 0], [0, 1, 0], [0, 1, 1], [0, 0, 1]])
 _OUTWARD = np.array([[0, 0, -1], [0, 1, 0], [0, 0, 1], [0, -1, 0]])
@@ -82,7 +81,7 @@ class CoarseInterior:
 
     covered: BoolArray
     """True for the centres of voxels inside a larger cube, in the order of the lattice's centres."""
-    tets: npt.NDArray[np.int64]
+    tets: IntArray
     """Flat lattice indices, shape (t, 4), positively oriented: everything that the larger cubes share a face with."""
 
     def buried(self, lattice: BccLattice) -> BoolArray:
@@ -217,17 +216,17 @@ class _Points:
 
     origin: int
     """Flat index of the lowest corner of cube (0, 0, 0)."""
-    per_cube: npt.NDArray[np.int64]
+    per_cube: IntArray
     """Flat steps from a cube to the next along x, y, z."""
     centre: int
     """Flat step from a cube's lowest corner to its centre."""
     ahead: int
     """Flat step from a cube to the one ahead: one edge along the axis."""
-    corners: npt.NDArray[np.int64]
+    corners: IntArray
     """Flat steps from a cube's lowest corner to the corners of the face behind, shape (4,)."""
 
     @classmethod
-    def around(cls, lattice: BccLattice, first: npt.NDArray[np.int64], axis: int, size: int) -> _Points:
+    def around(cls, lattice: BccLattice, first: IntArray, axis: int, size: int) -> _Points:
         """Cubes of `size` voxels; the first of them begins at the centre `first` of the lattice."""
         strides = np.array(lattice.strides)
         per_cube = size * strides
@@ -240,12 +239,12 @@ class _Points:
         corners = _CORNERS @ np.roll(per_cube, -axis)
         return cls(int(origin), per_cube, int(centre), int(per_cube[axis]), corners)
 
-    def of(self, cubes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    def of(self, cubes: IntArray) -> IntArray:
         """Flat indices of the lowest corners of cubes, given by their indices, shape (n, 3)."""
         return self.origin + cubes @ self.per_cube
 
 
-def _between_equals(cubes: _Cubes, axis: int, points: _Points) -> Iterator[npt.NDArray[np.int64]]:
+def _between_equals(cubes: _Cubes, axis: int, points: _Points) -> Iterator[IntArray]:
     """Tetrahedra between each cube and the one ahead, if both are single."""
     pairs, whole = (_both(mask, axis) for mask in (cubes.single, cubes.whole))
     pair = np.flatnonzero(pairs)
@@ -266,7 +265,7 @@ def _between_equals(cubes: _Cubes, axis: int, points: _Points) -> Iterator[npt.N
             yield lowest[which, None] + np.array(tet)
 
 
-def _between_sizes(cubes: _Cubes, axis: int, points: _Points) -> Iterator[npt.NDArray[np.int64]]:
+def _between_sizes(cubes: _Cubes, axis: int, points: _Points) -> Iterator[IntArray]:
     """Tetrahedra between each single cube and a larger one, ahead of it or behind it."""
     single, joined = (np.moveaxis(mask, axis, 0) for mask in (cubes.single, cubes.joined))
     for larger_ahead in (True, False):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.stuffing.bcc_lattice import DIRECTIONS, BccLattice, bcc_lattice
@@ -31,15 +32,15 @@ _CHUNK = 1 << 16
 class StuffedSolid:
     """Tetrahedra that fill a solid up to its surface, in fractional corner indices of the voxel lattice."""
 
-    points: npt.NDArray[np.float64]
+    points: FloatArray
     """Nodes, shape (n, 3), all different and all used; each coordinate is from 0 to the number of voxels."""
-    tets: npt.NDArray[np.int64]
+    tets: IntArray
     """Node numbers, shape (t, 4), positively oriented."""
-    facets: npt.NDArray[np.int64]
+    facets: IntArray
     """Boundary triangles, shape (f, 3), right-hand normal out of the solid."""
-    on_surface: npt.NDArray[np.bool_]
+    on_surface: BoolArray
     """True for nodes of boundary triangles, shape (n,)."""
-    on_box: npt.NDArray[np.bool_]
+    on_box: BoolArray
     """True for boundary triangles on the border of the voxel lattice, exactly on its plane, shape (f,)."""
 
 
@@ -118,7 +119,7 @@ def _checked(level: npt.NDArray) -> npt.NDArray[np.floating]:
 class _Nodes:
     """The nodes: points inside that have cuts, other points inside, points on the surface, cuts."""
 
-    points: npt.NDArray[np.float64]
+    points: FloatArray
     """Positions, shape (n, 3)."""
     of_point: npt.NDArray[np.integer]
     """Node number of every lattice point, -1 where it is no node."""
@@ -159,11 +160,11 @@ def _number_nodes(lattice: BccLattice, warped: WarpedLattice, interior: CoarseIn
 class _Bundles:
     """Some of the voxel faces of one axis, each with the four lattice tetrahedra around it."""
 
-    points: npt.NDArray[np.int64]
+    points: IntArray
     """Flat lattice indices of the six points of each bundle, shape (6, b)."""
-    sides: npt.NDArray[np.int64]
+    sides: IntArray
     """Flat steps from a centre to the one beyond each side of the face, shape (4,)."""
-    directions: npt.NDArray[np.int64]
+    directions: IntArray
     """Lattice direction of each edge of a bundle, there and back, shape (13, 2)."""
 
 
@@ -226,9 +227,7 @@ def _fill(
     return tets, facets
 
 
-def _rows(
-    start: npt.NDArray[np.int64], code: npt.NDArray[np.int16]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _rows(start: IntArray, code: npt.NDArray[np.int16]) -> tuple[IntArray, IntArray]:
     """Bundle and table row of everything that the codes of the bundles call for."""
     counts = start[code + 1] - start[code]
     bundle = np.repeat(np.arange(len(code)), counts)

@@ -10,17 +10,10 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
-from thermoxels_ns.mesh.stuffing.edge_planes import (
-    BoolArray,
-    FloatArray,
-    IntArray,
-    Planes,
-    Surface,
-    edge_planes,
-    is_near,
-)
+from thermoxels_ns.mesh.stuffing.edge_planes import Planes, Surface, edge_planes, is_near
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid
 
 ANGLES_DEG = (13.0, 160.0)

@@ -9,6 +9,7 @@ from itertools import permutations, product
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.mesh.quality.face_count import OUTWARD_FACES
 
 BUNDLE_EDGES: tuple[tuple[int, int], ...] = (
@@ -18,11 +19,11 @@ BUNDLE_EDGES: tuple[tuple[int, int], ...] = (
     *((2, 3), (3, 4), (4, 5), (5, 2)),
 )
 """Ends of the 13 edges of a bundle; edge e has its cut at number 6 + e."""
-BUNDLE_POINTS: npt.NDArray[np.float64] = np.array(
+BUNDLE_POINTS: FloatArray = np.array(
     [[0, 0, 0], [1, 0, 0], [0.5, -0.5, -0.5], [0.5, 0.5, -0.5], [0.5, 0.5, 0.5], [0.5, -0.5, 0.5]]
 )
 """Positions of the six points, the first coordinate along the face's axis, the others in cyclic order, [voxels]."""
-SIDES_OUTWARD: npt.NDArray[np.int64] = np.array([[0, 0, -1], [0, 1, 0], [0, 0, 1], [0, -1, 0]])
+SIDES_OUTWARD: IntArray = np.array([[0, 0, -1], [0, 1, 0], [0, 0, 1], [0, -1, 0]])
 """Steps, [voxels], from either centre to the centre on the other side of the triangle it spans with side 2-3, 3-4, 4-5
 or 5-2 of the face."""
 NUM_BUNDLE_NODES = 19
@@ -50,15 +51,15 @@ class StencilTable:
     The same numbers serve the faces of all three axes: nothing changes when x, y, z are turned into y, z, x.
     """
 
-    tets: npt.NDArray[np.int64]
+    tets: IntArray
     """Bundle numbers, positively oriented, shape (t, 4)."""
-    tet_start: npt.NDArray[np.int64]
+    tet_start: IntArray
     """Shape (730,)."""
-    facets: npt.NDArray[np.int64]
+    facets: IntArray
     """Bundle numbers of triangles on the surface, right-hand normal out of the solid, shape (f, 3)."""
-    facet_start: npt.NDArray[np.int64]
+    facet_start: IntArray
     """Shape (730,)."""
-    facet_behind: npt.NDArray[np.int64]
+    facet_behind: IntArray
     """-1: always on the boundary. 4 * c + s: only if the centre beyond side s, seen from centre c (0 or 1), is not
     inside the solid, because the lattice tetrahedron on the other side is then empty. Shape (f,)."""
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.mesh.stuffing.bcc_lattice import DIRECTIONS, LENGTHS, NUM_DIRECTIONS, OPPOSITE, BccLattice
 
 ALPHA_INSIDE = np.where(LENGTHS == 1.0, 0.272, 0.397)
@@ -21,7 +22,7 @@ levels then goes down to 9.6 degrees.
 """
 
 
-def _contractible_links() -> npt.NDArray[np.bool_]:
+def _contractible_links() -> BoolArray:
     """For every set of neighbours, as 14 bits: is what the lattice spans between them one piece without holes?
 
     The neighbours of a point span a sphere of 24 triangles. A part of a sphere can be shrunk to a point if neither it
@@ -32,7 +33,7 @@ def _contractible_links() -> npt.NDArray[np.bool_]:
     around = joined @ (1 << np.arange(NUM_DIRECTIONS))
     sets = np.arange(1 << NUM_DIRECTIONS)
 
-    def in_one_piece(members: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    def in_one_piece(members: IntArray) -> BoolArray:
         reached = members & -members
         for _ in range(NUM_DIRECTIONS):
             for d in range(NUM_DIRECTIONS):
@@ -51,19 +52,19 @@ class WarpedLattice:
 
     sign: npt.NDArray[np.int8]
     """+1 inside the solid, 0 on its surface, -1 outside, one per point of the lattice."""
-    moved: npt.NDArray[np.int64]
+    moved: IntArray
     """Points that moved, shape (m,)."""
-    moved_to: npt.NDArray[np.float64]
+    moved_to: FloatArray
     """Where they are now, fractional corner indices, shape (m, 3)."""
-    inner: npt.NDArray[np.int64]
+    inner: IntArray
     """Points with sign +1 that are not buried, ascending; shape (p,)."""
-    cut_points: npt.NDArray[np.int64]
+    cut_points: IntArray
     """Those of them that have a cut edge, ascending; shape (s,)."""
-    cuts: npt.NDArray[np.float64]
+    cuts: FloatArray
     """How far along each of their edges the surface is, as a share of the edge, NaN where no cut is; shape (s, 14)."""
 
 
-def warp(lattice: BccLattice, buried: npt.NDArray[np.bool_] | None = None) -> WarpedLattice:
+def warp(lattice: BccLattice, buried: BoolArray | None = None) -> WarpedLattice:
     """Find the cuts and move points that are too close to one onto the surface.
 
     A cut is where linear interpolation along an edge between two opposite signs is 0. A point with cuts within alpha
@@ -118,9 +119,7 @@ def warp(lattice: BccLattice, buried: npt.NDArray[np.bool_] | None = None) -> Wa
     )
 
 
-def _ends_of_cut_edges(
-    lattice: BccLattice, sign: npt.NDArray[np.int8], inner: npt.NDArray[np.int64]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _ends_of_cut_edges(lattice: BccLattice, sign: npt.NDArray[np.int8], inner: IntArray) -> tuple[IntArray, IntArray]:
     """Points inside with a neighbour outside, and points outside with one inside, both ascending."""
     touches = np.zeros(len(inner), dtype=bool)
     touched = np.zeros(len(sign), dtype=bool)
@@ -131,9 +130,7 @@ def _ends_of_cut_edges(
     return inner[touches], np.flatnonzero(touched)
 
 
-def _cut_shares(
-    lattice: BccLattice, sign: npt.NDArray[np.int8], points: npt.NDArray[np.int64]
-) -> npt.NDArray[np.float64]:
+def _cut_shares(lattice: BccLattice, sign: npt.NDArray[np.int8], points: IntArray) -> FloatArray:
     """Share of each edge from the point to its cut, infinite where none is; shape (n, 14)."""
     neighbours = lattice.neighbours(points)
     own = lattice.level[points].astype(np.float64)
@@ -145,9 +142,7 @@ def _cut_shares(
     return share
 
 
-def _move_onto_surface(
-    lattice: BccLattice, sign: npt.NDArray[np.int8], points: npt.NDArray[np.int64], own: int
-) -> npt.NDArray[np.bool_]:
+def _move_onto_surface(lattice: BccLattice, sign: npt.NDArray[np.int8], points: IntArray, own: int) -> BoolArray:
     """Set the sign of points to 0 where that keeps the topology of all points of sign `own`; tell which.
 
     Taking a point away leaves the topology as it is if its neighbours of the same sign can be shrunk to a point. No
