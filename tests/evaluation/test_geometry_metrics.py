@@ -14,7 +14,6 @@ from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.evaluation.geometry_metrics import geometry_metrics
 from thermoxels_ns.evaluation.truth_comparison import KnownTruth, compare_with_truth
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
-from thermoxels_ns.training.image_metrics import half_transparent_share
 
 IDENTITY = np.eye(4)
 SCORES = ("fscore", "precision", "recall")
@@ -102,13 +101,6 @@ def test_photographs_have_no_figures_and_a_damaged_truth_is_told(sphere, tmp_pat
     assert said[0].startswith("Geometry is not compared with the truth: ")
 
 
-def test_half_transparent_rays_lie_strictly_between():
-    accumulation = torch.tensor([[0.0, 0.0999], [0.1001, 0.5], [0.8999, 0.9001], [1.0, 0.95]])[..., None]
-    assert half_transparent_share(accumulation) == 3 / 8
-    assert half_transparent_share(torch.tensor([0.0, 1.0])) == 0.0
-    assert half_transparent_share(torch.tensor([0.5])) == 1.0
-
-
 @pytest.fixture(scope="module")
 def pipeline(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene") / "hot"
@@ -151,11 +143,3 @@ def test_ns_eval_compares_the_trained_density_with_the_scene(pipeline, monkeypat
     assert "fscore_std" not in averages and "half_transparent_std" in averages
     ((rays, views),) = asked
     assert rays > 0 and views == len(pipeline.datamanager.train_dataset)  # what is solid is decided as in an export
-
-
-def test_ns_eval_takes_the_density_that_the_model_has(pipeline, monkeypatch):
-    said = []
-    monkeypatch.setattr("thermoxels_ns.training.pipeline.CONSOLE.print", said.append)
-    result = pipeline.geometry_metrics()
-    assert result["fscore"] == 0.0  # nothing is solid at the start
-    assert "The geometry scores 0" in said[0]

@@ -260,8 +260,3 @@ def test_colour_is_that_of_corners_with_density(snapshot_of):
     mesh = build_mesh(replace(field, density=density, colour=colour), DENSE, np.eye(4)).mesh
     assert mesh.colour is not None
     assert np.all(mesh.colour == np.array([0.75, 0.5, 0.25], np.float32))
-
-
-def test_unknown_kind_of_boundary_is_refused():
-    with pytest.raises(MeshError, match="boundary: expected conforming or voxel"):
-        MeshOptions(boundary="smooth")  # type: ignore[arg-type]

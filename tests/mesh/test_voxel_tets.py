@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
@@ -55,13 +54,6 @@ def test_volume_area_and_validity(mesh_of_cells, name):
     assert (quality.min_dihedral_deg, quality.max_dihedral_deg) == pytest.approx((45.0, 90.0))
 
 
-@pytest.mark.parametrize(
-    ("name", "edges"), [("single", 0), ("sharing a face", 0), ("sharing an edge", 1), ("sharing a corner", 0)]
-)
-def test_non_manifold_edges_are_counted(mesh_of_cells, name, edges):
-    assert check_mesh(mesh_of_cells(pattern(name))).num_non_manifold_edges == edges
-
-
 @pytest.mark.parametrize("seed", range(25))
 def test_random_carved_blocks_are_valid(mesh_of_cells, random_cells, seed):
     cells = random_cells(seed)
@@ -107,13 +99,6 @@ def test_nodes_are_the_used_corners_only():
     assert np.unique(tets).tolist() == list(range(8))
 
 
-def test_divergence_theorem_on_a_carved_block(mesh_of_cells, random_cells):
-    mesh = mesh_of_cells(random_cells(7))
-    a, b, c = (mesh.points_m[mesh.facets[:, n]] for n in range(3))
-    enclosed = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
-    assert enclosed == pytest.approx(signed_volumes(mesh.points_m, mesh.tets).sum(), rel=1e-12)
-
-
 def test_box_facets_are_those_on_the_lattice_border(mesh_of_cells):
     cells = np.zeros((3, 3, 3), dtype=bool)
     cells[1:, 1, 1] = True  # touches the box at x = 3 with one voxel face
@@ -130,33 +115,7 @@ def test_triangle_with_nodes_on_two_sides_of_the_box_is_no_cut():
     assert boundary_tags(facets, corners, (5, 5, 5)).tolist() == [FACET_SURFACE, FACET_SURFACE]
 
 
-def test_edges_of_one_voxel():
-    edges, num_voxels = lattice_edges(np.ones((1, 1, 1), dtype=bool))
-    corners, _ = kuhn_tets(np.ones((1, 1, 1), dtype=bool))
-    assert len(edges) == 12
-    assert np.all(num_voxels == 1)
-    assert np.all(np.abs(corners[edges[:, 0]] - corners[edges[:, 1]]).sum(axis=1) == 1)
-
-
-def test_edges_do_not_bridge_a_gap():
-    cells = np.array([True, False, True])[:, None, None]
-    edges, _ = lattice_edges(cells)
-    corners, _ = kuhn_tets(cells)
-    assert len(edges) == 24
-    assert set(map(tuple, corners[edges].min(axis=1)[:, :1])) == {(0,), (1,), (2,), (3,)}
-    pairs = np.sort(corners[edges][:, :, 0], axis=1)
-    assert [1, 2] not in pairs.tolist()
-
-
 def test_voxels_around_an_edge_are_counted():
     edges, num_voxels = lattice_edges(np.ones((2, 2, 2), dtype=bool))
     assert len(edges) == 54
     assert np.bincount(num_voxels).tolist() == [0, 24, 24, 0, 6]
-
-
-@pytest.mark.parametrize(
-    "bad", [np.zeros((2, 2, 2), dtype=bool), np.ones((2, 2), dtype=bool), np.ones((2, 2, 2)), np.ones((0, 2, 2), bool)]
-)
-def test_what_is_no_body_is_refused(bad):
-    with pytest.raises(MeshError, match="solid voxels: expected a three-dimensional boolean array"):
-        kuhn_tets(bad)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.support.posed_model import ring_model
-from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, measurement_rows
+from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.pairs import Pair
 from thermoxels_ns.capture.rig.parameters import PARAMETERS
@@ -21,9 +21,9 @@ from thermoxels_ns.capture.scene_writer import Scene
 from thermoxels_ns.capture.sfm.gravity import Up
 from thermoxels_ns.capture.sfm.metric_scale import MetricScale
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.radiometry.conditions import Conditions, conditions_text
+from thermoxels_ns.radiometry.conditions import Conditions
 from thermoxels_ns.reports.capture_page import CapturePage, Overlay, build_page
-from thermoxels_ns.reports.capture_pictures import colours, jpeg_of, spread_out, thermal_in_photograph
+from thermoxels_ns.reports.capture_pictures import colours, thermal_in_photograph
 
 THERMAL = Camera(80, 60, 70.0, 70.0, 41.0, 29.0)
 
@@ -51,13 +51,6 @@ def test_colours_go_from_dark_to_bright_and_nan_is_black():
     assert shown[0] < shown[1] < shown[2]
     assert shown[3] == 0
     assert (colours(np.full((2, 2), np.nan)) == 0).all()
-
-
-def test_small_things():
-    assert spread_out(100, 3) == [0, 50, 99]
-    assert list(spread_out(2, 6)) == [0, 1]
-    assert list(spread_out(0, 6)) == []
-    assert jpeg_of(np.zeros((2, 2, 3), np.uint8)).startswith(b"\xff\xd8\xff")
 
 
 MODEL = ring_model(4)
@@ -148,20 +141,6 @@ def test_a_scale_that_is_missing_says_what_it_costs(page):
     assert "0.5 ± 0.01 (2.0 %) m per unit" in known and "unknown" not in known
 
 
-def test_colours_say_their_degrees(page):
-    assert "12.3 °C and less are black, 20.1 °C and more are bright yellow" in words(page)
-
-
-def test_zeros_have_no_sign(page):
-    assert "up, as x, y, z 0.000, 0.000, 1.000. Assumed." in words(page)
-
-
-def test_stuck_pixels_that_were_not_looked_for_are_not_counted_as_none(page):
-    assert "stuck pixels of the sensor not looked for in fewer than 5 frames" in words(page)
-    more = with_scene(page, frames=[*page.scene.frames, *page.scene.frames])
-    assert "stuck pixels of the sensor 0" in words(more)
-
-
 def test_names_of_files_are_no_markup(page):
     evil = "<script>alert(1)</script>"
     frames = [replace(frame, camera=evil) for frame in page.scene.frames]
@@ -171,42 +150,3 @@ def test_names_of_files_are_no_markup(page):
     text = build_page(replace(changed, result=result))
     assert "<script" not in text
     assert text.count("&lt;script&gt;") >= 6
-
-
-def frame(**more) -> CaptureFrame:
-    return CaptureFrame("a", Path("a.jpg"), Path("a.npy"), "a.jpg", "a.tiff", **more)
-
-
-def test_settings_that_all_frames_share_are_said_once():
-    conditions = Conditions(emissivity=0.95, reflected_c=21.0, distance_m=4.0, air_c=19.5)
-    rows = dict(measurement_rows([frame(format="FLIR R-JPEG", conditions=conditions)] * 3))
-    assert rows["thermal files"] == "FLIR R-JPEG"
-    assert rows["computed with"] == (
-        "emissivity 0.95, reflected temperature 21 °C, 4 m of air of 50 % humidity and 19.5 °C"
-    )
-
-
-def test_settings_that_differ_are_counted_the_most_frequent_first():
-    kinds = [Conditions(emissivity=e, reflected_c=20.0) for e in (0.9, 0.8, 0.8, 0.7, 0.6, 0.5)]
-    rows = dict(measurement_rows([frame(format="TIFF", celsius_per_count=0.025, conditions=kind) for kind in kinds]))
-    assert rows["thermal files"] == "TIFF with 0.025 K per count"
-    said = rows["computed with"]
-    assert said.startswith("emissivity 0.8, reflected temperature 20 °C (2 frames); emissivity 0.9")
-    assert said.endswith("; 1 more kinds")
-
-
-def test_what_no_file_says_is_not_said():
-    assert measurement_rows([frame()]) == []
-
-
-@pytest.mark.parametrize(
-    ("conditions", "said"),
-    [
-        (Conditions(), "apparent temperatures"),
-        (Conditions(distance_m=2.0, air_c=10.0), "emissivity 1, 2 m of air"),
-        (Conditions(window_transmission=0.9, window_c=20.0), "a window that passes 90 %"),
-    ],
-)
-def test_what_lies_between_is_said(conditions, said):
-    assert said in conditions_text(conditions)
-    assert ("apparent" in conditions_text(conditions)) == (conditions == Conditions())

@@ -44,20 +44,6 @@ def rows(**by_name: tuple[float, float, float]) -> list[CostRow]:
     return median_rows([setting(n) for n in names], runs, names[-1])
 
 
-def test_the_front_of_points_that_can_be_checked_by_hand():
-    seconds = [10, 20, 20, 30, 40, 50]
-    psnr = [20, 25, 24, 25, 26, NAN]
-    # 24 dB at 20 s is beaten at the same time, 25 dB at 30 s by the same at 20 s.
-    assert pareto_front(seconds, psnr, True) == [True, True, False, False, True, False]
-    assert pareto_front([1, 2], [1.0, 0.5], False) == [True, True]
-    assert pareto_front([1, 2], [0.5, 1.0], False) == [True, False]
-    assert pareto_front([], [], True) == []
-
-
-def test_equal_points_are_both_on_the_front():
-    assert pareto_front([1, 1, 2], [5, 5, 5], True) == [True, True, False]
-
-
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), min_size=1, max_size=12), st.booleans())
 def test_every_point_off_the_front_is_beaten_by_one_on_it_and_none_on_it_is_beaten(points, higher):
     front = pareto_front([c for c, _ in points], [v for _, v in points], higher)
@@ -81,12 +67,6 @@ def test_medians_and_ratios():
     assert a.fronts == b.fronts == {"psnr"}
 
 
-def test_without_a_run_of_the_baseline_there_are_no_ratios():
-    (a,) = median_rows([setting("a"), setting("b")], [run("a", seconds=5.0)], "b")
-    assert math.isnan(a.time_ratio)
-    assert "| a | 5 s | - |" in markdown_table([a], "b")
-
-
 def test_the_cheapest_setting_keeps_all_targets():
     measured = rows(draft=(10, 25.0, 0.9), standard=(30, 31.0, 0.35), fine=(60, 33.0, 0.30), odd=(20, 20.0, 0.32))
 
@@ -100,21 +80,6 @@ def test_the_cheapest_setting_keeps_all_targets():
     assert name(thermal_mae_c=0.3, psnr=33.0) == "fine"
     assert name(thermal_mae_c=0.1) is None
     assert name(psnr=33.01) is None
-
-
-def test_a_setting_without_the_figure_keeps_no_target():
-    measured = rows(colourless=(1, NAN, 0.1), standard=(30, 31.0, 0.35))
-    best = cheapest(measured, Targets(psnr=20.0))
-    assert best is not None and best.setting.name == "standard"
-
-
-def test_the_verdict_names_the_setting_and_how_to_train_it():
-    measured = rows(draft=(10, 25.0, 0.9), standard=(30, 31.0, 0.35))
-    words = verdict(measured, Targets(0.4, 30.0), "my scene")
-    assert words.startswith(
-        "Cheapest setting with a thermal MAE of at most 0.4 °C and an RGB PSNR of at least 30 dB: standard (30 s, 0.35"
-    )
-    assert words.endswith("ns-train thermoxels --data 'my scene' --quality standard")
 
 
 def test_the_verdict_says_plainly_that_none_will_do():

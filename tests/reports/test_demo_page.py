@@ -9,7 +9,6 @@ from dataclasses import replace
 import pytest
 
 from tests.reports.test_page import HOSTILE, Outline, picture
-from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.reports.demo_page import Check, ColourBar, DemoPage, HeldOutView, build_page
 from thermoxels_ns.reports.page import Picture, Table
 
@@ -91,17 +90,3 @@ def test_nothing_is_fetched_and_words_stay_words(page: DemoPage) -> None:
     # Title, heading, summary, glance, check (4), figures (2), view, caption, step, command, next (2), file (2); colours
     # are no words.
     assert "".join(Outline(text).words).count(HOSTILE) == 18
-
-
-def test_the_colour_bar_says_the_temperatures_of_its_quarters(page: DemoPage) -> None:
-    text = build_page(page)
-    assert re.findall(r"<span>(.*?)</span>", text) == ["10.0", "15.0", "20.0", "25.0", "30.0\xa0°C"]
-    assert "linear-gradient(to right, #000004, #fcffa4)" in text
-    with pytest.raises(ThermoxelsError, match="colour bar: expected at least two colours, got 1"):
-        ColourBar(("red",), 0.0, 1.0)
-
-
-def test_what_is_no_picture_is_refused(page: DemoPage) -> None:
-    broken = replace(page.views[0], rendered_thermal=b"not a picture")
-    with pytest.raises(ThermoxelsError, match="frame_eval_00001, rendered: expected the content of a PNG or JPEG"):
-        build_page(replace(page, views=(broken,)))

@@ -107,27 +107,6 @@ def test_words_stay_words() -> None:
     assert "".join(Outline(text).words).count(HOSTILE) == 16
 
 
-def test_rules_for_phones_and_paper_come_last() -> None:
-    text = build_page(Page("x", "", ()))
-    assert text.index(".scroll") < text.index(".rows {") < text.index("max-width: 640px") < text.index("@media print")
-    style = text.split("<style>")[1].split("</style>")[0]
-    assert style.count("{") == style.count("}") and 'name="viewport" content="width=device-width' in text
-    screen, paper = style.split("@media print")
-    assert re.search(r"\.scroll \{[^}]*overflow-x: auto", screen) and ".scroll { overflow: visible; }" in paper
-
-
-def test_text_is_dark_on_white() -> None:
-    """A contrast of 4.5 : 1 at least is what WCAG 2 asks of text."""
-    text = build_page(Page("x", "", ()))
-    assert "background: #fff;" in text
-    for name in ("ink", "soft", "accent"):
-        colour = re.search(rf"--{name}: (#[0-9a-f]{{6}})", text)
-        assert colour is not None
-        shares = [int(colour[1][n : n + 2], 16) / 255 for n in (1, 3, 5)]
-        linear = [share / 12.92 if share <= 0.03928 else ((share + 0.055) / 1.055) ** 2.4 for share in shares]
-        assert 1.05 / (float(np.dot(linear, (0.2126, 0.7152, 0.0722))) + 0.05) > 4.5, name
-
-
 def test_what_is_no_picture_is_refused() -> None:
     with pytest.raises(ThermoxelsError, match=r"the roof: expected the content of a PNG or JPEG file, got 6 bytes"):
         image_address(b"GIF89a", "the roof")

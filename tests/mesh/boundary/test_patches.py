@@ -41,12 +41,6 @@ def test_facing_follows_the_up_direction() -> None:
     assert facing(normals, (0, 0, -1)).tolist() == [1, 1, 2, 1, 1, 0]
 
 
-@pytest.mark.parametrize("up", [(0, 0, 0), (0, float("nan"), 1), (0, 1)])
-def test_no_direction_is_refused(up: tuple) -> None:
-    with pytest.raises(MeshError, match="up: expected three finite numbers that are not all 0"):
-        facing(np.zeros((0, 3)), up)
-
-
 def test_default_patches_are_named_by_side_and_direction() -> None:
     normals = np.array([tilted(d) for d in (0, 90, 180, 0, 90, 180, 0)])
     seen = np.array([True, True, True, False, False, False, True])
@@ -80,13 +74,6 @@ def named(rules: PatchRules, colours: np.ndarray | None = None) -> list[str]:
     """Name of each facet's patch."""
     patch, names, _ = apply_patches(rules, **FACETS, colours=colours)
     return [names[p] for p in patch]
-
-
-def test_without_rules_the_default_patches_come_back() -> None:
-    patch, names, _ = apply_patches(PatchRules(), **FACETS)
-    expected, _ = default_patches(FACETS["normals"], UP, FACETS["seen"], FACETS["on_box"])
-    assert np.array_equal(patch, expected)
-    assert names == DEFAULT_PATCHES
 
 
 @pytest.mark.parametrize(
@@ -216,94 +203,37 @@ def test_the_example_is_read_and_does_what_its_comments_say() -> None:
     assert [regions[r] for r in region] == ["slab", "solid"]
 
 
-@pytest.mark.parametrize("text", ["patches: []", "regions: []", "{patches: [], regions: []}"])
-def test_empty_lists_are_no_rules(tmp_path: Path, text: str) -> None:
-    assert rules_of(tmp_path, text) == PatchRules()
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", r"^mine\.yaml: expected key: value lines, got nothing"),
-        ("[]", r"^mine\.yaml: expected key: value lines, got \[\]"),
-        ("patches: [", r"^mine\.yaml: expected a yaml file, got"),
         ("patch: []", r"^mine\.yaml: expected keys out of patches, regions, got patch\. Did you mean patches"),
-        ("patches:", r"mine\.yaml: patches: expected a list of entries.*got nothing"),
         ("patches: {name: a}", "patches: expected a list of entries"),
-        ("patches: [a]", "patches entry 1: expected key: value lines, got 'a'"),
         ("patches: [{facing: up}]", "patches entry 1: expected the key name, got facing. Add name"),
         ("patches: [{name: a, facing: up}, {name: b}]", r"patches entry 2: b: expected at least one of box, plane"),
-        ("patches: [{name: a, colour: 3}]", "entry 1: expected keys out of name, box.*got colour"),
-        ("patches: [{name: 7, facing: up}]", "entry 1: name: expected a text, got 7"),
         ("patches: [{name: a b, facing: up}]", "entry 1: name: expected up to 40 letters.*got 'a b'"),
-        ("patches: [{name: 2nd, facing: up}]", "name: expected up to 40 letters"),
-        ("patches: [{name: cut, facing: up}]", "entry 1: name: expected a name other than exterior-up.*got cut"),
         ("patches: [{name: Exterior-Up, facing: up}]", "expected a name other than.*got Exterior-Up"),
-        ("regions: [{name: solid, box: {}}]", r"entry 1: box: expected key: value lines"),
-        (
-            "regions: [{name: solid, box: {lower: [0, 0, 0], upper: [1, 1, 1]}}]",
-            "entry 1: name: expected a name other than solid, got solid",
-        ),
-        (
-            "patches: [{name: wall, facing: up}, {name: Wall, facing: side}]",
-            "entry 2: name: expected wall, as above, or another, got Wall",
-        ),
+        ("patches: [{name: wall, facing: up}, {name: Wall, facing: side}]", "entry 2: name: expected wall, as above"),
         ("regions: [{name: a, facing: up}]", "regions entry 1: expected keys out of name, box, plane, nearest_colour"),
         ("patches: [{name: a, facing: north}]", r"entry 1: facing: expected one of up, side, down, any, got 'north'"),
-        ("patches: [{name: a, only: seen}]", r"entry 1: only: expected one of exterior.* cut, all, got 'seen'"),
         ("patches: [{name: a, only: [cut]}]", r"only: expected one of exterior, interior, cut, all, got \['cut'\]"),
-        ("patches: [{name: a, only: cut, only: all}]", "expected a yaml file, got the key only twice"),
-        ("patches: [{name: a, box: {lower: [0, 0, 0]}}]", r"entry 1: box: expected the key upper, got lower"),
-        (
-            "patches: [{name: a, box: {lower: [0, 0], upper: [1, 1, 1]}}]",
-            r"box: lower: expected 3 numbers in square brackets, got \[0, 0\]",
-        ),
-        (
-            "patches: [{name: a, box: {lower: [0, 0, 1], upper: [1, 1, 1]}}]",
-            r"box: corners: expected each number of lower below that of upper, got \[0.0, 0.0, 1.0\] and \[1.0",
-        ),
+        ("patches: [{name: a, box: {lower: [0, 0, 1], upper: [1, 1, 1]}}]", "each number of lower below that of upper"),
         (
             "patches: [{name: a, box: {lower: [0, 0, 1e-3], upper: [1, 1, 1]}}]",
-            r"box: lower: expected a number, got '1e-3'\. Write 0\.001, without quotes",
+            r"expected a number, got '1e-3'\. Write",
         ),
-        (
-            "patches: [{name: a, box: {lower: [0, 0, .nan], upper: [1, 1, 1]}}]",
-            "expected each number of lower below.*nan",
-        ),
-        ("patches: [{name: a, box: {lower: [0, 0, true], upper: [1, 1, 1]}}]", "expected a number, got True"),
-        ("patches: [{name: a, box: {lower: [0, 0, 2 m], upper: [1, 1, 1]}}]", "expected a number, got '2 m'"),
-        (
-            "patches: [{name: a, plane: {point: [0, 0, 0], normal: [0, 0, 0]}}]",
-            r"plane: point and normal: expected finite numbers, and a normal that is not 0",
-        ),
-        (
-            "patches: [{name: a, plane: {point: [0, 0, .inf], normal: [0, 0, 1]}}]",
-            r"plane: point and normal: expected finite numbers, .*inf",
-        ),
-        ("patches: [{name: a, nearest_colour: [1, 2, 3]}]", "nearest_colour: expected key: value lines"),
-        (
-            "patches: [{name: a, nearest_colour: {rgb: [0, 0, 256]}}]",
-            r"nearest_colour: rgb: expected three numbers from 0 to 255",
-        ),
-        ("patches: [{name: a, nearest_colour: {rgb: [0, 0, -1]}}]", "expected three numbers from 0 to 255"),
-        (
-            "patches: [{name: a, nearest_colour: {rgb: [1, 0, 0]}}]",
-            r"got \[1, 0, 0\], which may be either\. Write \[1\.0, 0\.0, 0\.0\] for a bright .* or \[0\.0039,",
-        ),
+        ("patches: [{name: a, plane: {point: [0, 0, 0], normal: [0, 0, 0]}}]", "and a normal that is not 0"),
+        ("patches: [{name: a, nearest_colour: {rgb: [0, 0, 256]}}]", "rgb: expected three numbers from 0 to 255"),
+        ("patches: [{name: a, nearest_colour: {rgb: [1, 0, 0]}}]", r"got \[1, 0, 0\], which may be either\. Write"),
         (
             "patches: [{name: a, nearest_colour: {rgb: [9, 0, 0], max_distance: 0}}]",
-            r"max_distance: expected a number above 0, on the scale of rgb, got 0\.0",
+            "expected a number above 0",
         ),
     ],
 )
 def test_wrong_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(MeshError, match=f"(?s){message}"):
         rules_of(tmp_path, text)
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(MeshError, match=r"none\.yaml: expected a yaml file, got No such file"):
-        load_patch_rules(tmp_path / "none.yaml")
 
 
 @pytest.mark.parametrize(

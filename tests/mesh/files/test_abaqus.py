@@ -118,10 +118,6 @@ def test_names_that_become_one_are_refused(tmp_path, tagged_mesh, names):
     ("change", "message"),
     [
         ({"conductivity_w_mk": 0.0}, "conductivity_w_mk: expected a finite number above 0"),
-        ({"density_kg_m3": -1.0}, "density_kg_m3: expected"),
-        ({"specific_heat_j_kgk": float("nan")}, "specific_heat_j_kgk: expected"),
-        ({"step_seconds": 0.0}, "step_seconds: expected"),
-        ({"steps": 0}, "steps: expected a whole number"),
         ({"steps": 2.5}, "steps: expected a whole number"),
     ],
 )

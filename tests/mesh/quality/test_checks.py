@@ -56,13 +56,6 @@ def test_turned_over_tetrahedron(box_mesh):
         check_mesh(replace(box_mesh, tets=tets))
 
 
-def test_flat_tetrahedron():
-    points = CORNER_TET.copy()
-    points[3] = [1.0, 1.0, 0.0]
-    with pytest.raises(MeshError, match="volumes above 0"):
-        check_mesh(mesh_from(points, np.array([[0, 1, 2, 3]])))
-
-
 def test_face_with_three_owners():
     points = np.vstack([CORNER_TET, [[0.0, 0.0, 5.0], [0.0, 0.0, -1.0]]])
     tets = np.array([[0, 1, 2, 3], [0, 1, 2, 4], [0, 2, 1, 5]])
@@ -119,8 +112,6 @@ def test_numbers_out_of_range_nan_shapes_and_emptiness(box_mesh):
     hot[0] = np.nan
     with pytest.raises(MeshError, match="mesh temperature_c: expected finite"):
         check_mesh(replace(box_mesh, temperature_c=hot))
-    with pytest.raises(MeshError, match="mesh region: expected shape"):
-        check_mesh(replace(box_mesh, region=box_mesh.region[1:]))
     with pytest.raises(MeshError, match="at least one tetrahedron"):
         check_mesh(replace(box_mesh, tets=box_mesh.tets[:0], region=box_mesh.region[:0]))
 

@@ -47,11 +47,6 @@ def test_node_numbers_whose_triple_does_not_fit_in_64_bits():
     assert uses.tolist() == owners.tolist() and sorted(uses.tolist()) == [1] * 6 + [2]
 
 
-def test_no_tetrahedra_have_no_faces():
-    faces, uses = count_faces(np.zeros((0, 4), dtype=np.int64))
-    assert faces.shape == (0, 3) and uses.shape == (0,)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_edges_of_random_voxels(random_cells, seed):
     _, tets = kuhn_tets(random_cells(seed))
@@ -99,8 +94,3 @@ def test_what_is_no_boundary_is_refused(mesh_of_cells, kind):
         facets = np.concatenate([mesh.facets, [[1, 2, 4]]])
     with pytest.raises(MeshError, match="each a face of exactly one tetrahedron, got"):
         facet_owners(mesh.tets, facets)
-
-
-def test_no_triangles_have_no_owners():
-    owner, opposite = facet_owners(np.array([[0, 1, 2, 3]]), np.zeros((0, 3), dtype=np.int64))
-    assert len(owner) == len(opposite) == 0

@@ -10,7 +10,6 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from thermoxels_ns.core.errors import OutputError
 from thermoxels_ns.mesh.quality.picture import picture_of_quality
 from thermoxels_ns.mesh.quality.report import QualityReport, quality_report
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -103,12 +102,3 @@ def test_bars_are_the_counts(good):
     assert not [bar for bar in bars if bar[2] and (bar[0] < 44.99 or bar[1] > 90.01)]
     tall = [(bar.get_x(), bar.get_height()) for bar in ratios.patches if bar.get_height()]
     assert tall == [(pytest.approx(0.7), good.report.num_tets)]
-
-
-def test_a_name_that_is_no_png_and_a_place_that_is_no_folder(tmp_path, good):
-    with pytest.raises(OutputError, match=r"ends in \.png"):
-        picture_of_quality(tmp_path / "a.pdf", good.report)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="output folder"):
-        picture_of_quality(tmp_path / "file" / "a.png", good.report)
-    assert [p.name for p in tmp_path.iterdir()] == ["file"]

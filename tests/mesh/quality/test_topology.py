@@ -89,11 +89,6 @@ def test_an_open_surface_has_open_edges_and_no_genus():
     assert inward.num_open_edges == 3  # passed twice in one direction
 
 
-def test_no_triangles_are_no_surface():
-    found = surface_topology(np.zeros((4, 3)), np.zeros((0, 3), dtype=np.int64))
-    assert found.components == () and found.euler_characteristic == 0
-
-
 def test_bodies_that_share_a_node_an_edge_or_a_face():
     # Tetrahedra in a row: 0 and 1 share a face, 1 and 2 an edge, 2 and 3 a node, 4 nothing.
     tets = np.array([[0, 1, 2, 3], [1, 3, 2, 4], [3, 4, 5, 6], [6, 7, 8, 9], [10, 11, 12, 13]])

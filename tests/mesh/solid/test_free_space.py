@@ -98,14 +98,6 @@ def test_every_voxel_is_counted_once_by_a_camera_on_a_diagonal_of_the_lattice():
         assert np.array_equal(counts.free, counts.in_image)
 
 
-def test_a_wall_hides_what_is_behind_it_and_is_seen_itself():
-    cells = np.zeros(LATTICE.cell_shape, dtype=bool)
-    cells[8] = True
-    counts = count_cameras(cells, LATTICE, looking_at((0, 0, 0), (3.0, 0.0, 0.0)))
-    assert (counts.free[8:] == 1).all() and (counts.free[:8] == 0).all()
-    assert counts.seen[8:].all() and counts.hidden[:8].all()
-
-
 def test_what_no_image_holds_is_neither_seen_nor_hidden():
     counts = count_cameras(
         np.zeros(LATTICE.cell_shape, dtype=bool), LATTICE, looking_at((0, 0, 0), (3.0, 0, 0), focal=2000.0)

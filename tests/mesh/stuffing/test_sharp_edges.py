@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
 from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, Shape, box_distance, centres, tet_mesh, turn
-from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import check_mesh, dihedral_range_deg, facet_areas, facet_normals
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.stuffing.edge_planes import Surface
@@ -202,11 +199,3 @@ def test_edges_that_face_each_other_do_not_cross(seed):
 def test_a_body_that_is_all_border():
     solid = stuff(np.ones((3, 4, 5)))
     assert sharpen(solid, (3, 4, 5)) is solid
-
-
-def test_a_lattice_that_the_mesh_is_not_in():
-    solid = stuff(np.ones((3, 4, 5)))
-    with pytest.raises(MeshError, match=r"shape: expected the numbers of voxels .*, got \(3, 4, 4\)"):
-        sharpen(solid, (3, 4, 4))
-    with pytest.raises(MeshError, match="shape: expected the numbers of voxels"):
-        sharpen(replace(solid, points=solid.points - 0.5), (3, 4, 5))
