@@ -47,11 +47,10 @@ def geometry_metrics(
         say: Called with the reason where a figure cannot be given.
 
     Returns:
-        Nothing for a scene of real photographs. Else ``fscore``, ``precision``, ``recall``, 0 to 1, at 1.5 voxels of
-        the snapshot's lattice; ``fscore_128``, at 1.5 voxels of a lattice of 128 voxels over the same box, so that
-        lattices of any resolution can be compared; ``surface_distance_voxels`` and ``surface_distance_m``, the mean
-        distance of the reconstructed surface to the true one. Without any solid voxel the scores are 0 and there is no
-        distance.
+        Nothing for real photographs. Else ``fscore``, ``precision``, ``recall``, 0 to 1, at 1.5 voxels of the
+        snapshot's lattice; ``fscore_128``, at 1.5 voxels of a lattice of 128 voxels over the same box, to compare
+        resolutions; ``surface_distance_voxels`` and ``surface_distance_m``, the mean distance to the true surface.
+        Without any solid voxel the scores are 0 and there is no distance.
     """
     try:
         known = truth if isinstance(truth, KnownTruth) else load_known_truth(truth)

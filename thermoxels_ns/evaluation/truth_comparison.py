@@ -55,9 +55,6 @@ def sample_facets(points: FloatArray, facets: IntArray, count: int) -> FloatArra
 
     A low-discrepancy sequence (the golden ratio and the plastic number's R2 sequence) walks along the triangles in
     their order, so neighbouring triangles share the points in proportion to their areas.
-
-    Raises:
-        MeshError: No triangle has an area above 0.
     """
     area = facet_areas(points, facets)
     total = np.concatenate([[0.0], np.cumsum(area)])
@@ -77,7 +74,7 @@ def sample_facets(points: FloatArray, facets: IntArray, count: int) -> FloatArra
 def surface_distances(
     mesh: TetMesh, truth: TrueShape, true_points: FloatArray, metres_per_unit: float = 1.0
 ) -> SurfaceDistances | None:
-    """Measure a mesh against a body whose shape is known exactly.
+    """Measure a mesh against a body whose shape is known exactly; None if all of the boundary is cut by the box.
 
     Cuts by the scene box are not surface and are left out. Distances from the mesh are those of 20,000 points of it;
     those from the truth go to the nearest point of any triangle.
@@ -87,12 +84,6 @@ def surface_distances(
         truth: The true body, [truth units].
         true_points: Points of the true surface that a mesh can be expected to have, shape (m, 3), m at least 1.
         metres_per_unit: Scale of the mesh, metres per truth unit, above 0.
-
-    Returns:
-        The distances; None if all of the boundary is cut by the box.
-
-    Raises:
-        MeshError: An array does not fit.
     """
     import pyvista as pv
 
@@ -145,13 +136,7 @@ class KnownTruth:
 
 
 def load_known_truth(scene_folder: Path | str) -> KnownTruth | None:
-    """Get the truth of a scene folder, and its training cameras.
-
-    Args:
-        scene_folder: A scene folder, or its ``transforms.json``.
-
-    Returns:
-        The truth; None for a scene of real photographs (no ``transforms.json``, or one without ``truth``).
+    """Get the truth of a scene folder (or its ``transforms.json``) and its training cameras; None for real photographs.
 
     Raises:
         SceneError: The json is unreadable, names an unknown scene, or its cameras cannot be used.

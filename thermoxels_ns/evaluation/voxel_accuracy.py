@@ -87,16 +87,12 @@ def surface_fscore(
         cells: Solid voxels, shape `lattice.cell_shape`.
         lattice: Where they are, [world units].
         truth: The true body; only its `signed_distance` is asked.
-        true_points_seen: Points of the true surface that enough training cameras see (three, by custom), shape (m, 3),
-            m at least 1, [truth units].
+        true_points_seen: True surface that enough training cameras see, shape (m, 3), m at least 1, [truth units].
         tolerance: Distance that counts as agreement, above 0, [truth units]; 1.5 voxels by custom.
         world_to_truth: Similarity, shape (4, 4), from the lattice's world to truth coordinates (homogeneous column
             vectors); the identity if left out.
         views: The training cameras, in the coordinates of the lattice. With them the part of the boundary that they
             see is scored too, which takes a few passes over the lattice per camera.
-
-    Returns:
-        Precision, recall, F-score and mean distance.
 
     Raises:
         MeshError: Shapes do not fit, or no true point is given.

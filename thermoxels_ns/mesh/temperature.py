@@ -42,9 +42,6 @@ def interpolate_corners(
     Returns:
         values: At the points, shape (n,) or (n, k); 0 where nothing around is known.
         weight: sum_c t_c w_c, shape (n,).
-
-    Raises:
-        MeshError: Shapes do not fit.
     """
     shape = weights.shape
     check_shape("values", values, (*shape, *values.shape[3:]), "Pass one value per corner.", MeshError)
@@ -142,19 +139,11 @@ def extend_harmonically(
 
 
 def tet_conductances(points: FloatArray, tets: IntArray) -> tuple[IntArray, FloatArray]:
-    """What each tetrahedron adds to the conductance of its edges: minus the entries of its linear stiffness matrix.
+    """Edges of tetrahedra, shape (6 t, 2), and what each adds to their conductance: minus its linear stiffness entries.
 
     With them the extension is steady heat conduction in the mesh: a temperature that is linear in space is extended
     exactly, but for edges between angles so obtuse that their entries add up to less than 0 (next to the surface of a
-    conforming mesh; 0.6 % of the range in a ball).
-
-    Args:
-        points: Nodes, shape (n, 3).
-        tets: Node numbers, shape (t, 4).
-
-    Returns:
-        edges: Node pairs, shape (6 t, 2); an edge comes once for each tetrahedron around it.
-        conductances: At conductivity 1, shape (6 t,), below 0 opposite an obtuse angle.
+    conforming mesh; 0.6 % of the range in a ball). An edge comes once for each tetrahedron around it.
     """
     conductances = np.empty((len(tets), 6))
     for which, shapes in shapes_in_chunks(points, tets):

@@ -39,9 +39,6 @@ def kuhn_tets(cells: BoolArray) -> tuple[IntArray, IntArray]:
     The diagonal has the same direction in every voxel, so the triangles on a face shared by two voxels coincide: the
     mesh conforms. All dihedral angles are 45, 60 or 90 degrees, which keeps the heat equation's maximum principle.
 
-    Args:
-        cells: True where a voxel is solid, shape (nx-1, ny-1, nz-1).
-
     Returns:
         corner_indices: Lattice indices (i, j, k) of the used corners in C order, shape (n, 3).
         tets: Rows of `corner_indices`, shape (6 * solid voxels, 4), positively oriented.
@@ -59,16 +56,9 @@ def kuhn_tets(cells: BoolArray) -> tuple[IntArray, IntArray]:
 
 
 def lattice_edges(cells: BoolArray) -> tuple[IntArray, IntArray]:
-    """Edges of the solid voxels, numbered like the nodes of `kuhn_tets`.
+    """Edges of the solid voxels (e, 2) between nodes of `kuhn_tets`, and the number of solid voxels around each, 1 to 4.
 
     Two used corners across an empty gap are no edge, even if they are lattice neighbours.
-
-    Args:
-        cells: True where a voxel is solid, shape (nx-1, ny-1, nz-1).
-
-    Returns:
-        edges: Node pairs, shape (e, 2), each edge once.
-        num_voxels: Solid voxels around each edge, 1 to 4, shape (e,).
     """
     cells, _ = _cropped(_as_cells(cells))
     number = _node_numbers(cells)
@@ -87,16 +77,10 @@ def lattice_edges(cells: BoolArray) -> tuple[IntArray, IntArray]:
 
 
 def voxel_facets(cells: BoolArray) -> IntArray:
-    """Boundary triangles of `kuhn_tets`, taken from the voxel faces between solid and empty: cost follows these only.
+    """Boundary triangles of `kuhn_tets` (f, 3), normals outwards, taken from the voxel faces between solid and empty.
 
-    Kuhn's tetrahedra cut every voxel face along the diagonal from its lowest to its highest corner.
-
-    Args:
-        cells: True where a voxel is solid, shape (nx-1, ny-1, nz-1).
-
-    Returns:
-        Node indices, shape (f, 3), right-hand normals outwards; the two triangles of a face follow each other. The
-        same triangles as `boundary_facets` finds among all tetrahedra, in another order.
+    Kuhn's tetrahedra cut every voxel face along the diagonal from its lowest to its highest corner. The triangles of a
+    face follow each other; `boundary_facets` finds the same ones among all tetrahedra, in another order.
 
     >>> voxel_facets(np.ones((1, 1, 1), dtype=bool)).shape
     (12, 3)
@@ -128,15 +112,9 @@ def boundary_facets(tets: IntArray) -> IntArray:
 
 
 def boundary_tags(facets: IntArray, points_index: npt.NDArray, lattice_shape: tuple[int, ...]) -> IntArray:
-    """Tell triangles where the scene box cuts the solid from the solid's own surface.
+    """`FACET_BOX` where all three nodes of a triangle lie on one side of the lattice, else `FACET_SURFACE`; shape (f,).
 
-    Args:
-        facets: Boundary triangles, shape (f, 3).
-        points_index: Corner index of each node, whole or fractional, shape (n, 3).
-        lattice_shape: Number of corners along x, y, z.
-
-    Returns:
-        `FACET_BOX` where all three nodes lie on one side of the lattice, else `FACET_SURFACE`; shape (f,).
+    Corner indices are whole or fractional; `lattice_shape` is the number of corners along x, y, z.
     """
     # One bit per side of the lattice; a triangle lies on the sides that its nodes have in common.
     sides = np.zeros(len(points_index), dtype=np.uint8)

@@ -171,13 +171,7 @@ def pareto_front(cost: Sequence[float], value: Sequence[float], higher_is_better
 
 
 def median_rows(settings: Iterable[CostSetting], runs: Iterable[CostRun], baseline: str) -> list[CostRow]:
-    """Make a row of every setting that has a run.
-
-    Args:
-        settings: In the order of the table.
-        runs: Finished runs of these settings; those of other settings are left out.
-        baseline: Name of the setting that seconds are related to.
-    """
+    """Make a row of every setting that has a run; seconds are related to those of the setting `baseline`."""
     by_name: dict[str, list[CostRun]] = {}
     for run in runs:
         by_name.setdefault(run.setting, []).append(run)

@@ -75,10 +75,6 @@ def picture_of_mesh(
         bar_title: Quantity and unit, written beside the colour bar.
         note: Words below the size of the mesh.
         window_size: Width and height, [pixels].
-
-    Raises:
-        MeshError: An array does not fit the mesh, or the directions do not span a view.
-        OutputError: The file cannot be written.
     """
     # Without a screen VTK draws through Mesa, which loads the system's LLVM. A triton (torch's compiler) that is loaded
     # after that ends in a segmentation fault; loaded before, both work.
@@ -131,17 +127,10 @@ def picture_of_mesh(
 
 
 def change_colours(change: npt.NDArray[np.floating]) -> tuple[dict[str, Any], str]:
-    """Colours for changes to both sides of 0.
+    """Colours for changes to both sides of 0, [K], as arguments of `picture_of_mesh`, and a note to write below it.
 
     Where a few nodes changed far more than the rest, all others would be as grey as no change: the scale then ends
-    where 95 % of the sizes do.
-
-    Args:
-        change: Changes of the nodes that are shown, [K].
-
-    Returns:
-        colours: Arguments `clim`, `colour_map` and `bar_title` of `picture_of_mesh`.
-        note: What to write below the picture if some changed by more than the colours reach; else empty.
+    where 95 % of the sizes do, and the note says so; else it is empty.
     """
     size = np.abs(change)
     most, end = float(size.max()), float(np.quantile(size, _SHARE_OF_CHANGES))
@@ -325,11 +314,7 @@ def _quiet_vtk() -> Iterator[None]:
 def draw_mesh(paths: Sequence[Path], mesh: TetMesh, look: Mapping[str, Any], length_unit: str) -> None:
     """Draw the mesh twice: all temperatures, and with grey where no thermal ray measured one.
 
-    Args:
-        paths: The two files, each ending in .png.
-        mesh: The mesh.
-        look: Arguments `up` and `view_direction` of `picture_of_mesh`.
-        length_unit: Name of the unit of the node positions.
+    `look` are the arguments `up` and `view_direction` of `picture_of_mesh`.
     """
     every, measured = paths
     picture_of_mesh(every, mesh, title="Surface temperature", length_unit=length_unit, **look)
@@ -340,11 +325,7 @@ def draw_mesh(paths: Sequence[Path], mesh: TetMesh, look: Mapping[str, Any], len
 def draw_heat(path: Path, mesh: TetMesh, solution: HeatSolution, look: Mapping[str, Any]) -> None:
     """Draw the temperatures before and after in one range of colours, and beside them the change in its own.
 
-    Args:
-        path: The file, ending in .png.
-        mesh: The mesh, nodes in metres.
-        solution: Temperatures on its nodes.
-        look: Arguments `up` and `view_direction` of `picture_of_mesh`.
+    `look` are the arguments `up` and `view_direction` of `picture_of_mesh`.
     """
     from PIL import Image
 

@@ -31,16 +31,9 @@ class Applied(NamedTuple):
 
 
 def facing(normals: FloatArray, up: npt.ArrayLike) -> IntArray:
-    """Where normals point: index into `FACINGS`.
+    """Where unit normals (f, 3) point: index into `FACINGS`, shape (f,).
 
     Up is less than 45 degrees off the up direction, down more than 135 degrees, all else is side.
-
-    Args:
-        normals: Unit normals, shape (f, 3).
-        up: Up direction of any length above 0 in the same axes, shape (3,).
-
-    Returns:
-        0 up, 1 side, 2 down; shape (f,).
 
     Raises:
         MeshError: `up` is no direction.
@@ -58,17 +51,7 @@ def default_patches(
 ) -> tuple[IntArray, tuple[str, ...]]:
     """Patches that need no rules: cut by the scene box, else exterior (seen) or interior, facing up, sideways or down.
 
-    Args:
-        normals: Outward unit normals of the true surface, shape (f, 3).
-        up: Up direction in the same axes.
-        seen: True where some camera sees the triangle, shape (f,).
-        on_box: True where the scene box cuts the solid, shape (f,).
-
-    Returns:
-        Index of each triangle's patch, shape (f,), and the names of all patches, `DEFAULT_PATCHES`.
-
-    Raises:
-        MeshError: `up` is no direction.
+    Arguments are those of `apply_patches`; also the names of all patches, `DEFAULT_PATCHES`.
     """
     patch = np.where(seen, 0, len(FACINGS)) + facing(normals, up)
     return np.where(on_box, DEFAULT_PATCHES.index("cut"), patch).astype(np.int64), DEFAULT_PATCHES
@@ -84,7 +67,7 @@ def apply_patches(
     on_box: BoolArray,
     colours: npt.NDArray | None = None,
 ) -> Applied:
-    """Default patches with a user's rules over them.
+    """Each triangle's patch: default patches with a user's rules over them; the default names come first.
 
     Args:
         rules: The user's rules; without any, the default patches come back.
@@ -94,9 +77,6 @@ def apply_patches(
         seen: True where some camera sees the triangle, shape (f,).
         on_box: True where the scene box cuts the solid, shape (f,).
         colours: Red, green, blue in [0, 1] of each triangle, shape (f, 3); None if not known.
-
-    Returns:
-        Each triangle's patch; the default names come first, then the rules' in their order.
 
     Raises:
         MeshError: A rule asks for colours and there are none, `up` is no direction, or shapes do not fit.
@@ -120,13 +100,7 @@ def apply_patches(
 def apply_regions(rules: PatchRules, tet_centroids: FloatArray, tet_colours: npt.NDArray | None = None) -> Applied:
     """Regions of tetrahedra by a user's rules; what no rule claims is region 0, "solid".
 
-    Args:
-        rules: The user's rules.
-        tet_centroids: Middle of each tetrahedron, shape (t, 3), [m].
-        tet_colours: Red, green, blue in [0, 1] of each tetrahedron, shape (t, 3); None if not known.
-
-    Returns:
-        Each tetrahedron's region.
+    Centroids (t, 3) are in metres, colours (t, 3) red, green, blue in [0, 1]; None if not known.
 
     Raises:
         MeshError: A rule asks for colours and there are none, or shapes do not fit.

@@ -37,7 +37,7 @@ def tag_boundary(
     up: tuple[float, float, float],
     rules: PatchRules,
 ) -> tuple[Boundary, tuple[str, ...]]:
-    """Find out what physics needs to know of every boundary triangle.
+    """Find out what physics needs to know of every boundary triangle, and the rules that no triangle follows.
 
     Args:
         mesh: The mesh, whose `boundary` is not read.
@@ -49,12 +49,6 @@ def tag_boundary(
         mode: How the boundary runs.
         up: Up direction in the coordinates of the mesh.
         rules: Patches of the user.
-
-    Returns:
-        Normals, area factors, visibility and patches; and the rules that no triangle follows.
-
-    Raises:
-        MeshError: A rule cannot be applied, or `up` is no direction.
     """
     linear = world_to_metres[:3, :3] / np.cbrt(abs(np.linalg.det(world_to_metres[:3, :3])))
     on_box = mesh.facet_tags == FACET_BOX

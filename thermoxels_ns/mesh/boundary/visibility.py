@@ -28,7 +28,7 @@ _REMEDY = "Pass one centroid and one outward unit normal per boundary triangle."
 def seen_facets(
     cells: BoolArray, views: Views, lattice: Lattice, centroids_world: FloatArray, normals_world: FloatArray
 ) -> BoolArray:
-    """Tell which boundary triangles at least one training camera sees.
+    """Tell which boundary triangles at least one training camera sees, shape (f,).
 
     A camera sees a triangle that faces it, lies in its image and has no solid voxel on the straight line between
     them. Triangles that lie in the same voxel and face the same of the six sides share one answer, taken at their mean.
@@ -39,12 +39,6 @@ def seen_facets(
         lattice: Where the voxels are.
         centroids_world: Middle of each triangle, shape (f, 3), [world units].
         normals_world: Outward unit normals of the true surface, shape (f, 3), in world axes.
-
-    Returns:
-        True where seen, shape (f,).
-
-    Raises:
-        MeshError: Shapes that do not fit, or numbers that are not finite.
     """
     check_shape("cells", cells, lattice.cell_shape, "Pass the voxels of this lattice.", MeshError)
     check_shape("centroids_world", centroids_world, (None, 3), _REMEDY, MeshError)
@@ -77,11 +71,7 @@ def seen_facets(
 def _grouped(
     centroids: FloatArray, normals: FloatArray, shape: tuple[int, int, int]
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Group triangles by voxel and main direction.
-
-    Returns:
-        The group of each triangle, and mean centroid and unit mean normal of each group.
-    """
+    """Group triangles by voxel and main direction: group of each, mean centroid and unit mean normal of each group."""
     # The shift decides for one of two voxels where a triangle lies on their common face.
     voxel = np.clip(np.floor(centroids - 1e-3).astype(np.int64) + 1, 0, np.array(shape))
     axis = np.argmax(np.abs(normals), axis=1)

@@ -59,9 +59,7 @@ class FileContent:
 def file_content(mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None = None) -> FileContent:
     """Check what is to be written; a mesh without boundary tags gets one patch, `UNTAGGED_PATCH`, of all triangles.
 
-    Args:
-        mesh: The mesh.
-        temperature_c: Temperatures to write in place of the mesh's own, shape (n,), [degrees Celsius].
+    `temperature_c` takes the place of the mesh's own, shape (n,), [degrees Celsius].
 
     Raises:
         MeshError: An array has another shape than the mesh asks for, is not finite or points at what is not there,
@@ -209,15 +207,10 @@ def surface_of(points_m: FloatArray, facets: IntArray) -> Surface:
 
 
 def far_origin(points_m: FloatArray) -> FloatArray | None:
-    """Where to count positions from so that single precision can hold them.
+    """Where to count positions from so that single precision can hold them: the middle of the nodes in whole units.
 
-    Five million metres from the origin, as in national coordinates, single precision has steps of half a metre.
-
-    Args:
-        points_m: Nodes, shape (n, 3), n at least 1, [m].
-
-    Returns:
-        The middle of the nodes in whole units, shape (3,); None where the origin of the coordinates will do.
+    None where the origin of the coordinates will do. Five million metres from it, as in national coordinates, single
+    precision has steps of half a metre.
 
     >>> far_origin(np.array([[4.0e6, 0.2, 0.0], [4.0e6 + 9.0, 2.6, 1.0]]))
     array([4.000004e+06, 1.000000e+00, 0.000000e+00])
@@ -231,9 +224,6 @@ def surface_colours(mesh: TetMesh, surface: Surface, temperature_c: FloatArray, 
     """Colours of a surface's nodes, red, green, blue in [0, 1] as screens show them (sRGB), shape (m, 3).
 
     The colour map spans the surface's own temperatures; a surface of one temperature gets the map's middle.
-
-    Raises:
-        MeshError: The mesh has no colours from photographs, or `colouring` is none of the two.
     """
     if colouring == "photographs":
         if mesh.colour is None:

@@ -70,13 +70,10 @@ MESH_FORMATS: dict[str, MeshFormat] = {
 
 
 def mesh_format(path: Path | str) -> MeshFormat:
-    """Find the format that the ending of a file's name stands for.
+    """Find the format that the ending of a file's name stands for; `OutputError` if there is none.
 
     >>> mesh_format("house.msh").description
     'body and boundary as physical groups, MSH 4.1: Gmsh and what reads its files'
-
-    Raises:
-        OutputError: No format has this ending.
     """
     path = Path(path)
     if path.suffix not in MESH_FORMATS:
@@ -94,9 +91,6 @@ def mesh_file_paths(path: Path | str) -> list[Path]:
 
     >>> [path.name for path in mesh_file_paths("house.xdmf")]
     ['house.xdmf', 'house.h5']
-
-    Raises:
-        OutputError: No format has this ending.
     """
     path = Path(path)
     companion = mesh_format(path).companion
@@ -104,12 +98,7 @@ def mesh_file_paths(path: Path | str) -> list[Path]:
 
 
 def check_format(path: Path | str, mesh: TetMesh) -> None:
-    """Raise what `write_mesh` would because of the format, without writing.
-
-    Raises:
-        MeshError: The format cannot hold this mesh.
-        OutputError: No format has this ending.
-    """
+    """Raise what `write_mesh` would because of the format, without writing."""
     refuse = mesh_format(path).refuse
     if refuse is not None:
         refuse(mesh)

@@ -20,12 +20,9 @@ _TETRAHEDRON = 10  # VTK's number for the kind of cell
 
 
 def read_mesh(path: Path | str) -> TetMesh:
-    """Read ``NAME.vtu`` and ``NAME-boundary.vtp``.
+    """Read ``NAME.vtu`` and the ``NAME-boundary.vtp`` beside it.
 
     All comes back as it was written, bit for bit, but colours, which files hold as bytes.
-
-    Args:
-        path: The .vtu file; the .vtp file lies beside it.
 
     Raises:
         MeshError: A file is missing, cannot be read, lacks an array, or the two do not belong together.

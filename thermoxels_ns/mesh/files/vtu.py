@@ -72,16 +72,7 @@ def write_vtu(
 
 
 def write_vtk(writer: Any, path: Path, data: Any) -> None:
-    """Write a VTK data set with the XML writer for its kind; the folder is made if need be.
-
-    Args:
-        writer: A new writer.
-        path: File to write.
-        data: What to write.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write a VTK data set with the XML writer for its kind; the folder is made if need be."""
     writable_folder(path.parent)
     with replace_when_done(path) as temporary:
         writer.SetFileName(str(temporary))
@@ -97,18 +88,10 @@ def write_vtk(writer: Any, path: Path, data: Any) -> None:
 
 
 def write_summary(path: Path | str, summary: Mapping[str, Any]) -> None:
-    """Write figures as indented json, in the order given.
-
-    Numpy numbers and arrays and paths are converted; other types are refused.
-
-    Args:
-        path: File to write; its folder is made if need be.
-        summary: Names and values, nested as you like.
+    """Write figures, nested as you like, as indented json in the order given; the folder is made if need be.
 
     Raises:
-        MeshError: A number is NaN or infinite (json has neither), or a value has no place in json; the message names
-            it.
-        OutputError: The file cannot be written.
+        MeshError: A number is NaN or infinite (json has neither), or a value has no place in json.
     """
     text = summary_text(summary)
     path = Path(path)

@@ -73,12 +73,6 @@ def check_mesh(mesh: TetMesh) -> MeshQuality:
     closed (every edge of it belongs to an even number of triangles); no two boundary triangles lie on each other,
     which is how a crack between neighbours that do not match looks.
 
-    Args:
-        mesh: The mesh to check.
-
-    Returns:
-        Counts, volume, area and angles.
-
     Raises:
         MeshError: A check failed; the message says which, where and how often.
     """
@@ -163,14 +157,9 @@ def count_twin_nodes(points: FloatArray) -> int:
 
 
 def count_wrong_facets(mesh: TetMesh, faces: Groups) -> int:
-    """How far `mesh.facets` are from the faces of one owner with outward normals: missing, extra and turned ones.
+    """Number of triangles to take from and add to `mesh.facets` to get the faces of one owner, normals outwards.
 
-    Args:
-        mesh: The mesh; its arrays passed `check_arrays`.
-        faces: `face_count.group_faces(mesh.tets)`.
-
-    Returns:
-        Number of triangles to take away and to add; a triangle turned over counts twice, 0 if all is as it should be.
+    A triangle turned over counts twice. `faces` is `face_count.group_faces(mesh.tets)`.
     """
     wanted = faces_of_rows(mesh.tets, faces.order[faces.start[faces.sizes == 1]])
     both = np.concatenate([_smallest_first(wanted), _smallest_first(mesh.facets)])
@@ -182,11 +171,7 @@ def count_overlaps(points: FloatArray, facets: IntArray, sides: Groups) -> int:
     """Number of pairs of triangles that share an edge and lie on the same side of it in the same plane.
 
     This is how a crack looks: the faces of neighbours that do not match are boundary triangles, one upon the other.
-
-    Args:
-        points: Nodes, shape (n, 3).
-        facets: Triangles with an area, shape (f, 3).
-        sides: `topology.group_sides(facets)`.
+    `sides` is `topology.group_sides(facets)`.
     """
     vectors = facet_area_vectors(points, facets)
     with np.errstate(invalid="ignore", divide="ignore"):

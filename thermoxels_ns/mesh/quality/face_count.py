@@ -53,10 +53,7 @@ def group_pairs(first: IntArray, second: IntArray) -> Groups:
 
     Two stages, both linear in memory: a counting sort by the first number (a sparse row turned into columns), then a
     sort of the few rows that share it. On a million tetrahedra this is several times faster than one sort of all rows.
-
-    Args:
-        first: First numbers, shape (rows,); the work space grows with the largest of them.
-        second: Second numbers, below 2^63 - 1, shape (rows,).
+    The work space grows with the largest first number; second numbers are below 2^63 - 1.
 
     >>> groups = group_pairs(np.array([5, 2, 5, 2]), np.array([1, 9, 1, 0]))
     >>> groups.sizes, groups.first
@@ -92,10 +89,7 @@ def group_faces(tets: IntArray) -> Groups:
 
 
 def count_faces(tets: npt.NDArray[np.integer]) -> tuple[IntArray, IntArray]:
-    """All different triangles of a mesh, and how many tetrahedra own each.
-
-    Args:
-        tets: Node numbers of positively oriented tetrahedra, shape (t, 4).
+    """All different triangles of positively oriented tetrahedra (t, 4), and how many tetrahedra own each.
 
     Returns:
         faces: Node numbers, shape (f, 3), oriented outwards from the first owner, ordered by their sorted node numbers.
@@ -136,17 +130,9 @@ def _sorted_four(values: list[IntArray]) -> tuple[IntArray, IntArray, IntArray, 
 
 
 def facet_owners(tets: IntArray, facets: IntArray) -> tuple[IntArray, IntArray]:
-    """Find the tetrahedron of every boundary triangle, and which of its faces the triangle is.
+    """Tetrahedron of every boundary triangle, and which of its four nodes lies opposite to it, each shape (f,).
 
     Only faces whose nodes all lie on the boundary are looked at, so the sort follows the surface, not the volume.
-
-    Args:
-        tets: Node indices, shape (t, 4).
-        facets: Boundary triangles, shape (f, 3).
-
-    Returns:
-        owner: Index of the tetrahedron, shape (f,).
-        opposite: Which of the tetrahedron's four nodes the triangle lies opposite to, 0 to 3, shape (f,).
 
     Raises:
         MeshError: A triangle is listed twice, is no face of a tetrahedron, or lies between two.

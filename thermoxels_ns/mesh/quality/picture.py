@@ -22,15 +22,8 @@ _MET, _UNMET = "#2a7f3f", "#b3261e"
 def picture_of_quality(path: Path | str, report: QualityReport, title: str = "") -> None:
     """Draw the report as a PNG: two histograms above, figures and criteria below.
 
-    Counts are on a logarithmic axis, because a solver stumbles over the few worst tetrahedra.
-
-    Args:
-        path: File to write, ending in .png; its folder is made if need be.
-        report: What to draw.
-        title: Text above the picture; the boundary mode and the counts if left out.
-
-    Raises:
-        OutputError: The name does not end in .png, or the file cannot be written.
+    Counts are on a logarithmic axis, because a solver stumbles over the few worst tetrahedra. `title` is the boundary
+    mode and the counts if left out.
     """
     from matplotlib.figure import Figure
 

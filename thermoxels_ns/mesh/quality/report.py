@@ -138,13 +138,11 @@ def quality_report(
     Args:
         mesh: The mesh, damaged or not.
         boundary_mode: How its boundary was made.
-        observed_range_c: Lowest and highest observed temperature, [degrees Celsius]; those of the mesh's observed nodes
-            if left out.
+        observed_range_c: Lowest and highest observed temperature, [degrees Celsius]; the observed nodes' if left out.
         length_unit: Name of the unit of the nodes' positions.
 
     Raises:
-        MeshError: The arrays do not fit each other or are not finite, the mode is unknown, or no node is observed and
-            no range is given.
+        MeshError: The arrays do not fit each other or are not finite, or no temperature was observed.
     """
     if boundary_mode not in get_args(BoundaryMode):
         modes = " or ".join(get_args(BoundaryMode))

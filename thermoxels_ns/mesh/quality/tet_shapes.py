@@ -79,10 +79,7 @@ class TetShapes:
 
         V grad(lambda_i) . grad(lambda_j) = n_i . n_j / (36 V) for the linear element, which is the cotangent of the
         angle at the opposite edge times minus a sixth of that edge's length. Positive where that angle is obtuse; 0
-        where the volume is.
-
-        Args:
-            cosines: What `dihedral_cosines` returned.
+        where the volume is. `cosines` are those of `dihedral_cosines`.
         """
         entries = np.empty_like(cosines)
         weight = np.zeros_like(self.six_volumes)
@@ -95,12 +92,9 @@ class TetShapes:
 
 
 def node_rounding(points: FloatArray) -> float:
-    """How far rounding may have moved nodes, [m]; 0 where a mesh is so near the origin that it does not count.
+    """How far rounding may have moved nodes (n, 3), [m]; 0 where a mesh is so near the origin that it does not count.
 
     Nodes five million metres from the origin, as in national coordinates, have steps of a nanometre.
-
-    Args:
-        points: Nodes, shape (n, 3), [m].
     """
     if len(points) == 0:
         return 0.0
@@ -110,25 +104,12 @@ def node_rounding(points: FloatArray) -> float:
 
 
 def angle_rounding(rounding: float, side: float | FloatArray) -> float | FloatArray:
-    """How far rounding of the nodes may turn the angle between two faces at most, [rad].
-
-    Args:
-        rounding: What `node_rounding` returned, [m].
-        side: Shortest side of a tetrahedron, above 0, [m].
-    """
+    """How far rounding of the nodes turns the angle between two faces at most, [rad]; `side` is the shortest, [m]."""
     return _ANGLE_PER_ROUNDING * rounding / side
 
 
 def shapes_in_chunks(points: FloatArray, tets: IntArray) -> Iterator[tuple[slice, TetShapes]]:
-    """Go through tetrahedra a chunk at a time, so that memory does not grow with their number.
-
-    Args:
-        points: Nodes, shape (n, 3), [m].
-        tets: Node numbers, shape (t, 4).
-
-    Yields:
-        Which tetrahedra, and their shapes.
-    """
+    """Yield chunks of the tetrahedra (t, 4) and their shapes, so that memory does not grow with their number."""
     rounding = node_rounding(points)
     columns = np.ascontiguousarray(np.asarray(points, dtype=np.float64).T)
     for start in range(0, len(tets), _CHUNK):

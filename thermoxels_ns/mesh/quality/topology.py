@@ -65,9 +65,6 @@ def surface_topology(points: FloatArray, facets: IntArray, sides: Groups | None 
         points: Nodes, shape (n, 3), [m].
         facets: Triangles, shape (f, 3), right-hand normal out of the body.
         sides: `group_sides(facets)` where it is already known.
-
-    Returns:
-        Counts for the whole surface and for each component.
     """
     sides = group_sides(facets) if sides is None else sides
     uses = sides.sizes

@@ -41,19 +41,11 @@ class CameraCounts:
 
 
 def count_cameras(cells: BoolArray, lattice: Lattice, views: Views) -> CameraCounts:
-    """Count the cameras that see each voxel.
+    """Count the cameras, at most `MOST_CAMERAS`, that see each voxel past those of `cells` that block the view.
 
     Around each camera stand six pyramids, one per side of the lattice. In each of them, rays that lie one voxel apart
     at its far end go from layer to layer; a layer of voxels meets a regular grid of rays, so the ray of a voxel is a
     product of two look-ups along the axes. The cost is that of two or three passes over the lattice per camera.
-
-    Args:
-        cells: True where a voxel blocks the view, shape `lattice.cell_shape`.
-        lattice: Where the voxels are.
-        views: The cameras.
-
-    Returns:
-        The counts, of at most `MOST_CAMERAS` cameras.
     """
     chosen = np.arange(len(views.focal))
     if len(chosen) > MOST_CAMERAS:

@@ -47,26 +47,16 @@ class Interior:
 
 
 def interior(cells: BoolArray, lattice: Lattice, views: Views | None, seal: int) -> Interior:
-    """Find the inside of bodies of which only a shell was reconstructed.
+    """Find the inside, apart from `cells`, of bodies of which only a shell was reconstructed.
 
-    A body is what touches once openings are sealed. Its inside are cavities of the sealed shell and, if the cameras
-    are known, the space within its convex hull that they should see but do not, because the shell stands in front of
-    it (see `thermoxels_ns.mesh.solid.free_space`), and that the backs of seen surfaces surround (see
-    `thermoxels_ns.mesh.solid.interior`). The hull bounds the shadow behind bodies seen from one side; the winding
-    number tells the shadow of a body from its inside.
+    A body is what touches once openings of up to twice `seal` voxels are closed. Its inside are cavities of the sealed
+    shell and, if the cameras are known, the space within its convex hull that they should see but do not, because the
+    shell stands in front of it (`free_space`), and that the backs of seen surfaces surround (`winding_number`). The
+    hull bounds the shadow behind bodies seen from one side; the winding number tells a body's shadow from its inside.
 
     Through holes of the shell a few cameras look past it onto what others know to be inside. Such lines of sight end
     where that begins, and the cameras are asked again: crevices between shell and inside are hidden now. They are
     filled where surfaces surround them well.
-
-    Args:
-        cells: Solid voxels, shape `lattice.cell_shape`.
-        lattice: Where they are.
-        views: The training cameras, if they are known.
-        seal: Openings up to twice this many voxels wide are no way out and cannot be looked through.
-
-    Returns:
-        The inside; none of it is in `cells`.
     """
     sealed = close_gaps(cells, seal)
     enclosed, room = _enclosed(cells, sealed, lattice, views, seal)
@@ -191,13 +181,7 @@ def winding_number(solid: BoolArray, air: BoolArray) -> Float32Array:
     surfaces given as triangles: Jacobson, Kavan and Sorkine-Hornung 2013, Robust inside-outside segmentation using
     generalized winding numbers, equation 5. Here it is the function that jumps by one across the surface and is
     harmonic elsewhere, solved for with sine transforms in blocks of 2^3 voxels: Lap w = div J, where J holds the jumps.
-
-    Args:
-        solid: Voxels behind the surface, shape (nx, ny, nz).
-        air: Voxels before it, of the same shape; none of them is solid.
-
-    Returns:
-        The winding number, shape (nx, ny, nz); all voxels of a block have the same.
+    All voxels of a block have the same.
     """
     shape = solid.shape
     # Lengths for which the transforms are fast, with the lattice about in the middle.
@@ -242,21 +226,12 @@ def _jumps(side: npt.NDArray[np.int8], axis: int) -> Float32Array:
 
 
 def wall_behind(cells: BoolArray, lattice: Lattice, views: Views, thickness: float) -> BoolArray:
-    """Find the voxels that make the seen surface as thick as a wall.
+    """Find the empty voxels that make the seen surface as thick as a wall, the seen voxel included, [voxels].
 
     Seen surface are the solid voxels that enough cameras have a free line to (see `free_space`). An
     empty voxel joins if it lies within the thickness of them, counted from their outer faces, on the straight way
     through space that is solid or not seen. Voxels that cameras look through never join, so a plate that is seen from
     both sides does not grow.
-
-    Args:
-        cells: Solid voxels, shape `lattice.cell_shape`.
-        lattice: Where they are.
-        views: The training cameras.
-        thickness: Thickness of the wall, the seen voxel included, above 0, [voxels].
-
-    Returns:
-        The voxels to add, shape `lattice.cell_shape`; none of them is in `cells`.
     """
     added = np.zeros_like(cells)
     # The middle of a surface voxel lies half a voxel below its face, that of the last one half a voxel before the end.

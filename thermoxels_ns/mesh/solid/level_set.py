@@ -37,7 +37,7 @@ def level_of(
     *,
     makes_up_volume: bool = True,
 ) -> Float32Array:
-    """Give every voxel a level: above 0 in solid voxels, below 0 in empty ones, 0 on the surface between them.
+    """Give every voxel a level in [-1, 1]: above 0 in solid voxels, below 0 in empty ones, 0 on the surface between.
 
     Where density falls smoothly across the surface (`surface_ramp`), the level is a function of density that is linear
     in the distance there; area and volume of a body are then of second order in the voxel size.
@@ -57,9 +57,6 @@ def level_of(
             are not solid were removed on purpose and lie far outside.
         makes_up_volume: Whether the level shifts in thin and small bodies so that its trilinear zero holds their
             volume. Not for voxels, which hold it as they are.
-
-    Returns:
-        The level, shape of `cells`, in [-1, 1], never 0; -1 far outside.
     """
     level = np.full(cells.shape, -1.0, dtype=np.float32)
     near = bounding_box(cells, MARGIN)

@@ -52,7 +52,7 @@ class _Crossings:
 def surface_ramp(
     density: npt.NDArray[np.floating], threshold: float, deep_ratio: float, dense: BoolArray, cells: BoolArray
 ) -> SurfaceRamp | None:
-    """Look for a smooth ramp of density across the surface.
+    """Level and where to believe it, if density falls smoothly across most of the surface; None if it jumps there.
 
     Where density passes the threshold along a smooth ramp over a few voxels, a function of it that is linear in the
     distance is a level that needs no smoothing. Where it jumps, or is noisy, there is no such function.
@@ -67,9 +67,6 @@ def surface_ramp(
         deep_ratio: How many times denser than the threshold the body is where the logarithm's level reaches 1.
         dense: Voxels that the threshold chose.
         cells: Solid voxels; where they are not the dense ones, density says nothing.
-
-    Returns:
-        The level and where to believe it; None if density jumps at most of the surface or is nowhere smooth.
     """
     with np.errstate(divide="ignore"):
         logarithm = np.log(np.asarray(density, dtype=np.float64) / threshold)

@@ -56,11 +56,7 @@ def automatic_threshold(snapshot: GridSnapshot, density: FloatArray) -> Threshol
     otherwise widen the body by a layer: the inside that no camera sees reaches as far as its farthest voxels.
 
     Without evidence the rule is that of `optical_depth_threshold`; without `RayEvidence.voxel_ends` all voxels that
-    reach the threshold are solid.
-
-    Args:
-        snapshot: The trained field.
-        density: Its density at the voxel centres.
+    reach the threshold are solid. `density` is that at the voxel centres.
     """
     evidence = snapshot.evidence
     if evidence is None or len(evidence.half_depth_density) < FEWEST_RAYS:

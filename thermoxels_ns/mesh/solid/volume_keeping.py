@@ -52,16 +52,7 @@ def keep_volume(level: Float32Array, sharp: Float32Array, least: Float32Array, c
     changes its sign along the axes. Their differences, averaged with weights 1 4 6 4 1 along each axis and divided by
     the surface around, say how far the surface should move. Differences below `UNNOTICED` of what is there are left
     alone, so that this acts on bars, corners, specks and pits, not on the faces and long edges of a body of many
-    voxels.
-
-    Args:
-        level: The smoothed level, in [-1, 1].
-        sharp: The level before, same signs.
-        least: No level comes nearer to 0 than this.
-        cells: Solid voxels, where both levels are above 0.
-
-    Returns:
-        The level, with the same signs, in [-1, 1].
+    voxels. Signs stay, and no level comes nearer to 0 than `least`.
     """
     near = np.pad(near_surface(cells), 1)
     index = np.flatnonzero(near)
@@ -144,14 +135,7 @@ def _found(levels: Float32Array, index: IntArray, steps: IntArray) -> _Found:
 
 
 def _windowed(values: Float32Array, at_index: Float32Array, index: IntArray, steps: IntArray) -> Float32Array:
-    """Mean around some voxels with weights 1 4 6 4 1 along each axis, shape (n,).
-
-    Args:
-        values: What there is at all other voxels; those at `index` are overwritten.
-        at_index: What there is at these, shape (n,).
-        index: Flat indices of voxels, shape (n,).
-        steps: Flat steps to the 27 voxels around, shape (27,).
-    """
+    """Mean around voxels at flat indices, with weights 1 4 6 4 1 along each axis; `at_index` overwrites `values`."""
     for _ in range(2):
         values[index] = at_index
         at_index = np.empty(len(index), dtype=np.float32)

@@ -139,19 +139,15 @@ def select_solid(
     *,
     makes_up_volume: bool = True,
 ) -> SolidCells:
-    """Choose the solid voxels of a trained field.
+    """Choose the solid voxels of a trained field, by the density at their centres.
 
-    A voxel's density is that at its centre. A voxel without density is solid only if a step after the threshold makes
-    it so.
+    A voxel without density is solid only if a step after the threshold makes it so.
 
     Args:
         snapshot: The trained field on its corner lattice.
         selection: Threshold and what to do with gaps, floaters and interiors.
         metres_per_world_unit: Length of one unit of the lattice's world, [m]; only a wall thickness needs it.
         makes_up_volume: As in `level_of`.
-
-    Returns:
-        The solid voxels, the level whose zero is their surface, and what each step did.
 
     Raises:
         MeshError: No voxel is solid, density does not tell solid from empty, or a wall thickness is asked for but the

@@ -93,18 +93,12 @@ class BccLattice:
 
 
 def bcc_lattice(level: npt.NDArray[np.floating]) -> BccLattice:
-    """Put the levels of voxel centres on the lattice and close it where the solid touches the border.
+    """Put levels of voxel centres, above 0 somewhere, on the lattice and close it where the solid touches the border.
 
     A corner gets the mean of the eight centres around it, which is the trilinear value, or 0 where that would break a
     layer of one voxel. Beyond the border every centre has the level -|level| of the centre inside, and corners on the
     border are at most 0: linear interpolation is then 0 exactly on the border where solid touches it, and nothing above
-    0 lies on the border or beyond.
-
-    Args:
-        level: Level at the voxel centres, above 0 somewhere, finite, shape (cx, cy, cz).
-
-    Returns:
-        The lattice around the solid voxels; what is farther than two voxels from all of them is left out.
+    0 lies on the border or beyond. What is farther than two voxels from all solid voxels is left out.
     """
     box = bounding_box(level > 0.0, margin=2)
     first, inner = np.array([part.start for part in box]), level[box]

@@ -110,16 +110,10 @@ class Planes:
 
 
 def edge_planes(surface: Surface) -> Planes:
-    """Find the nodes of chamfers and the planes beside them.
+    """Find the nodes of chamfers, ascending, and the planes beside them.
 
     A node that is not flat, with flat surface nearby that lies in two or three planes, is taken for one of a chamfer.
-    Planes are made of flat triangles only, never of the chamfer itself.
-
-    Args:
-        surface: The surface.
-
-    Returns:
-        Nodes in ascending order, with their planes. There are none on a surface that is smooth or noisy all over.
+    Planes are made of flat triangles only, never of the chamfer itself. Surfaces that are smooth or noisy have none.
     """
     flat_nodes = surface.flat_nodes()
     flat = flat_nodes[surface.facets].all(axis=1)
@@ -143,20 +137,10 @@ def edge_planes(surface: Surface) -> Planes:
 
 
 def _planes_beside(surface: Surface, nodes: IntArray, tree: KDTree, centroids: FloatArray, facets: IntArray) -> Planes:
-    """Sort flat triangles near each node by their normals into planes.
+    """Sort the flat triangles near each of some nodes by their normals into planes; nodes with one plane are left out.
 
     Three seeds are chosen: the nearest normal, the one that differs most from it, and the one that differs most from
-    both. If what is taken for a plane is not plane, the node has none.
-
-    Args:
-        surface: The surface.
-        nodes: Node numbers, shape (m,).
-        tree: Of the centroids.
-        centroids: Of flat triangles, shape (g, 3).
-        facets: Their numbers, shape (g,).
-
-    Returns:
-        Those of the nodes with surface in different directions beside them, and their planes.
+    both. If what is taken for a plane is not plane, the node has none. The tree holds the flat triangles' centroids.
     """
     distance, found = map(np.asarray, tree.query(surface.points[nodes], k=_NEAREST, distance_upper_bound=_REACH))
     several = np.flatnonzero(np.count_nonzero(np.isfinite(distance), axis=1) >= 2 * _LEAST_FACETS)

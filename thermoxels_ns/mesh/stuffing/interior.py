@@ -29,15 +29,11 @@ def eroded(cells: BoolArray, by: int) -> BoolArray:
 
 
 def balanced_octree(cells: BoolArray, largest: int) -> tuple[BoolArray, ...]:
-    """Join voxels into cubes of 2, 4, 8, ... voxels along an edge that only hold voxels of the set.
+    """Join voxels into cubes of 2, 4, 8, ... `largest` voxels along an edge that only hold voxels of the set.
 
     Cube (i, j, k) of edge s begins at voxel (i s, j s, k s). Cubes that touch, if only at a corner, differ at most by
     a factor 2 in size; voxels outside the set, beyond the array too, count as cubes of one voxel. Under these rules
     every cube is as large as it can be, which no choice elsewhere can change.
-
-    Args:
-        cells: The voxels that may be joined, shape (cx, cy, cz).
-        largest: No edge is longer than this, [voxels]; a power of two.
 
     Returns:
         Entry n is for cubes of 2^(n + 1) voxels along an edge: True where the cube is one cube or part of a larger one,
@@ -97,7 +93,7 @@ class CoarseInterior:
 
 
 def coarse_interior(lattice: BccLattice, largest: int) -> CoarseInterior | None:
-    """Build the inside of a solid from cubes of two and more voxels.
+    """Build the inside of a solid from cubes of two to `largest` voxels; None if there are no such cubes.
 
     Every cube of the octree has a node at its centre and, as the voxels outside the octree have, nodes at its corners;
     all of them are points of the body-centred cubic lattice. Between two neighbours
@@ -112,13 +108,6 @@ def coarse_interior(lattice: BccLattice, largest: int) -> CoarseInterior | None:
 
     The octree begins at the lowest voxel that may be joined with others, so that the place of the solid in the voxel
     lattice does not matter.
-
-    Args:
-        lattice: Levels on the lattice.
-        largest: Edge of the largest cubes, [voxels], a power of two.
-
-    Returns:
-        What is larger than one voxel; None if nothing is.
     """
     if largest == 1:
         return None

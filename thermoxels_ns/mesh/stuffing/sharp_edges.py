@@ -45,19 +45,12 @@ def sharpen(solid: StuffedSolid, shape: tuple[int, ...]) -> StuffedSolid:
     as on smooth or noisy surfaces and walls of less than 3 voxels, nothing moves. Nodes move one after another, those
     with the shortest way first, each only if all tetrahedra around it end up with dihedral angles between 13 and 160
     degrees and volumes above 0. Nodes on the border of the lattice stay, and so do those with another surface in
-    front of them.
+    front of them. `shape` is the number of voxels along each axis.
 
     Measured at 48 voxels across: the area of boxes at any angle is within 0.5 % instead of 3.2 %, that of a cylinder
     within 0.1 % instead of 1.4 %, and true edges are 0.04 to 0.11 voxels from the mesh on average instead of 0.38.
     With noise of a tenth of the largest level the gain is as large; with twice that next to nothing moves, and on
     spheres and tori of more than 5 voxels radius nothing.
-
-    Args:
-        solid: What `stuff` returned.
-        shape: Number of voxels along each axis of the lattice.
-
-    Returns:
-        The same mesh with other points.
 
     Raises:
         MeshError: The mesh is not within the lattice.

@@ -69,19 +69,13 @@ def warp(lattice: BccLattice, buried: BoolArray | None = None) -> WarpedLattice:
 
     A cut is where linear interpolation along an edge between two opposite signs is 0. A point with cuts within alpha
     times the edge length moves to the nearest of them and has sign 0 from then on; its edges are cut no more (Labelle
-    and Shewchuk 2007, section 3).
+    and Shewchuk 2007, section 3). The remaining cuts are within [alpha, 1 - alpha]. `buried` points are not looked at,
+    because they and all their neighbours are inside.
 
     Beyond the paper, nothing thin is lost: a point stays if the solid is not on its other side, seen from the cut, or
     if the solid (for a point outside: the empty space) would fall apart, close up or vanish with it. Its cuts are then
     held at alpha times the edge length, which the bounds on the angles allow. Where the surface is smooth and the
     solid a few voxels thick, no point stays.
-
-    Args:
-        lattice: Levels on the lattice, above 0 somewhere.
-        buried: True for points that need not be looked at, because they and all their neighbours are inside.
-
-    Returns:
-        Signs, moved points and the remaining cuts, all within [alpha, 1 - alpha].
     """
     level = lattice.level
     sign = (level > 0.0).astype(np.int8)
