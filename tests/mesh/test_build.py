@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.boundary.patch_rules import PatchRules, Rule
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh, check_similarity
 from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
@@ -152,15 +151,6 @@ def test_part_of_a_conforming_mesh_no_thermal_ray_saw_is_counted(snapshot_of):
     assert check_mesh(built.mesh).volume_m3 == pytest.approx(27 * 0.5**3, rel=0.2)
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_rules_without_effect_are_named(snapshot_of, mode):
-    far = ((50.0, 50.0, 50.0), (51.0, 51.0, 51.0))
-    rules = PatchRules((Rule("top", facing="up"), Rule("typo", box=far)), (Rule("pipe", box=far),))
-    built = build_mesh(carved(snapshot_of), DENSE, np.eye(4), MeshOptions(mode, rules=rules))
-    assert built.idle_rules == ("patch typo (entry 2)", "region pipe (entry 1)")
-    assert build_mesh(carved(snapshot_of), DENSE, np.eye(4), MeshOptions(mode)).idle_rules == ()
-
-
 @pytest.mark.parametrize(
     "bad",
     [
@@ -240,17 +230,6 @@ def test_faces_of_the_box_are_tagged_and_flat(snapshot_of, mode):
     assert np.all(mesh.boundary.area_factor[cut] == 1.0)
     names = [mesh.boundary.patch_names[n] for n in np.unique(mesh.boundary.patch[cut])]
     assert names == ["cut"]
-
-
-def test_up_decides_which_way_a_facet_faces(snapshot_of):
-    field = ball(snapshot_of)
-    shares = {}
-    for up in ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0)):
-        boundary = build_mesh(field, DENSE, np.eye(4), MeshOptions(up=up)).mesh.boundary
-        assert boundary is not None
-        top = boundary.patch == boundary.patch_names.index("exterior-up")
-        shares[up] = boundary.normal[top].mean(axis=0)
-    assert np.argmax(shares[(0.0, 0.0, 1.0)]) == 2 and np.argmax(shares[(1.0, 0.0, 0.0)]) == 0
 
 
 def test_colour_is_that_of_corners_with_density(snapshot_of):

@@ -125,15 +125,6 @@ def test_numbers_of_the_rig_have_their_errors_and_an_unsure_turn_its_reason(page
     assert "41.0, 29.0 41.0, 29.0 " in given and "how sure the turn is" not in given
 
 
-def test_what_the_correction_of_drift_changed(page):
-    assert "corrected: two frames of one point differ by 1.55 K before, 0.11 K after" in words(page)
-    assert "not corrected: two frames of one point differ by 1.55 K" in words(
-        with_scene(page, drift=replace(page.scene.drift, used=False))
-    )
-    off = replace(page.scene.drift, used=False, before_k=np.nan, after_k=np.nan)
-    assert "Drift and vignetting not corrected Scale" in words(with_scene(page, drift=off))
-
-
 def test_a_scale_that_is_missing_says_what_it_costs(page):
     said = words(page)
     assert "unknown (no photograph has a GPS position); give a length when you export the mesh" in said

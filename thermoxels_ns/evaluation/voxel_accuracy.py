@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
+from thermoxels_ns.core.checks import check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
@@ -28,10 +28,6 @@ class TrueShape(Protocol):
 
     def signed_distance(self, points: FloatArray, /) -> FloatArray:
         """Distance of points (n, 3) to the surface, shape (n,), negative inside the body."""
-        ...
-
-    def surface_points(self, n: int, seed: int, /) -> tuple[FloatArray, FloatArray]:
-        """`n` points spread evenly by area over the surface, and their outward unit normals, each (n, 3)."""
         ...
 
 
@@ -93,18 +89,10 @@ def surface_fscore(
             vectors); the identity if left out.
         views: The training cameras, in the coordinates of the lattice. With them the part of the boundary that they
             see is scored too, which takes a few passes over the lattice per camera.
-
-    Raises:
-        MeshError: Shapes do not fit, or no true point is given.
     """
-    remedy = "Pass the solid voxels of this lattice."
-    cells = check_shape("cells", np.asarray(cells, dtype=bool), lattice.cell_shape, remedy, MeshError)
-    remedy = "Pass points of the true surface that the training cameras see."
-    seen = check_shape("true_points_seen", np.asarray(true_points_seen, np.float64), (None, 3), remedy, MeshError)
-    check_finite("true_points_seen", seen, remedy, MeshError)
-    if len(seen) == 0:
-        raise MeshError("true_points_seen", expected="at least one point", got="none", remedy=remedy)
-    check_positive("tolerance", tolerance, "Pass 1.5 voxels in truth units.", MeshError)
+    cells = check_shape("cells", cells, lattice.cell_shape, "Pass the solid voxels of this lattice.", MeshError)
+    seen = np.asarray(true_points_seen, dtype=np.float64)
+    assert len(seen) and tolerance > 0.0
     transform = check_similarity("world_to_truth", np.eye(4) if world_to_truth is None else world_to_truth)
 
     solid = fill_enclosed(cells)

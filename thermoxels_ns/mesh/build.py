@@ -6,8 +6,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape
@@ -17,6 +15,7 @@ from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.boundary.patch_rules import PatchRules
 from thermoxels_ns.mesh.boundary.patches import apply_regions
 from thermoxels_ns.mesh.boundary.tags import BoundaryMode, tag_boundary
+from thermoxels_ns.mesh.quality.topology import part_labels
 from thermoxels_ns.mesh.solid.morphology import bounding_box, connected, face_connected
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, select_solid
 from thermoxels_ns.mesh.stuffing.isosurface import check_coarsest, stuff
@@ -204,7 +203,7 @@ def _with_a_measurement(shape: _Shape, observed: BoolArray) -> tuple[BoolArray, 
 
     Voxels that touch by a corner only are one part as voxels, but may be two once their surface is smooth.
     """
-    part = node_parts(shape.tets, len(shape.points))
+    part = part_labels(len(shape.points), shape.tets[:, :3].ravel(), shape.tets[:, 1:].ravel())
     seen = np.bincount(part[observed], minlength=int(part.max()) + 1) > 0
     if not seen.any():
         seen[:] = True
@@ -213,7 +212,7 @@ def _with_a_measurement(shape: _Shape, observed: BoolArray) -> tuple[BoolArray, 
 
 def _kept(shape: _Shape, stays: BoolArray) -> _Shape:
     """The parts of a mesh whose nodes stay."""
-    number = renumbered(stays)
+    number = np.cumsum(stays, dtype=np.int64) - 1
     facet_stays = stays[shape.facets[:, 0]]
     return _Shape(
         shape.points[stays],
@@ -279,25 +278,3 @@ def check_similarity(name: str, matrix: npt.ArrayLike) -> FloatArray:
 def apply_transform(matrix: FloatArray, points: FloatArray) -> FloatArray:
     """Map points (n, 3) by a 4x4 that acts on homogeneous column vectors."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
-
-
-def node_parts(tets: IntArray, num_nodes: int) -> IntArray:
-    """Number of the connected part of each node, shape (n,), from 0; parts share no node.
-
-    >>> node_parts(np.array([[0, 1, 2, 3], [3, 4, 5, 6], [7, 8, 9, 10]]), 11).tolist()
-    [0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1]
-    """
-    start, end = tets[:, :3].ravel(), tets[:, 1:].ravel()
-    links = sparse.coo_array((np.ones(len(start), np.int8), (start, end)), shape=(num_nodes, num_nodes))
-    return connected_components(links, directed=False)[1].astype(np.int64)
-
-
-def renumbered(keep: BoolArray) -> IntArray:
-    """New number of each node when only some stay, -1 for the others, shape (n,).
-
-    >>> renumbered(np.array([True, False, True])).tolist()
-    [0, -1, 1]
-    """
-    number = np.cumsum(keep, dtype=np.int64) - 1
-    number[~keep] = -1
-    return number

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.checks import check_finite
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
 from thermoxels_ns.mesh.quality.face_count import TET_EDGES
@@ -44,7 +44,6 @@ def interpolate_corners(
         weight: sum_c t_c w_c, shape (n,).
     """
     shape = weights.shape
-    check_shape("values", values, (*shape, *values.shape[3:]), "Pass one value per corner.", MeshError)
     low = np.clip(np.floor(points_index).astype(np.int64), 0, np.array(shape) - 2)
     fraction = np.clip(points_index - low, 0.0, 1.0)
     flat_values = values.reshape(-1, *values.shape[3:])
@@ -77,7 +76,7 @@ def extend_harmonically(
     observed: BoolArray,
     edge_weights: npt.NDArray | None = None,
 ) -> FloatArray:
-    """Fill in the temperature of unobserved nodes by the graph Laplace equation.
+    """Fill in the temperature of unobserved nodes by the graph Laplace equation, shape (n,), [degrees Celsius].
 
     Observed nodes keep their value. Every other node i solves sum_j w_ij (T_i - T_j) = 0 over its edges: steady heat
     conduction in an insulated body. The matrix is an M-matrix, so the maximum principle holds: no filled-in value
@@ -92,9 +91,6 @@ def extend_harmonically(
             edge (`voxel_tets.lattice_edges`) gives uniform conductivity in the voxels, `tet_conductances` that in any
             tetrahedra.
 
-    Returns:
-        Temperature of every node, shape (n,), [degrees Celsius].
-
     Raises:
         MeshError: A connected part has no observed node, or the solver did not converge.
 
@@ -104,11 +100,7 @@ def extend_harmonically(
     """
     num_nodes = len(temperature_c)
     observed = np.asarray(observed, dtype=bool)
-    remedy = "Pass one entry per mesh node or edge."
-    check_shape("observed", observed, (num_nodes,), remedy, MeshError)
-    check_shape("edges", edges, (None, 2), remedy, MeshError)
     weights = np.ones(len(edges)) if edge_weights is None else np.asarray(edge_weights, dtype=np.float64)
-    check_shape("edge_weights", weights, (len(edges),), remedy, MeshError)
     temperature = np.where(observed, np.asarray(temperature_c, dtype=np.float64), 0.0)
     check_finite(
         "observed temperatures", temperature, "The checkpoint is damaged; resume from an earlier one.", MeshError
@@ -157,10 +149,8 @@ def _parts_with_measurement(links: sparse.csr_array, observed: BoolArray) -> Int
     measured = np.bincount(parts[observed], minlength=count)
     blind = np.flatnonzero(measured == 0)
     if len(blind):
-        sizes = np.bincount(parts, minlength=count)
-        shown = ", ".join(
-            f"part {p} ({sizes[p]} nodes, the first is node {int(np.argmax(parts == p))})" for p in blind[:3]
-        )
+        sizes, first = np.bincount(parts, minlength=count), np.unique(parts, return_index=True)[1]
+        shown = ", ".join(f"part {p} ({sizes[p]} nodes, the first is node {first[p]})" for p in blind[:3])
         raise MeshError(
             "observed temperatures",
             expected="at least one node seen by a thermal ray in each connected part of the mesh",

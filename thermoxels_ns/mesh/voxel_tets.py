@@ -56,7 +56,7 @@ def kuhn_tets(cells: BoolArray) -> tuple[IntArray, IntArray]:
 
 
 def lattice_edges(cells: BoolArray) -> tuple[IntArray, IntArray]:
-    """Edges of the solid voxels (e, 2) between nodes of `kuhn_tets`, and the number of solid voxels around each, 1 to 4.
+    """Edges of the solid voxels (e, 2) between nodes of `kuhn_tets`; how many solid voxels are around each, 1 to 4.
 
     Two used corners across an empty gap are no edge, even if they are lattice neighbours.
     """

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray
-from thermoxels_ns.core.checks import check_direction, check_finite, check_shape, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import check_direction, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -54,9 +54,7 @@ def picture_of_mesh(
     note: str = "",
     window_size: tuple[int, int] = (1200, 900),
 ) -> None:
-    """Draw the surface of a mesh, coloured by temperature, as a PNG with a white background.
-
-    Parallel projection, framed so that the whole mesh is in the picture beside its colour bar.
+    """Draw the surface of a mesh, coloured by temperature, as a PNG: all of it, in parallel projection.
 
     Args:
         path: File to write, ending in .png; its folder is made if need be.
@@ -86,9 +84,6 @@ def picture_of_mesh(
     if path.suffix != ".png":
         raise OutputError("picture", expected="a name that ends in .png", got=path.name, remedy="Rename the file.")
     values = np.asarray(mesh.temperature_c if temperature_c is None else temperature_c, dtype=np.float64)
-    remedy = "Pass one finite temperature per mesh node."
-    check_shape("temperature_c", values, (len(mesh.points_m),), remedy, MeshError)
-    check_finite("temperature_c", values, remedy, MeshError)
     right, true_up, towards_camera = _view_axes(up, view_direction)
     shown = values[np.unique(mesh.facets)]
     low, high = _colour_limits(_without_outliers(shown) if clim is None else np.asarray(clim, dtype=np.float64))
@@ -174,8 +169,6 @@ def _without_outliers(values: FloatArray) -> FloatArray:
 def _colour_limits(values: FloatArray) -> tuple[float, float]:
     """Ends of the colour bar; a constant temperature gets 1 K around it."""
     low, high = float(values.min()), float(values.max())
-    if not (np.isfinite(low) and np.isfinite(high)):
-        raise MeshError("clim", expected="finite temperatures", got=(low, high), remedy="Leave clim out.")
     return (low, high) if high - low > 1e-3 else (low - 0.5, high + 0.5)
 
 
@@ -249,10 +242,9 @@ def _add_words(
 ) -> None:
     """Title, size of the mesh, axes, what grey means, and extremes that the colours do not reach."""
     height = plotter.window_size[1]
+    how: Any = {"viewport": True, "color": _INK, "font_file": font}
     if title:
-        plotter.add_text(
-            title, position=(0.04, 0.925), viewport=True, font_size=round(height / 60), color=_INK, font_file=font
-        )
+        plotter.add_text(title, position=(0.04, 0.925), font_size=round(height / 60), **how)
     size = mesh.points_m.max(axis=0) - mesh.points_m.min(axis=0)
     words = f"{size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} {length_unit}, {len(mesh.tets):,} tetrahedra"
     if unseen:
@@ -261,9 +253,7 @@ def _add_words(
         words += f"\ncolours: middle 99 %; all: {extremes[0]:.1f} to {extremes[1]:.1f}"
     if note:
         words += f"\n{note}"
-    plotter.add_text(
-        words, position=(0.17, 0.04), viewport=True, font_size=round(height / 78), color=_INK, font_file=font
-    )
+    plotter.add_text(words, position=(0.17, 0.04), font_size=round(height / 78), **how)
     plotter.renderer.add_axes(viewport=(0.0, 0.0, 0.15, 0.155), line_width=3, color=_INK)
 
 
@@ -348,11 +338,6 @@ def draw_heat(path: Path, mesh: TetMesh, solution: HeatSolution, look: Mapping[s
             panel_path = Path(scratch) / f"{number}.png"
             picture_of_mesh(panel_path, mesh, values, title=title, **colours, **look)
             with Image.open(panel_path) as image:
-                panels.append(image.convert("RGB"))
-    picture = Image.new("RGB", (sum(p.width for p in panels), max(p.height for p in panels)), "white")
-    left = 0
-    for panel in panels:
-        picture.paste(panel, (left, 0))
-        left += panel.width
+                panels.append(np.asarray(image.convert("RGB")))
     with replace_when_done(path) as temporary:
-        picture.save(temporary)
+        Image.fromarray(np.concatenate(panels, axis=1)).save(temporary)

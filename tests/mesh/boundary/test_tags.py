@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from tests.support.stuffed_shapes import SHAPES, centres
-from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.boundary.tags import LEAST_AREA_FACTOR, voxel_surface
 from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
 from thermoxels_ns.mesh.solid.level_set import level_of
@@ -111,9 +110,3 @@ def test_noise_has_bounded_factors_and_normals_that_point_outwards(least: float)
     assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0, abs=1e-9)
     assert np.einsum("ij,ij->i", normals, facet_normals(points.astype(float), facets)).min() > 0.0
     assert factors.min() >= LEAST_AREA_FACTOR and factors.max() <= 1.0
-
-
-@pytest.mark.parametrize("points", [[[1, 1, 1], [2, 2, 1], [1, 2, 2]], [[5, 1, 1], [5, 2, 1], [5, 2, 2]]])
-def test_what_is_no_boundary_of_voxels_is_refused(points: list) -> None:
-    with pytest.raises(MeshError, match="expected halves of the faces of 4 x 4 x 4 voxels, got 1 other triangles"):
-        voxel_surface(np.ones((4, 4, 4)), np.array(points), np.array([[0, 1, 2]]))

@@ -73,14 +73,6 @@ def test_ply_without_photographs_is_coloured_by_temperature(tmp_path, box_mesh):
     assert comment.encode() in (tmp_path / "box.ply").read_bytes()
 
 
-def test_temperatures_of_another_time_colour_the_surface(tmp_path, tagged_mesh):
-    later = np.full(len(tagged_mesh.points_m), 12.0)
-    write_ply(tmp_path / "house.ply", tagged_mesh, temperature_c=later, colouring="temperature")
-    read = meshio.read(tmp_path / "house.ply")
-    assert set(read.point_data["temperature_c"]) == {12.0}
-    assert len(np.unique(read.point_data["red"])) == 1
-
-
 @pytest.mark.parametrize(("colouring", "message"), [("photographs", "a mesh whose nodes"), ("true", "got 'true'")])
 def test_colours_that_are_not_there_are_refused(tmp_path, box_mesh, colouring, message):
     with pytest.raises(MeshError, match=message):

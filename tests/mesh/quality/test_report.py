@@ -183,19 +183,6 @@ def test_bodies_that_touch_are_counted_both_ways(mesh_of_cells):
     assert (report.genus, len(report.components)) == (0, 3)
 
 
-def test_unused_nodes_are_no_bodies(box_mesh):
-    one = np.ones(1)
-    mesh = replace(
-        box_mesh,
-        points_m=np.vstack([[[9.0, 9.0, 9.0]], box_mesh.points_m]),
-        tets=box_mesh.tets + 1,
-        facets=box_mesh.facets + 1,
-        temperature_c=np.concatenate([20.0 * one, box_mesh.temperature_c]),
-        observed=np.concatenate([one > 0, box_mesh.observed]),
-    )
-    assert quality_report(mesh, "voxel").bodies_by_node == 1
-
-
 def test_mapping_is_json_and_complete(mesh_of_cells):
     cells = np.zeros((60, 1, 1), dtype=bool)
     cells[::2] = True  # 30 bodies
@@ -221,8 +208,6 @@ def test_mapping_is_json_and_complete(mesh_of_cells):
 def test_bad_input_is_refused(box_mesh):
     with pytest.raises(MeshError, match="boundary_mode: expected voxel or conforming, got 'smooth'"):
         quality_report(box_mesh, "smooth")  # type: ignore[arg-type]
-    with pytest.raises(MeshError, match="observed_range_c: expected two finite temperatures"):
-        quality_report(box_mesh, "voxel", observed_range_c=(30.0, 10.0))
     blind = replace(box_mesh, observed=np.zeros(60, dtype=bool))
     with pytest.raises(MeshError, match="at least one node that a thermal ray saw"):
         quality_report(blind, "voxel")

@@ -6,8 +6,6 @@ import numpy as np
 from scipy import ndimage
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
-from thermoxels_ns.core.checks import check_finite, check_shape
-from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
@@ -22,7 +20,6 @@ _LARGEST_BLOCK = 5
 """Empty blocks of up to 2^5 voxels along an edge are crossed in one step."""
 _NUDGE = 1e-4
 """How far a line steps into the next block, [voxels]."""
-_REMEDY = "Pass one centroid and one outward unit normal per boundary triangle."
 
 
 def seen_facets(
@@ -40,13 +37,7 @@ def seen_facets(
         centroids_world: Middle of each triangle, shape (f, 3), [world units].
         normals_world: Outward unit normals of the true surface, shape (f, 3), in world axes.
     """
-    check_shape("cells", cells, lattice.cell_shape, "Pass the voxels of this lattice.", MeshError)
-    check_shape("centroids_world", centroids_world, (None, 3), _REMEDY, MeshError)
-    check_shape("normals_world", normals_world, (len(centroids_world), 3), _REMEDY, MeshError)
-    centroids = check_finite("centroids_world", lattice.world_to_index(centroids_world), _REMEDY, MeshError)
-    normals = check_finite("normals_world", np.asarray(normals_world, dtype=np.float64), _REMEDY, MeshError)
-
-    group, middle, normal = _grouped(centroids, normals, lattice.cell_shape)
+    group, middle, normal = _grouped(lattice.world_to_index(centroids_world), normals_world, lattice.cell_shape)
     space = _EmptySpace(cells)
     start = middle + START_ABOVE_SURFACE[0] * normal
     inside = space.solid_at(start)

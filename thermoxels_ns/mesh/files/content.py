@@ -14,7 +14,7 @@ from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.core.units import celsius_to_kelvin
-from thermoxels_ns.mesh.quality.checks import facet_area_vectors
+from thermoxels_ns.mesh.quality.checks import facet_normals
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 UNTAGGED_PATCH = "boundary"
@@ -88,7 +88,7 @@ def file_content(mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None =
     _check_indices("region", region, len(mesh.region_names))
     if mesh.boundary is None:
         patch, patch_names = np.zeros(len(facets), dtype=np.int64), (UNTAGGED_PATCH,)
-        normal, factor = normals_of(points, facets), np.ones(len(facets))
+        normal, factor = facet_normals(points, facets), np.ones(len(facets))
     else:
         remedy = "Give every boundary triangle a finite value."
         normal = np.asarray(mesh.boundary.normal, dtype=np.float64)
@@ -125,13 +125,6 @@ def node_arrays(mesh: TetMesh, content: FileContent) -> dict[str, npt.NDArray]:
     if mesh.colour is not None:
         arrays["colour"] = colour_bytes(mesh.colour)
     return arrays
-
-
-def normals_of(points_m: FloatArray, facets: IntArray) -> FloatArray:
-    """Unit normals of triangles (right-hand rule), 0 for one without area, shape (f, 3)."""
-    vectors = facet_area_vectors(points_m, facets)
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors / np.where(length > 0.0, length, 1.0)
 
 
 def write_bytes(path: Path, parts: Iterable[bytes]) -> None:

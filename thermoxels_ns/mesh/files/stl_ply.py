@@ -14,13 +14,12 @@ from thermoxels_ns.mesh.files.content import (
     check_suffix,
     colour_bytes,
     file_content,
-    normals_of,
     surface_colours,
     surface_of,
     surface_range_c,
     write_bytes,
 )
-from thermoxels_ns.mesh.quality.checks import facet_areas
+from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _STL_HEADER = b"Surface of a tetrahedral mesh, metres".ljust(80)
@@ -38,7 +37,7 @@ def write_stl(path: Path | str, mesh: TetMesh) -> None:
     content = file_content(mesh)
     check_stl(mesh)
     triangles = np.zeros(len(content.facets), dtype=_STL_TRIANGLE)
-    triangles["normal"] = normals_of(content.points_m, content.facets)
+    triangles["normal"] = facet_normals(content.points_m, content.facets)
     triangles["corners"] = content.points_m[content.facets]
     write_bytes(path, [_STL_HEADER, np.array(len(triangles), "<u4").tobytes(), triangles.tobytes()])
 

@@ -55,9 +55,10 @@ def facet_areas(points: FloatArray, facets: IntArray) -> FloatArray:
 
 
 def facet_normals(points: FloatArray, facets: IntArray) -> FloatArray:
-    """Unit normals of triangles (right-hand rule), shape (f, 3)."""
+    """Unit normals of triangles (right-hand rule), 0 for one without area, shape (f, 3)."""
     vectors = facet_area_vectors(points, facets)
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(length > 0.0, length, 1.0)
 
 
 def dihedral_range_deg(points: FloatArray, tets: IntArray) -> tuple[float, float]:
@@ -173,9 +174,7 @@ def count_overlaps(points: FloatArray, facets: IntArray, sides: Groups) -> int:
     This is how a crack looks: the faces of neighbours that do not match are boundary triangles, one upon the other.
     `sides` is `topology.group_sides(facets)`.
     """
-    vectors = facet_area_vectors(points, facets)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        normals = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    normals = facet_normals(points, facets)
     facet, side = np.divmod(sides.order, 3)
     direction = np.where(facets[facet, side] < facets[facet, (side + 1) % 3], 1.0, -1.0)
     edge = np.repeat(np.arange(len(sides.start)), sides.sizes)

@@ -149,11 +149,11 @@ def quality_report(
         raise MeshError("boundary_mode", expected=modes, got=repr(boundary_mode), remedy="Pass one of these.")
     check_arrays(mesh)
     low_c, high_c = _observed_range(mesh, observed_range_c)
-    shapes = _measure_shapes(mesh, angle_bins(boundary_mode))
+    shapes, volumes, stiffness = _measure_shapes(mesh, angle_bins(boundary_mode))
     edges = group_edges(mesh.tets)
     ends = edges_of_rows(mesh.tets, edges.order[edges.start])
     lengths = np.linalg.norm(mesh.points_m[ends[:, 0]] - mesh.points_m[ends[:, 1]], axis=1)
-    entries, sizes = edges.sums(shapes.stiffness), edges.sums(np.abs(shapes.stiffness))
+    entries, sizes = edges.sums(stiffness), edges.sums(np.abs(stiffness))
     share_positive = float(np.mean(entries > _CANCELLED * sizes))
 
     faces = group_faces(mesh.tets)
@@ -164,14 +164,14 @@ def quality_report(
     overlaps = count_overlaps(mesh.points_m, mesh.facets, sides)
     temperature = mesh.temperature_c
     figures = Figures(
-        min_volume_m3=shapes.min_volume_m3,
-        num_non_positive=shapes.num_non_positive,
+        min_volume_m3=float(volumes.min()),
+        num_non_positive=int(np.count_nonzero(~(volumes > 0.0))),
         num_mismatches=int(np.count_nonzero(faces.sizes > 2)) + overlaps + count_twin_nodes(mesh.points_m),
         num_open_edges=surface.num_open_edges,
         num_wrong_facets=count_wrong_facets(mesh, faces),
-        dihedral_range_deg=shapes.dihedral_range_deg,
+        dihedral_range_deg=shapes["dihedral_range_deg"],
         temperature_excess_k=float(max(low_c - temperature.min(), temperature.max() - high_c)),
-        share_obtuse=shapes.share_obtuse,
+        share_obtuse=shapes["share_obtuse"],
         share_positive_edges=share_positive,
         angle_rounding_deg=float(np.degrees(angle_rounding(node_rounding(mesh.points_m), float(lengths.min()) or 1.0))),
     )
@@ -183,16 +183,10 @@ def quality_report(
         num_edges=len(ends),
         num_facets=len(mesh.facets),
         num_box_facets=int(np.count_nonzero(mesh.facet_tags == FACET_BOX)),
-        volume_m3=shapes.volume_m3,
         area_m2=float(areas.sum()),
         true_area_m2=None if mesh.boundary is None else float((areas * mesh.boundary.area_factor).sum()),
         edge_length_m=(float(lengths.min()), float(lengths.mean()), float(lengths.max())),
-        dihedral_range_deg=shapes.dihedral_range_deg,
-        dihedral_counts=tuple(shapes.dihedral_counts.tolist()),
-        radius_ratio_range=shapes.radius_ratio_range,
-        radius_ratio_mean=shapes.radius_ratio_mean,
-        radius_ratio_counts=tuple(shapes.radius_ratio_counts.tolist()),
-        share_obtuse=shapes.share_obtuse,
+        **shapes,
         share_positive_edges=share_positive,
         bodies_by_node=_bodies_by_node(mesh.tets, ends),
         bodies_by_face=count_bodies(len(mesh.tets), tets_across_faces(faces)),
@@ -205,24 +199,8 @@ def quality_report(
     )
 
 
-@dataclass(frozen=True)
-class _Shapes:
-    """What one pass over the tetrahedra gives."""
-
-    volume_m3: float
-    min_volume_m3: float
-    num_non_positive: int
-    share_obtuse: float
-    dihedral_range_deg: tuple[float, float]
-    dihedral_counts: IntArray
-    radius_ratio_range: tuple[float, float]
-    radius_ratio_mean: float
-    radius_ratio_counts: IntArray
-    stiffness: FloatArray
-    """Rows as in `face_count.group_edges`, shape (6 t,)."""
-
-
-def _measure_shapes(mesh: TetMesh, bins: AngleBins) -> _Shapes:
+def _measure_shapes(mesh: TetMesh, bins: AngleBins) -> tuple[dict[str, Any], FloatArray, FloatArray]:
+    """Figures by their names in `QualityReport`, volumes (t,), and stiffness in rows of `face_count.group_edges`."""
     num = len(mesh.tets)
     volumes, ratios, stiffness = np.empty(num), np.empty(num), np.empty((num, 6))
     angle_counts = np.zeros(bins.number, dtype=np.int64)
@@ -236,18 +214,16 @@ def _measure_shapes(mesh: TetMesh, bins: AngleBins) -> _Shapes:
         obtuse += int(np.count_nonzero(cosines.min(axis=0) < 0.0))
         volumes[which], ratios[which] = shapes.volumes, shapes.radius_ratios()
         stiffness[which] = shapes.stiffness(cosines).T
-    return _Shapes(
-        volume_m3=float(volumes.sum()),
-        min_volume_m3=float(volumes.min()),
-        num_non_positive=int(np.count_nonzero(~(volumes > 0.0))),
-        share_obtuse=obtuse / num,
-        dihedral_range_deg=(smallest, largest),
-        dihedral_counts=angle_counts,
-        radius_ratio_range=(float(ratios.min()), float(ratios.max())),
-        radius_ratio_mean=float(ratios.mean()),
-        radius_ratio_counts=_histogram(ratios / RATIO_BIN, round(1.0 / RATIO_BIN)),
-        stiffness=stiffness.ravel(),
-    )
+    figures = {
+        "volume_m3": float(volumes.sum()),
+        "share_obtuse": obtuse / num,
+        "dihedral_range_deg": (smallest, largest),
+        "dihedral_counts": tuple(angle_counts.tolist()),
+        "radius_ratio_range": (float(ratios.min()), float(ratios.max())),
+        "radius_ratio_mean": float(ratios.mean()),
+        "radius_ratio_counts": tuple(_histogram(ratios / RATIO_BIN, round(1.0 / RATIO_BIN)).tolist()),
+    }
+    return figures, volumes, stiffness.ravel()
 
 
 def _histogram(bin_of: FloatArray, bins: int) -> IntArray:
@@ -258,15 +234,7 @@ def _histogram(bin_of: FloatArray, bins: int) -> IntArray:
 def _observed_range(mesh: TetMesh, given: tuple[float, float] | None) -> tuple[float, float]:
     """Lowest and highest observed temperature, [degrees Celsius]."""
     if given is not None:
-        low, high = (float(value) for value in given)
-        if not (np.isfinite([low, high]).all() and low <= high):
-            raise MeshError(
-                "observed_range_c",
-                expected="two finite temperatures, the lower one first",
-                got=given,
-                remedy="Pass the lowest and the highest observed temperature.",
-            )
-        return low, high
+        return given
     observed = mesh.temperature_c[np.asarray(mesh.observed, dtype=bool)]
     if len(observed) == 0:
         raise MeshError(

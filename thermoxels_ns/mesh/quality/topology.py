@@ -50,7 +50,7 @@ def group_sides(facets: IntArray) -> Groups:
 
 def count_bodies(num: int, pairs: IntArray) -> int:
     """Number of connected parts of the things 0 to `num` - 1, given which pairs of them hang together (p, 2)."""
-    return int(_labels(num, pairs[:, 0], pairs[:, 1]).max(initial=-1)) + 1
+    return int(part_labels(num, pairs[:, 0], pairs[:, 1]).max(initial=-1)) + 1
 
 
 def tets_across_faces(face_groups: Groups) -> IntArray:
@@ -73,7 +73,7 @@ def surface_topology(points: FloatArray, facets: IntArray, sides: Groups | None 
     num_open = int(np.count_nonzero(sides.sums(np.where(upwards, 1, -1))))
 
     left, right = _neighbours(sides)
-    part = _labels(len(facets), left // 3, right // 3)
+    part = part_labels(len(facets), left // 3, right // 3)
     # Corner 3 f + s of triangle f lies at its node s. Two corners at one node are in one fan if an edge with just two
     # triangles lies between them.
     two_only = (uses == 2)[sides.of_row[left]]
@@ -81,7 +81,7 @@ def surface_topology(points: FloatArray, facets: IntArray, sides: Groups | None 
     rows = np.arange(len(start))
     next_corner = rows - rows % 3 + (rows + 1) % 3
     low, high = np.where(upwards, rows, next_corner), np.where(upwards, next_corner, rows)
-    fan = _labels(len(start), np.concatenate([low[left], high[left]]), np.concatenate([low[right], high[right]]))
+    fan = part_labels(len(start), np.concatenate([low[left], high[left]]), np.concatenate([low[right], high[right]]))
     a_corner = np.zeros(int(fan.max(initial=-1)) + 1, dtype=np.int64)
     a_corner[fan] = rows
     fans_at_node = np.bincount(start[a_corner], minlength=1)
@@ -122,7 +122,7 @@ def _neighbours(groups: Groups) -> tuple[IntArray, IntArray]:
     return groups.order[at - 1], groups.order[at]
 
 
-def _labels(num: int, first: IntArray, second: IntArray) -> IntArray:
+def part_labels(num: int, first: IntArray, second: IntArray) -> IntArray:
     """Number of the connected part that each of `num` things is in, shape (num,)."""
     if num == 0:
         return np.zeros(0, dtype=np.int64)
