@@ -100,12 +100,9 @@ def build_mesh(
         snapshot: The trained field on its corner lattice.
         selection: Which voxels are solid.
         world_to_metres: Similarity (rotation or reflection, one scale, shift), shape (4, 4), that maps homogeneous
-            column vectors of the trained scene to metres.
+            column vectors of the trained scene to metres. A reflection turns the tetrahedra over, so that their
+            volumes stay positive.
         options: Kind of boundary, tags, and what counts as measured.
-
-    Returns:
-        The mesh, and the solid voxels it was made from. A reflection turns the tetrahedra over, so that their volumes
-        stay positive.
 
     Raises:
         MeshError: Nothing is solid, the 4x4 is no similarity, or no node of the mesh was measured.
@@ -169,10 +166,8 @@ def build_mesh(
 
 
 def _voxel_shape(cells: BoolArray) -> _Shape:
-    corners, tets = kuhn_tets(cells)
-    facets = voxel_facets(cells)
-    nx, ny, nz = cells.shape
-    tags = boundary_tags(facets, corners, (nx + 1, ny + 1, nz + 1))
+    (corners, tets), facets = kuhn_tets(cells), voxel_facets(cells)
+    tags = boundary_tags(facets, corners, tuple(n + 1 for n in cells.shape))
     return _Shape(corners.astype(np.float64), tets, facets, tags)
 
 

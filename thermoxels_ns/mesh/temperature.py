@@ -102,9 +102,8 @@ def extend_harmonically(
     observed = np.asarray(observed, dtype=bool)
     weights = np.ones(len(edges)) if edge_weights is None else np.asarray(edge_weights, dtype=np.float64)
     temperature = np.where(observed, np.asarray(temperature_c, dtype=np.float64), 0.0)
-    check_finite(
-        "observed temperatures", temperature, "The checkpoint is damaged; resume from an earlier one.", MeshError
-    )
+    remedy = "The checkpoint is damaged; resume from an earlier one."
+    check_finite("observed temperatures", temperature, remedy, MeshError)
     if observed.all():
         return temperature
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from thermoxels_ns.core.arrays import BoolArray, IntArray
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
-from thermoxels_ns.mesh.quality.face_count import count_faces
+from thermoxels_ns.mesh.quality.face_count import faces_of_rows, group_faces
 from thermoxels_ns.mesh.solid.morphology import bounding_box
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
 
@@ -104,11 +104,11 @@ def voxel_facets(cells: BoolArray) -> IntArray:
 def boundary_facets(tets: IntArray) -> IntArray:
     """Triangles that belong to exactly one tetrahedron, outwards, shape (f, 3), ordered by their sorted node numbers.
 
-    Args:
-        tets: Node indices of positively oriented tetrahedra, shape (t, 4).
+    >>> boundary_facets(np.array([[0, 1, 2, 3], [1, 3, 2, 4]])).shape
+    (6, 3)
     """
-    faces, uses = count_faces(tets)
-    return faces[uses == 1]
+    groups = group_faces(tets)
+    return faces_of_rows(tets, groups.first[groups.sizes == 1])
 
 
 def boundary_tags(facets: IntArray, points_index: npt.NDArray, lattice_shape: tuple[int, ...]) -> IntArray:

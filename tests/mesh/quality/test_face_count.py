@@ -6,8 +6,20 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.quality.face_count import OUTWARD_FACES, count_faces, edges_of_rows, facet_owners, group_edges
+from thermoxels_ns.mesh.quality.face_count import (
+    OUTWARD_FACES,
+    edges_of_rows,
+    faces_of_rows,
+    facet_owners,
+    group_edges,
+    group_faces,
+)
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
+
+
+def count_faces(tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    groups = group_faces(tets)
+    return faces_of_rows(tets, groups.first), groups.sizes
 
 
 def faces_by_sorting(tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -55,9 +55,8 @@ class HeatStep:
             object.__setattr__(self, field, check_positive(field, getattr(self, field), remedy, HeatError))
         whole = isinstance(self.steps, numbers.Integral) and not isinstance(self.steps, bool)
         if not whole or self.steps < 1:
-            raise HeatError(
-                "steps", expected="a whole number of at least 1", got=repr(self.steps), remedy="Pass 10, for example."
-            )
+            expected = "a whole number of at least 1"
+            raise HeatError("steps", expected=expected, got=repr(self.steps), remedy="Pass 10, for example.")
 
 
 def write_inp(

@@ -32,7 +32,10 @@ def read_mesh(path: Path | str) -> TetMesh:
         raise _wrong("mesh file", "a name that ends in .vtu", path.name, "Pass the mesh.vtu of an export.")
     body, surface = _read(path), _read(boundary_path(path))
     points = np.array(body.points, dtype=np.float64)
-    tets = _tets(body, path.name)
+    others = np.count_nonzero(body.celltypes != _TETRAHEDRON)
+    if others:
+        raise _wrong(path.name, "tetrahedra only", f"{others} cells of other kinds", _REMEDY)
+    tets = np.array(body.cell_connectivity, dtype=np.int64).reshape(-1, 4)
     names = _region_names(body, path.name)
     region = _cell_numbers(body, "region", path.name, len(names))
     colour = body.point_data.get("colour")
@@ -76,13 +79,6 @@ def _read(path: Path) -> Any:
     if data is None or complaints or reader.GetErrorCode() or not data.n_cells:
         raise _wrong(path.name, f"a VTK file ({path.suffix})", "a damaged or empty one", _REMEDY)
     return data
-
-
-def _tets(body: Any, name: str) -> IntArray:
-    others = np.count_nonzero(body.celltypes != _TETRAHEDRON)
-    if others:
-        raise _wrong(name, "tetrahedra only", f"{others} cells of other kinds", _REMEDY)
-    return np.array(body.cell_connectivity, dtype=np.int64).reshape(-1, 4)
 
 
 def _region_names(body: Any, name: str) -> tuple[str, ...]:

@@ -95,9 +95,8 @@ def check_mesh(mesh: TetMesh) -> MeshQuality:
         _fail("tetrahedra", "faces shared by at most 2", f"{shared_by_more} faces shared by more")
     wrong = count_wrong_facets(mesh, faces)
     if wrong:
-        _fail(
-            "facets", "the faces owned by one tetrahedron, normals outwards", f"{wrong} missing, extra or turned over"
-        )
+        expected = "the faces owned by one tetrahedron, normals outwards"
+        _fail("facets", expected, f"{wrong} missing, extra or turned over")
     sides = group_sides(mesh.facets)
     # Closed: each tetrahedron's faces meet every edge an even number of times, and faces with two owners cancel.
     assert not np.any(sides.sizes % 2)

@@ -88,22 +88,6 @@ def group_faces(tets: IntArray) -> Groups:
     return group_pairs(lowest.ravel(), others.ravel())
 
 
-def count_faces(tets: npt.NDArray[np.integer]) -> tuple[IntArray, IntArray]:
-    """All different triangles of positively oriented tetrahedra (t, 4), and how many tetrahedra own each.
-
-    Returns:
-        faces: Node numbers, shape (f, 3), oriented outwards from the first owner, ordered by their sorted node numbers.
-        uses: Number of owners, shape (f,); 1 on the boundary, 2 inside a conforming mesh.
-
-    >>> faces, uses = count_faces(np.array([[0, 1, 2, 3], [1, 3, 2, 4]]))
-    >>> faces[uses == 2], len(faces)
-    (array([[1, 2, 3]]), 7)
-    """
-    tets = np.asarray(tets, dtype=np.int64)
-    groups = group_faces(tets)
-    return faces_of_rows(tets, groups.first), groups.sizes
-
-
 def faces_of_rows(tets: IntArray, rows: IntArray) -> IntArray:
     """Node numbers of faces numbered as in `group_faces`, outwards from the tetrahedron, shape (rows, 3)."""
     return tets.ravel().take((rows & ~3)[:, None] + OUTWARD_FACES[rows & 3])

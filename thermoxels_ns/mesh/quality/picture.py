@@ -31,11 +31,8 @@ def picture_of_quality(path: Path | str, report: QualityReport, title: str = "")
     if path.suffix != ".png":
         raise OutputError("picture", expected="a name that ends in .png", got=path.name, remedy="Rename the file.")
     figure = Figure(figsize=(12.5, 9.0), dpi=110, facecolor="white", layout="constrained")
-    figure.suptitle(
-        title or f"Mesh quality, {report.boundary_mode} boundary: {report.num_tets:,} tetrahedra",
-        fontsize=14,
-        color=_INK,
-    )
+    title = title or f"Mesh quality, {report.boundary_mode} boundary: {report.num_tets:,} tetrahedra"
+    figure.suptitle(title, fontsize=14, color=_INK)
     grid = figure.add_gridspec(2, 2, height_ratios=(1.0, 1.05))
     _draw_angles(figure.add_subplot(grid[0, 0]), report)
     _draw_ratios(figure.add_subplot(grid[0, 1]), report)
@@ -128,15 +125,8 @@ def _write_lines(axis: Axes, heading: str, lines: list[tuple[str, str]]) -> None
 
 def _write_criteria(axis: Axes, report: QualityReport) -> None:
     met = len(report.criteria) - len(report.unmet)
-    _write(
-        axis,
-        0.0,
-        0.98,
-        f"Criteria of a {report.boundary_mode} boundary: {met} of {len(report.criteria)} met",
-        _INK,
-        size=12.0,
-        bold=True,
-    )
+    heading = f"Criteria of a {report.boundary_mode} boundary: {met} of {len(report.criteria)} met"
+    _write(axis, 0.0, 0.98, heading, _INK, size=12.0, bold=True)
     for number, criterion in enumerate(report.criteria):
         y = 0.89 - 0.113 * number
         _write(axis, 0.0, y, *(("yes", _MET) if criterion.kept else ("no", _UNMET)), bold=True)

@@ -74,11 +74,8 @@ def _holds(views: Views, camera: int, direction: FloatArray) -> BoolArray:
     depth = -local[..., 2]
     ahead = depth > 1e-9
     scale = 1.0 / np.where(ahead, depth, 1.0)
-    (focal_x, focal_y), (centre_x, centre_y), (width, height) = (
-        views.focal[camera],
-        views.centre[camera],
-        views.size[camera],
-    )
+    (focal_x, focal_y), (centre_x, centre_y) = views.focal[camera], views.centre[camera]
+    width, height = views.size[camera]
     x = centre_x + focal_x * local[..., 0] * scale
     y = centre_y - focal_y * local[..., 1] * scale
     return ahead & (x >= 0) & (x <= width) & (y >= 0) & (y <= height)

@@ -171,10 +171,8 @@ def select_solid(
         return after
 
     if selection.close_gaps:
-        width = 2 * selection.close_gaps
-        cells = step(
-            "close gaps", close_gaps(cells, selection.close_gaps), f"Gaps up to {width} voxels wide are filled."
-        )
+        remark = f"Gaps up to {2 * selection.close_gaps} voxels wide are filled."
+        cells = step("close gaps", close_gaps(cells, selection.close_gaps), remark)
     kept, sizes, remark = _bodies(cells, selection)
     cells = step("largest body" if selection.largest_component else "small bodies", kept, remark)
     if thickness is not None:
@@ -226,9 +224,8 @@ def _filled(cells: BoolArray, snapshot: GridSnapshot, selection: SolidSelection)
     if snapshot.views is None:
         remark += "; the cameras are not known, so nothing is known to be hidden from them."
     else:
-        remark += (
-            f", and {int(inside.hidden.sum())} voxels that cameras cannot look into, within the hull of their body."
-        )
+        hidden = int(inside.hidden.sum())
+        remark += f", and {hidden} voxels that cameras cannot look into, within the hull of their body."
     if inside.rooms:
         remark += f" {inside.rooms} cavities with a camera in them stay empty."
     return cells | inside.enclosed | inside.hidden, remark
