@@ -2,18 +2,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from skfem import FacetBasis, MeshTet
+from skfem import FacetBasis, LinearForm, MeshTet
 
 from tests.support.heat_meshes import box_mesh, planes
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.forms import exchange, inflow
+from thermoxels_ns.fem.forms import FluxForm, exchange
 from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.quantities import Bounded, Bounds, Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.space import Space
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.fem.terms import FluxTerm
 from thermoxels_ns.heat.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.heat.materials import Material
 
@@ -177,8 +178,11 @@ def test_integrals_over_the_surface_are_those_of_a_basis_on_facets(options) -> N
     facets = np.array([number[tuple(sorted(facet))] for facet in mesh.facets.tolist()])
     ours, theirs = space.surface(np.arange(len(facets))), FacetBasis(tets, space.element, facets=facets, intorder=4)
     value = np.random.default_rng(6).uniform(1.0, 2.0, (len(facets), 1))
-    for form, name in ((exchange, "coefficient"), (inflow, "flux")):
-        found, expected = (
-            form.assemble(basis, **{name: np.broadcast_to(value, basis.dx.shape)}) for basis in (ours, theirs)
-        )
-        assert abs(found - expected).max() < 1e-12 * abs(expected).max()
+    matrix, expected = (
+        exchange.assemble(basis, coefficient=np.broadcast_to(value, basis.dx.shape)) for basis in (ours, theirs)
+    )
+    assert abs(matrix - expected).max() < 1e-12 * abs(expected).max()
+    flux = Bounded(Varying(lambda places, time_s: value[:, 0], in_time=False), Bounds("flux", "W/m2"))
+    found = FluxForm(FluxTerm("sun", np.arange(len(facets)), (flux,)), space).load(0.0)
+    expected = LinearForm(lambda v, w: w.flux * v).assemble(theirs, flux=np.broadcast_to(value, theirs.dx.shape))
+    assert abs(found - expected).max() < 1e-12 * abs(expected).max()

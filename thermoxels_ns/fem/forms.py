@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
-from skfem import BilinearForm, LinearForm
+from skfem import BilinearForm
 
 from thermoxels_ns.core.errors import HeatError, explain
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
@@ -29,19 +29,25 @@ COLDEST_SLOPE_K = 1e-2
 _SAME_TEMPERATURE_K = 1e-9
 """Two effects may fix the same node if their temperatures differ by no more than this, [K]."""
 _KEPT_TIMES = 4
-"""Times whose temperatures are kept, because what begins a step has ended the one before."""
+"""Times whose values are kept: those of the stages of a step, whose start has ended the one before."""
+
+T = TypeVar("T")
+
+
+def at_time(kept: dict[float, T], time_s: float, compute: Callable[[float], T], most: int = _KEPT_TIMES) -> T:
+    """Look up the value at a time, or compute it and keep it instead of the oldest one."""
+    if time_s not in kept:
+        value = compute(time_s)
+        while len(kept) >= most:
+            del kept[next(iter(kept))]
+        kept[time_s] = value
+    return kept[time_s]
 
 
 @BilinearForm
 def exchange(u, v, w):
     """Heat per kelvin through a surface, h u v, [W / K]."""
     return w.coefficient * u * v
-
-
-@LinearForm
-def inflow(v, w):
-    """Heat through a surface, q v, [W]."""
-    return w.flux * v
 
 
 class Form(Protocol):
@@ -69,28 +75,37 @@ class _Boundary:
         self.effect = effect
         self.basis = space.surface(facets)
         self.nodes = space.facet_nodes(facets)
+        self._numbers, self._space = self.nodes.T.ravel(), space
         # `basis.interpolate` would find gradients, too.
         self._shapes = np.stack([np.asarray(field)[0] for (field,) in self.basis.basis])
         self.places = selection.facet_places(facets)
         used, self.group = np.unique(selection.facet_patch[facets], return_inverse=True)
         self.groups = tuple(selection.patch_names[number] for number in used)
+        self._kept: dict[int, dict[float, Vector]] = {}
 
     def at(self, quantity: Bounded, time_s: float) -> Vector:
-        """Ask for a quantity at each triangle, shape (k, 1): it is even over the triangle."""
-        return quantity.at(self.places, time_s)[:, None]
+        """Ask for a quantity of the term at each triangle, shape (k, 1): it is even over the triangle."""
+        kept = self._kept.setdefault(id(quantity), {})
+        return at_time(kept, time_s if quantity.in_time else 0.0, lambda t: quantity.at(self.places, t)[:, None])
 
     def surface_k(self, relative_k: Vector) -> Vector:
         """Temperature at the points of integration, shape (k, q)."""
-        return np.einsum("ka,aq->kq", relative_k[self.nodes], self._shapes)
+        nodal_k = relative_k[self.nodes]
+        return nodal_k if self._space.lumped_boundary else np.einsum("ka,aq->kq", nodal_k, self._shapes)
 
     def vector(self, flux_w_m2: Vector) -> Vector:
         """Entries integral(q phi_i), [W]; q at the points or even over each triangle."""
-        return inflow.assemble(self.basis, flux=np.broadcast_to(flux_w_m2, self.basis.dx.shape))
+        heat_w = flux_w_m2 * self.basis.dx
+        shares = heat_w.T if self._space.lumped_boundary else np.einsum("kq,aq->ak", heat_w, self._shapes)
+        return sums_by_number(self._numbers, shares.ravel(), self._space.num_nodes)
 
     def matrix(self, coefficient_w_m2k: Vector) -> sparse.csr_matrix:
         """Entries integral(h phi_i phi_j), [W / K]; diagonal if points of integration are the nodes."""
-        coefficient = np.broadcast_to(coefficient_w_m2k, self.basis.dx.shape)
-        matrix = sparse.csr_matrix(exchange.assemble(self.basis, coefficient=coefficient))
+        if self._space.lumped_boundary:
+            matrix = sparse.diags(self.vector(coefficient_w_m2k), format="csr")
+        else:
+            coefficient = np.broadcast_to(coefficient_w_m2k, self.basis.dx.shape)
+            matrix = sparse.csr_matrix(exchange.assemble(self.basis, coefficient=coefficient))
         matrix.eliminate_zeros()
         return matrix
 
@@ -207,17 +222,18 @@ class RadiationForm(_Boundary):
     def slope(self, relative_k: Vector, time_s: float) -> sparse.csr_matrix:
         """Minus the derivative of the load, entries integral(4 sigma eps T^3 phi_i phi_j), [W / K]."""
         kelvin = np.maximum(np.abs(self.surface_k(relative_k) + self._reference_k), COLDEST_SLOPE_K)
-        return self.matrix(4.0 * self._strength(time_s) * kelvin**3)
+        return self.matrix(4.0 * self._strength(time_s) * (kelvin * kelvin * kelvin))
 
     def magnitude(self, relative_k: Vector, time_s: float) -> Vector:
         """Sizes of what the load adds up, with those of the temperatures' differences from the reference, [W].
 
         Round-off of the load is a few eps of it.
         """
-        size = sum(
-            (part + self._reference_k) ** 4 + 4.0 * np.abs(part + self._reference_k) ** 3 * np.abs(part)
-            for part in (self.surface_k(relative_k), self.surroundings_k(time_s))
-        )
+        size = 0.0
+        for part in (self.surface_k(relative_k), self.surroundings_k(time_s)):
+            kelvin = np.abs(part + self._reference_k)
+            # Products, because powers of arrays take many times as long.
+            size = size + kelvin * kelvin * kelvin * (kelvin + 4.0 * np.abs(part))
         return self.vector(self._strength(time_s) * size)
 
     def surroundings_k(self, time_s: float) -> Vector:
@@ -239,7 +255,8 @@ class RadiationForm(_Boundary):
         surface, around = self.surface_k(relative_k), self.surroundings_k(time_s)
         t, s = surface + self._reference_k, around + self._reference_k
         # As a product with the difference, which loses nothing where both are close.
-        fourth = np.where(t >= 0.0, (around - surface) * (s + t) * (s * s + t * t), s**4 + t**4)
+        ss, tt = s * s, t * t
+        fourth = np.where(t >= 0.0, (around - surface) * (s + t) * (ss + tt), ss * ss + tt * tt)
         return self._strength(time_s) * fourth
 
 
@@ -320,19 +337,17 @@ class FixedNodes:
         Raises:
             HeatError: Two effects fix different temperatures at one node.
         """
-        known = self._kept.get(time_s)
-        if known is None:
-            known = np.full(len(self.nodes), np.nan)
-            for number, form in enumerate(self._forms):
-                place, wanted = self._places[number], form.temperature_k(time_s)
-                clash = np.abs(known[place] - wanted) > _SAME_TEMPERATURE_K
-                if clash.any():
-                    raise HeatError(self._explain_clash(number, form.nodes[clash], wanted[clash], time_s))
-                known[place] = wanted
-            known.setflags(write=False)
-            while len(self._kept) >= _KEPT_TIMES:
-                del self._kept[next(iter(self._kept))]
-            self._kept[time_s] = known
+        return at_time(self._kept, time_s, self._temperature_k)
+
+    def _temperature_k(self, time_s: float) -> Vector:
+        known = np.full(len(self.nodes), np.nan)
+        for number, form in enumerate(self._forms):
+            place, wanted = self._places[number], form.temperature_k(time_s)
+            clash = np.abs(known[place] - wanted) > _SAME_TEMPERATURE_K
+            if clash.any():
+                raise HeatError(self._explain_clash(number, form.nodes[clash], wanted[clash], time_s))
+            known[place] = wanted
+        known.setflags(write=False)
         return known
 
     @cached_property

@@ -149,28 +149,33 @@ class Stage:
         if self.system.nonlinear:
             found = newton(balance, len(first.heat_w), relative_tolerance=self._relative_tolerance)
             u, spent = found.u, found.linear_iterations
-            rest = self._unexplained(balance, u) if found.converged else None
+            rest = self._unexplained(found.residual, u) if found.converged else None
             if rest is not None:
                 more, linear = balance.correction(u, rest)
                 u, spent = u + more if linear.converged else u, spent + linear.iterations
             return balance.solution(u, spent, found.iterations, found.converged, found.status)
         change, linear = self.correction(self._own_solver, self.held_w_k, first)
         iterations = linear.iterations
-        rest = self._unexplained(balance, change) if linear.converged else None
+        rest = None
+        if linear.converged and self._may_be_unexplained:
+            rest = self._unexplained(balance.residual(change), change)
         if rest is not None:
             more, again = self.correction(self._own_solver, self.held_w_k, rest)
             iterations += again.iterations
             change = change + more if again.converged else change
         return balance.solution(change, iterations, 0, linear.converged, linear.status)
 
-    def _unexplained(self, balance: _Balance, change: Vector) -> Residual | None:
+    @property
+    def _may_be_unexplained(self) -> bool:
+        return self._free is not None and bool(np.isfinite(self.step_s))
+
+    def _unexplained(self, rest: Residual, change: Vector) -> Residual | None:
         """What is left to balance after a step with fixed nodes, if it is much beside what is stored.
 
         In a long step, what is nothing beside the heat that flows may be much beside what is stored.
         """
-        if self._free is None or not np.isfinite(self.step_s):
+        if not self._may_be_unexplained:
             return None
-        rest = balance.residual(change)
         stored_w = self.at_free(self.system.mass_product(self.everywhere(change))) / self.step_s
         much = abs(np.sum(rest.heat_w)) > _UNEXPLAINED * np.sum(np.abs(stored_w))
         return rest if much and not rest.is_round_off else None
@@ -348,6 +353,8 @@ class _NewtonSolution:
 
     u: Vector
     """The solution, shape (m,)."""
+    residual: Residual
+    """What it leaves."""
     iterations: int
     """Newton steps."""
     linear_iterations: int
@@ -379,12 +386,12 @@ def newton(balance: _Balance, num_unknowns: int, *, relative_tolerance: float) -
         if count == MAX_ITERATIONS or not np.isfinite(_norm(residual.heat_w)):
             share = _norm(residual.heat_w) / first if first > 0.0 else np.inf
             status = f"Newton's method {reason}, at a relative residual of {share:.1e}."
-            return _NewtonSolution(u, count, spent, False, status)
+            return _NewtonSolution(u, residual, count, spent, False, status)
         direction, linear = balance.correction(u, residual)
         spent += linear.iterations
         if not linear.converged:
             return _NewtonSolution(
-                u, count, spent, False, f"Newton's method stopped in step {count + 1}: {linear.status}"
+                u, residual, count, spent, False, f"Newton's method stopped in step {count + 1}: {linear.status}"
             )
         settled, lost = balance.is_short(u, direction, _SETTLED), balance.is_lost(u, direction)
         u = u + _length(balance, u, direction) * direction
@@ -393,7 +400,7 @@ def newton(balance: _Balance, num_unknowns: int, *, relative_tolerance: float) -
         if settled and lost:
             # What is left of the residual is round-off that its bound does not know of, such as that of what was given.
             break
-    return _NewtonSolution(u, count, spent, True, f"Newton's method converged in {count} steps.")
+    return _NewtonSolution(u, residual, count, spent, True, f"Newton's method converged in {count} steps.")
 
 
 def _length(balance: _Balance, u: Vector, direction: Vector) -> float:

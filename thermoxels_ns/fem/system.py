@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients, LinearSolver, TwoLevel
-from thermoxels_ns.fem.forms import FixedNodes, FluxForm, RobinForm, SourceForm, effect_forms
+from thermoxels_ns.fem.forms import FixedNodes, FluxForm, RobinForm, SourceForm, at_time, effect_forms
 from thermoxels_ns.fem.p1_kernels import product_and_bound
 from thermoxels_ns.fem.pieces import Pieces
 from thermoxels_ns.fem.problem import HeatProblem
@@ -76,8 +76,10 @@ class HeatSystem:
         """Effect and patch or region of each heat flow of `group_heat_w`, then of each of the fixed nodes."""
         self._mass: tuple[sparse.csr_matrix | None, Vector] | None = None
         self._kept_exchange: sparse.csr_matrix | None = None
+        self._kept_exchanges: dict[float, sparse.csr_matrix | None] = {}
         self._kept_matrix: sparse.csr_matrix | None = None
         self._kept_load: Vector | None = None
+        self._kept_loads: dict[float, Vector] = {}
         self._fixed_rows: sparse.csr_matrix | None = None
         self._kept_ranges: dict[float, tuple[float, float]] = {}
         self._prolongation: sparse.csr_matrix | None = None
@@ -134,7 +136,8 @@ class HeatSystem:
             self._kept_exchange = self._sum_of_exchange(False, 0.0)
         if not self.matrix_in_time:
             return self._kept_exchange
-        return _sum_of(self._kept_exchange, self._sum_of_exchange(True, time_s))
+        constant = self._kept_exchange
+        return at_time(self._kept_exchanges, time_s, lambda t: _sum_of(constant, self._sum_of_exchange(True, t)))
 
     def matrix(self, time_s: float, step_s: float) -> sparse.csr_matrix:
         """M / step + K + R, shape (n, n), [W / K]; without M for a step without end."""
@@ -175,7 +178,8 @@ class HeatSystem:
             self._kept_load = self._sum_of_loads(False, 0.0)
         if not any(form.load_in_time for form in (*self._robin, *self._loads)):
             return self._kept_load
-        return self._kept_load + self._sum_of_loads(True, time_s)
+        constant = self._kept_load
+        return at_time(self._kept_loads, time_s, lambda t: constant + self._sum_of_loads(True, t))
 
     def radiation_load(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat radiated into the body, shape (n,), [W]."""
@@ -279,9 +283,9 @@ class HeatSystem:
 
     def surroundings_k(self, time_s: float) -> tuple[float, float]:
         """Range of all that surrounds the body at a time, [K]; kept for some of the last times that were asked for."""
-        known = self._kept_ranges.get(time_s)
-        if known is not None:
-            return known
+        return at_time(self._kept_ranges, time_s, self._surroundings_k, most=_KEPT_RANGES)
+
+    def _surroundings_k(self, time_s: float) -> tuple[float, float]:
         low, high = np.inf, -np.inf
         ambients = [form.ambient_k(time_s) for form in self._robin]
         ambients += [form.surroundings_k(time_s) for form in self._radiation]
@@ -291,9 +295,6 @@ class HeatSystem:
         for form in self._loads:
             cools, heats = form.signs(time_s)
             low, high = -np.inf if cools else low, np.inf if heats else high
-        while len(self._kept_ranges) >= _KEPT_RANGES:
-            del self._kept_ranges[next(iter(self._kept_ranges))]
-        self._kept_ranges[time_s] = low, high
         return low, high
 
     def _masses(self) -> tuple[sparse.csr_matrix | None, Vector]:
