@@ -17,7 +17,6 @@ from thermoxels_ns.fem.conjugate_gradients import (
     LinearSolver,
     Multigrid,
     TwoLevel,
-    _CoarsestLevel,
 )
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.refine_mesh import refine_mesh
@@ -69,19 +68,6 @@ def diagonal_iterations(matrix: sparse.csr_matrix, b: np.ndarray, tolerance: flo
 
     cg(matrix, b, rtol=tolerance, atol=0.0, M=sparse.diags(1.0 / matrix.diagonal()), callback=step, maxiter=10_000)
     return count
-
-
-def test_solves_to_the_tolerance() -> None:
-    matrix = laplacian(200)
-    exact = np.sin(np.arange(200.0))
-    solution = ConjugateGradients(matrix).solve(matrix @ exact)
-    assert solution.converged
-    np.testing.assert_allclose(solution.x, exact, atol=1e-9)
-
-
-def test_zero_right_hand_side() -> None:
-    solution = ConjugateGradients(laplacian(5)).solve(np.zeros(5))
-    assert solution.converged and not solution.x.any() and solution.residual == 0.0
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1e-30, 1e30])
@@ -136,33 +122,6 @@ def test_agrees_with_a_direct_solver() -> None:
     np.testing.assert_allclose(solution.x, exact, atol=1e-8 * np.abs(exact).max())
 
 
-def test_order_and_type_of_the_entries_do_not_matter() -> None:
-    matrix, b = weighted_graph(seed=3), np.random.default_rng(3).normal(size=400)
-    expected = ConjugateGradients(matrix).solve(b)
-    shuffled = matrix.copy()
-    for row in range(400):
-        part = slice(shuffled.indptr[row], shuffled.indptr[row + 1])
-        shuffled.indices[part] = shuffled.indices[part][::-1].copy()
-        shuffled.data[part] = shuffled.data[part][::-1].copy()
-    shuffled.has_sorted_indices = False
-    wide = matrix.copy()
-    wide.indices, wide.indptr = wide.indices.astype(np.int64), wide.indptr.astype(np.int64)
-    for same in (shuffled, wide):
-        solution = ConjugateGradients(same).solve(b)
-        assert solution.converged
-        np.testing.assert_allclose(solution.x, expected.x, rtol=1e-7)
-
-
-def test_solving_changes_neither_matrix_nor_right_hand_side() -> None:
-    matrix, b = weighted_graph(seed=4), np.random.default_rng(4).normal(size=400)
-    data, given = matrix.data.copy(), b.copy()
-    solver = ConjugateGradients(matrix)
-    first, second = solver.solve(b), solver.solve(b)
-    np.testing.assert_array_equal(matrix.data, data)
-    np.testing.assert_array_equal(b, given)
-    np.testing.assert_array_equal(first.x, second.x)
-
-
 def test_a_matrix_that_is_not_symmetric_does_not_pass_for_solved() -> None:
     """Iterations read the upper triangle; the residual is that of the whole matrix."""
     matrix = laplacian(50).tolil()
@@ -195,22 +154,6 @@ def test_long_steps_take_less_than_half_of_the_iterations(side: int) -> None:
     swept, plain = ConjugateGradients(matrix).solve(b), diagonal_iterations(matrix, b)
     assert swept.converged
     assert swept.iterations < 0.45 * plain, (swept.iterations, plain)
-
-
-def test_steps_that_suit_the_mesh_take_as_many_iterations_on_any_of_them() -> None:
-    counts = []
-    for side in (16, 24, 32):
-        matrix = lattice(side, 1.0)
-        counts.append(ConjugateGradients(matrix).solve(right_hand_side(matrix)).iterations)
-    assert max(counts) <= 1.2 * min(counts), counts
-
-
-def test_of_a_chain_the_factor_is_complete() -> None:
-    chain = sparse.diags([-1.0, 2.0, -1.0], [-1, 0, 1], shape=(2000, 2000), format="csr")
-    exact = np.cos(0.01 * np.arange(2000.0))
-    solution = ConjugateGradients(chain).solve(chain @ exact)
-    assert solution.converged and solution.iterations <= 2 and "incomplete factor" in solution.status
-    np.testing.assert_allclose(solution.x, exact, atol=1e-7)
 
 
 @pytest.mark.parametrize("pattern", ["halves", "checks", "random"])
@@ -297,46 +240,10 @@ def test_the_number_of_threads_changes_no_bit(cube) -> None:
     np.testing.assert_array_equal(found[0].x, found[1].x)
 
 
-def test_nobody_s_random_numbers_are_drawn(cube) -> None:
-    np.random.seed(3)
-    expected = np.random.random()
-    np.random.seed(3)
-    by_multigrid(cube[0], cube[1])
-    assert np.random.random() == expected
-
-
 def test_few_iterations_to_the_solution_of_the_diagonal_alone(cube) -> None:
     solution = by_multigrid(cube[0], cube[1])
     assert solution.converged and solution.iterations <= 20
     np.testing.assert_allclose(solution.x, ConjugateGradients(cube[0]).solve(cube[1]).x, rtol=1e-9)
-
-
-def test_a_level_that_nothing_holds_leaves_its_mean_alone() -> None:
-    """A line of nodes without exchange: the last eigenvalue is round-off."""
-    matrix = _line(30)
-    matrix[0, 0] = matrix[-1, -1] = 1.0
-    heat = np.sin(np.arange(30.0))
-    heat -= heat.mean()
-    found = _CoarsestLevel()(matrix.tocsr(), heat)
-    assert abs(found.mean()) < 1e-12
-    np.testing.assert_allclose(matrix @ found, heat, atol=1e-12)
-
-
-@pytest.mark.parametrize("heat", [1e-200, 1.0, 1e200])
-def test_the_size_of_the_heat_does_not_matter(cube, heat) -> None:
-    """Sums of squares neither vanish nor overflow."""
-    plain = by_multigrid(cube[0], cube[1])
-    found = by_multigrid(cube[0], heat * cube[1])
-    assert found.converged and found.iterations == plain.iterations
-    np.testing.assert_allclose(found.x, heat * plain.x, rtol=1e-9)
-
-
-def test_a_good_start_saves_iterations(cube) -> None:
-    cold = by_multigrid(*cube)
-    assert by_multigrid(*cube, cold.x).iterations <= 1 < cold.iterations
-    near = by_multigrid(*cube, cold.x * (1.0 + 1e-6))
-    assert near.iterations < cold.iterations
-    np.testing.assert_allclose(near.x, cold.x, rtol=1e-9)
 
 
 def _line(count: int) -> sparse.lil_matrix:
@@ -413,12 +320,3 @@ def test_a_mesh_whose_corners_are_all_fixed() -> None:
     solution = solve_steady(HeatProblem(mesh, STEEL, effects=effects), order=2)
     assert solution.edge_temperature_c.max() > 0.0 and np.abs(solution.temperature_c).max() == 0.0
     assert solution.effects[0].heat_w[0] == pytest.approx(-60.0, rel=1e-9)
-
-
-def test_small_and_large_numbers() -> None:
-    system, matrix, b = matrix_and_load(shell(0))
-    ordinary = system.linear_solver(matrix, 1e-10).solve(b)
-    for factor in (2.0**-500, 2.0**500):
-        scaled = system.linear_solver(matrix, 1e-10).solve(factor * b)
-        np.testing.assert_array_equal(scaled.x, factor * ordinary.x)
-    assert np.all(system.linear_solver(matrix, 1e-10).solve(0.0 * b).x == 0.0)

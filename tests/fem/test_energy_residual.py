@@ -12,9 +12,8 @@ from thermoxels_ns.fem import steady
 from thermoxels_ns.fem.heat_balance import HeatBalance
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.solution import EffectHeat
-from thermoxels_ns.fem.steady import is_still, solve_steady
+from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.stepping import solve_heat
-from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, Radiation
 from thermoxels_ns.heat.materials import Material
 
@@ -93,12 +92,3 @@ def test_a_balance_through_time_that_is_wrong_is_seen(monkeypatch, effects, thic
 def test_where_nothing_makes_heat_flow_round_off_is_no_share_of_itself(effects, relative_tolerance) -> None:
     solution = solve_steady(sheet(1e-3, *effects), relative_tolerance=relative_tolerance)
     assert solution.energy_residual < 1e-9
-
-
-def test_still_is_only_where_nothing_makes_heat_flow() -> None:
-    for effects, still in ((GIVEN, False), (HARDLY, False), (AIR, False), (SKY, False), (GIVEN[:1], True), ((), True)):
-        system = HeatSystem(sheet(1e-4, *effects))
-        level_k = np.full(system.num_nodes, 20.0 - system.reference_c)
-        if len(system.fixed.nodes):
-            level_k[system.fixed.nodes] = system.fixed.temperature_k(0.0)
-        assert is_still(system, level_k, 0.0) is still

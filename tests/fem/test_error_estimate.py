@@ -7,7 +7,7 @@ import pytest
 
 from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.error_estimate import error_ratios, recovered_error_w_k, richardson
+from thermoxels_ns.fem.error_estimate import recovered_error_w_k
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.refine_mesh import refine_mesh
@@ -89,36 +89,6 @@ def test_the_recovered_error_is_that_of_the_heat_flow() -> None:
         estimate_w = recovered_error_w_k(problem, solution).sum() / 20.0
         assert surplus_w > 0.0
         assert 0.5 < estimate_w / surplus_w < 2.0, (parts, estimate_w, surplus_w)
-
-
-def test_the_worst_tetrahedra_are_at_the_notch() -> None:
-    problem = corner(16)
-    error = recovered_error_w_k(problem, solve_steady(problem))
-    centre = problem.mesh.points_m[problem.mesh.tets].mean(axis=1)
-    from_notch = np.abs(centre[:, :2] - 0.5).max(axis=1)
-    assert error[from_notch < 1 / 16].mean() > 10.0 * error.mean()
-
-
-def test_richardson() -> None:
-    """T_h = 1 + 0.4 h^2: from h = 1 and h = 1/2 the error of the second is 0.1."""
-    assert richardson(1.4 - 1.1, 0.25) == pytest.approx(0.1)
-    assert richardson(1.1 - 1.4, 0.25) == pytest.approx(0.1)
-    assert richardson(0.0, 0.5) == 0.0
-    for ratio in (0.0, 1.0, -0.1, np.nan):
-        with pytest.raises(HeatError, match="ratio: expected a number above 0 and below 1"):
-            richardson(1.0, ratio)
-
-
-def test_error_ratios() -> None:
-    first, second, nothing = np.array([1.0, 3.0]), np.array([0.5, 0.5]), np.zeros(2)
-    ratios = error_ratios(first, second, decrease=0.16)
-    assert (ratios.temperature_k, ratios.heat_flow) == (pytest.approx(0.2), 0.25)
-    assert error_ratios(second, first, decrease=2.0).heat_flow == 0.7
-    ratios = error_ratios(first, 0.1 * second)
-    assert (ratios.temperature_k, ratios.heat_flow) == (pytest.approx(0.0125**0.57), pytest.approx(0.0125))
-    assert error_ratios(first, second).temperature_k == 0.24
-    for pair in ((first, nothing), (nothing, first)):
-        assert error_ratios(*pair, decrease=0.0).temperature_k == 0.17
 
 
 def test_a_solution_of_another_mesh_is_refused() -> None:

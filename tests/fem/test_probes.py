@@ -29,28 +29,11 @@ def test_a_linear_field_is_interpolated_exactly_everywhere(box) -> None:
     assert np.all(probes.weights >= 0.0) and np.allclose(probes.weights.sum(axis=1), 1.0, rtol=1e-14)
 
 
-def test_a_node_has_its_own_value_and_points_between_stay_between(box) -> None:
-    values = np.random.default_rng(1).uniform(-20.0, 40.0, len(box.points_m))
-    np.testing.assert_allclose(place_probes(box, box.points_m).at(values), values, atol=1e-9)
-    inside = place_probes(box, np.random.default_rng(2).uniform([0, 0, -1], [1, 0.5, 0], (300, 3)))
-    assert values.min() <= inside.at(values).min() and inside.at(values).max() <= values.max()
-
-
 @pytest.mark.parametrize("point", [(1.001, 0.2, -0.5), (0.5, 0.5 + 1e-6, -0.5), (7.0, 8.0, 9.0)])
 def test_a_point_outside_is_refused_with_the_nearest_node(box, point) -> None:
     message = r"probe 2: expected a point inside the body, which lies between \(0, 0, -1\) and \(1, 0\.5, 0\) m, got .*"
     with pytest.raises(HeatError, match=message + "outside.*nearest node is"):
         place_probes(box, [(0.5, 0.25, -0.5), point])
-
-
-def test_a_point_in_a_hole_is_outside() -> None:
-    frame = box_mesh(planes(0.0, 3.0, step=1.0), planes(0.0, 3.0, step=1.0), [0.0, 1.0], keep=lambda p: ~hole(p))
-    with pytest.raises(HeatError, match="probe 1"):
-        place_probes(frame, [(1.5, 1.5, 0.5)])
-
-
-def hole(points: np.ndarray) -> np.ndarray:
-    return np.all(np.abs(points[..., :2] - 1.5) < 0.5, axis=-1)
 
 
 @pytest.mark.parametrize("points", [(0.5, 0.25, -0.5), [[0.1, 0.2]], [[np.nan, 0.0, 0.0]]])

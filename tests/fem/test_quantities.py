@@ -8,7 +8,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Places, Quantity, Varying, tabulated
 from thermoxels_ns.fem.stepping import solve_heat
-from thermoxels_ns.heat.effects import Convection, HeatFlux
+from thermoxels_ns.heat.effects import HeatFlux
 from thermoxels_ns.heat.materials import Material
 
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
@@ -45,14 +45,6 @@ def test_a_table_that_is_none_is_refused(times_s, values) -> None:
         tabulated(times_s, values)
 
 
-def test_a_table_stays_as_it_was_given() -> None:
-    times, values = np.array([0.0, 10.0]), np.array([1.0, 3.0])
-    table = tabulated(times, values)
-    times *= 2.0
-    values[:] = 0.0
-    assert table.function(Places(np.zeros((1, 3)), np.zeros((1, 3))), 5.0) == 2.0
-
-
 def test_adaptive_steps_do_not_step_over_a_table() -> None:
     """Two hours of heat in a week: a triangle of 500 W/m2, 1800 kJ/m2 in all."""
     solution = warmed(tabulated(TIMES_S, FLASH), AdaptiveSteps(TIMES_S[-1], 0.5, outputs=1))
@@ -71,14 +63,3 @@ def test_what_may_be_stepped_over_is_said() -> None:
     assert "resolution_s" in missed.status and "tabulated" in missed.status
     seen = warmed(Varying(flash, resolution_s=HOUR_S), AdaptiveSteps(TIMES_S[-1], 0.5, outputs=1))
     assert float(seen.heat_w[0]) > 0.0 and "Nothing says" not in seen.status
-
-
-def test_nothing_is_said_of_what_does_not_change_or_of_steps_that_were_given() -> None:
-    still = Varying(lambda places, _: places.points_m[:, 0], in_time=False)
-    assert "Nothing says" not in warmed(still, AdaptiveSteps(HOUR_S)).status
-    assert "Nothing says" not in warmed(5.0, AdaptiveSteps(HOUR_S)).status
-    assert "Nothing says" not in warmed(Varying(lambda _, time_s: time_s), TimeSteps(2, 60.0)).status
-    mesh = box_mesh(np.linspace(0, 0.2, 5), [0, 0.1], [0, 0.1])
-    wind = Convection(("x0",), Varying(lambda _, time_s: 5.0 + 1e-3 * time_s), 20.0)
-    status = solve_heat(HeatProblem(mesh, CONCRETE, effects=(wind,)), AdaptiveSteps(HOUR_S)).status
-    assert "how fast convection on x0 may change" in status

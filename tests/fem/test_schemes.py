@@ -112,17 +112,6 @@ def test_theta_steps_are_the_textbook_s(theta) -> None:
         np.testing.assert_allclose(computed, state, atol=1e-9)
 
 
-def test_fixed_surfaces_follow_their_function() -> None:
-    mesh = bar()
-    at = mesh.points_m[:, 0] == 0.0
-    warming = FixedTemperature(("x0",), Varying(lambda places, time_s: 30.0 + 0.1 * time_s))
-    for scheme in SCHEMES:
-        solution = solve_heat(HeatProblem(mesh, CONCRETE, effects=(warming,)), TimeSteps(3, 60.0), scheme=scheme)
-        expected = np.repeat(30.0 + 0.1 * solution.times_s[:, None], at.sum(), axis=1)
-        np.testing.assert_allclose(solution.temperature_c[:, at], expected, rtol=1e-14)
-        assert solution.energy_residual < 1e-12
-
-
 def jump(fourier: float, scheme: Scheme | None, **options) -> np.ndarray:
     """A bar at 0 degrees whose end jumps to 1: temperatures of ten steps."""
     problem = HeatProblem(bar(20, 0.0), CONCRETE, effects=(FixedTemperature(("x0",), 1.0),))
@@ -244,39 +233,3 @@ def test_cooling_below_absolute_zero_is_refused() -> None:
     stopped = solve_heat(problem, TimeSteps(10, 600.0), allow_unconverged=True)
     assert not stopped.converged and len(stopped.times_s) == len(stopped.effects[0].heat_w) + 1 < 11
     assert stopped.temperature_c.min() > -273.15
-
-
-def test_almost_no_heat_capacity() -> None:
-    """A body without inertia is at its steady state after any step."""
-    from thermoxels_ns.fem.steady import solve_steady
-
-    air = Material("nearly nothing", 1.7, 1e-6, 1e-3)
-    problem = HeatProblem(bar(), air, effects=JUMPS["cold air"] + JUMPS["sky"][:1])
-    steady = solve_steady(problem).temperature_c
-    for time in (TimeSteps(1, 60.0), AdaptiveSteps(60.0, 0.01, outputs=1)):
-        np.testing.assert_allclose(solve_heat(problem, time).temperature_c[-1], steady, atol=1e-6)
-
-
-def test_a_slab_forgets_its_start_and_becomes_steady() -> None:
-    from thermoxels_ns.fem.steady import solve_steady
-
-    problem = HeatProblem(bar(), CONCRETE, effects=EVERY[2:3] + EVERY[3:6])
-    late = HeatProblem(bar(), CONCRETE, effects=(Convection(("z0",), 8.0, 3.0), *EVERY[3:6]))
-    steady = solve_steady(late)
-    end = solve_heat(late, TimeSteps(3, 1e12))
-    np.testing.assert_allclose(end.temperature_c[-1], steady.temperature_c, atol=1e-6)
-    np.testing.assert_allclose([h.heat_w[-1] for h in end.effects], [h.heat_w[0] for h in steady.effects], rtol=1e-6)
-    assert solve_steady(problem, time_s=600.0 * np.arcsin(0.6)).temperature_c == pytest.approx(steady.temperature_c)
-
-
-def test_newton_steps_are_counted_and_conduction_has_none() -> None:
-    warm = solve_heat(HeatProblem(bar(), CONCRETE, effects=JUMPS["sky"]), TimeSteps(3, 600.0))
-    assert np.all((warm.newton_iterations >= 1) & (warm.newton_iterations <= 4)), warm.newton_iterations
-    plain = solve_heat(HeatProblem(bar(), CONCRETE, effects=JUMPS["cold air"]), TimeSteps(3, 600.0))
-    assert plain.newton_iterations.tolist() == [0, 0, 0]
-
-
-def test_two_runs_agree_to_the_bit() -> None:
-    runs = [solve_heat(HeatProblem(bar(), CONCRETE, effects=EVERY), AdaptiveSteps(3600.0)) for _ in range(2)]
-    np.testing.assert_array_equal(runs[0].temperature_c, runs[1].temperature_c)
-    assert runs[0].status == runs[1].status

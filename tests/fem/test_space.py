@@ -76,16 +76,6 @@ def test_p1_is_part_of_p2() -> None:
     np.testing.assert_allclose(down @ load, linear.source_load(every, conductivity), atol=1e-12)
 
 
-def test_mass() -> None:
-    """A total of rho c V, negative at corners."""
-    space = Space(Selection(crooked_box()), order=2, lumped=False)
-    matrix, row_sums = space.mass(3.0)
-    assert matrix is not None
-    assert row_sums.sum() == pytest.approx(3.0, rel=1e-12) and row_sums.min() < 0.0
-    x = space.points_m[:, 0]
-    assert (x**2) @ (matrix @ x**2) == pytest.approx(3.0 / 5.0, rel=1e-12)
-
-
 def test_a_quadratic_temperature_is_exact() -> None:
     """div(k grad q) + s = 0 with the flux of q through one side, convection, and q itself on the others."""
     mesh, k = crooked_box(), 50.0
@@ -136,36 +126,11 @@ def test_radiation_is_integrated() -> None:
     np.testing.assert_allclose(end_k, 927.0076, atol=1e-4)
 
 
-def test_normals_of_edges_point_out() -> None:
-    """What is asked at fixed nodes is told the normal there, also in the middle of an edge."""
-    mesh = box_mesh([0, 1], [0, 1], [0, 1])
-    space = Space(Selection(mesh), order=2, lumped=False)
-    places = space.node_places(np.arange(space.num_nodes))
-    inside = np.all((places.points_m > 0) & (places.points_m < 1), axis=1)
-    assert np.all(places.normals[inside] == 0.0) and inside.sum() == 1
-    outward = np.einsum("ki,ki->k", places.normals, places.points_m - 0.5)
-    assert np.all(outward[~inside] > 0.2)
-    np.testing.assert_allclose(np.linalg.norm(places.normals[~inside], axis=1), 1.0)
-
-
 @pytest.mark.parametrize("options", [{"lumped": True}, {"lumped": False, "lumped_boundary": True}])
 def test_lumping_is_refused(options) -> None:
     problem = HeatProblem(box_mesh([0, 1], [0, 1], [0, 1]), STEEL)
     with pytest.raises(HeatError, match=r"order 2: expected integrals that are not lumped, got lumped.*negative"):
         HeatSystem(problem, order=2, **options)
-
-
-def test_other_orders_are_refused() -> None:
-    problem = HeatProblem(box_mesh([0, 1], [0, 1], [0, 1]), STEEL, effects=(FixedTemperature(("*",), 0.0),))
-    with pytest.raises(HeatError, match="order: expected 1 or 2, got 3"):
-        solve_steady(problem, order=3)
-
-
-def test_a_loose_piece_is_named_in_quadratic_meshes_too() -> None:
-    mesh = box_mesh(np.linspace(0, 0.5, 6), [0, 0.1], [0, 0.1], keep=lambda p: abs(p[..., 0] - 0.25) > 0.06)
-    problem = HeatProblem(mesh, STEEL, effects=(Convection(("x0",), 5.0, 10.0),))
-    with pytest.raises(HeatError, match=r"none on 1 of 2 pieces.*\(0\.3, 0, 0\) to \(0\.5,"):
-        solve_steady(problem, order=2)
 
 
 @pytest.mark.parametrize("options", [{"lumped_boundary": False}, {"order": 2, "lumped": False}], ids=["P1", "P2"])

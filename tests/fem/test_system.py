@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.support.heat_matrices import assemble
-from tests.support.heat_meshes import SIDES, box_mesh
+from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
@@ -14,7 +14,6 @@ from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
     Convection,
-    FixedTemperature,
     GroundContact,
     HeatFlux,
     InternalHeat,
@@ -100,21 +99,6 @@ def test_the_default_matrix_is_an_m_matrix(box, concrete) -> None:
     assert np.linalg.inv(dense).min() >= 0.0
 
 
-def test_materials_by_region(concrete) -> None:
-    """Two layers: the stiffness and the mass are the sums of the layers' own."""
-    wool = Material("wool", 0.04, 30.0, 1030.0)
-    layers = {"inner": lambda p: p[..., 0] < 0.25, "outer": lambda p: p[..., 0] > 0.25}
-    mesh = box_mesh(np.linspace(0, 0.5, 5), [0, 0.2], [0, 0.2], regions=layers)
-    both = HeatSystem(HeatProblem(mesh, {"inner": concrete, "outer": wool}))
-    gradient = mesh.points_m[:, 0]
-    energy = gradient @ both.matrix(0.0, np.inf) @ gradient
-    assert energy == pytest.approx((1.7 + 0.04) * 0.25 * 0.04, rel=1e-12)
-    assert both.nodal_mass_j_k.sum() == pytest.approx((2200 * 880 + 30 * 1030) * 0.25 * 0.04, rel=1e-12)
-    same = HeatSystem(HeatProblem(mesh, {"inner": concrete, "outer": concrete}))
-    one = HeatSystem(HeatProblem(mesh, concrete))
-    np.testing.assert_array_equal(same.matrix(0.0, np.inf).toarray(), one.matrix(0.0, np.inf).toarray())
-
-
 @pytest.mark.parametrize(
     ("material", "message"),
     [
@@ -181,22 +165,11 @@ def test_what_changes_in_time_is_assembled_again(box, concrete) -> None:
     assert system.assembled.counts["robin"] == (2 + 2) + (1 + 4)
 
 
-def test_shares_of_fixed_nodes_add_up(box, concrete) -> None:
-    system = HeatSystem(HeatProblem(box, concrete, effects=(FixedTemperature(("x?", "y0"), 20.0),)))
-    shares = system.fixed.shares
-    np.testing.assert_allclose(np.asarray(shares.sum(axis=0)).ravel(), 1.0, rtol=1e-12)
-    assert [patch for _, patch in system.fixed.groups] == ["x0", "x1", "y0"]
-    assert set(SIDES[:3]) == {"x0", "x1", "y0"}
-    edge = np.flatnonzero((box.points_m[system.fixed.nodes] == [0.0, 0.0, 0.1]).all(axis=1))
-    np.testing.assert_allclose(shares[:, edge].toarray().ravel(), [0.5, 0.0, 0.5], atol=0.01)
-
-
 def test_labels_differ_even_where_a_patch_is_named_like_a_number() -> None:
     """Two equal labels would count the heat of both effects twice."""
     from tests.support.heat_meshes import box_mesh
     from thermoxels_ns.fem.problem import HeatProblem, effect_labels
     from thermoxels_ns.heat.effects import Convection
-    from thermoxels_ns.heat.materials import Material
 
     side = [0.0, 0.1]
     airs = tuple(Convection((name,), 8.0, 0.0) for name in ("wall (2)", "wall", "wall", "wall (2)"))

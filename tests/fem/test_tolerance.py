@@ -148,16 +148,6 @@ def test_slab_with_convection(biot) -> None:
         assert 1 / WITHIN < estimate.heat_flow / true.heat_flow < WITHIN, (found.settings, true)
 
 
-def test_three_solutions_tell_the_errors_of_mesh_and_steps() -> None:
-    """The given mesh, the same with halved steps, and half the size; then what the tolerance asks for."""
-    levels = solve_to_tolerance(nafems_t3(), Tolerance(0.2), duration_s=32.0, log=silent).levels
-    assert [level.refinements for level in levels] == [0, 0, 1, 2]
-    first, halved, finer_mesh, _ = levels
-    assert halved.step_tolerance_k == pytest.approx(0.3 * first.step_tolerance_k, rel=1e-6)
-    assert finer_mesh.step_tolerance_k == first.step_tolerance_k
-    assert finer_mesh.error.temperature_k < 0.5 * first.error.temperature_k
-
-
 @pytest.mark.parametrize(
     "effect",
     [
@@ -177,46 +167,6 @@ def test_radiation_and_changing_coefficients_in_time(effect) -> None:
     assert found.met and found.settings.refinements < 2
     assert true.temperature_k <= 3.0
     assert 1 / WITHIN < found.settings.error.temperature_k / true.temperature_k < WITHIN, (found.settings, true)
-
-
-def test_long_steps_are_shortened() -> None:
-    """On a fine mesh the steps are what errs: their error is found and brought within the tolerance."""
-    mesh = box_mesh(np.linspace(0, 0.1, 61), [0, 0.01], [0, 0.01], temperature_c=20.0)
-    effects = (Convection(("x1",), 50.0, 0.0),)
-    problem = HeatProblem(mesh, CONCRETE, effects=effects)
-    found = solve_to_tolerance(problem, Tolerance(0.01), duration_s=3600.0, outputs=2, log=silent)
-    exact = solve_heat(problem, AdaptiveSteps(3600.0, 1e-4, outputs=2))
-    assert isinstance(found.solution, HeatSolution)
-    nodes = len(mesh.points_m)
-    assert np.abs(found.solution.temperature_c[:, :nodes] - exact.temperature_c).max() < 0.01
-    assert found.settings.refinements == 0
-
-
-def test_radiation_is_solved_to_tolerance() -> None:
-    axis = np.linspace(0, 0.2, 4)
-    mesh = box_mesh(axis, axis, axis, temperature_c=300.0)
-    effects = (FixedTemperature(("x0",), 600.0), Radiation(("x1", "y?"), 0.9, 20.0))
-    problem = HeatProblem(mesh, Material("ceramic", 2.0, 2000.0, 900.0), effects=effects)
-    exact = solve_steady(finer(problem, 2), order=2)
-    found = solve_to_tolerance(problem, Tolerance(None, 0.02), log=silent)
-    assert true_error(found, problem, exact).heat_flow <= 0.02
-
-
-def test_lines_say_what_was_done() -> None:
-    lines: list[str] = []
-    found = solve_to_tolerance(shell(), Tolerance(0.1, 0.01), log=lines.append)
-    assert len(lines) == len(found.levels) + 2
-    assert lines[0].startswith("P2 on the given mesh needs about ") and lines[0].endswith(" MiB at most.")
-    assert lines[1].startswith("P1, given mesh, 122 unknowns: estimated error ") and lines[1].endswith(" s")
-    assert lines[2].startswith("P2, given mesh, 651 unknowns: estimated error ")
-    assert lines[-1] == found.status
-    assert found.status.startswith("Within 0.1 K and 1 % of the heat flow: P2, given mesh,")
-    assert f"{found.seconds:.2f} s in all." in found.status
-
-
-def test_printing_is_the_default(capsys) -> None:
-    solve_to_tolerance(shell(), Tolerance(1.0))
-    assert "Within 1 K: P1, given mesh" in capsys.readouterr().out
 
 
 def test_too_little_memory_is_a_status() -> None:
@@ -255,18 +205,6 @@ def test_too_little_memory_is_a_status() -> None:
 def test_bad_input(make, message) -> None:
     with pytest.raises(HeatError, match=message):
         make()
-
-
-def test_differences_and_flows() -> None:
-    problem = shell()
-    solution = solve_steady(problem)
-    flows = mean_flows_w(solution)
-    assert list(flows) == ["convection on inside", "convection on outside"]
-    assert sum(flows.values()) == pytest.approx(0.0, abs=1e-9 * max(flows.values()))
-    warmer = replace(solution, temperature_c=solution.temperature_c + np.arange(len(solution.temperature_c)))
-    assert difference_between(solution, warmer, 3) == ErrorSize(2.0, 0.0)
-    assert Tolerance(4.0, 0.1).excess(ErrorSize(2.0, 0.2)) == 2.0
-    assert Tolerance(4.0).excess(ErrorSize(2.0, 0.2)) == 0.5
 
 
 @pytest.mark.parametrize("outputs", [1, 2])

@@ -96,13 +96,9 @@ class ConjugateGradients:
         relative_tolerance: float = 1e-12,
         max_iterations: int = 10_000,
     ) -> None:
-        """Check the matrix.
+        """Check A, symmetric positive definite; the preconditioner is `Sweeps` if None.
 
-        Args:
-            matrix: A, symmetric positive definite, shape (n, n).
-            preconditioner: Made for this matrix; None: `Sweeps`.
-            relative_tolerance: Stop when ||b - A x|| <= relative_tolerance * ||b||.
-            max_iterations: Give up after this many iterations.
+        Iterations end at ||b - A x|| <= relative_tolerance * ||b||.
 
         Raises:
             HeatError: If an entry is not finite or a diagonal entry is not above 0.
@@ -127,13 +123,7 @@ class ConjugateGradients:
         return self._preconditioner.name
 
     def solve(self, right_hand_side: Vector, start: Vector | None = None) -> LinearSolution:
-        """Solve A x = b.
-
-        Args:
-            right_hand_side: b, shape (n,).
-            start: Where to start from, shape (n,); None, or one that is worse than 0: from 0. It changes the number of
-                iterations only.
-        """
+        """Solve A x = b, b of shape (n,); a start, if it is better than 0, changes only the number of iterations."""
         # In units of its largest entry, so that the squares in the norms neither overflow nor vanish.
         scale = float(np.max(np.abs(right_hand_side), initial=0.0)) or 1.0
         b = right_hand_side / scale
@@ -157,12 +147,7 @@ class ConjugateGradients:
         return LinearSolution(scale * x, count, residual, converged, status)
 
     def _iterate(self, r: Vector, tolerance: float) -> tuple[Vector, int, bool]:
-        """Iterate until the residual is within the tolerance.
-
-        Returns:
-            The solution for this residual, the number of iterations, and whether they ended before the tolerance was
-            reached: there were too few, or a breakdown.
-        """
+        """Give the solution for a residual, the number of iterations, and whether they ended too early."""
         given, seen = self._preconditioner, self._preconditioner.residual(r)
         x, direction = np.zeros_like(r), np.zeros_like(r)
         before, square, count = math.inf, dot(seen, seen), 0
@@ -192,15 +177,7 @@ class LinearSolver:
     """Solver for A x = b that is cheap to set up, until it has shown that it is slow: then multigrid takes over."""
 
     def __init__(self, matrix: sparse.csr_matrix, *, relative_tolerance: float = 1e-12) -> None:
-        """Set up sweeps.
-
-        Args:
-            matrix: A, symmetric positive definite, shape (n, n).
-            relative_tolerance: Stop when ||b - A x|| <= relative_tolerance * ||b||.
-
-        Raises:
-            HeatError: If an entry is not finite or a diagonal entry is not above 0.
-        """
+        """Set up sweeps; matrix, tolerance and errors are those of `ConjugateGradients`."""
         self._matrix, self._relative_tolerance = matrix, relative_tolerance
         self._solver = ConjugateGradients(matrix, relative_tolerance=relative_tolerance, max_iterations=PATIENCE)
         self._swept, self._slow = True, False
@@ -310,11 +287,8 @@ class _Plain:
 class Multigrid(_Plain):
     """Smoothed aggregation by pyamg: iterations hardly grow with the mesh; dear to set up.
 
-    Plain aggregation without a strength threshold, one forward Gauss-Seidel sweep before and one backward sweep after
-    the coarse correction: symmetric, as conjugate gradients need it.
-
-    Prolongations are smoothed by row sums instead of estimates of a spectral radius, and the last level is solved
-    here: pyamg's own ways start from random vectors and add up in BLAS, whose sums depend on the number of its threads.
+    It is symmetric. Random starts and BLAS, whose sums depend on the number of its threads, are avoided: row sums stand
+    for estimates of a spectral radius, and the last level is solved here.
     """
 
     name = "multigrid"
@@ -350,12 +324,7 @@ class TwoLevel(_Plain):
     name = "linear tetrahedra"
 
     def __init__(self, matrix: sparse.csr_matrix, prolongation: sparse.csr_matrix) -> None:
-        """Set up the coarse level.
-
-        Args:
-            matrix: A, shape (n, n).
-            prolongation: P, what unknowns of the coarse level are on the fine one, shape (n, m).
-        """
+        """Set up the coarse level; `prolongation` is P, shape (n, m)."""
         super().__init__(matrix)
         self._diagonal = matrix.diagonal()
         self._prolongation, self._restriction = prolongation, sparse.csr_matrix(prolongation.T)
@@ -475,11 +444,7 @@ def _pivot_roots(first, other, values, root):
 
 @kernel
 def _divide_and_part(first, other, values, root, surplus, beside):
-    """Divide rows and columns by the roots, so that D is 1, and part couplings to the next node from the others.
-
-    Sets `surplus` to 2 - the diagonal and `beside` to the couplings to the next node; moves the others together in
-    place, and returns how many they are.
-    """
+    """Divide by the roots, so that D is 1; put couplings to the next node into `beside`, move the others together."""
     place = begin = 0
     for i in range(len(root)):
         surplus[i] = 2.0 - 1.0 / (root[i] * root[i])

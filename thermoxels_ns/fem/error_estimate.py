@@ -77,34 +77,19 @@ def richardson(difference: float, ratio: float) -> float:
 
 
 def mean_flows_w(solution: SteadySolution | HeatSolution) -> dict[str, float]:
-    """Give the mean heat flow into the body of each effect over all times, [W].
-
-    Not of each patch: how much of the heat of a fixed node between two patches belongs to either is a convention.
-    """
+    """Give the mean heat flow into the body of each effect over all times, [W]."""
     lengths = np.diff(solution.times_s) if isinstance(solution, HeatSolution) else np.ones(1)
     return {heat.effect: float(lengths @ heat.heat_w / lengths.sum()) for heat in solution.effects}
 
 
 def compared_values(solution: SteadySolution | HeatSolution, num_nodes: int) -> Vector:
-    """List what solutions are compared by: temperatures of the first nodes at all times, then `mean_flows_w`.
-
-    Args:
-        solution: One of them.
-        num_nodes: Number of nodes of the mesh that all have in common; they come first.
-    """
+    """List temperatures of the first `num_nodes` nodes, which solutions share, at all times, then `mean_flows_w`."""
     flows_w = np.array(list(mean_flows_w(solution).values()))
     return np.concatenate([solution.temperature_c[..., :num_nodes].ravel(), flows_w])
 
 
 def error_size(error: Vector, solution: SteadySolution | HeatSolution) -> ErrorSize:
-    """Give the largest errors of a solution.
-
-    Where all temperatures are equal nothing flows but round-off, which has no share of it.
-
-    Args:
-        error: Errors of its `compared_values`.
-        solution: The solution, whose flows errors are shares of.
-    """
+    """Give the largest errors of a solution from those of its `compared_values`; shares are of its heat flows."""
     flows_w = np.abs(list(mean_flows_w(solution).values()))
     errors = np.abs(error)
     temperature_k = float(np.max(errors[: len(errors) - len(flows_w)]))

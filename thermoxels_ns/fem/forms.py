@@ -225,10 +225,7 @@ class RadiationForm(_Boundary):
         return self.matrix(4.0 * self._strength(time_s) * (kelvin * kelvin * kelvin))
 
     def magnitude(self, relative_k: Vector, time_s: float) -> Vector:
-        """Sizes of what the load adds up, with those of the temperatures' differences from the reference, [W].
-
-        Round-off of the load is a few eps of it.
-        """
+        """Sizes of what the load adds up, [W]; round-off of the load is a few eps of it."""
         size = 0.0
         for part in (self.surface_k(relative_k), self.surroundings_k(time_s)):
             kelvin = np.abs(part + self._reference_k)
@@ -290,12 +287,7 @@ class FixedNodes:
     """All nodes that any effect fixes."""
 
     def __init__(self, forms: Sequence[FixedForm], num_nodes: int) -> None:
-        """Merge the nodes of the forms.
-
-        Args:
-            forms: One per effect that fixes temperatures.
-            num_nodes: Number of nodes of the body.
-        """
+        """Merge the nodes of the forms, one for each effect that fixes temperatures."""
         self._forms = tuple(forms)
         self.nodes: npt.NDArray[np.int64] = np.unique(
             np.concatenate([np.zeros(0, np.int64), *(f.nodes for f in forms)])

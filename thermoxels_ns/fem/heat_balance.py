@@ -24,13 +24,7 @@ class HeatBalance:
     """Keeps states at the ends of intervals and adds up the heat that flowed in between."""
 
     def __init__(self, system: HeatSystem, states_k: Vector, times_s: Vector) -> None:
-        """Begin with no steps.
-
-        Args:
-            system: The equations.
-            states_k: Room for the states, the first one given, relative to the reference, shape (s + 1, n), [K].
-            times_s: Their times, shape (s + 1,), [s].
-        """
+        """Begin with room for the states, shape (s + 1, n), [K], the first one given, and their times, [s]."""
         self._system, self._states, self._times = system, states_k, times_s
         self._done = self._steps = self._most_iterations = 0
         self.followed_s = 0.0
@@ -121,15 +115,9 @@ class HeatBalance:
         )
 
     def _terms_j(self, states_k: Vector, times_s: Vector, least_j: float) -> float:
-        """Sizes of all that is added up to the heat that flows in, up to states at which nothing makes heat flow, [J].
+        """Sizes of all that is added up to the heat that flows in where nothing makes heat flow, [J].
 
-        There next to nothing is left of their sum; if a step is far longer than heat takes to leave the body, round-off
-        of it is much beside what the body stores. Where heat flows, what is unaccounted for is a share of that.
-
-        Args:
-            states_k: Temperatures at all times, shape (s + 1, n), [K].
-            times_s: The times, shape (s + 1,), [s].
-            least_j: Less than that is as good as nothing: if no more can come of it, no state is looked at.
+        If no more than `least_j` can come of it, no state is looked at.
         """
         system, fixed, lengths_s = self._system, self._system.fixed.nodes, np.diff(times_s)
         most_w = np.zeros(len(lengths_s))

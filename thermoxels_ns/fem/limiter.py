@@ -54,11 +54,7 @@ class PositiveOffDiagonals:
     """
 
     def __init__(self, system: HeatSystem) -> None:
-        """Find them; none is left out.
-
-        Args:
-            system: The equations.
-        """
+        """Find them; none is left out."""
         self._system = system
         upper, diagonal = sparse.triu(system.stiffness, k=1, format="coo"), system.stiffness.diagonal()
         positive = upper.data > _ROUND_OFF * np.minimum(diagonal[upper.row], diagonal[upper.col])
@@ -75,13 +71,9 @@ class PositiveOffDiagonals:
         return int(np.count_nonzero(self._left_out))
 
     def leave_out(self, outside: npt.NDArray[np.bool_]) -> HeatSystem | None:
-        """Leave out those of more nodes, and all after some attempts.
+        """Leave out those of more nodes, marked by `outside`, shape (n,), and all after some attempts.
 
-        Args:
-            outside: Marks nodes whose temperature is out of range, shape (n,).
-
-        Returns:
-            The equations without them; None if there are no more to leave out.
+        Returns the equations without them, or None if there are no more to leave out.
         """
         last = self._attempts == _ATTEMPTS
         more = ~self._left_out if last else (outside[self._first] | outside[self._second]) & ~self._left_out
@@ -138,21 +130,14 @@ class AllowedRange:
     """
 
     def __init__(self, system: HeatSystem) -> None:
-        """Begin.
-
-        Args:
-            system: The equations.
-        """
+        """Begin."""
         self._system, self._widest_k = system, 0.0
 
     def at(self, start_k: Vector, times_s: tuple[float, ...], slack_k: float = 0.0) -> tuple[float, float]:
-        """Give lowest and highest temperature after a step, [K].
+        """Give lowest and highest temperature after a step from `start_k`, shape (n,), [K].
 
-        Args:
-            start_k: Temperatures at the start, relative to the system's reference, shape (n,), [K].
-            times_s: Times at which the surroundings count, [s].
-            slack_k: How far out of it a temperature may be besides round-off, [K], but no more than `MOST_SLACK` of the
-                widest range.
+        Surroundings count at `times_s`. Temperatures may be out by `slack_k`, but no more than `MOST_SLACK` of the
+        widest range, and by round-off.
         """
         coldest_k, warmest_k = float(start_k.min()), float(start_k.max())
         low, high = self._system.allowed_range_k((coldest_k, warmest_k), times_s)
@@ -185,29 +170,17 @@ class Limiter:
     """
 
     def __init__(self, system: HeatSystem, *, relative_tolerance: float) -> None:
-        """Prepare; what only some meshes need is made when it is needed.
-
-        Args:
-            system: The equations.
-            relative_tolerance: Of the linear solver.
-        """
+        """Prepare; what only some meshes need is made when it is needed."""
         self._system, self._relative_tolerance = system, relative_tolerance
         self._plain = Stepper(system, BACKWARD_EULER, relative_tolerance=relative_tolerance)
         self._range = AllowedRange(system)
         self._entries: PositiveOffDiagonals | None = None
 
     def step(self, start_k: Vector, time_s: float, step_s: float, slack_k: float = 0.0) -> tuple[Step, Vector]:
-        """Take one step.
+        """Take one step from `start_k`, shape (n,), [K]; `slack_k` as in `AllowedRange.at`.
 
-        Args:
-            start_k: Temperatures at the start, relative to the system's reference, shape (n,), [K].
-            time_s: Time at the start.
-            step_s: Length, [s].
-            slack_k: As in `AllowedRange.at`.
-
-        Returns:
-            The step, and the temperatures after it as they were before any entry was left out, shape (n,), [K]. They
-            may be out of range if the step failed, or with consistent masses or boundary exchange.
+        Returns the step, and the temperatures after it before any entry was left out, shape (n,), [K]. They may be out
+        of range if the step failed, or with consistent masses or boundary exchange.
         """
         plain = self._plain.step(start_k, time_s, step_s)
         if not plain.converged:

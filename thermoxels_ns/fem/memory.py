@@ -80,12 +80,7 @@ def describe_bytes(amount: float) -> str:
 
 
 def check_memory(needed: float, allowed: float, remedy: str) -> None:
-    """Refuse what does not fit.
-
-    Args:
-        needed: What it takes, [bytes].
-        allowed: What it may take, [bytes].
-        remedy: What to do about it.
+    """Refuse what needs more bytes than are allowed.
 
     Raises:
         HeatError: It is too much.

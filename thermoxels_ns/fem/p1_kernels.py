@@ -46,14 +46,7 @@ class MeshEdges:
         return 0.5 * (nodal[self.smaller_nodes()] + nodal[self.other])
 
     def numbers(self, elements: npt.NDArray[np.int64], ends: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Number the edges of elements of the mesh.
-
-        Args:
-            elements: Node numbers of tetrahedra or of triangles, shape (k, m).
-            ends: Which two of an element's nodes each of its edges joins, shape (j, 2).
-
-        Returns:
-            Numbers of edges, shape (k, j).
+        """Number the edges, shape (k, j), of tetrahedra or triangles; `ends` are the local nodes of each, shape (j, 2).
 
         >>> edges = mesh_edges(np.array([[3, 0, 2, 1]]), 4)
         >>> edges.numbers(np.array([[0, 2, 3]]), FACET_EDGES).tolist()
@@ -65,14 +58,7 @@ class MeshEdges:
 
 
 def mesh_edges(tets: npt.NDArray[np.int64], num_nodes: int) -> MeshEdges:
-    """Find the edges of a mesh, in time and memory that grow with the number of tetrahedra.
-
-    Args:
-        tets: Node numbers, shape (t, 4).
-        num_nodes: Number of nodes, above the largest node number.
-
-    Returns:
-        The edges, in ascending order.
+    """Find the edges of a mesh in ascending order, in time and memory that grow with the number of tetrahedra.
 
     Raises:
         HeatError: If a node number is out of range.
@@ -155,21 +141,9 @@ def mass_matrix(
     *,
     edges: MeshEdges | None = None,
 ) -> tuple[sparse.csr_matrix, npt.NDArray[np.float64]]:
-    """Assemble the consistent M, entries rho c * integral(phi_i phi_j).
+    """Assemble the consistent M, entries rho c * integral(phi_i phi_j), and its row sums, the lumped mass, [J / K].
 
-    Args:
-        points_m: Nodes, shape (n, 3), [m].
-        tets: Node numbers, shape (t, 4), positively oriented.
-        heat_capacity_j_m3k: rho c, [J / (m3 K)], one for all or one per tetrahedron, shape (t,).
-        edges: The edges of the mesh, if they have been found already.
-
-    Returns:
-        mass: M, symmetric bit for bit, shape (n, n), [J / K].
-        nodal: Its row sums, which are the lumped mass, shape (n,), [J / K].
-
-    Raises:
-        HeatError: If an array has the wrong shape, a heat capacity is not above 0, a node number is out of range or a
-            tetrahedron is flat or inverted.
+    M is symmetric bit for bit. Arguments and errors are those of `stiffness_matrix`, with rho c in [J / (m3 K)].
     """
     edges = mesh_edges(tets, len(points_m)) if edges is None else edges
     nodal, along = _capacities(points_m, tets, heat_capacity_j_m3k, edges)

@@ -44,14 +44,7 @@ class Pieces:
         return marks
 
     def without_sums(self, floating: npt.NDArray[np.bool_], nodal: Vector, held: Vector, sums: Vector) -> Vector:
-        """Subtract multiples of a vector so that what is left sums to 0 over each floating piece, twice for round-off.
-
-        Args:
-            floating: Which of the pieces to treat, shape (p,).
-            nodal: Values of the nodes, shape (n,).
-            held: The vector, shape (n,).
-            sums: Its sums over the pieces, shape (p,); those of pieces that do not float count for nothing.
-        """
+        """Subtract multiples of `held`, whose sums over the pieces are `sums`, until floating pieces sum to 0."""
         for _ in range(2):
             nodal = nodal - self.at_nodes(np.where(floating, self.sums(nodal) / sums, 0.0)) * held
         return nodal

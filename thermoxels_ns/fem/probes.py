@@ -33,12 +33,7 @@ class Probes:
         return np.einsum("...pa,pa->...p", nodal[..., self.nodes], self.weights)
 
     def at_quadratic(self, mesh: TetMesh, values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """Interpolate in quadratic tetrahedra, shape (..., p).
-
-        Args:
-            mesh: The mesh in which the probes were placed.
-            values: Of its nodes and then of the middles of its edges, in the order of `mesh_edges`, shape (..., n).
-        """
+        """Interpolate values of a mesh's nodes and then of its `mesh_edges`, shape (..., n), to shape (..., p)."""
         middles = len(mesh.points_m) + mesh_edges(mesh.tets, len(mesh.points_m)).numbers(self.nodes, TET_EDGES)
         nodes, element = np.concatenate([self.nodes, middles], axis=1), ElementTetP2()
         shapes = np.stack([element.lbasis(self.weights[:, 1:].T, i)[0] for i in range(nodes.shape[1])], axis=1)

@@ -69,10 +69,7 @@ _OPPOSITE = ((4, 9), (6, 8), (7, 5))
 
 
 def _children() -> npt.NDArray[np.int64]:
-    """Local nodes of the eight children for each of the three diagonals, shape (3, 8, 4).
-
-    Local nodes 0 to 3 are the corners and 4 to 9 the middles of `TET_EDGES`.
-    """
+    """Local nodes (corners, then middles of `TET_EDGES`) of the children for each diagonal, shape (3, 8, 4)."""
     middle = {frozenset(map(int, ends)): 4 + number for number, ends in enumerate(TET_EDGES)}
     corners = [[i if j == i else middle[frozenset((i, j))] for j in range(4)] for i in range(4)]
     place = np.vstack([np.zeros(3), np.eye(3)])

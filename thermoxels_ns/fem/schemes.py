@@ -60,9 +60,7 @@ def theta_scheme(theta: float) -> Scheme:
 def _sdirk2() -> Scheme:
     """Alexander's two-stage scheme (SIAM Journal on Numerical Analysis 14, 1977), gamma = 1 - 1 / sqrt(2), L-stable.
 
-    The estimate adds the flow at the start. Its three weights meet the conditions sum b = 1, sum b c = 1 / 2 and
-    sum b a c = 1 / 6: of third order for what conduction itself does; for loads that change with time it is an
-    estimate from above.
+    The estimate adds the flow at the start and meets the conditions of third order for constant loads.
     """
     gamma = 1.0 - 1.0 / math.sqrt(2.0)
     second = (1.0 - gamma) * gamma + gamma

@@ -135,13 +135,7 @@ class SteadySolution:
 def heat_by_effect(
     effects: Sequence[str], groups: Sequence[tuple[str, str]], group_heat_w: npt.NDArray[np.float64]
 ) -> tuple[EffectHeat, ...]:
-    """Sort the heat flows of groups by effect.
-
-    Args:
-        effects: Labels of all effects.
-        groups: Effect and patch or region of each column.
-        group_heat_w: Heat flows, shape (s, g), [W].
-    """
+    """Sort heat flows, shape (s, g), [W], of groups, each an effect and a patch or region, by effect."""
     sorted_heat = []
     for effect in effects:
         columns = [number for number, (owner, _) in enumerate(groups) if owner == effect]
@@ -182,12 +176,7 @@ class SolutionNodes:
 
 
 def solution_nodes(problem: HeatProblem, solution: Solution) -> SolutionNodes:
-    """Put a solution on a mesh of linear tetrahedra without losing any of its temperatures.
-
-    Args:
-        problem: What was solved.
-        solution: Its outcome.
-    """
+    """Put a solution on a mesh of linear tetrahedra without losing any of its temperatures."""
     if isinstance(solution, HeatSolution):
         return SolutionNodes(problem.mesh, solution.times_s, solution.temperature_c, False)
     if not len(solution.edge_temperature_c):

@@ -144,10 +144,7 @@ class Space:
     def assembled(self, form: BilinearForm, degree: int, **tet_values: float | Vector) -> sparse.csr_matrix:
         """Assemble a form by scikit-fem, symmetric bit for bit.
 
-        Args:
-            form: What is integrated.
-            degree: Of the polynomials that it is for constant parameters.
-            tet_values: Its parameters by name, one for all or one per tetrahedron, shape (t,).
+        `degree` is that of the polynomials; parameters are one number for all or one per tetrahedron, shape (t,).
         """
         points_m, tets, nodes = self.selection.mesh.points_m, self.selection.mesh.tets, self.tet_nodes()
         values = {name: np.broadcast_to(value, len(tets)) for name, value in tet_values.items()}

@@ -61,10 +61,7 @@ class Residual:
         return is_within(self.piece_heat_w, self.piece_round_off_w) and is_within(self.heat_w, self.round_off_w)
 
     def is_small(self, heat_w: float, before: Residual) -> bool:
-        """Whether it is within a tolerance or round-off at the nodes, and each piece is balanced.
-
-        A piece is balanced to round-off, or if it is not much better than it was a step `before`.
-        """
+        """Whether nodes are within `heat_w` or round-off, and pieces are balanced or no longer get better."""
         nodes = _norm(self.heat_w) <= max(heat_w, _norm(self.round_off_w))
         piece_w = np.abs(self.piece_heat_w)
         balanced = (piece_w <= self.piece_round_off_w) | (piece_w > 0.5 * np.abs(before.piece_heat_w))
@@ -103,14 +100,7 @@ class Stage:
     """
 
     def __init__(self, system: HeatSystem, time_s: float, step_s: float, *, relative_tolerance: float) -> None:
-        """Assemble the matrix.
-
-        Args:
-            system: The equations.
-            time_s: Time at which what acts on the body is taken; it matters here only if the matrix changes with time.
-            step_s: Length of the stage, [s]; infinite for a steady state.
-            relative_tolerance: Of the linear solver, and of Newton's method.
-        """
+        """Assemble the matrix at a time, for a step of a length, [s]; infinite for a steady state."""
         self.system = system
         self.step_s = step_s
         self._relative_tolerance = relative_tolerance
@@ -133,13 +123,10 @@ class Stage:
         given_w: Vector | None = None,
         given_to_pieces_w: Vector | None = None,
     ) -> StageSolution:
-        """Find the temperatures at the end.
+        """Find the temperatures at the end from T_0, shape (n,), [K].
 
-        Args:
-            start_k: T_0, shape (n,), [K].
-            time_s: Time at the end.
-            given_w: Heat from earlier stages, shape (n,), [W].
-            given_to_pieces_w: Its sum over each piece without the round-off of conduction, shape (p,), [W].
+        Earlier stages give `given_w`, shape (n,), and its sum over each piece without the round-off of conduction,
+        shape (p,), [W].
         """
         balance = _Balance(self, start_k, time_s, given_w, given_to_pieces_w)
         first = balance.residual()
@@ -170,10 +157,7 @@ class Stage:
         return self._free is not None and bool(np.isfinite(self.step_s))
 
     def _unexplained(self, rest: Residual, change: Vector) -> Residual | None:
-        """What is left to balance after a step with fixed nodes, if it is much beside what is stored.
-
-        In a long step, what is nothing beside the heat that flows may be much beside what is stored.
-        """
+        """What is left to balance after a step with fixed nodes, if it is much beside what is stored."""
         if not self._may_be_unexplained:
             return None
         stored_w = self.at_free(self.system.mass_product(self.everywhere(change))) / self.step_s
@@ -187,11 +171,7 @@ class Stage:
     def damped(self, heat_w: Vector, piece_heat_w: Vector, relative_k: Vector, time_s: float) -> Vector:
         """Solve (M / step + K + R + slope of radiation) e = heat roughly, for error estimates; shape (n,), [K].
 
-        Args:
-            heat_w: Shape (n,), [W].
-            piece_heat_w: Its sum over each piece without the round-off of conduction, shape (p,), [W].
-            relative_k: Temperatures at which the slope of radiation is taken, shape (n,), [K].
-            time_s: Time at which it is taken.
+        `piece_heat_w` is the heat of each piece without the round-off of conduction; the slope is that at `relative_k`.
         """
         held_w_k = self.held_w_k
         if self.system.nonlinear:
@@ -211,13 +191,7 @@ class Stage:
         return self.everywhere(self.correction(solver, held_w_k, balance)[0])
 
     def correction(self, solver: SystemSolver, held_w_k: Vector, residual: Residual) -> tuple[Vector, LinearSolution]:
-        """Solve for a change of the free nodes, its mean over floating pieces by their balance.
-
-        Args:
-            solver: Of the matrix.
-            held_w_k: The matrix's row sums, exactly, shape (n,).
-            residual: What is to be balanced.
-        """
+        """Solve for a change of the free nodes; `held_w_k` are the matrix's row sums, exactly, shape (n,)."""
         if not self.floats:
             linear = solver.solve(residual.heat_w)
             return linear.x, linear

@@ -151,10 +151,7 @@ def _limited_state(system: HeatSystem, time_s: float, relative_tolerance: float)
 
 
 def _slack_k(system: HeatSystem, low: float, high: float, relative_tolerance: float) -> float:
-    """How far out of range floating point and the linear solver may put a temperature, [K].
-
-    What the solver looks for is the change from the start, so that its error is a share of that.
-    """
+    """How far out of range round-off and the linear solver, whose error is a share of the change, may put it, [K]."""
     start_k = system.start_k
     ends = [end for end in (low, high, float(start_k.min()), float(start_k.max())) if np.isfinite(end)]
     level_k = max(abs(end) for end in ends) + abs(system.reference_c + ZERO_CELSIUS_K)
@@ -169,11 +166,7 @@ def _residual(
     group_heat_w: np.ndarray,
     relative_tolerance: float = 1e-12,
 ) -> float:
-    """Heat that comes in and does not go out, as a share of the heat that flows through the nodes.
-
-    Opposite flows through one patch cancel in the sum of its group, not in that of its nodes. Where nothing makes heat
-    flow, as between equal airs, what is left is round-off of the terms that cancel, and a share of these.
-    """
+    """Heat that comes in and does not go out, as a share of what flows through the nodes, or of terms that cancel."""
     exchanged_w, terms_w = system.exchanged_heat(relative_k, time_s)
     flows_w = float(np.abs(exchanged_w).sum() + np.abs(system.net_heat_at_fixed(relative_k, time_s)).sum())
     surplus_w = abs(float(group_heat_w.sum()))
@@ -185,14 +178,7 @@ def _residual(
 
 
 def is_still(system: HeatSystem, relative_k: np.ndarray, time_s: float, relative_tolerance: float = 1e-12) -> bool:
-    """Whether nothing makes heat flow: each connected piece, at one temperature, balances what acts on every node.
-
-    Args:
-        system: The equations.
-        relative_k: Temperatures, relative to the system's reference, shape (n,), [K].
-        time_s: Time.
-        relative_tolerance: Of the linear solver that found them.
-    """
+    """Whether nothing makes heat flow: each connected piece, at one temperature, balances what acts on every node."""
     pieces, fixed = system.pieces, system.fixed.nodes
     mean_k = pieces.sums(relative_k) / pieces.sums(np.ones_like(relative_k))
     level_k = np.zeros_like(relative_k) + pieces.at_nodes(mean_k)
@@ -207,14 +193,7 @@ def is_still(system: HeatSystem, relative_k: np.ndarray, time_s: float, relative
 def heat_of_groups_w(
     system: HeatSystem, relative_k: np.ndarray, time_s: float, stored_w: np.ndarray | None = None
 ) -> np.ndarray:
-    """Heat flow into the body of each group of a system, fixed nodes included, shape (g,), [W].
-
-    Args:
-        system: The equations.
-        relative_k: Temperatures, relative to the system's reference, shape (n,), [K].
-        time_s: Time.
-        stored_w: Heat that each node stores, shape (n,), [W]; None: a steady state.
-    """
+    """Heat flow into the body of each group, fixed nodes included, shape (g,), [W]; what nodes store counts too."""
     kept = -system.net_heat_at_fixed(relative_k, time_s)
     if stored_w is not None:
         kept = kept + stored_w[system.fixed.nodes]
@@ -236,10 +215,6 @@ def too_cold(system: HeatSystem, relative_k: np.ndarray) -> str:
 def check_held(system: HeatSystem, time_s: float) -> None:
     """Refuse a body of which a piece may have any temperature in a steady state.
 
-    Args:
-        system: The equations.
-        time_s: Time at which effects that change are taken, [s].
-
     Raises:
         HeatError: There is such a piece.
     """
@@ -252,13 +227,7 @@ def check_held(system: HeatSystem, time_s: float) -> None:
 
 
 def check_stored(system: HeatSystem, duration_s: float) -> None:
-    """Refuse a piece without heat capacity into which heat flows that it does not pass on.
-
-    Only fluxes and sources at the start count; what such a piece does later is found when it happens.
-
-    Args:
-        system: The equations.
-        duration_s: Time that the body is followed for, [s].
+    """Refuse a piece without heat capacity into which more flows at the start than it passes on.
 
     Raises:
         HeatError: There is such a piece.

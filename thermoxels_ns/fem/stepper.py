@@ -48,27 +48,14 @@ class Stepper:
     """Takes steps of any length; matrices and preconditioners of the lengths used last are kept."""
 
     def __init__(self, system: HeatSystem, scheme: Scheme, *, relative_tolerance: float) -> None:
-        """Choose a scheme.
-
-        Args:
-            system: The equations.
-            scheme: The scheme in time.
-            relative_tolerance: Of the linear solver.
-        """
+        """Choose a scheme and the tolerance of the linear solver."""
         self.scheme = scheme
         self._system = system
         self._relative_tolerance = relative_tolerance
         self._stages: dict[tuple[float, float], Stage] = {}
 
     def step(self, start_k: Vector, time_s: float, step_s: float, *, estimate: bool = False) -> Step:
-        """Take one step.
-
-        Args:
-            start_k: Temperatures at the start, relative to the system's reference, shape (n,), [K].
-            time_s: Time at the start.
-            step_s: Length, [s].
-            estimate: Whether to estimate the error.
-        """
+        """Take one step from `start_k`, shape (n,), [K], relative to the reference; estimate its error if asked."""
         system, scheme = self._system, self.scheme
         states: list[Vector] = []
         inner_w: list[Vector] = []
@@ -117,11 +104,7 @@ class Stepper:
     def _error(
         self, start_k: Vector, inner_w: list[Vector], pieces_w: list[Vector], time_s: float, step_s: float
     ) -> float:
-        """Largest error by the scheme of the next order, damped as the stages are.
-
-        As in the stages, sums over pieces come from what the pieces exchange: in those of the nodes' flows, the
-        round-off of conduction is as large as a small error where a step is long for the mesh.
-        """
+        """Largest error by the scheme of the next order; sums over pieces come from what they exchange."""
         system, scheme = self._system, self.scheme
         assert scheme.estimate is not None
         implicit = scheme.weights[-1][-1]

@@ -115,13 +115,10 @@ class _Taken:
 class _March:
     """Takes steps.
 
-    Equal steps of backward Euler are limited to the range that temperatures may have, that of the step's start and of
-    all surroundings; those of other schemes are watched only. An adaptive or given step whose result leaves the range
-    is taken with the limiter's backward Euler instead; of an adaptive one the difference between both schemes is then
-    the error estimate. What the limiter changes is the mesh's error, not the step's, and no part of it: it would ask
-    for ever shorter steps. So nothing overshoots by more than a thousandth of the tolerance or a millionth of the
-    range, and second order returns as soon as it is safe. No adaptive step is longer than effects can be followed by,
-    so that none steps over a day of sunshine.
+    Equal steps of backward Euler are limited to the range that temperatures may have. An adaptive or given step that
+    leaves the range is taken with the limiter's backward Euler instead; the difference between both schemes is then the
+    error estimate. What the limiter changes is the mesh's error and no part of the step's. No adaptive step is longer
+    than effects can be followed by.
     """
 
     def __init__(

@@ -36,13 +36,7 @@ class HeatSystem:
     def __init__(
         self, problem: HeatProblem, *, lumped: bool = True, lumped_boundary: bool | None = None, order: int = 1
     ) -> None:
-        """Turn effects into terms, terms into forms, and assemble the stiffness.
-
-        Args:
-            problem: The body, its materials and the effects.
-            lumped: Lump the mass matrix; of linear tetrahedra only.
-            lumped_boundary: Evaluate boundary exchange at the nodes; None: on linear tetrahedra.
-            order: 1 for linear tetrahedra, 2 for quadratic ones.
+        """Turn effects into terms and forms, and assemble the stiffness; options are those of `Space`.
 
         Raises:
             HeatError: An effect names what the mesh does not have, or quadratic tetrahedra are to be lumped.
@@ -198,11 +192,9 @@ class HeatSystem:
         return total
 
     def exchanged_heat(self, relative_k: Vector, time_s: float) -> tuple[Vector, Vector]:
-        """Heat that flows into each node from outside the body, load - R T + radiation(T).
+        """Heat from outside the body into each node, load - R T + radiation(T), and the sum of sizes added up, [W].
 
-        Returns:
-            heat: Shape (n,), [W].
-            bound: Sum of the sizes of all that was added up; round-off in `heat` is a few eps of it. Shape (n,), [W].
+        Round-off in the first is a few eps of the second.
         """
         heat = self.load(time_s).copy()
         bound = np.abs(heat)
@@ -217,13 +209,9 @@ class HeatSystem:
         return heat, bound
 
     def net_heat(self, relative_k: Vector, time_s: float) -> tuple[Vector, Vector]:
-        """Heat that flows into each node from outside and from its neighbours, `exchanged_heat` - K T.
+        """Heat into each node from outside and from its neighbours, `exchanged_heat` - K T, and its bound, [W].
 
         What keeps fixed nodes fixed is not in it.
-
-        Returns:
-            heat: Shape (n,), [W].
-            bound: As in `exchanged_heat`.
         """
         heat, bound = self.exchanged_heat(relative_k, time_s)
         conducted, size = self.conducted_heat(relative_k)
@@ -256,10 +244,7 @@ class HeatSystem:
     def group_heat_w(self, relative_k: Vector, time_s: float, *, radiating_k: Vector | None = None) -> Vector:
         """Heat flow into the body of each group but those of fixed nodes, [W].
 
-        Args:
-            relative_k: Temperatures, relative to the reference, shape (n,), [K].
-            time_s: Time.
-            radiating_k: Temperatures of radiation, such as those of a mean fourth power; None: the same.
+        `radiating_k` are temperatures of radiation, such as those of a mean fourth power; None: the same.
         """
         radiating_k = relative_k if radiating_k is None else radiating_k
         given = (form.group_heat_w(relative_k, time_s) for form in (*self._robin, *self._loads))

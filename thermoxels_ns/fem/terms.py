@@ -15,13 +15,17 @@ from thermoxels_ns.fem.selection import Selection
 
 
 @dataclass(frozen=True)
-class RobinTerm:
-    """q = h (T_ambient - T) through boundary triangles, positive into the body."""
-
+class _OnFacets:
     effect: str
     """Label of the effect that it comes from."""
     facets: npt.NDArray[np.int64]
     """Numbers of boundary triangles, shape (k,)."""
+
+
+@dataclass(frozen=True)
+class RobinTerm(_OnFacets):
+    """q = h (T_ambient - T) through boundary triangles, positive into the body."""
+
     coefficient_w_m2k: Bounded
     """h, [W / (m2 K)]."""
     ambient_c: Bounded
@@ -29,25 +33,17 @@ class RobinTerm:
 
 
 @dataclass(frozen=True)
-class FluxTerm:
+class FluxTerm(_OnFacets):
     """A given heat flux through boundary triangles, positive into the body."""
 
-    effect: str
-    """Label of the effect that it comes from."""
-    facets: npt.NDArray[np.int64]
-    """Numbers of boundary triangles, shape (k,)."""
     factors: tuple[Bounded, ...]
     """The heat flux is the product of these, [W / m2]."""
 
 
 @dataclass(frozen=True)
-class RadiationTerm:
+class RadiationTerm(_OnFacets):
     """q = sigma eps (T_s^4 - T^4) through boundary triangles, temperatures in kelvin, positive into the body."""
 
-    effect: str
-    """Label of the effect that it comes from."""
-    facets: npt.NDArray[np.int64]
-    """Numbers of boundary triangles, shape (k,)."""
     emissivity: Bounded
     """eps, [1]."""
     surroundings_c: Bounded
@@ -69,13 +65,9 @@ class SourceTerm:
 
 
 @dataclass(frozen=True)
-class FixedTerm:
+class FixedTerm(_OnFacets):
     """Given temperatures at the nodes of boundary triangles."""
 
-    effect: str
-    """Label of the effect that it comes from."""
-    facets: npt.NDArray[np.int64]
-    """Numbers of boundary triangles, shape (k,)."""
     temperature_c: Bounded
     """Temperature, [degrees Celsius]."""
 

@@ -218,11 +218,7 @@ class _Run:
         return f"{what}, more than the {describe_bytes(self._memory_bytes)} allowed"
 
     def close(self, failure: str, allow_unmet: bool) -> ToleratedSolution:
-        """Choose the smallest solution whose error is allowed, or else the best, and say how it ended.
-
-        Args:
-            failure: Why the tolerance was not met, or nothing.
-            allow_unmet: Return a solution even so.
+        """Choose the smallest solution whose error is allowed, or else the best; `failure` says why none is.
 
         Raises:
             HeatError: The tolerance was not met, or nothing was solved at all.
@@ -322,8 +318,7 @@ class _Refinable:
 def _solve_in_time(run: _Run, steps: AdaptiveSteps, progress: Callable[[float, int], None] | None) -> str:
     """Follow a body through time well enough; returns why that was not possible, or nothing.
 
-    Choices (m, j) have the mesh size halved m times and the steps j times. Their error is
-    of_mesh * HALVED^m + of_steps * HALVED^j, and the difference of two of them tells the unknown parts.
+    The error of m halvings of the mesh and j of the steps is of_mesh * HALVED^m + of_steps * HALVED^j.
     """
     failure = run.lacks_memory(1, 1, steps.num_times)
     if failure:
