@@ -27,12 +27,11 @@ from scipy import sparse
 from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients, LinearSolver
 from thermoxels_ns.fem.forms import FixedNodes
 from thermoxels_ns.fem.p1_kernels import lumped_mass, product_and_bound, stiffness_matrix
-from thermoxels_ns.fem.pieces import Pieces
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.schemes import BACKWARD_EULER
 from thermoxels_ns.fem.stepper import Stepper
 from thermoxels_ns.fem.stepping import solve_heat
-from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.fem.system import HeatSystem, Pieces
 from thermoxels_ns.heat.scene_file import load_heat_scene
 from thermoxels_ns.heat.screening import screen
 from thermoxels_ns.mesh.boundary.patches import default_patches

@@ -227,8 +227,8 @@ def cube() -> tuple[sparse.csr_matrix, np.ndarray]:
     return system.matrix(0.0, np.inf), system.load(0.0)
 
 
-def by_multigrid(matrix: sparse.csr_matrix, b: np.ndarray, start: np.ndarray | None = None) -> LinearSolution:
-    return ConjugateGradients(matrix, Multigrid(matrix), max_iterations=500).solve(b, start)
+def by_multigrid(matrix: sparse.csr_matrix, b: np.ndarray) -> LinearSolution:
+    return ConjugateGradients(matrix, Multigrid(matrix), max_iterations=500).solve(b)
 
 
 def test_the_number_of_threads_changes_no_bit(cube) -> None:

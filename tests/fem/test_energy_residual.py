@@ -9,11 +9,10 @@ import pytest
 
 from tests.support.heat_meshes import SIDES, box_mesh
 from thermoxels_ns.fem import steady
-from thermoxels_ns.fem.heat_balance import HeatBalance
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.solution import EffectHeat
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.stepping import HeatBalance, solve_heat
 from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, Radiation
 from thermoxels_ns.heat.materials import Material
 

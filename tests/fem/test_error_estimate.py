@@ -23,10 +23,6 @@ def exact(p: np.ndarray) -> np.ndarray:
     return np.cos(np.pi * p[:, 0]) * np.sin(np.pi * p[:, 1]) * np.exp(p[:, 2])
 
 
-ENERGY = (np.exp(2.0) - 1.0) / 8.0 * (2.0 * np.pi**2 + 1.0)
-"""integral |grad u|^2 over the unit cube for the function above."""
-
-
 def smooth(parts: int) -> HeatProblem:
     axis = np.linspace(0, 1, parts + 1)
     given = Varying(lambda places, t: exact(places.points_m), in_time=False)

@@ -31,13 +31,10 @@ def test_a_table_is_straight_from_entry_to_entry_and_held_outside() -> None:
 @pytest.mark.parametrize(
     ("times_s", "values"),
     [
-        ([0.0], [1.0]),
         ([0.0, 1.0], [1.0]),
         ([1.0, 0.0], [1.0, 2.0]),
-        ([0.0, 0.0], [1.0, 2.0]),
         ([0.0, np.nan], [1, 2]),
         (["a", "b"], [1.0, 2.0]),
-        ([0.0, [1.0, 2.0]], [1.0, 2.0]),
     ],
 )
 def test_a_table_that_is_none_is_refused(times_s, values) -> None:

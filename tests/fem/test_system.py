@@ -8,7 +8,7 @@ import pytest
 from tests.support.heat_matrices import assemble
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.heat.effects import (
@@ -168,7 +168,7 @@ def test_what_changes_in_time_is_assembled_again(box, concrete) -> None:
 def test_labels_differ_even_where_a_patch_is_named_like_a_number() -> None:
     """Two equal labels would count the heat of both effects twice."""
     from tests.support.heat_meshes import box_mesh
-    from thermoxels_ns.fem.problem import HeatProblem, effect_labels
+    from thermoxels_ns.fem.problem import HeatProblem
     from thermoxels_ns.heat.effects import Convection
 
     side = [0.0, 0.1]

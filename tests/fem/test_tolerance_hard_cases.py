@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from tests.support.heat_meshes import box_mesh
-from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.tolerance import Tolerance, ToleratedSolution, solve_to_tolerance
-from thermoxels_ns.heat.effects import Convection, Effect, HeatFlux
+from thermoxels_ns.heat.effects import Convection, Effect
 from thermoxels_ns.heat.materials import Material
 
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
@@ -36,15 +34,3 @@ def test_an_effect_that_acts_nowhere_brings_nothing(tolerance_k) -> None:
     assert found.met and not found.solution.effects[1].heat_w.any()
     alone = followed(tolerance_k, CONCRETE, air)
     np.testing.assert_array_equal(found.solution.temperature_c, alone.solution.temperature_c)
-
-
-def test_heat_that_nothing_can_store_is_refused() -> None:
-    with pytest.raises(HeatError, match="heat problem: expected heat capacity"):
-        followed(0.5, EMPTY, HeatFlux(("x0",), 100.0))
-
-
-@pytest.mark.parametrize(("resolution_s", "said"), [(np.inf, True), (600.0, False)])
-def test_what_may_be_stepped_over_is_said(resolution_s, said) -> None:
-    sun = Varying(lambda _, time_s: 100.0 * np.sin(time_s / HOUR_S), resolution_s=resolution_s)
-    status = followed(5.0, CONCRETE, HeatFlux(("x0",), sun)).solution.status
-    assert ("Nothing says how fast heat flux on x0 may change with time" in status) is said

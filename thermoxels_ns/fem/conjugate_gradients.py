@@ -187,10 +187,11 @@ class LinearSolver:
         """What preconditioned the last solution, for reports."""
         return self._solver.name
 
-    def solve(self, right_hand_side: Vector, start: Vector | None = None) -> LinearSolution:
-        """Solve A x = b, from a start if there is one."""
+    def solve(self, right_hand_side: Vector) -> LinearSolution:
+        """Solve A x = b."""
+        start = None
         if self._swept and not self._slow:
-            found = self._solver.solve(right_hand_side, start)
+            found = self._solver.solve(right_hand_side)
             self._slow = found.iterations > PATIENCE_WHEN_REPEATED
             # A breakdown after few iterations is not slowness, and no preconditioner mends it.
             if found.converged or found.iterations < PATIENCE:
@@ -355,17 +356,11 @@ class _CoarsestLevel:
 
 
 def is_solved(error: float, tolerance: float, right_hand_side: float, matrix_times_solution: float) -> bool:
-    """Whether a residual is good enough.
+    """Whether a residual ||b - A x|| of x itself is good enough; `matrix_times_solution` is ||A|| ||x||.
 
-    It must be within ten times the tolerance, because the residual of a recursion drifts away from b - A x, or its
-    backward error ||b - A x|| / (||A|| ||x|| + ||b||) must be at the level of round-off (1e-14). Of a matrix that is
-    all but singular, a huge x has a small backward error and need not solve anything: half of b must be explained too.
-
-    Args:
-        error: ||b - A x||, from x itself.
-        tolerance: What was asked for.
-        right_hand_side: ||b||.
-        matrix_times_solution: ||A|| ||x||.
+    It must be within ten times the tolerance, because the residual of a recursion drifts away from it, or its backward
+    error must be at the level of round-off. Of a matrix that is all but singular, a huge x has a small backward error
+    and need not solve anything: half of b must be explained too.
 
     >>> is_solved(5e-12, 1e-12, 1.0, 1.0), is_solved(1e-3, 1e-12, 1.0, 1e12), is_solved(0.9, 1e-12, 1.0, 1e15)
     (True, True, False)

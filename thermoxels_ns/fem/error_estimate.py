@@ -55,14 +55,10 @@ class ErrorSize:
 
 
 def richardson(difference: float, ratio: float) -> float:
-    """Estimate the error of the finer of two solutions.
+    """Estimate the error of the finer of two solutions from their difference, in any unit.
 
-    If the finer one has a share `ratio` of the error of the coarser one, they differ by (1 - ratio) of that error
-    (Richardson 1911). Galerkin's heat flows approach the exact one from one side, so errors do share their sign.
-
-    Args:
-        difference: Size of the difference between both, in any unit.
-        ratio: Error of the finer one over that of the coarser one, above 0 and below 1.
+    If the finer one has a share `ratio`, above 0 and below 1, of the error of the coarser one, they differ by (1 -
+    ratio) of that error (Richardson 1911). Galerkin's heat flows approach the exact one from one side.
 
     Raises:
         HeatError: The ratio is out of range.
@@ -114,10 +110,6 @@ def recovered_error_w_k(problem: HeatProblem, solution: SteadySolution) -> Vecto
     The recovered gradient interpolates means of grad T over the tetrahedra around each corner, weighted by volume. The
     means are taken in every region apart, because gradients jump where the conductivity does.
 
-    Args:
-        problem: What was solved.
-        solution: Its steady state, with linear or quadratic tetrahedra.
-
     Raises:
         HeatError: The solution is not of this problem's mesh.
     """
@@ -133,17 +125,11 @@ def recovered_error_w_k(problem: HeatProblem, solution: SteadySolution) -> Vecto
 
 
 def error_ratios(before_w_k: Vector, after_w_k: Vector, decrease: float | None = None) -> ErrorSize:
-    """Tell what is left of the errors of a coarser solution in a finer one, for `richardson`, from recovered errors.
+    """Tell what is left of the errors of a coarser solution in a finer, quadratic one, from their recovered errors.
 
     The error of a heat flow is of second order in that of the flux. So is that of a temperature from one mesh to a
-    finer one. Where a given temperature meets convection at an edge, nodes gain more than that, which the difference
-    between two levels shows; the mean of both, kept above a least ratio, is within a factor of two of the true one.
-
-    Args:
-        before_w_k: `recovered_error_w_k` of the coarser solution.
-        after_w_k: The same of the finer one, which has quadratic tetrahedra.
-        decrease: Difference of the temperatures of both solutions over that of the coarser one and the one before it;
-            None: the coarser solution has linear tetrahedra.
+    finer one; where a given temperature meets convection at an edge, nodes gain more. `decrease`, the difference of
+    both solutions over the one before, shows it; None: the coarser solution has linear tetrahedra.
     """
     before, after = float(before_w_k.sum()), float(after_w_k.sum())
     share = after / before if before > 0.0 else 0.0

@@ -117,6 +117,8 @@ class _Boundary:
 class RobinForm(_Boundary):
     """h (T_ambient - T): a matrix and a load."""
 
+    kind = "robin"
+
     def __init__(self, term: RobinTerm, space: Space, reference_c: float) -> None:
         super().__init__(term.effect, term.facets, space)
         self.term, self._reference_c = term, reference_c
@@ -148,6 +150,8 @@ class RobinForm(_Boundary):
 class FluxForm(_Boundary):
     """A given heat flux: a load."""
 
+    kind = "flux"
+
     def __init__(self, term: FluxTerm, space: Space) -> None:
         super().__init__(term.effect, term.facets, space)
         self._factors = term.factors
@@ -175,6 +179,8 @@ class FluxForm(_Boundary):
 
 class SourceForm:
     """A given heat source: a load."""
+
+    kind = "source"
 
     def __init__(self, term: SourceTerm, space: Space) -> None:
         self.effect = term.effect
@@ -393,12 +399,8 @@ def effect_forms(
 ) -> EffectForms:
     """Turn effects into terms and terms into forms; what acts nowhere has none.
 
-    Args:
-        problem: The effects.
-        space: The nodes.
-        reference_c: What temperatures are relative to, [degrees Celsius].
-        assembled: Where fixed temperatures are counted, which are ready at once; None: nowhere.
-        where: Patches and regions that effects are looked for in, if others than those that `space` adds up heat by.
+    `assembled` counts fixed temperatures, which are ready at once. Effects are looked for in the patches and regions of
+    `where`, if others than those that `space` adds up heat by.
 
     Raises:
         HeatError: An effect names what the mesh does not have.

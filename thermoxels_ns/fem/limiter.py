@@ -97,15 +97,8 @@ def solve_in_range(
 ) -> tuple[Solved, HeatSystem | None]:
     """Solve again without positive off-diagonals of nodes out of range until none is, or nothing is left to leave out.
 
-    Args:
-        entries: The positive off-diagonals, none of them left out.
-        first: The solution of the unchanged equations.
-        low: Lowest temperature that is in range, [K].
-        high: Highest one, [K].
-        solve: Solves limited equations; gets the last solution too.
-
-    Returns:
-        The last solution with the iterations of all, and the equations that it fulfils; None: the unchanged ones.
+    `solve` gets the limited equations and the last solution. Returns the last solution with the iterations of all, and
+    the equations that it fulfils; None: the unchanged ones.
     """
     solution, limited = first, None
     while solution.converged:
@@ -157,16 +150,13 @@ def is_in_range(step: Step, low: float, high: float) -> bool:
 class Limiter:
     """Steps of backward Euler that keep temperatures in range.
 
-    Where faces meet at an obtuse angle, the stiffness matrix has an entry above 0 off its diagonal: heat flows from the
-    colder to the warmer of two nodes. With smooth temperatures that is right, because flows along other edges outweigh
-    it; beside a jump that the mesh cannot resolve, a temperature may leave the range that it came from and that
-    surrounds it.
+    Where faces meet at an obtuse angle, the stiffness matrix has an entry above 0 off its diagonal: beside a jump that
+    the mesh cannot resolve, a temperature may leave the range that it came from and that surrounds it.
 
-    A step of backward Euler, or a steady state, in which a temperature has left is solved again without the positive
-    off-diagonals of the nodes that left, and again if others leave then. Without all of them the matrix is an M-matrix,
-    of which no temperature leaves its range (Ciarlet and Raviart, Computer Methods in Applied Mechanics and Engineering
-    2, 1973), so it ends. Where the mesh resolves the temperatures nothing is left out, and the order of the error is
-    what it was. Steps with entries left out were measured to be of first order too.
+    A step in which one has left is solved again without the positive off-diagonals of the nodes that left, and again if
+    others leave then. Without all of them the matrix is an M-matrix, of which no temperature leaves its range (Ciarlet
+    and Raviart, Computer Methods in Applied Mechanics and Engineering 2, 1973), so it ends. Where the mesh resolves the
+    temperatures nothing is left out. Steps with entries left out were measured to be of first order too.
     """
 
     def __init__(self, system: HeatSystem, *, relative_tolerance: float) -> None:

@@ -34,17 +34,14 @@ def peak_bytes(
 ) -> float:
     """Estimate the most memory that a computation takes besides the problem itself, [bytes].
 
-    The arrays that are alive together are counted: matrices by the number of nodes and of couplings between them,
-    vectors by the number of nodes. Couplings are counted on a sample, because lattices have none along edges between
-    right angles. Measured on lattices and on conforming meshes; interpreter and libraries, which need about 150 MB,
-    come on top, and so does multigrid, which takes over where conjugate gradients are slow and needs about as much as
-    the matrices.
+    The arrays that are alive together are counted; couplings on a sample, because lattices have none along edges
+    between right angles. Interpreter and libraries, which need about 150 MB, come on top, and so does multigrid, which
+    takes over where conjugate gradients are slow and needs about as much as the matrices.
 
     Args:
         problem: Body, materials and effects.
         order: 1 for linear tetrahedra, 2 for quadratic ones.
-        refinements: How often the mesh size of the problem is halved first, which makes eight tetrahedra, and about
-            eight nodes, of each.
+        refinements: How often the mesh size of the problem is halved first, which makes eight tetrahedra of each.
         times: Number of times whose temperatures are kept; 1 for a steady state.
         adaptive: Whether the length of the time steps changes, so that matrices of two lengths are kept.
 
@@ -56,7 +53,9 @@ def peak_bytes(
     if times < 1:
         raise HeatError("times", expected="at least 1", got=repr(times), remedy="Count the start as one.")
     mesh, finer = problem.mesh, 8.0**refinements
-    nodes, edges = float(len(mesh.points_m)), _count_edges(mesh)
+    nodes = float(len(mesh.points_m))
+    # Euler's formula, nodes - edges + faces - tetrahedra = 1; each tetrahedron has four halves of a face.
+    edges = nodes + len(mesh.tets) + len(mesh.facets) // 2
     states = 8.0 * times * nodes
     if order == 2:
         matrices = _BYTES_PER_TET_OF_ORDER_2 * len(mesh.tets) + _BYTES_PER_UNKNOWN_OF_ORDER_2 * (nodes + edges)
@@ -88,11 +87,6 @@ def check_memory(needed: float, allowed: float, remedy: str) -> None:
     if needed > allowed:
         expected, got = f"at most {describe_bytes(allowed)}", f"about {describe_bytes(needed)}"
         raise HeatError("memory of the heat problem", expected=expected, got=got, remedy=remedy)
-
-
-def _count_edges(mesh: TetMesh) -> float:
-    """Edges by Euler's formula, nodes - edges + faces - tetrahedra = 1; each tetrahedron has four halves of a face."""
-    return float(len(mesh.points_m) + len(mesh.tets) + len(mesh.facets) // 2)
 
 
 def _coupled_share(mesh: TetMesh) -> float:

@@ -81,23 +81,18 @@ def stiffness_matrix(
     *,
     edges: MeshEdges | None = None,
 ) -> sparse.csr_matrix:
-    """Assemble K, entries k * integral(grad phi_i . grad phi_j).
+    """Assemble K, entries k * integral(grad phi_i . grad phi_j), shape (n, n), [W / K], symmetric bit for bit.
 
-    It is what `space.conduction` gives through scikit-fem. Whole runs take a tenth of the time and of the memory of a
-    scikit-fem script with it (`tests/benchmarks/heat_speed.py`).
-
-    In a tetrahedron with faces opposite i and j of outward area vectors n_i and n_j, grad phi_i = -n_i / (3 V): the
-    entry is k n_i . n_j / (9 V), and 0 where the two faces are at a right angle. An angle that is right up to the
-    round-off of the coordinates counts as right, so that the many right angles of a lattice give no entries.
+    It is what `space.conduction` gives through scikit-fem, in a tenth of the time and of the memory of whole runs
+    (`tests/benchmarks/heat_speed.py`). In a tetrahedron with faces opposite i and j of outward area vectors n_i and
+    n_j, the entry is k n_i . n_j / (9 V), and 0 where the angle between the faces is right up to round-off of the
+    coordinates.
 
     Args:
         points_m: Nodes, shape (n, 3), [m].
         tets: Node numbers, shape (t, 4), positively oriented.
         conductivity_w_mk: Thermal conductivity, [W / (m K)], one for all or one per tetrahedron, shape (t,).
         edges: The edges of the mesh, if they have been found already.
-
-    Returns:
-        K, symmetric bit for bit, rows sum to 0 up to round-off, shape (n, n), [W / K].
 
     Raises:
         HeatError: If an array has the wrong shape, a conductivity is not above 0, a node number is out of range or a
@@ -151,14 +146,14 @@ def mass_matrix(
     return _symmetric_matrix(edges, along, 0.4 * nodal), nodal
 
 
-def count_flat_tets(points_m: npt.NDArray[np.float64], tets: npt.NDArray[np.int64]) -> int:
-    """Count tetrahedra that are inverted, or flat to round-off of their own size; all numbers are in range.
+def refuse_flat_tets(points_m: npt.NDArray[np.float64], tets: npt.NDArray[np.int64]) -> None:
+    """Check a mesh.
 
-    >>> count_flat_tets(np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 1, 2, 3], [1, 0, 2, 3]]))
-    1
+    Raises:
+        HeatError: Points or tetrahedra have the wrong shape or range, or tetrahedra are inverted or flat.
     """
     points_m, tets, unit_m = _checked(points_m, tets)
-    return int(_count_flat(points_m, tets, 1.0 / unit_m))
+    _refuse_flat(_count_flat(points_m, tets, 1.0 / unit_m), len(tets))
 
 
 def product_and_bound(

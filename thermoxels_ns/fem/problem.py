@@ -15,7 +15,7 @@ import numpy.typing as npt
 from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.p1_kernels import count_flat_tets
+from thermoxels_ns.fem.p1_kernels import refuse_flat_tets
 from thermoxels_ns.fem.terms import Effect
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -168,27 +168,15 @@ class HeatProblem:
 
     def __post_init__(self) -> None:
         points, tets = self.mesh.points_m, self.mesh.tets
-        remedy = "Build the mesh with thermoxels_ns.mesh."
-        check_shape("mesh points", points, (None, 3), remedy, HeatError)
-        check_finite("mesh points", points, remedy, HeatError)
-        check_shape("mesh tets", tets, (None, 4), remedy, HeatError)
-        if len(tets) == 0 or tets.min() < 0 or tets.max() >= len(points):
-            raise HeatError(
-                "mesh tets",
-                expected=f"at least one tetrahedron with node numbers from 0 to {len(points) - 1}",
-                got=f"{len(tets)} tetrahedra"
-                + (f" with node numbers from {tets.min()} to {tets.max()}" if len(tets) else ""),
-                remedy=remedy,
-            )
+        if len(tets) == 0:
+            remedy = "Build the mesh with thermoxels_ns.mesh."
+            raise HeatError("mesh tets", expected="at least one tetrahedron", got="none", remedy=remedy)
+        refuse_flat_tets(points, tets)
         unused = len(points) - np.count_nonzero(np.bincount(tets.ravel(), minlength=len(points)))
         if unused:
-            raise HeatError(
-                "mesh points",
-                expected="every node in at least one tetrahedron",
-                got=f"{unused} of {len(points)} in none",
-                remedy="Remove the unused nodes; they have no heat capacity.",
-            )
-        self._check_volumes(remedy)
+            expected, got = "every node in at least one tetrahedron", f"{unused} of {len(points)} in none"
+            remedy = "Remove the unused nodes; they have no heat capacity."
+            raise HeatError("mesh points", expected=expected, got=got, remedy=remedy)
         self._check_temperatures()
         self._check_materials()
         self._check_effects()
@@ -259,28 +247,14 @@ class HeatProblem:
             raise HeatError("up", expected=expected, got=repr(self.up), remedy=remedy)
         object.__setattr__(self, "up", tuple(float(part) / length for part in self.up))
 
-    def _check_volumes(self, remedy: str) -> None:
-        bad = count_flat_tets(self.mesh.points_m, self.mesh.tets)
-        if bad:
-            raise HeatError(
-                "mesh tets",
-                expected="volumes above 0",
-                got=f"{bad} of {len(self.mesh.tets)} flat or inverted",
-                remedy=remedy,
-            )
-
     def _check_temperatures(self) -> None:
         name = "mesh temperature_c" if self.initial_temperature_c is None else "initial_temperature_c"
         remedy = "Give one temperature in degrees Celsius per mesh node."
         start = check_shape(name, self.start_c, (len(self.mesh.points_m),), remedy, HeatError)
         check_finite(name, start, remedy, HeatError)
         if start.min() < -ZERO_CELSIUS_K:
-            raise HeatError(
-                name,
-                expected=f"temperatures above absolute zero ({-ZERO_CELSIUS_K} C)",
-                got=f"{start.min():.6g} C",
-                remedy=remedy,
-            )
+            expected = f"temperatures above absolute zero ({-ZERO_CELSIUS_K} C)"
+            raise HeatError(name, expected=expected, got=f"{start.min():.6g} C", remedy=remedy)
 
 
 def effect_labels(problem: HeatProblem) -> tuple[str, ...]:

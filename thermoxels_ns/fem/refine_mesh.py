@@ -13,21 +13,15 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 
 def refine_mesh(mesh: TetMesh) -> TetMesh:
-    """Halve all edges of a mesh.
+    """Halve all edges of a mesh; it stays conforming, and the body stays the same.
 
     A tetrahedron loses its four corners to children of its own shape. What remains is an octahedron, cut into four
     along the one of its three diagonals that leaves the smallest largest angle between faces. Where a tetrahedron is
-    one of the six of a cube (Kuhn), so are its children, and no angle becomes obtuse. The body stays the same: new
-    nodes lie in the middles of edges, also on the boundary.
+    one of the six of a cube (Kuhn), so are its children, and no angle becomes obtuse.
 
-    Args:
-        mesh: The mesh. Nodes keep their numbers; each edge's middle is numbered after them, in the order of
-            `mesh_edges`.
-
-    Returns:
-        A conforming mesh. Children inherit regions, tags, patches, normals and area factors, and stand in the order of
-        their parents; temperatures and colours of new nodes are means, and a new node counts as observed if both ends
-        of its edge are.
+    Nodes keep their numbers; the middles of `mesh_edges` follow. Children inherit regions, tags, patches, normals and
+    area factors, and stand in the order of their parents; temperatures and colours of new nodes are means, and a new
+    node counts as observed if both ends of its edge are.
     """
     edges = mesh_edges(mesh.tets, len(mesh.points_m))
     num_nodes, low, high = len(mesh.points_m), edges.smaller_nodes(), edges.other

@@ -21,11 +21,7 @@ class Selection:
     """The named parts of a mesh and their geometry."""
 
     def __init__(self, mesh: TetMesh, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> None:
-        """Check the tags of a mesh.
-
-        Args:
-            mesh: The body.
-            up: Unit vector that points up; functions of place are told.
+        """Check the tags of a mesh; `up` is a unit vector, which functions of place are told.
 
         Raises:
             HeatError: Facets or tags have the wrong shape, or refer to what is not there.

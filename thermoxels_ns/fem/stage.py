@@ -13,7 +13,6 @@ from scipy import sparse
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.conjugate_gradients import LinearSolution
 from thermoxels_ns.fem.forms import COLDEST_SLOPE_K
-from thermoxels_ns.fem.pieces import is_within
 from thermoxels_ns.fem.system import HeatSystem, SystemSolver
 
 Vector = npt.NDArray[np.float64]
@@ -58,7 +57,7 @@ class Residual:
     @property
     def is_round_off(self) -> bool:
         """Whether it is nothing but round-off, at every node and piece."""
-        return is_within(self.piece_heat_w, self.piece_round_off_w) and is_within(self.heat_w, self.round_off_w)
+        return _is_within(self.piece_heat_w, self.piece_round_off_w) and _is_within(self.heat_w, self.round_off_w)
 
     def is_small(self, heat_w: float, before: Residual) -> bool:
         """Whether nodes are within `heat_w` or round-off, and pieces are balanced or no longer get better."""
@@ -199,7 +198,7 @@ class Stage:
         held = np.where(self.floating, pieces.sums(held_w_k), 1.0)
         # In multiples of the row sums, this shifts the solution by a constant in each piece.
         rest_w = self.at_free(pieces.without_sums(self.floating, full_w, held_w_k, held))
-        if is_within(rest_w, residual.round_off_w, ROUND_OFF, residual.heat_w):
+        if _is_within(rest_w, residual.round_off_w, ROUND_OFF, residual.heat_w):
             linear = LinearSolution(np.zeros_like(rest_w), 0, 0.0, True, "Each piece changes as a whole.")
         else:
             linear = solver.solve(rest_w)
@@ -340,16 +339,11 @@ class _NewtonSolution:
 
 
 def newton(balance: _Balance, num_unknowns: int, *, relative_tolerance: float) -> _NewtonSolution:
-    """Find where the residual vanishes, from u = 0.
+    """Find where the residual vanishes, or is at most a share of the first one, from u = 0.
 
     Radiation grows with the temperature and its slope is symmetric, so the solution is the one minimum of a convex
     energy. Newton's direction always leads down, and how far to go is a search for the zero of one increasing function
     along it: no damping factor is guessed, and the method converges from any start.
-
-    Args:
-        equations: The balance.
-        num_unknowns: Length of u.
-        relative_tolerance: Stop when the residual is at most this share of the first one.
     """
     u = np.zeros(num_unknowns)
     residual = balance.residual(u)
@@ -398,3 +392,12 @@ def _length(balance: _Balance, u: Vector, direction: Vector) -> float:
 
 def _norm(vector: Vector) -> float:
     return float(np.sqrt(np.sum(np.square(vector))))
+
+
+def _is_within(values: Vector, bounds: Vector, slack: float = 0.0, sizes: Vector | None = None) -> bool:
+    """Whether |values| <= bounds + slack * |sizes| everywhere.
+
+    >>> _is_within(np.array([1.0, -2.0]), np.array([1.0, 2.0])), _is_within(np.array([np.nan]), np.array([1.0]))
+    (True, False)
+    """
+    return bool(np.all(np.abs(values) <= (bounds if sizes is None else bounds + slack * np.abs(sizes))))

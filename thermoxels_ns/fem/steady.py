@@ -190,13 +190,9 @@ def is_still(system: HeatSystem, relative_k: np.ndarray, time_s: float, relative
     return bool(np.all(apart_k <= share * np.abs(level_k[fixed]) + round_off_k) and np.all(np.abs(heat_w) <= allowed_w))
 
 
-def heat_of_groups_w(
-    system: HeatSystem, relative_k: np.ndarray, time_s: float, stored_w: np.ndarray | None = None
-) -> np.ndarray:
-    """Heat flow into the body of each group, fixed nodes included, shape (g,), [W]; what nodes store counts too."""
+def heat_of_groups_w(system: HeatSystem, relative_k: np.ndarray, time_s: float) -> np.ndarray:
+    """Heat flow into the body of each group in a steady state, fixed nodes included, shape (g,), [W]."""
     kept = -system.net_heat_at_fixed(relative_k, time_s)
-    if stored_w is not None:
-        kept = kept + stored_w[system.fixed.nodes]
     return np.concatenate([system.group_heat_w(relative_k, time_s), system.fixed.shares @ kept])
 
 

@@ -8,11 +8,11 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients, LinearSolver, TwoLevel
-from thermoxels_ns.fem.forms import FixedNodes, FluxForm, RobinForm, SourceForm, at_time, effect_forms
+from thermoxels_ns.fem.forms import FixedNodes, at_time, effect_forms
 from thermoxels_ns.fem.p1_kernels import product_and_bound
-from thermoxels_ns.fem.pieces import Pieces
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import Assembled
@@ -25,6 +25,46 @@ SystemSolver: TypeAlias = LinearSolver | ConjugateGradients
 
 _KEPT_RANGES = 64
 """Times at which the range of the surroundings is kept."""
+
+
+class Pieces:
+    """Numbers of the connected pieces that a body's nodes belong to, and sums over them.
+
+    >>> pieces = Pieces(sparse.csr_matrix([[2.0, -2.0, 0.0], [-2.0, 2.0, 0.0], [0.0, 0.0, 0.0]]))
+    >>> pieces.count, pieces.sums(np.array([1.0, 2.0, 4.0])).tolist()
+    (2, [3.0, 4.0])
+    """
+
+    def __init__(self, stiffness: sparse.csr_matrix) -> None:
+        """Find the pieces of a matrix whose links go both ways."""
+        # Links go both ways, so that strong connection is connection; for the undirected kind scipy would transpose.
+        count, number = connected_components(stiffness, directed=True, connection="strong")
+        self.count = int(count)
+        """How many there are."""
+        self.number: npt.NDArray[np.int32] = number
+        """Number of each node's piece, shape (n,)."""
+
+    def sums(self, nodal: Vector) -> Vector:
+        """Add up over each piece, shape (p,)."""
+        if self.count == 1:
+            return np.array([np.sum(nodal)])
+        return np.bincount(self.number, weights=nodal, minlength=self.count).astype(np.float64, copy=False)
+
+    def at_nodes(self, values: Vector) -> Vector:
+        """Values of the pieces where their nodes are; one value for all nodes if there is one piece."""
+        return values[self.number] if self.count > 1 else values
+
+    def touched(self, nodes: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+        """Mark the pieces that have any of the nodes, shape (p,)."""
+        marks = np.zeros(self.count, dtype=bool)
+        marks[self.number[nodes]] = True
+        return marks
+
+    def without_sums(self, floating: npt.NDArray[np.bool_], nodal: Vector, held: Vector, sums: Vector) -> Vector:
+        """Subtract multiples of `held`, whose sums over the pieces are `sums`, until floating pieces sum to 0."""
+        for _ in range(2):
+            nodal = nodal - self.at_nodes(np.where(floating, self.sums(nodal) / sums, 0.0)) * held
+        return nodal
 
 
 class HeatSystem:
@@ -226,13 +266,10 @@ class HeatSystem:
         nodes = self.fixed.nodes
         if len(nodes) == 0:
             return np.zeros(0)
-        from_nodes_w = self._rows_of_fixed() @ relative_k
-        return self.exchanged_heat(relative_k, time_s)[0][nodes] - from_nodes_w if self.exchanges else -from_nodes_w
-
-    def _rows_of_fixed(self) -> sparse.csr_matrix:
         if self._fixed_rows is None:
-            self._fixed_rows = sparse.csr_matrix(self._stiffness[self.fixed.nodes])
-        return self._fixed_rows
+            self._fixed_rows = sparse.csr_matrix(self._stiffness[nodes])
+        from_nodes_w = self._fixed_rows @ relative_k
+        return self.exchanged_heat(relative_k, time_s)[0][nodes] - from_nodes_w if self.exchanges else -from_nodes_w
 
     def radiation_magnitude(self, relative_k: Vector, time_s: float) -> Vector:
         """Sum of the sizes of what `radiation_load` adds up, shape (n,), [W]."""
@@ -298,15 +335,11 @@ class HeatSystem:
 
     def _sum_of_loads(self, in_time: bool, time_s: float) -> Vector:
         total = np.zeros(self.num_nodes)
-        for kind, form in self._kinds_of_loads():
+        for form in (*self._robin, *self._loads):
             if form.load_in_time == in_time:
-                with self.assembled.form(kind):
+                with self.assembled.form(form.kind):
                     total += form.load(time_s)
         return total
-
-    def _kinds_of_loads(self) -> list[tuple[str, RobinForm | FluxForm | SourceForm]]:
-        kinds: list[tuple[str, RobinForm | FluxForm | SourceForm]] = [("robin", form) for form in self._robin]
-        return kinds + [("source" if isinstance(form, SourceForm) else "flux", form) for form in self._loads]
 
 
 def _sum_of(first: sparse.csr_matrix | None, second: sparse.csr_matrix | None) -> sparse.csr_matrix | None:

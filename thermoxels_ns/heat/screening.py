@@ -15,11 +15,11 @@ from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients
 from thermoxels_ns.fem.limiter import holds_maximum_principle
 from thermoxels_ns.fem.p1_kernels import lumped_mass
-from thermoxels_ns.fem.pieces import Pieces
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.quantities import Bounded, Places
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.space import Space, sums_by_number
+from thermoxels_ns.fem.system import Pieces
 from thermoxels_ns.fem.terms import FixedTerm, FluxTerm, RobinTerm, SourceTerm, Term
 
 Vector = npt.NDArray[np.float64]
