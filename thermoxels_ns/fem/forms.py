@@ -102,7 +102,7 @@ class _Boundary:
     def matrix(self, coefficient_w_m2k: Vector) -> sparse.csr_matrix:
         """Entries integral(h phi_i phi_j), [W / K]; diagonal if points of integration are the nodes."""
         if self._space.lumped_boundary:
-            matrix = sparse.diags(self.vector(coefficient_w_m2k), format="csr")
+            matrix = sparse.csr_matrix(sparse.diags(self.vector(coefficient_w_m2k), format="csr"))
         else:
             coefficient = np.broadcast_to(coefficient_w_m2k, self.basis.dx.shape)
             matrix = sparse.csr_matrix(exchange.assemble(self.basis, coefficient=coefficient))
