@@ -64,11 +64,6 @@ def test_grown_sphere_has_neither_precision_nor_recall():
     assert score.mean_distance == pytest.approx(3.5 * H, rel=0.1)
 
 
-def test_nothing_scores_zero():
-    score = surface_fscore(np.zeros(LATTICE.cell_shape, dtype=bool), LATTICE, SPHERE, SEEN, TOLERANCE)
-    assert (score.precision, score.recall, score.fscore, score.mean_distance) == (0.0, 0.0, 0.0, None)
-
-
 def test_half_a_sphere_has_half_the_recall():
     cells = voxels(SPHERE)
     cells[:12] = False

@@ -11,7 +11,6 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh, check_similarity
 from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
-from thermoxels_ns.mesh.tetrahedra import FACET_BOX
 
 DENSE = SolidSelection(close_gaps=0, density_threshold=0.5)
 VOXEL = MeshOptions("voxel")
@@ -218,18 +217,6 @@ def test_boundary_is_tagged_with_normal_and_true_area(snapshot_of, mode):
     true_area = (facet_areas(mesh.points_m, mesh.facets) * boundary.area_factor).sum()
     radius = 5.3 + np.log(2.0) / 3.0  # where density is one half, [voxels]; a voxel is 0.5 * 2 wide
     assert true_area == pytest.approx(4 * np.pi * radius**2, rel=0.03 if mode == "conforming" else 0.04)
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_faces_of_the_box_are_tagged_and_flat(snapshot_of, mode):
-    mesh = build_mesh(carved(snapshot_of), DENSE, np.eye(4), MeshOptions(mode)).mesh
-    assert mesh.boundary is not None
-    cut = mesh.facet_tags == FACET_BOX
-    assert 0 < cut.sum() < len(cut)
-    assert np.abs(mesh.boundary.normal[cut]).max(axis=1) == pytest.approx(np.ones(cut.sum()))
-    assert np.all(mesh.boundary.area_factor[cut] == 1.0)
-    names = [mesh.boundary.patch_names[n] for n in np.unique(mesh.boundary.patch[cut])]
-    assert names == ["cut"]
 
 
 def test_colour_is_that_of_corners_with_density(snapshot_of):

@@ -100,18 +100,6 @@ def words(page: CapturePage) -> str:
     return re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", build_page(page)))
 
 
-def test_how_the_degrees_were_measured(page):
-    assert "thermal files TIFF" in words(page)
-    assert "computed with emissivity 0.95, reflected temperature 20 °C" in words(page)
-
-
-def test_how_sure_the_rig_is(page):
-    assert "a point&#39;s place is known to 0.33 thermal pixels" in words(page)
-    assert "Rig known" in words(with_scene(page, rig=replace(page.scene.rig, projection_sigma_px=np.nan)))
-    unsure = words(with_scene(page, rig=replace(page.scene.rig, determined=False, explanation="Too flat.")))
-    assert "not determined: the start value is kept" in unsure and "Too flat." in unsure
-
-
 def test_numbers_of_the_rig_have_their_errors_and_an_unsure_turn_its_reason(page):
     errors = {"rx": 0.003, "ry": 0.004, "rz": 0.012, "log_focal": 0.01, "cx": 0.42, "cy": 0.57}
     covariance = np.diag([errors.get(name, 0.0) ** 2 for name in PARAMETERS])

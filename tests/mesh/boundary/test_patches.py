@@ -175,16 +175,6 @@ regions:
     assert apply_regions(PatchRules(), centroids)[1] == ("solid",)
 
 
-def test_rules_by_colour_need_colours() -> None:
-    rules = PatchRules((Rule("red", colour=(1.0, 0.0, 0.0)),), (Rule("red", colour=(1.0, 0.0, 0.0)),))
-    with pytest.raises(MeshError, match=r"patch red: expected a mesh with colours.*got a mesh without"):
-        named(rules)
-    with pytest.raises(MeshError, match="region red: expected a mesh with colours"):
-        apply_regions(rules, np.zeros((2, 3)))
-    with pytest.raises(MeshError, match="colours: expected shape"):
-        apply_regions(rules, np.zeros((2, 3)), np.zeros((1, 3)))
-
-
 def test_the_example_is_read_and_does_what_its_comments_say() -> None:
     rules = load_patch_rules(EXAMPLE)
     assert [rule.name for rule in rules.patches] == ["window", "window", "roof", "brick", "plaster"]

@@ -71,10 +71,3 @@ def test_ply_without_photographs_is_coloured_by_temperature(tmp_path, box_mesh):
     assert brightness[order[-1]] > 4.0 * brightness[order[0]]
     comment = f"inferno from {box_mesh.temperature_c.min():.6g} to {box_mesh.temperature_c.max():.6g} degrees Celsius"
     assert comment.encode() in (tmp_path / "box.ply").read_bytes()
-
-
-@pytest.mark.parametrize(("colouring", "message"), [("photographs", "a mesh whose nodes"), ("true", "got 'true'")])
-def test_colours_that_are_not_there_are_refused(tmp_path, box_mesh, colouring, message):
-    with pytest.raises(MeshError, match=message):
-        write_ply(tmp_path / "box.ply", box_mesh, colouring=colouring)
-    assert not list(tmp_path.iterdir())

@@ -54,13 +54,6 @@ def test_zero_density_is_never_solid(snapshot_of):
         assert select_solid(snapshot, selection).cells[:, 0, 0].tolist() == [False, False, False, True]
 
 
-def test_ties_at_the_start_value_do_not_fill_the_box(snapshot_of):
-    # 19 of 20 voxels still have the density training starts with: the 90th percentile is that value.
-    snapshot = snapshot_of(cells_along_x([0.25] * 19 + [7.0]))
-    solid = select_solid(snapshot, SolidSelection(close_gaps=0, density_percentile=90.0))
-    assert np.flatnonzero(solid.cells).tolist() == [19]
-
-
 def test_empty_names_threshold_maximum_and_remedy(snapshot_of):
     with pytest.raises(MeshError, match=r"threshold 9.*highest density.*is 3\..*--density-threshold"):
         select_solid(snapshot_of(np.full((3, 3, 3), 3.0)), SolidSelection(close_gaps=0, density_threshold=9.0))
