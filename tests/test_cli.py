@@ -60,14 +60,6 @@ def test_synthetic_writes_the_scene_that_was_asked_for(tmp_path, capsys):
     assert f"Train with: ns-train thermoxels --data '{folder}'" in capsys.readouterr().out
 
 
-def test_synthetic_with_a_camera_for_each_band(tmp_path):
-    options = ["--own-thermal-camera", "True", "--thermal-width", "10"]
-    assert cli.main(["synthetic", "sphere", "--output-dir", str(tmp_path), *SMALL, *options]) == 0
-    content = json.loads((tmp_path / "transforms.json").read_text())
-    assert content["thermal_camera"]["w"] == 10
-    assert all("thermal_transform_matrix" in frame for frame in content["frames"])
-
-
 def test_bad_input_is_one_sentence_and_exit_status_1(tmp_path, capsys):
     assert cli.main(["synthetic", "sphere", "--output-dir", str(tmp_path), "--noise-k", "-1"]) == 1
     shown = capsys.readouterr()
@@ -82,15 +74,6 @@ def test_markup_in_a_message_is_shown_as_it_is(monkeypatch, capsys):
     monkeypatch.setattr(cli.Synthetic, "main", fail)
     assert cli.main(["synthetic", "sphere", "--output-dir", "x"]) == 1
     assert "folder [bold]x[/bold] [/oops]" in capsys.readouterr().err
-
-
-def test_an_error_of_the_program_is_not_hidden(monkeypatch):
-    def fail(self):
-        raise RuntimeError("a bug")
-
-    monkeypatch.setattr(cli.Synthetic, "main", fail)
-    with pytest.raises(RuntimeError, match="a bug"):
-        cli.main(["synthetic", "sphere", "--output-dir", "x"])
 
 
 def test_an_interrupted_command_has_its_own_status(monkeypatch, capsys):

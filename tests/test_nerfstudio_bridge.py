@@ -139,12 +139,6 @@ def test_other_commands_load_nothing_heavy(tmp_path) -> None:
     assert not [name for name in loaded if name.startswith((*HEAVY, "thermoxels_ns.commands.export"))]
 
 
-def test_nothing_is_touched_without_the_exporter() -> None:
-    before = dict(vars(tyro))
-    nerfstudio_bridge.install()
-    assert dict(vars(tyro)) == before and type(tyro) is ModuleType
-
-
 def stand_in_exporter() -> ModuleType:
     """A module that does what nerfstudio's exporter does, without what it loads."""
     exporter = ModuleType("nerfstudio.scripts.exporter")
@@ -204,22 +198,6 @@ def test_numpy_scalars_load_with_weights_only(tmp_path, number) -> None:
     assert loaded == number and type(loaded) is type(number)
 
 
-def test_numpy_scalars_do_not_load_without_the_bridge(tmp_path) -> None:
-    """The reason for the bridge; and that importing it is not enough."""
-    torch.save({"lr": np.float64(1.0)}, tmp_path / "step.ckpt")
-    code = """
-        import pickle, torch
-        from thermoxels_ns import nerfstudio_bridge
-        try:
-            torch.load("step.ckpt", weights_only=True)
-        except pickle.UnpicklingError:
-            nerfstudio_bridge.install()
-            print(torch.load("step.ckpt", weights_only=True))
-    """
-    result = run(code, tmp_path)
-    assert result.returncode == 0 and "lr" in result.stdout, result.stderr
-
-
 class Harmful:
     def __reduce__(self):
         return (os.mkdir, ("harmful",))
@@ -232,16 +210,3 @@ def test_other_objects_are_still_refused(tmp_path, monkeypatch) -> None:
     with pytest.raises(Exception, match=r"[Ww]eights.only"):
         torch.load("bad.ckpt", weights_only=True)
     assert not Path("harmful").exists()
-
-
-def test_torch_without_the_registry_is_left_alone(monkeypatch) -> None:
-    monkeypatch.delattr(torch.serialization, "add_safe_globals")
-    nerfstudio_bridge.allow_checkpoint_globals()
-    assert not hasattr(torch.serialization, "add_safe_globals")
-
-
-def test_installing_twice_registers_nothing_new() -> None:
-    nerfstudio_bridge.install()
-    before = list(torch.serialization.get_safe_globals())
-    nerfstudio_bridge.install()
-    assert sorted(map(str, torch.serialization.get_safe_globals())) == sorted(map(str, before))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 
 from tests.reference.two_renderers import random_grid, random_request
@@ -33,38 +32,11 @@ def test_memory_comes_back_when_the_last_view_of_it_is_gone():
     assert address(pool.empty(LARGE // 8, np.float64)) == where
 
 
-def test_two_arrays_in_use_never_share_memory():
-    pool = BufferPool()
-    arrays = [pool.empty(LARGE, np.uint8) for _ in range(5)]
-    for number, array in enumerate(arrays):
-        array.fill(number)
-    assert [set(array.tolist()) for array in arrays] == [{number} for number in range(5)]
-
-
 def test_zeros_are_zeros_also_in_memory_that_was_used():
     pool = BufferPool()
     pool.empty(LARGE, np.float32).fill(7.0)
     assert pool.held_bytes() > 0
     assert not pool.zeros(LARGE, np.float32).any()
-
-
-def test_small_arrays_are_not_kept():
-    pool = BufferPool()
-    small = pool.empty(SMALLEST - 1, np.uint8)
-    assert small.base is None
-    del small
-    assert pool.held_bytes() == 0
-
-
-@pytest.mark.parametrize("shape", [0, (0, 27), (5, 0)])
-def test_empty_arrays(shape):
-    assert BufferPool().empty(shape, np.float32).size == 0
-
-
-@pytest.mark.parametrize("size", [1, 3, 1023, 1024, 1025, 99_999, 2**20 + 1])
-def test_rounding_adds_at_most_a_quarter(size):
-    assert size <= rounded_size(size) <= max(1.25 * size, size + 1)
-    assert rounded_size(rounded_size(size)) == rounded_size(size)
 
 
 def test_what_nobody_asks_for_is_given_back():

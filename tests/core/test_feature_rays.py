@@ -105,11 +105,3 @@ def test_points_without_lines_are_not_doubted_and_nothing_is_made_of_nothing() -
     assert agrees_with_neighbours(nothing).tolist() == [True] * 4
     none = FeatureRays(nothing.origins, nothing.point, np.zeros((0, 3)), nothing.uncertainty)
     assert agrees_with_neighbours(none).shape == (0,)
-
-
-def test_without_their_lines_points_keep_their_places_and_numbers() -> None:
-    lines = seen_by_all(floor(5), uncertainty=0.1)
-    some = lines.of_points(np.array([True, False, True, False, False]))
-    assert some.points is lines.points
-    assert some.point.tolist() == [0] * 6 + [2] * 6
-    assert np.array_equal(some.origins, np.tile(CAMERAS, (2, 1))) and len(some.uncertainty) == 12

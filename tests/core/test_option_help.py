@@ -8,13 +8,11 @@ import subprocess
 import sys
 import textwrap
 from dataclasses import dataclass, field
-from typing import Union
 
 import pytest
 import tyro
 
-from thermoxels_ns import cli, config, nerfstudio_bridge
-from thermoxels_ns.commands.export import ExportThermoxelsMesh
+from thermoxels_ns import cli
 from thermoxels_ns.core.option_help import join_help_lines, joined_lines
 
 LONG = "Every option's text is one paragraph here, however many lines it takes in the source: 12 of them, or more."
@@ -76,23 +74,6 @@ def test_tyro_is_told_what_stands_below_the_fields_of_a_class(monkeypatch, capsy
     shown = capsys.readouterr().out
     assert "however many lines it takes in the source: 12 of them," in shown
     assert "however many lines it takes in the source: 12 of them, or more" in words(shown)
-
-
-def test_a_class_of_the_package_is_joined_with_what_it_inherits() -> None:
-    nerfstudio_bridge._with_mesh_export(Union[Options, Below])  # noqa: UP007 - as nerfstudio has it
-    texts = {each.name: each.metadata.get("help", "") for each in dataclasses.fields(ExportThermoxelsMesh)}
-    assert all(texts.values()) and "\n" not in "".join(texts.values())
-
-
-@pytest.mark.parametrize("method", ["thermoxels", "thermoxels_paper", "thermoxels_arco", "plenoxels_t"])
-def test_what_a_method_holds_is_joined(method) -> None:
-    trainer = getattr(config, method).config
-    for part, option in (
-        *((trainer, "quality"), (trainer.pipeline.model, "resolutions")),
-        *((trainer.pipeline.datamanager, "streams"), (trainer.pipeline.datamanager.dataparser, "missing_thermal")),
-    ):
-        (text,) = (each.metadata["help"] for each in dataclasses.fields(part) if each.name == option)
-        assert "\n" not in text and len(text) > 40
 
 
 @pytest.mark.parametrize("command", ["capture", "demo", "synthetic", "cost", "heat"])

@@ -17,7 +17,6 @@ from nerfstudio.plugins.registry_dataparser import discover_dataparsers
 from nerfstudio.plugins.types import MethodSpecification
 
 from thermoxels_ns import config
-from thermoxels_ns.core import presets
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.presets import read_preset, with_overrides
 
@@ -32,7 +31,6 @@ METHODS: dict[str, str] = PROJECT["entry-points"]["nerfstudio.method_configs"]
 DATAPARSERS: dict[str, str] = PROJECT["entry-points"]["nerfstudio.dataparser_configs"]
 
 FILES = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
-SCENES = [name for name in FILES if name.startswith("scene-")]
 OTHERS = ("patches-", "scene-", "materials")
 METHOD_FILES = [name for name in FILES if not name.startswith(OTHERS)]
 
@@ -77,13 +75,6 @@ def test_a_method_has_the_values_of_its_file(name: str) -> None:
     for path, value in _leaves(_settings(name)):
         assert _at(specification.config, path) == value, ".".join(path)
     assert specification.description == read_preset(name)["description"]
-
-
-@pytest.mark.parametrize("name", METHOD_FILES)
-def test_a_method_repeats_no_default(name: str) -> None:
-    base = config.thermoxels.config
-    repeated = [".".join(path) for path, value in _leaves(_settings(name)) if _at(base, path) == value]
-    assert repeated == []
 
 
 @pytest.mark.parametrize("name", METHOD_FILES)
@@ -137,10 +128,6 @@ def test_an_entry_point_of_a_dataparser_leads_to_it(name: str) -> None:
     assert descriptions[name] == specification.description
 
 
-def test_the_command_line_is_callable() -> None:
-    assert callable(_object(PROJECT["scripts"]["thermoxels"]))
-
-
 @pytest.mark.parametrize(
     ("overrides", "named"),
     [
@@ -169,13 +156,6 @@ def test_overrides_leave_the_base_alone() -> None:
 def test_an_unknown_preset_lists_the_known() -> None:
     with pytest.raises(ThermoxelsError, match=f"^preset: expected one of {', '.join(METHOD_FILES)}, got cheese"):
         read_preset("cheese")
-
-
-def test_a_preset_that_is_no_mapping_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "mine.yaml").write_text("- a\n- list\n")
-    monkeypatch.setattr(presets, "configs_folder", lambda: tmp_path)
-    with pytest.raises(ThermoxelsError, match=r"^mine\.yaml: expected key: value lines, got \['a', 'list'\]"):
-        read_preset("mine")
 
 
 def test_an_installed_package_brings_the_presets(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from thermoxels_ns.core import threads
-from thermoxels_ns.core.threads import num_threads, run_ranges, run_tasks, set_num_threads
+from thermoxels_ns.core.threads import run_ranges, run_tasks, set_num_threads
 
 
 @pytest.fixture(autouse=True)
@@ -60,13 +60,6 @@ def test_tasks_keep_their_order():
     set_num_threads(4)
     assert run_tasks([lambda n=n: n for n in range(20)]) == list(range(20))
     assert run_tasks([]) == [] and run_ranges(lambda a, b: b, 0) == []
-
-
-def test_default_is_one_thread_per_processor():
-    set_num_threads(7)
-    assert num_threads() == 7
-    set_num_threads(None)
-    assert num_threads() == os.cpu_count()
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from tests.reference.two_renderers import EVERYTHING, RENDERERS, random_grid, random_request, see
-from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.field.harmonics import num_coefficients
 from thermoxels_ns.field.refine import widen_colour
 from thermoxels_ns.field.voxel_grid import VoxelGrid
@@ -39,13 +38,6 @@ def test_colours_stay_and_new_columns_are_nil(low, high):
     assert int((grid.sh != 0).sum()) == int((before != 0).sum())
     torch.testing.assert_close(grid.rgb_at(grid.locate(points), directions), colours, rtol=0, atol=1e-6)
     assert torch.equal(change(before), grid.sh)
-
-
-def test_a_degree_that_is_stored_already_is_an_error():
-    with pytest.raises(AssertionError):
-        widen_colour(random_grid(2), 2)
-    with pytest.raises(ThermoxelsError, match="SH degree"):
-        widen_colour(random_grid(2), 3)
 
 
 @pytest.mark.parametrize("renderer", RENDERERS)
@@ -107,14 +99,6 @@ def test_optimisers_go_on_as_if_the_columns_had_been_there(make, low, high):
     states = [optimizer.state[grid.sh] for grid, optimizer in pair]
     assert states[0].keys() == states[1].keys()
     assert all(torch.equal(values, states[1][name]) for name, values in states[0].items())
-
-
-def test_columns_may_change_before_the_first_step():
-    grid = random_grid(0)
-    old, optimizer = grid.sh, RowAdam([grid.sh])
-    change = widen_colour(grid, 2)
-    optimizer.change_columns(old, grid.sh, change)
-    assert optimizer.param_groups[0]["params"][0] is grid.sh and grid.sh is not old and not optimizer.state
 
 
 @pytest.mark.parametrize("saved, built", [(0, 2), (2, 0), (1, 2)])

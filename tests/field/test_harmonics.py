@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.field.background import SkyTemperature, SphereImage
+from thermoxels_ns.field.background import SphereImage
 from thermoxels_ns.field.harmonics import harmonics, harmonics_with_unit_mean
 
 
@@ -59,9 +59,3 @@ def test_sphere_image_gradient():
         return torch.func.functional_call(image, {"image": values}, (directions,))
 
     assert torch.autograd.gradcheck(seen, (parameter,))
-
-
-def test_sky_starts_constant():
-    sky = SkyTemperature(degree=2, start=0.25)
-    directions = torch.nn.functional.normalize(torch.randn(10, 3), dim=-1)
-    torch.testing.assert_close(sky(directions), torch.full((10, 1), 0.25))

@@ -67,24 +67,6 @@ def test_growth_is_that_of_a_cube_within_the_kept_voxels(voxels, by, seed):
     np.testing.assert_array_equal(voxels.dilated(chosen, by), expected)
 
 
-def test_growth_passes_through_voxels_that_are_not_kept_and_stops_at_the_border():
-    voxels = KeptVoxels(lattice_of((5, 1, 1)), [0, 2, 4])
-    assert voxels.dilated(np.array([True, False, False]), 1).tolist() == [True, False, False]
-    assert voxels.dilated(np.array([True, False, False]), 2).tolist() == [True, True, False]
-    cube = KeptVoxels(lattice_of((4, 4, 4)))
-    corner = np.arange(64) == 0
-    assert cube.dilated(corner, 1).sum() == 8 and cube.dilated(corner, 0).sum() == 1
-    assert corner.sum() == 1, "growing changes no input"
-
-
-def test_all_voxels_are_the_default():
-    lattice = lattice_of((3, 9, 2))
-    implicit, explicit = KeptVoxels(lattice), KeptVoxels(lattice, np.arange(54))
-    assert implicit.all_kept and implicit.num_rows == lattice.num_corners
-    for name in ("cells", "corners", "voxel_rows", "block_slot", "voxel_number"):
-        np.testing.assert_array_equal(getattr(implicit, name), getattr(explicit, name))
-
-
 def test_empty_blocks_cost_one_entry():
     """Tables follow what is kept, not the resolution."""
     voxels = KeptVoxels(lattice_of((256, 256, 256)), [0, 256**3 - 1])

@@ -71,17 +71,6 @@ def test_old_corners_keep_their_values_to_the_last_bit(factor, kept):
     torch.testing.assert_close(change(torch.full((old.num_rows, 1), 7.0)), torch.full((grid.voxels.num_rows, 1), 7.0))
 
 
-def test_refinement_while_an_old_graph_is_alive():
-    grid = random_grid()
-    loss = grid.density_at(grid.locate(points_inside(grid))).sum()
-    loss.backward()
-    refine(grid, 2)
-    fresh = grid.density_at(grid.locate(points_inside(grid))).sum()
-    fresh.backward()
-    assert grid.density.grad is not None and grid.density.grad.shape == grid.density.shape
-    assert float(loss.detach()) == pytest.approx(float(fresh.detach()), rel=1e-5)
-
-
 def test_refinement_keeps_the_children_of_kept_voxels():
     grid = random_grid()
     prune(grid, grid.voxels.cells == at_index(grid.lattice, (2, 3, 1)))
@@ -101,13 +90,6 @@ def test_split_voxels_are_those_of_the_dense_mask(factor):
     fine = split_voxels(voxels, factor)
     np.testing.assert_array_equal(fine.mask(), expected)
     assert fine.lattice == voxels.lattice.refined(factor) and bool((np.diff(fine.cells) > 0).all())
-
-
-def test_kept_includes_the_far_face_and_nothing_outside():
-    grid = random_grid()
-    hi = torch.tensor([grid.lattice.hi])
-    assert bool(grid.in_kept_voxel(hi)) and not bool(grid.in_kept_voxel(hi + 1e-3))
-    assert not bool(grid.in_kept_voxel(torch.tensor([grid.lattice.lo]) - 1e-3))
 
 
 @pytest.mark.parametrize("kept", [1.0, 0.3])
@@ -176,9 +158,3 @@ def test_checkpoint_whose_rows_do_not_fit_is_refused():
     state["cells"] = state["cells"][:-5]
     with pytest.raises(RuntimeError, match="size mismatch"):
         random_grid().load_state_dict(state)
-
-
-def test_a_query_without_points_gives_no_rows():
-    grid = random_grid()
-    at = grid.locate(torch.zeros(0, 3))
-    assert grid.rgb_at(at, torch.zeros(0, 3)).shape == (0, 3) and grid.thermal_at(at, torch.zeros(0, 3)).shape == (0, 1)

@@ -12,7 +12,6 @@ import torch
 from tests.support.plane_photographs import EYES, LATTICE, PLANE, SIZE, photographs
 from tests.support.short_training import train
 from thermoxels_ns.core.feature_rays import FeatureRays
-from thermoxels_ns.field.refine import refine
 from thermoxels_ns.multiview.depth_supervision import (
     ERROR_PLANES,
     feature_rays_of_photographs,
@@ -64,20 +63,6 @@ def test_lines_end_at_the_plane_that_the_photographs_show():
     assert len(off) > 10_000 and np.quantile(off, 0.95) < 0.02
 
 
-def test_lines_of_two_kinds_stay_with_their_points():
-    def some(count: int, points: int, seed: int) -> FeatureRays:
-        draw = np.random.default_rng(seed)
-        order = np.sort(draw.integers(0, points, count))
-        return FeatureRays(draw.random((count, 3)), order, draw.random((points, 3)), draw.random(count))
-
-    one, two = some(7, 3, 0), some(5, 4, 1)
-    both = one.joined_with(two)
-    assert np.array_equal(both.points[both.point], np.concatenate((one.points[one.point], two.points[two.point])))
-    assert np.array_equal(both.origins, np.concatenate((one.origins, two.origins)))
-    assert np.array_equal(both.uncertainty, np.concatenate((one.uncertainty, two.uncertainty)))
-    assert np.all(np.diff(both.point) >= 0) and len(both.points) == 7
-
-
 def test_most_lines_of_a_scene_end_at_its_surface(untrained):
     lines = rays_of(untrained)
     assert lines is not None and len(lines.points) > 200
@@ -88,17 +73,6 @@ def test_most_lines_of_a_scene_end_at_its_surface(untrained):
     points = lines.points @ to_input[:3, :3].T + to_input[:3, 3]
     off = np.abs(make_scene("pipes").signed_distance(points))
     assert np.median(off) < 0.02 and np.quantile(off, 0.9) < 0.06, np.quantile(off, [0.5, 0.9])
-
-
-def test_photographs_that_agree_about_nothing_give_no_lines(untrained, monkeypatch):
-    def unsure(seen, lo, hi):
-        nothing = np.full(len(seen.colours), np.nan, np.float32)
-        return Depths(seen, nothing, nothing)
-
-    monkeypatch.setattr("thermoxels_ns.multiview.depth_supervision.depths_of", unsure)
-    said: list[str] = []
-    assert rays_of(untrained, said.append) is None
-    assert "too few to tell anything" in said[0]
 
 
 def asked_boxes(monkeypatch, found=None) -> list:
@@ -126,16 +100,6 @@ def test_without_photographs_in_training_nothing_is_asked(scene, untrained, monk
     data = SimpleNamespace(config=SimpleNamespace(streams="thermal"), train_dataset=untrained.datamanager.train_dataset)
     follow_depths(untrained.model, attributes_of(data))
     assert boxes == []
-
-
-def test_depths_are_looked_for_in_the_box_of_the_scene_however_the_lattice_was_refined(scene, monkeypatch):
-    boxes = asked_boxes(monkeypatch)
-    pipeline = train(scene, 0)
-    first = pipeline.model.grid.lattice
-    follow_depths(pipeline.model, attributes_of(pipeline.datamanager))
-    refine(pipeline.model.grid, 2)
-    follow_depths(pipeline.model, attributes_of(pipeline.datamanager))
-    assert boxes[0] == boxes[1] == (first.lo, first.hi)
 
 
 @pytest.mark.parametrize(
@@ -167,29 +131,6 @@ def test_a_training_follows_depths(scene, capsys):
     assert "depths:" not in capsys.readouterr().out
     assert followed.feature_ray_sampler is not None and alone.feature_ray_sampler is None
     assert not torch.equal(followed.grid.density, alone.grid.density)
-
-
-def test_depths_are_followed_beside_tracks_where_that_is_asked_for(scene, monkeypatch):
-    import thermoxels_ns.training.callbacks as course
-    from thermoxels_ns.training.model import ThermoxelsModel
-
-    def some(count: int, at: float) -> FeatureRays:
-        return FeatureRays(np.zeros((count, 3)), np.arange(count), np.full((count, 3), at), np.full(count, 0.1))
-
-    populate, followed = ThermoxelsModel.populate_modules, []
-
-    def with_tracks(model):
-        populate(model)
-        model.feature_rays = some(3, 0.2)
-        model.feature_ray_sampler = FeatureRaySampler(model.feature_rays)
-
-    monkeypatch.setattr(ThermoxelsModel, "populate_modules", with_tracks)
-    asked_boxes(monkeypatch, some(2, 0.1))
-    monkeypatch.setattr(
-        course, "FeatureRaySampler", lambda lines, light=0.0: followed.append(lines) or FeatureRaySampler(lines, light)
-    )
-    train(scene, 1, {"carve": "off", "photo_depth": "on"})
-    assert len(followed) == 1 and followed[0].points[:, 0].tolist() == [0.2] * 3 + [0.1] * 2
 
 
 @pytest.mark.parametrize(("depths", "light"), [("on", COARSE_LIGHT), ("off", 0.0)])

@@ -17,7 +17,7 @@ from thermoxels_ns.multiview.stereo import (
     Depths,
     depths_of,
 )
-from thermoxels_ns.multiview.stereo_kernels import agreeing_views, correlate, weigh_patches
+from thermoxels_ns.multiview.stereo_kernels import correlate, weigh_patches
 
 LO, HI = (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)
 TRUE_DEPTH = 1.6 - PLANE
@@ -103,39 +103,6 @@ def test_a_camera_that_looks_away_from_the_box_has_no_depths():
     assert away.share == 0.0
 
 
-def agreement(seen: Photographs, depth: np.ndarray, tolerance: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
-    """Photographs that agree with each pixel's depth, and that look through it; planes are 0.01 apart."""
-    total = len(seen.colours)
-    inverses, error = np.linalg.inv(seen.matrices[:, :, :3]), np.full(total, 0.01, np.float32)
-    agreeing, looking_through = (np.zeros(total, np.int32) for _ in range(2))
-    places = seen.matrices, inverses, seen.centres, seen.sizes, seen.firsts
-    agreeing_views(0, total, *places, depth, error, tolerance, agreeing, looking_through)
-    return agreeing, looking_through
-
-
-@pytest.mark.parametrize(("off", "agrees", "through"), [(0.0, True, False), (0.009, True, False), (0.03, False, False)])
-def test_depths_agree_within_the_tolerance_alone(off, agrees, through):
-    seen = photographs()
-    depth = np.full(len(seen.colours), TRUE_DEPTH, np.float32)
-    middle = SIZE // 2 * SIZE + SIZE // 2
-    depth[middle] -= off
-    agreeing, looking_through = agreement(seen, depth)
-    assert (agreeing[middle] >= FEWEST_VIEWS) == agrees
-    assert (looking_through[middle] > 0) == through
-    assert agreeing[middle + 1] >= FEWEST_VIEWS
-
-
-def test_photographs_look_through_a_point_before_what_they_see_and_not_through_one_behind():
-    seen = photographs()
-    depth = np.full(len(seen.colours), TRUE_DEPTH, np.float32)
-    before, behind = SIZE // 2 * SIZE + SIZE // 2, SIZE // 2 * SIZE + SIZE // 2 + 9
-    depth[before] -= 0.1
-    depth[behind] += 0.1
-    agreeing, looking_through = agreement(seen, depth)
-    assert agreeing[before] == agreeing[behind] == 0
-    assert looking_through[before] >= FEWEST_VIEWS and looking_through[behind] == 0
-
-
 def plate(noise: float) -> tuple[Photographs, np.ndarray]:
     """Photographs of a part of the plane before a plain, far background, and which pixels show the plane."""
     eyes = [(x, y, 1.6) for x in (-0.3, -0.1, 0.1, 0.3) for y in (-0.25, 0.0, 0.25)]
@@ -161,22 +128,6 @@ def test_an_outline_gives_its_depth_to_nothing_beside_it(noise):
     assert (known & ~shown).sum() <= 0.001 * known.sum()
 
 
-def test_weights_of_a_patch_are_those_of_its_own_colours_and_sum_to_one():
-    colours = np.full((9, 9, 3), 0.5, np.float32)
-    colours[:, 5:] = 0.9
-    colours[3, 3] += 0.02
-    weights, (means, variances) = np.zeros((9, 9, 25), np.float32), np.zeros((2, 9, 9), np.float32)
-    weigh_patches(colours, colours.mean(-1), 2, 0.025, 0.0, 0.05, np.float32(1e-9), weights, means, variances)
-    own = weights[4, 4].reshape(5, 5)
-    assert own.sum() == pytest.approx(1.0, abs=1e-6)
-    assert np.all(own[:, 3:] == 0.0) and own[1, 1] == pytest.approx(own[0, 0] * np.exp(-0.64), rel=1e-4)
-    inside = own.ravel() @ colours[2:7, 2:7].mean(-1).ravel()
-    assert means[4, 4] == pytest.approx(inside, abs=1e-6)
-    assert variances[4, 4] == pytest.approx(own.ravel() @ (colours[2:7, 2:7].mean(-1).ravel() - inside) ** 2, rel=1e-4)
-    assert variances[4, 6] == 0.0  # plain among what has its colour, however near the edge
-    assert np.all(variances[:2] == 0.0) and np.all(variances[:, -2:] == 0.0)  # patches beyond the photograph
-
-
 def test_correlation_is_that_of_the_weighted_patches_and_the_best_count():
     draw = np.random.default_rng(1)
     colours = (0.5 + 0.03 * draw.random((9, 9, 3))).astype(np.float32)
@@ -195,25 +146,6 @@ def test_correlation_is_that_of_the_weighted_patches_and_the_best_count():
         best = np.sort([*expected, -1.0])[-count:].mean()
         assert result[4, 4] == pytest.approx(best, abs=2e-4)
         assert result[0, 0] == -1.0
-
-
-def test_a_texture_widens_what_belongs_to_a_pixel_and_an_outline_does_not():
-    draw = np.random.default_rng(2)
-    colours = (0.5 + 0.2 * draw.random((9, 9, 3))).astype(np.float32)
-    weights, (means, variances) = np.zeros((9, 9, 25), np.float32), np.zeros((2, 9, 9), np.float32)
-
-    def relative(at: tuple[int, int]) -> np.ndarray:
-        weigh_patches(colours, colours.mean(-1), 2, 0.025, 1.0, 0.0, np.float32(0.0), weights, means, variances)
-        own = weights[at].reshape(5, 5)
-        return own / own[2, 2]
-
-    off = np.abs(colours[2:7, 2:7].astype(float) - colours[4, 4]).mean(-1)
-    scale = np.sort(off[1:4, 1:4].ravel())[5]  # the first is the pixel itself
-    assert scale > 0.05
-    assert relative((4, 4)) == pytest.approx(np.exp(-((off / scale) ** 2)), abs=1e-5)
-    colours[:, :5], colours[:, 5:] = 0.5, 0.9  # of the eight pixels around one beside the outline five are its own
-    assert np.all(relative((4, 4))[:, 3:] == pytest.approx(0.0, abs=1e-9))
-    assert np.all(relative((4, 5))[:, :2] == pytest.approx(0.0, abs=1e-9))
 
 
 @pytest.mark.parametrize(("liars", "sure"), [(4, False), (9, True)])

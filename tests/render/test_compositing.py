@@ -132,20 +132,6 @@ def test_only_the_rays_of_a_stream_are_rendered():
     torch.testing.assert_close(seen.rgb[:, 0], torch.tensor([1.0, 0.0, 1.0]))
 
 
-@pytest.mark.parametrize("smallest", [1e-3, 1e-2])
-def test_skipping_light_samples_keeps_its_bound(smallest):
-    density = torch.rand(40, 100, dtype=torch.float64) * 3
-    deltas = torch.full_like(density, 0.02)
-    steps = RaySteps(torch.cumsum(deltas, -1), deltas)
-    rows = torch.rand(4000, 3, dtype=torch.float64)
-    along = ray_weights(density, deltas)
-    exact = composite(steps, along, lambda flat: rows[flat]).rgb
-    fast = composite(steps, along, lambda flat: rows[flat], smallest_weight=smallest).rgb
-    assert exact is not None and fast is not None
-    worst = (exact - fast).abs().max()
-    assert 0 < worst <= smallest * 100
-
-
 def test_march_skips_what_is_not_kept_and_integrates_the_chord():
     lattice = Lattice((-1.0, -1.0, -1.0), 0.25, (9, 9, 9))
     origins = torch.tensor([[-3.0, 0.1, 0.2], [0.0, 0.0, 0.0]], dtype=torch.float64)

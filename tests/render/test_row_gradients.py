@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
@@ -19,8 +18,7 @@ from tests.reference.two_renderers import (
 )
 from thermoxels_ns.core.threads import num_threads, set_num_threads
 from thermoxels_ns.render import fused, row_gradients
-from thermoxels_ns.render.kernels import AHEAD, Records
-from thermoxels_ns.render.kernels_rows import Order, first_voxel, order_records
+from thermoxels_ns.render.kernels import AHEAD
 from thermoxels_ns.render.ray_render import RenderOptions
 from thermoxels_ns.render.renderers import fused_render
 from thermoxels_ns.training.optimizers import touched_rows
@@ -32,45 +30,6 @@ def three_threads():
     set_num_threads(3)
     yield
     set_num_threads(before)
-
-
-def records_with(offset, used, number, uses) -> Records:
-    total = len(number)
-    nothing = np.zeros(total, np.float32)
-    return Records(
-        np.array(offset),
-        np.array(used),
-        np.array(number, np.int32),
-        np.zeros(total, np.int32),
-        np.zeros((total, 3), np.float32),
-        nothing,
-        nothing,
-        nothing,
-        np.zeros((total, 3), np.float32),
-        nothing,
-        np.array(uses, np.uint8),
-    )
-
-
-@pytest.mark.parametrize(
-    ("shift", "record", "group"),
-    [(0, [5, 0, 1, 4], [0, 1, 2, 3, 3, 4]), (1, [0, 5, 1, 4], [0, 2, 3, 4])],
-    ids=["one voxel a group", "two voxels a group"],
-)
-def test_records_are_ordered_by_group_then_by_ray(shift, record, group):
-    # Ray 0 has records 0 to 1, ray 1 has 4 to 6; record 3 is a gap, 6 has no gradient.
-    records = records_with([0, 4], [2, 3], [1, 2, 9, 9, 4, 0, 3], [1, 2, 7, 7, 4, 1, 0])
-    order = Order(shift, np.zeros(len(group), np.int64), np.full(4, -1, np.int32), np.full(4, -1, np.int32))
-    order_records(records, order)
-    assert order.record.tolist() == record and order.group.tolist() == group
-    assert order.ray.tolist() == [0 if n < 2 else 1 for n in record]
-
-
-def test_first_voxel_is_a_binary_search():
-    rows = np.array([[0, 2, 5, 7], [1, 3, 6, 8], [4, 6, 9, 11]], np.int32)
-    for corner in range(4):
-        for row in range(-1, 13):
-            assert first_voxel(rows, corner, row) == int(np.searchsorted(rows[:, corner], row))
 
 
 @pytest.mark.usefixtures("three_threads")
@@ -87,21 +46,6 @@ def test_any_number_of_row_ranges_gives_the_reference_s_sums(monkeypatch, ranges
     reference = see("reference", grid, request, options)
     assert_same(see("fused", grid, request, options), reference, 1e-11, 1e-11)
     assert all(float(g.norm()) > 0 for g in reference.gradients.values())
-
-
-def test_rows_of_total_variation_alone_have_a_gradient_and_no_others():
-    grid = random_grid(2, kept=0.4)
-    first, last = 50, 60
-    options = fused.RenderOptions(variation={"sh": (first, last)})
-    fused_render_variation(grid, options).backward()
-    corners = grid.voxels.voxel_rows[first:last]
-    expected = np.unique(np.concatenate((corners[:, 0], corners[:, 0] + 1, corners[:, 1], corners[:, 2])))
-    assert grid.sh.grad._indices()[0].tolist() == expected.tolist()
-    assert grid.density.grad is None and grid.temperature.grad is None
-
-
-def fused_render_variation(grid, options) -> torch.Tensor:
-    return fused_render(grid, random_request(grid, 10), options).variation["sh"]
 
 
 @pytest.mark.usefixtures("three_threads")

@@ -89,14 +89,6 @@ def test_pruning_that_would_remove_a_part_of_the_scene_fails_and_changes_nothing
     assert model.grid.voxels.all_kept and model.grid.density is before
 
 
-def test_pruning_without_any_weight_fails():
-    model = model_of()
-    model.grid.density.data.zero_()
-    with pytest.raises(PruningError):
-        prune_by_rays(model, Rays(), 0.01, 1)
-    assert model.grid.voxels.all_kept
-
-
 def attributes(model: ThermoxelsModel, steps: int) -> TrainingCallbackAttributes:
     groups = model.get_param_groups()
     rows = model.grid.row_parameters()
@@ -164,12 +156,4 @@ def test_a_refinement_beyond_the_budget_leaves_the_lattice_as_it_is():
     with pytest.raises(MemoryBudgetError, match="32 x 32 x 32"):
         for callback in callbacks:
             callback.run_callback(2)
-    assert model.grid.lattice.cell_shape == (8, 8, 8) and model.grid.voxels.all_kept
-
-
-def test_what_lies_behind_the_end_of_the_run_does_not_happen():
-    model = model_of(resolutions=(8, 16), refine_at=(3,), prune_at=(5,))
-    for step in range(3):
-        for callback in coarse_to_fine_callbacks(model, attributes(model, 3)):
-            callback.run_callback(step)
     assert model.grid.lattice.cell_shape == (8, 8, 8) and model.grid.voxels.all_kept

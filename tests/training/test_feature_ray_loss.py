@@ -50,13 +50,6 @@ def test_rays_end_before_and_behind_their_points_by_margin_and_uncertainty() -> 
     assert request.rgb_rays is not None and not bool(request.rgb_rays.any())
 
 
-def test_rays_to_points_nearer_than_the_margin_have_no_length_before_them() -> None:
-    request = track_rays(uncertainty=1.0)[0].request(25, 0.1, 0.05, torch.Generator().manual_seed(3), CPU)
-    assert request.far is not None
-    assert torch.equal(request.far[:25], torch.zeros(25))
-    assert bool((request.far[25:] > 1.1).all())
-
-
 @pytest.mark.parametrize("backend", ["reference", "fused"])
 def test_a_wall_in_place_costs_nothing_and_one_before_or_behind_it_everything(backend: str) -> None:
     assert wall(0.16, backend) < 1e-3
@@ -75,12 +68,3 @@ def test_the_gradient_thins_what_is_before_the_points_and_thickens_what_is_at_th
     x = torch.linspace(-1, 1, 21)
     assert bool((by_x[(x > 0.15) & (x < 0.25)] < 0).all())
     assert float(by_x[(x > -0.9) & (x < 0.0)].sum()) > float(by_x[(x > 0.15) & (x < 0.25)].sum())
-
-
-def test_the_same_seed_chooses_the_same_lines() -> None:
-    rays, _ = track_rays()
-    first, again, other = (
-        rays.request(20, 0.0, 0.1, torch.Generator().manual_seed(seed), CPU).origins for seed in (1, 1, 2)
-    )
-    assert torch.equal(first, again)
-    assert not torch.equal(first, other)

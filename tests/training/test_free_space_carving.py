@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-import thermoxels_ns.training.free_space_carving as free_space_carving
 from thermoxels_ns.core.feature_rays import FeatureRays, agrees_with_neighbours
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.voxel_grid import VoxelGrid
@@ -111,29 +110,6 @@ def test_lines_along_faces_and_from_outside_count_as_any() -> None:
     assert not empty_voxels(BOX, lines(np.zeros((0, 3)), np.zeros((0, 3)))).any()
 
 
-def test_how_lines_are_cut_into_pieces_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    sight, _ = room(300)
-    whole = empty_voxels(BOX, sight)
-    monkeypatch.setattr(free_space_carving, "_SAMPLES_AT_ONCE", 50)
-    assert np.array_equal(empty_voxels(BOX, sight), whole)
-
-
-def test_of_very_many_lines_some_are_looked_at_and_all_points_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    sight, free = room()
-    whole = empty_voxels(BOX, sight)
-    monkeypatch.setattr(free_space_carving, "MOST_LINES", -(-len(sight.origins) // 3))
-    seen = []
-    crossings = free_space_carving._crossings
-    monkeypatch.setattr(free_space_carving, "_crossings", lambda box, some: seen.append(some) or crossings(box, some))
-    some = empty_voxels(BOX, sight)
-    assert len(seen[0].origins) <= len(sight.origins) // 3 + 5
-    assert np.array_equal(seen[0].points, sight.points[::3])
-    assert seen[0].point.tolist() == np.repeat(np.arange(len(seen[0].points)), 5).tolist()
-    held = np.floor(BOX.world_to_index(sight.points)).astype(int)
-    assert not some[tuple(held.T)].any() and not (some & ~free).any()
-    assert some.sum() > 0.9 * whole.sum()
-
-
 def carved_grid(sight: FeatureRays) -> tuple[VoxelGrid, Any]:
     grid = VoxelGrid(BOX, sh_degree=0)
     return grid, carve_free_space(grid, sight)
@@ -147,15 +123,3 @@ def test_carved_voxels_are_no_longer_stored_and_rows_follow() -> None:
     rows = torch.arange(BOX.num_corners)[:, None]
     assert change is not None
     assert torch.equal(change(rows)[:, 0], torch.from_numpy(grid.voxels.corners))
-
-
-@pytest.mark.parametrize("doubted", [0, 7])
-def test_the_log_tells_points_with_lines_from_those_that_are_doubted(
-    doubted: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    said: list[str] = []
-    monkeypatch.setattr(free_space_carving.CONSOLE, "log", said.append)
-    sight, _ = room(300)
-    carved_grid(sight.of_points(np.arange(300) >= doubted))
-    assert f"to {300 - doubted} points" in said[0]
-    assert ("; 7 others do not" in said[0]) == (doubted == 7)

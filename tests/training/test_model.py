@@ -147,15 +147,6 @@ def test_decisions_about_the_background_are_in_the_checkpoint():
     assert torch.equal(model(rays())["rgb"], loaded(rays())["rgb"])
 
 
-def test_backgrounds_are_built_only_when_wanted():
-    assert make(background="off", thermal_background="minimum").get_param_groups().keys() == {
-        *("density", "sh", "temperature")
-    }
-    empty = make(background="off", thermal_background="minimum", start_density=1e-12).eval()(rays(stream=None))
-    assert float(empty["rgb"].max()) < 1e-6
-    torch.testing.assert_close(empty["temperature_c"], torch.full((60, 1), 10.0), atol=1e-4, rtol=0)
-
-
 @pytest.mark.parametrize(
     "options", [{"resolutions": (8, 12), "refine_at": (5,)}, {"resolutions": (8, 16)}, {"refine_at": (5,)}]
 )
@@ -206,19 +197,6 @@ def test_snapshot_holds_what_rays_say_on_the_whole_lattice():
     assert colour[4:].std() > 0.1 and (colour[:4] == 0.5).all()
 
 
-def test_snapshot_says_nothing_of_what_is_not_known():
-    snapshot = make(sh_degree=None, background="off").grid_snapshot(())
-    assert (snapshot.colour, snapshot.evidence, snapshot.views) == (None, None, None)
-    assert make().grid_snapshot([rays()]).evidence is not None
-
-
-def test_evaluation_batches_have_losses_without_regularisers():
-    model = make().eval()
-    outputs = model(rays())
-    assert set(model.get_loss_dict(outputs, targets())) == {"rgb_loss", "thermal_loss"}
-    assert set(model.get_metrics_dict(outputs, targets())) == {"psnr", "thermal_mae_c"}
-
-
 def test_a_crop_is_kept():
     model = make(start_density=30.0, background="off").eval()
     bundle = rays(stream=None)
@@ -226,12 +204,6 @@ def test_a_crop_is_kept():
     bundle.nears, bundle.fars = torch.full((60, 1), 2.9), torch.full((60, 1), 2.95)
     cropped = model(bundle)["accumulation"]
     assert float(cropped.max()) < 0.9 * float(whole.max()) and float(cropped.max()) > 0.0
-
-
-def test_stock_exporters_get_colour_and_opacity():
-    model = make().eval()
-    outputs = model(rays(stream=None))
-    assert torch.equal(model.get_rgba_image(outputs)[:, 3:], outputs["accumulation"])
 
 
 def test_depth_of_a_miss_does_not_depend_on_its_neighbours():
@@ -273,12 +245,6 @@ def test_values_that_cannot_work_are_refused(option, value):
         make(**{option: value})
 
 
-@pytest.mark.parametrize("degree", [-1, 3])
-def test_a_degree_of_colour_that_there_is_not_is_refused_before_the_first_step(degree):
-    with pytest.raises(ThermoxelsError, match="sh_degree"):
-        make(sh_degree=degree, resolutions=(8, 16), refine_at=(4,))  # the first lattice stores one colour
-
-
 def test_masked_pixels_do_not_count_in_evaluation():
     model = make().eval()
     generator = torch.Generator().manual_seed(2)
@@ -313,12 +279,6 @@ def test_torch_leaves_room_for_other_programs(monkeypatch, environment, expected
     assert torch_asked == ([] if expected is None else [expected, expected]) and kernels_asked == [3, None]
 
 
-@pytest.mark.parametrize("given", [0, -2])
-def test_impossible_numbers_of_threads_are_refused(given):
-    with pytest.raises(SceneError, match=f"cpu_threads: expected 1 or more, got {given}"):
-        pipeline.ThermoxelsPipelineConfig(cpu_threads=given).setup(device="cpu")
-
-
 def test_both_backends_train_alike():
     """The same batch through the compiled kernels and through plain torch: outputs, losses and gradients."""
     found = {}
@@ -347,11 +307,3 @@ def test_a_lattice_beyond_the_budget_is_refused_before_it_is_built(monkeypatch):
     monkeypatch.setattr("thermoxels_ns.training.model.VoxelField", lambda *_: pytest.fail("the field was built"))
     with pytest.raises(MemoryBudgetError, match=r"4096 x 4096 x 2048 voxels .*--pipeline.model.memory-budget-gb"):
         make(resolutions=(4096,), memory_budget_gb=64.0)
-
-
-def test_a_refinement_beyond_the_budget_is_refused():
-    model = make(memory_budget_gb=0.001)
-    model.check_memory(1)
-    with pytest.raises(MemoryBudgetError, match="64 x 64 x 32 voxels"):
-        model.check_memory(8)
-    assert model.grid.lattice.cell_shape == (8, 8, 4)

@@ -14,10 +14,8 @@ from thermoxels_ns.field.refine import prune, refine
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.training.optimizers import (
     RowAdam,
-    RowAdamConfig,
     RowOptimizer,
     RowRMSprop,
-    RowRMSpropConfig,
     touched_rows,
 )
 
@@ -91,19 +89,6 @@ def test_each_row_counts_its_own_updates():
     assert len({len(grads) for grads in history}) > 3
 
 
-def test_first_touch_late_in_training_gets_the_full_first_step():
-    """With the correction of all other rows it would move by lr (1 - beta1) / sqrt(1 - beta2), three times too much."""
-    value = parameter()
-    before = value.detach().clone()
-    optimizer = RowAdam([value], lr=0.1)
-    for _ in range(300):
-        step(optimizer, value, torch.sparse_coo_tensor([[0]], torch.ones(1, CHANNELS), value.shape))
-    push = torch.sparse_coo_tensor([[7]], torch.tensor([[3.0, -3.0, 1e-6, -1e-6, 1e4, -1e4]]), value.shape)
-    step(optimizer, value, push)
-    moved = before[7] - value.detach()[7]
-    torch.testing.assert_close(moved, 0.1 * torch.tensor([1.0, -1.0] * 3), rtol=1e-5, atol=0)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("layout", ["sparse", "dense"])
 def test_rows_without_a_gradient_keep_value_and_state_to_the_last_bit(kind, layout):
@@ -167,21 +152,6 @@ def test_compiled_updates_are_those_of_their_plain_twin(kind, fractional):
         torch.testing.assert_close(optimizer.state[value][name], values, rtol=1e-12, atol=1e-14)
 
 
-def test_rounded_numbers_of_updates_count_as_what_they_were():
-    """Splitting into thirds interpolates 7 updates as 6.9999995 or 7.0000005: the correction stays that of 7."""
-    moved = []
-    for count in (7.0, 7.0 - 5e-7, 7.0 + 5e-7):
-        value = parameter()
-        optimizer = RowAdam([value], lr=0.1, betas=(0.5, 0.7))
-        step(optimizer, value, gradient(0))
-        optimizer.state[value]["updates"].fill_(count)
-        start = value.detach().clone()
-        step(optimizer, value, gradient(1))
-        moved.append(value.detach() - start)
-    torch.testing.assert_close(moved[0], moved[1], rtol=1e-5, atol=1e-7)
-    torch.testing.assert_close(moved[0], moved[2], rtol=1e-5, atol=1e-7)
-
-
 @pytest.mark.parametrize("late", [1, 4095, 4096, 4097, 9999])
 @pytest.mark.parametrize("same", [False, True])
 def test_rows_out_of_order_are_found_wherever_they_are(late, same):
@@ -194,21 +164,6 @@ def test_rows_out_of_order_are_found_wherever_they_are(late, same):
     assert torch.equal(
         torch.zeros(10_002, 1).index_add(0, rows, sums), torch.zeros(10_002, 1).index_add(0, listed, values)
     )
-
-
-def test_rows_in_order_are_taken_as_they_are():
-    listed, values = torch.arange(0, 20_000, 2), torch.ones(10_000, 1)
-    rows, given = touched_rows(torch.sparse_coo_tensor(listed[None], values, (20_000, 1)))
-    assert torch.equal(rows, listed) and given.data_ptr() == values.data_ptr()
-
-
-def test_duplicate_and_unsorted_rows_are_summed():
-    rows, values = touched_rows(torch.sparse_coo_tensor([[4, 1, 4]], torch.tensor([[1.0], [2.0], [3.0]]), (6, 1)))
-    assert rows.tolist() == [1, 4] and values.tolist() == [[2.0], [4.0]]
-    dense = torch.zeros(6, 2, 2)
-    dense[3, 1, 0] = -1.0
-    rows, values = touched_rows(dense)
-    assert rows.tolist() == [3] and values.tolist() == [[0.0, 0.0, -1.0, 0.0]]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -267,15 +222,6 @@ def test_state_follows_split_and_pruned_rows(kind, change):
         assert (new != before).any(-1).nonzero()[:, 0].tolist() == rows.tolist()
 
 
-def test_rows_may_change_before_the_first_step():
-    grid = VoxelGrid(Lattice((0.0, 0.0, 0.0), 1.0, (3, 3, 3)), sh_degree=None)
-    old = grid.density
-    optimizer = RowAdam([old])
-    optimizer.change_rows(old, grid.density, refine(grid, 2))
-    optimizer.change_rows(old, grid.density, lambda rows: rows)
-    assert optimizer.param_groups[0]["params"][0] is grid.density and not optimizer.state
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_training_goes_on_bit_for_bit_after_a_checkpoint(kind):
     grid, optimizers = trained_grid(kind)
@@ -297,28 +243,3 @@ def test_training_goes_on_bit_for_bit_after_a_checkpoint(kind):
             step(resumed[name], q, push.clone())
             assert torch.equal(p, q)
             assert all(torch.equal(v, resumed[name].state[q][k]) for k, v in optimizers[name].state[p].items())
-
-
-def test_configs_build_their_optimisers():
-    value = parameter()
-    adam = RowAdamConfig(lr=0.2, betas=(0.8, 0.9)).setup([value])
-    assert isinstance(adam, RowAdam) and adam.defaults == {"lr": 0.2, "betas": (0.8, 0.9), "eps": 1e-15}
-    rmsprop = RowRMSpropConfig(lr=0.2).setup([value])
-    assert isinstance(rmsprop, RowRMSprop) and rmsprop.defaults["alpha"] == 0.95
-    schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda n: 0.5**n)
-    schedule.step()
-    assert adam.param_groups[0]["lr"] == pytest.approx(0.1)
-
-
-def test_step_evaluates_a_closure():
-    value = torch.nn.Parameter(torch.tensor([[2.0], [0.0]]))
-    optimizer = RowAdam([value], lr=0.1)
-
-    def closure():
-        optimizer.zero_grad()
-        loss = (value**2).sum()
-        loss.backward()
-        return loss
-
-    assert float(optimizer.step(closure)) == 4.0
-    assert value.detach()[:, 0].tolist() == pytest.approx([1.9, 0.0])

@@ -11,7 +11,6 @@ from nerfstudio.cameras.rays import RayBundle
 
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
-from thermoxels_ns.field.interpolation import TrilinearPoints
 from thermoxels_ns.field.refine import prune
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
@@ -225,48 +224,6 @@ def test_rays_of_photographs_are_evidence_but_measure_no_temperature(backend):
     assert torch.equal(half.temperature.weight, thermal.temperature.weight)
     assert torch.equal(half.temperature.thermal, thermal.temperature.thermal)
     assert torch.equal(half.voxel_weight, colour.voxel_weight)
-
-
-def test_without_rays_there_is_no_evidence():
-    scene = slab()
-    evidence = field_evidence(scene, ())
-    assert evidence.rays == 0 and len(evidence.half_depth_density) == 0
-    assert float(evidence.voxel_weight.sum()) == float(evidence.voxel_ends.sum()) == 0.0
-    assert torch.equal(evidence.temperature.thermal, scene.grid.temperature.data[:, 0].clamp(0, 1))
-
-
-class Listed:
-    """A grid of one kept layer of voxels with samples as a test says."""
-
-    def __init__(self, ray: list[int], weight: list[float], before: list[float], transmittance: list[float]):
-        self.grid = VoxelGrid(Lattice((0.0, 0.0, 0.0), 1.0, (len(ray) + 1, 2, 2)), sh_degree=None)
-        self.grid.density.data = torch.arange(len(ray) + 1.0).repeat_interleave(4)[:, None] * 10
-        number = torch.arange(len(ray))
-        at = TrilinearPoints.placed(self.grid.voxels, number, torch.full((len(ray), 3), 0.5))
-        self.samples = GridSamples(
-            torch.tensor(ray), at, torch.tensor(weight), torch.tensor(before), torch.tensor(transmittance)
-        )
-
-    def sample_rays(self, origins, directions) -> GridSamples:
-        return self.samples
-
-
-def test_each_ray_that_ends_has_exactly_one_half_depth_however_sums_are_rounded():
-    """Ray 0 meets its half twice and ray 2 between two samples; ray 1 ends on nothing."""
-    scene = Listed(
-        ray=[0, 0, 0, 1, 2, 2],
-        weight=[0.4999999, 1e-7, 0.5, 0.5, 0.3, 0.3],
-        before=[0.0, 0.4999998, 0.4999999, 0.0, 0.0, 0.2999999],
-        transmittance=[0.0, 0.5, 0.4],
-    )
-    along_y = torch.tensor([0.0, 1.0, 0.0]).expand(3, 3)  # out of the layer, where there is no voxel to meet
-    bundle = RayBundle(torch.zeros(3, 3), along_y, torch.ones(3, 1))
-    evidence = field_evidence(scene, [bundle])
-    found = evidence.half_depth_density
-    assert len(found) == 2 and found.tolist()[0] in (15.0, 25.0) and found.tolist()[1] in (45.0, 55.0)
-    ends = voxel_weights(scene, [bundle]).ends
-    assert ends.tolist() == [float(10 * number + 5) in found.tolist() for number in range(6)]
-    assert evidence.voxel_ends.tolist() == ends.double().tolist()
 
 
 def behind_plane(place: float, backend: Backend) -> Scene:

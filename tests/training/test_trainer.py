@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 import tyro
-import yaml
 
 from thermoxels_ns.config import thermoxels
 from thermoxels_ns.core.errors import CheckpointError
@@ -65,22 +64,6 @@ def test_a_number_of_steps_that_a_quality_replaces_is_named(scene, tmp_path, cap
     assert "goes on from" not in said and writer.GLOBAL_BUFFER["max_iter"] == 800
 
 
-def test_a_quality_that_replaces_nothing_says_so_little(scene, tmp_path, capsys):
-    trainer(scene, tmp_path, "--quality", "standard").setup()
-    said = words(capsys)
-    assert "quality standard: 128 voxels and 1500 steps" in said and "in place of" not in said
-
-
-def test_what_was_replaced_is_no_option_and_survives_the_config_file(scene, tmp_path, capsys):
-    config = trainer(scene, tmp_path, *DRAFT).config
-    assert yaml.load(yaml.dump(config), Loader=yaml.Loader).replaced == "128 voxels and 1500 steps"
-    with pytest.raises(SystemExit):
-        trainer(scene, tmp_path, "--replaced", "nothing")
-    with pytest.raises(SystemExit):
-        trainer(scene, tmp_path, "--help")
-    assert "--replaced" not in capsys.readouterr().out
-
-
 def test_a_quality_ends_where_it_ends_also_in_a_resumed_training(scene, checkpoints, tmp_path, capsys):
     made = trainer(scene, tmp_path, *DRAFT, "--load-dir", str(checkpoints), "--load-step", "99")
     made.setup()
@@ -123,8 +106,3 @@ def test_folders_without_checkpoints(scene, checkpoints, tmp_path, where):
     folder = checkpoints.parent if where == "run" else tmp_path / where
     with pytest.raises(CheckpointError, match=r"no step-\*.ckpt in .* Pass the folder nerfstudio_models"):
         trainer(scene, tmp_path, "--load-dir", str(folder)).setup()
-
-
-def test_a_file_that_is_not_there(scene, tmp_path):
-    with pytest.raises(CheckpointError, match=r"got no file .*absent\.ckpt"):
-        trainer(scene, tmp_path, "--load-checkpoint", str(tmp_path / "absent.ckpt")).setup()

@@ -16,7 +16,6 @@ from nerfstudio.engine.optimizers import Optimizers
 from thermoxels_ns.config import thermoxels
 from thermoxels_ns.core.errors import CheckpointError
 from thermoxels_ns.core.presets import with_overrides
-from thermoxels_ns.field.memory import memory_need
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig
 from thermoxels_ns.training.pipeline import ThermoxelsPipeline
@@ -136,14 +135,6 @@ def test_a_training_resumed_at_any_step_ends_with_the_same_bits(scene, stop):
     assert differing(resumed.advance(STEPS).tensors(), straight.tensors()) == []
 
 
-def test_a_resumed_training_may_let_colour_depend_on_the_direction_earlier(scene):
-    saved = Training(scene).advance(6).save()
-    resumed = Training(scene, {"view_dependence_from": 2}, saved)
-    assert resumed.columns == 3
-    assert resumed.advance(7).columns == 27
-    assert float(resumed.pipeline.model.grid.sh.detach().view(-1, 3, 9)[..., 1:].abs().max()) > 0
-
-
 @pytest.mark.parametrize("stop", [5, STEPS])
 def test_images_and_snapshots_need_no_further_columns(scene, stop):
     """A model loaded for evaluation shows what the trained one does, before and after colour depends on directions."""
@@ -170,21 +161,6 @@ def test_a_checkpoint_of_another_degree_is_refused(scene, options, columns, expe
         training.pipeline.load_pipeline(state, 0)
 
 
-@pytest.mark.parametrize(
-    "options, degree",
-    [
-        ({}, 0),
-        ({"view_dependence_from": 0}, 2),
-        ({"view_dependence_from": 0, "sh_degree": 1}, 1),
-        ({"sh_degree": None}, None),
-        ({"sh_degree": 0, "view_dependence_from": 0}, 0),
-        ({"view_dependence_from": 1}, 0),
-    ],
-)
-def test_degree_at_the_beginning(options, degree):
-    assert ThermoxelsModelConfig(**options).first_sh_degree() == degree
-
-
 def test_memory_is_predicted_for_the_columns_that_a_lattice_will_have():
     """Only lattices that give way before colour depends on the direction stay narrow; the last one never does."""
     course: dict[str, Any] = {"resolutions": (8, 16, 32, 64), "refine_at": (10, 20, 30), "view_dependence_from": 20}
@@ -192,13 +168,3 @@ def test_memory_is_predicted_for_the_columns_that_a_lattice_will_have():
     assert [config.row_channels(resolution) for resolution in config.resolutions] == [5, 5, 29, 29]
     assert ThermoxelsModelConfig(view_dependence_from=0).row_channels(32) == 29
     assert ThermoxelsModelConfig(sh_degree=None, temperature_degree=2).row_channels(128) == 10
-
-
-def test_widening_stays_within_the_memory_that_was_predicted(scene):
-    """What is there at once while a parameter and its two moments are widened, the last of them twice."""
-    training = Training(scene).advance(RISES)
-    grid = training.pipeline.model.grid
-    need = memory_need(grid.lattice, len(grid.voxels), training.pipeline.model.config.row_channels(16))
-    rows = grid.voxels.num_rows
-    at_once = 4 * rows * (3 * 27 + 3 + 1 + 4 + 4)
-    assert training.columns == 3 and at_once < 1e9 * need.gigabytes
