@@ -43,8 +43,7 @@ def kernel(function: Callable | None = None, **options: Any) -> Any:
 def _forget_once(room: str, cached: Path) -> None:
     folders = (_PACKAGE / room, _PACKAGE / "core")
     forget_stale_kernels(
-        cached,
-        {path for folder in folders for path in folder.rglob("*.py") if b"kernel_cache" in path.read_bytes()},
+        cached, {path for folder in folders for path in folder.rglob("*.py") if b"kernel_cache" in path.read_bytes()}
     )
 
 

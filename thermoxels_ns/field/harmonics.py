@@ -60,13 +60,7 @@ def harmonics(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n
     if degree >= 1:
         basis += [-_Y1 * y, _Y1 * z, -_Y1 * x]
     if degree >= 2:
-        basis += [
-            _Y2_OFF * x * y,
-            -_Y2_OFF * y * z,
-            _Y20 * (3 * z * z - 1),
-            -_Y2_OFF * x * z,
-            _Y22 * (x * x - y * y),
-        ]
+        basis += [_Y2_OFF * x * y, -_Y2_OFF * y * z, _Y20 * (3 * z * z - 1), -_Y2_OFF * x * z, _Y22 * (x * x - y * y)]
     return torch.stack(basis, -1)
 
 

@@ -10,13 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.field.harmonics import (
-    MAX_DEGREE,
-    degree_of,
-    harmonics,
-    harmonics_with_unit_mean,
-    num_coefficients,
-)
+from thermoxels_ns.field.harmonics import MAX_DEGREE, degree_of, harmonics, harmonics_with_unit_mean, num_coefficients
 from thermoxels_ns.field.interpolation import TrilinearPoints, interpolate
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 
