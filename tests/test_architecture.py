@@ -209,7 +209,7 @@ def test_the_checker_sees_a_forbidden_import(module: str, source: str) -> None:
 @pytest.mark.parametrize(
     ("module", "source"),
     [
-        ("training.model", "from thermoxels_ns.field.field import VoxelField\nimport torch"),
+        ("training.model", "from thermoxels_ns.field.voxel_grid import VoxelField\nimport torch"),
         ("mesh.build", "from thermoxels_ns.core.lattice import Lattice\nfrom . import tetrahedra\nimport pyvista"),
         ("fem.problem", "from thermoxels_ns.mesh.tetrahedra import TetMesh"),
         ("commands.export", "import torch, pyvista, thermoxels_ns.fem.stepping, thermoxels_ns.training.model"),

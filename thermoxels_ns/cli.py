@@ -69,16 +69,7 @@ class Synthetic:
         folder = write_scene(
             make_scene(self.scene),
             self.output_dir,
-            num_train=self.num_train,
-            num_eval=self.num_eval,
-            width=self.width,
-            height=self.height,
-            thermal_width=self.thermal_width,
-            thermal_format=self.thermal_format,
-            noise_k=self.noise_k,
-            drift_k=self.drift_k,
-            seed=self.seed,
-            own_thermal_camera=self.own_thermal_camera,
+            **{name: value for name, value in vars(self).items() if name not in ("scene", "output_dir")},
         )
         Console(highlight=False).print(
             f"Written to {folder}. Train with: ns-train thermoxels --data {shlex.quote(str(folder))}",

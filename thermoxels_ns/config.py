@@ -10,7 +10,7 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from thermoxels_ns import nerfstudio_bridge
 from thermoxels_ns.core.option_help import join_help_lines
-from thermoxels_ns.core.presets import read_preset, with_overrides
+from thermoxels_ns.core.yaml_records import read_preset, with_overrides
 from thermoxels_ns.data.datamanager import ThermalDataManagerConfig
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig

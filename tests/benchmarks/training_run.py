@@ -12,7 +12,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCall
 from nerfstudio.engine.optimizers import Optimizers
 
 from thermoxels_ns.config import thermoxels
-from thermoxels_ns.core.presets import with_overrides
+from thermoxels_ns.core.yaml_records import with_overrides
 from thermoxels_ns.training.pipeline import ThermoxelsPipeline
 from thermoxels_ns.training.schedule import Schedule
 

@@ -18,7 +18,7 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from thermoxels_ns import config
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.core.presets import read_preset, with_overrides
+from thermoxels_ns.core.yaml_records import read_preset, with_overrides
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -14,8 +14,7 @@ import pytest
 
 from thermoxels_ns.core.errors import MemoryBudgetError
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.field.kept_voxels import KeptVoxels
-from thermoxels_ns.field.memory import check_memory, memory_need
+from thermoxels_ns.field.kept_voxels import KeptVoxels, check_memory, memory_need
 
 TESTS = Path(__file__).parents[1]
 KERNELS = 0.3e9

@@ -12,12 +12,13 @@ import torch
 from tests.support.plane_photographs import EYES, LATTICE, PLANE, SIZE, photographs
 from tests.support.short_training import train
 from thermoxels_ns.core.feature_rays import FeatureRays
-from thermoxels_ns.multiview.depth_supervision import (
+from thermoxels_ns.multiview.stereo import (
     ERROR_PLANES,
+    Depths,
+    depths_of,
     feature_rays_of_photographs,
     feature_rays_to_depths,
 )
-from thermoxels_ns.multiview.stereo import Depths, depths_of
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 from thermoxels_ns.training.callbacks import SHORTEST_RUN_WITH_DEPTHS, follow_depths
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler, feature_ray_loss

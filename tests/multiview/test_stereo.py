@@ -10,12 +10,12 @@ import pytest
 from tests.support.plane_photographs import EYES, FOCAL, PLANE, SIZE, photographs, texture
 from thermoxels_ns.core.threads import set_num_threads
 from thermoxels_ns.multiview import stereo
-from thermoxels_ns.multiview.depth_supervision import feature_rays_to_depths
 from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo import (
     FEWEST_VIEWS,
     Depths,
     depths_of,
+    feature_rays_to_depths,
 )
 from thermoxels_ns.multiview.stereo_kernels import correlate, weigh_patches
 

@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.render.compositing import composite, ray_weights
+from thermoxels_ns.render.compositing import RaySteps, composite, ray_weights
 from thermoxels_ns.render.renderers import march
-from thermoxels_ns.render.sampling import RaySteps
 
 
 def double_loop(density, deltas, rgb, thermal, t, background_rgb, background_thermal):

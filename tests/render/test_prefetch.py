@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from thermoxels_ns.render.prefetch import prefetch
+from thermoxels_ns.render.kernels import prefetch
 
 
 @njit(error_model="numpy")

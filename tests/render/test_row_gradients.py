@@ -17,7 +17,7 @@ from tests.reference.two_renderers import (
     see,
 )
 from thermoxels_ns.core.threads import num_threads, set_num_threads
-from thermoxels_ns.render import fused, row_gradients
+from thermoxels_ns.render import fused
 from thermoxels_ns.render.kernels import AHEAD
 from thermoxels_ns.render.ray_render import RenderOptions
 from thermoxels_ns.render.renderers import fused_render
@@ -38,7 +38,7 @@ def three_threads():
 @pytest.mark.parametrize("ranges", [1, 30, 400])
 def test_any_number_of_row_ranges_gives_the_reference_s_sums(monkeypatch, ranges, degree, kept):
     """Ranges of a few rows cut through voxels, blocks of total variation and groups of samples."""
-    monkeypatch.setattr(row_gradients, "RANGES_PER_THREAD", ranges)
+    monkeypatch.setattr(fused, "RANGES_PER_THREAD", ranges)
     grid = as_double(random_grid(2, 1, "exp", kept, density=0.0))
     request, count = in_double(random_request(grid)), len(grid.voxels)
     blocks = {"density": (3, count), "sh": (count // 3, count // 2), "temperature": (0, 1)}

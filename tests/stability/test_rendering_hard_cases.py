@@ -11,9 +11,8 @@ from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.refine import prune
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.render.compositing import composite, ray_weights
+from thermoxels_ns.render.compositing import composite, intersect_box, ray_weights, sample_box
 from thermoxels_ns.render.renderers import march
-from thermoxels_ns.render.sampling import intersect_box, sample_box
 
 LO, HI = torch.tensor([-1.0, -1.0, -1.0]), torch.tensor([1.0, 1.0, 1.0])
 

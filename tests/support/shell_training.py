@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.field.memory import MemoryNeed, memory_need
+from thermoxels_ns.field.kept_voxels import MemoryNeed, memory_need
 from thermoxels_ns.field.refine import prune, refine
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render import fused  # noqa: F401 (the compiled kernels belong to the imports)

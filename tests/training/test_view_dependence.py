@@ -15,7 +15,7 @@ from nerfstudio.engine.optimizers import Optimizers
 
 from thermoxels_ns.config import thermoxels
 from thermoxels_ns.core.errors import CheckpointError
-from thermoxels_ns.core.presets import with_overrides
+from thermoxels_ns.core.yaml_records import with_overrides
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig
 from thermoxels_ns.training.pipeline import ThermoxelsPipeline

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from thermoxels_ns.field.harmonics import harmonics_with_unit_mean, num_coefficients
+from thermoxels_ns.field.harmonics import MAX_DEGREE, harmonics_with_unit_mean, num_coefficients
 
 RAYS_AT_ONCE = 8192
 """Rays for which a background is evaluated together: torch splits tensors of 32,768 entries or more among its threads,
@@ -56,23 +56,15 @@ class SphereImage(nn.Module):
 
 
 class SkyTemperature(nn.Module):
-    """Normalised temperature at infinity as spherical harmonics of low degree.
+    """Normalised temperature at infinity as spherical harmonics, 0 in every direction at first."""
 
-    Args:
-        degree: 0 (one temperature) to 2.
-        start: Start value in every direction.
-    """
-
-    def __init__(self, degree: int = 2, start: float = 0.0):
+    def __init__(self) -> None:
         super().__init__()
-        self.degree = degree
-        self.coefficients = nn.Parameter(torch.zeros(num_coefficients(degree)))
-        with torch.no_grad():
-            self.coefficients[0] = start
+        self.coefficients = nn.Parameter(torch.zeros(num_coefficients(MAX_DEGREE)))
 
     def forward(self, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
         """Normalised temperature seen along unit directions."""
         # BLAS splits a product over rays among its threads; the gradient of `embedding` adds rays in their order.
         one = torch.zeros(len(directions), dtype=torch.long, device=directions.device)
         coefficients = F.embedding(one, self.coefficients[None])
-        return (harmonics_with_unit_mean(directions, self.degree) * coefficients).sum(-1, keepdim=True)
+        return (harmonics_with_unit_mean(directions, MAX_DEGREE) * coefficients).sum(-1, keepdim=True)

@@ -52,13 +52,9 @@ class TrilinearPoints:
         face = torch.stack((v * w, v * z, y * w, y * z), -1)
         return torch.cat((face * u[:, None], face * x[:, None]), -1)
 
-    def voxel_rows(self) -> Int64[Tensor, "voxels 8"]:
-        """Rows of the corners of every kept voxel in the order of `CORNER_OFFSETS`."""
-        return self.voxels.tables(self.number.device)[0]
-
     def rows(self) -> Int64[Tensor, "n 8"]:
         """Rows of the corners of each point's voxel in the order of `CORNER_OFFSETS`."""
-        return self.voxel_rows()[self.number]
+        return self.voxels.tables(self.number.device)[0][self.number]
 
     def select(self, chosen: Tensor | slice) -> TrilinearPoints:
         """The same for a subset of the points (boolean mask, indices or slice)."""
@@ -83,7 +79,21 @@ def interpolate(rows: Float[Tensor, "rows channels"], at: TrilinearPoints) -> Fl
 
 def splat(values: Float[Tensor, "n channels"], at: TrilinearPoints) -> Float[Tensor, "rows channels"]:
     """Add values at points to their voxels' corners with trilinear weights: the transpose of `interpolate`."""
-    return _splat(values, at)
+    total = values.new_zeros((at.voxels.num_rows, values.shape[1]))
+    if values.shape[0] == 0:
+        return total
+    ordered, order = torch.sort(at.number, stable=True)
+    numbers, counts = torch.unique_consecutive(ordered, return_counts=True)
+    starts = torch.cumsum(counts, 0) - counts
+    weights = at.weights().to(values.dtype)[order]
+    rows = at.voxels.tables(at.number.device)[0][numbers]
+    values = values.contiguous()
+    for corner in range(8):
+        per_voxel = F.embedding_bag(
+            order, values, starts, mode="sum", per_sample_weights=weights[:, corner].contiguous()
+        )
+        total.index_add_(0, rows[:, corner], per_voxel)  # rows are distinct: no race
+    return total
 
 
 class _Interpolate(torch.autograd.Function):
@@ -96,22 +106,4 @@ class _Interpolate(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *grad_outputs: Tensor):
-        return _splat(grad_outputs[0], ctx.at), None
-
-
-def _splat(values: Tensor, at: TrilinearPoints) -> Tensor:
-    total = values.new_zeros((at.voxels.num_rows, values.shape[1]))
-    if values.shape[0] == 0:
-        return total
-    ordered, order = torch.sort(at.number, stable=True)
-    numbers, counts = torch.unique_consecutive(ordered, return_counts=True)
-    starts = torch.cumsum(counts, 0) - counts
-    weights = at.weights().to(values.dtype)[order]
-    rows = at.voxel_rows()[numbers]
-    values = values.contiguous()
-    for corner in range(8):
-        per_voxel = F.embedding_bag(
-            order, values, starts, mode="sum", per_sample_weights=weights[:, corner].contiguous()
-        )
-        total.index_add_(0, rows[:, corner], per_voxel)  # rows are distinct: no race
-    return total
+        return splat(grad_outputs[0], ctx.at), None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,14 +14,13 @@ from torch import Tensor
 
 from thermoxels_ns.core.buffer_pool import BUFFERS
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.core.threads import run_ranges, run_tasks
-from thermoxels_ns.field.kept_voxels import KeptVoxels
+from thermoxels_ns.core.threads import num_threads, run_ranges, run_tasks
+from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render import kernels, kernels_backward, kernels_rows, kernels_shading
 from thermoxels_ns.render.kernels import Marched, Rays, Records, Settings, Sums, Volume
 from thermoxels_ns.render.kernels_backward import RayGradients
-from thermoxels_ns.render.kernels_rows import Blocks
+from thermoxels_ns.render.kernels_rows import Blocks, Order, RowGradients
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions, near_and_far
-from thermoxels_ns.render.row_gradients import row_gradients
 
 ACTIVATIONS = {"relu": kernels.RELU, "softplus": kernels.SOFTPLUS, "exp": kernels.EXP}
 SMALLEST_VARIATION = 1e-10
@@ -33,21 +32,18 @@ FEWEST_SAMPLES = 24
 """Samples per ray that a batch has room for at first, on average over a range."""
 SPARE = 1.25
 """Room made when that was too little, over what the rays so far took."""
+MOST_GROUPS = 1 << 12
+"""Groups of voxels that samples are put in order by."""
+RANGES_PER_THREAD = 4
+VARIATION_SHARE = 0.02
+"""Work of one channel's variation in a voxel, in samples."""
 _room: dict[int, int] = {}
 """Samples per ray that batches of the last lattice had room for, by its number of rows."""
 NAMES = ("density", "sh", "temperature")
 
 
-def march(
-    voxels: KeptVoxels,
-    density: Tensor,
-    sh: Tensor | None,
-    temperature: Tensor,
-    activation: str,
-    request: RayRequest,
-    options: RenderOptions,
-) -> Marched:
-    """March rays and record their samples without gaps, for statistics; no gradients.
+def march(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> Marched:
+    """March rays and record their samples without gaps and without colour, for statistics; no gradients.
 
     Returns:
         The samples; ``records.offset`` has a last entry, the number of all records.
@@ -55,7 +51,7 @@ def march(
     Raises:
         ThermoxelsError: A density on the way is NaN.
     """
-    marched, spans = _march(voxels, density, sh, temperature, activation, request, options)
+    marched, spans = _march(grid, None, request, options)
     records = marched.records
     listed = [np.concatenate([field[:0], *(field[a:b] for a, b in spans)]) for field in records[2:]]
     offset = np.concatenate((np.zeros(1, np.int64), np.cumsum(records.used)))
@@ -63,16 +59,11 @@ def march(
 
 
 def _march(
-    voxels: KeptVoxels,
-    density: Tensor,
-    sh: Tensor | None,
-    temperature: Tensor,
-    activation: str,
-    request: RayRequest,
-    options: RenderOptions,
+    grid: VoxelGrid, sh: Tensor | None, request: RayRequest, options: RenderOptions
 ) -> tuple[Marched, list[tuple[int, int]]]:
     """March rays and record their samples; give also the spans of the records in which there are no gaps."""
-    dtype = density.detach().numpy().dtype
+    density = grid.density.detach().numpy()
+    voxels, dtype = grid.voxels, density.dtype
     lattice = voxels.lattice
     volume = Volume(
         np.asarray(lattice.lo),
@@ -82,10 +73,10 @@ def _march(
         voxels.block_slot,
         voxels.voxel_number,
         voxels.voxel_rows,
-        density.detach().numpy(),
+        density,
         np.zeros((0, 0), dtype) if sh is None else sh.detach().numpy(),
-        temperature.detach().numpy(),
-        ACTIVATIONS[activation],
+        grid.temperature.detach().numpy(),
+        ACTIVATIONS[grid.activation],
     )
     near, far = near_and_far(request)
     count = len(request.origins)
@@ -169,38 +160,17 @@ def _empty_records(rays: int, total: int, volume: Volume) -> Records:
     )
 
 
-def render(
-    voxels: KeptVoxels,
-    density: Tensor,
-    sh: Tensor | None,
-    temperature: Tensor,
-    activation: str,
-    request: RayRequest,
-    options: RenderOptions,
-) -> RayRender:
-    """Render rays; differentiable once with respect to the three parameters.
-
-    Args:
-        voxels: The kept voxels.
-        density: Raw density, (rows, 1), float32 or float64, on the CPU.
-        sh: Colour harmonics, (rows, 3 k); None: no colour.
-        temperature: Temperature harmonics, (rows, k).
-        activation: relu, softplus or exp.
-        request: Rays and what they want.
-        options: What to compute and how exactly.
-
-    Returns:
-        Sums per ray and the variations asked for.
+def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayRender:
+    """Render rays through a grid on the CPU; differentiable once with respect to its parameters.
 
     Raises:
         ThermoxelsError: A density on the way is NaN.
     """
-    context = _Context(voxels, activation, request, options)
-    out = _Render.apply(density, sh, temperature, context)
+    out = _Render.apply(grid.density, grid.sh, grid.temperature, grid, request, options)
     assert isinstance(out, tuple)
     rgb, thermal, transmittance, accumulation, depth, distortion, sparsity, *variation = out
     return RayRender(
-        rgb if sh is not None else None,
+        rgb if grid.sh is not None else None,
         thermal,
         transmittance,
         accumulation,
@@ -211,25 +181,16 @@ def render(
     )
 
 
-@dataclass
-class _Context:
-    voxels: KeptVoxels
-    activation: str
-    request: RayRequest
-    options: RenderOptions
-
-
 class _Render(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, density: Tensor, sh: Tensor | None, temperature: Tensor, context: _Context):
-        options, voxels = context.options, context.voxels
-        marched, _ = _march(voxels, density, sh, temperature, context.activation, context.request, options)
-        parameters = {"density": density, "sh": sh, "temperature": temperature}
-
+    def forward(ctx, density, sh, temperature, grid: VoxelGrid, request: RayRequest, options: RenderOptions):
+        # `density`, `sh` and `temperature` are the grid's: autograd differentiates only by what it is handed.
+        marched, _ = _march(grid, grid.sh, request, options)
+        parameters, rows = grid.row_parameters(), grid.voxels.voxel_rows
         found = [
-            _total_variation(values.detach().numpy(), voxels.voxel_rows, first, last, _channels(options, name, values))
+            _total_variation(values.detach().numpy(), rows, first, last, _channels(options, name, values))
             for name, (first, last) in options.variation.items()
-            if (values := parameters[name]) is not None
+            if (values := parameters.get(name)) is not None
         ]
         ctx.marched, ctx.options = marched, options
         ctx.set_materialize_grads(False)
@@ -264,7 +225,7 @@ class _Render(torch.autograd.Function):
             )
         else:
             records.used.fill(0)
-        return (*row_gradients(marched, _blocks(options, variation, volume)), None)
+        return (*row_gradients(marched, _blocks(options, variation, volume)), None, None, None)
 
 
 def _channels(options: RenderOptions, name: str, values: Tensor | np.ndarray) -> int:
@@ -306,3 +267,79 @@ def _array(values: Tensor) -> np.ndarray:
 
 def _gradient(gradient: Tensor | None, like: np.ndarray) -> np.ndarray:
     return np.zeros_like(like) if gradient is None else _array(gradient.to(torch.from_numpy(like).dtype))
+
+
+def row_gradients(marched: Marched, blocks: Blocks) -> list[Tensor | None]:
+    """Gradients of density, colour and temperature as row-sparse tensors; None for one that no row has.
+
+    Args:
+        marched: Samples with their gradients, see `kernels_backward`.
+        blocks: Total variation to add.
+    """
+    volume, records = marched.volume, marched.records
+    parameters = (volume.density, volume.sh, volume.temperature)
+    order = _ordered(marched)
+    bounds = _row_ranges(volume.voxel_rows, len(volume.density), order, blocks, [p.shape[1] for p in parameters])
+    ranges = list(itertools.pairwise(bounds))
+    uses = BUFFERS.empty(len(volume.density), np.uint8)
+    counts: Any = run_tasks(
+        [lambda a=a, b=b: kernels_rows.use_rows(a, b, volume, records, order, blocks, uses) for a, b in ranges]
+    )
+    places = np.concatenate((np.zeros((1, 3), np.int64), np.cumsum(np.asarray(counts).reshape(-1, 3), axis=0)))
+    lists = [BUFFERS.empty(int(total), np.int64) for total in places[-1]]
+    values = [
+        BUFFERS.empty((int(total), parameter.shape[1]), parameter.dtype)
+        for total, parameter in zip(places[-1], parameters)
+    ]
+    place = BUFFERS.empty((len(uses), 3), np.int32)
+    active = min(3 * marched.settings.sh_active, volume.sh.shape[1])
+    narrow = active < volume.sh.shape[1]
+    sums = BUFFERS.empty((len(values[1]), active), volume.sh.dtype) if narrow else values[1]
+    rows = RowGradients(uses, place, lists[0], values[0], lists[1], values[1], sums, lists[2], values[2])
+
+    def add(first: int, last: int, start: np.ndarray, stop: np.ndarray) -> None:
+        kernels_rows.list_rows(first, last, int(start[0]), int(start[1]), int(start[2]), rows)
+        kernels_rows.add_samples(first, last, marched.rays, volume, marched.settings, records, order, rows)
+        kernels_rows.spread_harmonics(int(start[1]), int(stop[1] if narrow else start[1]), rows)
+        for kind, parameter in enumerate(parameters):
+            if blocks.last[kind] > blocks.first[kind]:
+                kernels_rows.add_variation(first, last, parameter, volume.voxel_rows, kind, blocks, place, values[kind])
+
+    steps = zip(ranges, itertools.pairwise(places))
+    run_tasks([lambda a=a, b=b, start=start, stop=stop: add(a, b, start, stop) for (a, b), (start, stop) in steps])
+    return [
+        torch.sparse_coo_tensor(
+            torch.from_numpy(touched)[None],
+            torch.from_numpy(gradient),
+            parameter.shape,
+            is_coalesced=True,
+            check_invariants=False,
+        )
+        if len(touched)
+        else None
+        for touched, gradient, parameter in zip(lists, values, parameters)
+    ]
+
+
+def _ordered(marched: Marched) -> Order:
+    """The samples that have a gradient in the order of their voxels."""
+    voxels, total = len(marched.volume.voxel_rows), int(marched.records.used.sum())
+    shift = max(0, (voxels - 1).bit_length() - MOST_GROUPS.bit_length() + 1)
+    groups = (voxels >> shift) + 1
+    order = Order(shift, np.zeros(groups + 1, np.int64), BUFFERS.empty(total, np.int32), BUFFERS.empty(total, np.int32))
+    kernels_rows.order_records(marched.records, order)
+    return order
+
+
+def _row_ranges(voxel_rows: np.ndarray, num_rows: int, order: Order, blocks: Blocks, channels: list[int]) -> list[int]:
+    """Bounds of row ranges with about equally much work."""
+    ranges = num_threads() * RANGES_PER_THREAD
+    if num_threads() == 1 or len(voxel_rows) == 0:
+        return [0, num_rows]
+    starts = np.minimum(np.arange(len(order.group)) << order.shift, len(voxel_rows))
+    work = order.group.astype(np.float64)
+    for first, last, count in zip(blocks.first, blocks.last, channels):
+        work += VARIATION_SHARE * count * (np.clip(starts, first, max(first, last)) - first)
+    cuts = np.searchsorted(work, work[-1] * np.arange(1, ranges) / ranges)
+    rows = [int(voxel_rows[start, 0]) for start in starts[cuts] if start < len(voxel_rows)]
+    return sorted({0, *rows, num_rows})

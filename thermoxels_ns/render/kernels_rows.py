@@ -18,8 +18,8 @@ from thermoxels_ns.render.kernels import (
     Settings,
     Volume,
     basis_of,
+    prefetch,
 )
-from thermoxels_ns.render.prefetch import prefetch
 
 NEAR, FAR = 8, 16
 """Samples ahead whose sums, and whose places of sums, are asked for; records are asked for at twice the latter."""

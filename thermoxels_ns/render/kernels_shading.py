@@ -20,9 +20,9 @@ from thermoxels_ns.render.kernels import (
     gather_one,
     gather_some,
     place_of,
+    prefetch,
     prefetch_corners,
 )
-from thermoxels_ns.render.prefetch import prefetch
 
 NEAR, FAR = 8, 24
 """Samples ahead whose values, and whose row numbers, are asked for."""

@@ -15,9 +15,16 @@ from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.interpolation import TrilinearPoints
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.render.compositing import RayWeights, composite, ray_distortion, ray_sparsity, ray_weights
+from thermoxels_ns.render.compositing import (
+    RaySteps,
+    RayWeights,
+    composite,
+    ray_distortion,
+    ray_sparsity,
+    ray_weights,
+    sample_box,
+)
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
-from thermoxels_ns.render.sampling import RaySteps, sample_box
 
 Backend = Literal["auto", "reference", "fused"]
 
@@ -200,7 +207,7 @@ def fused_render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -
     """Render rays with the compiled kernels."""
     from thermoxels_ns.render.fused import render
 
-    return render(grid.voxels, grid.density, grid.sh, grid.temperature, grid.activation, request, options)
+    return render(grid, request, options)
 
 
 @dataclass(frozen=True)
@@ -227,7 +234,7 @@ def sample_rays(grid: VoxelGrid, request: RayRequest, options: RenderOptions, ba
 
         nothing = torch.zeros(len(request.origins), dtype=torch.bool)
         request = RayRequest(request.origins, request.directions, request.near, request.far, nothing, nothing)
-        marched = fused_march(grid.voxels, grid.density, None, grid.temperature, grid.activation, request, options)
+        marched = fused_march(grid, request, options)
         records = marched.records
         offset, used = torch.from_numpy(records.offset), torch.from_numpy(records.used)
         ray = torch.repeat_interleave(torch.arange(len(used)), offset.diff())

@@ -15,7 +15,7 @@ from thermoxels_ns.core.errors import PruningError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.field.refine import RowChange, prune
-from thermoxels_ns.multiview.depth_supervision import feature_rays_of_photographs
+from thermoxels_ns.multiview.stereo import feature_rays_of_photographs
 from thermoxels_ns.training.free_space_carving import carve_free_space
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler
 from thermoxels_ns.training.model import ThermoxelsModel
@@ -50,9 +50,6 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     # Where the lattice never changes within the run, a third of it is time enough to know what stands behind.
     decisions = {step for step in steps if end is None or step < end} or {(end or 0) // 3}
 
-    def count(step: int) -> None:
-        model.update_to_step(step)
-
     def carve(step: int) -> None:
         """Drop what lines of sight show to be air; at the first step of a training, not of a resumed one."""
         if model.config.carve == "off" or model.feature_rays is None:
@@ -85,9 +82,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             CONSOLE.log(f"step {step}: {'thinning' if thin else 'pruning'} {report}")
         if step in factors:
             old = model.grid.row_parameters()
-            change = model.split(factors[step])
-            assert change is not None
-            follow(old, change)
+            follow(old, model.split(factors[step]))
             CONSOLE.log(f"step {step}: lattice refined to {' x '.join(map(str, model.grid.lattice.cell_shape))} voxels")
             carve(step)
 
@@ -102,7 +97,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             attributes.optimizers.parameters["sh"] = [model.grid.sh]
 
     return [
-        TrainingCallback(before, count),
+        TrainingCallback(before, model.update_to_step),
         TrainingCallback(before, carve, iters=(0,)),
         TrainingCallback(before, change_lattice, iters=tuple(sorted(steps | decisions))),
         TrainingCallback(before, widen),
@@ -147,9 +142,8 @@ class PruningReport:
     """Share of the rays with an end of whose weight more than half lay in the voxels removed."""
 
     def __str__(self) -> str:
-        share = self.kept_voxels / self.total_voxels
         return (
-            f"kept {self.kept_voxels:,} of {self.total_voxels:,} voxels ({share:.1%}); "
+            f"kept {self.kept_voxels:,} of {self.total_voxels:,} voxels ({self.kept_voxels / self.total_voxels:.1%}); "
             f"threshold {self.threshold:.2g}, {self.opened:.2%} of the rays lost what they ended on"
         )
 

@@ -21,10 +21,10 @@ from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.field.background import SkyTemperature, SphereImage, seen_behind
-from thermoxels_ns.field.field import VoxelField
 from thermoxels_ns.field.harmonics import harmonics, num_coefficients
-from thermoxels_ns.field.memory import check_memory
+from thermoxels_ns.field.kept_voxels import check_memory
 from thermoxels_ns.field.refine import ColumnChange, RowChange, refine, widen_colour
+from thermoxels_ns.field.voxel_grid import VoxelField
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
 from thermoxels_ns.render.renderers import GridSamples, render_rays, sample_rays
 from thermoxels_ns.training import losses
@@ -111,14 +111,12 @@ class ThermoxelsModel(Model):
             groups["thermal_offset"] = [self.thermal_offset]
         return groups
 
-    def split(self, factor: int) -> RowChange | None:
-        """Split every kept voxel into factor^3, and return how values of rows change; None where the factor is 1.
+    def split(self, factor: int) -> RowChange:
+        """Split every kept voxel into factor^3, and return how values of rows change.
 
         Raises:
             MemoryBudgetError: The next lattice needs more than `memory_budget_gb`.
         """
-        if factor == 1:
-            return None
         self.check_memory(factor)
         return refine(self.grid, factor)
 
