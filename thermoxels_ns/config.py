@@ -35,12 +35,7 @@ def _group(lr: float, lr_final: float, optimizer: type[OptimizerConfig]) -> dict
 def _trainer(
     optimizer: type[OptimizerConfig] = RowAdamConfig, dense: type[OptimizerConfig] = FusedAdamConfig
 ) -> ThermoxelsTrainerConfig:
-    """The default training.
-
-    Args:
-        optimizer: For the rows of the voxel grid.
-        dense: For what every batch touches whole.
-    """
+    """The default training: `optimizer` for the rows of the voxel grid, `dense` for what every batch touches whole."""
     return ThermoxelsTrainerConfig(
         method_name="thermoxels",
         max_num_iterations=ITERATIONS,

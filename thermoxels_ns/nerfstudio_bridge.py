@@ -57,18 +57,15 @@ def allow_checkpoint_globals() -> None:
     Torch without the registry loads them anyway.
     """
     register = getattr(torch.serialization, "add_safe_globals", None)
-    if register is not None:
-        register(_checkpoint_globals())
-
-
-def _checkpoint_globals() -> list[Any]:
+    if register is None:
+        return
     numbers = (
         *(np.bool_, np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32, np.uint64),
         *(np.float16, np.float32, np.float64),
     )
     # The function that pickle names: numpy.core.multiarray.scalar in numpy 1, numpy._core.multiarray.scalar in 2.
     rebuild_scalar = np.float64(0).__reduce__()[0]
-    return [rebuild_scalar, np.dtype, *dict.fromkeys(type(np.dtype(number)) for number in numbers)]
+    register([rebuild_scalar, np.dtype, *dict.fromkeys(type(np.dtype(number)) for number in numbers)])
 
 
 def extend_exporter() -> None:

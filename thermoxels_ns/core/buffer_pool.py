@@ -27,12 +27,7 @@ class BufferPool:
         self._lock = threading.RLock()  # a loan may end inside of any other call, when garbage is collected
 
     def empty(self, shape: int | tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-        """An array with whatever stands in the memory it gets.
-
-        Args:
-            shape: Its shape.
-            dtype: Its type.
-        """
+        """An array with whatever stands in the memory it gets."""
         shape = (shape,) if isinstance(shape, int) else shape
         wanted = np.dtype(dtype)
         count = math.prod(shape)

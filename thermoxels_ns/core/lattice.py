@@ -33,20 +33,8 @@ class Lattice:
     """Number of corners along x, y, z; at least 2 each."""
 
     def __post_init__(self) -> None:
-        if not (all(math.isfinite(v) for v in self.lo) and math.isfinite(self.voxel_size) and self.voxel_size > 0):
-            raise ThermoxelsError(
-                "lattice",
-                expected="a finite origin and a voxel size above 0",
-                got=f"lo {self.lo}, voxel size {self.voxel_size}",
-                remedy="Check the scene box: its sides must be longer than 0.",
-            )
-        if len(self.shape) != 3 or min(self.shape) < 2:
-            raise ThermoxelsError(
-                "lattice shape",
-                expected="at least 2 corners along each axis",
-                got=self.shape,
-                remedy="Raise the resolution or check the scene box.",
-            )
+        assert all(map(math.isfinite, (*self.lo, self.voxel_size))) and self.voxel_size > 0, self
+        assert len(self.shape) == 3 and min(self.shape) >= 2, self
 
     @classmethod
     def covering(cls, box_lo: npt.ArrayLike, box_hi: npt.ArrayLike, resolution: int) -> Lattice:

@@ -46,13 +46,6 @@ def harmonics(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n
 
     Order and signs are those of Plenoxels (Fridovich-Keil et al. 2022): l = 0; l = 1 as -y, z, -x;
     l = 2 as xy, -yz, 3z^2 - 1, -xz, x^2 - y^2, each with its normalising constant.
-
-    Args:
-        directions: Unit vectors.
-        degree: 0, 1 or 2.
-
-    Returns:
-        Basis values, (degree + 1)^2 per direction.
     """
     num_coefficients(degree)
     x, y, z = directions.unbind(-1)

@@ -223,15 +223,7 @@ class VoxelGrid(nn.Module):
 
 
 class VoxelField(Field):
-    """Density, view-dependent colour and temperature, trilinear on a corner lattice (the paper's V_i).
-
-    Args:
-        lattice: Start lattice.
-        sh_degree: Degree of the colour harmonics, 0 to 2; None: no colour.
-        temperature_degree: Degree of the temperature harmonics; 0: the same from all directions.
-        start_density: Start density, [1 / world unit].
-        activation: Density activation, applied after interpolation.
-    """
+    """Density, view-dependent colour and temperature, trilinear on a corner lattice (the paper's V_i)."""
 
     def __init__(
         self,

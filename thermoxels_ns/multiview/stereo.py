@@ -248,10 +248,7 @@ def _backed(depth: npt.NDArray[np.float32], error: npt.NDArray[np.float32]) -> n
 
 
 def _num_planes(view: _View, others: list[_View], near: float, far: float) -> int:
-    """Planes such that the middle of the picture moves by a pixel in the neighbour where it moves most.
-
-    Where no neighbour sees the middle both near and far, as many as there may be.
-    """
+    """Planes such that the middle of the picture moves by a pixel in the neighbour where it moves most."""
     height, width = view.brightness.shape
     middle = view.points(np.array([[0.5 * width, 0.5 * height]] * 2), np.array([near, far]))
     most = 0.0

@@ -34,19 +34,8 @@ def intersect_box(
 
     An axis along which the direction is 0 (below 1e-20, whose inverse would overflow) constrains nothing if the
     origin lies in the closed slab and misses otherwise; no direction is ever shifted away from 0. A camera inside
-    the box starts at `near`.
-
-    Args:
-        origins: Ray origins, world units.
-        directions: Unit directions.
-        lo: Lower corner of the box.
-        hi: Upper corner of the box.
-        near: Smallest distance from the origin, >= 0.
-        far: Largest distance from the origin; None: none.
-
-    Returns:
-        Entry distance, exit distance and whether the ray meets the box over a length above 0; a miss has both
-        distances 0.
+    the box starts at `near`. Gives entry, exit and whether there is a length
+    above 0 between them; a miss has both distances 0.
     """
     parallel = directions.abs() < 1e-20
     inverse = 1.0 / torch.where(parallel, torch.ones_like(directions), directions)
@@ -71,20 +60,7 @@ def sample_box(
     near: float | Float[Tensor, " rays"] = 0.0,
     far: Float[Tensor, " rays"] | None = None,
 ) -> RaySteps:
-    """Cut each ray's chord through the box into steps of length `step`; the last step takes what is left.
-
-    Args:
-        origins: Ray origins, world units.
-        directions: Unit directions.
-        lo: Lower corner of the box.
-        hi: Upper corner of the box.
-        step: Step length, world units (the paper: half a voxel).
-        near: Distance in front of the camera where sampling starts.
-        far: Distance where it ends; None: at the box.
-
-    Returns:
-        Samples in the middle of their steps.
-    """
+    """Cut each ray's chord through the box into steps of length `step`; the last step takes what is left."""
     t_enter, t_leave, _ = intersect_box(origins, directions, lo, hi, near, far)
     length = t_leave - t_enter
     num_steps = max(1, int(torch.ceil(length.amax() / step)) if len(length) else 1)

@@ -321,18 +321,7 @@ def add_variation(
     place: Ints,
     gradient: Floats,
 ):
-    """Add the gradient of the mean total variation of a parameter's block to rows `first_row` to `last_row`.
-
-    Args:
-        first_row: First row of the range.
-        last_row: One behind its last.
-        values: Parameter, (rows, channels).
-        voxel_rows: Rows of the voxels.
-        kind: Number of the parameter.
-        blocks: The blocks.
-        place: Where rows stand in `gradient`, (rows, 3).
-        gradient: Gradients of the rows that have one, (n, channels).
-    """
+    """Add the gradient of the mean total variation of a parameter's block to rows `first_row` to `last_row`."""
     channels = values.shape[1]
     first, last = blocks.first[kind], blocks.last[kind]
     one = values.dtype.type

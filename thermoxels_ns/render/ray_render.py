@@ -69,9 +69,9 @@ class RayRender:
     depth: Float[Tensor, " rays"]
     """Expected distance of what was hit; infinite where nothing was. Carries no gradient."""
     distortion: Float[Tensor, " rays"] | None = None
-    """Distortion of each ray (`losses.distortion_loss` is its mean)."""
+    """Distortion of each ray."""
     sparsity: Float[Tensor, " rays"] | None = None
-    """Sum of log(1 + 2 density^2) over each ray's samples (`losses.sparsity_loss` is its mean)."""
+    """Sum of log(1 + 2 density^2) over each ray's samples."""
     variation: dict[str, Float[Tensor, ""]] = field(default_factory=dict)
     """Total variation of the blocks asked for."""
 

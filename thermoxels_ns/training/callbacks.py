@@ -107,7 +107,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
 def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> None:
     """Give the model feature rays to depths of photographs, beside those of tracks, where it is to have them.
 
-    See `ThermoxelsModelConfig.photo_depth`. Without photographs in training there are none.
+    See `ThermoxelsModelConfig.photo_depth`; without photographs in training there are none.
     """
     config, pipeline, trainer = model.config, attributes.pipeline, attributes.trainer
     if config.photo_depth == "off" or not model.loss_weights.tracks or pipeline is None:
@@ -192,21 +192,21 @@ def decide_backdrop(model: ThermoxelsModel, datamanager) -> None:
     config = model.config
     rgb_on, thermal_on = model.backdrop_on.tolist()
     if config.background == "auto" and rgb_on:
-        evidence = backdrop_evidence(model, datamanager.training_rays(RGB_STREAM, RAYS_PER_IMAGE))
-        keep = evidence.unsaturated >= FEWEST_OPEN_RAYS
+        unsaturated, _ = backdrop_evidence(model, datamanager.training_rays(RGB_STREAM, RAYS_PER_IMAGE))
+        keep = unsaturated >= FEWEST_OPEN_RAYS
         model.backdrop_on[0] = keep
         CONSOLE.log(
             f"background: {'sphere image kept' if keep else 'none'}, "
-            f"{evidence.unsaturated:.2%} of RGB rays leave the box unsaturated"
+            f"{unsaturated:.2%} of RGB rays leave the box unsaturated"
         )
     if config.thermal_background == "auto" and thermal_on and model.background_thermal is not None:
-        evidence = backdrop_evidence(model, datamanager.training_rays(THERMAL_STREAM, RAYS_PER_IMAGE))
-        sky = model.background_thermal(evidence.directions)
+        unsaturated, directions = backdrop_evidence(model, datamanager.training_rays(THERMAL_STREAM, RAYS_PER_IMAGE))
+        sky = model.background_thermal(directions)
         difference = float(sky.abs().mean()) if len(sky) else 0.0
-        learned = evidence.unsaturated >= FEWEST_OPEN_RAYS and difference > FEWEST_SKY_DIFFERENCE
+        learned = unsaturated >= FEWEST_OPEN_RAYS and difference > FEWEST_SKY_DIFFERENCE
         model.backdrop_on[1] = learned
         CONSOLE.log(
             f"thermal background: {'learned sky' if learned else 'the minimum of the scene'}, "
-            f"{evidence.unsaturated:.2%} of thermal rays leave the box unsaturated, "
+            f"{unsaturated:.2%} of thermal rays leave the box unsaturated, "
             f"where the sky differs from the minimum by {difference * model.temperature_range.span_k:.1f} K"
         )

@@ -136,10 +136,6 @@ def lpips(predicted: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> 
 
 
 def half_transparent_share(accumulation: Tensor) -> float:
-    """Share of rays that are neither through nor stopped, 0 to 1: semi-transparent volume, or edges.
-
-    Args:
-        accumulation: Opacity of rays, 0 to 1, any shape, at least one.
-    """
+    """Share of rays that are neither through nor stopped, 0 to 1: semi-transparent volume, or edges."""
     low, high = HALF_TRANSPARENT
     return float(((accumulation > low) & (accumulation < high)).double().mean())

@@ -73,17 +73,9 @@ class FeatureRaySampler:
     def request(
         self, count: int, near: float, voxel_size: float, generator: torch.Generator, device: torch.device
     ) -> RayRequest:
-        """Choose feature rays at random and make two of each, that before the point and that through it.
+        """Choose `count` feature rays at random and make two of each: first all that end before their points.
 
-        Args:
-            count: Number of rays.
-            near: Distance where sampling starts, [world units].
-            voxel_size: Of the lattice, [world units].
-            generator: On the CPU.
-            device: Where the rays are wanted.
-
-        Returns:
-            2 `count` rays without colour and temperature: first those that end before their points.
+        They want neither colour nor temperature. Lengths are in world units; the generator is on the CPU.
         """
         chosen = torch.randint(len(self._length), (count,), generator=generator)
         margin = MARGIN_VOXELS * voxel_size + MARGIN_ERRORS * self._uncertainty[chosen]

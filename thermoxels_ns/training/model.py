@@ -112,16 +112,7 @@ class ThermoxelsModel(Model):
         return groups
 
     def split(self, factor: int) -> RowChange:
-        """Split every kept voxel into factor^3, and return how values of rows change.
-
-        Raises:
-            MemoryBudgetError: The next lattice needs more than `memory_budget_gb`.
-        """
-        self.check_memory(factor)
-        return refine(self.grid, factor)
-
-    def check_memory(self, factor: int) -> None:
-        """Say what splitting every kept voxel into factor^3 will need, and refuse what exceeds the budget.
+        """Split every kept voxel into factor^3, say what that needs, and return how values of rows change.
 
         Raises:
             MemoryBudgetError: The next lattice needs more than `memory_budget_gb`.
@@ -129,6 +120,7 @@ class ThermoxelsModel(Model):
         lattice = self.grid.lattice.refined(factor)
         voxels, channels = len(self.grid.voxels) * factor**3, self.config.row_channels(max(lattice.cell_shape))
         CONSOLE.log(f"memory: {check_memory(lattice, voxels, channels, self.config.memory_budget_gb)}")
+        return refine(self.grid, factor)
 
     def widen_colour(self) -> ColumnChange | None:
         """Store all harmonics of colour once it depends on the direction.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 from nerfstudio.models.base_model import ModelConfig
@@ -22,49 +22,32 @@ _STANDARD = schedule_for(*QUALITIES["standard"])
 class LossWeights:
     """Weight of each loss term; a term of weight 0 is not computed."""
 
-    rgb: float
+    rgb: float = 1.0
     """Mean squared error of colour (paper, eq. 3)."""
-    thermal: float
+    thermal: float = 1.0
     """lambda L2 + (1 - lambda) L1 of temperature (paper, eq. 4)."""
-    tv_density: float
+    tv_density: float = 1e-5
     """Total variation of the stored density."""
-    tv_sh: float
+    tv_sh: float = 1e-5
     """Total variation of the colour harmonics."""
-    tv_temperature: float
+    tv_temperature: float = 1e-3
     """Total variation of temperature."""
-    sparsity: float
+    sparsity: float = 0.0
     """Cauchy sparsity of density along rays."""
-    beta: float
+    beta: float = 0.0
     """Push rays to be opaque or empty."""
-    distortion: float
+    distortion: float = 0.1
     """Gather each ray's weight in one short interval."""
-    tracks: float = 0.0
+    tracks: float = 0.05
     """Feature rays end at their points: tracks of structure from motion, depths on which photographs agree."""
 
 
 LOSS_RECIPES: Mapping[str, LossWeights] = {
     # Tuned on the synthetic scenes for what meshes need: opaque solids, empty air.
-    "default": LossWeights(
-        rgb=1.0,
-        thermal=1.0,
-        tv_density=1e-5,
-        tv_sh=1e-5,
-        tv_temperature=1e-3,
-        sparsity=0.0,
-        beta=0.0,
-        distortion=0.1,
-        tracks=0.05,
-    ),
+    "default": LossWeights(),
     # The published training configuration of the original code (TV, sparsity and beta as there).
     "paper": LossWeights(
-        rgb=1.0,
-        thermal=1.0,
-        tv_density=5e-3,
-        tv_sh=5e-2,
-        tv_temperature=1e-6,
-        sparsity=1e-11,
-        beta=1e-5,
-        distortion=0.0,
+        tv_density=5e-3, tv_sh=5e-2, tv_temperature=1e-6, sparsity=1e-11, beta=1e-5, distortion=0.0, tracks=0.0
     ),
 }
 
@@ -159,16 +142,10 @@ class ThermoxelsModelConfig(ModelConfig):
 
     def loss_weights(self) -> LossWeights:
         """The recipe's weights with the overrides in place."""
-        base = LOSS_RECIPES[self.recipe]
-        known = {f.name: getattr(base, f.name) for f in fields(base)}
-        for name in self.loss_overrides:
-            if name not in known:
-                raise ThermoxelsError(
-                    f"loss_overrides.{name}",
-                    expected="one of " + ", ".join(known),
-                    got=name,
-                    remedy="Correct the name.",
-                )
+        known = vars(LOSS_RECIPES[self.recipe])
+        for name in self.loss_overrides.keys() - known.keys():
+            expected = "one of " + ", ".join(known)
+            raise ThermoxelsError(f"loss_overrides.{name}", expected=expected, got=name, remedy="Correct the name.")
         return LossWeights(**{**known, **self.loss_overrides})
 
     def check(self) -> None:
@@ -205,8 +182,7 @@ class ThermoxelsModelConfig(ModelConfig):
             if not low <= value <= high:  # NaN fails too
                 option = name.replace("_", "-")
                 raise ThermoxelsError(name, expected=expected, got=value, remedy=f"Correct --pipeline.model.{option}.")
-        for name in ("prune_at", "thin_at"):
-            at = getattr(self, name)
+        for name, at in (("prune_at", self.prune_at), ("thin_at", self.thin_at)):
             if at and min(at) < 1:
                 raise ThermoxelsError(name, expected="steps of at least 1", got=at, remedy="Correct the steps.")
 
@@ -239,14 +215,11 @@ class ThermoxelsModelConfig(ModelConfig):
         return 1 + num_coefficients(self.temperature_degree) + (0 if degree is None else 3 * num_coefficients(degree))
 
     def checkpoint_columns(self) -> dict[str, tuple[int, ...]]:
-        """Columns that each parameter of the grid may have in a checkpoint.
-
-        Colour has one per channel until it depends on the direction, and all of them then.
-        """
+        """Columns that each parameter of the grid may have in a checkpoint."""
         columns: dict[str, tuple[int, ...]] = {
             "density": (1,),
             "temperature": (num_coefficients(self.temperature_degree),),
         }
-        if self.sh_degree is not None:
+        if self.sh_degree is not None:  # one per channel until colour depends on the direction
             columns["sh"] = tuple(dict.fromkeys((3, 3 * num_coefficients(self.sh_degree))))
         return columns

@@ -47,7 +47,7 @@ class RowOptimizer(torch.optim.Optimizer):
 
     def new_state(self, parameter: Tensor) -> dict[str, Tensor]:
         """State of a parameter that was never updated; each entry has the parameter's rows."""
-        raise TypeError(f"{type(self).__name__} does not say what its state is")
+        raise TypeError(f"{type(self).__name__} has no state")
 
     def update_rows(
         self, parameter: Tensor, rows: Tensor, gradient: Tensor, state: dict[str, Tensor], group: dict[str, Any]
@@ -56,23 +56,11 @@ class RowOptimizer(torch.optim.Optimizer):
         raise TypeError(f"{type(self).__name__} does not say how rows are updated")
 
     def change_rows(self, old: Tensor, new: torch.nn.Parameter, change: RowChange) -> None:
-        """Go on with a parameter whose rows were split or dropped: the state follows as the values did.
-
-        Args:
-            old: The parameter so far.
-            new: The one that takes its place.
-            change: How values of rows changed.
-        """
+        """Go on with a parameter whose rows were split or dropped: the state follows as the values did."""
         self._follow(old, new, lambda values: change(values.view(len(values), -1)).reshape(-1, *values.shape[1:]))
 
     def change_columns(self, old: Tensor, new: torch.nn.Parameter, change: ColumnChange) -> None:
-        """Go on with a parameter whose rows have other columns; state that is one number per row stays.
-
-        Args:
-            old: The parameter so far.
-            new: The one that takes its place.
-            change: How values of columns changed.
-        """
+        """Go on with a parameter whose rows have other columns; state that is one number per row stays."""
         self._follow(old, new, lambda values: change(values) if values.shape == old.shape else values)
 
     def _follow(self, old: Tensor, new: torch.nn.Parameter, change: Callable[[Tensor], Tensor]) -> None:
@@ -99,14 +87,7 @@ def touched_rows(gradient: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class RowAdam(RowOptimizer):
-    """Adam (Kingma and Ba 2015) on touched rows, each with its own bias correction.
-
-    Args:
-        params: Parameters or groups.
-        lr: Learning rate.
-        betas: Decay of the running means of the gradient and of its square.
-        eps: Added to the root of the second moment.
-    """
+    """Adam (Kingma and Ba 2015) on touched rows, each with its own bias correction."""
 
     def __init__(self, params, lr: float = 1e-3, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15):
         super().__init__(params, {"lr": lr, "betas": tuple(betas), "eps": eps})
@@ -124,9 +105,7 @@ class RowAdam(RowOptimizer):
         (beta1, beta2), lr, eps = group["betas"], group["lr"], group["eps"]
         first, second = (state[name].view(len(parameter), -1) for name in ("exp_avg", "exp_avg_sq"))
         if parameter.device.type == "cpu":
-            from thermoxels_ns.training import optimizer_kernels as optim_kernels
-
-            adam_rows: Any = optim_kernels.adam_rows
+            from thermoxels_ns.training.optimizer_kernels import adam_rows
 
             arrays = [t.detach().contiguous().numpy() for t in (rows, gradient)]
             held = [t.detach().numpy() for t in (parameter, first, second, state["updates"])]
@@ -143,14 +122,7 @@ class RowAdam(RowOptimizer):
 
 
 class RowRMSprop(RowOptimizer):
-    """RMSprop (Tieleman and Hinton 2012) on touched rows, as Plenoxels uses it.
-
-    Args:
-        params: Parameters or groups.
-        lr: Learning rate.
-        alpha: Decay of the running mean of squared gradients.
-        eps: Added to its root.
-    """
+    """RMSprop (Tieleman and Hinton 2012) on touched rows, as Plenoxels uses it."""
 
     def __init__(self, params, lr: float = 1e-2, alpha: float = 0.95, eps: float = 1e-8):
         super().__init__(params, {"lr": lr, "alpha": alpha, "eps": eps})
@@ -164,9 +136,7 @@ class RowRMSprop(RowOptimizer):
         lr, alpha, eps = group["lr"], group["alpha"], group["eps"]
         square = state["square_avg"].view(len(parameter), -1)
         if parameter.device.type == "cpu":
-            from thermoxels_ns.training import optimizer_kernels as optim_kernels
-
-            rmsprop_rows: Any = optim_kernels.rmsprop_rows
+            from thermoxels_ns.training.optimizer_kernels import rmsprop_rows
 
             arrays = [t.detach().contiguous().numpy() for t in (rows, gradient)]
             held = [t.detach().numpy() for t in (parameter, square)]

@@ -102,12 +102,11 @@ class ThermoxelsPipeline(VanillaPipeline):
             if name.startswith(_GRID) and getattr(tensor, "ndim", 0) == 2
         }
         if expected.keys() != found.keys() or any(found[name] not in columns for name, columns in expected.items()):
+            here = _columns({name: (columns,) for name, columns in found.items()})
             raise CheckpointError(
                 "checkpoint",
                 expected=f"a voxel grid with the columns {_columns(expected)}",
-                got=_columns({name: (columns,) for name, columns in found.items()})
-                if found
-                else "no voxel grid: the checkpoint of another method",
+                got=here or "no voxel grid: the checkpoint of another method",
                 remedy="Load it with the config.yml that was written beside it.",
             )
         self._check_settings(self.state_dict(), state)
@@ -131,8 +130,7 @@ class ThermoxelsPipeline(VanillaPipeline):
                 got=f"{resolution} voxels",
                 remedy="Pass --pipeline.model.resolutions as in training; finer ones may follow.",
             )
-        activations = [own[_ACTIVATION], state[_ACTIVATION]]
-        if not torch.equal(activations[0].cpu(), activations[1].cpu()):
+        if not torch.equal(own[_ACTIVATION].cpu(), state[_ACTIVATION].cpu()):
             raise CheckpointError(
                 "density_activation",
                 expected="the checkpoint's",
@@ -142,14 +140,12 @@ class ThermoxelsPipeline(VanillaPipeline):
         for name, what, tolerance in (
             ("world_from_input", "poses and scene box", 1e-4),
             ("_model.temperature_bounds_c", "temperature range", 1e-3),
-            ("_model.thermal_offset", "number of training images", 0.0),
+            ("_model.thermal_offset", "number of training images", math.inf),
         ):
             if name not in own:
                 continue
             here, stored = own[name].cpu().double(), state[name].cpu().double()
-            offset = name == "_model.thermal_offset"
-            same = here.shape == stored.shape and (offset or torch.allclose(here, stored, atol=tolerance, rtol=1e-4))
-            if not same:
+            if here.shape != stored.shape or not torch.allclose(here, stored, atol=tolerance, rtol=1e-4):
                 raise CheckpointError(
                     what,
                     expected="those the checkpoint was trained with",

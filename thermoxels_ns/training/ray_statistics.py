@@ -69,11 +69,6 @@ def share_of_rays_opened(model: RaySampler, rays: Iterable[RayBundle], keep: Boo
     """Share of the rays that end on something (opacity above one half) of whose weight more than half would go.
 
     Removing thin, half-transparent voxels lets no ray through; removing a body does.
-
-    Args:
-        model: The field.
-        rays: Rays to ask.
-        keep: Voxels that would stay, one boolean per kept voxel.
     """
     device = model.grid.density.device
     hit, opened = 0, 0
@@ -187,21 +182,9 @@ def _is_thermal(bundle: RayBundle, device: torch.device) -> Bool[Tensor, " rays"
     return (stream[:, 0].to(device) & THERMAL_STREAM) > 0
 
 
-@dataclass(frozen=True)
-class BackdropEvidence:
-    """What rays show behind the box."""
-
-    rays: int
-    """Rays looked at."""
-    unsaturated: float
-    """Share of them that leave the box with more than half of their light still to come."""
-    directions: Float[Tensor, "n 3"]
-    """Directions of those rays."""
-
-
 @torch.no_grad()
-def backdrop_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> BackdropEvidence:
-    """Find the rays that leave the box unsaturated."""
+def backdrop_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> tuple[float, Float[Tensor, "n 3"]]:
+    """Share and directions of the rays that leave the box with more than half of their light still to come."""
     device = model.grid.density.device
     seen, open_directions = 0, [torch.zeros(0, 3, device=device)]
     for bundle in rays:
@@ -210,4 +193,4 @@ def backdrop_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> BackdropE
         open_directions.append(directions[samples.transmittance > 0.5])
         seen += len(directions)
     found = torch.cat(open_directions)
-    return BackdropEvidence(seen, len(found) / max(1, seen), found)
+    return len(found) / max(1, seen), found
