@@ -71,13 +71,7 @@ def room_of(module: str) -> str:
 
 
 def imports(source: str, package: str, modules: frozenset[str]) -> Iterator[str]:
-    """Yield what a file imports, anywhere in it, as full names of modules.
-
-    Args:
-        source: The text of the file.
-        package: The full name of the package that relative imports start from.
-        modules: Full names of our modules, to tell ``from package import module`` from ``from module import name``.
-    """
+    """Yield what a file imports, anywhere in it, as full names of modules."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -94,13 +88,7 @@ def imports(source: str, package: str, modules: frozenset[str]) -> Iterator[str]
 
 
 def forbidden_arrows(module: str, source: str, modules: frozenset[str]) -> list[str]:
-    """List the imports of a file that its room may not have.
-
-    Args:
-        module: Name of the file's module below the package, such as ``mesh.tetrahedra``.
-        source: The text of the file.
-        modules: Full names of all our modules.
-    """
+    """List the imports of a file that its room may not have."""
     room = room_of(module)
     allowed = MAY_IMPORT[room]
     wrong = []
@@ -185,21 +173,14 @@ def test_a_circle_is_seen() -> None:
     ("module", "source"),
     [
         ("core.lattice", "from thermoxels_ns.field.voxel_grid import VoxelGrid"),
-        ("core.lattice", "from thermoxels_ns import cli"),
-        ("data.splits", "import thermoxels_ns.field.refine"),
-        ("synthetic.solids", "from thermoxels_ns.data.scene_file import read_scene"),
         ("render.renderers", "from ..training import losses"),
         ("training.model", "def f():\n    from thermoxels_ns.mesh import build"),
-        ("training.pipeline", "def f():\n    from thermoxels_ns.commands import export"),
-        ("training.losses", "import skfem"),
         ("mesh.build", "class A:\n    def f(self):\n        import torch.nn as nn"),
         ("mesh.build", "from .. import fem"),
         ("mesh.build", "import importlib\nimportlib.import_module('thermoxels_ns.training.model')"),
         ("mesh.build", "if TYPE_CHECKING:\n    from thermoxels_ns.training.model import Model"),
         ("fem.stepping", "from thermoxels_ns.mesh.build import build_mesh"),
-        ("fem.stepping", "from thermoxels_ns.heat.scene import HeatScene"),
         ("fem.stepping", "if True:\n    from nerfstudio.cameras.rays import RayBundle"),
-        ("reports.heat_page", "from thermoxels_ns.commands.heat import HeatCommand"),
     ],
 )
 def test_the_checker_sees_a_forbidden_import(module: str, source: str) -> None:

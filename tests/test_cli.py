@@ -12,7 +12,6 @@ import pytest
 
 from thermoxels_ns import cli
 from thermoxels_ns.commands.demo import SceneName
-from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.scene_folder import SCENE_NAMES, load_truth
 
 SMALL = ["--num-train", "3", "--num-eval", "1", "--width", "16", "--height", "12"]
@@ -65,15 +64,6 @@ def test_bad_input_is_one_sentence_and_exit_status_1(tmp_path, capsys):
     shown = capsys.readouterr()
     assert shown.err.splitlines() == ["Error: noise_k: expected a finite number of at least 0, got -1.0. Pass 0."]
     assert "Traceback" not in shown.out
-
-
-def test_markup_in_a_message_is_shown_as_it_is(monkeypatch, capsys):
-    def fail(self):
-        raise SceneError("folder [bold]x[/bold] [/oops]")
-
-    monkeypatch.setattr(cli.Synthetic, "main", fail)
-    assert cli.main(["synthetic", "sphere", "--output-dir", "x"]) == 1
-    assert "folder [bold]x[/bold] [/oops]" in capsys.readouterr().err
 
 
 def test_an_interrupted_command_has_its_own_status(monkeypatch, capsys):

@@ -66,12 +66,6 @@ def test_folder_that_cannot_be_made_is_refused(tmp_path):
     assert writable_folder(tmp_path / "a" / "b").is_dir()
 
 
-@pytest.mark.parametrize("value", [True, np.True_, "1", None])
-def test_what_is_no_number_is_not_positive(value):
-    with pytest.raises(ThermoxelsError, match="speed: expected a finite number above 0"):
-        check_positive("speed", value, "Go forward.")
-
-
 def test_errors_of_the_disk_become_output_errors(tmp_path):
     (tmp_path / "mesh.vtu").mkdir()
     blocked = pytest.raises(OutputError, match=r"mesh\.vtu: expected a file that can be written.*Move away")

@@ -13,7 +13,7 @@ import pytest
 import tyro
 
 from thermoxels_ns import cli
-from thermoxels_ns.core.option_help import join_help_lines, joined_lines
+from thermoxels_ns.core.option_help import join_help_lines
 
 LONG = "Every option's text is one paragraph here, however many lines it takes in the source: 12 of them, or more."
 
@@ -53,10 +53,6 @@ def help_of(program: list[str], columns: int, monkeypatch, capsys) -> str:
 def words(text: str) -> str:
     """A help text as the terminal broke it, in one line."""
     return " ".join(re.sub(r"[│╭╮╰╯─]", " ", text).split())
-
-
-def test_only_empty_lines_break_a_text() -> None:
-    assert joined_lines("\n  One, \n  (2),\n\n  `three`\n    4.\n") == "One, (2),\n\n`three` 4."
 
 
 def test_tyro_is_told_what_stands_below_the_fields_of_a_class(monkeypatch, capsys) -> None:

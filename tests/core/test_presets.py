@@ -153,11 +153,6 @@ def test_overrides_leave_the_base_alone() -> None:
     assert yaml.dump(config.thermoxels.config) == before
 
 
-def test_an_unknown_preset_lists_the_known() -> None:
-    with pytest.raises(ThermoxelsError, match=f"^preset: expected one of {', '.join(METHOD_FILES)}, got cheese"):
-        read_preset("cheese")
-
-
 def test_an_installed_package_brings_the_presets(tmp_path: Path) -> None:
     """The wheel holds configs/ inside the package, where `configs_folder` looks first."""
     from hatchling.builders.wheel import WheelBuilder

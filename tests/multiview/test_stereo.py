@@ -6,18 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from tests.support.plane_photographs import EYES, FOCAL, PLANE, SIZE, photographs, texture
 from thermoxels_ns.core.threads import set_num_threads
 from thermoxels_ns.multiview import stereo
-from thermoxels_ns.multiview.photographs import Photographs
+from thermoxels_ns.multiview.photographs import Photographs, read_photographs
 from thermoxels_ns.multiview.stereo import (
     FEWEST_VIEWS,
     Depths,
     depths_of,
     feature_rays_to_depths,
 )
-from thermoxels_ns.multiview.stereo_kernels import correlate, weigh_patches
 
 LO, HI = (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)
 TRUE_DEPTH = 1.6 - PLANE
@@ -128,26 +129,6 @@ def test_an_outline_gives_its_depth_to_nothing_beside_it(noise):
     assert (known & ~shown).sum() <= 0.001 * known.sum()
 
 
-def test_correlation_is_that_of_the_weighted_patches_and_the_best_count():
-    draw = np.random.default_rng(1)
-    colours = (0.5 + 0.03 * draw.random((9, 9, 3))).astype(np.float32)
-    mine = colours.mean(-1)
-    weights, (means, variances) = np.zeros((9, 9, 25), np.float32), np.zeros((2, 9, 9), np.float32)
-    weigh_patches(colours, mine, 2, 0.025, 0.0, 0.05, np.float32(0.0), weights, means, variances)
-    others = np.stack((mine, draw.random((9, 9)).astype(np.float32), 1.3 * mine - 0.1, np.full_like(mine, -100.0)))
-    own, noise = weights[4, 4].astype(float), 1e-6
-    expected = []
-    for other in others[:3].astype(float):
-        a, b = (v[2:7, 2:7].ravel() - own @ v[2:7, 2:7].ravel() for v in (mine.astype(float), other))
-        expected.append(own @ (a * b) / np.sqrt((own @ (a * a) + noise) * (own @ (b * b) + noise)))
-    for count in (1, 2, 3, 4):
-        result = np.zeros((9, 9), np.float32)
-        correlate(mine, others, 2, weights, means, variances, np.float32(noise), count, result)
-        best = np.sort([*expected, -1.0])[-count:].mean()
-        assert result[4, 4] == pytest.approx(best, abs=2e-4)
-        assert result[0, 0] == -1.0
-
-
 @pytest.mark.parametrize(("liars", "sure"), [(4, False), (9, True)])
 def test_what_many_look_through_is_not_sure_however_few_agree(monkeypatch, liars, sure):
     """Some photographs agree about a plate before the plane, which all others look through."""
@@ -207,3 +188,64 @@ def test_depths_of_a_room_from_within_lie_on_its_walls():
     off = np.abs(np.abs(lines.points).max(1) - half)
     assert len(sure) > 500
     assert np.quantile(off, 0.9) < 0.05, np.quantile(off, [0.5, 0.9])
+
+
+class Frames:
+    """A dataset of pictures whose red and green say where a pixel's ray goes: x and y on the plane at depth 1."""
+
+    def __init__(self, width: int, height: int, distortion: list[float] | None, masked: bool = False):
+        focal, kinds = 0.8 * width, CameraType.PERSPECTIVE
+        poses = torch.eye(4)[None, :3].repeat(40, 1, 1)
+        poses[:, 0, 3] = torch.arange(40.0)
+        lens = None if distortion is None else torch.tensor([distortion])
+        self.cameras = Cameras(
+            poses, focal, focal, width / 2, height / 2, width, height, distortion_params=lens, camera_type=kinds
+        )
+        directions = self.cameras.generate_rays(camera_indices=0).directions
+        x, y = directions[..., 0] / -directions[..., 2], directions[..., 1] / -directions[..., 2]
+        picture = torch.stack((0.5 + 0.4 * x, 0.5 + 0.4 * y, torch.zeros_like(x)), -1)
+        self.picture, self.masked = (255 * picture).round().to(torch.uint8), masked
+
+    def get_image_uint8(self, index: int) -> torch.Tensor:
+        return self.picture
+
+    def get_mask(self, index: int) -> torch.Tensor | None:
+        mask = torch.ones(*self.picture.shape[:2], 1, dtype=torch.bool)
+        mask[: len(mask) // 4] = False
+        return mask if self.masked else None
+
+
+@pytest.mark.parametrize("distortion", [None, [-0.12, 0.03, 0.0, 0.0, 0.004, -0.006]])
+@pytest.mark.parametrize(("width", "height"), [(120, 90), (1000, 750)])
+def test_read_photographs_are_pinholes(distortion, width, height):
+    read = read_photographs(Frames(width, height, distortion), most=32, longest_side=400)
+    assert read is not None and len(read) == 32
+    assert read.centres[0, 0] == 0.0 and read.centres[-1, 0] == 39.0 and len(set(read.centres[:, 0])) == 32
+    assert tuple(read.sizes[3]) == ((120, 90) if width == 120 else (400, 300))
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 9), np.linspace(-0.35, 0.35, 7))
+    for k in (0, 17):
+        points = np.stack((read.centres[k, 0] + 2 * x, 2 * y, np.full_like(x, -2.0), np.ones_like(x)), -1)
+        u, v, depth = np.moveaxis(points @ read.matrices[k].T, -1, 0)
+        assert depth == pytest.approx(2.0)
+        picture = read.colours[read.firsts[k] :][: np.prod(read.sizes[k])].reshape(*read.sizes[k][::-1], 3)
+        shown = picture[np.floor(v / depth).astype(int), np.floor(u / depth).astype(int)]
+        pixel = 0.4 * 1.25 / read.sizes[k, 0]
+        assert shown[..., 0] == pytest.approx(0.5 + 0.4 * x, abs=0.6 * pixel + 0.004)
+        assert shown[..., 1] == pytest.approx(0.5 + 0.4 * y, abs=0.6 * pixel + 0.004)
+
+
+def test_masks_of_read_photographs():
+    read = read_photographs(Frames(600, 450, None, masked=True), most=32, longest_side=400)
+    assert read is not None
+    rows = np.isnan(read.colours[: np.prod(read.sizes[0])].reshape(*read.sizes[0][::-1], 3)).all((1, 2))
+    assert rows[:75].all() and not rows[76:].any()
+
+
+def test_other_lenses_are_left_out():
+    frames = Frames(60, 40, None)
+    kinds = torch.full((40, 1), CameraType.FISHEYE.value)
+    frames.cameras.camera_type = kinds
+    assert read_photographs(frames) is None
+    kinds[3:9] = CameraType.PERSPECTIVE.value
+    read = read_photographs(frames)
+    assert read is not None and read.centres[:, 0].tolist() == [3.0, 4.0, 5.0, 6.0, 7.0, 8.0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.reference.two_renderers import random_grid, random_request
 from tests.support.short_training import train_with_optimizers
+from thermoxels_ns.core import threads
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.threads import num_threads, set_num_threads
 from thermoxels_ns.field.background import SkyTemperature, SphereImage, seen_behind
@@ -17,6 +19,16 @@ from thermoxels_ns.render.ray_render import RenderOptions
 from thermoxels_ns.render.renderers import fused_render, sample_rays
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 from thermoxels_ns.training.optimizers import RowAdam, RowRMSprop
+
+
+@pytest.fixture
+def restored_threads() -> Iterator[None]:
+    """Give kernels and torch their threads back after a test."""
+    kernels, ours = threads._state["threads"], torch.get_num_threads()
+    yield
+    threads.set_num_threads(kernels or None)
+    torch.set_num_threads(ours)
+
 
 COUNTS = (1, 2, 5)
 

@@ -39,17 +39,7 @@ def random_grid(
     seed: int = 0,
     density: float = 1.0,
 ) -> VoxelGrid:
-    """A grid in single precision with random values in every row.
-
-    Args:
-        sh_degree: Degree of colour; None: none.
-        temperature_degree: Degree of temperature.
-        activation: Density activation.
-        kept: Share of the voxels that is kept at random, or the flat indices of the kept ones.
-        lattice: The lattice; None: 12 voxels along the longest side of a box that is not a cube.
-        seed: Seed.
-        density: Middle of the raw densities.
-    """
+    """A grid in single precision with random values in every row; `kept` is a share or the flat indices of voxels."""
     lattice = lattice or Lattice.covering((-1, -1, -0.8), (1, 1, 0.8), 12)
     grid = VoxelGrid(lattice, sh_degree, temperature_degree, 1.0, activation)
     random = np.random.default_rng(seed)
@@ -73,14 +63,7 @@ def as_double(grid: VoxelGrid) -> VoxelGrid:
 
 
 def random_request(grid: VoxelGrid, rays: int = 150, seed: int = 0, mixed: bool = True) -> RayRequest:
-    """Rays from outside towards the middle of the box, some from inside, some that miss it.
-
-    Args:
-        grid: Gives the box.
-        rays: How many.
-        seed: Seed.
-        mixed: Rays that want colour, temperature, both or none; else all want both.
-    """
+    """Rays from outside towards the middle of the box, some from inside, some that miss it."""
     generator = torch.Generator().manual_seed(seed + 1)
     lo, hi = torch.tensor(grid.lattice.lo), torch.tensor(grid.lattice.hi)
     half = float((hi - lo).norm()) / 2.0
@@ -118,15 +101,7 @@ def see(
     options: RenderOptions = EVERYTHING,
     background: bool = False,
 ) -> Seen:
-    """Render, and differentiate a random combination of everything that has a gradient.
-
-    Args:
-        renderer: A name of `RENDERERS`.
-        grid: The grid; its precision is that of the render.
-        request: The rays, in the same precision.
-        options: What to compute.
-        background: Put a random background behind the box, whose gradient is compared too.
-    """
+    """Render, and differentiate a random combination of everything that has a gradient."""
     generator = torch.Generator().manual_seed(7)
     dtype, rays = grid.density.dtype, len(request.origins)
     backdrop = [torch.rand(rays, n, generator=generator).to(dtype).requires_grad_() for n in (3, 1)]

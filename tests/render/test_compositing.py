@@ -7,9 +7,7 @@ import math
 import pytest
 import torch
 
-from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.render.compositing import RaySteps, composite, ray_weights
-from thermoxels_ns.render.renderers import march
 
 
 def double_loop(density, deltas, rgb, thermal, t, background_rgb, background_thermal):
@@ -109,42 +107,3 @@ def test_temperature_does_not_move_density_unless_asked():
         else:
             gradient = torch.autograd.grad(seen.thermal.sum(), [density, thermal], allow_unused=True)
             assert gradient[0] is None and gradient[1].abs().max() > 1e-3
-
-
-def test_only_the_rays_of_a_stream_are_rendered():
-    deltas = torch.full((3, 4), 0.5)
-    asked = []
-
-    def rgb_at(flat):
-        asked.extend((flat // 4).tolist())
-        return torch.ones(len(flat), 3)
-
-    seen = composite(
-        RaySteps(torch.cumsum(deltas, -1), deltas),
-        ray_weights(torch.ones(3, 4), deltas),
-        rgb_at,
-        rgb_rays=torch.tensor([True, False, True]),
-        background_rgb=torch.ones(3),
-    )
-    assert set(asked) == {0, 2}
-    assert seen.rgb is not None
-    torch.testing.assert_close(seen.rgb[:, 0], torch.tensor([1.0, 0.0, 1.0]))
-
-
-def test_march_skips_what_is_not_kept_and_integrates_the_chord():
-    lattice = Lattice((-1.0, -1.0, -1.0), 0.25, (9, 9, 9))
-    origins = torch.tensor([[-3.0, 0.1, 0.2], [0.0, 0.0, 0.0]], dtype=torch.float64)
-    directions = torch.nn.functional.normalize(torch.tensor([[1.0, 0.1, 0.05], [0.3, 0.4, 0.5]]).double(), dim=-1)
-    asked = []
-
-    def density_at(positions):
-        asked.append(len(positions))
-        return torch.full((len(positions),), 0.7, dtype=positions.dtype)
-
-    whole = march(origins, directions, lattice, density_at)
-    chord = whole.steps.deltas.sum(-1)
-    torch.testing.assert_close(whole.along.transmittance, torch.exp(-0.7 * chord))
-    half = march(origins, directions, lattice, density_at, keep=lambda p: p[:, 0] > 0)
-    assert asked[1] < asked[0]
-    assert half.along.transmittance[0] > 1.5 * whole.along.transmittance[0]
-    assert half.along.transmittance[1] == whole.along.transmittance[1]  # this ray never leaves what is kept

@@ -69,15 +69,6 @@ def test_only_terms_of_non_zero_weight_are_computed(recipe):
     assert set(model.get_loss_dict(model(rays()), targets())) == {"rgb_loss"}
 
 
-@pytest.mark.parametrize("feature_rays, options", [(None, {}), (LINES, {"sh_degree": None})])
-def test_without_tracks_or_photographs_their_term_has_nothing_to_say(feature_rays, options):
-    model = make(feature_rays, **options).train()
-    outputs = model(rays(stream=THERMAL_STREAM))
-    assert "tracks_loss" not in model.get_loss_dict(outputs, targets())
-    again = make(LINES).train()
-    assert "tracks_loss" in again.get_loss_dict(again(rays(stream=THERMAL_STREAM)), targets())
-
-
 def test_lines_of_sight_move_density_alone_and_weigh_as_asked():
     values = []
     for weight in (0.05, 0.1):
@@ -160,19 +151,6 @@ def test_unknown_loss_and_missing_range_are_refused():
         make(loss_overrides={"tv": 1.0})
     with pytest.raises(SceneError, match="thermal images with a temperature range"):
         ThermoxelsModelConfig(resolutions=(8,), refine_at=()).setup(scene_box=BOX, num_train_data=1, metadata={})
-
-
-def test_snapshot_is_what_the_field_says():
-    model = make(start_density=5.0).eval()
-    with torch.no_grad():
-        model.grid.density += torch.rand(model.grid.density.shape)
-    snapshot = model.grid_snapshot([rays()])
-    lattice = model.grid.lattice
-    centres = torch.as_tensor(lattice.cell_centres(), dtype=torch.float32).reshape(-1, 3)
-    at_centres = model.grid.density_at(model.grid.locate(centres)).detach().view(lattice.cell_shape).numpy()
-    np.testing.assert_allclose(snapshot.centre_density(), at_centres, rtol=1e-5)
-    np.testing.assert_allclose(snapshot.temperature_c, 20.0, atol=1e-4)  # 0.5 of 10 to 30
-    assert 0 < np.count_nonzero(snapshot.observed_weight) < lattice.num_corners
 
 
 def test_snapshot_holds_what_rays_say_on_the_whole_lattice():

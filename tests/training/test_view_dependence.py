@@ -41,13 +41,7 @@ def stored_whole(monkeypatch):
 
 
 class Training:
-    """A training that can be saved and resumed at any step.
-
-    Args:
-        scene: Scene folder.
-        options: Settings of the model beside those of `COURSE`.
-        saved: What `save` gave; the training goes on behind it.
-    """
+    """A training that can be saved and resumed at any step."""
 
     def __init__(self, scene: Path, options: dict[str, Any] | None = None, saved: bytes | None = None):
         rays = {"data": scene, "train_num_rays_per_batch": 300}
