@@ -48,14 +48,9 @@ def _forget_once(room: str, cached: Path) -> None:
 
 
 def forget_stale_kernels(cached: Path, sources: Iterable[Path]) -> bool:
-    """Remove what numba keeps in a folder if any of the sources differs from when it was kept.
+    """Remove what numba keeps in a folder if any of the sources differs from when it was kept; say whether one does.
 
-    Args:
-        cached: Folder in which numba keeps compiled functions.
-        sources: Python files with compiled functions that may inline each other's.
-
-    Returns:
-        Whether anything was out of date. A folder that cannot be written is left alone.
+    A folder that cannot be written is left alone.
     """
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in sorted(sources))).hexdigest()
     mark = cached / _DIGEST

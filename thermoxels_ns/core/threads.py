@@ -33,17 +33,10 @@ def _executor() -> ThreadPoolExecutor:
 
 
 def run_ranges(work: Callable[[int, int], object], total: int, smallest: int = 64) -> list[object]:
-    """Call ``work(first, last)`` on ranges that cover 0 to `total`, in parallel.
+    """Call ``work(first, last)`` on ranges that cover 0 to `total`, in parallel; give the results in order.
 
-    Kernels release Python's lock and write to disjoint places; how many threads there are never changes a result.
-
-    Args:
-        work: Called with the bounds of a range; must write nothing that another range writes.
-        total: Number of items.
-        smallest: Items below which a range is not worth a thread.
-
-    Returns:
-        What each range returned, in order.
+    Kernels release Python's lock and write to disjoint places; how many threads there are never changes a result. A
+    range of fewer than `smallest` items is not worth a thread.
     """
     threads = num_threads()
     if threads == 1 or total <= smallest:

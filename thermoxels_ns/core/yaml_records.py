@@ -224,12 +224,7 @@ def read_preset(name: str) -> dict[str, Any]:
 
 
 def with_overrides(config: Config, overrides: Mapping[str, Any], name: str = "preset") -> Config:
-    """A copy of a (nested) dataclass with some fields replaced; the original is not touched.
-
-    Args:
-        config: A dataclass instance, or a dict of such.
-        overrides: Nested mapping of field names to values. Lists replace tuples as tuples.
-        name: Where the overrides come from, for messages.
+    """A copy of a (nested) dataclass, or of a dict of such, with some fields replaced; lists replace tuples as tuples.
 
     Raises:
         ThermoxelsError: A name that the configuration does not have, or a value of another kind.

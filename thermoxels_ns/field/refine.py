@@ -62,10 +62,8 @@ def parents_of_corners(old: KeptVoxels, new: KeptVoxels, factor: int) -> Triline
 def refine(grid: VoxelGrid, factor: int = 2) -> RowChange:
     """Split every kept voxel into factor^3 without changing the field (what is interpolated stays trilinear).
 
-    Density is per world unit, so nothing is rescaled.
-
-    Returns:
-        How values of rows change: trilinear interpolation; old corners keep theirs exactly.
+    Density is per world unit, so nothing is rescaled. Rows change by trilinear interpolation; old corners keep theirs
+    exactly.
     """
     BUFFERS.release()  # rows are there twice for a moment; what steps on the old lattice needed makes room
     new = split_voxels(grid.voxels, factor)
@@ -85,15 +83,7 @@ def refine(grid: VoxelGrid, factor: int = 2) -> RowChange:
 
 @torch.no_grad()
 def prune(grid: VoxelGrid, keep: npt.NDArray[np.bool_]) -> RowChange:
-    """Keep only some of the kept voxels.
-
-    Args:
-        grid: The grid.
-        keep: One boolean per kept voxel.
-
-    Returns:
-        How values of rows change: those of corners that stay are copied.
-    """
+    """Keep only some of the kept voxels, one boolean for each, and return how rows change: by a copy."""
     BUFFERS.release()
     voxels = grid.voxels
     new = KeptVoxels(voxels.lattice, voxels.cells[keep])
@@ -111,14 +101,8 @@ def widen_colour(grid: VoxelGrid, degree: int) -> ColumnChange:
     """Store colour up to a higher degree without changing the field.
 
     While colour is the same from all sides its further harmonics are 0 and no gradient moves them, so they need not be
-    stored, nor passed over by optimisers, total variation, refinement, pruning and checkpoints.
-
-    Args:
-        grid: A grid with colour of a lower degree; it gets a new parameter.
-        degree: The new degree.
-
-    Returns:
-        How values of columns change: harmonics keep theirs, those that were not stored are 0.
+    stored, nor passed over by optimisers, total variation, refinement, pruning and checkpoints. Columns that were not
+    stored are 0.
     """
     assert grid.sh is not None and grid.sh_degree is not None and grid.sh_degree < degree
     BUFFERS.release()  # what steps on the narrow rows needed makes room for the wide ones

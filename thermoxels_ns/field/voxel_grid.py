@@ -172,13 +172,7 @@ class VoxelGrid(nn.Module):
     def rgb_at(
         self, at: TrilinearPoints, directions: Float[Tensor, "n 3"], degree: int | None = None
     ) -> Float[Tensor, "n 3"]:
-        """Colour in [0, 1] seen along unit directions: the sigmoid of the interpolated harmonics.
-
-        Args:
-            at: The points.
-            directions: Unit directions.
-            degree: Degree up to which the harmonics take part; None: all.
-        """
+        """Colour in [0, 1] seen along unit directions: the sigmoid of the interpolated harmonics up to `degree`."""
         assert self.sh is not None and self.sh_degree is not None, "this grid has no colour"
         degree = self.sh_degree if degree is None else min(degree, self.sh_degree)
         coefficients = interpolate(self.sh, at).view(len(directions), 3, num_coefficients(self.sh_degree))

@@ -42,16 +42,10 @@ class Photographs:
 def read_photographs(
     dataset: Any, near: float = 0.0, most: int = MOST_PHOTOGRAPHS, longest_side: int = LONGEST_SIDE
 ) -> Photographs | None:
-    """Read a selection of photographs as small pinhole pictures.
+    """Read a selection of a `ThermalDataset`'s photographs as small pinhole pictures, see `Photographs`.
 
-    Args:
-        dataset: A `ThermalDataset` (any with cameras, get_image_uint8 and get_mask).
-        near: Depth up to which they show nothing, [world units].
-        most: Photographs read; of more, that many are taken at equal distances in the list.
-        longest_side: Pixels along the longer side; larger photographs are averaged down.
-
-    Returns:
-        The photographs of perspective cameras; None if there are none.
+    Of more than `most`, that many are taken at equal distances in the list; those with a side longer than
+    `longest_side` [pixels] are averaged down. None if there are none of perspective cameras.
     """
     cameras = dataset.cameras.to("cpu")
     usable = np.flatnonzero(cameras.camera_type.numpy().reshape(-1) == CameraType.PERSPECTIVE.value)

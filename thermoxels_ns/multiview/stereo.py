@@ -317,17 +317,9 @@ def feature_rays_to_depths(depths: Depths) -> FeatureRays:
 def feature_rays_of_photographs(
     dataset: Any, near: float, lo: npt.ArrayLike, hi: npt.ArrayLike, say: Callable[[str], None]
 ) -> FeatureRays | None:
-    """Find how far away is what training photographs show, and say what was found.
+    """Feature rays to each depth that several training photographs agree about; None where they say too little.
 
-    Args:
-        dataset: The training photographs, see `read_photographs`.
-        near: Depth up to which they show nothing, [world units].
-        lo: Lower corner of the box in which depths are looked for, [world units].
-        hi: Upper corner.
-        say: Told what was found.
-
-    Returns:
-        A ray to each depth that several photographs agree about; None where they say too little.
+    Depths are looked for in the box from `lo` to `hi`, and behind `near`, [world units]; what was found is said.
     """
     began = time.perf_counter()
     photographs = read_photographs(dataset, near)

@@ -220,14 +220,8 @@ def ray_distortion(
 ) -> Float[Tensor, " rays"]:
     """How far each ray's weight is spread (mip-NeRF 360, eq. 15, in the O(n) form of DVGOv2, eq. 6-7).
 
-    sum_ij w_i w_j |t_i - t_j| + 1/3 sum_i w_i^2 d_i, lengths divided by `scale`; its mean gathers the weight of rays
-    in one short interval.
-
-    Args:
-        weights: Weights of the steps.
-        t: Step middles, ascending along each ray.
-        deltas: Step lengths.
-        scale: Length that counts as 1, world units (the diagonal of the box).
+    sum_ij w_i w_j |t_i - t_j| + 1/3 sum_i w_i^2 d_i, lengths divided by `scale` [world units]; its mean gathers the
+    weight of rays in one short interval. Step middles `t` ascend along each ray.
     """
     t, deltas = t / scale, deltas / scale
     moment = weights * t

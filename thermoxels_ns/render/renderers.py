@@ -88,18 +88,8 @@ def march(
 ) -> March:
     """Sample rays inside the lattice and turn density into weights.
 
-    Args:
-        origins: Ray origins, world units.
-        directions: Unit directions.
-        lattice: Gives the box and the step: a voxel over `steps_per_voxel` (the paper: half a voxel).
-        density_at: Maps positions (n, 3) to densities (n,), [1 / world unit].
-        keep: Maps positions to booleans: samples it refuses have density 0 without being asked; None: ask all.
-        steps_per_voxel: Samples per voxel edge.
-        near: Distance in front of the camera where sampling starts, world units.
-        far: Distance where it ends; None: at the box.
-
-    Returns:
-        Samples, densities and weights.
+    `density_at` maps positions (n, 3) to densities (n,), [1 / world unit]; samples whose positions `keep` refuses have
+    density 0 without being asked.
     """
     lo = torch.tensor(lattice.lo, dtype=origins.dtype, device=origins.device)
     hi = torch.tensor(lattice.hi, dtype=origins.dtype, device=origins.device)

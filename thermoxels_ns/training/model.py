@@ -336,14 +336,8 @@ class ThermoxelsModel(Model):
     def grid_snapshot(self, rays: Iterable[RayBundle], views: Views | None = None) -> GridSnapshot:
         """The trained field for the mesher.
 
-        Args:
-            rays: Training rays of both streams; they tell where solid is, which corners were measured and what
-                temperature was seen there. Without any there is no evidence.
-            views: The training cameras.
-
-        Returns:
-            Density, temperature, observed weight and colour on the corners, density at the voxel centres, and what the
-            rays say.
+        Training rays of both streams tell where solid is, which corners were measured and what temperature was seen
+        there; without any there is no evidence.
         """
         grid = self.grid
         seen = field_evidence(self, rays)

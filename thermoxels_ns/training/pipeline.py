@@ -205,11 +205,7 @@ def _columns(grid: dict[str, tuple[int, ...]]) -> str:
 
 
 def compile_kernels(say: Callable[[str], None]) -> None:
-    """Run every kernel once on a few rays; numba keeps the compiled result.
-
-    Args:
-        say: Told what is going on if it takes longer than `SILENT_SECONDS`.
-    """
+    """Run every kernel once on a few rays; numba keeps the compiled result. What takes long is said."""
     notice = threading.Timer(
         SILENT_SECONDS, say, ("compiling the kernels for this processor: 10 to 30 s, the first time",)
     )
