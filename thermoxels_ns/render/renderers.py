@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,7 +11,6 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.interpolation import TrilinearPoints
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.compositing import (
@@ -76,52 +74,27 @@ class March:
         return flat // self.steps.t.shape[1]
 
 
-def march(
-    origins: Float[Tensor, "rays 3"],
-    directions: Float[Tensor, "rays 3"],
-    lattice: Lattice,
-    density_at: Callable[[Tensor], Tensor],
-    keep: Callable[[Tensor], Tensor] | None = None,
-    steps_per_voxel: float = 2.0,
-    near: float | Float[Tensor, " rays"] = 0.0,
-    far: Float[Tensor, " rays"] | None = None,
-) -> March:
-    """Sample rays inside the lattice and turn density into weights.
-
-    `density_at` maps positions (n, 3) to densities (n,), [1 / world unit]; samples whose positions `keep` refuses have
-    density 0 without being asked.
-    """
+def march(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> March:
+    """Sample rays through the kept voxels and weigh the samples, in plain torch."""
+    origins, directions, lattice = request.origins, request.directions, grid.lattice
     lo = torch.tensor(lattice.lo, dtype=origins.dtype, device=origins.device)
     hi = torch.tensor(lattice.hi, dtype=origins.dtype, device=origins.device)
-    steps = sample_box(origins, directions, lo, hi, lattice.voxel_size / steps_per_voxel, near, far)
+    step = lattice.voxel_size / options.steps_per_voxel
+    steps = sample_box(origins, directions, lo, hi, step, request.near, request.far)
     active = (steps.deltas > 0).flatten().nonzero()[:, 0]
     rays = active // steps.t.shape[1]
     positions = origins[rays] + directions[rays] * steps.t.flatten()[active][:, None]
-    if keep is not None:
-        kept = keep(positions)
+    if not grid.voxels.all_kept:
+        kept = grid.in_kept_voxel(positions)
         active, positions = active[kept], positions[kept]
-    asked = density_at(positions)
+    asked = grid.density_at(grid.locate(positions))
     density = torch.zeros_like(steps.t).flatten().index_put((active,), asked).view_as(steps.t)
     return March(steps, density, ray_weights(density, steps.deltas), active, positions)
 
 
-def march_grid(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> March:
-    """Sample rays through the kept voxels and weigh the samples, in plain torch."""
-    return march(
-        request.origins,
-        request.directions,
-        grid.lattice,
-        lambda positions: grid.density_at(grid.locate(positions)),
-        None if grid.voxels.all_kept else grid.in_kept_voxel,
-        options.steps_per_voxel,
-        request.near,
-        request.far,
-    )
-
-
 def reference_render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayRender:
     """Render rays in plain torch: the twin that every faster renderer is tested against."""
-    marched = march_grid(grid, request, options)
+    marched = march(grid, request, options)
     at = grid.locate(marched.positions)
 
     def rows(query):
@@ -234,7 +207,7 @@ def sample_rays(grid: VoxelGrid, request: RayRequest, options: RenderOptions, ba
         weight = torch.from_numpy(records.weight)[reached]
         before = 1.0 - torch.from_numpy(records.left)[reached] - weight
         return GridSamples(ray, at, weight, before, torch.from_numpy(marched.sums.transmittance))
-    marched = march_grid(grid, request, options)
+    marched = march(grid, request, options)
     weights = marched.along.weights
     before = torch.cumsum(weights, -1) - weights
     return GridSamples(
