@@ -64,15 +64,10 @@ class TrilinearPoints:
 def interpolate(rows: Float[Tensor, "rows channels"], at: TrilinearPoints) -> Float[Tensor, "n channels"]:
     """Interpolate `rows` at points: f(p) = sum over the voxel's corners of w_c(p) rows[c].
 
+    All points lie in kept voxels; the result is differentiable with respect to `rows`.
+
     The gradient sums each voxel's points in their order and adds rows without duplicates, so that it does not depend on
     thread count or on a race.
-
-    Args:
-        rows: One row of values per stored corner.
-        at: The points, all in kept voxels.
-
-    Returns:
-        Interpolated rows; differentiable with respect to `rows`.
     """
     return _Interpolate.apply(rows, at)  # type: ignore[return-value]
 

@@ -294,12 +294,8 @@ def _between(agreement: npt.NDArray[np.float32], best: npt.NDArray[np.int64]) ->
 def feature_rays_to_depths(depths: Depths) -> FeatureRays:
     """One line of sight per sure pixel, to a point of its own.
 
-    Args:
-        depths: Of photographs.
-
-    Returns:
-        The lines, photograph after photograph, [world units]. A line's uncertainty is `ERROR_PLANES` times the distance
-        between the planes of its sweep, along the line.
+    The lines stand photograph after photograph [world units]. A line's uncertainty is `ERROR_PLANES` times the distance
+    between the planes of its sweep, along the line.
     """
     photographs = depths.photographs
     (sure,) = np.nonzero(np.isfinite(depths.depth))

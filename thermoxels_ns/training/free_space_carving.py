@@ -46,17 +46,10 @@ def carve_free_space(grid: VoxelGrid, lines: FeatureRays) -> RowChange | None:
 
 
 def empty_voxels(lattice: Lattice, lines: FeatureRays) -> npt.NDArray[np.bool_]:
-    """Find the voxels that are air.
+    """Find the voxels that are air: one boolean per voxel, shape of the lattice's voxels.
 
     A voxel is air if the lines to at least `FEWEST_POINTS` points cross it and leave it `MARGIN_VOXELS` voxels and
     `MARGIN_ERRORS` standard errors before their points, and no point lies in it, with lines or without.
-
-    Args:
-        lattice: The voxels.
-        lines: Feature rays, world units.
-
-    Returns:
-        One boolean per voxel, shape of the lattice's voxels.
     """
     shape = np.asarray(lattice.cell_shape)
     step = max(1, -(-len(lines.origins) // MOST_LINES))

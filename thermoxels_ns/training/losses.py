@@ -89,12 +89,8 @@ class FeatureRaySampler:
 def feature_ray_loss(accumulation: Tensor, transmittance: Tensor, tolerated: float = 0.0) -> Tensor:
     """Mean share of light that a feature ray loses before its point, plus that which passes the point.
 
-    Both are 0 where the surface lies at the point.
-
-    Args:
-        accumulation: Of the rays of `FeatureRaySampler.request`, shape (2 n,).
-        transmittance: Of the same rays, shape (2 n,).
-        tolerated: Share of the light that may pass without counting.
+    Both are 0 where the surface lies at the point. The rays are those of `FeatureRaySampler.request`, shape (2 n,); the
+    share `tolerated` of the light may pass without counting.
 
     >>> float(feature_ray_loss(torch.tensor([0.25, 0.9]), torch.tensor([0.75, 0.1])))
     0.3499999940395355

@@ -126,11 +126,7 @@ def field_evidence(model: RaySampler, rays: Iterable[RayBundle]) -> FieldEvidenc
     is only ever used mixed with its neighbours', so an image can be right while single corners overshoot; the average
     over what rays used has no such freedom. Only first hits count for it: samples of rays that end on something
     (opacity above one half), before half of the ray's light is spent. What leaks through a surface measures nothing
-    behind it.
-
-    Args:
-        model: The field.
-        rays: Rays of either stream. One that says of no stream (see `core.ray_streams`) counts as thermal too.
+    behind it. A ray that says of no stream (see `core.ray_streams`) counts as thermal too.
     """
     grid = model.grid
     device = grid.density.device
