@@ -12,7 +12,6 @@ from tests.support.camera_card import counts, jpeg_bytes, photograph
 from tests.support.flir_file import FlirFile
 from thermoxels_ns.capture.frames import CaptureFrames, read_frames
 from thermoxels_ns.capture.pairs import Pair
-from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.radiometry.camera_file import RadiometryOptions
 
 RADIOMETRY = RadiometryOptions()
@@ -87,13 +86,6 @@ def bad_files(card: Path) -> dict[str, Pair]:
     return pairs
 
 
-def test_every_damaged_file_is_an_error_that_names_it(tmp_path):
-    pairs = bad_files(tmp_path / "card")
-    for name, one in pairs.items():
-        with pytest.raises(ThermoxelsError, match=name):
-            read([one], tmp_path)
-
-
 def test_the_rest_goes_on_without_damaged_files(tmp_path):
     pairs = bad_files(tmp_path / "card")
     good = pair(tmp_path / "card", "good")
@@ -101,11 +93,6 @@ def test_the_rest_goes_on_without_damaged_files(tmp_path):
     assert [frame.name for frame in frames.frames] == ["good"]
     assert set(frames.dropped) == set(pairs)
     assert all(name in why for name, why in frames.dropped.items())
-
-
-def test_nothing_but_damaged_files_is_an_error_even_when_they_may_be_skipped(tmp_path):
-    with pytest.raises(ThermoxelsError, match="at least one pair"):
-        read(list(bad_files(tmp_path / "card").values()), tmp_path, skip_bad=True)
 
 
 def test_a_frame_of_another_thermal_camera_is_dropped_by_name(tmp_path):

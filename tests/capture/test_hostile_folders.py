@@ -10,9 +10,8 @@ import pytest
 
 from tests.support.camera_card import counts, photograph
 from tests.support.flir_file import picture_bytes, segment
-from thermoxels_ns.capture.camera_files import files_below, natural_key, scan_folder, shown_name
+from thermoxels_ns.capture.camera_files import scan_folder, shown_name
 from thermoxels_ns.capture.pairs import find_pairs
-from thermoxels_ns.capture.results import load_pairs, save_pairs
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.commands.capture import capture_folder
 from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
@@ -52,12 +51,6 @@ def no_pairs_said(card: Path, **more: object) -> str:
             (),
             ("3 photographs, no thermal images", "Copy the thermal files as the camera wrote them"),
         ),
-        (
-            ("0-thermal", "1-thermal"),
-            (),
-            ("2 pictures for the eye, named thermal, without temperatures", "Copy the thermal files as the camera"),
-        ),
-        ((), ("a",), ("no photographs, 1 thermal image, 1 file of other kinds (a.tiff", "Copy the photographs")),
         (("a",), ("b",), ("1 photograph, 1 thermal image", "--pairs", "--clock-offset-s")),
     ],
 )
@@ -100,35 +93,6 @@ def test_what_is_not_looked_at_is_named(tmp_path):
     assert "Not looked at: " in no_pairs_said(card)
 
 
-def test_a_folder_that_is_shut_is_named(tmp_path, monkeypatch):
-    photograph(tmp_path / "open" / "a.jpg")
-    photograph(tmp_path / "shut" / "b.jpg")
-    really = os.scandir
-
-    def refuse(path):
-        if Path(path).name == "shut":
-            raise PermissionError(13, "Permission denied", str(path))
-        return really(path)
-
-    monkeypatch.setattr(os, "scandir", refuse)
-    files, passed_over = files_below(tmp_path)
-    assert [path.name for path in files] == ["a.jpg"]
-    assert passed_over == {tmp_path / "shut": "a folder that cannot be opened (Permission denied)"}
-
-
-def test_a_file_that_may_not_be_read_says_so(tmp_path, monkeypatch):
-    path = photograph(tmp_path / "a.jpg")
-    really = Path.open
-
-    def refuse(self, *arguments, **more):
-        if self == path:
-            raise PermissionError(13, "Permission denied", str(self))
-        return really(self, *arguments, **more)
-
-    monkeypatch.setattr(Path, "open", refuse)
-    assert "got Permission denied. Check its permissions" in scan_folder(tmp_path).unreadable[path]
-
-
 @pytest.mark.parametrize("name", [b"two\nlines.jpg", b"caf\xe9.jpg", b"\x1b[31mred.jpg"])
 def test_a_name_that_cannot_be_printed_is_refused_and_can_be_left_out(tmp_path, name):
     path = photograph(Path(os.fsdecode(os.fsencode(tmp_path / "card") + b"/" + name)))
@@ -138,35 +102,6 @@ def test_a_name_that_cannot_be_printed_is_refused_and_can_be_left_out(tmp_path, 
     assert [file.path.name for file in found.files] == ["ok.jpg"]
     for text in (shown_name(path), found.unreadable[path], no_pairs_said(tmp_path / "card", skip_bad=True)):
         assert text.isprintable() and text.encode("utf-8")
-
-
-def test_names_in_any_alphabet_are_read_and_sorted(tmp_path):
-    names = ("Москва 2 visible.jpg", "²5.jpg", "壁.jpg", "x" * 240 + ".jpg", "٣.jpg")
-    for name in names:
-        photograph(tmp_path / name)
-    assert {file.path.name for file in scan_folder(tmp_path).files} == set(names)
-    assert natural_key(Path("²5")) != natural_key(Path("25"))
-
-
-def test_frames_have_different_names_also_where_a_disk_takes_capitals_for_small_letters(tmp_path):
-    stems = ("shot 1", "shot_1", "shot_1-2", "Shot_1", "壁", "床")
-    for number, stem in enumerate(stems):
-        photograph(tmp_path / f"{number}" / f"{stem}-visible.jpg")
-        counts(tmp_path / f"{number}" / f"{stem}-radiometric.tiff")
-    for stem in ("a-2", "a", "A"):
-        photograph(tmp_path / f"{stem}-visible.jpg")
-        counts(tmp_path / f"{stem}-radiometric.tiff")
-    pairs = find_pairs(scan_folder(tmp_path)).pairs
-    assert len(pairs) == len(stems) + 3
-    assert len({pair.name.lower() for pair in pairs}) == len(pairs)
-    assert all(pair.photograph.stem.split("-vis")[0] == pair.thermal.stem.split("-rad")[0] for pair in pairs)
-
-
-def test_what_is_in_no_pair_keeps_its_printable_name(tmp_path):
-    photograph(tmp_path / "card" / "day" / "a.jpg")
-    (tmp_path / "card" / "b\n.jpg").symlink_to("nowhere")
-    save_pairs(tmp_path, find_pairs(scan_folder(tmp_path / "card")), tmp_path / "card")
-    assert list(load_pairs(tmp_path, tmp_path / "card")[1]) == ["b\\n.jpg", "day/a.jpg"]
 
 
 def test_an_input_inside_the_output_is_not_touched(tmp_path):
@@ -179,27 +114,6 @@ def test_an_input_inside_the_output_is_not_touched(tmp_path):
         with pytest.raises(SceneError, match="output: expected another folder"):
             capture_folder(source, scene, CaptureSettings())
     assert kept.is_file()
-
-
-def test_an_output_inside_the_input_is_no_part_of_it(tmp_path):
-    photograph(tmp_path / "card" / "a-visible.jpg")
-    counts(tmp_path / "card" / "a-radiometric.tiff")
-    out = tmp_path / "card" / "with space"
-    photograph(out / "images" / "b.jpg")
-    (out / ".capture").mkdir()
-    files, passed_over = files_below(tmp_path / "card", [out])
-    assert [path.name for path in files] == ["a-radiometric.tiff", "a-visible.jpg"] and not passed_over
-
-
-def test_a_full_disk_is_no_bad_file_and_says_so(tmp_path, monkeypatch):
-    three_pairs(tmp_path / "card")
-
-    def full(path, *_):
-        raise OSError(28, "No space left on device", str(path))
-
-    monkeypatch.setattr("thermoxels_ns.capture.frames.np.save", full)
-    with pytest.raises(OutputError, match=r"a\.npy: expected .* No space left on device.*finished stages are kept"):
-        capture(tmp_path / "card", skip_bad=True)
 
 
 def test_too_little_space_for_features_is_said_before_colmap_starts(tmp_path, monkeypatch):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -73,38 +71,11 @@ def test_a_mask_of_another_size_is_refused(tmp_path):
         mask_files(tmp_path / "nowhere")
 
 
-def pictures(folder: Path, draw, sizes: tuple[tuple[int, int], ...] = ((320, 240),)) -> list[Path]:
-    """Ten different smooth pictures with something drawn over all of them."""
-    rng, paths = np.random.default_rng(0), []
-    for number in range(10):
-        size = sizes[number % len(sizes)]
-        grey = cv2.resize(rng.integers(0, 255, (6, 8), dtype=np.uint8), size, interpolation=cv2.INTER_CUBIC)
-        draw(grey)
-        paths.append(folder / f"{number}.png")
-        Image.fromarray(grey).save(paths[-1])
-    return paths
-
-
-def test_dead_pixels_are_no_overlay(tmp_path) -> None:
-    def dead(grey: np.ndarray) -> None:
-        grey[20::50, 20::60] = 255
-
-    assert find_overlay(pictures(tmp_path, dead)) is None
-
-
 @pytest.mark.parametrize(("width", "found"), [(320, False), (32, True)])
 def test_what_covers_much_of_the_picture_is_no_overlay(tmp_path, width, found) -> None:
     """Stripes, as of a fence that the camera stands behind."""
-
-    def stripes(grey: np.ndarray) -> None:
-        grey[:, :width][:, np.arange(width) // 8 % 2 == 0] = 255
-
-    assert (find_overlay(pictures(tmp_path, stripes)) is not None) == found
-
-
-def test_pictures_of_two_sizes_are_not_laid_upon_each_other(tmp_path) -> None:
-    def bar(grey: np.ndarray) -> None:
-        grey[60:70, 20:120] = 255
-
-    assert find_overlay(pictures(tmp_path, bar)) is not None
-    assert find_overlay(pictures(tmp_path, bar, ((320, 240), (400, 300)))) is None
+    paths = []
+    for number, pixels in enumerate(scenes()):
+        pixels[:, :width][:, np.arange(width) // 8 % 2 == 0] = 255
+        paths.append(write(tmp_path, number, pixels))
+    assert (find_overlay(paths) is not None) == found

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from dataclasses import fields
-from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -16,11 +14,8 @@ from tests.support.camera_card import photograph
 from tests.support.textured_room import RIG, THERMAL, VISIBLE, alignment, poses, write_card
 from thermoxels_ns import cli
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.feature_matching import LensModel, Matching
 from thermoxels_ns.commands.capture import capture_folder
-from thermoxels_ns.core.errors import OutputError, SceneError
-from thermoxels_ns.data.dataparser import ThermalDataParserConfig
-from thermoxels_ns.radiometry.stored_temperatures import COUNT_SCALES
+from thermoxels_ns.core.errors import SceneError
 
 COUNT = 6
 DRIFT_K = 0.6
@@ -110,13 +105,6 @@ def test_z_is_up(capture):
     assert np.degrees(np.arccos(np.einsum("ni,ni->n", found[:, 2], poses(COUNT)[:, 2, :3]))).max() < 2.0
 
 
-def test_the_dataparser_reads_the_scene(capture):
-    outputs = ThermalDataParserConfig(data=capture[1]).setup().get_dataparser_outputs("train")
-    assert len(outputs.image_filenames) == COUNT - 1
-    limits = outputs.metadata["temperature_range"]
-    assert 13 < limits.min_c < limits.max_c < 25
-
-
 def test_the_page_shows_everything_and_fetches_nothing(capture):
     page = capture[2].page.read_text()
     for words in ("shot9-visible.jpg", "lonely.jpg", f"shot{COUNT}", "too few matches", "480 x 360", "160 x 128"):
@@ -141,19 +129,6 @@ def test_a_second_run_takes_everything_from_the_first(capture):
     assert again.dropped == first.dropped
     assert np.array_equal(again.scene.rig.visible_to_thermal, first.scene.rig.visible_to_thermal)
     assert np.array_equal(again.scene.drift.offsets_k, first.scene.drift.offsets_k)
-
-
-def test_tracks_that_someone_deleted_are_written_again_and_nothing_else_is_done(capture, tmp_path):
-    card, earlier, _, _ = capture
-    scene, said = tmp_path / "scene", []
-    shutil.copytree(earlier, scene)
-    before = {path: path.read_bytes() for path in scene.rglob("*") if ".capture" not in path.parts and path.is_file()}
-    (scene / "sparse_tracks.npz").unlink()
-    capture_folder(card, scene, settings(skip_bad=True), said.append)
-    ran = [line for line in said if re.match(r"\d/9", line) and not re.search("as before|left out", line)]
-    assert ran == ["8/9 scene"]
-    assert len(before[scene / "sparse_tracks.npz"]) > 1000
-    assert {path: path.read_bytes() for path in before} == before
 
 
 def test_another_scale_runs_only_what_depends_on_it_and_so_does_from_stage(capture, tmp_path):
@@ -198,11 +173,6 @@ def test_a_board_gives_the_rig_and_a_scale_is_needed_for_it(capture, tmp_path):
     assert "5/9 board: as before" in said
 
 
-def test_a_bad_file_stops_the_capture_and_is_named(capture, tmp_path):
-    with pytest.raises(SceneError, match=r"shot9-visible\.jpg.*--skip-bad True"):
-        capture_folder(capture[0], tmp_path / "scene", settings())
-
-
 def test_given_poses_and_a_given_rig_are_kept(capture, tmp_path):
     card, scene, _, _ = capture
     meta = content(scene)
@@ -220,17 +190,6 @@ def test_given_poses_and_a_given_rig_are_kept(capture, tmp_path):
     assert result.scene.drift.used
 
 
-@pytest.mark.parametrize("output", ["card", "full"])
-def test_folders_that_are_not_ours_are_not_written_to(capture, tmp_path, output):
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "thesis.txt").write_text("mine")
-    folder = capture[0] if output == "card" else tmp_path / "full"
-    before = sorted(folder.iterdir())
-    with pytest.raises((OutputError, SceneError), match="output"):
-        capture_folder(capture[0], folder, settings())
-    assert sorted(folder.iterdir()) == before
-
-
 def test_the_command(capture, tmp_path, capsys):
     assert cli.main(["capture", str(tmp_path / "nowhere"), "--output", str(tmp_path / "scene")]) == 1
     assert "nothing at" in capsys.readouterr().err
@@ -240,21 +199,3 @@ def test_the_command(capture, tmp_path, capsys):
     out = capsys.readouterr().out
     assert f"{COUNT} frames of {COUNT + 1} pairs" in out
     assert "shot9-visible.jpg" in out and f"--data {scene}" in " ".join(out.split())
-
-
-def test_the_help_names_every_option(capsys):
-    with pytest.raises(SystemExit) as stop:
-        cli.main(["capture", "--help"])
-    assert stop.value.code == 0
-    words = capsys.readouterr().out
-    for option in ("--from-stage", "--skip-bad", "--known-distance", "--marker-side-m", "--poses", "--rig", "--masks"):
-        assert option in words
-    assert "Longest side to which photographs are reduced" in re.sub(r"[\s│]+", " ", words)
-
-
-def test_the_choices_on_the_command_line_are_those_there_are():
-    choices = {each.name: get_args(get_type_hints(CaptureSettings)[each.name]) for each in fields(CaptureSettings)}
-    cameras = next(get_args(each) for each in choices["camera"] if get_args(each))
-    assert cameras == tuple(COUNT_SCALES)
-    assert choices["matching"] == get_args(Matching)
-    assert choices["lens"] == get_args(LensModel)

@@ -6,7 +6,6 @@ import json
 
 import numpy as np
 import pytest
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from tests.support.camera_card import photograph
@@ -65,16 +64,6 @@ def test_every_eighth_frame_evaluates_and_the_ends_train():
         assert not sides[-1] and len(sides) == count
 
 
-def test_the_dataparser_reads_what_was_written(scene, tmp_path):
-    output = prepare_output(tmp_path / "scene")
-    write_scene_folder(scene, output)
-    outputs = ThermalDataParserConfig(data=output).setup().get_dataparser_outputs("train")
-    assert len(outputs.image_filenames) == COUNT - 1
-    cameras = outputs.metadata["thermal_cameras"]
-    assert (int(cameras.width[0]), int(cameras.height[0]), float(cameras.fx[0])) == (40, 30, 50.0)
-    assert outputs.metadata["temperature_range"].max_c > 20
-
-
 def test_numbers_come_back_as_they_went_in(scene, tmp_path):
     output = prepare_output(tmp_path / "scene")
     write_scene_folder(scene, output)
@@ -128,15 +117,6 @@ def test_tracks_say_which_training_photograph_sees_which_point(scene, tmp_path):
     lines = outputs.metadata["feature_rays"]
     assert len(lines.origins) == pytest.approx(seen[train].sum(), rel=0.05)
     assert len(lines.origins) <= seen[train].sum()
-
-
-def test_masks_are_written_for_all_frames(scene, tmp_path):
-    output = prepare_output(tmp_path / "scene")
-    write_scene_folder(with_masks(scene), output)
-    frames = read_scene_file(output).frames
-    assert all(frame.mask is not None for frame in frames)
-    mask = np.asarray(Image.open(frames[0].mask))  # type: ignore[arg-type]
-    assert mask.shape == (480, 640) and (mask[:40, :100] == 0).all() and mask[100, 200] == 255
 
 
 def test_an_earlier_scene_is_replaced_and_nothing_else(scene, tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import gc
 import shutil
 import signal
@@ -10,20 +9,18 @@ import sqlite3
 import subprocess
 import sys
 
-import filelock
 import pytest
 
 from tests.support.camera_card import counts, photograph
 from tests.support.posed_model import ring_model
 from tests.support.textured_room import VISIBLE
-from thermoxels_ns.capture.results import load, load_json, save
+from thermoxels_ns.capture.results import load, save
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, ReducedPhotographs, fill_database
 from thermoxels_ns.capture.sfm.model import SfmModel
-from thermoxels_ns.capture.stage_cache import STAGES, StageCache, fingerprint, locked, prepare_output
+from thermoxels_ns.capture.stage_cache import StageCache, locked, prepare_output
 from thermoxels_ns.commands.capture import capture_folder
-from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
-from thermoxels_ns.core.json_values import read_json
+from thermoxels_ns.core.errors import OutputError, SceneError
 
 
 def run_two(folder, first=1, second=1, from_stage=None):
@@ -52,24 +49,6 @@ def test_an_interrupted_stage_finds_what_it_left_and_a_changed_one_does_not(tmp_
     StageCache(tmp_path).run("poses", {"size": 1}, lambda where: found.append((where / "half").exists()))
     StageCache(tmp_path).run("poses", {"size": 2}, lambda where: found.append((where / "half").exists()))
     assert found == [True, False]
-
-
-def test_a_damaged_result_says_what_to_do(tmp_path):
-    path = tmp_path / "pairs.json"
-    for read, said in ((load_json, "--from-stage pairs"), (read_json, "pass another file")):
-        for content in ("{", "[" * 100_000, None):
-            path.unlink() if content is None else path.write_text(content)
-            with pytest.raises(ThermoxelsError, match=rf"{path.name}.*{said}"):
-                read(path)
-
-
-def test_a_file_that_was_replaced_is_noticed(tmp_path):
-    file = tmp_path / "a.jpg"
-    file.write_bytes(b"1")
-    before = fingerprint([file], tmp_path)
-    file.write_bytes(b"22")
-    assert before[0][0] == "a.jpg"
-    assert fingerprint([file], tmp_path) != before
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path):
@@ -114,17 +93,6 @@ def test_killed_while_an_old_result_is_removed(tmp_path, monkeypatch, first):
     assert run_stage(tmp_path) is None
 
 
-def test_an_old_result_that_cannot_be_removed_is_not_built_upon(tmp_path, monkeypatch):
-    run_stage(tmp_path)
-
-    def refused(*_, **__):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(shutil, "rmtree", refused)
-    with pytest.raises(OutputError, match=r"poses.*Permission denied.*--output"):
-        run_stage(tmp_path, "poses")
-
-
 @pytest.mark.parametrize("damage", ["gone", "short", "more"])
 def test_a_scene_that_someone_changed_is_written_again(tmp_path, damage):
     images = tmp_path / "images"
@@ -135,21 +103,6 @@ def test_a_scene_that_someone_changed_is_written_again(tmp_path, damage):
     else:
         (images / ("picture" if damage == "short" else "another")).write_text("w")
     assert run_stage(tmp_path, writes=[images]) == ["a", "b"]
-
-
-def test_killed_while_a_scene_is_written_again(tmp_path):
-    """Files of the right sizes are no proof while the stage has not ended."""
-    images = tmp_path / "images"
-    run_stage(tmp_path, writes=[images])
-    (images / "picture").write_text("w")
-
-    def killed(_):
-        (images / "picture").write_text("other"[:5])
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        StageCache(tmp_path).run("poses", {}, killed, [images])
-    assert run_stage(tmp_path, writes=[images]) is not None
 
 
 def test_a_database_without_its_last_frame_is_begun_again(tmp_path):
@@ -226,47 +179,6 @@ def test_every_change_of_the_input_is_noticed(card, tmp_path):
     assert stages_that_ran(card, scene, emissivity=0.9, reflected_c=20.0, seed=1) == ["poses"]
 
 
-def test_the_page_that_a_killed_run_was_writing_is_cleared_away(card, tmp_path):
-    scene = tmp_path / "scene"
-    (scene / ".capture").mkdir(parents=True)
-    (scene / ".capture.4711.part.html").write_text("half")
-    assert stages_that_ran(card, scene) == ["pairs", "temperatures", "poses"]
-    assert [path.name for path in scene.iterdir()] == [".capture"]
-
-
-def test_a_listed_file_of_any_name_is_noticed(card, tmp_path):
-    scene, listed = tmp_path / "scene", tmp_path / "pairs.csv"
-    for name in "abc":
-        (card / f"{name}-radiometric.tiff").rename(card / f"{name}.raw")
-    listed.write_text("".join(f"{name}-visible.jpg,{name}.raw\n" for name in "abc"))
-    assert stages_that_ran(card, scene, pairs=listed) == ["pairs", "temperatures", "poses"]
-    assert stages_that_ran(card, scene, pairs=listed) == ["poses"]
-    (card / "b.raw").touch()
-    assert stages_that_ran(card, scene, pairs=listed) == ["pairs", "temperatures", "poses"]
-
-
-def test_another_library_at_the_same_place_is_noticed(card, tmp_path):
-    library = tmp_path / "libdirp.so"
-    library.write_bytes(b"1")
-    assert stages_that_ran(card, tmp_path / "scene", dji_library=library) == ["pairs", "temperatures", "poses"]
-    library.write_bytes(b"22")
-    assert stages_that_ran(card, tmp_path / "scene", dji_library=library) == ["temperatures", "poses"]
-
-
-@pytest.mark.parametrize("stage", STAGES)
-def test_from_stage_runs_that_stage_and_all_after_it(tmp_path, stage):
-    def run(from_stage=None):
-        ran = []
-        cache = StageCache(tmp_path, from_stage)
-        for name in STAGES:
-            cache.run(name, {}, lambda _, name=name: ran.append(name))
-        return ran
-
-    assert run() == list(STAGES)
-    assert run(stage) == list(STAGES[STAGES.index(stage) :])
-    assert run() == []
-
-
 HOLD = """
 import sys, time
 from pathlib import Path
@@ -295,13 +207,6 @@ def test_a_second_capture_is_refused_and_changes_nothing(tmp_path, output):
             assert half.exists()
 
 
-def test_a_folder_is_free_again_after_an_error(output):
-    with pytest.raises(KeyboardInterrupt), locked(output):
-        raise KeyboardInterrupt
-    with locked(output):
-        pass
-
-
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
 def test_a_killed_process_leaves_no_lock(output):
     with subprocess.Popen([sys.executable, "-c", HOLD, str(output)], stdout=subprocess.PIPE, text=True) as process:
@@ -312,13 +217,3 @@ def test_a_killed_process_leaves_no_lock(output):
         process.kill()
     with locked(output):
         pass
-
-
-def test_a_drive_without_locks_says_so_and_goes_on(output, monkeypatch):
-    def refused(*_, **__):
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    monkeypatch.setattr(filelock.FileLock, "acquire", refused)
-    said = []
-    with locked(output, said.append):
-        assert len(said) == 1 and "No locks available" in said[0] and "start one at a time" in said[0]

@@ -9,8 +9,7 @@ import pytest
 
 from tests.support.known_rig import known_capture
 from thermoxels_ns.capture.rig.drift import DriftSamples, drift_of_samples, estimate_drift
-from thermoxels_ns.capture.rig_types import DriftEstimate, radius_squared
-from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.capture.rig_types import radius_squared
 
 FRAMES = 12
 
@@ -68,13 +67,6 @@ def test_noise_alone_calls_for_no_correction() -> None:
     assert "No correction" in found.explanation
 
 
-def test_no_radial_term_where_there_is_no_vignetting(offsets_k: np.ndarray) -> None:
-    found = drift_of_samples(readings(offsets_k))
-    assert found.used
-    assert found.radial == ()
-    assert "no radial term" in found.explanation
-
-
 def test_groups_that_share_no_points_get_mean_zero_each(offsets_k: np.ndarray) -> None:
     found = drift_of_samples(readings(offsets_k, groups=2))
     half = FRAMES // 2
@@ -82,15 +74,6 @@ def test_groups_that_share_no_points_get_mean_zero_each(offsets_k: np.ndarray) -
         assert abs(found.offsets_k[part].mean()) < 1e-6
         assert np.allclose(found.offsets_k[part], offsets_k[part] - offsets_k[part].mean(), atol=0.05)
     assert "2 groups of images share no points" in found.explanation
-
-
-def test_order_of_frames_and_unit_of_temperature_do_not_matter(offsets_k: np.ndarray) -> None:
-    samples = readings(offsets_k, (1.5, -0.4))
-    plain = drift_of_samples(samples)
-    kelvin = drift_of_samples(replace(samples, temperature_c=samples.temperature_c + 273.15))
-    assert np.allclose(kelvin.offsets_k, plain.offsets_k, atol=1e-6)
-    turned = drift_of_samples(replace(samples, frame=FRAMES - 1 - samples.frame))
-    assert np.allclose(turned.offsets_k, plain.offsets_k[::-1], atol=1e-6)
 
 
 def test_too_few_points_or_frames_are_said() -> None:
@@ -128,19 +111,6 @@ def test_pixels_without_a_temperature_are_left_out() -> None:
     found = estimate_drift(frames, capture.thermal, capture.visible_to_thermal)
     assert np.isfinite(found.offsets_k).all()
     assert np.abs(found.offsets_k - capture.offsets_k).max() < 0.15
-
-
-def test_an_image_of_another_size_is_refused_by_name() -> None:
-    capture = known_capture("sphere", views=2, photograph_width=80, thermal_width=40)
-    frames = [capture.frames[0], replace(capture.frames[1], temperature_c=np.zeros((7, 9)))]
-    with pytest.raises(SceneError, match="view 1: temperatures: expected the thermal camera's 32 rows"):
-        estimate_drift(frames, capture.thermal, capture.visible_to_thermal)
-
-
-def test_a_correction_of_nothing_changes_nothing() -> None:
-    nothing = DriftEstimate(np.zeros(1), (), 0.1, 0.1, False, "")
-    image = np.random.default_rng(0).normal(20.0, 5.0, (6, 8)).astype(np.float32)
-    assert np.array_equal(nothing.corrected(0, image), image)
 
 
 @pytest.mark.parametrize("seed", range(3))

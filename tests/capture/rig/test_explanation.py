@@ -41,11 +41,6 @@ def test_two_short_lines_say_what_was_found(rig):
     assert "0.05 units apart" in rig_lines(rig, None)[0]
 
 
-@pytest.mark.parametrize("change", [{"determined": False}, {"projection_sigma_px": np.nan}])
-def test_a_rig_that_was_not_estimated_says_why(rig, change):
-    assert rig_lines(replace(rig, **change), 2.0) == ("Found. Long words.",)
-
-
 def test_a_turn_that_is_less_sure_than_the_points_says_why(rig):
     assert turn_error_deg(rig) == pytest.approx(np.degrees(0.013))
     assert why_turn_is_unsure(rig).startswith("The turn is sure to 0.74 degrees only, though points fall within 0.08")
@@ -55,7 +50,7 @@ def test_a_turn_that_is_less_sure_than_the_points_says_why(rig):
     assert why_turn_is_unsure(replace(rig, parameters=(), covariance=np.zeros((0, 0)))) == ""
 
 
-RX, TY, FOCAL, CY = (PARAMETERS.index(name) for name in ("rx", "ty", "log_focal", "cy"))
+RX, TY, CY = (PARAMETERS.index(name) for name in ("rx", "ty", "cy"))
 
 
 def covariance_of(first: int, second: int, correlation: float) -> np.ndarray:
@@ -65,39 +60,12 @@ def covariance_of(first: int, second: int, correlation: float) -> np.ndarray:
     return result
 
 
-def test_a_rig_that_is_known_needs_no_words() -> None:
-    assert uncertainty_text(covariance_of(RX, CY, 0.5), np.ones(10)) == ""
-
-
 def test_what_stands_for_each_other_is_named_with_either_sign() -> None:
     for sign in (1.0, -1.0):
         text = uncertainty_text(covariance_of(RX, CY, 0.95 * sign), np.ones(10))
         assert "hardly tell apart the tilt up or down and the principal point's row:" in text
         assert "shift" not in text and "focal" not in text
     assert "the tilt up or down and the shift up or down" in uncertainty_text(covariance_of(RX, TY, 0.9), np.ones(10))
-
-
-def test_what_is_as_unsure_as_before_is_named_and_what_is_kept_fixed_is_not() -> None:
-    covariance = covariance_of(RX, CY, 0.0)
-    sigmas = np.ones(10)
-    sigmas[[FOCAL, CY]] = np.sqrt(np.diag(covariance))[[FOCAL, CY]]
-    text = uncertainty_text(covariance, sigmas)
-    assert text.endswith("about the focal length, the principal point's row: they are as unsure as at the start.")
-    covariance[CY], covariance[:, CY], sigmas[CY] = 0.0, 0.0, 0.0
-    text = uncertainty_text(covariance, sigmas)
-    assert text == "The images say next to nothing about the focal length: it is as unsure as at the start."
-
-
-def test_the_turn_is_said_as_it_is_and_with_the_principal_point_known() -> None:
-    errors = np.full(10, 1e-6)
-    errors[[RX, CY]] = np.radians(0.5), 0.4
-    covariance = np.diag(errors**2)
-    covariance[RX, CY] = covariance[CY, RX] = -0.96 * errors[RX] * errors[CY]
-    text = uncertainty_text(covariance, np.ones(10))
-    assert "The turn is sure to 0.50 degrees; with the principal point known, " in text
-    assert "it would be to 0.14." in text  # 0.5 sqrt(1 - 0.96^2)
-    covariance[RX, CY] = covariance[CY, RX] = 0.5 * covariance[RX, CY]
-    assert "The turn is sure to" not in uncertainty_text(covariance, np.ones(10))
 
 
 def test_what_the_turn_would_be_is_the_inverse_of_the_information_on_all_but_the_principal_point() -> None:

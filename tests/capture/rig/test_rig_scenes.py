@@ -10,38 +10,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.support.known_rig import changes_between, drawn_capture, known_capture, projection_difference_px
+from tests.support.known_rig import changes_between, drawn_capture, projection_difference_px
 from thermoxels_ns.capture.rig.drift import estimate_drift
 from thermoxels_ns.capture.rig.explanation import turn_errors_deg
 from thermoxels_ns.capture.rig.parameters import PARAMETERS
 from thermoxels_ns.capture.rig.search import estimate_rig
 from thermoxels_ns.capture.rig_types import RigFrame, RigStart
 from thermoxels_ns.core.camera import Camera
-
-
-@pytest.mark.parametrize(
-    ("scene", "photograph_width", "thermal_width", "baseline_m"),
-    [
-        ("house-corner", 800, 200, (0.15, 0.03, 0.02)),  # 4 times the resolution
-        ("house-corner", 1600, 80, (0.19, -0.02, 0.01)),  # 20 times
-        ("courtyard", 640, 160, (0.05, 0.02, 0.0)),
-    ],
-)
-def test_rig_and_drift_of_a_noisy_drifting_vignetting_camera(
-    scene: str, photograph_width: int, thermal_width: int, baseline_m: tuple[float, float, float]
-) -> None:
-    views = 6 if photograph_width > 1000 else 8
-    capture = known_capture(scene, views, photograph_width, thermal_width, baseline_m)
-    found = estimate_rig(capture.frames, capture.visible, capture.measured_start())
-    assert found.determined, found.explanation
-    assert capture.turn_error_deg(found) < 0.2
-    assert capture.focal_error(found) < 0.01
-    assert capture.projection_error_px(found) < 0.4
-    assert found.score_after > found.score_before
-    drift = estimate_drift(capture.frames, found.thermal_camera, found.visible_to_thermal)
-    assert drift.used, drift.explanation
-    assert np.abs(drift.offsets_k - capture.offsets_k).max() < 0.1
-    assert drift.after_k < 0.5 * drift.before_k
 
 
 @pytest.mark.real_data

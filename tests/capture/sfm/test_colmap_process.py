@@ -5,20 +5,16 @@ from __future__ import annotations
 import importlib
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from tests.support.camera_card import counts, photograph
-from tests.support.posed_model import ring_model
 from thermoxels_ns.capture.settings import CaptureSettings
-from thermoxels_ns.capture.sfm.colmap_process import check_free_space, disk_of, run_in_process
-from thermoxels_ns.capture.sfm.poses import add_points
+from thermoxels_ns.capture.sfm.colmap_process import disk_of, run_in_process
 from thermoxels_ns.commands.capture import capture_folder
 from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
 
@@ -26,7 +22,7 @@ FULL = shutil.disk_usage(os.sep)._replace(free=4096)
 
 
 WORK = """
-import os, signal, time
+import os, time
 
 def count_to(last, folder, say):
     for number in range(last):
@@ -38,11 +34,6 @@ def threads_of_blas(say):
     return os.environ["OPENBLAS_NUM_THREADS"], ["ä"] * 100_000
 
 
-def end_within_its_answer(say):
-    os.write(1, b"\\n\\x1egASVhA")
-    os._exit(3)
-
-
 def raise_one(problem, say):
     say("before")
     raise problem
@@ -51,10 +42,6 @@ def raise_one(problem, say):
 def abort_as_colmap(words, say):
     os.write(2, words.encode())
     os.abort()
-
-
-def killed(say):
-    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def wait_for_ever(folder, say):
@@ -88,11 +75,6 @@ def test_what_it_returns_arrives_and_its_blas_has_one_thread(work, tmp_path, mon
     assert run_in_process(work.count_to, (0, tmp_path), tmp_path) is None
 
 
-def test_a_part_of_an_answer_is_none(work, tmp_path):
-    with pytest.raises(ThermoxelsError, match="COLMAP: expected to end"):
-        run_in_process(work.end_within_its_answer, (), tmp_path)
-
-
 @pytest.mark.parametrize("problem", [SceneError("frame 3: no."), OSError(28, "No space left on device", "pairs.txt")])
 def test_errors_arrive_as_they_were_raised(tmp_path, work, problem):
     said = []
@@ -108,17 +90,6 @@ def test_an_abort_is_an_error_with_its_reason(tmp_path, work):
         run_in_process(work.abort_as_colmap, (words,), tmp_path)
 
 
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
-def test_a_lack_of_memory_is_named(tmp_path, work):
-    with pytest.raises(ThermoxelsError, match=r"killed.*memory runs out.*--max-features"):
-        run_in_process(work.killed, (), tmp_path)
-
-
-def test_a_mistake_of_ours_is_not_silent(tmp_path, work):
-    with pytest.raises(ThermoxelsError, match=r"exit status 1 \(.*ZeroDivisionError"):
-        run_in_process(work.raise_one, (ZeroDivisionError("zero"),), tmp_path)
-
-
 @pytest.mark.parametrize("says_so", [True, False])
 def test_a_full_disk_is_named_whatever_colmap_says(tmp_path, work, monkeypatch, says_so):
     """The disk may have room again when it is looked at: then COLMAP's words tell."""
@@ -128,21 +99,6 @@ def test_a_full_disk_is_named_whatever_colmap_says(tmp_path, work, monkeypatch, 
     with pytest.raises(OutputError, match=r"free space for features, matches and poses.*finished stages are kept") as e:
         run_in_process(work.abort_as_colmap, (words,), tmp_path)
     assert str(e.value).startswith(f"disk at {disk_of(tmp_path)}: ")
-
-
-def test_a_disk_that_fills_during_a_capture_is_named(tmp_path, monkeypatch):
-    """The space is there when features begin; the process that looks for them dies; then there is none."""
-    for name in "abc":
-        photograph(tmp_path / "card" / f"{name}-visible.jpg")
-        counts(tmp_path / "card" / f"{name}-radiometric.tiff")
-    usage = [shutil.disk_usage(tmp_path), FULL]
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage.pop(0) if len(usage) > 1 else usage[0])
-    monkeypatch.setattr("thermoxels_ns.capture.sfm.feature_matching._find_and_match", _abort_in_the_middle)
-    with pytest.raises(OutputError, match=rf"disk at {disk_of(tmp_path)}: .*got 0 MB.*\.capture"):
-        capture_folder(tmp_path / "card", tmp_path / "scene", CaptureSettings())
-    monkeypatch.undo()
-    with pytest.raises(SceneError, match="photographs that fit together"):  # grey ones: it got past the features
-        capture_folder(tmp_path / "card", tmp_path / "scene", CaptureSettings())
 
 
 def test_a_mapping_that_aborts_is_an_error_and_the_capture_goes_on_behind_its_features(tmp_path, monkeypatch):
@@ -159,26 +115,8 @@ def test_a_mapping_that_aborts_is_an_error_and_the_capture_goes_on_behind_its_fe
         capture_folder(tmp_path / "card", tmp_path / "scene", CaptureSettings())
 
 
-def test_points_for_given_poses_that_abort_are_an_error(tmp_path, monkeypatch):
-    model = ring_model(3)
-    size = model.camera.height, model.camera.width, 3
-    files = {name: photograph(tmp_path / f"{name}.jpg", np.full(size, 90, np.uint8)) for name in model.frames}
-    monkeypatch.setattr("thermoxels_ns.capture.sfm.mapping._triangulate", _abort_in_the_middle)
-    with pytest.raises(ThermoxelsError, match=r"COLMAP: expected to end, got exit status.*--from-stage poses"):
-        add_points(model, files, tmp_path)
-    monkeypatch.undo()
-    assert not len(add_points(model, files, tmp_path).points)
-
-
 def _abort_in_the_middle(*_):
     os.abort()
-
-
-def test_the_disk_of_a_path_is_where_it_is_mounted(tmp_path):
-    disk = disk_of(tmp_path / "not" / "there")
-    assert os.path.ismount(disk) and tmp_path.resolve().is_relative_to(disk)
-    with pytest.raises(OutputError, match=r"up to 9000000000000 MB free for dreams, got \d+ MB\. Wait; finished"):
-        check_free_space(tmp_path, 9e18, "dreams", "Wait")
 
 
 PARENT = """

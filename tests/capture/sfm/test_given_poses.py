@@ -9,11 +9,10 @@ import pytest
 from PIL import Image
 
 from tests.support.posed_model import CAMERA, ring_model
-from thermoxels_ns.capture.sfm.colmap_model import camera_of_colmap, model_of_colmap, read_colmap
-from thermoxels_ns.capture.sfm.colmap_process import quiet_colmap
-from thermoxels_ns.capture.sfm.given_poses import fitted_to_photographs, read_given_poses, reordered
-from thermoxels_ns.capture.sfm.poses import Poses, add_points
-from thermoxels_ns.core.errors import SceneError, ThermoxelsError
+from thermoxels_ns.capture.sfm.colmap_model import model_of_colmap, read_colmap
+from thermoxels_ns.capture.sfm.given_poses import fitted_to_photographs, read_given_poses
+from thermoxels_ns.capture.sfm.poses import Poses
+from thermoxels_ns.core.errors import SceneError
 
 MODEL = ring_model(5, points=60)
 SOURCES = {name: f"visible/{name}-visible.jpg" for name in MODEL.frames}
@@ -43,12 +42,6 @@ def test_photographs_are_recognised_by_name(tmp_path, form):
     assert list(found.dropped) == ["other"]
 
 
-@pytest.mark.parametrize("name", ["../../etc/f0-visible.jpg", "/data/f0-visible.jpg", "C:\\f0-visible.jpg"])
-def test_a_name_that_leads_out_is_refused(tmp_path, name):
-    with pytest.raises(SceneError, match="a file inside"):
-        read_given_poses(transforms(tmp_path, {**SOURCES, "f0": name}), SOURCES)
-
-
 def test_files_without_poses_are_refused(tmp_path):
     with pytest.raises(SceneError, match="no known one"):
         read_given_poses(transforms(tmp_path), {"x": "x.jpg"})
@@ -58,27 +51,6 @@ def test_files_without_poses_are_refused(tmp_path):
         read_given_poses(tmp_path, SOURCES)
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"w": 0}, "positive focal lengths and size"),
-        ({"w": 1e400}, "numbers as intrinsics"),
-        ({"fl_x": float("nan")}, "finite intrinsics"),
-        ({"fl_y": -100.0}, "positive focal lengths"),
-        ({"cx": "middle"}, "numbers as intrinsics"),
-        ({"camera_model": ["OPENCV"]}, "camera_model"),
-        ({"frames": {}}, "a list 'frames'"),
-        ({"frames": [7]}, "a list 'frames'"),
-        ({"frames": []}, "no known one"),
-    ],
-)
-def test_cameras_that_cannot_be_are_refused(tmp_path, change, said):
-    path = transforms(tmp_path)
-    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    with pytest.raises(SceneError, match=said):
-        read_given_poses(path, SOURCES)
-
-
 MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 
 
@@ -86,11 +58,8 @@ MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
     ("change", "said"),
     [
         (lambda pose: (pose @ MIRROR).tolist(), "a rotation in the upper left"),
-        (lambda pose: (pose * 2).tolist(), "a rotation in the upper left"),
         (lambda pose: np.where(pose == pose[0, 3], np.nan, pose).tolist(), "finite numbers"),
-        (lambda pose: pose[:2].tolist(), "4 x 4 numbers"),
         (lambda pose: None, "4 x 4 numbers"),
-        (lambda pose: "pose", "4 x 4 numbers"),
     ],
 )
 def test_poses_that_cannot_be_are_refused_with_their_frame(tmp_path, change, said):
@@ -126,19 +95,6 @@ def test_poses_of_cropped_or_turned_photographs_are_refused(tmp_path):
         files = photographs(tmp_path, [size] * len(MODEL.frames))
         with pytest.raises(SceneError, match=rf"proportions of .*got {size[0]} x {size[1]}.*cropped"):
             fitted_to_photographs(Poses(MODEL, {}), files)
-
-
-def test_one_pose_is_too_few_for_points(tmp_path):
-    model = MODEL.without(MODEL.frames[1:])
-    with pytest.raises(SceneError, match="at least 2 photographs"):
-        add_points(model, photographs(tmp_path, [(CAMERA.width, CAMERA.height)]), tmp_path)
-
-
-def test_what_colmap_refuses_is_an_error_with_a_remedy(tmp_path):
-    for problem in (ValueError("[sfm.cc:671] Check failed"), RuntimeError("disk")):
-        refused = pytest.raises(ThermoxelsError, match=r"COLMAP: expected to end.*--from-stage poses")
-        with refused, quiet_colmap(tmp_path):
-            raise problem
 
 
 def test_a_photograph_of_another_size_is_left_out_of_given_poses(tmp_path):
@@ -198,28 +154,3 @@ def test_a_model_of_reduced_photographs_is_scaled_to_the_originals(tmp_path):
     assert (large.camera.fl_x, large.camera.cx, large.camera.k1) == (1000.0, 640.0, 0.02)
     assert large.sighting_error_px().max() < 1e-6
     assert large.point_error_px == pytest.approx(1.0)
-
-
-def test_a_lens_that_ours_cannot_be_is_refused(tmp_path):
-    reconstruction = read_colmap(colmap_model(tmp_path, "FOV"))
-    with pytest.raises(SceneError, match="got FOV"):
-        camera_of_colmap(reconstruction.cameras[1])
-
-
-def test_sorting_frames_keeps_sightings_with_their_frames():
-    turned = reordered(MODEL, lambda name: -int(name[1:]))
-    assert turned.frames == MODEL.frames[::-1]
-    assert turned.sighting_error_px().max() == pytest.approx(MODEL.sighting_error_px().max())
-    for index, name in enumerate(turned.frames):
-        before = MODEL.seen_by(MODEL.frames.index(name))
-        assert np.array_equal(turned.seen_by(index)[0], before[0])
-
-
-def test_leaving_frames_out_and_moving_the_world_keep_reprojection():
-    some = MODEL.without(["f1", "f3"])
-    assert some.frames == ("f0", "f2", "f4")
-    assert some.sighting_error_px().max() < 1e-9
-    rotation = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    moved = some.moved(rotation, np.array([1.0, 2.0, 3.0]))
-    assert moved.sighting_error_px().max() < 1e-9
-    assert moved.points[0] == pytest.approx(rotation @ (some.points[0] - [1.0, 2.0, 3.0]))
