@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -26,17 +26,6 @@ class KnownCapture:
     visible_to_thermal: FloatArray
     offsets_k: FloatArray
     radial: tuple[float, float]
-
-    def measured_start(self, focal_error: float = 1.04) -> RigStart:
-        """What a user knows: a focal length some percent off, and the lenses' distance by a ruler, to 2 cm.
-
-        The principal point is held near the image's centre: it and the turn stand for each other.
-        """
-        transform = np.eye(4)
-        transform[:3, 3] = np.round(self.visible_to_thermal[:3, 3] / 0.02) * 0.02
-        focal = self.thermal.fl_x * focal_error
-        camera = replace(self.thermal, fl_x=focal, fl_y=focal)
-        return RigStart(camera, transform, centre_sigma=0.001, k1_sigma=0.02, translation_sigma=0.015)
 
     def turn_error_deg(self, found: RigEstimate) -> float:
         """Angle between the rotation found and the true one [degrees]."""
@@ -107,9 +96,8 @@ def known_capture(
     small = scene.camera(thermal_width, thermal_width * 4 // 5)
     focal = small.fl_x * zoom
     cx, cy = small.cx + centre_px[0], small.cy + centre_px[1]
-    pinhole = Camera(small.width, small.height, focal, focal, cx, cy)
-    visible = Camera(plain.width, plain.height, plain.fl_x, plain.fl_y, plain.cx, plain.cy)
     thermal = Camera(small.width, small.height, focal, focal, cx, cy)
+    visible = Camera(plain.width, plain.height, plain.fl_x, plain.fl_y, plain.cx, plain.cy)
     rig = np.eye(4)
     rig[:3, :3], rig[:3, 3] = turned(*turn_deg), baseline_m
     to_visible = OPENGL_FROM_OPENCV @ np.linalg.inv(rig) @ OPENGL_FROM_OPENCV
@@ -123,7 +111,7 @@ def known_capture(
         view = render_view(scene, pose, plain, samples_per_axis=1)
         photographs.append(np.round(255.0 * view.rgb).astype(np.uint8))
         depths.append(view.depth_m)
-        measured = render_view(scene, pose @ to_visible, pinhole).temperature_c
+        measured = render_view(scene, pose @ to_visible, thermal).temperature_c
         measured = measured + offsets[number] + radial[0] * r2 + radial[1] * r2 * r2
         temperatures.append((measured + noise_k * draw.standard_normal(measured.shape)).astype(np.float32))
         seen = np.flatnonzero(view.hit.ravel())

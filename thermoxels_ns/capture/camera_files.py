@@ -86,15 +86,10 @@ def natural_key(path: Path) -> list[tuple[int, str, int]]:
 def scan_folder(
     folder: Path, without: Sequence[Path] = (), say: Callable[[str], None] = lambda _: None
 ) -> CameraFolder:
-    """Look at every picture and table in a folder and the folders in it.
+    """Look at every picture and table in a folder and the folders in it, but those of `without`.
 
     Hidden files and folders are passed over. Links that lead out of the folder, linked folders, folders that are shut
     and what is no file are passed over and named.
-
-    Args:
-        folder: What the user hands over.
-        without: Folders in it that are none of the camera's, such as the output.
-        say: Told how far it is.
 
     Raises:
         SceneError: There is no such folder.
@@ -123,15 +118,7 @@ def scan_folder(
 
 
 def files_below(folder: Path, without: Sequence[Path] = ()) -> tuple[list[Path], dict[Path, str]]:
-    """List the files of a folder and of the folders in it, sorted as people sort names.
-
-    Args:
-        folder: Where to look.
-        without: Folders in it to leave out.
-
-    Returns:
-        The files, and why other things with a name that is not hidden are not among them.
-    """
+    """Files of a folder and its folders but `without`, sorted as people do, and why others are not among them."""
     root, skipped = folder.resolve(), [path.resolve() for path in without]
     files, passed_over = [], dict[Path, str]()
 

@@ -81,7 +81,7 @@ class CaptureFrames:
     """Why, by the frame's name."""
 
     def save(self, folder: Path, root: Path) -> None:
-        """Write the list of frames into the folder that holds their images; both folders may be moved later."""
+        """Write the list of frames beside their images; both folders may be moved later."""
         content = asdict(self)
         for row in content["frames"]:
             for name in ("photograph", "thermal"):
@@ -114,18 +114,10 @@ def read_frames(
     thermal_mask: Path | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> CaptureFrames:
-    """Read all pairs: degrees from thermal files, photographs out of files that hold both.
+    """Read all pairs into `folder`: degrees from thermal files, photographs out of files that hold both.
 
-    Pixels of the thermal sensor that are stuck at one value, and those that the user's mask shuts out, become NaN.
-
-    Args:
-        pairs: What belongs together.
-        root: The capture's folder.
-        folder: For what is read; frames are written here.
-        radiometry: How files become degrees.
-        skip_bad: Leave a pair out and say why, where one of its files cannot be read; else that is an error.
-        thermal_mask: Picture of the thermal images' size, black where there is no measurement.
-        say: Told how far it is.
+    Pixels of the thermal sensor that are stuck at one value, and those that the user's mask shuts out, become NaN. With
+    `skip_bad` a pair with a file that cannot be read is left out and named.
 
     Raises:
         ThermoxelsError: A file cannot be read and `skip_bad` is off, or no pair is left.
@@ -250,27 +242,15 @@ def _frame_of(row: dict[str, Any]) -> CaptureFrame:
 
 
 def measurement_rows(frames: Sequence[CaptureFrame]) -> list[tuple[str, str]]:
-    """Describe file formats and the settings that degrees were computed with.
-
-    Args:
-        frames: Those of the scene.
-
-    Returns:
-        Names and texts; where frames differ, each kind with the number of its frames, the most frequent first.
-    """
-    rows = []
-    formats = [_format(frame) for frame in frames if frame.format]
-    if formats:
-        rows.append(("thermal files", _counted(formats)))
+    """File formats and the settings behind degrees, as names and texts; the most frequent kind first."""
+    formats = [
+        frame.format + ("" if frame.celsius_per_count is None else f" with {frame.celsius_per_count:.4g} K per count")
+        for frame in frames
+        if frame.format
+    ]
     conditions = [conditions_text(frame.conditions) for frame in frames if frame.conditions]
-    if conditions:
-        rows.append(("computed with", _counted(conditions)))
-    return rows
-
-
-def _format(frame: CaptureFrame) -> str:
-    step = "" if frame.celsius_per_count is None else f" with {frame.celsius_per_count:.4g} K per count"
-    return f"{frame.format}{step}"
+    listed = {"thermal files": formats, "computed with": conditions}
+    return [(name, _counted(texts)) for name, texts in listed.items() if texts]
 
 
 def _counted(texts: Sequence[str]) -> str:

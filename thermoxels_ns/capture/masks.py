@@ -61,12 +61,7 @@ class PhotographMasks:
 
 
 def find_masks(frames: Sequence[CaptureFrame], folder: Path | None, look_for_overlays: bool) -> PhotographMasks:
-    """Masks for photographs of the size that most of them have.
-
-    Args:
-        frames: At least one.
-        folder: The user's masks; None: there are none.
-        look_for_overlays: Whether to look for what the camera drew.
+    """Masks for photographs of the size that most of at least one frame have.
 
     Raises:
         SceneError: The user's masks are not named like photographs, or a photograph cannot be read.
@@ -110,13 +105,10 @@ def user_masks(frames: Sequence[CaptureFrame], folder: Path | None) -> dict[str,
 
 
 def find_overlay(photographs: Sequence[Path]) -> npt.NDArray[np.bool_] | None:
-    """Find what the camera drew over all photographs: text, scales and logos, at the same place in each.
+    """Find what the camera drew over all photographs of one size: text, scales and logos, at the same place in each.
 
     A pixel belongs to an overlay if it stays the same in all photographs, stands out from its surroundings in their
     mean, and the surroundings change. Numbers that change from frame to frame are found by their outlines only.
-
-    Args:
-        photographs: Files of one size.
 
     Returns:
         True where the scene shows, shape (height, width) of the photographs; None where nothing is drawn, or where

@@ -7,6 +7,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -74,10 +75,6 @@ def find_pairs(found: CameraFolder, options: PairOptions | None = None) -> PairS
     Equal names are equal after words for the kind of image are dropped: ``10-58-15-636-visible.jpg`` and
     ``10-58-15-636-radiometric.tiff``, or ``visible/a7.jpg`` and ``thermal/a7.npy``. By time: each the other's nearest,
     within the limit, and no second candidate about as near.
-
-    Args:
-        found: What the folder holds.
-        options: Limits.
     """
     options = options or PairOptions()
     pairs: list[tuple[CameraFile, CameraFile, str]] = []
@@ -86,7 +83,7 @@ def find_pairs(found: CameraFolder, options: PairOptions | None = None) -> PairS
     pairs += [(file, file, "both in one file") for file in both]
     photographs = [file for file in found.files if file.role == "photograph"]
     thermal = [file for file in found.files if file.role in ("thermal", "thermal picture")]
-    for step in (_by_dji_names, _by_names(found.folder)):
+    for step in (_by_dji_names, partial(_by_names, folder=found.folder)):
         matched, explained = step(photographs, thermal)
         pairs += matched
         unpaired |= explained
@@ -105,11 +102,9 @@ def find_pairs(found: CameraFolder, options: PairOptions | None = None) -> PairS
 
 
 def read_pair_list(file: Path, folder: Path) -> PairSearch:
-    """Read pairs that the user lists: a CSV file with one photograph and its thermal image per line.
+    """Read the user's pairs: a CSV file with one photograph and its thermal image per line, relative to `folder`.
 
-    Args:
-        file: The list; names are relative to `folder`. A first line without files in it is taken for a heading.
-        folder: The capture.
+    A first line without files in it is taken for a heading.
 
     Raises:
         SceneError: The list cannot be read, names a file twice, one that is not there, or one outside the folder.
@@ -185,26 +180,23 @@ def _seconds_apart(first: re.Match[str], second: re.Match[str]) -> float:
     return abs(seconds(first["time"]) - seconds(second["time"]))
 
 
-def _by_names(folder: Path) -> Callable[[Sequence[CameraFile], Sequence[CameraFile]], _Found]:
-    def match(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile]) -> _Found:
-        pairs, explained = [], dict[Path, str]()
-        for group in _groups((*photographs, *thermal), lambda file: _shot(file.path.stem)):
-            for part in _parted(group, folder):
-                photos = [file for file in part if file.role == "photograph"]
-                hot = [file for file in part if file.role == "thermal"]
-                pictures = [file for file in part if file.role == "thermal picture"]
-                for picture in pictures if hot else []:
-                    explained[picture.path] = f"a picture for the eye; the temperatures are in {hot[0].path.name}"
-                hot = hot or pictures
-                if len(photos) == 1 and len(hot) == 1:
-                    pairs.append((photos[0], hot[0], "equal names"))
-                elif photos and hot:
-                    listed = ", ".join(file.path.name for file in (*photos, *hot))
-                    why = f"ambiguous: {len(photos)} photographs and {len(hot)} thermal images share a name ({listed})"
-                    explained |= {file.path: why for file in (*photos, *hot)}
-        return pairs, explained
-
-    return match
+def _by_names(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], folder: Path) -> _Found:
+    pairs, explained = [], dict[Path, str]()
+    for group in _groups((*photographs, *thermal), lambda file: _shot(file.path.stem)):
+        for part in _parted(group, folder):
+            photos = [file for file in part if file.role == "photograph"]
+            hot = [file for file in part if file.role == "thermal"]
+            pictures = [file for file in part if file.role == "thermal picture"]
+            for picture in pictures if hot else []:
+                explained[picture.path] = f"a picture for the eye; the temperatures are in {hot[0].path.name}"
+            hot = hot or pictures
+            if len(photos) == 1 and len(hot) == 1:
+                pairs.append((photos[0], hot[0], "equal names"))
+            elif photos and hot:
+                listed = ", ".join(file.path.name for file in (*photos, *hot))
+                why = f"ambiguous: {len(photos)} photographs and {len(hot)} thermal images share a name ({listed})"
+                explained |= {file.path: why for file in (*photos, *hot)}
+    return pairs, explained
 
 
 def _groups(files: Iterable[CameraFile], key: Callable[[CameraFile], tuple]) -> list[list[CameraFile]]:
@@ -325,16 +317,7 @@ def _without_role(stem: str) -> str:
 
 
 def no_pairs(found: CameraFolder, unpaired: Mapping[Path, str], has_dji_library: bool) -> SceneError:
-    """Describe a folder without a pair.
-
-    Args:
-        found: What it holds.
-        unpaired: Why each file is in no pair.
-        has_dji_library: Whether the user has named DJI's library.
-
-    Returns:
-        The error to raise: what there is, one file with its reason, and a remedy that fits what is missing.
-    """
+    """Error for a folder without a pair: what there is, one file with its reason, and a remedy for what is missing."""
     photographs = [file for file in found.files if file.role == "photograph"]
     thermal = [file for file in found.files if file.role == "thermal"]
     pictures = [file for file in found.files if file.role == "thermal picture"]

@@ -27,7 +27,9 @@ _REMEDY = "Run it again with --from-stage pairs."
 def save(path: Path, record: Any) -> None:
     """Write a dataclass of arrays, numbers, texts, tuples and perspective cameras as .npz, whole or not at all."""
     values = {each.name: getattr(record, each.name) for each in fields(record)}
-    values = {name: _numbers(value) if isinstance(value, Camera) else value for name, value in values.items()}
+    for name, value in values.items():
+        if isinstance(value, Camera):  # all but the lens, which comes last
+            values[name] = tuple(getattr(value, each.name) for each in fields(value)[:-1])
     packed = io.BytesIO()  # in memory, because numpy's half-made files complain later
     np.savez(packed, **{name: np.asarray(value) for name, value in values.items()})  # type: ignore[arg-type]
     with replace_when_done(path) as temporary:
@@ -51,11 +53,7 @@ def load(path: Path, kind: type[_Record]) -> _Record:
 
 
 def load_json(path: Path) -> Any:
-    """Read json that a stage wrote.
-
-    Raises:
-        ThermoxelsError: The file is missing or damaged.
-    """
+    """Read json that a stage wrote; a `ThermoxelsError` where it is missing or damaged."""
     return json_values.read_json(path, _EXPECTED, _REMEDY)
 
 
@@ -67,11 +65,6 @@ def _value(array: np.ndarray, hint: Any) -> Any:
     if hint in (str, bool, float, int):
         return hint(array.item())
     return tuple(array.tolist()) if getattr(hint, "__origin__", None) is tuple else array
-
-
-def _numbers(camera: Camera) -> tuple[float, ...]:
-    """Its fields without the lens, which comes last."""
-    return tuple(getattr(camera, each.name) for each in fields(camera)[:-1])
 
 
 def save_pairs(folder: Path, search: PairSearch, root: Path) -> None:

@@ -92,14 +92,9 @@ def run_capture(
     write_page: Callable[[CaptureResult], None],
     say: Callable[[str], None] = lambda _: None,
 ) -> CaptureResult:
-    """Turn a folder of camera files into a scene.
+    """Turn a folder of camera files into a scene, a page and the stages' results in `output`.
 
-    Args:
-        source: The folder; nothing is written to it, unless the output lies in it.
-        output: For the scene, the page and the stages' results.
-        settings: How.
-        write_page: Writes the page; the last stage.
-        say: Told how far it is, one line at a time.
+    `write_page` is the last stage; `say` is told how far it is, one line at a time.
 
     Raises:
         ThermoxelsError: A file cannot be read, there are no pairs or no poses, or an option is out of range.
@@ -108,11 +103,9 @@ def run_capture(
     if not source.is_dir():
         scan_folder(source)  # says what is wrong
     if source.resolve().is_relative_to(output.resolve()):
+        remedy = "Pass a new folder with --output; the camera's files stay as they are."
         raise SceneError(
-            "output",
-            expected="another folder than the input, which does not hold it either",
-            got=output,
-            remedy="Pass a new folder with --output; the camera's files stay as they are.",
+            "output", expected="another folder than the input, which does not hold it either", got=output, remedy=remedy
         )
     board = board_of(settings)
     if settings.board_photos is not None and not settings.board_photos.is_dir():

@@ -65,12 +65,7 @@ def scene_names(count: int) -> list[str]:
 
 
 def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = lambda _: None) -> None:
-    """Write a scene; until its last file, transforms.json, is in place the folder holds no scene.
-
-    Args:
-        scene: What is written.
-        output: The capture's output folder; an earlier scene in it is replaced.
-        say: Told how far it is.
+    """Write a scene in place of an earlier one; until its last file, transforms.json, is there the folder holds none.
 
     Raises:
         OutputError: The folder cannot be written to.

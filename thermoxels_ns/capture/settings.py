@@ -8,6 +8,8 @@ from typing import Literal
 
 StageName = Literal["pairs", "temperatures", "poses", "scale", "board", "rig", "drift", "scene", "page"]
 """The stages of a capture in order."""
+Matching = Literal["auto", "exhaustive", "sequential"]
+LensModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV"]
 
 
 @dataclass
@@ -45,10 +47,10 @@ class CaptureSettings:
     """How far the thermal camera's clock is ahead of that of the photographs, in seconds."""
     poses: Path | None = None
     """Poses that exist already: folder of a COLMAP model, or a transforms.json. Default: found from the photographs."""
-    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
+    matching: Matching = "auto"
     """Which photographs are compared: each with each, or each with its neighbours in time. auto: each with each up to
     80 photographs."""
-    lens: Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV"] = "SIMPLE_RADIAL"
+    lens: LensModel = "SIMPLE_RADIAL"
     """Lens model of the photographs, by COLMAP's names. OPENCV fits strong distortion and needs many photographs."""
     image_size: int = 1600
     """Longest side to which photographs are reduced for finding poses, in pixels. The scene keeps the originals."""

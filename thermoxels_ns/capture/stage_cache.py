@@ -50,7 +50,7 @@ class StageCache:
     def run(
         self, name: StageName, depends_on: Mapping[str, Any], work: Callable[[Path], None], writes: Sequence[Path] = ()
     ) -> Path:
-        """Run a stage, or take its earlier result.
+        """Run a stage, or take its earlier result; return the folder with the result.
 
         Args:
             name: Which stage; each once, in order.
@@ -59,9 +59,6 @@ class StageCache:
                 same key left.
             writes: Files and folders that the stage writes elsewhere; where one of them, or a file in one, is gone or
                 has another size than the stage gave it, the stage runs again.
-
-        Returns:
-            The folder with the result.
 
         Raises:
             OutputError: An earlier result cannot be removed, or the new one cannot be written.
@@ -114,11 +111,7 @@ def fingerprint(paths: Sequence[Path], root: Path) -> list[tuple[str, int, int]]
 
 
 def given_fingerprints(paths: Sequence[Path | None]) -> list[tuple[str, int, int]]:
-    """Fingerprints of files that the user names, which need not lie in the capture; None: the user names none.
-
-    Raises:
-        SceneError: A file is not there.
-    """
+    """Fingerprints of files that the user names (None: of none); a `SceneError` where one is not there."""
     there = [path for path in paths if path is not None]
     for path in there:
         if not path.is_file():
@@ -157,10 +150,6 @@ def locked(output: Path, say: Callable[[str], None] = lambda _: None) -> Iterato
 
     The system ends the lock with the process that holds it, however that ends. Where the drive has no locks the block
     runs all the same, and `say` is told so.
-
-    Args:
-        output: The output folder, made by `prepare_output`.
-        say: Told where another capture would not be noticed.
 
     Raises:
         OutputError: Another capture holds the folder.

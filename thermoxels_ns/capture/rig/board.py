@@ -22,7 +22,7 @@ from thermoxels_ns.capture.rig_types import FloatArray, RigEstimate, RigStart
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.metric_scale import MetricScale
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.errors import SceneError, explain
+from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.camera_file import RadiometryOptions
 
 _SIZE = re.compile(r"(\d{1,3})\s*[xX]\s*(\d{1,3})")
@@ -64,11 +64,7 @@ class CheckerBoard:
 
 
 def find_board(image: npt.NDArray, board: CheckerBoard) -> FloatArray | None:
-    """Find the board's inner corners to a fraction of a pixel.
-
-    Args:
-        image: Grey values or temperatures, shape (height, width).
-        board: What to look for.
+    """Find the board's inner corners in grey values or temperatures (height, width), to a fraction of a pixel.
 
     Returns:
         Pixel positions in the order of `CheckerBoard.corners`, from one of the two ends, shape (n, 2); None: no board.
@@ -92,16 +88,10 @@ def find_board(image: npt.NDArray, board: CheckerBoard) -> FloatArray | None:
 def rig_from_boards(
     pairs: Sequence[tuple[npt.NDArray, npt.NDArray]], visible: Camera, start: RigStart, board: CheckerBoard
 ) -> RigEstimate:
-    """Find the rig from pictures of a checker board in different places.
+    """Find the rig from photographs (grey) and temperatures of a checker board in different places.
 
     The photograph and the visible camera say where the board is; robust least squares (Huber's loss) moves the thermal
-    camera until the corners fall where the thermal image shows them, held weakly by the start.
-
-    Args:
-        pairs: Photograph (grey) and temperatures of each picture.
-        visible: Intrinsics of the photographs.
-        start: First guess and how far it can be off, lengths in metres.
-        board: The board.
+    camera until the corners fall where the thermal image shows them, held weakly by the start (lengths in metres).
 
     Returns:
         The rig, its transform in metres. With the board in fewer than three pairs: the start, `determined` False.
@@ -182,11 +172,9 @@ def board_of(settings: CaptureSettings) -> CheckerBoard | None:
         )
     match = _SIZE.fullmatch(str(settings.board).strip())
     if match is None:
+        remedy = "Count the corners where four squares meet; one less than squares."
         raise SceneError(
-            "--board",
-            expected="inner corners along both sides, such as 7x5",
-            got=repr(settings.board),
-            remedy="Count the corners where four squares meet; one less than squares.",
+            "--board", expected="inner corners along both sides, such as 7x5", got=repr(settings.board), remedy=remedy
         )
     sides = sorted(map(int, match.groups()), reverse=True)
     assert settings.board_square_m is not None
@@ -203,20 +191,9 @@ def rig_from_board_photos(
     radiometry: RadiometryOptions,
     say: Callable[[str], None] = lambda _: None,
 ) -> RigEstimate:
-    """Find the rig from a folder with photographs and thermal images of a board.
+    """Find the rig, lengths in metres, from a folder with photographs and thermal images of a board.
 
-    Args:
-        source: The folder; its files are paired and read like those of the capture.
-        board: What is in the pictures.
-        visible: Camera of the capture's photographs, which took these too.
-        thermal_size: Width and height of the capture's thermal images.
-        folder: For what is read.
-        settings: How pairs are recognised, and what is known of the lens.
-        radiometry: How files become degrees.
-        say: Told how far it is.
-
-    Returns:
-        The rig, lengths in metres.
+    Its files are paired and read like those of the capture, into `folder`, and come from the same two cameras.
 
     Raises:
         SceneError: There are no pairs, they come from another camera, or fewer than three show the board to both
@@ -236,13 +213,12 @@ def rig_from_board_photos(
         )
     read = read_frames(search.pairs, source, folder, radiometry, settings.skip_bad, settings.thermal_mask, say)
     if read.thermal_size != thermal_size:
-        raise SceneError(_another_camera("thermal images", thermal_size, read.thermal_size))
+        raise _another_camera("thermal images", thermal_size, read.thermal_size)
     pairs, names = [], []
     for frame in read.frames:
         photograph = open_photograph(frame.photograph)
         if photograph.size != (visible.width, visible.height):
-            problem = _another_camera(frame.photograph_source, (visible.width, visible.height), photograph.size)
-            raise SceneError(problem)
+            raise _another_camera(frame.photograph_source, (visible.width, visible.height), photograph.size)
         pairs.append((np.asarray(photograph.convert("L")), np.load(frame.thermal, allow_pickle=False)))
         names.append(frame.name)
     start = rig_start(read.frames, visible, thermal_size, settings.thermal_field_of_view_deg)
@@ -259,11 +235,7 @@ def rig_from_board_photos(
 
 
 def in_scene_units(rig: RigEstimate, scale: MetricScale | None, missing: str) -> RigEstimate:
-    """Turn a rig in metres into one in units of the scene.
-
-    Raises:
-        SceneError: The scene's scale is unknown.
-    """
+    """Turn a rig in metres into one in units of the scene; a `SceneError` where the scene's scale is unknown."""
     if scale is None:
         raise SceneError(
             "scale",
@@ -278,8 +250,8 @@ def in_scene_units(rig: RigEstimate, scale: MetricScale | None, missing: str) ->
     return replace(rig, visible_to_thermal=transform, covariance=covariance)
 
 
-def _another_camera(name: str, wanted: Sequence[int], got: Sequence[int]) -> str:
-    return explain(
+def _another_camera(name: str, wanted: Sequence[int], got: Sequence[int]) -> SceneError:
+    return SceneError(
         f"board pictures: {name}",
         expected=f"{wanted[0]} x {wanted[1]} pixels, as in the capture",
         got=f"{got[0]} x {got[1]}",

@@ -41,16 +41,11 @@ class CoarseSearch:
     """
 
     def __init__(self, score: RigScore, sigmas: FloatArray, median_depth: float) -> None:
-        """Prepare the search.
-
-        Args:
-            score: Score at the coarsest size.
-            sigmas: Standard deviations of the ten changes (`parameters.prior_sigmas`); they set the range.
-            median_depth: Of the scene points, to tell how far a shift of the camera moves its image [world units].
-        """
+        """Take the score at the coarsest size, the ten standard deviations and the points' depth [world units]."""
         camera = score.rig.camera
         self._rig = score.rig
-        rows, columns = (_padded_length(length) for length in (camera.height, camera.width))
+        # Lengths that Fourier transforms are fast at, with room for shifts.
+        rows, columns = (int(fft.next_fast_len(int(_PADDING * n)) or 0) for n in (camera.height, camera.width))
         self._shape: tuple[int, int] = (rows, columns)
         content = [float(np.sum(np.abs(edges.field) ** 2 * edges.weight)) for edges in score.thermal]
         chosen = np.sort(np.argsort(-np.array(content), kind="stable")[:_MOST_FRAMES])
@@ -151,11 +146,6 @@ class CoarseSearch:
             shifted[:2] = -(row - down) / focal[1], (column - across) / focal[0]
             found.append(CoarseRig(shifted, float(window[row, column])))
         return found
-
-
-def _padded_length(length: int) -> int:
-    """A length that Fourier transforms are fast at, with room for shifts."""
-    return int(fft.next_fast_len(int(_PADDING * length)) or 0)
 
 
 def _steps(reach: float, step: float) -> FloatArray:

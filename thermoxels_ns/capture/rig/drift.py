@@ -49,11 +49,6 @@ def estimate_drift(
     loss, reweighted), the points' temperatures eliminated, mean offset 0. The correction is fitted to four fifths of
     the points and kept only if it lowers the disagreement at the others.
 
-    Args:
-        frames: Pairs with poses and scene points.
-        thermal_camera: Thermal intrinsics.
-        visible_to_thermal: x_thermal = visible_to_thermal @ x_visible, shape (4, 4), OpenCV axes.
-
     Returns:
         The correction; all zeros with `used` False and the reason where there is nothing to gain.
 
@@ -213,14 +208,6 @@ def sample_shared_points(frames: Sequence[RigFrame], camera: Camera, visible_to_
     A frame sees a point if structure from motion found it there, or if the point lies in its image at the depth
     that the frame's own points have around it. Points on steep temperature edges are left out, because there a
     pixel's error in place is a large error in degrees.
-
-    Args:
-        frames: Pairs with poses and scene points.
-        camera: Thermal intrinsics.
-        visible_to_thermal: x_thermal = visible_to_thermal @ x_visible (4, 4), OpenCV axes.
-
-    Returns:
-        All readings.
     """
     world, tracked = _chosen_points(frames)
     columns: list[tuple[IntArray, IntArray, FloatArray, FloatArray]] = []

@@ -51,15 +51,7 @@ def found_in_images(rig: RigEstimate) -> bool:
 
 
 def rig_lines(rig: RigEstimate, metres_per_unit: float | None) -> tuple[str, ...]:
-    """Say in short what was found.
-
-    Args:
-        rig: The rig, lengths in units of the scene.
-        metres_per_unit: Scale of the scene; None: it has none.
-
-    Returns:
-        Two short lines; of a rig that is given or not determined its explanation.
-    """
+    """Say in two short lines what was found; of a rig that is given or not determined its explanation."""
     if not rig.determined or not np.isfinite(rig.projection_sigma_px):
         return (rig.explanation,)
     focal_px = rig.thermal_camera.fl_x
@@ -105,9 +97,8 @@ def with_error(value: float, error: float, decimals: int) -> str:
 def uncertainty_text(covariance: FloatArray, sigmas: FloatArray) -> str:
     """Say which of the ten numbers of a rig are not to be trusted alone; empty where all are.
 
-    Args:
-        covariance: Of the ten changes, shape (10, 10).
-        sigmas: Their standard deviations before the images were looked at, 0 for what is kept fixed, shape (10,).
+    `covariance` is that of the ten changes (10, 10), `sigmas` their standard deviations before the images were looked
+    at, 0 for what is kept fixed.
 
     >>> uncertainty_text(np.diag(np.full(10, 0.01)), np.ones(10))
     ''
@@ -146,10 +137,7 @@ def turn_errors_deg(covariance: FloatArray) -> tuple[float, float]:
     """Standard error of the turn about all axes together, as it is and were the principal point known [degrees].
 
     The second is the root of the trace of C_rr - C_rc C_cc^-1 C_cr, the covariance of the turn r given the principal
-    point c (the conditional of a normal distribution).
-
-    Args:
-        covariance: Of the ten changes, shape (10, 10); a principal point that is kept fixed has zeros.
+    point c (the conditional of a normal distribution). A principal point that is kept fixed has zeros in `covariance`.
 
     >>> covariance = np.diag([1e-4, 0, 0, 0, 0, 0, 0, 0, 1.0, 0])
     >>> covariance[0, 8] = covariance[8, 0] = 0.8e-2

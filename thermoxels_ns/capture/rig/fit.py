@@ -3,32 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.optimize import minimize
 
-from thermoxels_ns.capture.rig.parameters import RigModel
+from thermoxels_ns.capture.rig.patches import PatchScore
+from thermoxels_ns.capture.rig.score import RigScore
 from thermoxels_ns.capture.rig_types import FloatArray
 
 _DIFFERENCE_PX = 0.05
 _MOST_STEPS = 20
 _GRADIENT_TOLERANCE = 3e-2
-
-
-class RigObjective(Protocol):
-    """A score of rigs that knows its derivative."""
-
-    rig: RigModel
-    """What changes count from."""
-
-    def value(self, change: FloatArray) -> float:
-        """Score of all frames together."""
-        ...
-
-    def slopes(self, change: FloatArray) -> tuple[float, FloatArray]:
-        """What is maximised, and its derivative split by the parts that it comes from, shape (parts, 10)."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +23,6 @@ class RigFit:
     change: FloatArray
     """The ten changes."""
     score: float
-    log_posterior: float
-    """Score times its weight less half the squared distance from the start in standard deviations."""
 
 
 class RigMaximizer:
@@ -54,7 +37,9 @@ class RigMaximizer:
     many times.
     """
 
-    def __init__(self, score: RigObjective, sigmas: FloatArray, median_depth: float, correlated: float = 1.0) -> None:
+    def __init__(
+        self, score: RigScore | PatchScore, sigmas: FloatArray, median_depth: float, correlated: float = 1.0
+    ) -> None:
         """Take a score, the prior standard deviations, the scene's median depth and how many parts are correlated."""
         self._correlated = correlated
         self._score = score
@@ -80,9 +65,8 @@ class RigMaximizer:
 
         options = {"maxiter": _MOST_STEPS, "gtol": _GRADIENT_TOLERANCE}
         best = minimize(negative, np.zeros(len(z)), jac=True, method="BFGS", options=options)
-        z = z + root @ best.x
-        change = self._full(z)
-        return RigFit(change, self._score.value(change), -float(best.fun))
+        change = self._full(z + root @ best.x)
+        return RigFit(change, self._score.value(change))
 
     def covariance(self, change: FloatArray) -> FloatArray:
         """Covariance of the ten changes at a maximum, shape (10, 10); 0 for those that are kept fixed."""

@@ -60,8 +60,6 @@ class PreparedFrames:
     frames: tuple[PreparedFrame, ...]
     visible: Camera
     thermal: Camera
-    pattern_correlation: float
-    """How far two halves of the frames agree on a pattern that stays in place in the thermal images."""
     median_depth: float
     """Of all scene points [world units]."""
 
@@ -127,19 +125,15 @@ def edge_weights(
 
 
 def prepare_frames(frames: Sequence[RigFrame], visible: Camera, thermal: Camera) -> PreparedFrames:
-    """Read the images of all frames, take out the thermal camera's fixed pattern and check sizes.
-
-    Raises:
-        SceneError: An image cannot be read or has not the size of its camera.
-    """
+    """Read the images of all frames, take out the thermal camera's fixed pattern and check sizes (`SceneError`)."""
     temperatures = [read_temperatures(frame, thermal) for frame in frames]
-    contrasts, correlation = without_fixed_pattern(temperatures)
+    contrasts, _ = without_fixed_pattern(temperatures)
     prepared, depths = [], []
     for frame, contrast in zip(frames, contrasts):
         points = frame.points_visible()
         depths.append(points[points[:, 2] > 0.0, 2])
         prepared.append(PreparedFrame(frame.name, read_photograph(frame, visible), contrast, SparseDepth(points)))
-    return PreparedFrames(tuple(prepared), visible, thermal, correlation, float(np.median(np.concatenate(depths))))
+    return PreparedFrames(tuple(prepared), visible, thermal, float(np.median(np.concatenate(depths))))
 
 
 def read_temperatures(frame: RigFrame, camera: Camera) -> FloatImage:
@@ -185,7 +179,7 @@ def read_photograph(frame: RigFrame, camera: Camera) -> FloatImage:
 
 
 def edge_field(image: FloatImage, blur_px: float, pixels_per_pixel: float = 1.0) -> npt.NDArray[np.complex64]:
-    """Edges of an image as complex numbers of magnitude 0 to 1 and twice the edge's angle.
+    """Edges of an image as complex numbers of magnitude 0 to 1 and twice the edge's angle, shape (height, width).
 
     A warm thing may be bright or dark, so the sign of an edge says nothing; its place and its direction do. The squared
     complex gradient (gx + i gy)^2 has the edge's strength and twice its angle, so an edge and its negative are equal.
@@ -197,9 +191,6 @@ def edge_field(image: FloatImage, blur_px: float, pixels_per_pixel: float = 1.0)
         image: Shape (height, width).
         blur_px: Standard deviation of the blur that follows, which is how far apart two edges may lie to be found.
         pixels_per_pixel: How many pixels of this image are one of those that lengths are given in.
-
-    Returns:
-        Shape (height, width).
     """
     bad = ~np.isfinite(image)
     filled = np.where(bad, np.float32(np.nanmedian(image) if not bad.all() else 0.0), image).astype(np.float32)
@@ -225,10 +216,6 @@ def without_fixed_pattern(images: Sequence[FloatImage], neighbours: int = 20) ->
 
     The pattern is the median local contrast over the frames around each one, because cameras renew it now and
     then. It is taken out only if two halves of the frames agree on it.
-
-    Args:
-        images: Temperatures in the order they were taken, all of one shape.
-        neighbours: Over how many frames the median goes.
 
     Returns:
         Local contrasts, with the pattern taken out where there is one, and the correlation of the two halves.

@@ -70,16 +70,10 @@ class RigModel:
         return camera.project(points @ transform[:3, :3].T + transform[:3, 3])
 
     def pull_back(self, change: FloatArray, points: FloatArray, slope: FloatArray) -> FloatArray:
-        """Derivative of a sum over points with respect to the ten changes, by the chain rule.
+        """Derivative of a sum over points with respect to the ten changes, shape (10,), by the chain rule.
 
-        Args:
-            change: The ten changes.
-            points: Points in the visible camera (n, 3).
-            slope: Derivative of the sum with respect to every point's pixel position (n, 2); 0 where a point does
-                not count.
-
-        Returns:
-            Shape (10,). Tangential distortion is taken as constant: it is far below a pixel's worth of slope.
+        `slope` (n, 2) is the derivative of the sum with respect to the pixels of `points` (n, 3) of the visible camera;
+        0 where a point does not count. Tangential distortion is taken as constant: it is far below a pixel's worth.
         """
         camera, transform = self.changed(change)
         _, turned = _rotation(change[:3])

@@ -46,11 +46,8 @@ class PatchDesign:
     def at_depth(self, depth: FloatArray, distance: FloatArray, farthest: float, sure: float) -> PatchDesign:
         """Move the points from depth 1 to their own and leave windows out that have a point of unknown depth.
 
-        Args:
-            depth: Of every point, shape (n,).
-            distance: Of every point from what its depth is known by, shape (n,).
-            farthest: Distance beyond which a depth is not known.
-            sure: Distance up to which a window counts fully.
+        `distance` says how far each point lies from what its depth is known by: beyond `farthest` it is not known, up
+        to `sure` a window counts fully.
         """
         points = self.points * np.where(np.isfinite(depth), depth, 1.0)[:, None]
         known = (np.isfinite(depth) & (distance < farthest))[self.index].all(axis=1)
@@ -125,12 +122,7 @@ class PatchScore:
         return sum(len(design.index) for design in self.designs)
 
     def agreement(self, change: FloatArray, shift_px: tuple[float, float] = (0.0, 0.0)) -> list[FloatArray]:
-        """R2 of every window by frame, 0 where a window leaves the thermal image.
-
-        Args:
-            change: The ten changes of the rig.
-            shift_px: By how much to move every window in the thermal image.
-        """
+        """R2 of every window, moved by `shift_px`, by frame; 0 where a window leaves the thermal image."""
         result = []
         for design, thermal in zip(self.designs, self.thermal):
             pixels = self.rig.project(change, design.points) + shift_px

@@ -63,12 +63,6 @@ def refine(prepared: PreparedFrames, rig: RigModel, change: FloatArray, sigmas: 
     that thirty tell more than six. What the windows say of the principal point counts less still
     (`inflate_centre_covariance`).
 
-    Args:
-        prepared: All frames.
-        rig: What changes count from, at full size.
-        change: The ten changes so far.
-        sigmas: Standard deviations of the ten changes (`parameters.prior_sigmas`).
-
     Returns:
         The better rig; None where too few windows agree, or hardly more than by chance.
     """
@@ -107,14 +101,8 @@ def inflate_centre_covariance(covariance: FloatArray, sigmas: FloatArray) -> Flo
     Turn and principal point differ in the image only by terms of second order, some tenths of a pixel in its corners,
     which errors that all windows share reach. With C_cc the covariance of the principal point and D that of the start,
     the information gained is C_cc^-1 - D^-1; a quarter of it counts. The other numbers follow by their regression on
-    the principal point, so what they would be with it known stays as it is.
-
-    Args:
-        covariance: Of the ten changes, shape (10, 10).
-        sigmas: Their standard deviations before the images were looked at, 0 for what is kept fixed, shape (10,).
-
-    Returns:
-        The covariance, nowhere smaller; unchanged where the principal point is kept fixed.
+    the principal point, so what they would be with it known stays as it is. Where the principal point is kept fixed
+    (0 in `sigmas`), the covariance is unchanged.
     """
     if np.any(sigmas[_CENTRE] <= 0.0):
         return covariance

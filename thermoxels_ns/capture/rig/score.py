@@ -42,11 +42,7 @@ class ThermalEdges:
         self._planes[1:-1, :, 4:] = 0.5 * (values[2:] - values[:-2])
 
     def sample(self, pixels: FloatArray) -> npt.NDArray[np.float32]:
-        """Edge values at pixel positions (n, 2) and their derivatives along x and along y.
-
-        Returns:
-            Real and imaginary part of each of the three, shape (n, 6); 0 outside the image.
-        """
+        """Edge values at pixels (n, 2), and their derivatives along x and y: complex as pairs (n, 6); 0 outside."""
         return _bilinear(self._planes, pixels + 2.0)
 
     def weight_at(self, pixels: FloatArray) -> FloatArray:
@@ -70,14 +66,7 @@ class RigScore:
     def __init__(
         self, edges: Sequence[EdgePoints], thermal: Sequence[ThermalEdges], rig: RigModel, around: FloatArray
     ) -> None:
-        """Prepare to score rigs.
-
-        Args:
-            edges: Of the photographs.
-            thermal: Thermal images of the same frames.
-            rig: What changes count from.
-            around: The ten changes that the points' weights are taken at.
-        """
+        """Take edges of photographs and thermal images, what changes count from, and where the weights are taken."""
         self.edges, self.thermal, self.rig = edges, thermal, rig
         self._weights = [t.weight_at(rig.project(around, e.points)) for e, t in zip(edges, thermal)]
         self._own = sum(float(w @ np.abs(e.value) ** 2) for e, w in zip(edges, self._weights))

@@ -38,14 +38,8 @@ def estimate_rig(
     """Find the thermal camera's intrinsics and the fixed transform from the visible to the thermal camera.
 
     The photographs' edges are carried into the thermal images through the scene points of structure from motion, and
-    the rig is moved until they lie on the thermal edges, coarse to fine, over all frames together.
-
-    Args:
-        frames: Pairs with poses and scene points, in the order they were taken. Those with fewer than 12 points are
-            left out; of more than 40 an even choice is used.
-        visible: Intrinsics of the photographs.
-        start: First guess and how far it can be off.
-        progress: Told what is being done and which share of the work is behind (0 to 1).
+    the rig is moved until they lie on the thermal edges, coarse to fine, over all frames together. Frames (in the order
+    they were taken) with fewer than 12 points are left out; of more than 40 an even choice is used.
 
     Returns:
         The rig; the start with `determined` False and the reason where the images cannot tell.

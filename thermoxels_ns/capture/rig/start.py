@@ -58,12 +58,7 @@ def rig_start(
 ) -> RigStart:
     """Guess the thermal camera from the user's angle of view, its lens, FLIR's alignment or its angle of view.
 
-    Args:
-        frames: What the files say.
-        visible: The photographs' camera.
-        thermal_size: Width and height of the thermal images.
-        field_of_view_deg: Horizontal angle of view of the thermal lens that the user gives, [degrees].
-        metres_per_unit: Scale of the scene, where it is known: the lenses of a pair of cameras lie close together.
+    Where `metres_per_unit` is known, the lenses of a pair of cameras are known to lie close together.
     """
     width, height = thermal_size
     transform = np.eye(4)
@@ -106,10 +101,7 @@ def rig_start(
 def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float | None = None) -> RigEstimate:
     """Read a rig that was found before: ``thermal_camera`` and ``rig`` of a transforms.json.
 
-    Args:
-        file: The json.
-        thermal_size: Width and height of this capture's thermal images.
-        metres_per_unit: Scale of this capture; where the json has one too, lengths are converted.
+    Where the json has a scale and this capture too, lengths are converted.
 
     Raises:
         SceneError: One of them is missing or no camera, or no rotation and shift, or the camera has another size or one

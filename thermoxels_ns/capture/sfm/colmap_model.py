@@ -24,19 +24,11 @@ _FIELDS = {
 
 
 def camera_of_colmap(camera: Any) -> Camera:
-    """Turn a pycolmap camera into ours.
-
-    Raises:
-        SceneError: Its lens model has terms that ours does not have.
-    """
+    """Turn a pycolmap camera into ours; a `SceneError` where its lens model has terms that ours does not have."""
     name = camera.model.name
     if name not in _FIELDS:
-        raise SceneError(
-            "COLMAP camera",
-            expected="a lens model out of " + ", ".join(_FIELDS),
-            got=name,
-            remedy="Run COLMAP with --ImageReader.camera_model OPENCV, or let thermoxels capture find the poses.",
-        )
+        remedy = "Run COLMAP with --ImageReader.camera_model OPENCV, or let thermoxels capture find the poses."
+        raise SceneError("COLMAP camera", expected="a lens model out of " + ", ".join(_FIELDS), got=name, remedy=remedy)
     values: dict[str, Any] = dict(zip(_FIELDS[name], map(float, camera.params)))
     focal = values.pop("f", None)
     if focal is not None:
@@ -47,12 +39,9 @@ def camera_of_colmap(camera: Any) -> Camera:
 def model_of_colmap(
     reconstruction: Any, frame_of_image: Mapping[str, str], size: tuple[int, int] | None = None
 ) -> SfmModel:
-    """Turn a pycolmap reconstruction into our model.
+    """Turn a pycolmap reconstruction into our model, without the images that are not in `frame_of_image`.
 
-    Args:
-        reconstruction: `pycolmap.Reconstruction`.
-        frame_of_image: Frame of an image, by the image's name; images that are not in it are left out.
-        size: Width and height of the photographs, where the model was made from smaller ones.
+    `size` is the photographs' width and height where the model was made from smaller ones.
 
     Raises:
         SceneError: No frame has a pose, or there are several cameras or an unknown lens model.
@@ -98,11 +87,7 @@ def model_of_colmap(
 
 
 def read_colmap(folder: Path) -> Any:
-    """Read a COLMAP model's folder.
-
-    Raises:
-        SceneError: It holds no readable model.
-    """
+    """Read a COLMAP model's folder; a `SceneError` where it holds no readable model."""
     import pycolmap
 
     try:

@@ -37,19 +37,11 @@ _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1"}
 def run_in_process(
     work: Callable[..., _Result], arguments: tuple[Any, ...], folder: Path, say: Say = lambda _: None
 ) -> _Result:
-    """Call ``work(*arguments, say)`` in a new process and wait for its end.
+    """Call ``work(*arguments, say)`` in a new process, wait for its end and return what it returned.
 
     What ends COLMAP from inside, such as a thread that cannot write, then does not end this process. The new one ends
-    with this one, also where this one is killed.
-
-    Args:
-        work: A function at the top of a module.
-        arguments: What pickle can hold.
-        folder: Where it writes; looked at when it fails.
-        say: Gets what the function tells its own `say`.
-
-    Returns:
-        What the function returned; pickle must be able to hold it.
+    with this one, also where this one is killed. `work` is a function at the top of a module; pickle must be able to
+    hold what goes in and out.
 
     Raises:
         OutputError: It ended because the disk of `folder` is full.
@@ -138,11 +130,8 @@ def _reason(status: int, words: deque[str]) -> str:
 def quiet_colmap(folder: Path) -> Iterator[None]:
     """Silence COLMAP in the block; what matters comes back as results or exceptions.
 
-    Args:
-        folder: Where it writes; looked at when it fails.
-
     Raises:
-        OutputError: COLMAP stopped because the disk is full.
+        OutputError: COLMAP stopped because the disk of `folder` is full.
         ThermoxelsError: COLMAP stopped.
     """
     import pycolmap
@@ -160,12 +149,7 @@ def quiet_colmap(folder: Path) -> Iterator[None]:
 
 
 def colmap_stopped(reason: str, folder: Path) -> ThermoxelsError:
-    """Build the error for a COLMAP that stopped; a full disk is named as the reason, whatever COLMAP says.
-
-    Args:
-        reason: What COLMAP said.
-        folder: Where it was writing.
-    """
+    """Build the error for a COLMAP that stopped; a full disk is named as the reason, whatever COLMAP says."""
     free = shutil.disk_usage(folder).free
     if free < _FULL_BYTES or "disk is full" in reason:
         return _too_little(folder, "free space for features, matches and poses, to the end", free, "Make space")
@@ -179,17 +163,7 @@ def colmap_stopped(reason: str, folder: Path) -> ThermoxelsError:
 
 
 def check_free_space(folder: Path, needed_bytes: float, purpose: str, remedy: str) -> None:
-    """Refuse to start what may not fit.
-
-    Args:
-        folder: Where it will be written; it exists.
-        needed_bytes: How much that may be.
-        purpose: What is written, for the message.
-        remedy: What else helps besides space, for the message.
-
-    Raises:
-        OutputError: Less is free; the message names the disk.
-    """
+    """Refuse to start what may not fit into `folder`: an `OutputError` that names the disk and the purpose."""
     free = shutil.disk_usage(folder).free
     if free < needed_bytes:
         raise _too_little(folder, f"up to {needed_bytes / 1e6:.0f} MB free for {purpose}", free, remedy)

@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.capture.settings import LensModel, Matching
 from thermoxels_ns.capture.sfm.colmap_process import check_free_space, quiet_colmap, run_in_process
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import remove_file
-
-Matching = Literal["auto", "exhaustive", "sequential"]
-LensModel = Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV"]
 
 EXHAUSTIVE_UP_TO = 80
 """Photographs up to which every pair is matched; the time grows with the square of their number."""
@@ -67,11 +65,9 @@ class ReducedPhotographs:
 
 
 def image_pairs(count: int, matching: Matching) -> npt.NDArray[np.int64]:
-    """Choose which photographs are compared.
+    """Choose which of so many photographs, in the order they were taken, are compared.
 
-    Args:
-        count: Number of photographs, in the order they were taken.
-        matching: Every pair (exhaustive); neighbours in time and some far ones (sequential); or by their number.
+    Every pair (exhaustive); neighbours in time and some far ones (sequential); or by their number (auto).
 
     Returns:
         Pairs of numbers (p, 2), the smaller one first, sorted, without repeats.
@@ -100,12 +96,8 @@ def fill_database(
 ) -> None:
     """Find features in photographs and match them; what an interrupted run has done is not done again.
 
-    Args:
-        photographs: Where they are; what their database may need must be free on its disk.
-        camera: Start value of their lens, at their reduced size.
-        known_focal: Whether the focal length is more than a guess.
-        options: How much and what is compared.
-        say: Told how far it is.
+    `camera` is the start value of their lens at their reduced size; `known_focal` says that its focal length is more
+    than a guess.
 
     Raises:
         OutputError: There is too little free space for features and matches, or the disk becomes full.

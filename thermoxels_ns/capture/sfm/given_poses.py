@@ -19,14 +19,10 @@ from thermoxels_ns.data.transforms_json import path_inside, read_intrinsics, rea
 
 
 def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
-    """Read poses; their world stays as it is.
+    """Read poses from a COLMAP model's folder or a transforms.json; their world stays as it is.
 
-    Args:
-        path: Folder of a COLMAP model, or a transforms.json.
-        photographs: The camera's files, relative to the capture, by the frame's name.
-
-    Returns:
-        The poses, and the frames that have none. The model of a transforms.json has no points.
+    `photographs` are the camera's files, relative to the capture, by the frame's name. The model of a transforms.json
+    has no points; the frames without a pose are named.
 
     Raises:
         SceneError: Nothing readable is there, no photograph is in it, it has several cameras, or a name in it leads
@@ -39,11 +35,9 @@ def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
     elif path.is_file():
         model = _read_transforms(path, photographs)
     else:
+        remedy = "Check the path."
         raise SceneError(
-            "poses",
-            expected="a COLMAP model's folder or a transforms.json",
-            got=f"nothing at {path}",
-            remedy="Check the path.",
+            "poses", expected="a COLMAP model's folder or a transforms.json", got=f"nothing at {path}", remedy=remedy
         )
     order = {name: number for number, name in enumerate(photographs)}
     missing = {name: f"{path.name} has no pose of it" for name in photographs if name not in model.frames}
@@ -53,12 +47,7 @@ def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
 def fitted_to_photographs(poses: Poses, photographs: Mapping[str, Path]) -> Poses:
     """Express given poses in the pixels of the photographs; they may come from photographs that were reduced.
 
-    Args:
-        poses: As `read_given_poses` found them.
-        photographs: Files by the frame's name.
-
-    Returns:
-        The same poses, without the frames whose photographs have another size than most.
+    Frames whose photographs have another size than most are left out.
 
     Raises:
         SceneError: The photographs have other proportions than the images that the poses come from.

@@ -39,12 +39,7 @@ def find_up(
     A camera pitched by p and rolled by r against gravity has up at (-sin r cos p, cos r cos p, -sin p) in its axes
     x right, y up, z back: pitch 0 is level, -90 looks straight down. Without such angles it is assumed that people hold
     the sides of a picture level: up is normal to the cameras' x axes where these turn enough, else the mean of their
-    y axes.
-
-    Args:
-        camera_to_world: Poses, shape (n, 4, 4), axes x right, y up, z back.
-        gimbal_deg: Pitch and roll per camera, [degrees], None where the file has none.
-        orientation: EXIF's orientation per photograph.
+    y axes. `gimbal_deg` is pitch and roll per camera [degrees], `orientation` EXIF's per photograph.
     """
     rotations = camera_to_world[:, :3, :3]
     measured = [i for i, angles in enumerate(gimbal_deg) if angles is not None]
@@ -69,11 +64,7 @@ def find_up(
 
 
 def level_rotation(up: npt.ArrayLike, ahead: npt.ArrayLike) -> FloatArray:
-    """Rotation (3, 3) that turns `up` to z and `ahead`, as far as it is level, to y.
-
-    Args:
-        up: Direction, shape (3,).
-        ahead: Direction, shape (3,); any level one is taken where it is vertical.
+    """Rotation (3, 3) that turns `up` to z and `ahead`, as far as it is level, to y; to any level axis where it is not.
 
     >>> level_rotation([0, 1, 0], [0, 0, -1]).round(9).tolist()
     [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]

@@ -29,39 +29,12 @@ class MappedPhotographs:
 
 
 def map_photographs(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> MappedPhotographs | None:
-    """Find camera, poses and points (incremental structure from motion).
-
-    Args:
-        matched: Features and matches.
-        seed: Of all random choices; the same one gives the same bits.
-        say: Told how far it is.
-
-    Returns:
-        What was found; None where no photographs fit together.
-
-    Raises:
-        OutputError: The disk became full.
-        ThermoxelsError: COLMAP stopped.
-    """
+    """Find camera, poses and points (incremental structure from motion); None where no photographs fit together."""
     return run_in_process(_map, (matched, seed), matched.database.parent, say)
 
 
 def triangulate(matched: ReducedPhotographs, posed: SfmModel, seed: int, say: Callable[[str], None]) -> SfmModel:
-    """Find the points that photographs with known camera and poses share.
-
-    Args:
-        matched: Features and matches.
-        posed: Camera, at the photographs' own size, and poses; its points do not count.
-        seed: Of all random choices; the same one gives the same bits.
-        say: Told how far it is.
-
-    Returns:
-        The same frames, camera and poses with the points that were found.
-
-    Raises:
-        OutputError: The disk became full.
-        ThermoxelsError: COLMAP stopped.
-    """
+    """Find the points that photographs with known camera (at their own size) and poses share; those of `posed` go."""
     return run_in_process(_triangulate, (matched, posed, seed), matched.database.parent, say)
 
 

@@ -55,17 +55,10 @@ class MeasuredDistance:
 
 
 def scale_from_gps(centres: FloatArray, fixes: Sequence[GpsFix | None]) -> tuple[MetricScale | None, str]:
-    """Fit the cameras' places to their GPS fixes by a similarity, robustly.
+    """Fit the cameras' places, shape (n, 3), to their GPS fixes by a similarity; None and why where that fails.
 
     Closed-form least squares (Umeyama 1991, equation 42) with Huber's weights. The standard error is that of the scale
     in the linearised fit, from the scatter of the residuals.
-
-    Args:
-        centres: The cameras' places in the model, shape (n, 3).
-        fixes: What GPS says, per camera.
-
-    Returns:
-        The scale, or None and why there is none.
     """
     known = [i for i, fix in enumerate(fixes) if fix is not None]
     if not known:
@@ -116,12 +109,7 @@ def scale_from_distance(model: SfmModel, measured: MeasuredDistance, photograph_
     """Find the scale from a length that was measured between two points that one photograph shows.
 
     The depth at a pixel is that of a plane through the scene points around it: inverse depth is linear in the pixel,
-    fitted by weighted least squares.
-
-    Args:
-        model: Poses and points.
-        measured: Pixels and distance.
-        photograph_of: Name of the photograph's file by frame.
+    fitted by weighted least squares. `photograph_of` names the photograph's file by frame.
 
     Raises:
         ThermoxelsError: The photograph has no pose, a pixel lies outside or has no scene points around it, or the
@@ -148,23 +136,16 @@ def scale_from_distance(model: SfmModel, measured: MeasuredDistance, photograph_
 def scale_from_markers(
     model: SfmModel, photographs: Mapping[str, Path], side_m: float, standard_error_m: float | None = None
 ) -> tuple[MetricScale | None, str]:
-    """Find the scale from printed ArUco markers (4 x 4 cells, numbers 0 to 49) of known side.
+    """Find the scale from printed ArUco markers (4 x 4 cells, numbers 0 to 49) of known side [m]; None and why without.
 
     A marker's corners are triangulated from all photographs that show it (linear least squares of the rays). Every
     marker gives four sides; the standard error is that of their mean, or of the corners' scatter where that is larger.
-
-    Args:
-        model: Poses.
-        photographs: Files by frame.
-        side_m: Side of the black square, [m].
-        standard_error_m: Of the side, [m].
-
-    Returns:
-        The scale, or None and why there is none.
     """
     check_positive("marker side", side_m, "Pass the side of the black square in metres.")
     seen: dict[int, list[tuple[int, FloatArray]]] = {}
-    detector = _detector()
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(_MARKER_DICTIONARY), parameters)
     for index, name in enumerate(model.frames):
         grey = np.asarray(open_photograph(photographs[name]).convert("L"))
         corners, ids, _ = detector.detectMarkers(grey)
@@ -217,35 +198,25 @@ def _frame_named(model: SfmModel, name: str, photograph_of: Mapping[str, str]) -
         file = photograph_of.get(frame, frame)
         if name in (frame, file, Path(file).name, Path(file).stem):
             return index
-    raise SceneError(
-        "known distance",
-        expected="a photograph whose pose was found",
-        got=name,
-        remedy=f"Pass one of them, such as {photograph_of.get(model.frames[0], model.frames[0])}.",
-    )
+    remedy = f"Pass one of them, such as {photograph_of.get(model.frames[0], model.frames[0])}."
+    raise SceneError("known distance", expected="a photograph whose pose was found", got=name, remedy=remedy)
 
 
 def _surface_point(model: SfmModel, index: int, pixel: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
     """World point that a pixel shows, and its standard error along the ray as a vector."""
     camera = model.camera
     if not (0 <= pixel[0] <= camera.width and 0 <= pixel[1] <= camera.height):
+        remedy = "Count x to the right and y down from the upper left corner."
         raise SceneError(
-            "known distance",
-            expected=f"pixels inside {camera.width} x {camera.height}",
-            got=pixel,
-            remedy="Count x to the right and y down from the upper left corner.",
+            "known distance", expected=f"pixels inside {camera.width} x {camera.height}", got=pixel, remedy=remedy
         )
     points, pixels = model.seen_by(index)
     apart = np.linalg.norm(pixels - pixel, axis=1)
     near = np.argsort(apart, kind="stable")[:_NEAR_POINTS]
     near = near[apart[near] <= _NEAR_SHARE * max(camera.width, camera.height)]
     if len(near) < 4:
-        raise SceneError(
-            "known distance",
-            expected=f"scene points around pixel {pixel}",
-            got=len(near),
-            remedy="Measure between points with texture around them.",
-        )
+        remedy = "Measure between points with texture around them."
+        raise SceneError("known distance", expected=f"scene points around pixel {pixel}", got=len(near), remedy=remedy)
     depth = model.in_camera(index, model.points[points[near]])[:, 2]
     weight = 1.0 / (1.0 + apart[near] / (np.median(apart[near]) + 1e-9))
     table = np.column_stack([np.ones(len(near)), pixels[near] - pixel])
@@ -265,12 +236,6 @@ def _surface_point(model: SfmModel, index: int, pixel: tuple[float, float]) -> t
     ray = camera.rays(np.array([pixel]))[0] * (1.0, -1.0, -1.0) @ pose[:3, :3].T
     error = scatter / at**2 / math.sqrt(max(int(keep.sum()) - 3, 1))
     return pose[:3, 3] + ray / at, ray * error
-
-
-def _detector() -> cv2.aruco.ArucoDetector:
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(_MARKER_DICTIONARY), parameters)
 
 
 def _triangulate(model: SfmModel, views: Sequence[tuple[int, npt.NDArray]]) -> tuple[FloatArray, FloatArray]:

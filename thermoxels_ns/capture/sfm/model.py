@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV, FloatArray
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.errors import SceneError
 
 
 @dataclass(frozen=True)
@@ -39,21 +38,6 @@ class SfmModel:
     """Index into `points`, shape (s,)."""
     sighting_pixel: FloatArray
     """Where the frame shows the point, shape (s, 2), [pixels of the photographs]."""
-
-    def __post_init__(self) -> None:
-        shapes = {
-            "camera_to_world": (self.camera_to_world, (len(self.frames), 4, 4)),
-            "points": (self.points, (len(self.points), 3)),
-            "colours": (self.colours, (len(self.points), 3)),
-            "point_error_px": (self.point_error_px, (len(self.points),)),
-            "sighting_point": (self.sighting_point, self.sighting_frame.shape),
-            "sighting_pixel": (self.sighting_pixel, (*self.sighting_frame.shape, 2)),
-        }
-        for name, (array, shape) in shapes.items():
-            if array.shape != shape:
-                raise SceneError(
-                    f"SfM model: {name}", expected=f"shape {shape}", got=array.shape, remedy="Run it again."
-                )
 
     @property
     def centres(self) -> FloatArray:

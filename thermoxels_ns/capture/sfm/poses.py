@@ -43,13 +43,8 @@ def find_poses(
 ) -> Poses:
     """Find camera and poses from photographs of one camera alone (incremental structure from motion by COLMAP).
 
-    Args:
-        photographs: Files by the frame's name, in the order they were taken.
-        folder: For features, matches and reduced photographs; what an interrupted run left is used.
-        focal_px: Focal length that the photographs state, [pixels]; None: unknown.
-        masks: Where photographs may be used; None: everywhere.
-        options: Sizes and limits.
-        say: Told how far it is.
+    `photographs` are files by the frame's name, in the order they were taken; `folder` is for features, matches and
+    reduced photographs, and what an interrupted run left there is used. `focal_px` None: unknown.
 
     Returns:
         The largest group of photographs that fit together, and why the others are not in it.
@@ -94,15 +89,7 @@ def add_points(
     options: PoseOptions | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> SfmModel:
-    """Find the points that photographs with known poses share; camera and poses stay as they are.
-
-    Args:
-        given: Camera and poses; its points are replaced.
-        photographs: Files by the frame's name; at least those of `given`.
-        folder: For features, matches and reduced photographs.
-        masks: Where photographs may be used; None: everywhere.
-        options: Sizes and limits.
-        say: Told how far it is.
+    """Find the points that photographs with known poses share; camera and poses stay as they are, other points go.
 
     Raises:
         SceneError: There are fewer than two photographs, or they are of another size than the camera's.
@@ -131,11 +118,7 @@ def add_points(
 
 
 def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[str, tuple[int, int]]]:
-    """Find the size that most photographs have, and the frames of another size with theirs.
-
-    Raises:
-        SceneError: There is no photograph, or one cannot be read.
-    """
+    """Find the size that most photographs have, and the frames of another size with theirs."""
     sizes = {}
     for name, path in photographs.items():
         facts = read_photograph_facts(path)

@@ -32,12 +32,7 @@ class SparseDepth:
         self._tree = KDTree(self._places) if len(ahead) else None
 
     def at(self, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Depth along the camera's axis for rays (n, 3) of depth 1.
-
-        Returns:
-            Depth (n,) and the distance to the nearest scene point on the plane at depth 1 (n,); both infinite where
-            the frame has no points.
-        """
+        """Depth (n,) for rays (n, 3) of depth 1, and distance to the next point on that plane; inf without points."""
         if self._tree is None:
             return np.full(len(rays), np.inf), np.full(len(rays), np.inf)
         count = min(_NEIGHBOURS, len(self._inverse))
