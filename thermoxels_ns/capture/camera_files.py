@@ -86,13 +86,10 @@ def natural_key(path: Path) -> list[tuple[int, str, int]]:
 def scan_folder(
     folder: Path, without: Sequence[Path] = (), say: Callable[[str], None] = lambda _: None
 ) -> CameraFolder:
-    """Look at every picture and table in a folder and the folders in it, but those of `without`.
+    """Look at every picture and table in a folder (a `SceneError` if it is none) and the folders in it but `without`.
 
     Hidden files and folders are passed over. Links that lead out of the folder, linked folders, folders that are shut
     and what is no file are passed over and named.
-
-    Raises:
-        SceneError: There is no such folder.
     """
     if not folder.is_dir():
         raise SceneError(
@@ -169,11 +166,7 @@ def _check_name(name: Path) -> None:
 
 
 def identify(path: Path, folder: Path) -> CameraFile:
-    """Tell by content what a file is; its name only tells a thermal picture from a photograph.
-
-    Raises:
-        SceneError, ThermalFileError: It is empty, damaged or no picture.
-    """
+    """Tell by content what a file is, a thermal picture by its name; an error that names it where it is damaged."""
     with errors_name(path, "a camera file"):
         return _identify(path, folder)
 

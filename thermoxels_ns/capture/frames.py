@@ -97,12 +97,8 @@ class CaptureFrames:
             for name in ("photograph", "thermal"):
                 inside, relative = row[name]
                 row[name] = (folder if inside else root) / relative
-        return cls(
-            tuple(_frame_of(row) for row in content["frames"]),
-            (content["thermal_size"][0], content["thermal_size"][1]),
-            content["dead_pixels"],
-            content["dropped"],
-        )
+        frames, size = tuple(_frame_of(row) for row in content["frames"]), content["thermal_size"]
+        return cls(frames, (size[0], size[1]), content["dead_pixels"], content["dropped"])
 
 
 def read_frames(

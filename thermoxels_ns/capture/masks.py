@@ -50,22 +50,14 @@ class PhotographMasks:
         return self.overlay is not None or bool(self.files)
 
     def of(self, frame: str) -> npt.NDArray[np.bool_]:
-        """True where a frame's photograph may be used, shape (height, width).
-
-        Raises:
-            SceneError: The user's mask cannot be read or has another size.
-        """
+        """True where a frame's photograph may be used, shape (height, width); a `SceneError` for an unfit mask."""
         width, height = self.size
         use = np.ones((height, width), dtype=bool) if self.overlay is None else self.overlay.copy()
         return use & read_mask(self.files[frame], width, height) if frame in self.files else use
 
 
 def find_masks(frames: Sequence[CaptureFrame], folder: Path | None, look_for_overlays: bool) -> PhotographMasks:
-    """Masks for photographs of the size that most of at least one frame have.
-
-    Raises:
-        SceneError: The user's masks are not named like photographs, or a photograph cannot be read.
-    """
+    """Masks for photographs of the size that most of the frames have; a `SceneError` where one cannot be read."""
     sizes = []
     for frame in frames:
         facts = read_photograph_facts(frame.photograph)
@@ -80,11 +72,7 @@ def find_masks(frames: Sequence[CaptureFrame], folder: Path | None, look_for_ove
 
 
 def user_masks(frames: Sequence[CaptureFrame], folder: Path | None) -> dict[str, Path]:
-    """The user's masks by frame: those named like a photograph, or like a frame.
-
-    Raises:
-        SceneError: None of them is.
-    """
+    """The user's masks by frame: those named like a photograph, or like a frame; a `SceneError` where none is."""
     if folder is None:
         return {}
     files = mask_files(folder)
@@ -139,11 +127,7 @@ def find_overlay(photographs: Sequence[Path]) -> npt.NDArray[np.bool_] | None:
 
 
 def mask_files(folder: Path) -> dict[str, Path]:
-    """Masks in a folder by the stem of their names (of the photograph or of the frame), in small letters.
-
-    Raises:
-        SceneError: There is no such folder.
-    """
+    """Masks in a folder by the stem of their names, in small letters; a `SceneError` where there is no such folder."""
     if not folder.is_dir():
         raise SceneError("masks", expected="a folder of masks", got=f"no folder at {folder}", remedy="Check the path.")
     return {

@@ -63,11 +63,7 @@ class PhotographFacts:
 
 
 def read_photograph_facts(path: Path) -> PhotographFacts:
-    """Read a photograph's header.
-
-    Raises:
-        SceneError: It is no picture that can be read, or a header claims an absurd size.
-    """
+    """Read a photograph's header; a `SceneError` where it is no picture or claims an absurd size."""
     with errors_name(path, _EXPECTED, _REMEDY), Image.open(path) as image:
         width, height = image.size
         facts = read_exif_facts(image)
@@ -101,22 +97,14 @@ def check_photograph_size(path: Path, width: int, height: int) -> None:
 
 
 def open_photograph(path: Path) -> Image.Image:
-    """Decode a photograph as red, green and blue, as its pixels are stored (EXIF's orientation is not applied).
-
-    Raises:
-        SceneError: It is no picture, is cut off, or claims an absurd size.
-    """
+    """Decode a photograph as its RGB pixels are stored, without EXIF's orientation; a `SceneError` where it is none."""
     with errors_name(path, _EXPECTED, _REMEDY), Image.open(path) as image:
         check_photograph_size(path, *image.size)
         return image.convert("RGB")
 
 
 def read_mask(path: Path, width: int, height: int) -> npt.NDArray[np.bool_]:
-    """Read a mask: white (128 and more) where the image may be used.
-
-    Raises:
-        SceneError: It cannot be read, or has another size than the images.
-    """
+    """Read a mask, white (128 and more) where the image may be used; a `SceneError` where its size is another."""
     mask = np.asarray(open_photograph(path).convert("L")) >= 128
     if mask.shape != (height, width):
         raise SceneError(

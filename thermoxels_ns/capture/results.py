@@ -37,11 +37,7 @@ def save(path: Path, record: Any) -> None:
 
 
 def load(path: Path, kind: type[_Record]) -> _Record:
-    """Read a dataclass that `save` wrote.
-
-    Raises:
-        ThermoxelsError: The file is missing or damaged.
-    """
+    """Read a dataclass that `save` wrote; a `ThermoxelsError` where the file is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as opened:
             arrays = {name: opened[name] for name in opened.files}

@@ -65,11 +65,7 @@ def scene_names(count: int) -> list[str]:
 
 
 def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = lambda _: None) -> None:
-    """Write a scene in place of an earlier one; until its last file, transforms.json, is there the folder holds none.
-
-    Raises:
-        OutputError: The folder cannot be written to.
-    """
+    """Write a scene in place of an earlier one; until its last file, transforms.json, is there, there is none."""
     new = output / CACHE_FOLDER / "new_scene"
     shutil.rmtree(new, ignore_errors=True)
     for name in _FOLDERS if scene.masks.any else _FOLDERS[:2]:

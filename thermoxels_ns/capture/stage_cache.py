@@ -52,13 +52,10 @@ class StageCache:
     ) -> Path:
         """Run a stage, or take its earlier result; return the folder with the result.
 
-        Args:
-            name: Which stage; each once, in order.
-            depends_on: Everything but the earlier stages that its result depends on; json must be able to hold it.
-            work: Writes the result into the folder that it is given; that may hold what an interrupted run with the
-                same key left.
-            writes: Files and folders that the stage writes elsewhere; where one of them, or a file in one, is gone or
-                has another size than the stage gave it, the stage runs again.
+        Stages come once each, in order. `depends_on` is everything but the earlier stages that the result depends on,
+        as json can hold it. `work` writes the result into the folder that it is given; that may hold what an
+        interrupted run with the same key left. `writes` are files and folders that the stage writes elsewhere; where
+        one of them, or a file in one, is gone or has another size than the stage gave it, the stage runs again.
 
         Raises:
             OutputError: An earlier result cannot be removed, or the new one cannot be written.
@@ -127,11 +124,7 @@ def files_of(path: Path) -> list[Path]:
 
 
 def prepare_output(folder: Path) -> Path:
-    """Make the output folder, or take that of an earlier capture.
-
-    Raises:
-        OutputError: It holds something that no capture wrote, or cannot be written to.
-    """
+    """Make the output folder, or take that of an earlier capture; an `OutputError` where it holds other files."""
     folder = writable_folder(folder)
     if not (folder / CACHE_FOLDER).is_dir() and any(folder.iterdir()):
         raise OutputError(
@@ -146,13 +139,10 @@ def prepare_output(folder: Path) -> Path:
 
 @contextmanager
 def locked(output: Path, say: Callable[[str], None] = lambda _: None) -> Iterator[None]:
-    """Hold the output folder of a capture for the block: two would write each other's stages.
+    """Hold the output folder of a capture for the block; an `OutputError` where another capture holds it.
 
     The system ends the lock with the process that holds it, however that ends. Where the drive has no locks the block
     runs all the same, and `say` is told so.
-
-    Raises:
-        OutputError: Another capture holds the folder.
     """
     file = output / CACHE_FOLDER / LOCK_FILE
     lock = FileLock(file)

@@ -106,7 +106,7 @@ def test_a_mapping_that_aborts_is_an_error_and_the_capture_goes_on_behind_its_fe
         photograph(tmp_path / "card" / f"{name}-visible.jpg")
         counts(tmp_path / "card" / f"{name}-radiometric.tiff")
     said: list[str] = []
-    monkeypatch.setattr("thermoxels_ns.capture.sfm.mapping._map", _abort_in_the_middle)
+    monkeypatch.setattr("thermoxels_ns.capture.sfm.poses._map", _abort_in_the_middle)
     with pytest.raises(ThermoxelsError, match=r"COLMAP: expected to end, got exit status.*--from-stage poses"):
         capture_folder(tmp_path / "card", tmp_path / "scene", CaptureSettings(), said.append)
     assert said[-1].startswith("matches: 3 of 3")

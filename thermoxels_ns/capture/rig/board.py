@@ -66,8 +66,7 @@ class CheckerBoard:
 def find_board(image: npt.NDArray, board: CheckerBoard) -> FloatArray | None:
     """Find the board's inner corners in grey values or temperatures (height, width), to a fraction of a pixel.
 
-    Returns:
-        Pixel positions in the order of `CheckerBoard.corners`, from one of the two ends, shape (n, 2); None: no board.
+    Their order is that of `CheckerBoard.corners`, from one of the two ends, shape (n, 2); None: no board.
     """
     values = np.asarray(image, dtype=np.float32)
     if not np.isfinite(values).any():
@@ -88,13 +87,11 @@ def find_board(image: npt.NDArray, board: CheckerBoard) -> FloatArray | None:
 def rig_from_boards(
     pairs: Sequence[tuple[npt.NDArray, npt.NDArray]], visible: Camera, start: RigStart, board: CheckerBoard
 ) -> RigEstimate:
-    """Find the rig from photographs (grey) and temperatures of a checker board in different places.
+    """Find the rig, in metres, from photographs (grey) and temperatures of a checker board in different places.
 
     The photograph and the visible camera say where the board is; robust least squares (Huber's loss) moves the thermal
     camera until the corners fall where the thermal image shows them, held weakly by the start (lengths in metres).
-
-    Returns:
-        The rig, its transform in metres. With the board in fewer than three pairs: the start, `determined` False.
+    With the board in fewer than three pairs the start is returned, `determined` False.
     """
     points, seen = [], []
     for photograph, temperature_c in pairs:
@@ -150,11 +147,7 @@ def _board_in_camera(pixels: FloatArray, camera: Camera, board: CheckerBoard) ->
 
 
 def board_of(settings: CaptureSettings) -> CheckerBoard | None:
-    """The board that the options describe; None where they name no pictures of one.
-
-    Raises:
-        SceneError: An option of the board is missing, or has no meaning without the others.
-    """
+    """The board that the options describe, None where they name none; a `SceneError` where one of them is missing."""
     given = {
         "--board-photos": settings.board_photos,
         "--board": settings.board,
@@ -193,11 +186,8 @@ def rig_from_board_photos(
 ) -> RigEstimate:
     """Find the rig, lengths in metres, from a folder with photographs and thermal images of a board.
 
-    Its files are paired and read like those of the capture, into `folder`, and come from the same two cameras.
-
-    Raises:
-        SceneError: There are no pairs, they come from another camera, or fewer than three show the board to both
-            cameras; the message lists what each pair shows.
+    Its files are paired and read like those of the capture, into `folder`. A `SceneError` is raised where there are no
+    pairs, they come from another camera, or fewer than three show the board to both cameras.
     """
     found = scan_folder(source)
     if found.unreadable and not settings.skip_bad:

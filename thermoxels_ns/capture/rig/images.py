@@ -212,13 +212,10 @@ def edge_field(image: FloatImage, blur_px: float, pixels_per_pixel: float = 1.0)
 
 
 def without_fixed_pattern(images: Sequence[FloatImage], neighbours: int = 20) -> tuple[list[FloatImage], float]:
-    """Take out what stays in place while the camera moves: rows, columns and single pixels that read differently.
+    """Local contrasts without what stays in place while the camera moves, and how far two halves of the frames agree.
 
-    The pattern is the median local contrast over the frames around each one, because cameras renew it now and
-    then. It is taken out only if two halves of the frames agree on it.
-
-    Returns:
-        Local contrasts, with the pattern taken out where there is one, and the correlation of the two halves.
+    Rows, columns and single pixels may read differently. The pattern is the median local contrast over the frames
+    around each one, because cameras renew it now and then. It is taken out only if two halves of the frames agree.
     """
     contrast = [local_contrast(image) for image in images]
     if len(contrast) < _FEWEST_FOR_PATTERN:

@@ -39,10 +39,8 @@ def estimate_rig(
 
     The photographs' edges are carried into the thermal images through the scene points of structure from motion, and
     the rig is moved until they lie on the thermal edges, coarse to fine, over all frames together. Frames (in the order
-    they were taken) with fewer than 12 points are left out; of more than 40 an even choice is used.
-
-    Returns:
-        The rig; the start with `determined` False and the reason where the images cannot tell.
+    they were taken) with fewer than 12 points are left out; of more than 40 an even choice is used. Where the images
+    cannot tell, the start is returned, `determined` False.
 
     Raises:
         SceneError: No frame has scene points, or an image cannot be read or does not have the size of its camera.

@@ -36,16 +36,8 @@ def rig_frames(model: SfmModel, frames: Sequence[CaptureFrame]) -> list[RigFrame
     for index, name in enumerate(model.frames):
         seen, _ = model.seen_by(index)
         seen = seen[good[seen]]
-        result.append(
-            RigFrame(
-                name=name,
-                photograph=by_name[name].photograph,
-                temperature_c=by_name[name].thermal,
-                camera_to_world=model.camera_to_world[index],
-                points_world=model.points[seen],
-                point_ids=seen,
-            )
-        )
+        images = by_name[name].photograph, by_name[name].thermal
+        result.append(RigFrame(name, *images, model.camera_to_world[index], model.points[seen], seen))
     return result
 
 
@@ -89,23 +81,15 @@ def rig_start(
         focal = visible.fl_x * width / visible.width
         camera = Camera(width, height, focal, focal, width / 2, height / 2)
         sigma, source = _GUESSED, "a guess: the photographs' angle of view"
-    return RigStart(
-        thermal_camera=camera,
-        visible_to_thermal=transform,
-        focal_sigma=sigma,
-        translation_sigma=None if metres_per_unit is None else BASELINE_SIGMA_M / metres_per_unit,
-        source=source,
-    )
+    shift = None if metres_per_unit is None else BASELINE_SIGMA_M / metres_per_unit
+    return RigStart(camera, transform, focal_sigma=sigma, translation_sigma=shift, source=source)
 
 
 def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float | None = None) -> RigEstimate:
     """Read a rig that was found before: ``thermal_camera`` and ``rig`` of a transforms.json.
 
-    Where the json has a scale and this capture too, lengths are converted.
-
-    Raises:
-        SceneError: One of them is missing or no camera, or no rotation and shift, or the camera has another size or one
-            that is no whole number of pixels.
+    Where the json has a scale and this capture too, lengths are converted. A `SceneError` is raised where one is
+    missing or no camera of this size, or no rotation and shift.
     """
     content: Any = read_json(file)
     remedy = "Pass the transforms.json of an earlier capture with the same camera."

@@ -41,10 +41,8 @@ def model_of_colmap(
 ) -> SfmModel:
     """Turn a pycolmap reconstruction into our model, without the images that are not in `frame_of_image`.
 
-    `size` is the photographs' width and height where the model was made from smaller ones.
-
-    Raises:
-        SceneError: No frame has a pose, or there are several cameras or an unknown lens model.
+    `size` is the photographs' width and height where the model was made from smaller ones. A `SceneError` is raised
+    where no frame has a pose, or there are several cameras or an unknown lens model.
     """
     posed = {i: image for i, image in reconstruction.images.items() if image.has_pose and image.name in frame_of_image}
     posed = dict(sorted(posed.items(), key=lambda item: frame_of_image[item[1].name]))

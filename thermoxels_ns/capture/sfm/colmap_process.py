@@ -13,7 +13,6 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -58,7 +57,7 @@ def run_in_process(
     )
     assert child.stdin is not None and child.stdout is not None
     words: deque[str] = deque(maxlen=_LINES_KEPT)
-    ended: _Raised | _Returned | None = None
+    ended: tuple[Any, Exception | None] | None = None  # what it returned, and what it raised
     try:
         with suppress(BrokenPipeError):  # it ended before it could listen; its words and status follow
             child.stdin.write(pickle.dumps((work, arguments)))
@@ -80,21 +79,11 @@ def run_in_process(
         with suppress(OSError):
             child.stdin.close()
         child.stdout.close()
-    if isinstance(ended, _Raised):
-        raise ended.problem
+    if ended is not None and ended[1] is not None:
+        raise ended[1]
     if status or ended is None:
         raise colmap_stopped(_reason(status, words), folder)
-    return ended.result
-
-
-@dataclass(frozen=True)
-class _Raised:
-    problem: Exception
-
-
-@dataclass(frozen=True)
-class _Returned:
-    result: Any
+    return ended[0]
 
 
 def serve() -> None:
@@ -102,9 +91,9 @@ def serve() -> None:
     work, arguments = pickle.load(sys.stdin.buffer)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     try:
-        _send(_Returned(work(*arguments, _send)))
+        _send((work(*arguments, _send), None))
     except (ThermoxelsError, OSError) as problem:
-        _send(_Raised(problem))
+        _send((None, problem))
 
 
 def _exit_with_parent() -> None:
@@ -112,7 +101,7 @@ def _exit_with_parent() -> None:
     os._exit(1)
 
 
-def _send(message: str | _Raised | _Returned) -> None:
+def _send(message: str | tuple[Any, Exception | None]) -> None:
     sys.stdout.buffer.write(b"\n" + _MARK + base64.b64encode(pickle.dumps(message)) + b"\n")
     sys.stdout.buffer.flush()
 
@@ -128,12 +117,7 @@ def _reason(status: int, words: deque[str]) -> str:
 
 @contextmanager
 def quiet_colmap(folder: Path) -> Iterator[None]:
-    """Silence COLMAP in the block; what matters comes back as results or exceptions.
-
-    Raises:
-        OutputError: COLMAP stopped because the disk of `folder` is full.
-        ThermoxelsError: COLMAP stopped.
-    """
+    """Silence COLMAP in the block; where it stops, the error of `colmap_stopped` is raised."""
     import pycolmap
 
     log: Any = pycolmap.logging

@@ -65,12 +65,9 @@ class ReducedPhotographs:
 
 
 def image_pairs(count: int, matching: Matching) -> npt.NDArray[np.int64]:
-    """Choose which of so many photographs, in the order they were taken, are compared.
+    """Pairs (p, 2) of numbers of photographs, in the order they were taken, to compare; smaller first, sorted.
 
     Every pair (exhaustive); neighbours in time and some far ones (sequential); or by their number (auto).
-
-    Returns:
-        Pairs of numbers (p, 2), the smaller one first, sorted, without repeats.
 
     >>> image_pairs(3, "exhaustive").tolist()
     [[0, 1], [0, 2], [1, 2]]
@@ -97,11 +94,7 @@ def fill_database(
     """Find features in photographs and match them; what an interrupted run has done is not done again.
 
     `camera` is the start value of their lens at their reduced size; `known_focal` says that its focal length is more
-    than a guess.
-
-    Raises:
-        OutputError: There is too little free space for features and matches, or the disk becomes full.
-        ThermoxelsError: COLMAP stopped.
+    than a guess. An `OutputError` is raised where there is too little free space.
     """
     database, count = photographs.database, len(photographs.frame_of_image)
     pairs = image_pairs(count, options.matching)

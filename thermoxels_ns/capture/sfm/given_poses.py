@@ -22,11 +22,8 @@ def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
     """Read poses from a COLMAP model's folder or a transforms.json; their world stays as it is.
 
     `photographs` are the camera's files, relative to the capture, by the frame's name. The model of a transforms.json
-    has no points; the frames without a pose are named.
-
-    Raises:
-        SceneError: Nothing readable is there, no photograph is in it, it has several cameras, or a name in it leads
-            out of its folder.
+    has no points; the frames without a pose are named. A `SceneError` is raised where nothing readable is there, no
+    photograph is in it, it has several cameras, or a name in it leads out of its folder.
     """
     if path.is_dir():
         reconstruction = read_colmap(path)
@@ -47,10 +44,7 @@ def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
 def fitted_to_photographs(poses: Poses, photographs: Mapping[str, Path]) -> Poses:
     """Express given poses in the pixels of the photographs; they may come from photographs that were reduced.
 
-    Frames whose photographs have another size than most are left out.
-
-    Raises:
-        SceneError: The photographs have other proportions than the images that the poses come from.
+    Frames whose photographs have another size than most are left out; other proportions are a `SceneError`.
     """
     size, other = common_size({name: photographs[name] for name in poses.model.frames})
     dropped = dict(poses.dropped) | {

@@ -6,18 +6,24 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
-from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, ReducedPhotographs, fill_database
-from thermoxels_ns.capture.sfm.mapping import MIN_FRAMES, map_photographs, triangulate
+from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
+from thermoxels_ns.capture.sfm.colmap_model import model_of_colmap
+from thermoxels_ns.capture.sfm.colmap_process import quiet_colmap, run_in_process
+from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, ReducedPhotographs, fill_database, lens_parameters
 from thermoxels_ns.capture.sfm.model import SfmModel
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 
+MIN_FRAMES = 3
+"""Fewer photographs are no reconstruction."""
+_SAID_EVERY = 10
 _GUESSED_FOCAL = 1.0
 """Of the longest side, where the photograph does not say: a lens of 53 degrees."""
 _JPEG_QUALITY = 95
@@ -33,6 +39,15 @@ class Poses:
     """Why, by the frame's name."""
 
 
+@dataclass(frozen=True)
+class _Mapped:
+    """The largest group of photographs that fit together, and those of smaller groups."""
+
+    model: SfmModel
+    elsewhere: Mapping[str, int]
+    """With how many others a frame of a smaller group fits together."""
+
+
 def find_poses(
     photographs: Mapping[str, Path],
     folder: Path,
@@ -43,11 +58,8 @@ def find_poses(
 ) -> Poses:
     """Find camera and poses from photographs of one camera alone (incremental structure from motion by COLMAP).
 
-    `photographs` are files by the frame's name, in the order they were taken; `folder` is for features, matches and
-    reduced photographs, and what an interrupted run left there is used. `focal_px` None: unknown.
-
-    Returns:
-        The largest group of photographs that fit together, and why the others are not in it.
+    `photographs` are files by the frame's name, in the order they were taken. What an interrupted run left in `folder`
+    is used. The largest group of photographs that fit together is found, and why the others are not in it.
 
     Raises:
         SceneError: Fewer than 3 photographs fit together, or a photograph cannot be decoded.
@@ -69,7 +81,7 @@ def find_poses(
     focal = focal_px or _GUESSED_FOCAL * max(size)
     start = Camera(*size, focal, focal, size[0] / 2.0, size[1] / 2.0).resized(*small)
     fill_database(reduced, start, focal_px is not None, options, say)
-    mapped = map_photographs(reduced, options.seed, say)
+    mapped = run_in_process(_map, (reduced, options.seed), folder, say)
     found = 0 if mapped is None else len(mapped.model.frames)
     if mapped is None or found < MIN_FRAMES:
         raise _too_few(found, "photographs that fit together")
@@ -89,11 +101,7 @@ def add_points(
     options: PoseOptions | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> SfmModel:
-    """Find the points that photographs with known poses share; camera and poses stay as they are, other points go.
-
-    Raises:
-        SceneError: There are fewer than two photographs, or they are of another size than the camera's.
-    """
+    """Find the points that at least two photographs with known poses share; camera and poses stay as they are."""
     options = options or PoseOptions()
     names = list(given.frames)
     if len(names) < 2:
@@ -114,7 +122,7 @@ def add_points(
     small = _reduced_size(size, options.image_size)
     reduced = _reduced({name: photographs[name] for name in names}, folder, size, small, masks)
     fill_database(reduced, given.camera.resized(*small), True, replace(options, lens="OPENCV"), say)
-    return triangulate(reduced, given, options.seed, say)
+    return run_in_process(_triangulate, (reduced, given, options.seed), folder, say)
 
 
 def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[str, tuple[int, int]]]:
@@ -174,3 +182,97 @@ def _too_few(got: int, what: str) -> SceneError:
         remedy="Take more photographs with more overlap (each part of the scene in three or more), in focus and "
         "with texture; or give poses with --poses.",
     )
+
+
+def _map(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> _Mapped | None:
+    """Find camera, poses and points (incremental structure from motion); None where no photographs fit together."""
+    import pycolmap
+
+    found = 2  # the first pair comes without a call
+
+    def next_image() -> None:
+        nonlocal found
+        found += 1
+        if found % _SAID_EVERY == 0:
+            count = len(matched.frame_of_image)
+            say(f"poses: {min(found, count)} of {count} photographs")
+
+    folder = matched.database.parent
+    pycolmap.set_random_seed(seed)
+    groups: dict[int, Any] = {}
+    with quiet_colmap(folder):
+        groups = pycolmap.incremental_mapping(
+            matched.database, matched.images, folder, _options(seed), next_image_callback=next_image
+        )
+    if not groups:
+        return None
+    largest, *others = sorted(groups.values(), key=lambda group: (-group.num_reg_images(), -len(group.points3D)))
+    elsewhere = {
+        matched.frame_of_image[image.name]: group.num_reg_images() - 1
+        for group in others
+        for image in group.images.values()
+        if image.has_pose
+    }
+    return _Mapped(model_of_colmap(largest, matched.frame_of_image, matched.size), elsewhere)
+
+
+def _triangulate(matched: ReducedPhotographs, posed: SfmModel, seed: int, say: Callable[[str], None]) -> SfmModel:
+    """Find the points that photographs with known camera (at their own size) and poses share; those of `posed` go."""
+    import pycolmap
+
+    say("poses: given; looking for points")
+    number = {frame: index for index, frame in enumerate(posed.frames)}
+    with pycolmap.Database.open(matched.database) as opened:
+        ids = {image.name: image.image_id for image in opened.read_all_images()}
+        stored = opened.read_camera(1)
+    camera = posed.camera.resized(stored.width, stored.height)
+    start = pycolmap.Reconstruction()
+    start.add_camera_with_trivial_rig(
+        pycolmap.Camera(
+            model="OPENCV",
+            width=camera.width,
+            height=camera.height,
+            params=lens_parameters(camera, "OPENCV"),
+            camera_id=1,
+        )
+    )
+    for name, frame in matched.frame_of_image.items():
+        inverse = np.linalg.inv(posed.camera_to_world[number[frame]] @ OPENGL_FROM_OPENCV)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(inverse[:3, :3]), inverse[:3, 3])
+        start.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=1, image_id=ids[name]), pose)
+    options = _options(seed)
+    options.ba_refine_focal_length = options.ba_refine_extra_params = False
+    options.constant_cameras = {1}
+    options.fix_existing_frames = True
+    folder = matched.database.parent
+    pycolmap.set_random_seed(seed)
+    with quiet_colmap(folder):
+        found = pycolmap.triangulate_points(
+            start, matched.database, matched.images, folder, clear_points=True, options=options, refine_intrinsics=False
+        )
+    model = model_of_colmap(found, matched.frame_of_image, matched.size)
+    sighting_frame = np.array([number[frame] for frame in model.frames], dtype=np.int64)[model.sighting_frame]
+    order = np.lexsort((model.sighting_point, sighting_frame))
+    return replace(
+        posed,
+        points=model.points,
+        colours=model.colours,
+        point_error_px=model.point_error_px,
+        sighting_frame=sighting_frame[order],
+        sighting_point=model.sighting_point[order],
+        sighting_pixel=model.sighting_pixel[order],
+    )
+
+
+def _options(seed: int) -> Any:
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = seed
+    options.mapper.random_seed = seed
+    options.triangulation.random_seed = seed
+    # Sums over threads come in any order, and their last bits decide which point is kept: one thread, same result.
+    options.num_threads = 1
+    options.mapper.num_threads = 1
+    options.min_model_size = MIN_FRAMES
+    return options
