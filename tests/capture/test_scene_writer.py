@@ -93,18 +93,6 @@ def test_numbers_come_back_as_they_went_in(scene, tmp_path):
     assert read.meta["fl_x"] == CAMERA.fl_x and read.meta["thermal_camera"]["cx"] == THERMAL.cx
 
 
-def test_the_scene_box_holds_the_scene_points(scene, tmp_path):
-    output = prepare_output(tmp_path / "scene")
-    write_scene_folder(scene, output)
-    from thermoxels_ns.data.scene_box import find_scene_box
-
-    box, source = find_scene_box(read_scene_file(output), None, np.eye(3))
-    inside = ((scene.model.points >= box[0]) & (scene.model.points <= box[1])).all(axis=1)
-    assert "points" in source
-    assert inside.mean() > 0.95
-    assert (box[1] - box[0] < 6).all()
-
-
 def test_tracks_say_which_training_photograph_sees_which_point(scene, tmp_path):
     output = prepare_output(tmp_path / "scene")
     write_scene_folder(scene, output)

@@ -11,7 +11,6 @@ from thermoxels_ns.capture.rig.explanation import (
     rig_lines,
     turn_error_deg,
     turn_errors_deg,
-    uncertainty_text,
     why_turn_is_unsure,
 )
 from thermoxels_ns.capture.rig.parameters import PARAMETERS
@@ -50,22 +49,7 @@ def test_a_turn_that_is_less_sure_than_the_points_says_why(rig):
     assert why_turn_is_unsure(replace(rig, parameters=(), covariance=np.zeros((0, 0)))) == ""
 
 
-RX, TY, CY = (PARAMETERS.index(name) for name in ("rx", "ty", "cy"))
-
-
-def covariance_of(first: int, second: int, correlation: float) -> np.ndarray:
-    errors = np.linspace(0.01, 0.1, 10)
-    result = np.diag(errors**2)
-    result[first, second] = result[second, first] = correlation * errors[first] * errors[second]
-    return result
-
-
-def test_what_stands_for_each_other_is_named_with_either_sign() -> None:
-    for sign in (1.0, -1.0):
-        text = uncertainty_text(covariance_of(RX, CY, 0.95 * sign), np.ones(10))
-        assert "hardly tell apart the tilt up or down and the principal point's row:" in text
-        assert "shift" not in text and "focal" not in text
-    assert "the tilt up or down and the shift up or down" in uncertainty_text(covariance_of(RX, TY, 0.9), np.ones(10))
+CY = PARAMETERS.index("cy")
 
 
 def test_what_the_turn_would_be_is_the_inverse_of_the_information_on_all_but_the_principal_point() -> None:

@@ -90,8 +90,6 @@ LARGEST_TURN_DEG = 0.75
     ("scene", "ratio", "thermal_width", "baseline_m", "seed", "focal_limit"),
     [
         ("house-corner", 4, 160, 0.05, 11, FOCAL_KNOWN),
-        ("house-corner", 5, 160, 0.20, 13, FOCAL_KNOWN),
-        ("house-corner", 8, 120, 0.10, 15, FOCAL_UNSURE),
         ("courtyard", 10, 120, 0.05, 14, FOCAL_KNOWN),
         ("courtyard", 20, 80, 0.10, 12, FOCAL_UNSURE),
     ],

@@ -42,15 +42,6 @@ def test_photographs_are_recognised_by_name(tmp_path, form):
     assert list(found.dropped) == ["other"]
 
 
-def test_files_without_poses_are_refused(tmp_path):
-    with pytest.raises(SceneError, match="no known one"):
-        read_given_poses(transforms(tmp_path), {"x": "x.jpg"})
-    with pytest.raises(SceneError, match="nothing at"):
-        read_given_poses(tmp_path / "nowhere", SOURCES)
-    with pytest.raises(SceneError, match="a COLMAP model"):
-        read_given_poses(tmp_path, SOURCES)
-
-
 MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -73,18 +72,6 @@ def test_the_same_seed_gives_the_same_bits(card, found, tmp_path):
     assert np.array_equal(again.camera_to_world, found[0].model.camera_to_world)
     assert np.array_equal(again.points, found[0].model.points)
     assert again.camera == found[0].model.camera
-
-
-def test_an_interrupted_run_goes_on_with_its_features(card, found, tmp_path):
-    work, said = tmp_path / "work", []
-    shutil.copytree(found[1], work)
-    again = find_poses(card[0], work, 430.0, options=OPTIONS, say=said.append).model
-    assert not [line for line in said if line.startswith("features:")]
-    assert np.array_equal(again.camera_to_world, found[0].model.camera_to_world)
-    for file in work.glob("features.db*"):
-        file.unlink()
-    find_poses(card[0], work, 430.0, options=OPTIONS, say=said.append)
-    assert [line for line in said if line.startswith("features:")]
 
 
 def test_points_for_poses_that_are_given(card, tmp_path):
