@@ -92,12 +92,9 @@ def scan_folder(
     and what is no file are passed over and named.
     """
     if not folder.is_dir():
-        raise SceneError(
-            "input",
-            expected="a folder with camera files",
-            got=f"{'a file' if folder.exists() else 'nothing'} at {folder}",
-            remedy="Pass the folder that the memory card was copied to.",
-        )
+        remedy = "Pass the folder that the memory card was copied to."
+        got = f"{'a file' if folder.exists() else 'nothing'} at {folder}"
+        raise SceneError("input", expected="a folder with camera files", got=got, remedy=remedy)
     files, unreadable, others = [], dict[Path, str](), 0
     found, passed_over = files_below(folder, without)
     for number, path in enumerate(found):

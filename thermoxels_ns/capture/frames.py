@@ -134,12 +134,9 @@ def read_frames(
         if number % 20 == 0:
             say(f"read: {number} of {len(pairs)} pairs")
     if not frames:
-        raise SceneError(
-            "pairs",
-            expected="at least one pair whose files can be read",
-            got=f"none of {len(pairs)}: " + (next(iter(dropped.values())) if dropped else "there are no pairs"),
-            remedy="Look at the files, or at the pairs that were found in capture.html.",
-        )
+        remedy = "Look at the files, or at the pairs that were found in capture.html."
+        got = f"none of {len(pairs)}: " + (next(iter(dropped.values())) if dropped else "there are no pairs")
+        raise SceneError("pairs", expected="at least one pair whose files can be read", got=got, remedy=remedy)
     height, width = Counter(sizes).most_common(1)[0][0]
     for frame, shape in zip(frames, sizes):
         if shape != (height, width):
@@ -160,12 +157,9 @@ def _read(pair: Pair, root: Path, folder: Path, radiometry: RadiometryOptions) -
     if pair.in_one_file:
         content = read_flir_jpeg(pair.photograph).visible
         if content is None:
-            raise SceneError(
-                str(pair.photograph),
-                expected="a photograph inside the file",
-                got="none in a form that is known",
-                remedy="Export the photograph with the camera's program and put it beside the file.",
-            )
+            remedy = "Export the photograph with the camera's program and put it beside the file."
+            got = "none in a form that is known"
+            raise SceneError(str(pair.photograph), expected="a photograph inside the file", got=got, remedy=remedy)
         photograph = folder / "photographs" / (pair.name + (".jpg" if content.startswith(b"\xff\xd8") else ".png"))
         photograph.write_bytes(content)
     elif thermogram.metadata.format in ("TIFF", "DJI R-JPEG"):

@@ -83,12 +83,9 @@ def user_masks(frames: Sequence[CaptureFrame], folder: Path | None) -> dict[str,
         if own is not None:
             found[frame.name] = own
     if not found:
-        raise SceneError(
-            "masks",
-            expected="masks named like photographs",
-            got=f"{len(files)} pictures in {folder}, none of them named so",
-            remedy=f"Name them like {Path(frames[0].photograph_source).stem}.png.",
-        )
+        remedy = f"Name them like {Path(frames[0].photograph_source).stem}.png."
+        got = f"{len(files)} pictures in {folder}, none of them named so"
+        raise SceneError("masks", expected="masks named like photographs", got=got, remedy=remedy)
     return found
 
 

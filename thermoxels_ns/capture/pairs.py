@@ -131,12 +131,9 @@ def read_pair_list(file: Path, folder: Path) -> PairSearch:
         pairs.append((photograph, thermal))
     twice = [path.name for side in zip(*pairs) for path, count in Counter(side).items() if count > 1]
     if twice or not pairs:
-        raise SceneError(
-            str(file),
-            expected="at least one pair, and every file in one pair only",
-            got=f"{twice[0]} twice" if twice else "no pair",
-            remedy="Correct the list.",
-        )
+        expected = "at least one pair, and every file in one pair only"
+        remedy = "Correct the list."
+        raise SceneError(str(file), expected=expected, got=f"{twice[0]} twice" if twice else "no pair", remedy=remedy)
     root = folder.resolve()
     names = _names([photograph for photograph, _ in pairs], root)
     return PairSearch(tuple(Pair(n, p, t, f"listed in {file.name}") for n, (p, t) in zip(names, pairs)))

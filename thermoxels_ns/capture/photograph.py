@@ -88,12 +88,9 @@ def read_photograph_facts(path: Path) -> PhotographFacts:
 def check_photograph_size(path: Path, width: int, height: int) -> None:
     """Raise a `SceneError` if a photograph's header claims more pixels than cameras have."""
     if not (0 < width < LARGEST_SIDE and 0 < height < LARGEST_SIDE and width * height <= _LARGEST_PIXELS):
-        raise SceneError(
-            str(path),
-            expected=f"a photograph below {LARGEST_SIDE} pixels a side and {_LARGEST_PIXELS} in all",
-            got=f"a header that says {width} x {height}",
-            remedy="The header is damaged; copy the file from the camera again.",
-        )
+        expected = f"a photograph below {LARGEST_SIDE} pixels a side and {_LARGEST_PIXELS} in all"
+        remedy = "The header is damaged; copy the file from the camera again."
+        raise SceneError(str(path), expected=expected, got=f"a header that says {width} x {height}", remedy=remedy)
 
 
 def open_photograph(path: Path) -> Image.Image:
@@ -107,12 +104,9 @@ def read_mask(path: Path, width: int, height: int) -> npt.NDArray[np.bool_]:
     """Read a mask, white (128 and more) where the image may be used; a `SceneError` where its size is another."""
     mask = np.asarray(open_photograph(path).convert("L")) >= 128
     if mask.shape != (height, width):
-        raise SceneError(
-            str(path),
-            expected=f"a mask of {width} x {height} pixels, as the images have",
-            got=f"{mask.shape[1]} x {mask.shape[0]}",
-            remedy="Draw it on one of the images: white where they may be used, black elsewhere.",
-        )
+        expected = f"a mask of {width} x {height} pixels, as the images have"
+        remedy = "Draw it on one of the images: white where they may be used, black elsewhere."
+        raise SceneError(str(path), expected=expected, got=f"{mask.shape[1]} x {mask.shape[0]}", remedy=remedy)
     return mask
 
 

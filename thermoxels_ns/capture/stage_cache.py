@@ -127,12 +127,9 @@ def prepare_output(folder: Path) -> Path:
     """Make the output folder, or take that of an earlier capture; an `OutputError` where it holds other files."""
     folder = writable_folder(folder)
     if not (folder / CACHE_FOLDER).is_dir() and any(folder.iterdir()):
-        raise OutputError(
-            "output",
-            expected="an empty folder or one of an earlier capture",
-            got=f"{folder}, which holds other files",
-            remedy="Pass another folder with --output.",
-        )
+        remedy = "Pass another folder with --output."
+        got = f"{folder}, which holds other files"
+        raise OutputError("output", expected="an empty folder or one of an earlier capture", got=got, remedy=remedy)
     writable_folder(folder / CACHE_FOLDER)
     return folder
 
@@ -152,12 +149,10 @@ def locked(output: Path, say: Callable[[str], None] = lambda _: None) -> Iterato
             file.write_text(str(os.getpid()))
     except Timeout as problem:
         number = _read(file) or ""
-        raise OutputError(
-            "output",
-            expected="a folder that no other capture is working in",
-            got=f"{output}, where process {number} is at work" if number.isdigit() else f"{output}, where one is",
-            remedy="Wait until it ends, or pass another folder with --output.",
-        ) from problem
+        expected = "a folder that no other capture is working in"
+        got = f"{output}, where process {number} is at work" if number.isdigit() else f"{output}, where one is"
+        remedy = "Wait until it ends, or pass another folder with --output."
+        raise OutputError("output", expected=expected, got=got, remedy=remedy) from problem
     except OSError as problem:
         drive = f"the drive of the output folder ({problem.strerror})"
         say(f"output: {drive} does not tell whether another capture works in the folder; start one at a time")
@@ -196,9 +191,7 @@ def _remove_folder(folder: Path) -> None:
     except FileNotFoundError:
         pass
     except OSError as problem:
-        raise OutputError(
-            str(folder),
-            expected="an earlier result of the capture, which can be removed",
-            got=problem.strerror or str(problem),
-            remedy="Remove the folder by hand, or choose another one with --output.",
-        ) from problem
+        expected = "an earlier result of the capture, which can be removed"
+        got = problem.strerror or str(problem)
+        remedy = "Remove the folder by hand, or choose another one with --output."
+        raise OutputError(str(folder), expected=expected, got=got, remedy=remedy) from problem

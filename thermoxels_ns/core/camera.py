@@ -53,12 +53,10 @@ class Camera:
         numbers = (self.fl_x, self.fl_y, self.cx, self.cy, *self.distortion)
         good = all(map(math.isfinite, numbers)) and min(self.fl_x, self.fl_y) > 0 and min(self.width, self.height) > 0
         if not good:
-            raise SceneError(
-                "camera",
-                expected="at least one pixel, focal lengths above 0 and finite numbers",
-                got=f"{self.width} x {self.height} pixels, {numbers}",
-                remedy="Correct the intrinsics.",
-            )
+            expected = "at least one pixel, focal lengths above 0 and finite numbers"
+            got = f"{self.width} x {self.height} pixels, {numbers}"
+            remedy = "Correct the intrinsics."
+            raise SceneError("camera", expected=expected, got=got, remedy=remedy)
 
     @classmethod
     def from_field_of_view(cls, width: int, height: int, horizontal_deg: float) -> Camera:
@@ -68,12 +66,9 @@ class Camera:
         320.0
         """
         if not 0.0 < horizontal_deg < 179.0:
-            raise SceneError(
-                "field of view",
-                expected="an angle above 0 and below 179 degrees",
-                got=horizontal_deg,
-                remedy="Pass the horizontal angle of view from the lens's data sheet.",
-            )
+            remedy = "Pass the horizontal angle of view from the lens's data sheet."
+            got = horizontal_deg
+            raise SceneError("field of view", expected="an angle above 0 and below 179 degrees", got=got, remedy=remedy)
         focal = 0.5 * width / math.tan(math.radians(0.5 * horizontal_deg))
         return cls(width, height, focal, focal, 0.5 * width, 0.5 * height)
 

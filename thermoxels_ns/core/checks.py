@@ -71,12 +71,10 @@ def writable_folder(path: Path | str) -> Path:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as problem:
-        raise OutputError(
-            "output folder",
-            expected=f"a folder that can be written to at {folder}",
-            got=problem.strerror or str(problem),
-            remedy="Choose another folder or change its permissions.",
-        ) from problem
+        expected = f"a folder that can be written to at {folder}"
+        got = problem.strerror or str(problem)
+        remedy = "Choose another folder or change its permissions."
+        raise OutputError("output folder", expected=expected, got=got, remedy=remedy) from problem
     return folder
 
 
@@ -138,12 +136,9 @@ def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Itera
     blocked = [name for name in files if (folder / name).is_dir()]
     blocked += [name for name in folders if (folder / name).exists() and not (folder / name).is_dir()]
     if blocked:
-        raise OutputError(
-            "output folder",
-            expected=f"no folder in the place of a file, and no file in the place of a folder, in {folder}",
-            got=", ".join(blocked),
-            remedy="Move it away, or choose another folder.",
-        )
+        expected = f"no folder in the place of a file, and no file in the place of a folder, in {folder}"
+        remedy = "Move it away, or choose another folder."
+        raise OutputError("output folder", expected=expected, got=", ".join(blocked), remedy=remedy)
 
 
 def _output_error(path: Path, expected: str, problem: OSError) -> OutputError:

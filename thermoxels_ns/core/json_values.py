@@ -44,12 +44,9 @@ def plain_values(value: Any, name: str = "value", error: type[ThermoxelsError] =
         raise error(name, expected="a finite number", got=value, remedy="Leave it out, or write None for 'unknown'.")
     if value is None or isinstance(value, (str, bool, int, float)):
         return value
-    raise error(
-        name,
-        expected="text, a number, a list, a mapping, a path or None",
-        got=type(value).__name__,
-        remedy="Convert it before writing.",
-    )
+    remedy = "Convert it before writing."
+    got = type(value).__name__
+    raise error(name, expected="text, a number, a list, a mapping, a path or None", got=got, remedy=remedy)
 
 
 def write_json(path: Path, content: Any, error: type[ThermoxelsError] = ThermoxelsError) -> None:

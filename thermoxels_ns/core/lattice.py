@@ -48,12 +48,10 @@ class Lattice:
         lo, hi = np.asarray(box_lo, dtype=np.float64), np.asarray(box_hi, dtype=np.float64)
         size = hi - lo
         if resolution < 1 or not np.all(np.isfinite(size)) or not np.all(size > 0):
-            raise ThermoxelsError(
-                "scene box",
-                expected="three finite sides longer than 0 and a resolution of at least 1",
-                got=f"sides {size.tolist()}, resolution {resolution}",
-                remedy="Correct the scene box or the camera poses it comes from.",
-            )
+            expected = "three finite sides longer than 0 and a resolution of at least 1"
+            got = f"sides {size.tolist()}, resolution {resolution}"
+            remedy = "Correct the scene box or the camera poses it comes from."
+            raise ThermoxelsError("scene box", expected=expected, got=got, remedy=remedy)
         h = float(size.max()) / resolution
         cells = np.maximum(np.ceil(size / h - 1e-6).astype(int), 1)
         start = np.round(0.5 * (lo + hi) - 0.5 * cells * h, 12)

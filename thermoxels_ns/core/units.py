@@ -45,12 +45,10 @@ class TemperatureRange:
     def __post_init__(self) -> None:
         finite = np.isfinite(self.min_c) and np.isfinite(self.max_c)
         if not finite or self.max_c - self.min_c < _SMALLEST_SPAN_K:
-            raise ThermoxelsError(
-                "temperature range",
-                expected=f"finite bounds at least {_SMALLEST_SPAN_K} K apart",
-                got=f"{self.min_c} to {self.max_c} C",
-                remedy="Use TemperatureRange.spanning, which widens the range of a constant image.",
-            )
+            expected = f"finite bounds at least {_SMALLEST_SPAN_K} K apart"
+            got = f"{self.min_c} to {self.max_c} C"
+            remedy = "Use TemperatureRange.spanning, which widens the range of a constant image."
+            raise ThermoxelsError("temperature range", expected=expected, got=got, remedy=remedy)
 
     @classmethod
     def spanning(cls, min_c: float, max_c: float) -> TemperatureRange:

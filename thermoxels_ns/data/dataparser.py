@@ -227,12 +227,10 @@ class ThermalDataParser(DataParser):
         except (IndexError, RuntimeError):  # vertical needs three cameras; a decomposition may not converge
             oriented = torch.full((3, 4), torch.nan)
         if not bool(torch.isfinite(oriented).all()):
-            raise SceneError(
-                "orientation_method, center_method",
-                expected="cameras that tell where up and the middle are",
-                got=f"{len(poses)} cameras that do not, by {method} and {centre}",
-                remedy="Pass --orientation-method none --center-method box.",
-            )
+            expected = "cameras that tell where up and the middle are"
+            got = f"{len(poses)} cameras that do not, by {method} and {centre}"
+            remedy = "Pass --orientation-method none --center-method box."
+            raise SceneError("orientation_method, center_method", expected=expected, got=got, remedy=remedy)
         return oriented
 
     def _place(self, file: SceneFile) -> tuple[_World, SceneBox, str]:
@@ -254,12 +252,8 @@ class ThermalDataParser(DataParser):
             translation = _as_kept(translation)
         scale = (SCENE_SIZE / longest if config.auto_scale_poses else 1.0) * config.scale_factor
         if not (np.isfinite(scale) and scale > 0):
-            raise SceneError(
-                "scale_factor",
-                expected="a finite number above 0",
-                got=config.scale_factor,
-                remedy="Pass --scale-factor 1.",
-            )
+            remedy = "Pass --scale-factor 1."
+            raise SceneError("scale_factor", expected="a finite number above 0", got=config.scale_factor, remedy=remedy)
         placed = scale * (box + translation)
         return (
             _World(rotation, translation, scale),
@@ -295,12 +289,9 @@ def survey_thermal_files(
         height, width = temperature_c.shape
         shapes[path] = (height, width)
         if not np.isfinite(temperature_c).any():
-            raise ThermalFileError(
-                str(path),
-                expected=f"temperatures from {valid_range_c[0]} to {valid_range_c[1]} C",
-                got="no valid pixel",
-                remedy="Check thermal_unit or temperature_bounds.json, or widen --valid-range-c.",
-            )
+            expected = f"temperatures from {valid_range_c[0]} to {valid_range_c[1]} C"
+            remedy = "Check thermal_unit or temperature_bounds.json, or widen --valid-range-c."
+            raise ThermalFileError(str(path), expected=expected, got="no valid pixel", remedy=remedy)
         if not is_training:
             continue
         if len(extremes) % step == 0:
@@ -341,22 +332,16 @@ def _thermal_intrinsics(frame: Frame, shape: tuple[int, int]) -> Camera:
     own = frame.thermal_intrinsics
     if own is not None:
         if (own.height, own.width) != shape:
-            raise SceneError(
-                frame.thermal.name,
-                expected=f"{own.width} x {own.height} pixels as thermal_camera says",
-                got=f"{width} x {height}",
-                remedy="Correct w and h of thermal_camera, or use the thermal images it was calibrated with.",
-            )
+            expected = f"{own.width} x {own.height} pixels as thermal_camera says"
+            remedy = "Correct w and h of thermal_camera, or use the thermal images it was calibrated with."
+            raise SceneError(frame.thermal.name, expected=expected, got=f"{width} x {height}", remedy=remedy)
         return own
     colour = frame.intrinsics
     fitting = colour.height * width / colour.width
     if abs(height - fitting) > max(1.0, 0.03 * fitting):
-        raise SceneError(
-            frame.thermal.name,
-            expected=f"the photograph's aspect ratio {colour.width} x {colour.height}",
-            got=f"{width} x {height}",
-            remedy="Give the thermal camera its own intrinsics as 'thermal_camera' in the json.",
-        )
+        expected = f"the photograph's aspect ratio {colour.width} x {colour.height}"
+        remedy = "Give the thermal camera its own intrinsics as 'thermal_camera' in the json."
+        raise SceneError(frame.thermal.name, expected=expected, got=f"{width} x {height}", remedy=remedy)
     return colour.resized(width, height)
 
 

@@ -33,12 +33,9 @@ class ThermalDataset(InputDataset):
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
         super().__init__(dataparser_outputs, scale_factor)
         if "temperature_range" not in self.metadata:
-            raise SceneError(
-                "dataparser",
-                expected="thermal-data, which finds the thermal images",
-                got="one that gives photographs only",
-                remedy="Write: ns-train thermoxels thermal-data --data SCENE.",
-            )
+            expected = "thermal-data, which finds the thermal images"
+            remedy = "Write: ns-train thermoxels thermal-data --data SCENE."
+            raise SceneError("dataparser", expected=expected, got="one that gives photographs only", remedy=remedy)
         self.temperature_range: TemperatureRange = self.metadata["temperature_range"]
         self.thermal_cameras: Cameras | None = self.metadata["thermal_cameras"]
         if self.thermal_cameras is None and scale_factor != 1.0:
@@ -59,20 +56,13 @@ class ThermalDataset(InputDataset):
             picture = opened.convert("RGBA") if opened.mode in ("P", "PA", "LA") else opened.copy()
         if picture.mode == "RGBA":
             if picture.getchannel("A").getextrema()[0] != 255:
-                raise SceneError(
-                    str(path),
-                    expected="an opaque photograph",
-                    got="transparent pixels",
-                    remedy="Flatten it onto a colour, or give the transparent part as mask_path.",
-                )
+                remedy = "Flatten it onto a colour, or give the transparent part as mask_path."
+                raise SceneError(str(path), expected="an opaque photograph", got="transparent pixels", remedy=remedy)
             picture = picture.convert("RGB")
         elif picture.mode not in ("RGB", "L", "CMYK", "YCbCr"):
-            raise SceneError(
-                str(path),
-                expected="a photograph with 8 bits per channel",
-                got=f"image mode {picture.mode}",
-                remedy="Convert it to 8-bit RGB.",
-            )
+            remedy = "Convert it to 8-bit RGB."
+            got = f"image mode {picture.mode}"
+            raise SceneError(str(path), expected="a photograph with 8 bits per channel", got=got, remedy=remedy)
         return np.array(self._resized(picture.convert("RGB"), image_idx, Image.Resampling.BOX))
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
@@ -99,12 +89,9 @@ class ThermalDataset(InputDataset):
         with Image.open(self._dataparser_outputs.image_filenames[image_idx]) as photograph:
             size = photograph.size
         if picture.size != size:
-            raise SceneError(
-                str(path),
-                expected=f"a mask of {size[0]} x {size[1]} pixels like its photograph",
-                got=f"{picture.size[0]} x {picture.size[1]}",
-                remedy="Write the mask at the photograph's resolution.",
-            )
+            expected = f"a mask of {size[0]} x {size[1]} pixels like its photograph"
+            remedy = "Write the mask at the photograph's resolution."
+            raise SceneError(str(path), expected=expected, got=f"{picture.size[0]} x {picture.size[1]}", remedy=remedy)
         resized = np.array(self._resized(picture, image_idx, Image.Resampling.NEAREST))
         return torch.from_numpy(resized > 0)[..., None]
 

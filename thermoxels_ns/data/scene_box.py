@@ -70,12 +70,9 @@ def box_of_points(points: npt.NDArray[np.float64], frames: Sequence[Frame], rota
         distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
         points = points[distance <= _FAR * max(np.median(distance), 1e-12)]
     if len(points) < 10:
-        raise SceneError(
-            "sparse points",
-            expected="at least 10 points in front of the cameras to find the scene box",
-            got=len(points),
-            remedy=_REMEDY,
-        )
+        expected = "at least 10 points in front of the cameras to find the scene box"
+        remedy = _REMEDY
+        raise SceneError("sparse points", expected=expected, got=len(points), remedy=remedy)
     low, high = np.percentile(points, _PERCENTILES, axis=0)
     extent = high - low
     margin = _MARGIN * extent.max()
@@ -97,12 +94,9 @@ def box_of_cameras(frames: Sequence[Frame], rotation: npt.NDArray[np.float64]) -
     centre = np.linalg.solve(normal, np.einsum("nij,nj->i", across, origins) / len(frames))
     depth = ((centre - origins) * axes).sum(axis=1)
     if np.median(depth) <= 0:
-        raise SceneError(
-            "scene box",
-            expected="cameras that look at one place",
-            got="cameras that look away from each other",
-            remedy=_REMEDY,
-        )
+        remedy = _REMEDY
+        got = "cameras that look away from each other"
+        raise SceneError("scene box", expected="cameras that look at one place", got=got, remedy=remedy)
     half_view = np.array(
         [max(f.intrinsics.width / f.intrinsics.fl_x, f.intrinsics.height / f.intrinsics.fl_y) / 2 for f in frames]
     )
@@ -169,9 +163,6 @@ def _read_colmap(folder: str, scene: SceneFile) -> npt.NDArray[np.float64]:
         if np.median(off) <= 0.01 * max(spread, 1e-9):
             points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
             return points @ transform[:, :3].T + transform[:, 3]
-    raise SceneError(
-        folder,
-        expected="a COLMAP model with the camera centres of the json",
-        got=f"{len(known)} photographs in common, at other places" if known else "no photograph in common",
-        remedy=_REMEDY,
-    )
+    remedy = _REMEDY
+    got = f"{len(known)} photographs in common, at other places" if known else "no photograph in common"
+    raise SceneError(folder, expected="a COLMAP model with the camera centres of the json", got=got, remedy=remedy)

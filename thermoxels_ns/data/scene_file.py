@@ -67,12 +67,9 @@ def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "err
     meta = read_json_object(json_path, "Write the file again.", SceneError)
     entries = meta.get("frames")
     if not isinstance(entries, list) or not entries:
-        raise SceneError(
-            json_path.name,
-            expected="a list 'frames' with one posed photograph per entry",
-            got="no frames: the scene has no poses",
-            remedy="Run structure from motion (ns-process-data) on the photographs first.",
-        )
+        expected = "a list 'frames' with one posed photograph per entry"
+        remedy = "Run structure from motion (ns-process-data) on the photographs first."
+        raise SceneError(json_path.name, expected=expected, got="no frames: the scene has no poses", remedy=remedy)
     partners = _ThermalPartners(folder)
     frames, left_out = [], []
     for index, entry in enumerate(entries):
@@ -97,19 +94,14 @@ def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "err
         )
     orphans = partners.orphans(folder, [frame.image for frame in frames])
     if missing_thermal == "error" and orphans:
-        raise SceneError(
-            f"{folder.name}/thermal",
-            expected="one photograph in images/ for every thermal image",
-            got=f"{partners.count} thermal images, {len(orphans)} of them without a photograph: {_some(orphans)}",
-            remedy="Restore the photographs, remove these files, or pass --missing-thermal skip.",
-        )
+        expected = "one photograph in images/ for every thermal image"
+        got = f"{partners.count} thermal images, {len(orphans)} of them without a photograph: {_some(orphans)}"
+        remedy = "Restore the photographs, remove these files, or pass --missing-thermal skip."
+        raise SceneError(f"{folder.name}/thermal", expected=expected, got=got, remedy=remedy)
     if not frames:
-        raise SceneError(
-            json_path.name,
-            expected="at least one frame with a thermal partner",
-            got=f"{len(entries)} frames, none with one",
-            remedy="Put the thermal images in thermal/ or name them with 'thermal_file_path'.",
-        )
+        remedy = "Put the thermal images in thermal/ or name them with 'thermal_file_path'."
+        got = f"{len(entries)} frames, none with one"
+        raise SceneError(json_path.name, expected="at least one frame with a thermal partner", got=got, remedy=remedy)
     _refuse_duplicates(json_path, frames)
     _refuse_half_masks(json_path, frames)
     bounds = _read_bounds(folder)
@@ -140,12 +132,9 @@ class _ThermalPartners:
         self.used_stems = True
         found = self.by_stem.get(image.stem, [])
         if len(found) > 1:
-            raise SceneError(
-                f"thermal partner of {image.name}",
-                expected="one file",
-                got=", ".join(path.name for path in found),
-                remedy="Keep one of them, or name it with 'thermal_file_path' in the frame.",
-            )
+            remedy = "Keep one of them, or name it with 'thermal_file_path' in the frame."
+            got = ", ".join(path.name for path in found)
+            raise SceneError(f"thermal partner of {image.name}", expected="one file", got=got, remedy=remedy)
         return found[0] if found else None
 
     def orphans(self, folder: Path, images: list[Path]) -> list[str]:
@@ -164,12 +153,9 @@ def _find_json(data: Path) -> Path:
     for name in JSON_NAMES:
         if (data / name).is_file():
             return data / name
-    raise SceneError(
-        f"scene folder {data}",
-        expected=" or ".join(JSON_NAMES),
-        got="neither" if data.is_dir() else "no such folder",
-        remedy="Pass --data the folder that holds it (ns-process-data writes it).",
-    )
+    remedy = "Pass --data the folder that holds it (ns-process-data writes it)."
+    got = "neither" if data.is_dir() else "no such folder"
+    raise SceneError(f"scene folder {data}", expected=" or ".join(JSON_NAMES), got=got, remedy=remedy)
 
 
 def _read_bounds(folder: Path) -> tuple[float, float] | None:
@@ -183,12 +169,9 @@ def _read_bounds(folder: Path) -> tuple[float, float] | None:
     except (KeyError, TypeError, ValueError):
         first = second = float("nan")
     if not (np.isfinite(first) and np.isfinite(second)):
-        raise SceneError(
-            str(path),
-            expected=f"finite numbers {keys[0]} and {keys[1]} in degrees Celsius",
-            got={key: content.get(key) for key in keys},
-            remedy="Correct the file, or remove it if the thermal files hold degrees Celsius.",
-        )
+        expected = f"finite numbers {keys[0]} and {keys[1]} in degrees Celsius"
+        remedy = "Correct the file, or remove it if the thermal files hold degrees Celsius."
+        raise SceneError(str(path), expected=expected, got={key: content.get(key) for key in keys}, remedy=remedy)
     return min(first, second), max(first, second)  # published scenes exist with the two names swapped
 
 
@@ -198,12 +181,9 @@ def _unit(meta: dict[str, Any], json_path: Path, bounds: tuple[float, float] | N
         try:
             return ThermalUnit.linear(float(unit["celsius_per_count"]), float(unit["celsius_offset"]))
         except (KeyError, TypeError, ValueError) as problem:
-            raise SceneError(
-                f"{json_path.name}: thermal_unit",
-                expected="numbers celsius_per_count (not 0) and celsius_offset",
-                got=unit,
-                remedy="Correct the json.",
-            ) from problem
+            expected = "numbers celsius_per_count (not 0) and celsius_offset"
+            remedy = "Correct the json."
+            raise SceneError(f"{json_path.name}: thermal_unit", expected=expected, got=unit, remedy=remedy) from problem
     return ThermalUnit.bounds(*bounds) if bounds else ThermalUnit.celsius()
 
 
@@ -219,20 +199,13 @@ def _frame(
             raise SceneError(where, expected="'thermal_camera' as an object", got=camera, remedy="Correct the json.")
         thermal_intrinsics = read_intrinsics({}, camera, None, f"{where}: thermal_camera")
     elif thermal_pose is not None:
-        raise SceneError(
-            where,
-            expected="'thermal_camera' (w, h, fl_x, fl_y, cx, cy) beside 'thermal_transform_matrix'",
-            got="no thermal_camera",
-            remedy="Add it at the top of the json or in every frame.",
-        )
+        expected = "'thermal_camera' (w, h, fl_x, fl_y, cx, cy) beside 'thermal_transform_matrix'"
+        remedy = "Add it at the top of the json or in every frame."
+        raise SceneError(where, expected=expected, got="no thermal_camera", remedy=remedy)
     mask = _mask(folder, entry, where)
     if "transform_matrix" not in entry:
-        raise SceneError(
-            where,
-            expected="'transform_matrix', the camera's pose",
-            got="none",
-            remedy="Remove the frame or run structure from motion again.",
-        )
+        remedy = "Remove the frame or run structure from motion again."
+        raise SceneError(where, expected="'transform_matrix', the camera's pose", got="none", remedy=remedy)
     pose = read_pose(entry["transform_matrix"], f"{where}: transform_matrix")
     intrinsics = read_intrinsics(meta, entry, image, where)
     return Frame(name, image, thermal, mask, pose, intrinsics, thermal_pose, thermal_intrinsics)
@@ -243,12 +216,8 @@ def _mask(folder: Path, entry: dict[str, Any], where: str) -> Path | None:
         return None
     name = entry["mask_path"]
     if not isinstance(name, str):
-        raise SceneError(
-            f"{where}: mask_path",
-            expected="a file name",
-            got=repr(name),
-            remedy="Name the mask; or leave mask_path out of all frames if none has a mask.",
-        )
+        remedy = "Name the mask; or leave mask_path out of all frames if none has a mask."
+        raise SceneError(f"{where}: mask_path", expected="a file name", got=repr(name), remedy=remedy)
     return _existing(folder / name, where, "mask_path")
 
 
@@ -264,23 +233,18 @@ def _refuse_duplicates(json_path: Path, frames: list[Frame]) -> None:
     for kind, paths in (("photograph", [f.image for f in frames]), ("thermal image", [f.thermal for f in frames])):
         twice = [path.name for path, count in Counter(path.resolve() for path in paths).items() if count > 1]
         if twice:
-            raise SceneError(
-                json_path.name,
-                expected=f"every {kind} in one frame only",
-                got=f"{_some(twice)} more than once",
-                remedy="Remove the duplicate frames: one of them could leak from training to evaluation.",
-            )
+            remedy = "Remove the duplicate frames: one of them could leak from training to evaluation."
+            got = f"{_some(twice)} more than once"
+            raise SceneError(json_path.name, expected=f"every {kind} in one frame only", got=got, remedy=remedy)
 
 
 def _refuse_half_masks(json_path: Path, frames: list[Frame]) -> None:
     masks = sum(frame.mask is not None for frame in frames)
     if masks not in (0, len(frames)):
-        raise SceneError(
-            f"{json_path.name}: mask_path",
-            expected="a mask for every frame or for none",
-            got=f"{masks} masks for {len(frames)} frames",
-            remedy="Add the missing ones (white: use the pixel).",
-        )
+        expected = "a mask for every frame or for none"
+        got = f"{masks} masks for {len(frames)} frames"
+        remedy = "Add the missing ones (white: use the pixel)."
+        raise SceneError(f"{json_path.name}: mask_path", expected=expected, got=got, remedy=remedy)
 
 
 def _some(names: list[str]) -> str:

@@ -51,32 +51,24 @@ def split_frames(
         split = _by_interval(names, interval, offset)
     for side, chosen in (("training", split.train), ("evaluation", split.val), ("evaluation", split.test)):
         if not chosen:
-            raise SceneError(
-                f"{side} frames",
-                expected=f"at least one of the {len(names)} frames ({split.how})",
-                got="none",
-                remedy="Add frames or choose another split, e.g. --eval-mode interval --eval-interval 2.",
-            )
+            expected = f"at least one of the {len(names)} frames ({split.how})"
+            remedy = "Add frames or choose another split, e.g. --eval-mode interval --eval-interval 2."
+            raise SceneError(f"{side} frames", expected=expected, got="none", remedy=remedy)
     both = set(split.train) & (set(split.val) | set(split.test))
     if both:
-        raise SceneError(
-            "split lists",
-            expected="no frame on both sides",
-            got=", ".join(names[i] for i in sorted(both)) + " in training and in evaluation",
-            remedy="Remove them from one list: evaluation frames must never train.",
-        )
+        remedy = "Remove them from one list: evaluation frames must never train."
+        got = ", ".join(names[i] for i in sorted(both)) + " in training and in evaluation"
+        raise SceneError("split lists", expected="no frame on both sides", got=got, remedy=remedy)
     return split
 
 
 def _by_name(names: Sequence[str], tagged: list[tuple[bool, bool]]) -> Split:
     unclear = [name for name, (train, evaluate) in zip(names, tagged) if train == evaluate]
     if unclear:
-        raise SceneError(
-            "split by file name",
-            expected="frame_train_ or frame_eval_ in every name",
-            got=f"{unclear[0]} ({len(unclear)} such)",
-            remedy="Rename them or pass --eval-mode interval.",
-        )
+        expected = "frame_train_ or frame_eval_ in every name"
+        got = f"{unclear[0]} ({len(unclear)} such)"
+        remedy = "Rename them or pass --eval-mode interval."
+        raise SceneError("split by file name", expected=expected, got=got, remedy=remedy)
     evaluate = [i for i, (_, test) in enumerate(tagged) if test]
     return Split([i for i, (train, _) in enumerate(tagged) if train], evaluate, evaluate, "by file name")
 
@@ -89,12 +81,9 @@ def _by_lists(names: Sequence[str], meta: Mapping[str, Any], left_out: Sequence[
         listed = None if listed is None else [name for name in listed if name not in left_out]
         unknown = [name for name in listed or [] if name not in position]
         if unknown:
-            raise SceneError(
-                key,
-                expected="names that are in 'frames'",
-                got=f"{unknown[0]} ({len(unknown)} unknown)",
-                remedy="Correct the list; it must write names as 'file_path' does.",
-            )
+            remedy = "Correct the list; it must write names as 'file_path' does."
+            got = f"{unknown[0]} ({len(unknown)} unknown)"
+            raise SceneError(key, expected="names that are in 'frames'", got=got, remedy=remedy)
         found[side] = None if listed is None else sorted({position[name] for name in listed})
     val = found["val"] or found["test"]
     test = found["test"] or found["val"]
@@ -110,12 +99,9 @@ def _by_lists(names: Sequence[str], meta: Mapping[str, Any], left_out: Sequence[
 def _by_interval(names: Sequence[str], interval: int, offset: int | None) -> Split:
     start = interval // 2 if offset is None else offset
     if interval < 2 or not 0 <= start < interval:
-        raise SceneError(
-            "eval_interval, eval_offset",
-            expected="an interval of at least 2 and an offset from 0 to interval - 1",
-            got=f"{interval}, {start}",
-            remedy="Pass --eval-interval 8.",
-        )
+        expected = "an interval of at least 2 and an offset from 0 to interval - 1"
+        remedy = "Pass --eval-interval 8."
+        raise SceneError("eval_interval, eval_offset", expected=expected, got=f"{interval}, {start}", remedy=remedy)
     evaluate = list(range(start, len(names), interval))
     train = [i for i in range(len(names)) if i % interval != start]
     return Split(train, evaluate, evaluate, f"every {interval}th frame from number {start}")

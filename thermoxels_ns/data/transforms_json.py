@@ -122,9 +122,5 @@ def path_inside(folder: Path, name: str, where: str) -> Path:
             if path.is_relative_to(root):
                 return path
             got = f"{name!r}, a link to {path}"
-    raise SceneError(
-        where,
-        expected=f"a file inside {folder}",
-        got=got,
-        remedy="Copy the file into the folder and name it relative to it.",
-    )
+    remedy = "Copy the file into the folder and name it relative to it."
+    raise SceneError(where, expected=f"a file inside {folder}", got=got, remedy=remedy)

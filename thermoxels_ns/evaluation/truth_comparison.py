@@ -255,12 +255,10 @@ def points_seen(known: KnownTruth) -> FloatArray:
     points, normals = known.scene.surface_points(_SURFACE_POINTS, seed=0)
     seen = visible_surface_points(known.scene, known.training_poses, known.camera, points, normals, MIN_VIEWS)
     if not seen.any():
-        raise SceneError(
-            "training cameras",
-            expected=f"a part of the surface that at least {MIN_VIEWS} of them see",
-            got=f"none, with {len(known.training_poses)} training cameras",
-            remedy="Write the scene with more training views.",
-        )
+        expected = f"a part of the surface that at least {MIN_VIEWS} of them see"
+        got = f"none, with {len(known.training_poses)} training cameras"
+        remedy = "Write the scene with more training views."
+        raise SceneError("training cameras", expected=expected, got=got, remedy=remedy)
     return points[seen]
 
 

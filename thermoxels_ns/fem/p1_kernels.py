@@ -214,12 +214,9 @@ def _per_tet(name: str, value: float | npt.NDArray[np.float64], num_tets: int) -
     values = np.asarray(value, dtype=np.float64)
     bad = int(np.count_nonzero(~(np.isfinite(values) & (values > 0.0))))
     if bad or values.shape not in ((), (num_tets,)):
-        raise HeatError(
-            name,
-            expected=f"finite numbers above 0, one for all or shape ({num_tets},)",
-            got=f"shape {values.shape} with {bad} that are not",
-            remedy="Give one number per tetrahedron of the mesh.",
-        )
+        expected = f"finite numbers above 0, one for all or shape ({num_tets},)"
+        remedy = "Give one number per tetrahedron of the mesh."
+        raise HeatError(name, expected=expected, got=f"shape {values.shape} with {bad} that are not", remedy=remedy)
     return np.ascontiguousarray(values.reshape(-1))
 
 

@@ -172,10 +172,7 @@ class Bounded:
             return np.full(len(places), value, dtype=np.float64)
         values = self.bounds.check(value)
         if values.shape not in ((), (len(places),)):
-            raise HeatError(
-                f"function of {self.bounds.name}",
-                expected=f"one number, or one per place, shape ({len(places)},)",
-                got=values.shape,
-                remedy="Correct the function given to Varying.",
-            )
+            expected = f"one number, or one per place, shape ({len(places)},)"
+            remedy = "Correct the function given to Varying."
+            raise HeatError(f"function of {self.bounds.name}", expected=expected, got=values.shape, remedy=remedy)
         return np.broadcast_to(values, (len(places),)).copy()

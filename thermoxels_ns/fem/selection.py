@@ -119,11 +119,8 @@ def _matching(field: str, patterns: tuple[str, ...], names: tuple[str, ...]) -> 
     for pattern in patterns:
         matches = np.array([fnmatchcase(name, pattern) for name in names], dtype=bool)
         if not matches.any():
-            raise HeatError(
-                field,
-                expected=f"names or patterns of {', '.join(names)}",
-                got=repr(pattern),
-                remedy="Correct the name, or tag the mesh so that it has such a part.",
-            )
+            remedy = "Correct the name, or tag the mesh so that it has such a part."
+            got = repr(pattern)
+            raise HeatError(field, expected=f"names or patterns of {', '.join(names)}", got=got, remedy=remedy)
         chosen |= matches
     return chosen

@@ -49,12 +49,9 @@ class MeshOptions:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.min_observed_weight) and self.min_observed_weight >= 0.0):
-            raise MeshError(
-                "min_observed_weight",
-                expected="a finite number of at least 0",
-                got=self.min_observed_weight,
-                remedy=f"Leave it out to use {MIN_OBSERVED_WEIGHT}.",
-            )
+            remedy = f"Leave it out to use {MIN_OBSERVED_WEIGHT}."
+            got = self.min_observed_weight
+            raise MeshError("min_observed_weight", expected="a finite number of at least 0", got=got, remedy=remedy)
         check_coarsest("coarsest_cell", self.coarsest_cell, "Pass --coarsest-cell 4.")
         if self.boundary not in ("conforming", "voxel"):
             raise MeshError("boundary", expected="conforming or voxel", got=self.boundary, remedy="Pass one of them.")

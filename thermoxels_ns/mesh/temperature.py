@@ -150,12 +150,10 @@ def _parts_with_measurement(links: sparse.csr_array, observed: BoolArray) -> Int
     if len(blind):
         sizes, first = np.bincount(parts, minlength=count), np.unique(parts, return_index=True)[1]
         shown = ", ".join(f"part {p} ({sizes[p]} nodes, the first is node {first[p]})" for p in blind[:3])
-        raise MeshError(
-            "observed temperatures",
-            expected="at least one node seen by a thermal ray in each connected part of the mesh",
-            got=f"none in {len(blind)} of {count} parts: {shown}{', ...' if len(blind) > 3 else ''}",
-            remedy="Train with thermal images that show this part.",
-        )
+        expected = "at least one node seen by a thermal ray in each connected part of the mesh"
+        got = f"none in {len(blind)} of {count} parts: {shown}{', ...' if len(blind) > 3 else ''}"
+        remedy = "Train with thermal images that show this part."
+        raise MeshError("observed temperatures", expected=expected, got=got, remedy=remedy)
     return parts.astype(np.int64)
 
 
@@ -194,10 +192,8 @@ def _solve(matrix: sparse.csr_array, load: npt.NDArray, degree: npt.NDArray) -> 
     residual = float(np.linalg.norm(load - matrix @ solution))
     scale = float(np.linalg.norm(load)) or 1.0
     if not residual <= _RELATIVE_RESIDUAL * scale:
-        raise MeshError(
-            "harmonic extension of the temperature",
-            expected=f"a relative residual of at most {_RELATIVE_RESIDUAL:g}",
-            got=f"{residual / scale:.3g} with {len(load)} unobserved nodes",
-            remedy="Train at a lower resolution, or with thermal images that show more of the scene.",
-        )
+        expected = f"a relative residual of at most {_RELATIVE_RESIDUAL:g}"
+        got = f"{residual / scale:.3g} with {len(load)} unobserved nodes"
+        remedy = "Train at a lower resolution, or with thermal images that show more of the scene."
+        raise MeshError("harmonic extension of the temperature", expected=expected, got=got, remedy=remedy)
     return solution

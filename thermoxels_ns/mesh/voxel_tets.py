@@ -128,12 +128,10 @@ def boundary_tags(facets: IntArray, points_index: npt.NDArray, lattice_shape: tu
 def _as_cells(cells: npt.NDArray) -> BoolArray:
     cells = np.asarray(cells)
     if cells.ndim != 3 or cells.dtype != np.bool_ or not cells.any():
-        raise MeshError(
-            "solid voxels",
-            expected="a three-dimensional boolean array with at least one True",
-            got=f"{cells.dtype} array of shape {cells.shape} with {np.count_nonzero(cells)} solid voxels",
-            remedy="Lower the density threshold or percentile so that some voxels are solid.",
-        )
+        expected = "a three-dimensional boolean array with at least one True"
+        got = f"{cells.dtype} array of shape {cells.shape} with {np.count_nonzero(cells)} solid voxels"
+        remedy = "Lower the density threshold or percentile so that some voxels are solid."
+        raise MeshError("solid voxels", expected=expected, got=got, remedy=remedy)
     return cells
 
 

@@ -97,19 +97,14 @@ class RadiometryOptions(ConditionOverrides):
     def __post_init__(self) -> None:
         super().__post_init__()
         if (self.celsius_per_count is None) != (self.celsius_offset is None):
-            raise ThermalFileError(
-                "celsius_per_count and celsius_offset",
-                expected="both or neither",
-                got=f"{self.celsius_per_count} and {self.celsius_offset}",
-                remedy="Pass --celsius-per-count 0.04 --celsius-offset -273.15, for example.",
-            )
+            expected = "both or neither"
+            got = f"{self.celsius_per_count} and {self.celsius_offset}"
+            remedy = "Pass --celsius-per-count 0.04 --celsius-offset -273.15, for example."
+            raise ThermalFileError("celsius_per_count and celsius_offset", expected=expected, got=got, remedy=remedy)
         if self.celsius_per_count is not None and self.camera is not None:
-            raise ThermalFileError(
-                "camera",
-                expected="a preset or a scale of your own",
-                got=f"the preset {self.camera} and {self.celsius_per_count} K per count",
-                remedy="Leave --camera or --celsius-per-count and --celsius-offset out.",
-            )
+            remedy = "Leave --camera or --celsius-per-count and --celsius-offset out."
+            got = f"the preset {self.camera} and {self.celsius_per_count} K per count"
+            raise ThermalFileError("camera", expected="a preset or a scale of your own", got=got, remedy=remedy)
         _ = self.given_unit  # a scale of 0 raises here and not at the first file
 
     @property
@@ -146,12 +141,9 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
             return _read_dji(path, options)
         return _read_stored(path, found, options)
     except OSError as problem:
-        raise ThermalFileError(
-            str(path),
-            expected="a file that can be read",
-            got=problem.strerror or str(problem),
-            remedy="Check its permissions, or copy it again.",
-        ) from problem
+        remedy = "Check its permissions, or copy it again."
+        got = problem.strerror or str(problem)
+        raise ThermalFileError(str(path), expected="a file that can be read", got=got, remedy=remedy) from problem
 
 
 def detect_format(path: Path) -> ThermogramFormat:
@@ -177,12 +169,10 @@ def detect_format(path: Path) -> ThermogramFormat:
         return "NPY"
     if looks_like_csv(head):
         return "CSV"
-    raise ThermalFileError(
-        str(path),
-        expected="a FLIR or DJI R-JPEG, a TIFF, a 16-bit PNG, or a table of degrees C (.npy, .csv)",
-        got=f"none of them: it starts with {head[:8]!r}",
-        remedy="Export it from the camera's program in one of these formats.",
-    )
+    expected = "a FLIR or DJI R-JPEG, a TIFF, a 16-bit PNG, or a table of degrees C (.npy, .csv)"
+    got = f"none of them: it starts with {head[:8]!r}"
+    remedy = "Export it from the camera's program in one of these formats."
+    raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
 
 
 def _jpeg_format(path: Path) -> ThermogramFormat:
@@ -193,12 +183,10 @@ def _jpeg_format(path: Path) -> ThermogramFormat:
         return "DJI R-JPEG"
     with errors_name(path, "a whole radiometric JPEG", "Copy the file from the camera again.", ThermalFileError):
         check_jpeg(content)
-    raise ThermalFileError(
-        str(path),
-        expected="a radiometric JPEG: counts and calibration beside the picture",
-        got="a plain JPEG: a photograph, or a false-colour picture, whose palette cannot be turned back",
-        remedy="Use the file as the camera wrote it; editing, messengers and cloud albums drop the thermal part.",
-    )
+    expected = "a radiometric JPEG: counts and calibration beside the picture"
+    got = "a plain JPEG: a photograph, or a false-colour picture, whose palette cannot be turned back"
+    remedy = "Use the file as the camera wrote it; editing, messengers and cloud albums drop the thermal part."
+    raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
 
 
 def _read_flir(path: Path, options: RadiometryOptions) -> Thermogram:

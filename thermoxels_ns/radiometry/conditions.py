@@ -48,12 +48,9 @@ class Conditions:
                 low, high = (_COLDEST_AIR_C, _HOTTEST_AIR_C) if name == "air_c" else (-ZERO_CELSIUS_K, 5000.0)
                 check_between(name, value, low, high, f"from {low:g} to {high:g} degrees C")
             elif needed:
-                raise ThermoxelsError(
-                    name,
-                    expected=f"a temperature, because {why} needs one",
-                    got="none",
-                    remedy=f"Pass --{name.replace('_', '-')} in degrees C; indoors the room's is a good guess.",
-                )
+                remedy = f"Pass --{name.replace('_', '-')} in degrees C; indoors the room's is a good guess."
+                got = "none"
+                raise ThermoxelsError(name, expected=f"a temperature, because {why} needs one", got=got, remedy=remedy)
 
 
 @dataclass(frozen=True)

@@ -70,12 +70,10 @@ def check_thermal_size(path: Path | str, width: int, height: int) -> None:
         ThermalFileError: A side is zero or longer than `LARGEST_SIDE`.
     """
     if not (0 < width <= LARGEST_SIDE and 0 < height <= LARGEST_SIDE):
-        raise ThermalFileError(
-            str(path),
-            expected=f"a thermal image of 1 to {LARGEST_SIDE} pixels a side",
-            got=f"a header that says {width} x {height}",
-            remedy="The header is damaged or this is no camera file; copy it again, or cut a mosaic into parts.",
-        )
+        expected = f"a thermal image of 1 to {LARGEST_SIDE} pixels a side"
+        got = f"a header that says {width} x {height}"
+        remedy = "The header is damaged or this is no camera file; copy it again, or cut a mosaic into parts."
+        raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
 
 
 def check_file_size(path: Path) -> None:
@@ -86,16 +84,9 @@ def check_file_size(path: Path) -> None:
     """
     size = path.stat().st_size
     if size == 0:
-        raise ThermalFileError(
-            str(path),
-            expected="a camera file",
-            got="a file of zero bytes",
-            remedy="Copy it from the camera again, or remove it.",
-        )
+        remedy = "Copy it from the camera again, or remove it."
+        raise ThermalFileError(str(path), expected="a camera file", got="a file of zero bytes", remedy=remedy)
     if size > LARGEST_FILE_BYTES:
-        raise ThermalFileError(
-            str(path),
-            expected=f"a thermal image of at most {LARGEST_FILE_BYTES} bytes",
-            got=f"{size} bytes",
-            remedy="Write one file per image; read videos frame by frame.",
-        )
+        expected = f"a thermal image of at most {LARGEST_FILE_BYTES} bytes"
+        remedy = "Write one file per image; read videos frame by frame."
+        raise ThermalFileError(str(path), expected=expected, got=f"{size} bytes", remedy=remedy)

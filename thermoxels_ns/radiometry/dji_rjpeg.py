@@ -101,12 +101,9 @@ def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrid
     with errors_name(path, whole, "Copy the file from the drone again.", ThermalFileError):
         check_jpeg(content)  # before a library in another language takes it
     if library is None:
-        raise ThermalFileError(
-            str(path),
-            expected="DJI's library libdirp, the only one that turns the counts of a DJI R-JPEG into degrees",
-            got="no library",
-            remedy=f"Download {_SDK} and pass --dji-library with the path of libdirp.so (libdirp.dll on Windows).",
-        )
+        expected = "DJI's library libdirp, the only one that turns the counts of a DJI R-JPEG into degrees"
+        remedy = f"Download {_SDK} and pass --dji-library with the path of libdirp.so (libdirp.dll on Windows)."
+        raise ThermalFileError(str(path), expected=expected, got="no library", remedy=remedy)
     dirp = _load(library)
     data = (ctypes.c_uint8 * len(content)).from_buffer_copy(content)
     handle = ctypes.c_void_p()
@@ -114,12 +111,10 @@ def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrid
     def call(function: str, *arguments: Any) -> None:
         status = getattr(dirp, function)(*arguments)
         if status != 0:
-            raise ThermalFileError(
-                str(path),
-                expected=f"{function} of {library.name} to take the file",
-                got=f"status {status} ({_STATUS.get(status, 'unknown')})",
-                remedy=f"Copy the file from the drone again, unedited; use a newer library. {_LIMITS}",
-            )
+            expected = f"{function} of {library.name} to take the file"
+            got = f"status {status} ({_STATUS.get(status, 'unknown')})"
+            remedy = f"Copy the file from the drone again, unedited; use a newer library. {_LIMITS}"
+            raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
 
     call("dirp_create_from_rjpeg", data, ctypes.c_int32(len(content)), ctypes.byref(handle))
     try:
@@ -145,21 +140,15 @@ def _measure(path: Path, call: Callable[..., None], handle: ctypes.c_void_p, ove
             air_c=parameters.air_c if knows_air else parameters.reflected_c,
         )
     except ThermoxelsError as problem:
-        raise ThermalFileError(
-            str(path),
-            expected="possible measurement parameters",
-            got=str(problem),
-            remedy="Copy the file from the drone again, unedited.",
-        ) from problem
+        expected = "possible measurement parameters"
+        remedy = "Copy the file from the drone again, unedited."
+        raise ThermalFileError(str(path), expected=expected, got=str(problem), remedy=remedy) from problem
     after = before
     if overrides.given():
         if overrides.air_c is not None and not knows_air:
-            raise ThermalFileError(
-                "air_c",
-                expected="a libdirp that knows the air temperature",
-                got="one that takes the reflected temperature for it",
-                remedy="Use a newer DJI Thermal SDK, or leave --air-c out.",
-            )
+            remedy = "Use a newer DJI Thermal SDK, or leave --air-c out."
+            got = "one that takes the reflected temperature for it"
+            raise ThermalFileError("air_c", expected="a libdirp that knows the air temperature", got=got, remedy=remedy)
         after = overrides.applied_to(before)
         if not knows_air:
             after = replace(after, air_c=after.reflected_c)
@@ -189,9 +178,6 @@ def _load(library: Path) -> ctypes.CDLL:
             wrong = f"a file that cannot be loaded ({problem})"
         except AttributeError as problem:
             wrong = f"another library ({problem})"
-    raise ThermalFileError(
-        "dji_library",
-        expected=f"DJI's libdirp for this computer at {library}",
-        got=wrong,
-        remedy=f"Pass --dji-library with the path of the file in {_SDK}, and leave the libraries beside it.",
-    )
+    expected = f"DJI's libdirp for this computer at {library}"
+    remedy = f"Pass --dji-library with the path of the file in {_SDK}, and leave the libraries beside it."
+    raise ThermalFileError("dji_library", expected=expected, got=wrong, remedy=remedy)

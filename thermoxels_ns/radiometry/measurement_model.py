@@ -60,12 +60,8 @@ class PlanckConstants:
                 f"Planck constant {name.upper()}", getattr(self, name), "Use the constants of the camera file."
             )
         if not math.isfinite(self.o):
-            raise ThermoxelsError(
-                "Planck constant O",
-                expected="a finite number",
-                got=self.o,
-                remedy="Use the constants of the camera file.",
-            )
+            remedy = "Use the constants of the camera file."
+            raise ThermoxelsError("Planck constant O", expected="a finite number", got=self.o, remedy=remedy)
 
     def signal(self, temperature_k: npt.ArrayLike) -> Floats:
         """Counts of a black body, S = R1 / (R2 (exp(B / T) - F)) - O, any shape, float64.
@@ -222,12 +218,10 @@ class RadiometricModel:
                 background += share * float(self.sensor.signal(_kelvin(celsius)))
         weight = given.emissivity * tau * optics
         if not weight > 0:
-            raise ThermoxelsError(
-                "distance_m",
-                expected="a distance that some radiation passes",
-                got=f"{given.distance_m:g} m in air of {given.air_c} C and humidity {given.relative_humidity:g}",
-                remedy="Check --distance-m, --air-c and --relative-humidity.",
-            )
+            expected = "a distance that some radiation passes"
+            got = f"{given.distance_m:g} m in air of {given.air_c} C and humidity {given.relative_humidity:g}"
+            remedy = "Check --distance-m, --air-c and --relative-humidity."
+            raise ThermoxelsError("distance_m", expected=expected, got=got, remedy=remedy)
         return weight, background
 
 

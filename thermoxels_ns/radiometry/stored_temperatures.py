@@ -101,23 +101,18 @@ def read_count_image(
         check_thermal_size(path, *image.size)
         mode, depth, exif = image.mode, _depth(image), read_exif_facts(image)
     if mode != "F" and mode not in _COUNT_MODES:
-        raise ThermalFileError(
-            str(path),
-            expected="one channel of 16-bit counts or of floats, [degrees C]",
-            got=f"{depth}: a picture for the eye, whose shades are no temperatures",
-            remedy="Export the radiometric TIFF from the camera or its program.",
-        )
+        expected = "one channel of 16-bit counts or of floats, [degrees C]"
+        got = f"{depth}: a picture for the eye, whose shades are no temperatures"
+        remedy = "Export the radiometric TIFF from the camera or its program."
+        raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
     if mode == "F" and unit is None and camera is None:
         unit = ThermalUnit.celsius()
     if unit is None:
         camera = camera or recognised_camera(exif.make, exif.model)
         if camera is None:
-            raise ThermalFileError(
-                str(path),
-                expected="counts with a known unit",
-                got=f"counts of {exif.camera or 'an unnamed camera'}, which may mean several things",
-                remedy=f"Pass --camera with one of {known_cameras()}; or --celsius-per-count and --celsius-offset.",
-            )
+            remedy = f"Pass --camera with one of {known_cameras()}; or --celsius-per-count and --celsius-offset."
+            got = f"counts of {exif.camera or 'an unnamed camera'}, which may mean several things"
+            raise ThermalFileError(str(path), expected="counts with a known unit", got=got, remedy=remedy)
         unit = COUNT_SCALES[camera].unit
     return CountImage(
         image=read_thermal_file(path, unit, valid_range_c, suffix),
@@ -156,10 +151,7 @@ def read_npy(path: Path, unit: ThermalUnit | None, valid_range_c: tuple[float, f
     except Exception:  # the reader below says what is wrong with it
         kind = "f"
     if kind in "ui" and unit is None:
-        raise ThermalFileError(
-            str(path),
-            expected="an array of degrees C (float32 or float64), or whole numbers with a known unit",
-            got="whole numbers and no unit",
-            remedy="Pass --camera, or --celsius-per-count and --celsius-offset.",
-        )
+        expected = "an array of degrees C (float32 or float64), or whole numbers with a known unit"
+        remedy = "Pass --camera, or --celsius-per-count and --celsius-offset."
+        raise ThermalFileError(str(path), expected=expected, got="whole numbers and no unit", remedy=remedy)
     return read_thermal_file(path, unit or ThermalUnit.celsius(), valid_range_c, suffix=".npy")

@@ -46,12 +46,10 @@ class ThermalUnit:
     def __post_init__(self) -> None:
         wrong_scale = not np.isfinite(self.scale) or (self.kind == "linear" and self.scale == 0)
         if wrong_scale or not np.isfinite(self.offset_c):
-            raise ThermalFileError(
-                "thermal unit",
-                expected="a finite offset and a finite scale (not zero for counts)",
-                got=f"scale {self.scale}, offset {self.offset_c} C",
-                remedy=_UNIT_REMEDY,
-            )
+            expected = "a finite offset and a finite scale (not zero for counts)"
+            got = f"scale {self.scale}, offset {self.offset_c} C"
+            remedy = _UNIT_REMEDY
+            raise ThermalFileError("thermal unit", expected=expected, got=got, remedy=remedy)
 
     @classmethod
     def bounds(cls, min_c: float, max_c: float) -> ThermalUnit:
@@ -136,12 +134,9 @@ def read_thermal_file(
     with errors_name(path, _EXPECTED, _REMEDY, ThermalFileError):
         raw = _read_raw(path, suffix)
     if raw.values.ndim != 2 or 0 in raw.values.shape:
-        raise ThermalFileError(
-            str(path),
-            expected="one temperature per pixel, shape (height, width)",
-            got=f"shape {raw.values.shape}",
-            remedy="Export a single-channel thermal image.",
-        )
+        expected = "one temperature per pixel, shape (height, width)"
+        remedy = "Export a single-channel thermal image."
+        raise ThermalFileError(str(path), expected=expected, got=f"shape {raw.values.shape}", remedy=remedy)
     return _to_celsius(path, suffix, raw, unit, valid_range_c)
 
 
@@ -161,12 +156,10 @@ def _to_celsius(
     elif unit.kind == "bounds" and values.dtype in (np.uint8, np.uint16):
         celsius = values.astype(np.float64) / np.iinfo(values.dtype).max * unit.scale + unit.offset_c
     else:
-        raise ThermalFileError(
-            str(path),
-            expected="counts with a known unit (bounds need unsigned 8 or 16 bit)",
-            got=f"{values.dtype} counts and the unit '{unit.kind}'",
-            remedy=_UNIT_REMEDY,
-        )
+        expected = "counts with a known unit (bounds need unsigned 8 or 16 bit)"
+        got = f"{values.dtype} counts and the unit '{unit.kind}'"
+        remedy = _UNIT_REMEDY
+        raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
     if raw.no_data is not None:
         celsius[raw.no_data] = np.nan
     saturated &= np.isfinite(celsius)
@@ -192,12 +185,8 @@ def masked_image(
 
 def _read_raw(path: Path, suffix: str) -> _RawPixels:
     if not path.is_file():
-        raise ThermalFileError(
-            "thermal file",
-            expected=f"a file at {path}",
-            got="nothing there",
-            remedy="Restore the file, or remove the frame or pass --missing-thermal skip.",
-        )
+        remedy = "Restore the file, or remove the frame or pass --missing-thermal skip."
+        raise ThermalFileError("thermal file", expected=f"a file at {path}", got="nothing there", remedy=remedy)
     if path.stat().st_size == 0:
         raise _damaged(path, "a file of zero bytes")
     if suffix == ".npy":
@@ -214,12 +203,9 @@ def _read_raw(path: Path, suffix: str) -> _RawPixels:
         if is_flir_jpeg(path):
             return _RawPixels(read_flir_jpeg(path).temperature_c(), celsius=True)
         return _read_image(path)
-    raise ThermalFileError(
-        str(path),
-        expected="a thermal file of type " + ", ".join(THERMAL_SUFFIXES),
-        got=f"suffix '{suffix}'",
-        remedy="Convert the file to one of these.",
-    )
+    expected = "a thermal file of type " + ", ".join(THERMAL_SUFFIXES)
+    remedy = "Convert the file to one of these."
+    raise ThermalFileError(str(path), expected=expected, got=f"suffix '{suffix}'", remedy=remedy)
 
 
 def _read_csv(path: Path) -> npt.NDArray[np.float64]:
@@ -247,12 +233,9 @@ def _check_table_size(path: Path) -> None:
         while line := stream.readline(_LONGEST_LINE):
             width, height = max(width, 1 + max(line.count(","), line.count(";"))), height + 1
             if len(line) == _LONGEST_LINE:
-                raise ThermalFileError(
-                    str(path),
-                    expected=f"a table with lines below {_LONGEST_LINE} characters",
-                    got=f"a longer one, line {height}",
-                    remedy="The file is damaged or no table; write one row of the image per line.",
-                )
+                expected = f"a table with lines below {_LONGEST_LINE} characters"
+                remedy = "The file is damaged or no table; write one row of the image per line."
+                raise ThermalFileError(str(path), expected=expected, got=f"a longer one, line {height}", remedy=remedy)
             check_thermal_size(path, width, height)
 
 
@@ -264,12 +247,9 @@ def _read_image(path: Path) -> _RawPixels:
     with Image.open(path) as image:
         check_thermal_size(path, *image.size)
         if getattr(image, "n_frames", 1) != 1:
-            raise ThermalFileError(
-                str(path),
-                expected="one image",
-                got=f"{getattr(image, 'n_frames', 1)} pages",
-                remedy="Save the page that holds the temperatures as a file of its own.",
-            )
+            remedy = "Save the page that holds the temperatures as a file of its own."
+            got = f"{getattr(image, 'n_frames', 1)} pages"
+            raise ThermalFileError(str(path), expected="one image", got=got, remedy=remedy)
         image.load()  # raises on truncated data
         bits = _integer_type(path, image)
         if image.mode == "P":
@@ -287,12 +267,9 @@ def _read_image(path: Path) -> _RawPixels:
         return _RawPixels(pixels if pixels.dtype == bits else pixels.astype(bits))
     if mode in ("RGB", "RGBA", "LA"):
         return _one_channel(path, pixels, has_alpha=pixels.ndim == 3 and pixels.shape[-1] in (2, 4))
-    raise ThermalFileError(
-        str(path),
-        expected="a grey or floating-point image",
-        got=f"image mode {mode}",
-        remedy="Export the thermal image as 16-bit grey PNG or TIFF.",
-    )
+    remedy = "Export the thermal image as 16-bit grey PNG or TIFF."
+    got = f"image mode {mode}"
+    raise ThermalFileError(str(path), expected="a grey or floating-point image", got=got, remedy=remedy)
 
 
 def _integer_type(path: Path, image: Image.Image) -> npt.DTypeLike:
@@ -317,12 +294,9 @@ def _one_channel(path: Path, pixels: npt.NDArray[Any], has_alpha: bool) -> _RawP
         return _RawPixels(pixels)
     colours = pixels[..., :-1] if has_alpha else pixels
     if not (colours == colours[..., :1]).all():
-        raise ThermalFileError(
-            str(path),
-            expected="a grey image (all channels equal)",
-            got="a false-colour picture: its palette cannot be turned back into temperatures",
-            remedy="Export the radiometric data (16-bit PNG or TIFF, .npy, .csv) or a grey palette.",
-        )
+        remedy = "Export the radiometric data (16-bit PNG or TIFF, .npy, .csv) or a grey palette."
+        got = "a false-colour picture: its palette cannot be turned back into temperatures"
+        raise ThermalFileError(str(path), expected="a grey image (all channels equal)", got=got, remedy=remedy)
     no_data = pixels[..., -1] == 0 if has_alpha else None
     return _RawPixels(np.ascontiguousarray(colours[..., 0]), no_data)
 

@@ -119,12 +119,9 @@ def ray_weights(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "ray
         ThermoxelsError: A density is NaN.
     """
     if torch.isnan(density).any():
-        raise ThermoxelsError(
-            "density",
-            expected="numbers >= 0",
-            got=f"{int(torch.isnan(density).sum())} NaN",
-            remedy="Lower the density learning rate and resume from the last checkpoint.",
-        )
+        remedy = "Lower the density learning rate and resume from the last checkpoint."
+        got = f"{int(torch.isnan(density).sum())} NaN"
+        raise ThermoxelsError("density", expected="numbers >= 0", got=got, remedy=remedy)
     optical_depth = torch.where(
         deltas > 0, (density * deltas).clamp(min=0.0, max=OPAQUE_OPTICAL_DEPTH), torch.zeros_like(deltas)
     )

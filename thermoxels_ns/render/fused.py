@@ -134,12 +134,8 @@ def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple
         del records, work  # what was too small is given back before more is taken
         BUFFERS.release()
     if sum(wrong):
-        raise ThermoxelsError(
-            "density",
-            expected="numbers >= 0",
-            got=f"NaN in {sum(wrong)} places",
-            remedy="Lower the density learning rate and resume from the last checkpoint.",
-        )
+        remedy = "Lower the density learning rate and resume from the last checkpoint."
+        raise ThermoxelsError("density", expected="numbers >= 0", got=f"NaN in {sum(wrong)} places", remedy=remedy)
     return records, [(begin, end) for begin, _, end in found]
 
 

@@ -34,12 +34,9 @@ def choose_backend(backend: Backend, device: torch.device) -> Literal["reference
         ThermoxelsError: The compiled kernels are asked for on another device than the CPU.
     """
     if backend == "fused" and device.type != "cpu":
-        raise ThermoxelsError(
-            "backend",
-            expected=f"auto or reference on {device.type}",
-            got="fused, whose kernels run on the CPU",
-            remedy="Pass --pipeline.model.backend auto, or --machine.device-type cpu.",
-        )
+        remedy = "Pass --pipeline.model.backend auto, or --machine.device-type cpu."
+        got = "fused, whose kernels run on the CPU"
+        raise ThermoxelsError("backend", expected=f"auto or reference on {device.type}", got=got, remedy=remedy)
     if backend == "auto":
         return "fused" if device.type == "cpu" else "reference"
     return backend

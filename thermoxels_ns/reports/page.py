@@ -122,12 +122,9 @@ def image_address(image: bytes, words: str) -> str:
     """
     kind = next((kind for signature, kind in _SIGNATURES.items() if image.startswith(signature)), None)
     if kind is None:
-        raise ThermoxelsError(
-            words,
-            expected="the content of a PNG or JPEG file",
-            got=f"{len(image)} bytes that begin with {image[:8]!r}",
-            remedy="Draw the picture again.",
-        )
+        remedy = "Draw the picture again."
+        got = f"{len(image)} bytes that begin with {image[:8]!r}"
+        raise ThermoxelsError(words, expected="the content of a PNG or JPEG file", got=got, remedy=remedy)
     return f"data:{kind};base64,{base64.b64encode(image).decode()}"
 
 

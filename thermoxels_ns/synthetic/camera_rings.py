@@ -20,12 +20,9 @@ def look_at(position: npt.ArrayLike, target: npt.ArrayLike) -> FloatArray:
     back = position - np.asarray(target, dtype=np.float64)
     right = np.cross((0.0, 0.0, 1.0), back)
     if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(back):
-        raise SceneError(
-            "camera",
-            expected="a view direction that is not vertical",
-            got=f"position {position.tolist()}, target {np.asarray(target).tolist()}",
-            remedy="Move the camera to the side.",
-        )
+        remedy = "Move the camera to the side."
+        got = f"position {position.tolist()}, target {np.asarray(target).tolist()}"
+        raise SceneError("camera", expected="a view direction that is not vertical", got=got, remedy=remedy)
     right /= np.linalg.norm(right)
     back /= np.linalg.norm(back)
     pose = np.eye(4)
@@ -64,12 +61,9 @@ def ring_poses(rings: Sequence[CameraRing], num_train: int, num_eval: int) -> tu
     evenly. Poses have shapes (num_train, 4, 4) and (num_eval, 4, 4).
     """
     if num_train < 1 or num_eval < 0:
-        raise SceneError(
-            "number of views",
-            expected="at least 1 for training and at least 0 for evaluation",
-            got=f"{num_train} and {num_eval}",
-            remedy="Raise num_train or num_eval.",
-        )
+        expected = "at least 1 for training and at least 0 for evaluation"
+        remedy = "Raise num_train or num_eval."
+        raise SceneError("number of views", expected=expected, got=f"{num_train} and {num_eval}", remedy=remedy)
     used = rings[: min(len(rings), num_train)]
     train, held_out = [np.eye(4)] * num_train, [np.eye(4)] * num_eval
     for number, ring in enumerate(used):

@@ -171,12 +171,9 @@ def check_scene_name(name: str) -> str:
     'random-17'
     """
     if name not in _BUILDERS and random_seed(name) is None:
-        raise SceneError(
-            "synthetic scene",
-            expected=f"{RANDOM_NAME} with a whole number N from 0 on, or one of {', '.join(_BUILDERS)}",
-            got=repr(name),
-            remedy="Choose one of these names, or a seed as in random-17.",
-        )
+        expected = f"{RANDOM_NAME} with a whole number N from 0 on, or one of {', '.join(_BUILDERS)}"
+        remedy = "Choose one of these names, or a seed as in random-17."
+        raise SceneError("synthetic scene", expected=expected, got=repr(name), remedy=remedy)
     return name
 
 

@@ -110,10 +110,8 @@ def _look(
 def _position_outside(scene: SyntheticScene, pose: FloatArray) -> FloatArray:
     origin = pose[:3, 3]
     if float(scene.signed_distance(origin[None])[0]) < 0.0:
-        raise SceneError(
-            "camera position",
-            expected=f"a point outside the solid of scene {scene.name}",
-            got=f"{origin.tolist()}, which is inside it",
-            remedy="Move the camera out of the solid.",
-        )
+        expected = f"a point outside the solid of scene {scene.name}"
+        got = f"{origin.tolist()}, which is inside it"
+        remedy = "Move the camera out of the solid."
+        raise SceneError("camera position", expected=expected, got=got, remedy=remedy)
     return origin

@@ -153,12 +153,9 @@ def load_truth(scene_folder: Path | str) -> SyntheticScene | None:
     if truth is None:
         return None
     if not (isinstance(truth, dict) and isinstance(truth.get("synthetic_scene"), str)):
-        raise SceneError(
-            "transforms.json: truth",
-            expected='an object with the text "synthetic_scene"',
-            got=json.dumps(truth),
-            remedy="Write the scene again, or remove the key for real photographs.",
-        )
+        expected = 'an object with the text "synthetic_scene"'
+        remedy = "Write the scene again, or remove the key for real photographs."
+        raise SceneError("transforms.json: truth", expected=expected, got=json.dumps(truth), remedy=remedy)
     return make_scene(truth["synthetic_scene"])
 
 
@@ -172,23 +169,18 @@ def _thermal_size(width: int, height: int, thermal_width: int | None, own_camera
         return chosen, max(round(chosen * _THERMAL_ASPECT), 1)
     chosen = thermal_width or width
     if height * chosen % width:
-        raise SceneError(
-            "thermal_width",
-            expected=f"a width that keeps the aspect {width}:{height} in whole pixels",
-            got=f"{chosen}, for a height of {height * chosen / width:.2f}",
-            remedy=f"Pass a divisor of {width} such as {width // 2}, or give the thermal images their own camera.",
-        )
+        expected = f"a width that keeps the aspect {width}:{height} in whole pixels"
+        got = f"{chosen}, for a height of {height * chosen / width:.2f}"
+        remedy = f"Pass a divisor of {width} such as {width // 2}, or give the thermal images their own camera."
+        raise SceneError("thermal_width", expected=expected, got=got, remedy=remedy)
     return chosen, height * chosen // width
 
 
 def _check_options(thermal_format: str, noise_k: float, drift_k: float) -> None:
     if thermal_format not in get_args(ThermalFormat):
-        raise SceneError(
-            "thermal_format",
-            expected=f"one of {', '.join(get_args(ThermalFormat))}",
-            got=repr(thermal_format),
-            remedy="Choose one of these formats.",
-        )
+        expected = f"one of {', '.join(get_args(ThermalFormat))}"
+        remedy = "Choose one of these formats."
+        raise SceneError("thermal_format", expected=expected, got=repr(thermal_format), remedy=remedy)
     for name, value in (("noise_k", noise_k), ("drift_k", drift_k)):
         if not (np.isfinite(value) and value >= 0.0):
             raise SceneError(name, expected="a finite number of at least 0", got=value, remedy="Pass 0.")
@@ -204,12 +196,10 @@ def _prepared_folder(folder: Path | str) -> Path:
     if old.exists():
         content = _read_transforms(old)
         if content.get("truth") is None:
-            raise SceneError(
-                "output folder",
-                expected="an empty folder or one with an earlier synthetic scene",
-                got=f"{target}, whose transforms.json describes other photographs",
-                remedy="Choose another folder.",
-            )
+            expected = "an empty folder or one with an earlier synthetic scene"
+            got = f"{target}, whose transforms.json describes other photographs"
+            remedy = "Choose another folder."
+            raise SceneError("output folder", expected=expected, got=got, remedy=remedy)
         for path in _listed_files(target, content):
             remove_file(path)
         remove_file(old)

@@ -29,12 +29,10 @@ class SolidUnion:
     def __post_init__(self) -> None:
         for (i, first), (j, second) in combinations(enumerate(self.parts), 2):
             if _overlap(first, second):
-                raise SceneError(
-                    f"parts {i} and {j}",
-                    expected="solids that do not overlap and share no face",
-                    got=f"{type(first).__name__} {first.bounds} and {type(second).__name__} {second.bounds}",
-                    remedy="Move one of them, or join boxes in one BoxSolid.",
-                )
+                expected = "solids that do not overlap and share no face"
+                got = f"{type(first).__name__} {first.bounds} and {type(second).__name__} {second.bounds}"
+                remedy = "Move one of them, or join boxes in one BoxSolid."
+                raise SceneError(f"parts {i} and {j}", expected=expected, got=got, remedy=remedy)
 
     @property
     def bounds(self) -> Box:

@@ -175,12 +175,9 @@ def prune_by_rays(
         if opened <= MOST_OPENED_RAYS:
             total = math.prod(voxels.lattice.cell_shape)
             return PruningReport(int(keep.sum()), total, threshold, opened), prune(model.grid, keep)
-    raise PruningError(
-        "pruning",
-        expected=f"to open at most {MOST_OPENED_RAYS:.0%} of the rays that end on something",
-        got=f"{opened:.1%} at threshold {threshold:.2g}",
-        remedy="Lower --pipeline.model.prune-threshold, or prune later when surfaces have formed.",
-    )
+    expected = f"to open at most {MOST_OPENED_RAYS:.0%} of the rays that end on something"
+    remedy = "Lower --pipeline.model.prune-threshold, or prune later when surfaces have formed."
+    raise PruningError("pruning", expected=expected, got=f"{opened:.1%} at threshold {threshold:.2g}", remedy=remedy)
 
 
 @torch.no_grad()

@@ -50,12 +50,8 @@ class ThermoxelsModel(Model):
         self.loss_weights = config.loss_weights()
         temperature_range = (self.kwargs.get("metadata") or {}).get("temperature_range")
         if not isinstance(temperature_range, TemperatureRange):
-            raise SceneError(
-                "scene",
-                expected="thermal images with a temperature range",
-                got="none",
-                remedy="Use the dataparser thermal-data.",
-            )
+            remedy = "Use the dataparser thermal-data."
+            raise SceneError("scene", expected="thermal images with a temperature range", got="none", remedy=remedy)
         self.register_buffer(
             "temperature_bounds_c",
             torch.tensor([temperature_range.min_c, temperature_range.max_c], dtype=torch.float64),

@@ -196,12 +196,10 @@ class ThermoxelsModelConfig(ModelConfig):
         increasing = all(b % a == 0 and b > a for a, b in pairs) and sorted(set(self.refine_at)) == list(self.refine_at)
         increasing = increasing and min((1, *self.refine_at)) == 1
         if not self.resolutions or len(self.refine_at) != len(pairs) or not increasing:
-            raise ThermoxelsError(
-                "resolutions and refine_at",
-                expected="resolutions that are multiples of each other and one ascending step fewer",
-                got=f"{self.resolutions} at steps {self.refine_at}",
-                remedy="For example --pipeline.model.resolutions 32 64 128 --pipeline.model.refine-at 400 800.",
-            )
+            expected = "resolutions that are multiples of each other and one ascending step fewer"
+            got = f"{self.resolutions} at steps {self.refine_at}"
+            remedy = "For example --pipeline.model.resolutions 32 64 128 --pipeline.model.refine-at 400 800."
+            raise ThermoxelsError("resolutions and refine_at", expected=expected, got=got, remedy=remedy)
         return {step: b // a for step, (a, b) in zip(self.refine_at, pairs)}
 
     def first_sh_degree(self) -> int | None:

@@ -65,12 +65,10 @@ class ThermoxelsPipeline(VanillaPipeline):
             compile_kernels(CONSOLE.log)
         streams = getattr(config.datamanager, "streams", "both")
         if streams == "thermal" and (self.model.grid.sh is not None or not self.model.config.thermal_density_gradient):
-            raise SceneError(
-                "streams",
-                expected="thermal images alone only for a model without colour whose density they move",
-                got=f"thermal, with SH degree {self.model.config.sh_degree}",
-                remedy="Use the method plenoxels-t.",
-            )
+            expected = "thermal images alone only for a model without colour whose density they move"
+            got = f"thermal, with SH degree {self.model.config.sh_degree}"
+            remedy = "Use the method plenoxels-t."
+            raise SceneError("streams", expected=expected, got=got, remedy=remedy)
         datamanager: Any = self.datamanager
         outputs = datamanager.train_dataparser_outputs
         placed = torch.cat(
@@ -116,27 +114,18 @@ class ThermoxelsPipeline(VanillaPipeline):
         """Compare what must agree before anything is loaded."""
         differing = sorted(set(own) ^ set(state))
         if differing:
-            raise CheckpointError(
-                "checkpoint",
-                expected="the parts that the options build",
-                got=f"a difference in {', '.join(differing)}",
-                remedy="Use the same background, sky and per-image-offset options as in training.",
-            )
+            remedy = "Use the same background, sky and per-image-offset options as in training."
+            got = f"a difference in {', '.join(differing)}"
+            raise CheckpointError("checkpoint", expected="the parts that the options build", got=got, remedy=remedy)
         resolution = int(state[_GRID + "corner_shape"].max()) - 1
         if resolution not in self.model.config.resolutions:
-            raise CheckpointError(
-                "checkpoint",
-                expected=f"one of the resolutions {self.model.config.resolutions}",
-                got=f"{resolution} voxels",
-                remedy="Pass --pipeline.model.resolutions as in training; finer ones may follow.",
-            )
+            expected = f"one of the resolutions {self.model.config.resolutions}"
+            remedy = "Pass --pipeline.model.resolutions as in training; finer ones may follow."
+            raise CheckpointError("checkpoint", expected=expected, got=f"{resolution} voxels", remedy=remedy)
         if not torch.equal(own[_ACTIVATION].cpu(), state[_ACTIVATION].cpu()):
-            raise CheckpointError(
-                "density_activation",
-                expected="the checkpoint's",
-                got=self.model.config.density_activation,
-                remedy="Use the option as in training.",
-            )
+            remedy = "Use the option as in training."
+            got = self.model.config.density_activation
+            raise CheckpointError("density_activation", expected="the checkpoint's", got=got, remedy=remedy)
         for name, what, tolerance in (
             ("world_from_input", "poses and scene box", 1e-4),
             ("_model.temperature_bounds_c", "temperature range", 1e-3),
@@ -146,12 +135,9 @@ class ThermoxelsPipeline(VanillaPipeline):
                 continue
             here, stored = own[name].cpu().double(), state[name].cpu().double()
             if here.shape != stored.shape or not torch.allclose(here, stored, atol=tolerance, rtol=1e-4):
-                raise CheckpointError(
-                    what,
-                    expected="those the checkpoint was trained with",
-                    got="others from the scene",
-                    remedy="Use the scene folder and the dataparser options of the training run.",
-                )
+                remedy = "Use the scene folder and the dataparser options of the training run."
+                got = "others from the scene"
+                raise CheckpointError(what, expected="those the checkpoint was trained with", got=got, remedy=remedy)
 
     def get_average_eval_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, float]:
         """Average metrics over the held-out images; in ns-eval also those of the surface, if the truth is known."""

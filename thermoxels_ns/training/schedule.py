@@ -63,12 +63,9 @@ def schedule_for(resolution: int, steps: int) -> Schedule:
     (200, 500)
     """
     if resolution < 1 or steps < 10:
-        raise ThermoxelsError(
-            "schedule",
-            expected="at least 1 voxel and 10 steps",
-            got=f"{resolution} voxels, {steps} steps",
-            remedy="Raise them.",
-        )
+        remedy = "Raise them."
+        got = f"{resolution} voxels, {steps} steps"
+        raise ThermoxelsError("schedule", expected="at least 1 voxel and 10 steps", got=got, remedy=remedy)
     resolutions = [resolution]
     while resolutions[0] % 2 == 0 and resolutions[0] // 2 >= COARSEST and len(resolutions) <= max(_REFINE):
         resolutions.insert(0, resolutions[0] // 2)

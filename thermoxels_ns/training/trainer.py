@@ -79,12 +79,9 @@ class ThermoxelsTrainer(Trainer):
             return
         quality = self.config.quality
         if quality is not None and first >= steps:
-            raise CheckpointError(
-                "checkpoint",
-                expected=f"one from before step {steps}, where quality {quality} ends",
-                got=f"step {first}",
-                remedy="Pass --max-num-iterations, how many more steps to take, in place of --quality.",
-            )
+            expected = f"one from before step {steps}, where quality {quality} ends"
+            remedy = "Pass --max-num-iterations, how many more steps to take, in place of --quality."
+            raise CheckpointError("checkpoint", expected=expected, got=f"step {first}", remedy=remedy)
         self._check_lattice(first)
         if quality is not None:
             CONSOLE.log(f"goes on from step {first} to step {steps}, where quality {quality} ends")
@@ -101,12 +98,9 @@ class ThermoxelsTrainer(Trainer):
         else:
             missing = None if file is None or file.is_file() else f"no file {file}"
         if missing is not None:
-            raise CheckpointError(
-                "checkpoint",
-                expected="a folder with step-*.ckpt for --load-dir, or such a file for --load-checkpoint",
-                got=missing,
-                remedy="Pass the folder nerfstudio_models of a training.",
-            )
+            expected = "a folder with step-*.ckpt for --load-dir, or such a file for --load-checkpoint"
+            remedy = "Pass the folder nerfstudio_models of a training."
+            raise CheckpointError("checkpoint", expected=expected, got=missing, remedy=remedy)
 
     def _check_lattice(self, first: int) -> None:
         """Refuse a lattice that is coarser than the options have it at a step: it would never be refined."""

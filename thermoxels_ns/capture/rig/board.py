@@ -49,12 +49,10 @@ class CheckerBoard:
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or self.columns == self.rows or not self.square_m > 0.0:
-            raise SceneError(
-                "checker board",
-                expected="at least 3 inner corners per side, not as many along both, and a square above 0 m",
-                got=f"{self.columns} x {self.rows} corners of {self.square_m} m",
-                remedy="Count the inner corners; use a board with sides that differ.",
-            )
+            expected = "at least 3 inner corners per side, not as many along both, and a square above 0 m"
+            got = f"{self.columns} x {self.rows} corners of {self.square_m} m"
+            remedy = "Count the inner corners; use a board with sides that differ."
+            raise SceneError("checker board", expected=expected, got=got, remedy=remedy)
 
     @property
     def corners(self) -> FloatArray:
@@ -195,12 +193,9 @@ def rig_from_board_photos(
     search = find_pairs(found, PairOptions(settings.time_limit_s, settings.clock_offset_s))
     if not search.pairs:
         example = next((f"{path.name}: {why}" for path, why in search.unpaired.items()), "no camera files")
-        raise SceneError(
-            f"board pictures in {source}",
-            expected="photographs with thermal images",
-            got=f"none; {example}",
-            remedy="Give both of a shot the same name or time.",
-        )
+        expected = "photographs with thermal images"
+        remedy = "Give both of a shot the same name or time."
+        raise SceneError(f"board pictures in {source}", expected=expected, got=f"none; {example}", remedy=remedy)
     read = read_frames(search.pairs, source, folder, radiometry, settings.skip_bad, settings.thermal_mask, say)
     if read.thermal_size != thermal_size:
         raise _another_camera("thermal images", thermal_size, read.thermal_size)
@@ -214,12 +209,10 @@ def rig_from_board_photos(
     start = rig_start(read.frames, visible, thermal_size, settings.thermal_field_of_view_deg)
     estimate = rig_from_boards(pairs, visible, replace(start, translation_sigma=BASELINE_SIGMA_M), board)
     if not estimate.determined:
-        raise SceneError(
-            f"board pictures in {source}",
-            expected=f"at least three pairs in which both cameras show the {board.columns} x {board.rows} corners",
-            got=estimate.explanation + f" Pairs: {_listed(names)}",
-            remedy="Check --board; heat the board evenly, hold it still, and let it fill a third of the picture.",
-        )
+        expected = f"at least three pairs in which both cameras show the {board.columns} x {board.rows} corners"
+        got = estimate.explanation + f" Pairs: {_listed(names)}"
+        remedy = "Check --board; heat the board evenly, hold it still, and let it fill a third of the picture."
+        raise SceneError(f"board pictures in {source}", expected=expected, got=got, remedy=remedy)
     say(f"board: {estimate.explanation}")
     return estimate
 
@@ -227,12 +220,9 @@ def rig_from_board_photos(
 def in_scene_units(rig: RigEstimate, scale: MetricScale | None, missing: str) -> RigEstimate:
     """Turn a rig in metres into one in units of the scene; a `SceneError` where the scene's scale is unknown."""
     if scale is None:
-        raise SceneError(
-            "scale",
-            expected="a known scale, because a board gives the distance of the lenses in metres",
-            got=f"none: {missing}",
-            remedy="Pass --known-distance or --marker-side-m; poses that were found are kept.",
-        )
+        expected = "a known scale, because a board gives the distance of the lenses in metres"
+        remedy = "Pass --known-distance or --marker-side-m; poses that were found are kept."
+        raise SceneError("scale", expected=expected, got=f"none: {missing}", remedy=remedy)
     transform, covariance = rig.visible_to_thermal.copy(), rig.covariance.copy()
     transform[:3, 3] /= scale.metres_per_unit
     covariance[_SHIFTS] /= scale.metres_per_unit

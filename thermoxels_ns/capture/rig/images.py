@@ -141,12 +141,9 @@ def read_temperatures(frame: RigFrame, camera: Camera) -> FloatImage:
     source = frame.temperature_c
     image = np.load(source, allow_pickle=False) if isinstance(source, Path) else np.asarray(source)
     if image.shape != (camera.height, camera.width):
-        raise SceneError(
-            f"{frame.name}: temperatures",
-            expected=f"the thermal camera's {camera.height} rows and {camera.width} columns",
-            got=image.shape,
-            remedy="Leave the frame out, or give the camera that took it.",
-        )
+        expected = f"the thermal camera's {camera.height} rows and {camera.width} columns"
+        remedy = "Leave the frame out, or give the camera that took it."
+        raise SceneError(f"{frame.name}: temperatures", expected=expected, got=image.shape, remedy=remedy)
     return image.astype(np.float32)
 
 
@@ -158,23 +155,18 @@ def read_photograph(frame: RigFrame, camera: Camera) -> FloatImage:
         encoded = np.frombuffer(source.read_bytes(), np.uint8)
         image = cv2.imdecode(encoded, flags) if len(encoded) else None
         if image is None:
-            raise SceneError(
-                f"{frame.name}: {source.name}",
-                expected="a readable photograph",
-                got="a file that is damaged or no image",
-                remedy="Copy it from the camera again or leave the frame out.",
-            )
+            remedy = "Copy it from the camera again or leave the frame out."
+            got = "a file that is damaged or no image"
+            raise SceneError(f"{frame.name}: {source.name}", expected="a readable photograph", got=got, remedy=remedy)
     else:
         image = np.asarray(source)
         image = image[..., :3].mean(axis=2) if image.ndim == 3 else image
     height, width = image.shape
     if abs(width * camera.height / (height * camera.width) - 1.0) > _ASPECT_TOLERANCE:
-        raise SceneError(
-            f"{frame.name}: photograph",
-            expected=f"the aspect of the visible camera, {camera.width} x {camera.height}",
-            got=f"{width} x {height} pixels",
-            remedy="Use the photographs that the poses were computed from.",
-        )
+        expected = f"the aspect of the visible camera, {camera.width} x {camera.height}"
+        got = f"{width} x {height} pixels"
+        remedy = "Use the photographs that the poses were computed from."
+        raise SceneError(f"{frame.name}: photograph", expected=expected, got=got, remedy=remedy)
     return image.astype(np.float32)
 
 

@@ -47,12 +47,10 @@ def estimate_rig(
     """
     usable = [frame for frame in frames if np.count_nonzero(frame.points_visible()[:, 2] > 0.0) >= _FEWEST_POINTS]
     if not usable:
-        raise SceneError(
-            "rig",
-            expected=f"frames with a pose, a thermal partner and at least {_FEWEST_POINTS} scene points",
-            got=f"{len(frames)} frames, none of them with that many",
-            remedy="Check that structure from motion registered the photographs and that poses are in OpenGL axes.",
-        )
+        expected = f"frames with a pose, a thermal partner and at least {_FEWEST_POINTS} scene points"
+        got = f"{len(frames)} frames, none of them with that many"
+        remedy = "Check that structure from motion registered the photographs and that poses are in OpenGL axes."
+        raise SceneError("rig", expected=expected, got=got, remedy=remedy)
     chosen = [usable[i] for i in np.unique(np.linspace(0, len(usable) - 1, min(len(usable), _MOST_FRAMES)).astype(int))]
     progress("Reading the frames", 0.0)
     prepared = prepare_frames(chosen, visible, start.thermal_camera)

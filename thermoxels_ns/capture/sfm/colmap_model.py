@@ -48,12 +48,9 @@ def model_of_colmap(
     posed = dict(sorted(posed.items(), key=lambda item: frame_of_image[item[1].name]))
     cameras = {image.camera_id for image in posed.values()}
     if len(cameras) != 1:
-        raise SceneError(
-            "COLMAP model",
-            expected="photographs of one camera",
-            got=f"{len(posed)} of the {len(frame_of_image)} photographs, of {len(cameras)} cameras",
-            remedy="Give a model of these photographs with one camera (--ImageReader.single_camera 1).",
-        )
+        remedy = "Give a model of these photographs with one camera (--ImageReader.single_camera 1)."
+        got = f"{len(posed)} of the {len(frame_of_image)} photographs, of {len(cameras)} cameras"
+        raise SceneError("COLMAP model", expected="photographs of one camera", got=got, remedy=remedy)
     found = camera_of_colmap(reconstruction.cameras[cameras.pop()])
     size = size or (found.width, found.height)
     factor = np.array([size[0] / found.width, size[1] / found.height])
@@ -91,9 +88,7 @@ def read_colmap(folder: Path) -> Any:
     try:
         return pycolmap.Reconstruction(str(folder))
     except Exception as problem:  # pycolmap raises RuntimeError, ValueError, IndexError by version
-        raise SceneError(
-            str(folder),
-            expected="a COLMAP model (cameras, images and points3D as .bin or .txt)",
-            got=str(problem).splitlines()[0][:200] if str(problem) else type(problem).__name__,
-            remedy="Pass --poses the folder that holds them, such as sparse/0.",
-        ) from problem
+        expected = "a COLMAP model (cameras, images and points3D as .bin or .txt)"
+        got = str(problem).splitlines()[0][:200] if str(problem) else type(problem).__name__
+        remedy = "Pass --poses the folder that holds them, such as sparse/0."
+        raise SceneError(str(folder), expected=expected, got=got, remedy=remedy) from problem

@@ -107,22 +107,17 @@ def _read_transforms(path: Path, photographs: Mapping[str, str]) -> SfmModel:
         where = f"{path.name}: frame {index}"
         camera = read_intrinsics(content, entry, None, where)
         if camera.k3 or camera.k4 or camera.lens != "perspective":
-            raise SceneError(
-                where,
-                expected="a perspective lens with distortion k1, k2, p1, p2",
-                got=f"{camera.lens}, k3 {camera.k3}, k4 {camera.k4}",
-                remedy="Undistort first.",
-            )
+            expected = "a perspective lens with distortion k1, k2, p1, p2"
+            got = f"{camera.lens}, k3 {camera.k3}, k4 {camera.k4}"
+            remedy = "Undistort first."
+            raise SceneError(where, expected=expected, got=got, remedy=remedy)
         cameras.add(camera)
         frames.append(frame_of[name])
         poses.append(read_pose(entry.get("transform_matrix"), f"{where}: transform_matrix"))
     if len(cameras) != 1:
-        raise SceneError(
-            str(path),
-            expected="photographs of one camera",
-            got=f"{len(frames)} photographs of {len(cameras)} cameras",
-            remedy="Give one set of intrinsics for all frames, or let thermoxels capture find the poses.",
-        )
+        remedy = "Give one set of intrinsics for all frames, or let thermoxels capture find the poses."
+        got = f"{len(frames)} photographs of {len(cameras)} cameras"
+        raise SceneError(str(path), expected="photographs of one camera", got=got, remedy=remedy)
     return SfmModel(
         tuple(frames),
         cameras.pop(),
@@ -152,10 +147,7 @@ def _frames_of(names: list[str], photographs: Mapping[str, str], path: Path) -> 
                 break
     twice = {frame for frame, count in Counter(found.values()).items() if count > 1}
     if not found or twice:
-        raise SceneError(
-            str(path),
-            expected="names of the capture's photographs",
-            got=f"{sorted(twice)[0]} twice" if twice else f"{names[0] if names else 'no name'} and no known one",
-            remedy="Pass the poses of these photographs; they are recognised by their file names.",
-        )
+        remedy = "Pass the poses of these photographs; they are recognised by their file names."
+        got = f"{sorted(twice)[0]} twice" if twice else f"{names[0] if names else 'no name'} and no known one"
+        raise SceneError(str(path), expected="names of the capture's photographs", got=got, remedy=remedy)
     return found

@@ -105,20 +105,14 @@ def add_points(
     options = options or PoseOptions()
     names = list(given.frames)
     if len(names) < 2:
-        raise SceneError(
-            "given poses",
-            expected="poses of at least 2 photographs, which see the same points",
-            got=len(names),
-            remedy="Give poses of more photographs, or let thermoxels capture find them.",
-        )
+        expected = "poses of at least 2 photographs, which see the same points"
+        remedy = "Give poses of more photographs, or let thermoxels capture find them."
+        raise SceneError("given poses", expected=expected, got=len(names), remedy=remedy)
     size, other = common_size({name: photographs[name] for name in names})
     if other or size != (given.camera.width, given.camera.height):
-        raise SceneError(
-            "given poses",
-            expected=f"photographs of {given.camera.width} x {given.camera.height} pixels, as their camera has",
-            got=f"{size[0]} x {size[1]}",
-            remedy="Use the photographs that the poses were computed from.",
-        )
+        expected = f"photographs of {given.camera.width} x {given.camera.height} pixels, as their camera has"
+        remedy = "Use the photographs that the poses were computed from."
+        raise SceneError("given poses", expected=expected, got=f"{size[0]} x {size[1]}", remedy=remedy)
     small = _reduced_size(size, options.image_size)
     reduced = _reduced({name: photographs[name] for name in names}, folder, size, small, masks)
     fill_database(reduced, given.camera.resized(*small), True, replace(options, lens="OPENCV"), say)

@@ -88,12 +88,9 @@ def write_inp(
     """
     path = check_suffix(path, ".inp")
     if heat_step is None:
-        raise MeshError(
-            "heat_step",
-            expected="material and times, which an .inp file runs with",
-            got=None,
-            remedy="Pass heat_step=HeatStep(...), or choose another format.",
-        )
+        expected = "material and times, which an .inp file runs with"
+        remedy = "Pass heat_step=HeatStep(...), or choose another format."
+        raise MeshError("heat_step", expected=expected, got=None, remedy=remedy)
     content = file_content(mesh, temperature_c)
     regions = _set_names("region_names", content.region_names)
     patches = _set_names("boundary.patch_names", content.patch_names)

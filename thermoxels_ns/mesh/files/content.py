@@ -164,12 +164,9 @@ def _check_indices(name: str, values: npt.NDArray, count: int) -> None:
 def _check_names(name: str, names: Sequence[str]) -> None:
     for entry in names:
         if not (isinstance(entry, str) and entry.strip() and entry.isprintable() and '"' not in entry):
-            raise MeshError(
-                name,
-                expected="names of printable characters without a double quote",
-                got=repr(entry),
-                remedy="Rename it.",
-            )
+            expected = "names of printable characters without a double quote"
+            remedy = "Rename it."
+            raise MeshError(name, expected=expected, got=repr(entry), remedy=remedy)
     if len(set(names)) != len(names) or not names:
         raise MeshError(name, expected="at least one name, all different", got=list(names), remedy="Rename them.")
 
@@ -220,12 +217,9 @@ def surface_colours(mesh: TetMesh, surface: Surface, temperature_c: FloatArray, 
     """
     if colouring == "photographs":
         if mesh.colour is None:
-            raise MeshError(
-                "colouring 'photographs'",
-                expected="a mesh whose nodes have colours",
-                got="a mesh without",
-                remedy="Choose the colouring 'temperature', or build the mesh from a field that has colours.",
-            )
+            expected = "a mesh whose nodes have colours"
+            remedy = "Choose the colouring 'temperature', or build the mesh from a field that has colours."
+            raise MeshError("colouring 'photographs'", expected=expected, got="a mesh without", remedy=remedy)
         return np.clip(np.asarray(mesh.colour, dtype=np.float64)[surface.nodes], 0.0, 1.0)
     if colouring != "temperature":
         raise MeshError(

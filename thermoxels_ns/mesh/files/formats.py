@@ -77,12 +77,9 @@ def mesh_format(path: Path | str) -> MeshFormat:
     """
     path = Path(path)
     if path.suffix not in MESH_FORMATS:
-        raise OutputError(
-            "mesh file",
-            expected=f"a name that ends in one of {', '.join(MESH_FORMATS)}",
-            got=path.name,
-            remedy="Rename the file.",
-        )
+        expected = f"a name that ends in one of {', '.join(MESH_FORMATS)}"
+        remedy = "Rename the file."
+        raise OutputError("mesh file", expected=expected, got=path.name, remedy=remedy)
     return MESH_FORMATS[path.suffix]
 
 

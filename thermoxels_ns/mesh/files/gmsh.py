@@ -46,12 +46,10 @@ def write_msh(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
     content = file_content(mesh, temperature_c)
     for name in (*content.region_names, *content.patch_names):
         if len(name.encode()) > _LONGEST_NAME:
-            raise MeshError(
-                "name of a region or patch",
-                expected=f"at most {_LONGEST_NAME} bytes, which is what Gmsh reads",
-                got=f"{len(name.encode())} bytes: {name!r}",
-                remedy="Rename it.",
-            )
+            expected = f"at most {_LONGEST_NAME} bytes, which is what Gmsh reads"
+            got = f"{len(name.encode())} bytes: {name!r}"
+            remedy = "Rename it."
+            raise MeshError("name of a region or patch", expected=expected, got=got, remedy=remedy)
     # All that can fail on a bad mesh comes before the file is opened.
     owner, _ = facet_owners(content.tets, content.facets)
     blocks = _node_blocks(content)

@@ -54,12 +54,10 @@ def check_stl(mesh: TetMesh) -> None:
     farthest = float(np.abs(mesh.points_m[mesh.facets]).max())
     rounding = 0.5 * float(np.spacing(np.float32(farthest)))
     if rounding > _ROUNDING_NOTICED * side:
-        raise MeshError(
-            "mesh for .stl",
-            expected="coordinates near the origin, because STL has single precision",
-            got=f"one at {farthest:.6g}, where single precision moves nodes by up to {rounding:.3g}",
-            remedy="Write .ply, which has double precision, or shift the poses towards the origin.",
-        )
+        expected = "coordinates near the origin, because STL has single precision"
+        got = f"one at {farthest:.6g}, where single precision moves nodes by up to {rounding:.3g}"
+        remedy = "Write .ply, which has double precision, or shift the poses towards the origin."
+        raise MeshError("mesh for .stl", expected=expected, got=got, remedy=remedy)
 
 
 def write_ply(

@@ -79,12 +79,9 @@ def write_vtk(writer: Any, path: Path, data: Any) -> None:
         writer.SetInputData(data)
         writer.SetCompressionLevel(1)  # a quarter of the time of the default, for files 5 % larger
         if not writer.Write() or writer.GetErrorCode() or not temporary.is_file():
-            raise OutputError(
-                "mesh file",
-                expected=f"to write {path}",
-                got=f"VTK error {writer.GetErrorCode()}",
-                remedy="Check the free space and the permissions of the folder.",
-            )
+            remedy = "Check the free space and the permissions of the folder."
+            got = f"VTK error {writer.GetErrorCode()}"
+            raise OutputError("mesh file", expected=f"to write {path}", got=got, remedy=remedy)
 
 
 def write_summary(path: Path | str, summary: Mapping[str, Any]) -> None:

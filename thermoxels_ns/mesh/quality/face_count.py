@@ -146,12 +146,10 @@ def facet_owners(tets: IntArray, facets: IntArray) -> tuple[IntArray, IntArray]:
     first, uses = first[asked], uses[asked]
     second = order[np.minimum(first + 1, len(order) - 1)]
     if len(first) != len(facets) or np.any(uses != 2) or np.any(second < len(facets)):
-        raise MeshError(
-            "facets",
-            expected="different triangles, each a face of exactly one tetrahedron",
-            got=f"{len(facets) - np.count_nonzero((uses == 2) & (second >= len(facets)))} others",
-            remedy="Build the mesh with thermoxels_ns.mesh.build.",
-        )
+        expected = "different triangles, each a face of exactly one tetrahedron"
+        got = f"{len(facets) - np.count_nonzero((uses == 2) & (second >= len(facets)))} others"
+        remedy = "Build the mesh with thermoxels_ns.mesh.build."
+        raise MeshError("facets", expected=expected, got=got, remedy=remedy)
     face = np.empty(len(facets), dtype=np.int64)
     face[order[first]] = second - len(facets)
     return candidate_tet[face], candidate_face[face]

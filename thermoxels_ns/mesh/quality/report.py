@@ -237,12 +237,8 @@ def _observed_range(mesh: TetMesh, given: tuple[float, float] | None) -> tuple[f
         return given
     observed = mesh.temperature_c[np.asarray(mesh.observed, dtype=bool)]
     if len(observed) == 0:
-        raise MeshError(
-            "mesh observed",
-            expected="at least one node that a thermal ray saw",
-            got="none",
-            remedy="Pass observed_range_c, the lowest and the highest observed temperature.",
-        )
+        remedy = "Pass observed_range_c, the lowest and the highest observed temperature."
+        raise MeshError("mesh observed", expected="at least one node that a thermal ray saw", got="none", remedy=remedy)
     return float(observed.min()), float(observed.max())
 
 

@@ -127,12 +127,9 @@ def percentile_threshold(density: FloatArray, percentile: float) -> Threshold:
     """
     threshold = float(np.percentile(density, percentile))
     if percentile > 0.0 and 0.0 < density.min() == density.max():
-        raise MeshError(
-            "density",
-            expected="some voxels denser than others",
-            got=f"the same density {threshold:.6g} in all {density.size} voxels",
-            remedy="Train longer, or pass --density-threshold to say from which density on a voxel is solid.",
-        )
+        remedy = "Train longer, or pass --density-threshold to say from which density on a voxel is solid."
+        got = f"the same density {threshold:.6g} in all {density.size} voxels"
+        raise MeshError("density", expected="some voxels denser than others", got=got, remedy=remedy)
     positive = density > 0.0
     reached = positive & (density >= threshold)
     denser = positive & (density > threshold)

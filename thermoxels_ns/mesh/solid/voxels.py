@@ -69,12 +69,9 @@ class SolidSelection:
                 what = "a whole number" if kind is int else "a finite number"
                 most = "" if high == math.inf else f" to {high:g}"
                 option = f"--{name.replace('_', '-')}"
-                raise MeshError(
-                    name,
-                    expected=f"{what} from {low:g}{most}" if most else f"{what} of at least {low:g}",
-                    got=repr(value),
-                    remedy=f"Leave {option} out." if usual is None else f"Pass {option} {usual}, or leave it out.",
-                )
+                expected = f"{what} from {low:g}{most}" if most else f"{what} of at least {low:g}"
+                remedy = f"Leave {option} out." if usual is None else f"Pass {option} {usual}, or leave it out."
+                raise MeshError(name, expected=expected, got=repr(value), remedy=remedy)
         for name in ("voxel_optical_depth", "wall_thickness"):
             value = getattr(self, name)
             if value is not None:
@@ -157,12 +154,10 @@ def select_solid(
     density = snapshot.centre_density()
     chosen = _threshold(snapshot, density, selection)
     if not chosen.cells.any():
-        raise MeshError(
-            "solid voxels",
-            expected=f"at least one voxel with density above 0 and at least the threshold {chosen.density:.6g}",
-            got=f"none of {density.size}; the highest density at a voxel centre is {density.max():.6g}",
-            remedy="Train longer, or lower --voxel-optical-depth, --density-threshold or --density-percentile.",
-        )
+        expected = f"at least one voxel with density above 0 and at least the threshold {chosen.density:.6g}"
+        got = f"none of {density.size}; the highest density at a voxel centre is {density.max():.6g}"
+        remedy = "Train longer, or lower --voxel-optical-depth, --density-threshold or --density-percentile."
+        raise MeshError("solid voxels", expected=expected, got=got, remedy=remedy)
     cells = chosen.cells
     steps = [SolidStep("threshold", int(cells.sum()), 0, chosen.explanation)]
 
@@ -245,18 +240,12 @@ def _wall_voxels(
     if selection.wall_thickness is None:
         return None
     if metres_per_world_unit is None:
-        raise MeshError(
-            "wall_thickness",
-            expected="a scene whose scale is known",
-            got=f"{selection.wall_thickness:g} m, but no length of a unit",
-            remedy="Pass --metres-per-unit 1 if the input poses are in metres, or leave out --wall-thickness.",
-        )
+        remedy = "Pass --metres-per-unit 1 if the input poses are in metres, or leave out --wall-thickness."
+        got = f"{selection.wall_thickness:g} m, but no length of a unit"
+        raise MeshError("wall_thickness", expected="a scene whose scale is known", got=got, remedy=remedy)
     check_positive("metres_per_world_unit", metres_per_world_unit, "Pass --metres-per-unit.", MeshError)
     if snapshot.views is None or len(snapshot.views.focal) == 0:
-        raise MeshError(
-            "wall_thickness",
-            expected="training cameras, which tell the side that is seen",
-            got="a field without cameras",
-            remedy="Export from a trained scene, or leave out --wall-thickness.",
-        )
+        expected = "training cameras, which tell the side that is seen"
+        remedy = "Export from a trained scene, or leave out --wall-thickness."
+        raise MeshError("wall_thickness", expected=expected, got="a field without cameras", remedy=remedy)
     return selection.wall_thickness / (metres_per_world_unit * snapshot.lattice.voxel_size)
