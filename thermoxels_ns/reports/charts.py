@@ -119,8 +119,9 @@ def curves_over_time(
             above.plot(times, values, label=name, **({"color": INK, "linewidth": 2} if number == 0 else {}))
         below.axhline(0.0, color=SOFT, linewidth=0.8)
         for number, (name, values) in enumerate(steps):
-            strong = {"color": INK, "linewidth": 2} if number == len(steps) - 1 else {"linewidth": 1.4}
-            below.stairs(values, times, baseline=None, label=name, **strong)
+            last = number == len(steps) - 1
+            colour, width = (INK, 2.0) if last else (None, 1.4)
+            below.stairs(values, times, baseline=None, label=name, color=colour, linewidth=width)
         below.set_xlabel(f"time [{unit}]")
         below.set_xlim(times[0], times[-1])
         for axis, label in zip((above, below), labels):
