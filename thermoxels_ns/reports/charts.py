@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from io import StringIO
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +31,7 @@ def chart(width: float, height: float, rows: int = 1) -> Iterator[tuple[Figure, 
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
-    look = {"svg.hashsalt": "thermoxels", "svg.fonttype": "none", "font.size": 10}
+    look: Any = {"svg.hashsalt": "thermoxels", "svg.fonttype": "none", "font.size": 10}
     look |= {"axes.spines.top": False, "axes.spines.right": False}
     with rc_context(look):
         figure = Figure(figsize=(width, height), layout="constrained")
