@@ -193,8 +193,8 @@ class DriftSamples:
         """Only the readings of some points (by number), which are numbered anew."""
         stays = keep[self.point]
         number = np.cumsum(keep) - 1
-        kept = (values[stays] for values in (self.frame, self.temperature_c, self.radius2))
-        return DriftSamples(number[self.point[stays]], *kept, self.num_frames)
+        frame, temperature_c, radius2 = self.frame[stays], self.temperature_c[stays], self.radius2[stays]
+        return DriftSamples(number[self.point[stays]], frame, temperature_c, radius2, self.num_frames)
 
 
 def sample_shared_points(frames: Sequence[RigFrame], camera: Camera, visible_to_thermal: FloatArray) -> DriftSamples:
