@@ -137,6 +137,7 @@ SUNNY = (
         (SMALL + "initial: warm\n", "mine.yaml: initial: expected photographs, or a mapping .*, got 'warm'"),
         (SMALL + "outside: {air_c: 0}\n", r"got outside. Did you mean outside_air\?"),
         (AIR.replace("air_c", "air_k"), r"mine.yaml: outside_air: .* got air_k. Did you mean air_c\?"),
+        (AIR.replace("air_c: 0", f"air_c: 1{'0' * 400}"), "outside_air: air_c: expected a number below 1e308"),
         (AIR.replace("air_c: 0", "air_c: 1e1"), "outside_air: air_c: expected a number, got '1e1'. Write 10, without"),
         (AIR.replace("iso-6946-combined", "windy"), "outside_air: coefficient: expected one of iso-6946-combined"),
         (

@@ -23,7 +23,7 @@ def building_corner(cut_up: Callable[..., npt.NDArray[np.float64]]) -> HeatProbl
 
     Args:
         cut_up: Takes the coordinates of the planes between parts along one axis, [m], all multiples of 0.05; returns
-            those of the mesh, such as `planes` or `graded` of tests/heat_meshes.py with their options filled in.
+            those of the mesh, such as `planes` or `graded` of heat_meshes with their options filled in.
 
     Returns:
         Its effects are convection in the lower room, in the upper room and outside, in this order.

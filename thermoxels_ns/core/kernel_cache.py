@@ -19,7 +19,8 @@ def kernel(function: Callable | None = None, **options: Any) -> Any:
     """Compile a function with numba when it is first called, without the interpreter's lock, and keep the result.
 
     A kernel may call kernels of its own room and of ``core``: numba watches only the file that a kernel stands in,
-    so what was compiled in a room is thrown away when any file of the room that has kernels changed.
+    so what was compiled in a room is thrown away when any file of the room or of ``core`` changed: kernels freeze
+    constants of other files too.
 
     Args:
         function: A function in numba's subset of Python; plain use as ``@kernel``.
@@ -42,9 +43,7 @@ def kernel(function: Callable | None = None, **options: Any) -> Any:
 @cache
 def _forget_once(room: str, cached: Path) -> None:
     folders = (_PACKAGE / room, _PACKAGE / "core")
-    forget_stale_kernels(
-        cached, {path for folder in folders for path in folder.rglob("*.py") if b"kernel_cache" in path.read_bytes()}
-    )
+    forget_stale_kernels(cached, {path for folder in folders for path in folder.rglob("*.py")})
 
 
 def forget_stale_kernels(cached: Path, sources: Iterable[Path]) -> bool:

@@ -150,6 +150,8 @@ def wrong(name: str, expected: str, got: object, remedy: str = "Correct the file
 def _plain(name: str, content: object, kind: type) -> Any:
     if kind in (float, Real):
         if isinstance(content, (int, float)) and not isinstance(content, bool):
+            if isinstance(content, int) and content.bit_length() > 1023:
+                raise wrong(name, "a number below 1e308", f"one of {content.bit_length()} binary digits")
             return float(content) if kind is float else content
         raise wrong(name, "a number", shown(content), _as_number(content))
     if kind is int:

@@ -224,7 +224,7 @@ class _Run:
             HeatError: The tolerance was not met, or nothing was solved at all.
         """
         if not self._solved:
-            remedy = "Allow more memory, or use a coarser mesh."
+            remedy = "Allow more memory (--memory-gb), or use a coarser mesh."
             raise HeatError("memory_bytes", expected="room for a first estimate", got=failure, remedy=remedy)
 
         def rank(solved: tuple[Level, HeatProblem, SteadySolution | HeatSolution]) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from fnmatch import fnmatchcase
 from typing import TypeVar
 
@@ -135,9 +135,11 @@ class HeatScene:
             named.append(("outside_air", self.outside_air.convection()))
         named += [("sky and ground", effect) for effect in self._sky_and_ground(patches)]
         named += [("sun", effect) for effect in self._sunlight(patches)]
-        for key in ("fixed_temperature", "heat_flux", "convection", "radiation", "absorbed_solar", "ground_contact"):
+        for key in (field.name for field in fields(self) if field.name != "internal_heat"):
             entries = getattr(self, key)
-            named += [(f"{key} entry {number}", effect) for number, effect in enumerate(entries, start=1)]
+            if isinstance(entries, tuple):
+                listed = [(f"{key} entry {number}", entry) for number, entry in enumerate(entries, start=1)]
+                named += [(entry_name, entry) for entry_name, entry in listed if isinstance(entry, Effect)]
         return named
 
     def _material(self, mesh: TetMesh) -> Material | dict[str, Material]:
