@@ -19,7 +19,7 @@ STOCK_EXPORTS = ("pointcloud", "tsdf", "poisson", "marching-cubes", "cameras", "
 METRICS = (
     *("psnr", "ssim", "thermal_psnr", "thermal_ssim", "thermal_hssim"),
     *("thermal_mae_c", "thermal_mae_hit_c", "thermal_mae_roi_c", "thermal_mae_debiased_c"),
-    *("half_transparent", "fscore", "precision", "recall", "fscore_128"),
+    *("psnr_box", "thermal_mae_box_c", "half_transparent", "fscore", "precision", "recall", "fscore_128"),
 )
 
 

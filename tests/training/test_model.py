@@ -51,10 +51,20 @@ def targets(n: int = 60) -> dict[str, torch.Tensor]:
 def test_outputs_of_an_image():
     model = make().eval()
     outputs = model(rays(stream=None))
-    assert set(outputs) == {"rgb", "thermal", "temperature_c", "depth", "accumulation"}
+    assert set(outputs) == {"rgb", "thermal", "temperature_c", "depth", "accumulation", "in_box"}
     torch.testing.assert_close(outputs["temperature_c"], 10 + 20 * outputs["thermal"])
     assert torch.isfinite(outputs["depth"]).all() and outputs["rgb"].shape == (60, 3)
     assert ((outputs["accumulation"] >= 0) & (outputs["accumulation"] <= 1)).all()
+
+
+def test_only_rays_that_meet_the_box_ahead_are_in_it():
+    toward, away, beside, inside = ([0.0, 0.0, 3.0], [0.0, 0.0, -3.0], [1.2, 0.0, 3.0], [0.9, 0.9, 0.4])
+    bundle = rays(4, stream=None)
+    bundle.origins, bundle.directions = (
+        torch.tensor([toward, away, beside, inside]),
+        torch.tensor([[0.0, 0.0, -1.0]] * 4),
+    )
+    assert make().eval()(bundle)["in_box"][:, 0].tolist() == [1.0, 0.0, 0.0, 1.0]
 
 
 @pytest.mark.parametrize("recipe", list(LOSS_RECIPES))
@@ -227,7 +237,7 @@ def test_masked_pixels_do_not_count_in_evaluation():
     model = make().eval()
     generator = torch.Generator().manual_seed(2)
     outputs = {"rgb": torch.rand(24, 32, 3, generator=generator), "thermal": torch.rand(24, 32, 1, generator=generator)}
-    outputs |= {"accumulation": torch.ones(24, 32, 1), "depth": torch.ones(24, 32, 1)}
+    outputs |= {name: torch.ones(24, 32, 1) for name in ("accumulation", "depth", "in_box")}
     mask = torch.zeros(24, 32, 1, dtype=torch.bool)
     mask[:, :16] = True
     batch = {"image": outputs["rgb"].clone(), "thermal": outputs["thermal"].clone(), "mask": mask}
@@ -236,8 +246,14 @@ def test_masked_pixels_do_not_count_in_evaluation():
     batch["thermal"][:, 16:] = 1.4  # above the range, and masked
     metrics, images = model.get_image_metrics_and_images(outputs, batch)
     assert metrics["psnr"] == pytest.approx(100.0) and metrics["thermal_mae_c"] == 0.0
+    assert metrics["psnr_box"] == pytest.approx(100.0) and metrics["thermal_mae_box_c"] == 0.0
     assert metrics["ssim"] == pytest.approx(1.0) and metrics["thermal_ssim"] == pytest.approx(1.0)
     assert float(images["thermal"].max()) <= 1.0
+    batch["image"][:, :4], batch["thermal"][:, :4] = outputs["rgb"][:, :4] + 0.1, outputs["thermal"][:, :4] + 0.1
+    outputs["in_box"][:, 8:] = 0.0  # wrong are half of the pixels that the box covers, a quarter of all
+    metrics, _ = model.get_image_metrics_and_images(outputs, batch)
+    assert metrics["psnr_box"] == pytest.approx(23.01, abs=0.01) and metrics["psnr"] == pytest.approx(26.02, abs=0.01)
+    assert metrics["thermal_mae_box_c"] == pytest.approx(1.0) and metrics["thermal_mae_c"] == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("environment, expected", [("5", None), (None, 4)])

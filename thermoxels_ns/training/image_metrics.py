@@ -85,6 +85,7 @@ def thermal_metrics(
     target: Float[Tensor, "h w 1"],
     valid: Bool[Tensor, "h w 1"],
     accumulation: Float[Tensor, "h w 1"],
+    in_box: Bool[Tensor, "h w 1"],
     span_k: float,
 ) -> dict[str, float]:
     """All thermal metrics of one image.
@@ -94,13 +95,14 @@ def thermal_metrics(
         target: Measured normalised temperature.
         valid: Pixels that were measured.
         accumulation: Opacity of the rendered rays.
+        in_box: Pixels whose rays meet the scene box.
         span_k: Width of the temperature range, [K].
 
     Returns:
         `thermal_psnr`, `thermal_ssim`, `thermal_hssim` of normalised images, and mean absolute errors in kelvin (the
-        size of a degree Celsius): `thermal_mae_c` over all valid
-        pixels; `thermal_mae_hit_c` where opacity exceeds one half; `thermal_mae_roi_c` in the hot region;
-        `thermal_mae_debiased_c` with the image's mean difference removed first. NaN where no pixel qualifies.
+        size of a degree Celsius): `thermal_mae_c` over all valid pixels; `thermal_mae_hit_c` where opacity exceeds one
+        half; `thermal_mae_box_c` in the box; `thermal_mae_roi_c` in the hot region; `thermal_mae_debiased_c` with the
+        image's mean difference removed first. NaN where no pixel qualifies.
     """
     filled_p = torch.where(valid, predicted, torch.zeros_like(predicted))
     filled_t = torch.where(valid, target, torch.zeros_like(target))
@@ -112,6 +114,7 @@ def thermal_metrics(
         "thermal_hssim": hssim(filled_p, filled_t, valid),
         "thermal_mae_c": _mean_abs(error_k, valid),
         "thermal_mae_hit_c": _mean_abs(error_k, valid & (accumulation > 0.5)),
+        "thermal_mae_box_c": _mean_abs(error_k, valid & in_box),
         "thermal_mae_roi_c": _mean_abs(error_k, hot_region(target, valid)),
         "thermal_mae_debiased_c": _mean_abs(error_k - bias, valid),
     }

@@ -25,6 +25,7 @@ from thermoxels_ns.field.harmonics import harmonics, num_coefficients
 from thermoxels_ns.field.kept_voxels import check_memory
 from thermoxels_ns.field.refine import ColumnChange, RowChange, refine, widen_colour
 from thermoxels_ns.field.voxel_grid import VoxelField
+from thermoxels_ns.render.compositing import intersect_box
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
 from thermoxels_ns.render.renderers import GridSamples, render_rays, sample_rays
 from thermoxels_ns.training import losses
@@ -193,7 +194,7 @@ class ThermoxelsModel(Model):
         return rgb, thermal, seen
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Any]:
-        """Render rays: rgb, thermal (normalised), temperature_c, depth, accumulation.
+        """Render rays: rgb, thermal (normalised), temperature_c, depth, accumulation, in_box (1 if it meets the box).
 
         Rays of a batch carry their stream (see `core.ray_streams`). In training only what it needs is rendered, and the
         outputs are those that losses are made of. A crop that the viewer sets (nears, fars) is kept.
@@ -232,6 +233,7 @@ class ThermoxelsModel(Model):
             "temperature_c": self.temperature_range.to_celsius(thermal),
             "depth": torch.minimum(seen.depth, far)[:, None],
             "accumulation": seen.accumulation[:, None],
+            "in_box": intersect_box(origins, request.directions, lo, hi, request.near)[2][:, None].to(origins.dtype),
         }
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
@@ -300,7 +302,9 @@ class ThermoxelsModel(Model):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Metrics of one held-out frame, and pictures with the measured image left of the rendered one.
 
-        Where the thermal camera is its own, the thermal image is rendered from it.
+        Where the thermal camera is its own, the thermal image is rendered from it. ``psnr_box`` and
+        ``thermal_mae_box_c`` count every pixel whose ray meets the lattice's box ahead of the camera. That needs no
+        truth and no threshold; some of these pixels show what stands in front of the box or behind it.
         """
         metrics: dict[str, float] = {}
         images: dict[str, Tensor] = {}
@@ -309,6 +313,8 @@ class ThermoxelsModel(Model):
             mask = batch["mask"].to(self.device).bool() if "mask" in batch else None
             whole = None if mask is None else mask.expand_as(target)
             metrics |= {"psnr": psnr(predicted, target, whole), "ssim": ssim(predicted, target, mask)}
+            in_box = outputs["in_box"] > 0 if mask is None else (outputs["in_box"] > 0) & mask
+            metrics["psnr_box"] = psnr(predicted, target, in_box.expand_as(target))
             if lpips_available():
                 metrics["lpips"] = lpips(predicted, target)
             images["img"] = torch.cat((target, predicted), dim=1)
@@ -320,7 +326,8 @@ class ThermoxelsModel(Model):
         thermal, valid = batch["thermal"].to(self.device), batch["thermal_valid"].to(self.device)
         if "mask" in batch and batch["mask"].shape == valid.shape and seen is outputs:
             valid = valid & batch["mask"].to(self.device).bool()
-        metrics |= thermal_metrics(seen["thermal"], thermal, valid, seen["accumulation"], self.temperature_range.span_k)
+        span_k = self.temperature_range.span_k
+        metrics |= thermal_metrics(seen["thermal"], thermal, valid, seen["accumulation"], seen["in_box"] > 0, span_k)
         images["thermal"] = colormaps.apply_float_colormap(
             torch.cat((thermal, seen["thermal"]), dim=1).clamp(0, 1), "inferno"
         )
