@@ -179,8 +179,8 @@ def test_a_circle_is_seen() -> None:
         ("mesh.build", "from .. import fem"),
         ("mesh.build", "import importlib\nimportlib.import_module('thermoxels_ns.training.model')"),
         ("mesh.build", "if TYPE_CHECKING:\n    from thermoxels_ns.training.model import Model"),
-        ("fem.stepping", "from thermoxels_ns.mesh.build import build_mesh"),
-        ("fem.stepping", "if True:\n    from nerfstudio.cameras.rays import RayBundle"),
+        ("fem.time_loop", "from thermoxels_ns.mesh.build import build_mesh"),
+        ("fem.time_loop", "if True:\n    from nerfstudio.cameras.rays import RayBundle"),
     ],
 )
 def test_the_checker_sees_a_forbidden_import(module: str, source: str) -> None:
@@ -193,7 +193,7 @@ def test_the_checker_sees_a_forbidden_import(module: str, source: str) -> None:
         ("training.model", "from thermoxels_ns.field.voxel_grid import VoxelField\nimport torch"),
         ("mesh.build", "from thermoxels_ns.core.lattice import Lattice\nfrom . import tetrahedra\nimport pyvista"),
         ("fem.problem", "from thermoxels_ns.mesh.tetrahedra import TetMesh"),
-        ("commands.export", "import torch, pyvista, thermoxels_ns.fem.stepping, thermoxels_ns.training.model"),
+        ("commands.export", "import torch, pyvista, thermoxels_ns.fem.time_loop, thermoxels_ns.training.model"),
         ("data.splits", "from thermoxels_ns import __version__"),
     ],
 )

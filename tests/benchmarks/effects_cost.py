@@ -6,7 +6,7 @@ Run it on an otherwise idle machine:
 
 A room of concrete with the scene of configs/scene-all-effects.yaml takes equal steps, so that all rows take the same
 number of them. Times are medians; all problems take turns in one process, and compiled kernels are loaded before the
-first. The last table compares conduction alone, without any effect, with the assembly and the stepper called directly:
+first. The last table compares conduction alone, without any effect, with assembly and steps called directly:
 the same matrices, steps and tolerance and the same arithmetic, but no problem, patches, forms, effects or report. Below
 it stands what plain conjugate gradients cost on the same matrices, without what keeps the mean of a body exact and says
 how much of a heat flow is round-off.
@@ -28,10 +28,10 @@ from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients, LinearSolv
 from thermoxels_ns.fem.forms import FixedNodes
 from thermoxels_ns.fem.p1_kernels import lumped_mass, product_and_bound, stiffness_matrix
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, effect_labels
+from thermoxels_ns.fem.runge_kutta import RungeKutta
 from thermoxels_ns.fem.schemes import BACKWARD_EULER
-from thermoxels_ns.fem.stepper import Stepper
-from thermoxels_ns.fem.stepping import solve_heat
 from thermoxels_ns.fem.system import HeatSystem, Pieces
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.scene_file import load_heat_scene
 from thermoxels_ns.heat.screening import screen
 from thermoxels_ns.mesh.boundary.patches import default_patches
@@ -40,7 +40,7 @@ from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
 
 TOLERANCE = 1e-12
 Z_UP = (0.0, 0.0, 1.0)
-KINDS = ("stiffness", "mass", "robin", "flux", "radiation", "source", "fixed")
+KINDS = ("stiffness", "mass", "convection", "flux", "radiation", "source", "fixed")
 
 
 @dataclass
@@ -91,7 +91,7 @@ class EffectsCost:
         """Conduction alone, through the effects layer and without it."""
         sides: dict[str, Callable[[], np.ndarray]] = {
             "through effects": lambda: solve_heat(problem, steps, relative_tolerance=TOLERANCE).temperature_c,
-            "stepper directly": lambda: directly(problem, steps),
+            "runge_kutta directly": lambda: directly(problem, steps),
             "plain conjugate gradients": lambda: plainly(problem, steps),
         }
         runs = 5 * self.repeats
@@ -110,7 +110,7 @@ class EffectsCost:
 
 
 class Conduction:
-    """What the stepper asks of a body's matrices when there is nothing else."""
+    """What the runge_kutta asks of a body's matrices when there is nothing else."""
 
     nonlinear = matrix_in_time = exchanges = False
     groups = ()
@@ -146,13 +146,13 @@ def stiffness_and_mass(problem: HeatProblem) -> tuple[sparse.csr_matrix, np.ndar
 
 
 def directly(problem: HeatProblem, steps: TimeSteps) -> np.ndarray:
-    """Backward Euler by the assembly and the stepper, with no effects between."""
+    """Backward Euler by the assembly and the runge_kutta, with no effects between."""
     start, reference = problem.start_c, 0.5 * (problem.start_c.min() + problem.start_c.max())
-    stepper = Stepper(cast(HeatSystem, Conduction(problem)), BACKWARD_EULER, relative_tolerance=TOLERANCE)
+    runge_kutta = RungeKutta(cast(HeatSystem, Conduction(problem)), BACKWARD_EULER, relative_tolerance=TOLERANCE)
     states = np.empty((steps.steps + 1, len(start)))
     states[0] = start - reference
     for number in range(steps.steps):
-        step = stepper.step(states[number], float(steps.times_s[number]), steps.step_seconds)
+        step = runge_kutta.step(states[number], float(steps.times_s[number]), steps.step_seconds)
         assert step.converged, step.status
         states[number + 1] = step.relative_k
     states += reference

@@ -51,7 +51,7 @@ from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.fem.tolerance import Tolerance, solve_to_tolerance
 from thermoxels_ns.heat.effects import Convection, FixedTemperature
 from thermoxels_ns.heat.materials import Material

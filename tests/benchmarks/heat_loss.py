@@ -21,7 +21,7 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.evaluation.truth_comparison import load_known_truth
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
-from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh

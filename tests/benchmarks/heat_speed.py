@@ -123,7 +123,7 @@ class HeatSpeed:
     def ours(self, points: np.ndarray, tets: np.ndarray, start: np.ndarray, lumped: bool) -> np.ndarray:
         """Temperatures of all times by this package."""
         from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
-        from thermoxels_ns.fem.stepping import solve_heat
+        from thermoxels_ns.fem.time_loop import solve_heat
         from thermoxels_ns.heat.materials import Material
         from thermoxels_ns.mesh.tetrahedra import TetMesh
 

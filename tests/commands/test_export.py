@@ -229,7 +229,7 @@ def plain_pictures(monkeypatch) -> None:
     )
 
 
-@pytest.mark.parametrize("where", ["stepping.solve_heat", "summary"])
+@pytest.mark.parametrize("where", ["time_loop.solve_heat", "summary"])
 def test_failed_export_leaves_the_earlier_one_untouched(ball, tmp_path, monkeypatch, where) -> None:
     plain_pictures(monkeypatch)
     export_snapshot(ball, np.eye(4), ExportOptions(**SCALED), tmp_path)

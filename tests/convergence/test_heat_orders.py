@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
-from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets

@@ -10,7 +10,7 @@ import pytest
 from tests.support.obtuse_bodies import AT_THE_BOUNDS, CONCRETE, body
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import FixedTemperature
 
 STEPS = (8, 16, 32)

@@ -12,7 +12,7 @@ from thermoxels_ns.fem import steady
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.solution import EffectHeat
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.stepping import HeatBalance, solve_heat
+from thermoxels_ns.fem.time_loop import HeatBalance, solve_heat
 from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, Radiation
 from thermoxels_ns.heat.materials import Material
 

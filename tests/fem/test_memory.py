@@ -14,7 +14,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.memory import check_memory, peak_bytes
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection, Radiation
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 

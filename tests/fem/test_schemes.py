@@ -10,7 +10,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Scheme, theta_scheme
-from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
     Convection,
@@ -197,7 +197,7 @@ def test_adaptive_steps_grow_and_shrink_with_what_happens() -> None:
 
 def test_a_step_that_would_overshoot_is_taken_with_backward_euler(monkeypatch) -> None:
     """With a tolerance so loose that errors do not shorten the steps, only the range does."""
-    monkeypatch.setattr("thermoxels_ns.fem.stepping._March._first_length", lambda *_: 100.0 * STEP_S)
+    monkeypatch.setattr("thermoxels_ns.fem.time_loop._TimeLoop._first_length", lambda *_: 100.0 * STEP_S)
     problem = HeatProblem(bar(20, 0.0), CONCRETE, effects=(FixedTemperature(("x0",), 1.0),))
     solution = solve_heat(problem, AdaptiveSteps(1000 * STEP_S, 100.0))
     assert "taken with backward Euler because SDIRK2 would have overshot" in solution.status

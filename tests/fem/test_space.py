@@ -7,7 +7,7 @@ from skfem import FacetBasis, LinearForm, MeshTet
 from tests.support.heat_meshes import box_mesh, planes
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.forms import FluxForm, exchange
+from thermoxels_ns.fem.forms import FluxForm, heat_transfer
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Bounded, Bounds, Varying
 from thermoxels_ns.fem.selection import Selection
@@ -144,7 +144,7 @@ def test_integrals_over_the_surface_are_those_of_a_basis_on_facets(options) -> N
     ours, theirs = space.surface(np.arange(len(facets))), FacetBasis(tets, space.element, facets=facets, intorder=4)
     value = np.random.default_rng(6).uniform(1.0, 2.0, (len(facets), 1))
     matrix, expected = (
-        exchange.assemble(basis, coefficient=np.broadcast_to(value, basis.dx.shape)) for basis in (ours, theirs)
+        heat_transfer.assemble(basis, coefficient=np.broadcast_to(value, basis.dx.shape)) for basis in (ours, theirs)
     )
     assert abs(matrix - expected).max() < 1e-12 * abs(expected).max()
     flux = Bounded(Varying(lambda places, time_s: value[:, 0], in_time=False), Bounds("flux", "W/m2"))

@@ -6,8 +6,7 @@ from scipy import sparse
 
 from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem import stage as stage_module
-from thermoxels_ns.fem import steady
+from thermoxels_ns.fem import implicit_equation, steady
 from thermoxels_ns.fem.conjugate_gradients import PATIENCE, LinearSolver
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
@@ -75,7 +74,7 @@ def test_radiation_alone_levels_the_body(start_c, sky_c) -> None:
 
 
 def test_too_few_newton_steps_are_a_status(monkeypatch) -> None:
-    monkeypatch.setattr(stage_module, "MAX_ITERATIONS", 2)
+    monkeypatch.setattr(implicit_equation, "MAX_ITERATIONS", 2)
     problem = HeatProblem(slab(900.0), STEEL, effects=(Radiation(("*",), 0.9, -270.0),))
     with pytest.raises(HeatError, match=r"No steady state was found\. Newton's method stopped after 2 steps"):
         solve_steady(problem)

@@ -162,7 +162,7 @@ def test_what_changes_in_time_is_assembled_again(box, concrete) -> None:
     still_w = 5.0 * 0.08 * (20.0 - system.reference_c)
     np.testing.assert_allclose(loads, air_w + wind_w + still_w, rtol=1e-12)
     # Matrix: 2 constant, 1 changing, twice. Load: 1 constant, 2 changing, twice.
-    assert system.assembled.counts["robin"] == (2 + 2) + (1 + 4)
+    assert system.assembled.counts["convection"] == (2 + 2) + (1 + 4)
 
 
 def test_labels_differ_even_where_a_patch_is_named_like_a_number() -> None:

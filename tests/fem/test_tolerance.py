@@ -15,7 +15,7 @@ from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.fem.tolerance import Tolerance, ToleratedSolution, solve_to_tolerance
 from thermoxels_ns.heat.effects import Convection, FixedTemperature, Radiation
 from thermoxels_ns.heat.materials import Material

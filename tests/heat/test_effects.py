@@ -10,7 +10,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.solution import HeatSolution
-from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import (
     STEFAN_BOLTZMANN_W_M2K4,
     AbsorbedSolar,
@@ -205,7 +205,7 @@ def test_effects_of_one_kind_and_place_are_told_apart(box, concrete) -> None:
 
 EVERY = {
     "fixed": FixedTemperature(("x0",), 10.0),
-    "robin": Convection(("x1",), 8.0, 5.0),
+    "convection": Convection(("x1",), 8.0, 5.0),
     "flux": HeatFlux(("y0",), 20.0),
     "radiation": Radiation(("y1",), 0.9, -10.0),
     "source": InternalHeat(("*",), 100.0),
@@ -234,4 +234,4 @@ def test_an_effect_on_a_patch_without_triangles_assembles_nothing(box, concrete)
 def test_constant_effects_are_assembled_once(box, concrete) -> None:
     effects = tuple(effect for kind, effect in EVERY.items() if kind != "radiation")
     bill = solve_heat(HeatProblem(box, concrete, effects=effects), TimeSteps(20, 60.0)).assembled
-    assert bill.counts == {"stiffness": 1, "mass": 1, "fixed": 1, "robin": 2, "flux": 1, "source": 1}
+    assert bill.counts == {"stiffness": 1, "mass": 1, "fixed": 1, "convection": 2, "flux": 1, "source": 1}

@@ -12,11 +12,10 @@ from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.stepping import solve_heat
-from thermoxels_ns.fem.surface_heat import heat_by_part
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.heat.materials import Material
-from thermoxels_ns.heat.results import heat_results, wall_result
+from thermoxels_ns.heat.results import heat_by_part, heat_results, wall_result
 
 BRICK, WOOL = Material("brick", 0.7, 1600.0, 940.0), Material("wool", 0.04, 30.0, 1030.0)
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)

@@ -12,7 +12,7 @@ from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat import screening as screening_module
 from thermoxels_ns.heat.effects import (
     AbsorbedSolar,

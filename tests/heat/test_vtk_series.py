@@ -6,7 +6,7 @@ import pyvista
 
 from thermoxels_ns.core.errors import OutputError
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
-from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.vtk_series import remove_heat_series, write_heat_series
 
 

@@ -16,7 +16,7 @@ from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.schemes import CRANK_NICOLSON, SDIRK2
 from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, Radiation
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.quality.checks import check_mesh

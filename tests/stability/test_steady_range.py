@@ -10,9 +10,9 @@ import pytest
 from tests.support.heat_meshes import SIDES, box_mesh
 from tests.support.obtuse_bodies import AT_THE_BOUNDS, CONCRETE, body
 from thermoxels_ns.fem import steady
+from thermoxels_ns.fem.implicit_equation import ImplicitEquation
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.stage import Stage
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, HeatFlux, InternalHeat, Radiation
@@ -38,7 +38,7 @@ def problem(shape: str, contrast: float, *effects: Effect) -> HeatProblem:
 def plain(given: HeatProblem) -> np.ndarray:
     """The state without any keeping, [degrees Celsius]."""
     system = HeatSystem(given)
-    found = Stage(system, 0.0, np.inf, relative_tolerance=1e-12).solve(system.start_k, 0.0)
+    found = ImplicitEquation(system, 0.0, np.inf, relative_tolerance=1e-12).solve(system.start_k, 0.0)
     return found.relative_k + system.reference_c
 
 
@@ -102,13 +102,13 @@ def test_where_nothing_overshoots_the_first_answer_is_the_last(monkeypatch, shap
     """The same bits, from one solution."""
     given, made = problem(shape, 1.0, *effects), []
 
-    class Counted(Stage):
+    class Counted(ImplicitEquation):
         def __init__(self, *args, **kwargs) -> None:
             made.append(self)
             super().__init__(*args, **kwargs)
 
     before = plain(given)
-    monkeypatch.setattr(steady, "Stage", Counted)
+    monkeypatch.setattr(steady, "ImplicitEquation", Counted)
     solution = solve_steady(given)
     np.testing.assert_array_equal(solution.temperature_c, before)
     assert len(made) == 1 and "range" not in solution.status
@@ -127,7 +127,7 @@ def test_meshes_without_obtuse_angles_need_none() -> None:
 
 @pytest.mark.parametrize(
     ("options", "because"),
-    [({"order": 2}, "quadratic tetrahedra"), ({"lumped_boundary": False}, "boundary exchange that is not lumped")],
+    [({"order": 2}, "quadratic tetrahedra"), ({"lumped_boundary": False}, "convection that is not lumped")],
 )
 def test_what_is_not_kept_in_range_says_by_how_much_it_left(options, because) -> None:
     solution = solve_steady(problem("torus", 1.0, FixedTemperature(("x0",), HIGH), STRONG), **options)

@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 
 from tests.support.heat_matrices import assemble
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
-from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets

@@ -55,29 +55,34 @@ class LinearSolution:
 
 
 class Preconditioner(Protocol):
-    """A symmetric positive definite S that resembles A, as S = C C^T or as a function r -> S^-1 r."""
+    """A symmetric positive definite S that resembles A.
+
+    It is applied in two parts. A factor C changes the system that the loop solves to C^-1 A C^-T y = C^-1 b with x =
+    C^-T y, and `apply` preconditions that: S = C S' C^T. `Sweeps` has the factor alone (S' = 1), all others `apply`
+    alone (C = 1).
+    """
 
     name: str
     """What preconditions, for reports."""
 
     def residual(self, r: Vector) -> Vector:
-        """The residual that the loop sees, C^-1 r."""
+        """Residual of the changed system, C^-1 r."""
         ...
 
     def norm(self, seen: Vector) -> float:
-        """Norm of the residual r of which the loop sees C^-1 r."""
+        """Norm of r from C^-1 r."""
         ...
 
     def image(self, direction: Vector) -> tuple[Vector, Vector]:
-        """C^-T p, by which the solution moves, and C^-1 A C^-T p, by which the residual that the loop sees does."""
+        """For a direction p: C^-T p, and the changed matrix times p, C^-1 A C^-T p."""
         ...
 
     def solution(self, moved: Vector) -> Vector:
-        """The solution for the sum of all moves."""
+        """Turn the sum of all `image`'s C^-T p into x."""
         ...
 
     def apply(self, seen: Vector) -> Vector:
-        """What is left of S^-1 for the residual that the loop sees."""
+        """S'^-1 times the changed system's residual."""
         ...
 
 

@@ -20,7 +20,7 @@ from thermoxels_ns.fem.quantities import Bounded
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import Assembled
 from thermoxels_ns.fem.space import Space, sums_by_number
-from thermoxels_ns.fem.terms import FixedTerm, FluxTerm, RadiationTerm, RobinTerm, SourceTerm
+from thermoxels_ns.fem.terms import ConvectionTerm, FixedTerm, FluxTerm, RadiationTerm, SourceTerm
 
 Vector = npt.NDArray[np.float64]
 
@@ -45,8 +45,8 @@ def at_time(kept: dict[float, T], time_s: float, compute: Callable[[float], T], 
 
 
 @BilinearForm
-def exchange(u, v, w):
-    """Heat per kelvin through a surface, h u v, [W / K]."""
+def heat_transfer(u, v, w):
+    """Convection, or radiation's slope, per kelvin: h u v, [W / K]."""
     return w.coefficient * u * v
 
 
@@ -105,7 +105,7 @@ class _Boundary:
             matrix = sparse.csr_matrix(sparse.diags(self.vector(coefficient_w_m2k), format="csr"))
         else:
             coefficient = np.broadcast_to(coefficient_w_m2k, self.basis.dx.shape)
-            matrix = sparse.csr_matrix(exchange.assemble(self.basis, coefficient=coefficient))
+            matrix = sparse.csr_matrix(heat_transfer.assemble(self.basis, coefficient=coefficient))
         matrix.eliminate_zeros()
         return matrix
 
@@ -114,18 +114,20 @@ class _Boundary:
         return sums_by_number(self.group, (flux_w_m2 * self.basis.dx).sum(axis=1), len(self.groups))
 
 
-class RobinForm(_Boundary):
-    """h (T_ambient - T): a matrix and a load."""
+class ConvectionForm(_Boundary):
+    """Convection and ground contact, h (T_ambient - T): a matrix and a load (a Robin boundary condition)."""
 
-    kind = "robin"
+    kind = "convection"
 
-    def __init__(self, term: RobinTerm, space: Space, reference_c: float) -> None:
+    def __init__(self, term: ConvectionTerm, space: Space, reference_c: float) -> None:
         super().__init__(term.effect, term.facets, space)
         self.term, self._reference_c = term, reference_c
         self.matrix_in_time = term.coefficient_w_m2k.in_time
+        """Whether h, and with it the matrix, changes with time."""
         self.load_in_time = self.matrix_in_time or term.ambient_c.in_time
+        """Whether h T_ambient changes with time."""
 
-    def robin_matrix(self, time_s: float) -> sparse.csr_matrix:
+    def convection_matrix(self, time_s: float) -> sparse.csr_matrix:
         """Entries integral(h phi_i phi_j), [W / K]."""
         return self.matrix(self.at(self.term.coefficient_w_m2k, time_s))
 
@@ -138,7 +140,7 @@ class RobinForm(_Boundary):
         return self.at(self.term.ambient_c, time_s) - self._reference_c
 
     def exchanging_nodes(self, time_s: float) -> npt.NDArray[np.int64]:
-        """Nodes whose temperature it holds."""
+        """Nodes whose temperature its surroundings pull on: the coefficient is above 0 there."""
         return np.unique(self.nodes[self.at(self.term.coefficient_w_m2k, time_s)[:, 0] > 0.0])
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
@@ -231,7 +233,7 @@ class RadiationForm(_Boundary):
         return self.matrix(4.0 * self._strength(time_s) * (kelvin * kelvin * kelvin))
 
     def magnitude(self, relative_k: Vector, time_s: float) -> Vector:
-        """Sizes of what the load adds up, [W]; round-off of the load is a few eps of it."""
+        """Sum of the absolute values of the load's terms, [W]: the load's round-off is a few eps of this."""
         size = 0.0
         for part in (self.surface_k(relative_k), self.surroundings_k(time_s)):
             kelvin = np.abs(part + self._reference_k)
@@ -244,7 +246,7 @@ class RadiationForm(_Boundary):
         return self.at(self.term.surroundings_c, time_s) - self._reference_c
 
     def exchanging_nodes(self, time_s: float) -> npt.NDArray[np.int64]:
-        """Nodes whose temperature it holds."""
+        """Nodes whose temperature its surroundings pull on: the coefficient is above 0 there."""
         return np.unique(self.nodes[self._strength(time_s)[:, 0] > 0.0])
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
@@ -257,7 +259,7 @@ class RadiationForm(_Boundary):
     def _flux_w_m2(self, relative_k: Vector, time_s: float) -> Vector:
         surface, around = self.surface_k(relative_k), self.surroundings_k(time_s)
         t, s = surface + self._reference_k, around + self._reference_k
-        # As a product with the difference, which loses nothing where both are close.
+        # s^4 - t^4 = (s - t) (s + t) (s^2 + t^2): no digits are lost where both are close.
         ss, tt = s * s, t * t
         fourth = np.where(t >= 0.0, (around - surface) * (s + t) * (ss + tt), ss * ss + tt * tt)
         return self._strength(time_s) * fourth
@@ -374,19 +376,19 @@ class FixedNodes:
 class EffectForms:
     """Forms by what they do to the heat equation, each in the order of the effects."""
 
-    robin: tuple[RobinForm, ...]
-    """A matrix and a load."""
+    convection: tuple[ConvectionForm, ...]
+    """Convection and ground contact: a matrix and a load."""
     loads: tuple[FluxForm | SourceForm, ...]
     """Loads that do not depend on the temperature."""
     radiation: tuple[RadiationForm, ...]
-    """What depends on the temperature's fourth power."""
+    """Loads that depend on the fourth power of the temperature."""
     fixed: tuple[FixedForm, ...]
-    """Temperatures of nodes."""
+    """Given temperatures of nodes."""
 
     @property
     def exchanging(self) -> tuple[Form, ...]:
         """Forms that heat flows through other than by fixed nodes: convection, loads, radiation."""
-        return (*self.robin, *self.loads, *self.radiation)
+        return (*self.convection, *self.loads, *self.radiation)
 
 
 def effect_forms(
@@ -405,7 +407,7 @@ def effect_forms(
     Raises:
         HeatError: An effect names what the mesh does not have.
     """
-    robin: list[RobinForm] = []
+    convection: list[ConvectionForm] = []
     loads: list[FluxForm | SourceForm] = []
     radiation: list[RadiationForm] = []
     fixed: list[FixedForm] = []
@@ -414,8 +416,8 @@ def effect_forms(
             if not len(bare.tets if isinstance(bare, SourceTerm) else bare.facets):
                 continue
             term = replace(bare, effect=label)
-            if isinstance(term, RobinTerm):
-                robin.append(RobinForm(term, space, reference_c))
+            if isinstance(term, ConvectionTerm):
+                convection.append(ConvectionForm(term, space, reference_c))
             elif isinstance(term, FluxTerm):
                 loads.append(FluxForm(term, space))
             elif isinstance(term, SourceTerm):
@@ -426,4 +428,4 @@ def effect_forms(
                 counted: AbstractContextManager[None] = nullcontext() if assembled is None else assembled.form("fixed")
                 with counted:
                     fixed.append(FixedForm(term, space, reference_c))
-    return EffectForms(tuple(robin), tuple(loads), tuple(radiation), tuple(fixed))
+    return EffectForms(tuple(convection), tuple(loads), tuple(radiation), tuple(fixed))

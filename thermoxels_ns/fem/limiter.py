@@ -11,13 +11,13 @@ import numpy.typing as npt
 from scipy import sparse
 
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
+from thermoxels_ns.fem.implicit_equation import ImplicitSolution
+from thermoxels_ns.fem.runge_kutta import RungeKutta, Step
 from thermoxels_ns.fem.schemes import BACKWARD_EULER
-from thermoxels_ns.fem.stage import StageSolution
-from thermoxels_ns.fem.stepper import Step, Stepper
 from thermoxels_ns.fem.system import HeatSystem
 
 Vector = npt.NDArray[np.float64]
-Solved = TypeVar("Solved", Step, StageSolution)
+Solved = TypeVar("Solved", Step, ImplicitSolution)
 
 RANGE_ROUND_OFF = 1e-9
 """How far out of its range a temperature may be, as a share of the range of the whole computation so far."""
@@ -162,7 +162,7 @@ class Limiter:
     def __init__(self, system: HeatSystem, *, relative_tolerance: float) -> None:
         """Prepare; what only some meshes need is made when it is needed."""
         self._system, self._relative_tolerance = system, relative_tolerance
-        self._plain = Stepper(system, BACKWARD_EULER, relative_tolerance=relative_tolerance)
+        self._plain = RungeKutta(system, BACKWARD_EULER, relative_tolerance=relative_tolerance)
         self._range = AllowedRange(system)
         self._entries: PositiveOffDiagonals | None = None
 
@@ -170,7 +170,7 @@ class Limiter:
         """Take one step from `start_k`, shape (n,), [K]; `slack_k` as in `AllowedRange.at`.
 
         Returns the step, and the temperatures after it before any entry was left out, shape (n,), [K]. They may be out
-        of range if the step failed, or with consistent masses or boundary exchange.
+        of range if the step failed, or with consistent masses or convection.
         """
         plain = self._plain.step(start_k, time_s, step_s)
         if not plain.converged:
@@ -183,8 +183,8 @@ class Limiter:
         self._entries.reset()
 
         def solve(limited: HeatSystem, _: Step) -> Step:
-            stepper = Stepper(limited, BACKWARD_EULER, relative_tolerance=self._relative_tolerance)
-            return stepper.step(start_k, time_s, step_s)
+            runge_kutta = RungeKutta(limited, BACKWARD_EULER, relative_tolerance=self._relative_tolerance)
+            return runge_kutta.step(start_k, time_s, step_s)
 
         step, limited = solve_in_range(self._entries, plain, low, high, solve)
         in_range = step.converged and is_in_range(step, low, high)

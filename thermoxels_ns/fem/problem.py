@@ -107,7 +107,8 @@ class GivenSteps:
     lengths_s: tuple[npt.NDArray[np.float64], ...]
     """Lengths of the steps in each of some equal intervals at whose ends temperatures are kept, [s]."""
     tolerance_k: float
-    """Error that the steps were chosen for, [K]: a thousandth of it is how far temperatures may leave their range."""
+    """Tolerance of the adaptive steps that these came from, [K]. A step whose temperatures leave their range by more
+    than a thousandth of it is repeated with backward Euler."""
 
     def halved(self, times: int = 1) -> GivenSteps:
         """Halve every step so many times."""

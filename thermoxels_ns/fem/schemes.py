@@ -74,7 +74,8 @@ BACKWARD_EULER = Scheme("backward Euler", 1, (1.0,), ((1.0,),))
 """First order. With lumped masses and non-obtuse tetrahedra no temperature ever leaves the range of what it came from
 and of what surrounds it, however long the step."""
 CRANK_NICOLSON = theta_scheme(0.5)
-"""Second order, but it does not damp: after a jump, long steps overshoot by up to the jump itself."""
+"""Second order, but it does not damp: after a jump, long steps overshoot by up to the jump itself. No command uses it:
+it is the reference that the published NAFEMS benchmark T3 is compared with."""
 SDIRK2 = _sdirk2()
 """Second order and L-stable: it damps what a step is too long to follow. Very long steps may overshoot by 1 or 2 % of a
 jump."""

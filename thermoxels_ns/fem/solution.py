@@ -37,7 +37,7 @@ class Assembled:
     """
 
     counts: dict[str, int] = field(default_factory=dict)
-    """How often each kind was assembled: stiffness, mass, robin, flux, radiation, source, fixed."""
+    """How often each kind was assembled: stiffness, mass, convection, flux, radiation, source, fixed."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Time each kind took, [s]."""
 

@@ -60,13 +60,13 @@ class Space:
     def __init__(
         self, selection: Selection, *, order: int = 1, lumped: bool = True, lumped_boundary: bool | None = None
     ) -> None:
-        """Choose the elements and how masses and boundary exchange are integrated.
+        """Choose the elements and how masses, convection and radiation are integrated.
 
         Args:
             selection: The mesh and its parts.
             order: 1 for linear tetrahedra, 2 for quadratic ones.
             lumped: Put each node's mass on the diagonal; of linear tetrahedra only.
-            lumped_boundary: Evaluate boundary exchange at the nodes, which makes its matrices diagonal; False:
+            lumped_boundary: Evaluate convection and radiation at the nodes: diagonal matrices; False:
                 integrate it over each triangle; None: at the nodes of linear tetrahedra.
 
         Raises:

@@ -9,10 +9,10 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
+from thermoxels_ns.fem.implicit_equation import ImplicitEquation, ImplicitSolution
 from thermoxels_ns.fem.limiter import LEVEL_ROUND_OFF, MOST_SLACK, RANGE_ROUND_OFF, PositiveOffDiagonals, solve_in_range
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.solution import SteadySolution, heat_by_effect
-from thermoxels_ns.fem.stage import Stage, StageSolution
 from thermoxels_ns.fem.system import HeatSystem
 
 _SUSPICIOUS = 1e-12
@@ -92,7 +92,7 @@ def solve_steady(
 class _LimitedState:
     """A steady state and what was done to keep it in range."""
 
-    solution: StageSolution
+    solution: ImplicitSolution
     """Temperatures and how they were found; iterations of all repetitions count."""
     system: HeatSystem
     """The equations that they fulfil."""
@@ -121,18 +121,18 @@ class _LimitedState:
             elif self.system.num_nodes > len(self.system.problem.mesh.points_m):
                 sentence += ", which quadratic tetrahedra may do where they do not resolve the temperature."
             else:
-                sentence += ", which boundary exchange that is not lumped may do."
+                sentence += ", which convection that is not lumped may do."
         return sentence
 
 
 def _limited_state(system: HeatSystem, time_s: float, relative_tolerance: float) -> _LimitedState:
     """Find a steady state in the range of all given and surrounding temperatures; fluxes and sources open its sides."""
 
-    def solve(equations: HeatSystem, before: StageSolution | None) -> StageSolution:
+    def solve(equations: HeatSystem, before: ImplicitSolution | None) -> ImplicitSolution:
         # Radiation is found soonest from where the temperatures are already.
         start_k = before.relative_k if before is not None and system.nonlinear else system.start_k
-        stage = Stage(equations, time_s, np.inf, relative_tolerance=relative_tolerance)
-        return stage.solve(start_k, time_s)
+        equation = ImplicitEquation(equations, time_s, np.inf, relative_tolerance=relative_tolerance)
+        return equation.solve(start_k, time_s)
 
     solution, solved, left_out = solve(system, None), system, 0
     if not solution.converged:

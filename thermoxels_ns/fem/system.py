@@ -90,14 +90,14 @@ class HeatSystem:
         selection = Selection(problem.mesh, problem.up)
         self._space = Space(selection, order=order, lumped=lumped, lumped_boundary=lumped_boundary)
         forms = effect_forms(problem, self._space, self.reference_c, self.assembled)
-        self._robin, self._loads, self._radiation = forms.robin, forms.loads, forms.radiation
+        self._convection, self._loads, self._radiation = forms.convection, forms.loads, forms.radiation
         self.fixed: FixedNodes = FixedNodes(forms.fixed, self.num_nodes)
         """Nodes whose temperature is given."""
         with self.assembled.form("stiffness"):
             self._stiffness = self._space.stiffness(problem.conductivity_w_mk)
         self.pieces: Pieces = Pieces(self._stiffness)
         """Connected pieces of the body."""
-        self.matrix_in_time: bool = any(form.matrix_in_time for form in self._robin)
+        self.matrix_in_time: bool = any(form.matrix_in_time for form in self._convection)
         """Whether the matrix of the linear part changes with time."""
         self.nonlinear: bool = bool(self._radiation)
         """Whether there is radiation."""
@@ -109,8 +109,8 @@ class HeatSystem:
         )
         """Effect and patch or region of each heat flow of `group_heat_w`, then of each of the fixed nodes."""
         self._mass: tuple[sparse.csr_matrix | None, Vector] | None = None
-        self._kept_exchange: sparse.csr_matrix | None = None
-        self._kept_exchanges: dict[float, sparse.csr_matrix | None] = {}
+        self._kept_convection: sparse.csr_matrix | None = None
+        self._convection_at: dict[float, sparse.csr_matrix | None] = {}
         self._kept_matrix: sparse.csr_matrix | None = None
         self._kept_load: Vector | None = None
         self._kept_loads: dict[float, Vector] = {}
@@ -135,7 +135,7 @@ class HeatSystem:
 
     @property
     def lumped(self) -> bool:
-        """Whether masses and boundary exchange are both on the diagonal."""
+        """Whether masses, convection and radiation are all on the diagonal."""
         return self._space.lumped and self._space.lumped_boundary
 
     def with_stiffness(self, stiffness: sparse.csr_matrix) -> HeatSystem:
@@ -164,21 +164,21 @@ class HeatSystem:
         matrix, nodal = self._masses()
         return nodal * relative_k if matrix is None else matrix @ relative_k
 
-    def exchange_matrix(self, time_s: float) -> sparse.csr_matrix | None:
+    def convection_matrix(self, time_s: float) -> sparse.csr_matrix | None:
         """R, heat that convection takes from each node per kelvin, shape (n, n), [W / K]; None without convection."""
-        if self._kept_exchange is None:
-            self._kept_exchange = self._sum_of_exchange(False, 0.0)
+        if self._kept_convection is None:
+            self._kept_convection = self._sum_of_convection(False, 0.0)
         if not self.matrix_in_time:
-            return self._kept_exchange
-        constant = self._kept_exchange
-        return at_time(self._kept_exchanges, time_s, lambda t: _sum_of(constant, self._sum_of_exchange(True, t)))
+            return self._kept_convection
+        constant = self._kept_convection
+        return at_time(self._convection_at, time_s, lambda t: _sum_of(constant, self._sum_of_convection(True, t)))
 
     def matrix(self, time_s: float, step_s: float) -> sparse.csr_matrix:
         """M / step + K + R, shape (n, n), [W / K]; without M for a step without end."""
         matrix = self._kept_matrix
         if matrix is None:
-            exchange = self.exchange_matrix(time_s)
-            matrix = self._stiffness if exchange is None else sparse.csr_matrix(self._stiffness + exchange)
+            convection = self.convection_matrix(time_s)
+            matrix = self._stiffness if convection is None else sparse.csr_matrix(self._stiffness + convection)
         if np.isinf(step_s):
             # An estimate of the error asks for it again.
             self._kept_matrix = None if self.matrix_in_time else matrix
@@ -203,14 +203,14 @@ class HeatSystem:
     def held_w_k(self, time_s: float, step_s: float) -> Vector:
         """Row sums of M / step + R, shape (n,), [W / K]: of the matrix too, because those of K are 0, but exact."""
         held = self.nodal_mass_j_k / step_s if np.isfinite(step_s) else np.zeros(self.num_nodes)
-        exchange = self.exchange_matrix(time_s)
-        return held if exchange is None else held + exchange @ np.ones(self.num_nodes)
+        convection = self.convection_matrix(time_s)
+        return held if convection is None else held + convection @ np.ones(self.num_nodes)
 
     def load(self, time_s: float) -> Vector:
         """Heat that does not depend on the temperature: R T_ambient, fluxes and sources, shape (n,), [W]."""
         if self._kept_load is None:
             self._kept_load = self._sum_of_loads(False, 0.0)
-        if not any(form.load_in_time for form in (*self._robin, *self._loads)):
+        if not any(form.load_in_time for form in (*self._convection, *self._loads)):
             return self._kept_load
         constant = self._kept_load
         return at_time(self._kept_loads, time_s, lambda t: constant + self._sum_of_loads(True, t))
@@ -238,9 +238,9 @@ class HeatSystem:
         """
         heat = self.load(time_s).copy()
         bound = np.abs(heat)
-        exchange = self.exchange_matrix(time_s)
-        if exchange is not None:
-            lost, size = product_and_bound(exchange, relative_k)
+        convection = self.convection_matrix(time_s)
+        if convection is not None:
+            lost, size = product_and_bound(convection, relative_k)
             heat -= lost
             bound += size
         if self.nonlinear:
@@ -284,14 +284,14 @@ class HeatSystem:
         `radiating_k` are temperatures of radiation, such as those of a mean fourth power; None: the same.
         """
         radiating_k = relative_k if radiating_k is None else radiating_k
-        given = (form.group_heat_w(relative_k, time_s) for form in (*self._robin, *self._loads))
+        given = (form.group_heat_w(relative_k, time_s) for form in (*self._convection, *self._loads))
         radiated = (form.group_heat_w(radiating_k, time_s) for form in self._radiation)
         return np.concatenate([np.zeros(0), *given, *radiated])
 
     def exchanging_pieces(self, time_s: float) -> npt.NDArray[np.bool_]:
         """Mark the pieces whose temperature convection, radiation or fixed nodes hold, shape (p,)."""
         marks = self.pieces.touched(self.fixed.nodes)
-        for form in (*self._robin, *self._radiation):
+        for form in (*self._convection, *self._radiation):
             marks |= self.pieces.touched(form.exchanging_nodes(time_s))
         return marks
 
@@ -309,7 +309,7 @@ class HeatSystem:
 
     def _surroundings_k(self, time_s: float) -> tuple[float, float]:
         low, high = np.inf, -np.inf
-        ambients = [form.ambient_k(time_s) for form in self._robin]
+        ambients = [form.ambient_k(time_s) for form in self._convection]
         ambients += [form.surroundings_k(time_s) for form in self._radiation]
         ambients += [self.fixed.temperature_k(time_s)] if len(self.fixed.nodes) else []
         for ambient in ambients:
@@ -325,17 +325,17 @@ class HeatSystem:
                 self._mass = self._space.mass(self.problem.heat_capacity_j_m3k)
         return self._mass
 
-    def _sum_of_exchange(self, in_time: bool, time_s: float) -> sparse.csr_matrix | None:
+    def _sum_of_convection(self, in_time: bool, time_s: float) -> sparse.csr_matrix | None:
         total: sparse.csr_matrix | None = None
-        for form in self._robin:
+        for form in self._convection:
             if form.matrix_in_time == in_time:
-                with self.assembled.form("robin"):
-                    total = _sum_of(total, form.robin_matrix(time_s))
+                with self.assembled.form("convection"):
+                    total = _sum_of(total, form.convection_matrix(time_s))
         return total
 
     def _sum_of_loads(self, in_time: bool, time_s: float) -> Vector:
         total = np.zeros(self.num_nodes)
-        for form in (*self._robin, *self._loads):
+        for form in (*self._convection, *self._loads):
             if form.load_in_time == in_time:
                 with self.assembled.form(form.kind):
                     total += form.load(time_s)

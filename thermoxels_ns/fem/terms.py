@@ -23,8 +23,8 @@ class _OnFacets:
 
 
 @dataclass(frozen=True)
-class RobinTerm(_OnFacets):
-    """q = h (T_ambient - T) through boundary triangles, positive into the body."""
+class ConvectionTerm(_OnFacets):
+    """Convection or ground contact, q = h (T_ambient - T) through boundary triangles, positive into the body."""
 
     coefficient_w_m2k: Bounded
     """h, [W / (m2 K)]."""
@@ -72,7 +72,7 @@ class FixedTerm(_OnFacets):
     """Temperature, [degrees Celsius]."""
 
 
-Term: TypeAlias = RobinTerm | FluxTerm | RadiationTerm | SourceTerm | FixedTerm
+Term: TypeAlias = ConvectionTerm | FluxTerm | RadiationTerm | SourceTerm | FixedTerm
 """All kinds."""
 
 

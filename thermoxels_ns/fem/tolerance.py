@@ -26,7 +26,7 @@ from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem
 from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.time_loop import solve_heat
 
 _STEADY_TOLERANCE, _STEP_TOLERANCE = 1e-8, 1e-10
 """Of the linear solver: its error is far below any estimate here."""

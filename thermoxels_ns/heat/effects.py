@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.quantities import Bounded, Bounds, Quantity
 from thermoxels_ns.fem.selection import Selection
-from thermoxels_ns.fem.terms import Effect, FixedTerm, FluxTerm, RadiationTerm, RobinTerm, SourceTerm, Term
+from thermoxels_ns.fem.terms import ConvectionTerm, Effect, FixedTerm, FluxTerm, RadiationTerm, SourceTerm, Term
 
 STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8
 """Stefan-Boltzmann constant (CODATA 2018), [W / (m2 K4)]."""
@@ -76,7 +76,7 @@ class Convection(SurfaceEffect):
     def terms(self, selection: Selection) -> tuple[Term, ...]:
         """k grad T . n = h (T_air - T)."""
         facets = selection.facets(self.patches)
-        return (RobinTerm(self.label, facets, self.bounded("coefficient_w_m2k"), self.bounded("air_c")),)
+        return (ConvectionTerm(self.label, facets, self.bounded("coefficient_w_m2k"), self.bounded("air_c")),)
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class GroundContact(SurfaceEffect):
         facets = selection.facets(self.patches)
         coefficient = Bounds("1 / resistance_m2k_w", "W/(m2 K)", 0.0)
         conductance = Bounded(coefficient.check_quantity(1.0 / self.resistance_m2k_w), coefficient)
-        return (RobinTerm(self.label, facets, conductance, self.bounded("ground_c")),)
+        return (ConvectionTerm(self.label, facets, conductance, self.bounded("ground_c")),)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from thermoxels_ns.fem.quantities import Bounded, Places
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.space import Space, sums_by_number
 from thermoxels_ns.fem.system import Pieces
-from thermoxels_ns.fem.terms import FixedTerm, FluxTerm, RobinTerm, SourceTerm, Term
+from thermoxels_ns.fem.terms import ConvectionTerm, FixedTerm, FluxTerm, SourceTerm, Term
 
 Vector = npt.NDArray[np.float64]
 
@@ -47,8 +47,8 @@ class Span:
 
 
 @dataclass(frozen=True)
-class _Exchange:
-    """Exchange with surroundings through boundary triangles: strength times a difference."""
+class _SurfaceExchange:
+    """Convection or radiation through boundary triangles: strength times a difference."""
 
     nodes: npt.NDArray[np.int64]
     """Nodes of the triangles, shape (k, 3)."""
@@ -61,7 +61,7 @@ class _Exchange:
 
 
 class NodalHeat:
-    """What one effect can do to the nodes. Exchange counts at the nodes, as in the solvers' default.
+    """What one effect can do to the nodes. Convection and radiation count at the nodes, as in the solvers' default.
 
     Between the times at which a quantity is asked for, it may go beyond by as much as it changes from one to
     the next; where they are further apart than its resolution, it may be all that it is allowed to be.
@@ -71,7 +71,7 @@ class NodalHeat:
         """Evaluate an effect at times of shape (s,), [s]; `between`: quantities count between them as well."""
         self.effect = effect
         self.cooling_w: Vector = np.zeros(space.num_nodes)
-        """Largest given heat out of each node at any time, shape (n,), [W]; exchange is not in it."""
+        """Largest given heat out of each node at any time, shape (n,), [W]; convection and radiation are not in it."""
         self.heating_w: Vector = np.zeros(space.num_nodes)
         """The same into each node."""
         self.held_w_k: Vector = np.zeros(space.num_nodes)
@@ -82,7 +82,7 @@ class NodalHeat:
         """Nodes whose temperature it fixes, shape (n,)."""
         self.surroundings_c: list[Span] = []
         """Temperatures that it pulls towards."""
-        self._exchanges: list[_Exchange] = []
+        self._exchanges: list[_SurfaceExchange] = []
         self._space, self._times, self._between = space, times_s, between
         for term in terms:
             self._add(term)
@@ -123,17 +123,17 @@ class NodalHeat:
             self.fixed[used] = self.holds[used] = True
             self.surroundings_c.append(self._over_time(term.temperature_c, space.node_places(used)))
         else:
-            robin = isinstance(term, RobinTerm)
-            factor = term.coefficient_w_m2k if robin else term.emissivity
-            around = self._over_time(term.ambient_c if robin else term.surroundings_c, places)
-            scale = area if robin else area * term.stefan_boltzmann_w_m2k4
+            convection = isinstance(term, ConvectionTerm)
+            factor = term.coefficient_w_m2k if convection else term.emissivity
+            around = self._over_time(term.ambient_c if convection else term.surroundings_c, places)
+            scale = area if convection else area * term.stefan_boltzmann_w_m2k4
             share = self._over_time(factor, places)
             strength = Span(share.low * scale, share.high * scale)
             self.holds[nodes[strength.low > 0.0]] = True
-            if robin:
+            if convection:
                 self.held_w_k += self._spread(nodes, strength.low)
             self.surroundings_c.append(around)
-            self._exchanges.append(_Exchange(nodes, strength, around, 1 if robin else 4))
+            self._exchanges.append(_SurfaceExchange(nodes, strength, around, 1 if convection else 4))
 
     def _over_time(self, quantity: Bounded, places: Places) -> Span:
         """Lowest and highest value at each place."""
@@ -186,10 +186,11 @@ def _kelvin(span: Span) -> Span:
 
 
 _WORTH_A_STEP = 1e4
-"""Largest bound, in tolerances, that the implicit step may bring below the tolerance."""
+"""Bound over tolerance above which the implicit step is not tried: it would not bring the bound below the tolerance."""
 _STEP_TOLERANCE = 1e-3
-"""Relative tolerance of the implicit step; the bound holds for any v."""
+"""Relative tolerance of the linear solver in the implicit step; the bound of `screen` holds for an inexact v too."""
 _OBTUSE_FACTOR, _OBTUSE_WIDENING = 2.0, 0.1
+"""On meshes with obtuse angles: factor on bounds, and share by which the range of temperatures is widened."""
 
 
 @dataclass(frozen=True)
@@ -252,19 +253,19 @@ def screen(problem: HeatProblem, time: TimeSteps | AdaptiveSteps | None, toleran
 
     Without an effect, the temperatures differ by w with M w' + (K + R) w + radiation's own damping = f, where f
     is the heat that the effect would bring, and w = 0 at the start. K has no entry above 0 off its diagonal (no
-    obtuse angles), masses and exchange are lumped: so whatever z >= 0 fulfils M z' + (K + R) z >= |f| at every
+    obtuse angles), masses and convection are lumped: so whatever z >= 0 fulfils M z' + (K + R) z >= |f| at every
     node is a bound, |w| <= z (discrete maximum principle; it holds for backward Euler at any step length). Two
     such z are tried, F being the largest |f|:
 
-    - z rises at the rate max F / M towards the ceiling max F / r, r being the exchange that is kept at the node (in a
+    - z rises at the rate max F / M towards the ceiling max F / r, r being the convection that is kept at the node (in a
       steady state there is the ceiling alone: the flux over the coefficient, q / h);
     - from one implicit step over the whole duration t, (M / t + K) v = F: z = v + t max (F - K v) / M, which is 2 max v
       if v is exact. It knows how far heat spreads into the body in that time (the Fourier number).
 
-    Exchange brings at most its coefficient times the largest difference between its surroundings and the range
-    that temperatures can reach, which follows from the start, all surroundings, and the bound of all fluxes and
-    sources. Where angles are obtuse, which the principle does not allow for, the range is widened and bounds
-    are doubled.
+    Convection and radiation bring at most their coefficient times the largest difference between their surroundings
+    and the range that temperatures can reach, which follows from the start, all surroundings, and the bound of all
+    fluxes and sources. Where angles are obtuse, which the principle does not allow for, the range is widened and
+    bounds are doubled.
 
     A tolerance of 0 leaves out only what does nothing at all; without any effect nothing is computed.
 
@@ -408,12 +409,12 @@ class _Screener:
         with np.errstate(divide="ignore"):
             ceiling_k = float(np.max(heat / held)) * self._factor
         if not np.isfinite(self._duration_s):
-            return _Bound(ceiling_k, "the exchange that is kept carries its heat away")
+            return _Bound(ceiling_k, "the convection that is kept carries its heat away")
         rise_k = float(np.max(heat / self._mass[acting])) * self._duration_s * self._factor
         if not np.isfinite(ceiling_k):
             return _Bound(rise_k, "its heat warms no node by more in that time")
         value_k = -ceiling_k * float(np.expm1(-rise_k / ceiling_k))
-        return _Bound(value_k, "the exchange that is kept carries its heat away")
+        return _Bound(value_k, "the convection that is kept carries its heat away")
 
     def _implicit_step(self, heat_w: Vector) -> _Bound:
         """The bound from one implicit step over the whole duration."""

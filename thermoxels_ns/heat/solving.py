@@ -15,7 +15,7 @@ from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Bounds
 from thermoxels_ns.fem.solution import Solution
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.fem.tolerance import Tolerance, ToleratedSolution, solve_to_tolerance
 from thermoxels_ns.heat.screening import Screening, screen
 

@@ -74,8 +74,8 @@ def _summary(run: HeatRun) -> str:
     kind = "quadratic tetrahedra" if run.nodes.quadratic else "tetrahedra"
     what = f"A body of {len(mesh.tets):,} {kind}"
     if run.scene.time is None:
-        return f"{what} in its steady state. {run.solution.status}"
-    return f"{what}, followed for {in_words(float(run.scene.time.times_s[-1]))}. {run.solution.status}"
+        return f"{what} in its steady state."
+    return f"{what}, followed for {in_words(float(run.scene.time.times_s[-1]))}."
 
 
 def _figures(run: HeatRun) -> tuple[tuple[str, str], ...]:
@@ -270,7 +270,7 @@ def _built(run: HeatRun) -> Section:
 
 def _absent(named: HeatProblem, built: HeatProblem, counts: dict[str, int]) -> str:
     """Say what costs nothing because it is not there."""
-    absent = [kind for kind in ("radiation", "robin", "flux", "source", "fixed", "mass") if kind not in counts]
+    absent = [kind for kind in ("radiation", "convection", "flux", "source", "fixed", "mass") if kind not in counts]
     return f"Not there, and at no cost: {', '.join(absent)}." if absent else ""
 
 
@@ -286,7 +286,9 @@ def _made(run: HeatRun, command: str, files: Sequence[str]) -> Section:
     seconds = Table(("Part", "s"), tuple((name, f"{value:.2f}") for name, value in run.seconds.items()))
     said = ", ".join(words)
     lines = (command, *files)
-    return Section("How it was made", words=(f"{said[0].upper()}{said[1:]}.",), tables=(seconds,), lines=lines)
+    return Section(
+        "How it was made", words=(solution.status, f"{said[0].upper()}{said[1:]}."), tables=(seconds,), lines=lines
+    )
 
 
 def _values(effect: Effect, selection: Selection) -> list[str]:

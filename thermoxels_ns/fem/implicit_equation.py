@@ -1,4 +1,4 @@
-"""One implicit stage of a time step, or a steady state, with Newton's method for radiation."""
+"""The implicit equation of a Runge-Kutta stage or a steady state, by Newton's method if there is radiation."""
 
 from __future__ import annotations
 
@@ -25,15 +25,17 @@ MAX_ITERATIONS = 60
 """Newton steps before giving up."""
 
 _SAFE = 0.1
-"""A change of an absolute temperature by this share changes the slope of radiation by no more than a third, so that a
-full step leads down."""
+"""Largest change in a Newton step, as a share of the absolute temperature, at which a full step is taken without a line
+search: the slope of radiation, 4 sigma eps T^3, then changes by no more than a third."""
 _SETTLED = 1e-5
-"""After a step as short as this the error is about its square: a body that cools from 1000 K to 3 K has a residual of
-1e-10 of the first one long before."""
+"""Largest change in a Newton step, as a share of the absolute temperature, after which the method may end: the error
+left is about the square of it. A small residual alone is no proof: of a body that cools from 1000 K to 3 K it falls to
+1e-10 of the first one while the temperature is still wrong."""
 _ENOUGH = 0.5
-"""A step is long enough if the slope along it has changed sign or fallen, and is no more than this share of what it
-was."""
+"""The line search ends where the slope of the energy along the step has fallen to this share of what it was at its
+start, or has changed sign and is no larger than that."""
 _MOST_SEARCHES = 200
+"""Bisections of the line search."""
 _UNEXPLAINED = 1e-11
 """Largest share of the stored heat that may be unaccounted for where nodes are fixed."""
 _EPS = float(np.finfo(np.float64).eps)
@@ -68,8 +70,8 @@ class Residual:
 
 
 @dataclass(frozen=True)
-class StageSolution:
-    """Temperatures at the end of a stage."""
+class ImplicitSolution:
+    """Temperatures that solve an implicit equation."""
 
     relative_k: Vector
     """Relative to the system's reference, shape (n,), [K]."""
@@ -85,11 +87,12 @@ class StageSolution:
     """The outcome as a sentence."""
 
 
-class Stage:
+class ImplicitEquation:
     """Solver of M (T - T_0) / step = given + load - (K + R) T + radiation(T); step = inf: the steady state.
 
-    The unknown is the change T - T_0, which keeps round-off relative to the change. Where radiation is absent the
-    matrix and its preconditioner are made once and serve every stage of the same length.
+    A stage of a diagonally implicit Runge-Kutta scheme has this form; `given` is what earlier stages add. The unknown
+    is the change T - T_0, which keeps round-off relative to the change. Where radiation is absent the matrix and its
+    preconditioner are made once and serve every step of the same length.
 
     Conduction moves heat within a connected piece and never out of it, because the rows of K sum to 0. The sum of the
     equations over a piece without fixed nodes is therefore a balance of what it stores and exchanges, in which K does
@@ -121,7 +124,7 @@ class Stage:
         time_s: float,
         given_w: Vector | None = None,
         given_to_pieces_w: Vector | None = None,
-    ) -> StageSolution:
+    ) -> ImplicitSolution:
         """Find the temperatures at the end from T_0, shape (n,), [K].
 
         Earlier stages give `given_w`, shape (n,), and its sum over each piece without the round-off of conduction,
@@ -131,7 +134,7 @@ class Stage:
         first = balance.residual()
         if first.is_round_off:
             status = "The temperature is level: nothing flows."
-            return StageSolution(balance.base_k, balance.base_k - start_k, 0, 0, True, status)
+            return ImplicitSolution(balance.base_k, balance.base_k - start_k, 0, 0, True, status)
         if self.system.nonlinear:
             found = newton(balance, len(first.heat_w), relative_tolerance=self._relative_tolerance)
             u, spent = found.u, found.linear_iterations
@@ -225,37 +228,42 @@ class Stage:
 
 
 class _Balance:
-    """The heat balance of a stage as a function of the change of the free nodes."""
+    """The residual of an implicit equation as a function of the change of the free nodes."""
 
     def __init__(
-        self, stage: Stage, start_k: Vector, time_s: float, given_w: Vector | None, given_to_pieces_w: Vector | None
+        self,
+        equation: ImplicitEquation,
+        start_k: Vector,
+        time_s: float,
+        given_w: Vector | None,
+        given_to_pieces_w: Vector | None,
     ) -> None:
-        system = stage.system
-        self._stage, self._time_s = stage, time_s
+        system = equation.system
+        self._equation, self._time_s = equation, time_s
         self._given_w, self._given_to_pieces_w = given_w, given_to_pieces_w
         self.base_k, self._start_k = start_k, start_k
         if len(system.fixed.nodes):
             self.base_k = start_k.copy()
             self.base_k[system.fixed.nodes] = system.fixed.temperature_k(time_s)
-            if np.isfinite(stage.step_s):
-                moved_w = system.mass_product(self.base_k - start_k) / stage.step_s
+            if np.isfinite(equation.step_s):
+                moved_w = system.mass_product(self.base_k - start_k) / equation.step_s
                 self._given_w = -moved_w if given_w is None else given_w - moved_w
 
     def solution(
         self, u: Vector, iterations: int, newton_iterations: int, converged: bool, status: str
-    ) -> StageSolution:
+    ) -> ImplicitSolution:
         """Temperatures after a change of the free nodes, with how it was found."""
-        change_k = self._stage.everywhere(u)
+        change_k = self._equation.everywhere(u)
         end_k = self.base_k + change_k
-        fixed = self._stage.system.fixed.nodes
+        fixed = self._equation.system.fixed.nodes
         if len(fixed):
             change_k[fixed] = self.base_k[fixed] - self._start_k[fixed]
-        return StageSolution(end_k, change_k, iterations, newton_iterations, converged, status)
+        return ImplicitSolution(end_k, change_k, iterations, newton_iterations, converged, status)
 
     def residual(self, u: Vector | None = None) -> Residual:
         """Heat that is not balanced at a change of the temperature; None: at no change."""
-        stage, system, pieces = self._stage, self._stage.system, self._stage.system.pieces
-        now_k = self.base_k if u is None else self.base_k + stage.everywhere(u)
+        equation, system, pieces = self._equation, self._equation.system, self._equation.system.pieces
+        now_k = self.base_k if u is None else self.base_k + equation.everywhere(u)
         conducted_w, bound_w = system.conducted_heat(now_k)
         heat_w = np.negative(conducted_w, out=conducted_w)
         piece_w, piece_bound_w = np.zeros(pieces.count), np.zeros(pieces.count)
@@ -270,42 +278,42 @@ class _Balance:
         if self._given_w is not None:
             heat_w += self._given_w
             bound_w += np.abs(self._given_w)
-        if u is not None and np.isfinite(stage.step_s):
-            stored_w = system.mass_product(stage.everywhere(u)) / stage.step_s
+        if u is not None and np.isfinite(equation.step_s):
+            stored_w = system.mass_product(equation.everywhere(u)) / equation.step_s
             heat_w -= stored_w
             bound_w += np.abs(stored_w)
             piece_w -= pieces.sums(stored_w)
             piece_bound_w += pieces.sums(np.abs(stored_w))
         return Residual(
-            stage.at_free(heat_w),
-            np.where(stage.floating, piece_w, 0.0),
-            stage.at_free(np.multiply(bound_w, ROUND_OFF, out=bound_w)),
+            equation.at_free(heat_w),
+            np.where(equation.floating, piece_w, 0.0),
+            equation.at_free(np.multiply(bound_w, ROUND_OFF, out=bound_w)),
             ROUND_OFF * piece_bound_w,
         )
 
     def correction(self, u: Vector, residual: Residual) -> tuple[Vector, LinearSolution]:
         """Newton's direction."""
-        stage, system = self._stage, self._stage.system
+        equation, system = self._equation, self._equation.system
         slope = system.radiation_slope(self._now(u), self._time_s)
-        held_w_k = stage.held_w_k + slope @ np.ones(system.num_nodes)
-        matrix = sparse.csr_matrix(stage.matrix + stage.free_block(slope))
-        return stage.correction(system.linear_solver(matrix, _NEWTON_TOLERANCE), held_w_k, residual)
+        held_w_k = equation.held_w_k + slope @ np.ones(system.num_nodes)
+        matrix = sparse.csr_matrix(equation.matrix + equation.free_block(slope))
+        return equation.correction(system.linear_solver(matrix, _NEWTON_TOLERANCE), held_w_k, residual)
 
     def is_short(self, u: Vector, direction: Vector, share: float) -> bool:
         """Whether no absolute temperature changes by more than a share of it."""
-        kelvin = self._stage.at_free(self._now(u)) + self._stage.system.reference_c + ZERO_CELSIUS_K
+        kelvin = self._equation.at_free(self._now(u)) + self._equation.system.reference_c + ZERO_CELSIUS_K
         return bool(np.all(np.abs(direction) <= share * np.maximum(np.abs(kelvin), COLDEST_SLOPE_K)))
 
     def is_lost(self, u: Vector, direction: Vector) -> bool:
         """Whether a direction changes no temperature by more than round-off."""
-        size = np.abs(self._stage.at_free(self.base_k)) + np.abs(u)
+        size = np.abs(self._equation.at_free(self.base_k)) + np.abs(u)
         return bool(np.all(np.abs(direction) <= _EPS * size))
 
     def rise(self, u: Vector, direction: Vector) -> Callable[[float], float]:
         """Slope of the energy along a direction: minus the power of the residual."""
         linear_w = self.residual(u).heat_w - self._radiated(u)
         constant = float(np.sum(direction * linear_w))
-        curvature = float(np.sum(direction * (self._stage.matrix @ direction)))
+        curvature = float(np.sum(direction * (self._equation.matrix @ direction)))
 
         def along(length: float) -> float:
             radiated_w = self._radiated(u + length * direction)
@@ -314,10 +322,10 @@ class _Balance:
         return along
 
     def _radiated(self, u: Vector) -> Vector:
-        return self._stage.at_free(self._stage.system.radiation_load(self._now(u), self._time_s))
+        return self._equation.at_free(self._equation.system.radiation_load(self._now(u), self._time_s))
 
     def _now(self, u: Vector) -> Vector:
-        return self.base_k + self._stage.everywhere(u)
+        return self.base_k + self._equation.everywhere(u)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""One time step of any scheme, with the heat that flows during it."""
+"""One time step of a Runge-Kutta scheme, with the heat that flows during it."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from math import isclose
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.fem.implicit_equation import ImplicitEquation
 from thermoxels_ns.fem.schemes import Scheme
-from thermoxels_ns.fem.stage import Stage
 from thermoxels_ns.fem.system import HeatSystem
 
 Vector = npt.NDArray[np.float64]
 
-_KEPT_STAGES = 2
-"""Lengths of stages whose matrices are kept."""
+_KEPT_EQUATIONS = 2
+"""Implicit equations, one for each length of a stage, whose matrices are kept."""
 _SAME_LENGTH = 1e-12
 """Relative difference up to which two lengths are one."""
 
@@ -44,7 +44,7 @@ class Step:
     """Whether all temperatures are in the range of the start and of the surroundings."""
 
 
-class Stepper:
+class RungeKutta:
     """Takes steps of any length; matrices and preconditioners of the lengths used last are kept."""
 
     def __init__(self, system: HeatSystem, scheme: Scheme, *, relative_tolerance: float) -> None:
@@ -52,7 +52,7 @@ class Stepper:
         self.scheme = scheme
         self._system = system
         self._relative_tolerance = relative_tolerance
-        self._stages: dict[tuple[float, float], Stage] = {}
+        self._equations: dict[tuple[float, float], ImplicitEquation] = {}
 
     def step(self, start_k: Vector, time_s: float, step_s: float, *, estimate: bool = False) -> Step:
         """Take one step from `start_k`, shape (n,), [K], relative to the reference; estimate its error if asked."""
@@ -71,8 +71,8 @@ class Stepper:
                 continue
             shares = [weight / implicit for weight in row[:number]]
             given_w = _weighted(shares, inner_w)
-            stage = self._stage(now_s, implicit * step_s)
-            solution = stage.solve(start_k, now_s, given_w, _weighted(shares, pieces_w))
+            equation = self._equation(now_s, implicit * step_s)
+            solution = equation.solve(start_k, now_s, given_w, _weighted(shares, pieces_w))
             iterations += solution.iterations
             newton_iterations += solution.newton_iterations
             status = solution.status
@@ -114,22 +114,22 @@ class Stepper:
         pieces_difference_w = _weighted(more, [system.pieces.sums(exchanged_w), *pieces_w])
         assert difference_w is not None and pieces_difference_w is not None
         end_s = time_s + scheme.nodes[-1] * step_s
-        stage = self._stage(end_s, implicit * step_s)
-        error = stage.damped(difference_w, pieces_difference_w, start_k, end_s)
+        equation = self._equation(end_s, implicit * step_s)
+        error = equation.damped(difference_w, pieces_difference_w, start_k, end_s)
         return float(np.max(np.abs(error)))
 
-    def _stage(self, time_s: float, step_s: float) -> Stage:
+    def _equation(self, time_s: float, step_s: float) -> ImplicitEquation:
         time_s = time_s if self._system.matrix_in_time else 0.0
         # Lengths that are differences of times differ in the last digits.
-        alike = (key for key in self._stages if key[0] == time_s and isclose(key[1], step_s, rel_tol=_SAME_LENGTH))
+        alike = (key for key in self._equations if key[0] == time_s and isclose(key[1], step_s, rel_tol=_SAME_LENGTH))
         key = next(alike, (time_s, step_s))
-        stage = self._stages.pop(key, None)
-        if stage is None:
-            stage = Stage(self._system, time_s, step_s, relative_tolerance=self._relative_tolerance)
-        self._stages[key] = stage
-        while len(self._stages) > _KEPT_STAGES:
-            del self._stages[next(iter(self._stages))]
-        return stage
+        equation = self._equations.pop(key, None)
+        if equation is None:
+            equation = ImplicitEquation(self._system, time_s, step_s, relative_tolerance=self._relative_tolerance)
+        self._equations[key] = equation
+        while len(self._equations) > _KEPT_EQUATIONS:
+            del self._equations[next(iter(self._equations))]
+        return equation
 
 
 def _weighted(weights: list[float], vectors: list[Vector]) -> Vector | None:

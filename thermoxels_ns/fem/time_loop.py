@@ -1,4 +1,4 @@
-"""The temperatures of a body through time, in equal, given or adaptive steps."""
+"""The time loop: temperatures of a body in equal, given or adaptive steps."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import celsius_to_kelvin
 from thermoxels_ns.fem.limiter import AllowedRange, Limiter, is_in_range
 from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem, TimeSteps, effect_labels
+from thermoxels_ns.fem.runge_kutta import RungeKutta, Step
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, SDIRK2, Scheme
 from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect, left_out
 from thermoxels_ns.fem.steady import check_stored, is_still, too_cold
-from thermoxels_ns.fem.stepper import Step, Stepper
 from thermoxels_ns.fem.system import HeatSystem
 
 Vector = npt.NDArray[np.float64]
@@ -26,17 +26,19 @@ STEP_SHARE = 0.1
 """Share of the tolerance that one step may use. Conduction forgets errors, so that those of many steps do not add up
 to their sum."""
 RANGE_SHARE = 1e-3
-"""Share of the tolerance by which a temperature may leave its range: less than that is not worth shorter steps."""
+"""Share of the tolerance by which a temperature may leave its range before a step is repeated with backward Euler."""
 _SAFETY = 0.9
+"""Share of the longest step that meets the tolerance, by its estimate, that the next one is made."""
 _SHRINK, _GROW = 0.2, 5.0
+"""Least and most that one step changes the length of the next."""
 _KEEP_BELOW = 1.25
-"""A step that could be longer by less than this stays as it is, and so do its matrices."""
+"""Factor below which a step is not lengthened, so that its matrices serve again."""
 _SHORTEST = 1e-60
 """Shortest step as a share of the duration; bodies with next to no heat capacity begin with such short ones."""
 _ROUND_OFF = 64.0 * float(np.finfo(np.float64).eps)
 """Share of the terms of a sum that round-off leaves of it at most."""
 _SUSPICIOUS = 1e-12
-"""Residual from which on it is worth to look whether it is round-off."""
+"""Energy residual above which it is checked whether round-off explains it."""
 
 
 def solve_heat(
@@ -88,9 +90,9 @@ def solve_heat(
         raise HeatError("scheme", expected=expected, got=scheme.name, remedy="Use SDIRK2, or equal steps.")
     if scheme is None:
         scheme = BACKWARD_EULER if isinstance(time, TimeSteps) else SDIRK2
-    march = _March(system, scheme, time, relative_tolerance)
+    loop = _TimeLoop(system, scheme, time, relative_tolerance)
     failure = ""
-    for taken in march.steps(states[0]):
+    for taken in loop.steps(states[0]):
         failure = taken.failure or too_cold(system, taken.step.relative_k)
         if failure:
             break
@@ -99,13 +101,13 @@ def solve_heat(
             progress(balance.followed_s / time.duration_s, balance.steps)
     if failure and not allow_unconverged:
         raise HeatError(failure)
-    status = failure or balance.success(march.describe()) + _skips(problem, time)
+    status = failure or balance.success(loop.describe()) + _skips(problem, time)
     return balance.close(status, not failure, adaptive=adaptive)
 
 
 @dataclass(frozen=True)
 class _Taken:
-    """A step that counts."""
+    """A step that was accepted, or failed."""
 
     step: Step
     step_s: float
@@ -113,11 +115,11 @@ class _Taken:
     ends_interval: bool
     """Whether temperatures are kept at its end."""
     failure: str = ""
-    """Why the computation ends here; then the step does not count."""
+    """Why the computation ends here; empty if the step was accepted."""
 
 
-class _March:
-    """Takes steps.
+class _TimeLoop:
+    """Takes one step after the other, each with `RungeKutta` or the limiter.
 
     Equal steps of backward Euler are limited to the range that temperatures may have. An adaptive or given step that
     leaves the range is taken with the limiter's backward Euler instead; the difference between both schemes is then the
@@ -133,7 +135,7 @@ class _March:
         relative_tolerance: float,
     ) -> None:
         self._system, self._scheme, self._time = system, scheme, time
-        self._stepper = Stepper(system, scheme, relative_tolerance=relative_tolerance)
+        self._runge_kutta = RungeKutta(system, scheme, relative_tolerance=relative_tolerance)
         self._limiter = Limiter(system, relative_tolerance=relative_tolerance)
         self._range = AllowedRange(system)
         tolerance_k = 0.0 if isinstance(time, TimeSteps) else time.tolerance_k
@@ -148,7 +150,7 @@ class _March:
         return self._given(start_k, self._time)
 
     def describe(self) -> str:
-        """Say what was done besides the steps that count."""
+        """Count the steps that were repeated or replaced, in a sentence, or nothing."""
         sentence = ""
         if self._repeated:
             sentence += f" {self._repeated} more were repeated with a shorter length."
@@ -181,7 +183,7 @@ class _March:
             return self._safe_step(start_k, now_s, step_s)[0]
         if self._scheme is BACKWARD_EULER:
             return self._limiter.step(start_k, now_s, step_s)[0]
-        step = self._stepper.step(start_k, now_s, step_s)
+        step = self._runge_kutta.step(start_k, now_s, step_s)
         return replace(step, in_range=step.converged and self._in_range(step, start_k, now_s, step_s))
 
     def _adaptive(self, start_k: Vector, time: AdaptiveSteps) -> Iterator[_Taken]:
@@ -218,7 +220,7 @@ class _March:
 
     def _safe_step(self, start_k: Vector, now_s: float, step_s: float) -> tuple[Step, int]:
         """Take a step, with backward Euler if it leaves the range; the second value is the order of the scheme."""
-        plain = self._stepper.step(start_k, now_s, step_s, estimate=isinstance(self._time, AdaptiveSteps))
+        plain = self._runge_kutta.step(start_k, now_s, step_s, estimate=isinstance(self._time, AdaptiveSteps))
         order = self._scheme.order
         if not plain.converged or plain.error_k > self._allowed_k or self._in_range(plain, start_k, now_s, step_s):
             return plain, order
@@ -264,7 +266,7 @@ class HeatBalance:
         self._system, self._states, self._times = system, states_k, times_s
         self._done = self._steps = self._most_iterations = 0
         self.followed_s = 0.0
-        """Time that has been followed, [s]."""
+        """Sum of the steps so far, [s]."""
         self._heat_j = np.zeros((len(times_s) - 1, len(system.groups)))
         self._exchanged_j = np.zeros(len(times_s) - 1)
         self._iterations = np.zeros((len(times_s) - 1, 2), dtype=np.int64)
@@ -305,7 +307,7 @@ class HeatBalance:
         if self._out_of_range:
             sentence += (
                 f" In {self._out_of_range} a temperature left its range, which schemes other than backward Euler, "
-                "consistent masses and integrated boundary exchange may do."
+                "consistent masses and convection integrated over triangles may do."
             )
         return sentence
 

@@ -10,7 +10,7 @@ from tests.support.heat_matrices import assemble
 from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.stepping import solve_heat
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection
 from thermoxels_ns.heat.sun import moving_sun
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -81,7 +81,7 @@ def test_failure_to_converge_raises_and_can_be_a_status(random_body, concrete, m
 
 def test_states_that_do_not_fit_into_memory_are_refused(random_body, concrete, monkeypatch) -> None:
     nodes = len(random_body.points_m)
-    monkeypatch.setattr("thermoxels_ns.fem.stepping.MAX_STATE_BYTES", 11 * nodes * 8)
+    monkeypatch.setattr("thermoxels_ns.fem.time_loop.MAX_STATE_BYTES", 11 * nodes * 8)
     assert solve_heat(HeatProblem(random_body, concrete), PAPER).converged
     with pytest.raises(
         HeatError, match=rf"12 times x {nodes} nodes x 8 bytes = {12 * nodes * 8} .*Take at most 10 steps,"
