@@ -13,7 +13,7 @@ from thermoxels_ns.field.refine import prune
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render.compositing import composite, intersect_box, ray_weights, sample_box
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
-from thermoxels_ns.render.renderers import march
+from thermoxels_ns.render.renderers import reference_march
 
 LO, HI = torch.tensor([-1.0, -1.0, -1.0]), torch.tensor([1.0, 1.0, 1.0])
 
@@ -107,7 +107,7 @@ def test_grazing_an_edge_is_a_miss_of_no_length():
 def test_miss_is_exactly_the_background_with_depth_infinite():
     grid = VoxelGrid(Lattice((-1.0, -1.0, -1.0), 0.5, (5, 5, 5)), start_density=50.0)
     origins, directions = torch.tensor([[0.0, 0.0, 5.0]]), torch.tensor([[0.0, 0.0, 1.0]])
-    marched = march(grid, RayRequest(origins, directions), RenderOptions())
+    marched = reference_march(grid, RayRequest(origins, directions), RenderOptions())
     background = torch.tensor([0.125, 0.5, 0.75])
     seen = composite(
         marched.steps,
@@ -140,7 +140,7 @@ def test_wall_one_voxel_thick_is_opaque_from_both_sides(angle):
     for sign in (1.0, -1.0):
         origins = sign * 3.0 * normal + offsets * side + torch.tensor([0.0, 0.0, 0.137])
         directions = (-sign * normal).expand(101, 3)
-        marched = march(grid, RayRequest(origins, directions), RenderOptions())
+        marched = reference_march(grid, RayRequest(origins, directions), RenderOptions())
         assert float(marched.along.accumulation.min()) > 0.99
 
 
@@ -156,7 +156,7 @@ def test_constant_temperature_renders_constant_wherever_it_hits_after_pruning():
     assert bool((grid.temperature == 0.4).all()) and len(grid.voxels) == 2 * 32 * 32
     origins = torch.tensor([[3.0, 0.1, 0.2], [2.0, -2.0, 0.3]])
     directions = normalize(torch.tensor([[-1.0, 0.01, 0.02], [-1.0, 1.0, 0.0]]), dim=-1)
-    marched = march(grid, RayRequest(origins, directions), RenderOptions())
+    marched = reference_march(grid, RayRequest(origins, directions), RenderOptions())
     at = grid.locate(marched.positions)
     seen = composite(
         marched.steps,

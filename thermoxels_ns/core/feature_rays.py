@@ -1,4 +1,4 @@
-"""Feature rays: straight lines from cameras to points that their photographs see."""
+"""Feature rays: straight from cameras to points that their photographs agree on."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ STEEPEST = 3.0
 LEAST_TOLERANCE = 0.01
 """Share of the distance by which neighbours may differ at any slope: surfaces are rough."""
 TOLERANCE_ERRORS = 3.0
-"""Standard errors of a line's length by which they may differ too."""
-_LINES_AT_ONCE = 1 << 18
+"""Standard errors of a ray's length by which they may differ too."""
+_RAYS_AT_ONCE = 1 << 18
 
 
 @dataclass(frozen=True, eq=False)
 class FeatureRays:
-    """Straight lines from cameras to points that they see: what lies between is air. World units."""
+    """Rays from cameras to points that their photographs agree on: what lies between is air. World units."""
 
     origins: FloatArray
     """Where the cameras stood, shape (s, 3)."""
@@ -34,15 +34,15 @@ class FeatureRays:
     points: FloatArray
     """Shape (n, 3)."""
     uncertainty: FloatArray
-    """Standard error of each line's length, shape (s,)."""
+    """Standard error of each ray's length, shape (s,)."""
 
     def moved(self, rotation: FloatArray, translation: FloatArray, scale: float) -> FeatureRays:
-        """The same lines in another world: scale (rotation p + translation)."""
+        """The same rays in another world: scale (rotation p + translation)."""
         origins, points = (scale * (p @ rotation.T + translation) for p in (self.origins, self.points))
         return FeatureRays(origins, self.point, points, scale * self.uncertainty)
 
     def joined_with(self, others: FeatureRays) -> FeatureRays:
-        """These lines, and others after them."""
+        """These rays, and others after them."""
         point = np.concatenate((self.point, len(self.points) + others.point))
         return FeatureRays(
             np.concatenate((self.origins, others.origins)),
@@ -52,12 +52,12 @@ class FeatureRays:
         )
 
     def of_points(self, chosen: npt.NDArray[np.bool_]) -> FeatureRays:
-        """Only the lines to some points, one boolean per point; all points stay, with their numbers."""
+        """Only the rays to some points, one boolean per point; all points stay, with their numbers."""
         kept = chosen[self.point]
         return FeatureRays(self.origins[kept], self.point[kept], self.points, self.uncertainty[kept])
 
 
-def agrees_with_neighbours(lines: FeatureRays) -> npt.NDArray[np.bool_]:
+def agrees_with_neighbours(rays: FeatureRays) -> npt.NDArray[np.bool_]:
     """Which points lie where the points around them in the photographs do: wrong matches put theirs anywhere.
 
     A photograph vouches for a point if at least half of the `NEIGHBOURS` points that it sees nearest to it are as far
@@ -67,32 +67,32 @@ def agrees_with_neighbours(lines: FeatureRays) -> npt.NDArray[np.bool_]:
     something thin before other things may fail; it is then unknown, not wrong.
 
     Args:
-        lines: Feature rays; those with one origin are one photograph's.
+        rays: Feature rays; those with one origin are one photograph's.
 
     Returns:
-        One boolean per point; True for a point without lines, or which too few others are near to say.
+        One boolean per point; True for a point without rays, or which too few others are near to say.
     """
     from scipy.spatial import KDTree  # slow to import and only needed here
 
-    along = lines.points[lines.point] - lines.origins
+    along = rays.points[rays.point] - rays.origins
     length = np.linalg.norm(along, axis=1)
     direction = along / np.maximum(length, 1e-300)[:, None]
-    photograph = np.unique(lines.origins, axis=0, return_inverse=True)[1].reshape(-1)
+    photograph = np.unique(rays.origins, axis=0, return_inverse=True)[1].reshape(-1)
     key = np.column_stack((direction, 10.0 * photograph))  # far from those of all other photographs
     tree = KDTree(key) if len(key) else None
     vouched = np.zeros(len(key), dtype=bool)
-    for first in range(0, len(key), _LINES_AT_ONCE):
+    for first in range(0, len(key), _RAYS_AT_ONCE):
         assert tree is not None
-        some = slice(first, first + _LINES_AT_ONCE)
-        # Of each line the nearest is itself. A distance is the chord of an angle, or infinite where there is no other.
+        some = slice(first, first + _RAYS_AT_ONCE)
+        # Of each ray the nearest is itself. A distance is the chord of an angle, or infinite where there is no other.
         found = tree.query(key[some], NEIGHBOURS + 1, distance_upper_bound=3.0)
         apart, other = (np.asarray(value)[:, 1:] for value in found)
         known = np.isfinite(apart)
         own = length[some, None]
-        least = np.maximum(LEAST_TOLERANCE * own, TOLERANCE_ERRORS * lines.uncertainty[some, None])
+        least = np.maximum(LEAST_TOLERANCE * own, TOLERANCE_ERRORS * rays.uncertainty[some, None])
         off = np.abs(length[np.where(known, other, 0)] - own)
         agree = known & (off <= np.maximum(STEEPEST * own * np.where(known, apart, 0.0), least))
         count = known.sum(axis=1)
         vouched[some] = (2 * agree.sum(axis=1) >= count) | (count < FEWEST_NEIGHBOURS)
-    photographs, vouching = (np.bincount(lines.point, w, len(lines.points)) for w in (None, vouched))
+    photographs, vouching = (np.bincount(rays.point, w, len(rays.points)) for w in (None, vouched))
     return 2 * vouching >= photographs

@@ -33,8 +33,8 @@ class RayEvidence:
     voxel_weight: npt.NDArray[np.float32]
     """Sum of the weights that rays spent in each voxel, shape `lattice.cell_shape`, [rays]."""
     half_depth_density: npt.NDArray[np.float32]
-    """Density, [1 / world unit], that each ray that ends on something (opacity above one half) meets where it ends: the
-    highest at the centre of a voxel within half a voxel of where half of its weight is spent, shape (rays,)."""
+    """One density per ray of opacity above one half, shape (rays,), [1 / world unit]: the highest at the centres of the
+    voxels that the ray crosses within half a voxel of the point at which half of its weight is spent."""
     voxel_ends: npt.NDArray[np.float32] | None = None
     """Number of rays that end on something and have spent half of their weight in each voxel, shape
     `lattice.cell_shape`, [rays]. None: not known."""

@@ -34,7 +34,7 @@ TrackSource = Literal["auto", "given", "off"]
 
 
 def find_feature_rays(scene: SceneFile, training: Sequence[int], source: TrackSource = "auto") -> FeatureRays | None:
-    """The lines of sight of the photographs that train, in input coordinates; None where the scene has no tracks.
+    """The feature rays of the photographs that train, in input coordinates; None where the scene has no tracks.
 
     The source "auto" is the file that the json names, else a COLMAP model in the scene's folder; "given" only the file.
     What photographs see that do not train is not used.

@@ -213,10 +213,10 @@ class ThermalDataParser(DataParser):
         )
         if file.left_out:
             CONSOLE.print(f"Left out, no pair: {', '.join(file.left_out)}", style="bold yellow")
-        lines = find_feature_rays(file, split.train, config.tracks)
-        if lines is not None:
-            lines = lines.moved(world.rotation, world.translation, world.scale)
-        return _Scene(file, split, survey, world, box, lines)
+        rays = find_feature_rays(file, split.train, config.tracks)
+        if rays is not None:
+            rays = rays.moved(world.rotation, world.translation, world.scale)
+        return _Scene(file, split, survey, world, box, rays)
 
     def _oriented(self, poses: npt.NDArray[np.float64]) -> torch.Tensor:
         """nerfstudio's choice of rotation and shift for these poses (n, 4, 4), shape (3, 4) float32."""

@@ -108,12 +108,12 @@ def read_tracks(path: Path) -> SparseTracks:
 def feature_rays(
     tracks: SparseTracks, frames: Sequence[Frame], name: str = "tracks", remedy: str = _REMEDY
 ) -> FeatureRays:
-    """Lines from frames to the points that they see and that are well known.
+    """Rays from frames to the points that they see and that are well known.
 
     A point counts if at least `FEWEST_VIEWS` of the frames see it, more than `LEAST_PARALLAX_DEG` apart, with a mean
     reprojection error of at most `MOST_ERROR_PX`. Of those, one that does not agree with its neighbours in the frames
-    (`agrees_with_neighbours`) is listed without lines: wrong lines would make air of walls. The standard error of a
-    line's length is that of a triangulation: the error in the image, over the focal length and the sine of that angle,
+    (`agrees_with_neighbours`) is listed without rays: wrong rays would make air of walls. The standard error of a
+    ray's length is that of a triangulation: the error in the image, over the focal length and the sine of that angle,
     times the length.
 
     Raises:

@@ -292,10 +292,10 @@ def _between(agreement: npt.NDArray[np.float32], best: npt.NDArray[np.int64]) ->
 
 
 def feature_rays_to_depths(depths: Depths) -> FeatureRays:
-    """One line of sight per sure pixel, to a point of its own.
+    """One feature ray per sure pixel, to a point of its own.
 
-    The lines stand photograph after photograph [world units]. A line's uncertainty is `ERROR_PLANES` times the distance
-    between the planes of its sweep, along the line.
+    The rays stand photograph after photograph [world units]. A ray's uncertainty is `ERROR_PLANES` times the distance
+    between the planes of its sweep, along the ray.
     """
     photographs = depths.photographs
     (sure,) = np.nonzero(np.isfinite(depths.depth))

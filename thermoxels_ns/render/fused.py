@@ -17,7 +17,7 @@ from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.threads import num_threads, run_ranges, run_tasks
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.render import kernels, kernels_backward, kernels_rows, kernels_shading
-from thermoxels_ns.render.kernels import Marched, Rays, Records, Settings, Sums, Volume
+from thermoxels_ns.render.kernels import Rays, RecordedSamples, Records, SampleGradients, Settings, Sums, Volume
 from thermoxels_ns.render.kernels_backward import RayGradients
 from thermoxels_ns.render.kernels_rows import Blocks, Order, RowGradients
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions, near_and_far
@@ -29,20 +29,20 @@ MOST_HARMONICS = 9
 VOXELS_AT_ONCE = 1 << 14
 """Voxels whose total variation is one task."""
 FEWEST_SAMPLES = 24
-"""Samples per ray that a batch has room for at first, on average over a range."""
+"""Samples per ray, averaged over a range of rays, that the first batch on a lattice has memory for."""
 SPARE = 1.25
-"""Room made when that was too little, over what the rays so far took."""
+"""A batch with too little memory is marched again with this many times the samples per ray counted until it ran out."""
 MOST_GROUPS = 1 << 12
 """Groups of voxels that samples are put in order by."""
 RANGES_PER_THREAD = 4
 VARIATION_SHARE = 0.02
 """Work of one channel's variation in a voxel, in samples."""
 _room: dict[int, int] = {}
-"""Samples per ray that batches of the last lattice had room for, by its number of rows."""
+"""Samples per ray that batches on the last lattice had memory for; the key is the number of rows."""
 NAMES = ("density", "sh", "temperature")
 
 
-def march(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> Marched:
+def samples_without_gaps(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RecordedSamples:
     """March rays and record their samples without gaps and without colour, for statistics; no gradients.
 
     Returns:
@@ -51,17 +51,17 @@ def march(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> March
     Raises:
         ThermoxelsError: A density on the way is NaN.
     """
-    marched, spans = _march(grid, None, request, options)
-    records = marched.records
+    recorded, spans = _recorded_samples(grid, None, request, options)
+    records = recorded.records
     listed = [np.concatenate([field[:0], *(field[a:b] for a, b in spans)]) for field in records[2:]]
     offset = np.concatenate((np.zeros(1, np.int64), np.cumsum(records.used)))
-    return replace(marched, records=Records(offset, records.used, *listed))
+    return replace(recorded, records=Records(offset, records.used, *listed))
 
 
-def _march(
+def _recorded_samples(
     grid: VoxelGrid, sh: Tensor | None, request: RayRequest, options: RenderOptions
-) -> tuple[Marched, list[tuple[int, int]]]:
-    """March rays and record their samples; give also the spans of the records in which there are no gaps."""
+) -> tuple[RecordedSamples, list[tuple[int, int]]]:
+    """March rays and record their samples; also give the first and one behind the last record of each range of rays."""
     density = grid.density.detach().numpy()
     voxels, dtype = grid.voxels, density.dtype
     lattice = voxels.lattice
@@ -105,21 +105,20 @@ def _march(
         np.empty(count if options.sparsity else 0, dtype=dtype),
     )
     records, spans = _record(rays, volume, settings, sums)
-    return Marched(rays, volume, settings, records, sums), spans
+    return RecordedSamples(rays, volume, settings, records, sums), spans
 
 
 def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple[Records, list[tuple[int, int]]]:
-    """Fill `sums` and record the samples; every range of rays has room for as many per ray as were ever needed."""
+    """Fill `sums` and record the samples; where these are more than there is memory for, with more of it again."""
     count = len(rays.origins)
     rows = len(volume.density)
     while True:
-        # Of another lattice nothing is known.
         room = _room.get(rows, FEWEST_SAMPLES)
         records = _empty_records(count, (room + kernels.AHEAD) * count, volume)
 
         def work(first: int, last: int, room: int = room, records: Records = records) -> tuple[int, int, int]:
             begin, end = ((room + kernels.AHEAD) * ray for ray in (first, last))
-            wrong, behind = kernels.march_forward(first, last, rays, volume, settings, records, sums, begin, end)
+            wrong, behind = kernels.march_rays(first, last, rays, volume, settings, records, sums, begin, end)
             if wrong == 0:
                 kernels_shading.shade(first, last, rays, volume, settings, records, sums)
             return begin, wrong, behind
@@ -152,7 +151,6 @@ def _empty_records(rays: int, total: int, volume: Volume) -> Records:
         BUFFERS.empty(total, dtype),
         BUFFERS.empty((total if volume.sh.shape[1] else 0, 3), dtype),
         BUFFERS.empty(total, dtype),
-        BUFFERS.empty(total, np.uint8),
     )
 
 
@@ -181,27 +179,27 @@ class _Render(torch.autograd.Function):
     @staticmethod
     def forward(ctx, density, sh, temperature, grid: VoxelGrid, request: RayRequest, options: RenderOptions):
         # `density`, `sh` and `temperature` are the grid's: autograd differentiates only by what it is handed.
-        marched, _ = _march(grid, grid.sh, request, options)
+        recorded, _ = _recorded_samples(grid, grid.sh, request, options)
         parameters, rows = grid.row_parameters(), grid.voxels.voxel_rows
         found = [
             _total_variation(values.detach().numpy(), rows, first, last, _channels(options, name, values))
             for name, (first, last) in options.variation.items()
             if (values := parameters.get(name)) is not None
         ]
-        ctx.marched, ctx.options = marched, options
+        ctx.recorded, ctx.options = recorded, options
         ctx.set_materialize_grads(False)
-        sums = [torch.from_numpy(values) for values in marched.sums]
+        sums = [torch.from_numpy(values) for values in recorded.sums]
         ctx.mark_non_differentiable(sums[4])
         return (*sums, *(torch.tensor(value, dtype=density.dtype) for value in found))
 
     @staticmethod
     def backward(ctx, *grad_outputs: Any):
-        if ctx.marched is None:
+        if ctx.recorded is None:
             raise RuntimeError("a fused render can be differentiated once: its records hold the gradients afterwards")
-        marched, options = ctx.marched, ctx.options
-        ctx.marched = None
+        recorded, options = ctx.recorded, ctx.options
+        ctx.recorded = None
         rgb, thermal, transmittance, accumulation, _, distortion, sparsity, *variation = grad_outputs
-        sums, records, volume = marched.sums, marched.records, marched.volume
+        sums, records, volume = recorded.sums, recorded.records, recorded.volume
         left = _gradient(transmittance, sums.transmittance)
         if accumulation is not None:
             left = left - _gradient(accumulation, sums.transmittance)
@@ -212,16 +210,16 @@ class _Render(torch.autograd.Function):
             _gradient(distortion, sums.distortion),
             _gradient(sparsity, sums.sparsity),
         )
+        samples = SampleGradients(
+            *(records.offset, records.used, records.number, records.fraction),
+            *(records.density, records.transmittance, records.rgb, BUFFERS.empty(len(records.number), np.uint8)),
+        )
         if any(gradient is not None for gradient in grad_outputs[:7]):
-            run_ranges(
-                lambda a, b: kernels_backward.march_backward(
-                    a, b, marched.rays, volume, marched.settings, records, grads
-                ),
-                len(records.used),
-            )
+            inputs = recorded.rays, volume, recorded.settings, records, grads, samples
+            run_ranges(lambda a, b: kernels_backward.find_sample_gradients(a, b, *inputs), len(records.used))
         else:
             records.used.fill(0)
-        return (*row_gradients(marched, _blocks(options, variation, volume)), None, None, None)
+        return (*row_gradients(recorded, samples, _blocks(options, variation, volume)), None, None, None)
 
 
 def _channels(options: RenderOptions, name: str, values: Tensor | np.ndarray) -> int:
@@ -265,21 +263,22 @@ def _gradient(gradient: Tensor | None, like: np.ndarray) -> np.ndarray:
     return np.zeros_like(like) if gradient is None else _array(gradient.to(torch.from_numpy(like).dtype))
 
 
-def row_gradients(marched: Marched, blocks: Blocks) -> list[Tensor | None]:
+def row_gradients(recorded: RecordedSamples, samples: SampleGradients, blocks: Blocks) -> list[Tensor | None]:
     """Gradients of density, colour and temperature as row-sparse tensors; None for one that no row has.
 
     Args:
-        marched: Samples with their gradients, see `kernels_backward`.
+        recorded: Rays, volume and settings.
+        samples: Gradients of the samples.
         blocks: Total variation to add.
     """
-    volume, records = marched.volume, marched.records
+    volume = recorded.volume
     parameters = (volume.density, volume.sh, volume.temperature)
-    order = _ordered(marched)
+    order = _ordered(samples, len(volume.voxel_rows))
     bounds = _row_ranges(volume.voxel_rows, len(volume.density), order, blocks, [p.shape[1] for p in parameters])
     ranges = list(itertools.pairwise(bounds))
     uses = BUFFERS.empty(len(volume.density), np.uint8)
     counts: Any = run_tasks(
-        [lambda a=a, b=b: kernels_rows.use_rows(a, b, volume, records, order, blocks, uses) for a, b in ranges]
+        [lambda a=a, b=b: kernels_rows.use_rows(a, b, volume, samples, order, blocks, uses) for a, b in ranges]
     )
     places = np.concatenate((np.zeros((1, 3), np.int64), np.cumsum(np.asarray(counts).reshape(-1, 3), axis=0)))
     lists = [BUFFERS.empty(int(total), np.int64) for total in places[-1]]
@@ -288,14 +287,14 @@ def row_gradients(marched: Marched, blocks: Blocks) -> list[Tensor | None]:
         for total, parameter in zip(places[-1], parameters)
     ]
     place = BUFFERS.empty((len(uses), 3), np.int32)
-    active = min(3 * marched.settings.sh_active, volume.sh.shape[1])
+    active = min(3 * recorded.settings.sh_active, volume.sh.shape[1])
     narrow = active < volume.sh.shape[1]
     sums = BUFFERS.empty((len(values[1]), active), volume.sh.dtype) if narrow else values[1]
     rows = RowGradients(uses, place, lists[0], values[0], lists[1], values[1], sums, lists[2], values[2])
 
     def add(first: int, last: int, start: np.ndarray, stop: np.ndarray) -> None:
         kernels_rows.list_rows(first, last, int(start[0]), int(start[1]), int(start[2]), rows)
-        kernels_rows.add_samples(first, last, marched.rays, volume, marched.settings, records, order, rows)
+        kernels_rows.add_samples(first, last, recorded.rays, volume, recorded.settings, samples, order, rows)
         kernels_rows.spread_harmonics(int(start[1]), int(stop[1] if narrow else start[1]), rows)
         for kind, parameter in enumerate(parameters):
             if blocks.last[kind] > blocks.first[kind]:
@@ -317,13 +316,13 @@ def row_gradients(marched: Marched, blocks: Blocks) -> list[Tensor | None]:
     ]
 
 
-def _ordered(marched: Marched) -> Order:
+def _ordered(samples: SampleGradients, voxels: int) -> Order:
     """The samples that have a gradient in the order of their voxels."""
-    voxels, total = len(marched.volume.voxel_rows), int(marched.records.used.sum())
+    total = int(samples.used.sum())
     shift = max(0, (voxels - 1).bit_length() - MOST_GROUPS.bit_length() + 1)
     groups = (voxels >> shift) + 1
     order = Order(shift, np.zeros(groups + 1, np.int64), BUFFERS.empty(total, np.int32), BUFFERS.empty(total, np.int32))
-    kernels_rows.order_records(marched.records, order)
+    kernels_rows.order_samples(samples, order)
     return order
 
 

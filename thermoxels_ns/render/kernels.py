@@ -116,9 +116,9 @@ class Settings(NamedTuple):
 
 
 class Records(NamedTuple):
-    """What the forward pass remembers of each sample in a kept voxel before its ray was opaque, ray after ray.
+    """What the forward pass found of each sample in a kept voxel, ray after ray, until each ray is opaque.
 
-    Ranges of rays have places of their own, with gaps behind them.
+    Each range of rays writes from a place of its own on, so that unused records may lie between ranges.
     """
 
     offset: Ints
@@ -132,17 +132,31 @@ class Records(NamedTuple):
     fraction: Floats
     """Place in the voxel, (records, 3)."""
     density: Floats
-    """Density; after the backward pass the gradient of the raw density."""
-    left: Floats
-    """Transmittance behind the step; after the backward pass the gradient of the temperature."""
+    transmittance: Floats
+    """Share of the ray's light that is left behind the step."""
     weight: Floats
-    """Weight."""
     rgb: Floats
-    """Colour, (records, 3); after the backward pass the gradient of its logits."""
+    """Colour, (records, 3)."""
     thermal: Floats
     """Temperature."""
+
+
+class SampleGradients(NamedTuple):
+    """Gradients of recorded samples. Three take the memory of the `Records` that the backward pass has read by then."""
+
+    offset: Ints
+    """That of the records, as the next three."""
+    used: Ints
+    number: Ints
+    fraction: Floats
+    raw_density: Floats
+    """Written over `Records.density`."""
+    temperature: Floats
+    """Written over `Records.transmittance`."""
+    logits: Floats
+    """Those of the colour, (records, 3), written over `Records.rgb`."""
     uses: Ints
-    """After the backward pass which parameters have a gradient (bits), uint8."""
+    """Which of the three a sample has (bits), uint8."""
 
 
 class Sums(NamedTuple):
@@ -158,7 +172,7 @@ class Sums(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Marched:
+class RecordedSamples:
     """Samples of a batch of rays: `records` and how to read them."""
 
     rays: Rays
@@ -346,7 +360,7 @@ def activate(raw: float, kind: int):
 
 
 @kernel
-def march_forward(
+def march_rays(
     first: int,
     last: int,
     rays: Rays,
@@ -411,7 +425,7 @@ def march_forward(
                 weight = left * alpha
                 depth_sum += optical
                 left *= math.exp(-optical) if alpha > 0.5 else 1.0 - alpha
-                records.density[n], records.left[n], records.weight[n] = density, left, weight
+                records.density[n], records.transmittance[n], records.weight[n] = density, left, weight
                 expected += weight * t
                 if settings.distortion_scale > 0.0:
                     distortion += 2.0 * weight * (t * weight_sum - moment_sum) + weight * weight * delta / 3.0

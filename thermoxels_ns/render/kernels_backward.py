@@ -17,6 +17,7 @@ from thermoxels_ns.render.kernels import (
     Floats,
     Rays,
     Records,
+    SampleGradients,
     Settings,
     Volume,
     chord,
@@ -38,12 +39,17 @@ class RayGradients(NamedTuple):
 
 
 @kernel
-def march_backward(
-    first: int, last: int, rays: Rays, volume: Volume, settings: Settings, records: Records, grads: RayGradients
+def find_sample_gradients(
+    first: int,
+    last: int,
+    rays: Rays,
+    volume: Volume,
+    settings: Settings,
+    records: Records,
+    grads: RayGradients,
+    samples: SampleGradients,
 ):
-    """Replace in the records density, left and rgb by the gradients of raw density, temperature and colour logits.
-
-    `uses` says which of them a sample has.
+    """Find the gradients of the samples of rays `first` to `last`; each replaces what is recorded of its sample.
 
     With w_i = T_i (1 - exp(-x_i)), T_{i+1} = T_i exp(-x_i) and x_i the optical depth of step i,
     dL/dx_i = g_i T_{i+1} - sum_{j>i} g_j w_j - g_T T_end, where g_i = dL/dw_i and g_T is the gradient of what is left.
@@ -71,20 +77,21 @@ def march_backward(
                 weight_sum += records.weight[n]
                 moment_sum += records.weight[n] * t
         weight_after, moment_after = 0.0, 0.0
-        end_term = grads.transmittance[r] * records.left[end - 1]
+        end_term = grads.transmittance[r] * records.transmittance[end - 1]
         behind = 0.0
         for n in range(end - 1, start - 1, -1):
             i = records.step[n]
             delta = min(settings.step, length - i * settings.step)
-            weight, density, left = float(records.weight[n]), float(records.density[n]), float(records.left[n])
+            weight, density = float(records.weight[n]), float(records.density[n])
+            left = float(records.transmittance[n])
             gain = 0.0
             seen = weight > settings.smallest_weight
             if seen and wants_rgb:
                 cr, cg, cb = float(records.rgb[n, 0]), float(records.rgb[n, 1]), float(records.rgb[n, 2])
                 gain += red * cr + green * cg + blue * cb
-                records.rgb[n, 0] = red * weight * cr * (1.0 - cr)
-                records.rgb[n, 1] = green * weight * cg * (1.0 - cg)
-                records.rgb[n, 2] = blue * weight * cb * (1.0 - cb)
+                samples.logits[n, 0] = red * weight * cr * (1.0 - cr)
+                samples.logits[n, 1] = green * weight * cg * (1.0 - cg)
+                samples.logits[n, 2] = blue * weight * cb * (1.0 - cb)
             if seen and thermal_weight:
                 gain += heat * records.thermal[n]
             if spread != 0.0:
@@ -110,9 +117,9 @@ def march_backward(
                 slope *= -math.expm1(-density)
             else:
                 slope = slope * density if density < _FLAT_EXP else 0.0
-            records.density[n] = slope
-            records.left[n] = heat * weight if seen else 0.0
-            uses = DENSITY if records.density[n] != 0.0 else 0
+            samples.raw_density[n] = slope
+            samples.temperature[n] = heat * weight if seen else 0.0
+            uses = DENSITY if samples.raw_density[n] != 0.0 else 0
             if seen:
                 uses |= (COLOUR if wants_rgb else 0) | (TEMPERATURE if wants_thermal else 0)
-            records.uses[n] = uses
+            samples.uses[n] = uses

@@ -14,7 +14,7 @@ from thermoxels_ns.render.kernels import (
     Floats,
     Ints,
     Rays,
-    Records,
+    SampleGradients,
     Settings,
     Volume,
     basis_of,
@@ -71,19 +71,19 @@ class RowGradients(NamedTuple):
 
 
 @kernel
-def order_records(records: Records, order: Order):
+def order_samples(samples: SampleGradients, order: Order):
     """Fill `order` by counting; `order.group` holds zeros before."""
     group = order.group
-    for r in range(len(records.used)):
-        for n in range(records.offset[r], records.offset[r] + records.used[r]):
-            if records.uses[n]:
-                group[(records.number[n] >> order.shift) + 1] += 1
+    for r in range(len(samples.used)):
+        for n in range(samples.offset[r], samples.offset[r] + samples.used[r]):
+            if samples.uses[n]:
+                group[(samples.number[n] >> order.shift) + 1] += 1
     for g in range(1, len(group)):
         group[g] += group[g - 1]
-    for r in range(len(records.used)):
-        for n in range(records.offset[r], records.offset[r] + records.used[r]):
-            if records.uses[n]:
-                g = records.number[n] >> order.shift
+    for r in range(len(samples.used)):
+        for n in range(samples.offset[r], samples.offset[r] + samples.used[r]):
+            if samples.uses[n]:
+                g = samples.number[n] >> order.shift
                 order.record[group[g]], order.ray[group[g]] = n, r
                 group[g] += 1
     for g in range(len(group) - 1, 0, -1):
@@ -105,7 +105,9 @@ def first_voxel(voxel_rows: Ints, corner: int, row: int):
 
 
 @kernel
-def use_rows(first_row: int, last_row: int, volume: Volume, records: Records, order: Order, blocks: Blocks, uses: Ints):
+def use_rows(
+    first_row: int, last_row: int, volume: Volume, samples: SampleGradients, order: Order, blocks: Blocks, uses: Ints
+):
     """Mark which parameters rows `first_row` to `last_row` have a gradient for.
 
     Returns:
@@ -116,7 +118,7 @@ def use_rows(first_row: int, last_row: int, volume: Volume, records: Records, or
     begin, end = first_voxel(rows, 3, first_row - 1), first_voxel(rows, 0, last_row)
     for at in range(order.group[begin >> order.shift], order.group[_groups_before(end, order)]):
         n = order.record[at]
-        number, bits = records.number[n], records.uses[n]
+        number, bits = samples.number[n], samples.uses[n]
         if rows[number, 0] >= first_row and rows[number, 3] + 1 < last_row:
             for corner in range(4):
                 row = rows[number, corner]
@@ -177,13 +179,13 @@ def list_rows(first_row: int, last_row: int, density: int, colour: int, temperat
 
 
 @kernel
-def prefetch_record(records: Records, n: int):
-    """Ask for what is needed of a record."""
-    prefetch(records.number, n, 0)
-    prefetch(records.fraction, n, 0)
-    prefetch(records.density, n, 0)
-    prefetch(records.left, n, 0)
-    prefetch(records.rgb, n, 0)
+def prefetch_sample(samples: SampleGradients, n: int):
+    """Ask for what is needed of a sample."""
+    prefetch(samples.number, n, 0)
+    prefetch(samples.fraction, n, 0)
+    prefetch(samples.raw_density, n, 0)
+    prefetch(samples.temperature, n, 0)
+    prefetch(samples.logits, n, 0)
 
 
 @kernel
@@ -197,10 +199,10 @@ def prefetch_sums(rows: RowGradients, voxel_rows: Ints, number: int):
 
 
 @kernel
-def corner_shares(records: Records, n: int, shares: Floats):
+def corner_shares(samples: SampleGradients, n: int, shares: Floats):
     """Trilinear weights of a sample's corners, in the order of `lattice.CORNER_OFFSETS`."""
     one = shares.dtype.type(1.0)
-    fx, fy, fz = records.fraction[n, 0], records.fraction[n, 1], records.fraction[n, 2]
+    fx, fy, fz = samples.fraction[n, 0], samples.fraction[n, 1], samples.fraction[n, 2]
     gx, gy, gz = one - fx, one - fy, one - fz
     a, b, c, d = gx * gy, gx * fy, fx * gy, fx * fy
     shares[0], shares[1], shares[2], shares[3] = a * gz, a * fz, b * gz, b * fz
@@ -214,7 +216,7 @@ def add_samples(
     rays: Rays,
     volume: Volume,
     settings: Settings,
-    records: Records,
+    samples: SampleGradients,
     order: Order,
     rows: RowGradients,
 ):
@@ -233,28 +235,28 @@ def add_samples(
     stop = order.group[_groups_before(end, order)]
     for at in range(order.group[begin >> order.shift], stop):
         if at + 2 * FAR < stop:
-            prefetch_record(records, order.record[at + 2 * FAR])
+            prefetch_sample(samples, order.record[at + 2 * FAR])
         if at + FAR < stop:
-            number = records.number[order.record[at + FAR]]
+            number = samples.number[order.record[at + FAR]]
             for corner in range(4):
                 prefetch(rows.place, volume.voxel_rows[number, corner], 0)
         if at + NEAR < stop:
-            number = records.number[order.record[at + NEAR]]
+            number = samples.number[order.record[at + NEAR]]
             prefetch_sums(rows, volume.voxel_rows, number)
         n, r = order.record[at], order.ray[at]
-        number, bits = records.number[n], records.uses[n]
+        number, bits = samples.number[n], samples.uses[n]
         if volume.voxel_rows[number, 3] + 1 < first_row or volume.voxel_rows[number, 0] >= last_row:
             continue
         inside = volume.voxel_rows[number, 0] >= first_row and volume.voxel_rows[number, 3] + 1 < last_row
-        slope, heat = records.density[n], records.left[n]
+        slope, heat = samples.raw_density[n], samples.temperature[n]
         if bits & COLOUR:
             basis_of(rays.directions, r, active, 1.0, basis)
             for c in range(3):
                 for k in range(active):
-                    colour[c * active + k] = records.rgb[n, c] * basis[k]
+                    colour[c * active + k] = samples.logits[n, c] * basis[k]
         if bits & TEMPERATURE and thermal_channels > 1:
             basis_of(rays.directions, r, thermal_channels, 1.0 / 0.28209479177387814, thermal_basis)
-        corner_shares(records, n, shares)
+        corner_shares(samples, n, shares)
         for corner in range(8):
             row = volume.voxel_rows[number, corner >> 1] + (corner & 1)
             if not (inside or first_row <= row < last_row):

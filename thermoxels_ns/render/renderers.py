@@ -50,8 +50,8 @@ def render_rays(grid: VoxelGrid, request: RayRequest, options: RenderOptions, ba
 
 
 @dataclass(frozen=True)
-class March:
-    """Rays marched through the box."""
+class ReferenceSamples:
+    """Samples of rays through the box, and what density makes of them."""
 
     steps: RaySteps
     density: Float[Tensor, "rays steps"]
@@ -71,7 +71,7 @@ class March:
         return flat // self.steps.t.shape[1]
 
 
-def march(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> March:
+def reference_march(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> ReferenceSamples:
     """Sample rays through the kept voxels and weigh the samples, in plain torch."""
     origins, directions, lattice = request.origins, request.directions, grid.lattice
     lo = torch.tensor(lattice.lo, dtype=origins.dtype, device=origins.device)
@@ -86,12 +86,12 @@ def march(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> March
         active, positions = active[kept], positions[kept]
     asked = grid.density_at(grid.locate(positions))
     density = torch.zeros_like(steps.t).flatten().index_put((active,), asked).view_as(steps.t)
-    return March(steps, density, ray_weights(density, steps.deltas), active, positions)
+    return ReferenceSamples(steps, density, ray_weights(density, steps.deltas), active, positions)
 
 
 def reference_render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayRender:
     """Render rays in plain torch: the twin that every faster renderer is tested against."""
-    marched = march(grid, request, options)
+    marched = reference_march(grid, request, options)
     at = grid.locate(marched.positions)
 
     def rows(query):
@@ -189,12 +189,12 @@ class GridSamples:
 def sample_rays(grid: VoxelGrid, request: RayRequest, options: RenderOptions, backend: Backend) -> GridSamples:
     """March rays and list their samples; neither colour nor temperature is read."""
     if choose_backend(backend, grid.density.device) == "fused":
-        from thermoxels_ns.render.fused import march as fused_march
+        from thermoxels_ns.render.fused import samples_without_gaps
 
         nothing = torch.zeros(len(request.origins), dtype=torch.bool)
         request = RayRequest(request.origins, request.directions, request.near, request.far, nothing, nothing)
-        marched = fused_march(grid, request, options)
-        records = marched.records
+        recorded = samples_without_gaps(grid, request, options)
+        records = recorded.records
         offset, used = torch.from_numpy(records.offset), torch.from_numpy(records.used)
         ray = torch.repeat_interleave(torch.arange(len(used)), offset.diff())
         reached = torch.arange(len(ray)) - offset[ray] < used[ray]
@@ -202,9 +202,9 @@ def sample_rays(grid: VoxelGrid, request: RayRequest, options: RenderOptions, ba
         at = TrilinearPoints.placed(grid.voxels, number, fraction)
         ray = ray[reached]
         weight = torch.from_numpy(records.weight)[reached]
-        before = 1.0 - torch.from_numpy(records.left)[reached] - weight
-        return GridSamples(ray, at, weight, before, torch.from_numpy(marched.sums.transmittance))
-    marched = march(grid, request, options)
+        before = 1.0 - torch.from_numpy(records.transmittance)[reached] - weight
+        return GridSamples(ray, at, weight, before, torch.from_numpy(recorded.sums.transmittance))
+    marched = reference_march(grid, request, options)
     weights = marched.along.weights
     before = torch.cumsum(weights, -1) - weights
     return GridSamples(

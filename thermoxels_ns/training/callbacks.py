@@ -51,7 +51,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     decisions = {step for step in steps if end is None or step < end} or {(end or 0) // 3}
 
     def carve(step: int) -> None:
-        """Drop what lines of sight show to be air; at the first step of a training, not of a resumed one."""
+        """Drop what feature rays show to be air; at the first step of a training, not of a resumed one."""
         if model.config.carve == "off" or model.feature_rays is None:
             return
         old = model.grid.row_parameters()

@@ -14,58 +14,58 @@ from thermoxels_ns.field.refine import RowChange, prune
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 
 FEWEST_POINTS = 2
-"""Different points whose lines must cross a voxel: a single one may be wrong."""
+"""Different points whose rays must cross a voxel: a single one may be wrong."""
 MARGIN_VOXELS = 1.5
-"""Voxels before a point that are not judged by the lines to it."""
+"""Voxels before a point that are not judged by the rays to it."""
 MARGIN_ERRORS = 3.0
-"""Standard errors of a line's length that are not judged either."""
-MOST_LINES = 500_000
-"""Lines that are looked at; of more, those to every second, third, ... point. They say the same many times over."""
+"""Standard errors of a ray's length that are not judged either."""
+MOST_RAYS = 500_000
+"""Rays that are looked at; of more, those to every second, third, ... point. They say the same many times over."""
 _STEPS_PER_VOXEL = 2.0
 _SAMPLES_AT_ONCE = 1 << 20
 
 
-def carve_free_space(grid: VoxelGrid, lines: FeatureRays) -> RowChange | None:
+def carve_free_space(grid: VoxelGrid, rays: FeatureRays) -> RowChange | None:
     """Drop the kept voxels of a grid that feature rays show to be air, and say how many.
 
     Returns:
         How values of rows change; None where nothing changes.
     """
     voxels = grid.voxels
-    empty = empty_voxels(voxels.lattice, lines).reshape(-1)[voxels.cells]
+    empty = empty_voxels(voxels.lattice, rays).reshape(-1)[voxels.cells]
     carved = int(empty.sum())
     if carved in (0, len(empty)):
         return None
-    believed = len(np.unique(lines.point))
-    doubted = f"; {len(lines.points) - believed:,} others do not lie where their neighbours do"
+    believed = len(np.unique(rays.point))
+    doubted = f"; {len(rays.points) - believed:,} others do not lie where their neighbours do"
     CONSOLE.log(
         f"tracks: {carved:,} of {len(empty):,} voxels are air ({carved / len(empty):.1%}), crossed by the "
-        f"{len(lines.origins):,} feature rays to {believed:,} points{doubted if believed < len(lines.points) else ''}"
+        f"{len(rays.origins):,} feature rays to {believed:,} points{doubted if believed < len(rays.points) else ''}"
     )
     return prune(grid, ~empty)
 
 
-def empty_voxels(lattice: Lattice, lines: FeatureRays) -> npt.NDArray[np.bool_]:
+def empty_voxels(lattice: Lattice, rays: FeatureRays) -> npt.NDArray[np.bool_]:
     """Find the voxels that are air: one boolean per voxel, shape of the lattice's voxels.
 
-    A voxel is air if the lines to at least `FEWEST_POINTS` points cross it and leave it `MARGIN_VOXELS` voxels and
-    `MARGIN_ERRORS` standard errors before their points, and no point lies in it, with lines or without.
+    A voxel is air if the rays to at least `FEWEST_POINTS` points cross it and leave it `MARGIN_VOXELS` voxels and
+    `MARGIN_ERRORS` standard errors before their points, and no point lies in it, with rays or without.
     """
     shape = np.asarray(lattice.cell_shape)
-    step = max(1, -(-len(lines.origins) // MOST_LINES))
-    looked_at = lines if step == 1 else _every(step, lines)
+    step = max(1, -(-len(rays.origins) // MOST_RAYS))
+    looked_at = rays if step == 1 else _every(step, rays)
     crossing = np.zeros(int(shape.prod()), dtype=np.int64)
     for point, voxel in _crossings(lattice, looked_at):
         pairs = np.unique(point * len(crossing) + voxel)  # each point counts once per voxel
         crossing += np.bincount(pairs % len(crossing), minlength=len(crossing))
     empty = (crossing >= FEWEST_POINTS).reshape(lattice.cell_shape)
-    return empty & (_points_in(lattice, lines.points) == 0)
+    return empty & (_points_in(lattice, rays.points) == 0)
 
 
-def _every(step: int, lines: FeatureRays) -> FeatureRays:
-    """The lines to every `step`-th point."""
-    kept = lines.point % step == 0
-    return FeatureRays(lines.origins[kept], lines.point[kept] // step, lines.points[::step], lines.uncertainty[kept])
+def _every(step: int, rays: FeatureRays) -> FeatureRays:
+    """The rays to every `step`-th point."""
+    kept = rays.point % step == 0
+    return FeatureRays(rays.origins[kept], rays.point[kept] // step, rays.points[::step], rays.uncertainty[kept])
 
 
 def _points_in(lattice: Lattice, points: FloatArray) -> IntArray:
@@ -77,42 +77,42 @@ def _points_in(lattice: Lattice, points: FloatArray) -> IntArray:
     return count
 
 
-def _crossings(lattice: Lattice, lines: FeatureRays) -> Iterator[tuple[IntArray, IntArray]]:
-    """Points and flat voxels that lines to them cross, all lines of a point in one piece."""
+def _crossings(lattice: Lattice, rays: FeatureRays) -> Iterator[tuple[IntArray, IntArray]]:
+    """Points and flat voxels that rays to them cross, all rays of a point in one piece."""
     shape = np.asarray(lattice.cell_shape)
-    origin = lattice.world_to_index(lines.origins)
-    along = lattice.world_to_index(lines.points)[lines.point] - origin
+    origin = lattice.world_to_index(rays.origins)
+    along = lattice.world_to_index(rays.points)[rays.point] - origin
     length = np.linalg.norm(along, axis=1)
     direction = along / np.maximum(length, 1e-12)[:, None]
-    last = length - MARGIN_VOXELS - MARGIN_ERRORS * lines.uncertainty / lattice.voxel_size
+    last = length - MARGIN_VOXELS - MARGIN_ERRORS * rays.uncertainty / lattice.voxel_size
     first, end = _inside(origin, direction, shape)
     steps = np.maximum(np.ceil((np.minimum(end, last) - first) * _STEPS_PER_VOXEL), 0.0).astype(np.int64)
-    for piece in _pieces(lines.point, steps):
-        line = np.repeat(np.arange(piece.start, piece.stop), steps[piece])
-        number = np.arange(len(line)) - np.repeat(np.cumsum(steps[piece]) - steps[piece], steps[piece])
-        at = first[line] + (number + 0.5) / _STEPS_PER_VOXEL
-        place = origin[line] + at[:, None] * direction[line]
+    for piece in _pieces(rays.point, steps):
+        ray = np.repeat(np.arange(piece.start, piece.stop), steps[piece])
+        number = np.arange(len(ray)) - np.repeat(np.cumsum(steps[piece]) - steps[piece], steps[piece])
+        at = first[ray] + (number + 0.5) / _STEPS_PER_VOXEL
+        place = origin[ray] + at[:, None] * direction[ray]
         voxel = np.floor(place).astype(np.int64)
         with np.errstate(divide="ignore", invalid="ignore"):
-            left = (voxel + (direction[line] > 0) - place) / direction[line]
-        leaves = at + np.where(direction[line] == 0.0, np.inf, left).min(axis=1)
-        crossed = ((voxel >= 0) & (voxel < shape)).all(axis=1) & (leaves <= last[line])
+            left = (voxel + (direction[ray] > 0) - place) / direction[ray]
+        leaves = at + np.where(direction[ray] == 0.0, np.inf, left).min(axis=1)
+        crossed = ((voxel >= 0) & (voxel < shape)).all(axis=1) & (leaves <= last[ray])
         voxel = voxel[crossed]
-        yield lines.point[line[crossed]], (voxel[:, 0] * shape[1] + voxel[:, 1]) * shape[2] + voxel[:, 2]
+        yield rays.point[ray[crossed]], (voxel[:, 0] * shape[1] + voxel[:, 1]) * shape[2] + voxel[:, 2]
 
 
 def _inside(origin: FloatArray, direction: FloatArray, shape: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Where lines from `origin` enter the box [0, shape] (at 0 if they begin in it) and leave it, in voxels."""
+    """Where rays from `origin` enter the box [0, shape] (at 0 if they begin in it) and leave it, in voxels."""
     with np.errstate(divide="ignore", invalid="ignore"):
         sides = np.sort(np.stack([-origin / direction, (shape - origin) / direction]), axis=0)
-    # A line along a face of the box: 0 / 0.
+    # A ray along a face of the box: 0 / 0.
     near = np.where(np.isnan(sides[0]), -np.inf, sides[0]).max(axis=1)
     far = np.where(np.isnan(sides[1]), np.inf, sides[1]).min(axis=1)
     return np.maximum(near, 0.0), far
 
 
 def _pieces(point: IntArray, steps: IntArray) -> Iterator[slice]:
-    """Cut lines, sorted by point, between points, into pieces of not many more than `_SAMPLES_AT_ONCE` samples."""
+    """Cut rays, sorted by point, between points, into pieces of not many more than `_SAMPLES_AT_ONCE` samples."""
     ends = np.flatnonzero(np.diff(point, append=-1)) + 1
     done = np.cumsum(steps)[ends - 1] if len(ends) else np.zeros(0, dtype=np.int64)
     cuts = np.flatnonzero(np.diff(done // _SAMPLES_AT_ONCE, append=-1))

@@ -269,7 +269,7 @@ class ThermoxelsModel(Model):
         return terms
 
     def _feature_ray_loss(self, rays: losses.FeatureRaySampler) -> Tensor:
-        """How far this step's lines of sight are from ending at their points; coarse lattices may let light pass."""
+        """How far this step's feature rays are from ending at their points; coarse lattices may let light pass."""
         config, near, lattice = self.config, self.config.near_plane * self.unit, self.grid.lattice
         generator = torch.Generator().manual_seed((config.seed + 1) * 2_000_003 + self.step)
         request = rays.request(config.track_rays, near, lattice.voxel_size, generator, self.device)

@@ -114,8 +114,8 @@ class FieldEvidence:
     """Number of rays that end on something (opacity above one half) and have spent half of their weight in each kept
     voxel, [rays]."""
     half_depth_density: Float[Tensor, " ends"]
-    """Density that each ray that ends on something meets where it ends, [1 / world unit], in the order of the rays: the
-    highest at the centre of a voxel within `END_WIDTH` of where it has spent half of its weight."""
+    """One density per ray of opacity above one half, in the order of the rays, [1 / world unit]: the highest at the
+    centres of the voxels that it crosses within `END_WIDTH` of the point at which half of its weight is spent."""
 
 
 @torch.no_grad()
