@@ -29,7 +29,9 @@ class Synthetic:
     """Write a synthetic scene, whose shape and temperature are known exactly, as photographs and thermal images."""
 
     scene: tyro.conf.Positional[SceneWord]
-    """Which scene."""
+    """Which scene. After the name, in any order: +sky=R,G,B for a sky or backdrop of one colour (0 to 1), +street for
+    houses and trees around, +room for a room around, +white for white plaster under a white sky (house-corner alone);
+    for example house-corner+sky=0.55,0.57,0.60 or random-3+street."""
     output_dir: Path
     """Folder for the scene, in the ThermoScenes layout; made if it does not exist. An earlier synthetic scene in it is
     replaced."""
@@ -51,6 +53,8 @@ class Synthetic:
     """Standard deviation of the noise in every thermal pixel, [K]."""
     drift_k: float = 0.0
     """Standard deviation of one temperature offset per thermal image, [K], as uncooled cameras have it."""
+    photo_format: Literal["jpeg", "png"] = "jpeg"
+    """JPEG of quality 92, as cameras write it, or PNG, which loses nothing."""
     seed: int = 0
     """Seed of noise and drift; the same seed writes the same files."""
     own_thermal_camera: bool = False

@@ -121,13 +121,11 @@ def _is_written(scene: SyntheticScene, folder: Path) -> bool:
     path = folder / "transforms.json"
     if not path.is_file():
         return False
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content, truth = (json.loads((folder / name).read_text(encoding="utf-8")) for name in (path.name, "truth.json"))
     poses = np.array([frame["transform_matrix"] for frame in content["frames"]])
     wanted = np.concatenate(scene.poses(*_VIEWS))
     return (
-        poses.shape == wanted.shape
-        and np.allclose(poses, wanted)
-        and np.allclose(content["scene_box"], scene.scene_box)
+        poses.shape == wanted.shape and np.allclose(poses, wanted) and np.allclose(truth["scene_box"], scene.scene_box)
     )
 
 

@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.support.boxed_scene import write_boxed_scene
 from tests.support.short_training import train
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence, Views
-from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.synthetic.scene_folder import make_scene
 
 
 def full() -> GridSnapshot:
@@ -88,7 +89,7 @@ def test_numbers_that_cannot_be_are_refused(part, name, value, message):
 
 def test_a_pipeline_fills_evidence_and_views_from_both_streams(tmp_path):
     scene = tmp_path / "scene"
-    write_scene(make_scene("sphere"), scene, 6, 2, width=24, height=18, thermal_width=8, progress=False)
+    write_boxed_scene(make_scene("sphere"), scene, 6, 2, width=24, height=18, thermal_width=8)
     pipeline = train(scene, 20)
     snapshot = pipeline.grid_snapshot()
     evidence, views = snapshot.evidence, snapshot.views

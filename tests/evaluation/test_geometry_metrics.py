@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.boxed_scene import write_boxed_scene
 from tests.support.short_training import train
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.evaluation.geometry_metrics import geometry_metrics
 from thermoxels_ns.evaluation.truth_comparison import KnownTruth, compare_with_truth
-from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.synthetic.scene_folder import make_scene
 
 IDENTITY = np.eye(4)
 SCORES = ("fscore", "precision", "recall")
@@ -96,7 +97,8 @@ def test_photographs_have_no_figures_and_a_damaged_truth_is_told(sphere, tmp_pat
     said: list[str] = []
     assert geometry_metrics(snapshot, IDENTITY, tmp_path, said.append) == {}
     assert said == []
-    (tmp_path / "transforms.json").write_text("{")
+    for name in ("transforms.json", "truth.json"):
+        (tmp_path / name).write_text("{")
     assert geometry_metrics(snapshot, IDENTITY, tmp_path, said.append) == {}
     assert said[0].startswith("Geometry is not compared with the truth: ")
 
@@ -104,7 +106,7 @@ def test_photographs_have_no_figures_and_a_damaged_truth_is_told(sphere, tmp_pat
 @pytest.fixture(scope="module")
 def pipeline(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene") / "hot"
-    write_scene(make_scene("hot-object"), folder, 8, 2, width=24, height=18, progress=False)
+    write_boxed_scene(make_scene("hot-object"), folder, 8, 2, width=24, height=18)
     return train(folder, steps=0)
 
 

@@ -87,6 +87,19 @@ def test_faces_where_the_box_cuts_do_not_count_for_precision():
     assert score.precision == 1.0
 
 
+def test_what_truly_stands_beside_the_body_counts_neither_way_but_lumps_between_do():
+    wall = Sphere((0.0, 0.0, 5.72), 5.0)  # from z = 0.72 on, 0.12 above the ball
+    both = voxels(SPHERE) | voxels(wall)
+    assert surface_fscore(both, LATTICE, SPHERE, SEEN, TOLERANCE).precision < 0.9
+    score = surface_fscore(both, LATTICE, SPHERE, SEEN, TOLERANCE, surroundings=wall)
+    alone = surface_fscore(voxels(SPHERE), LATTICE, SPHERE, SEEN, TOLERANCE, surroundings=wall)
+    assert score.precision == alone.precision == 1.0 and score.recall >= 0.95
+    both[2:6, 2:6, 2:6] = True
+    assert surface_fscore(both, LATTICE, SPHERE, SEEN, TOLERANCE, surroundings=wall).precision < 0.95
+    nothing_else = surface_fscore(voxels(wall), LATTICE, SPHERE, SEEN, TOLERANCE, surroundings=wall)
+    assert nothing_else.fscore == 0.0
+
+
 def test_lattice_is_mapped_into_truth_coordinates():
     # Truth in millimetres, turned and shifted; tolerance in truth units.
     matrix = np.array([[0.0, -1000, 0, 5000], [1000, 0, 0, -70], [0, 0, 1000, 9], [0, 0, 0, 1]])

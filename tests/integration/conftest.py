@@ -7,13 +7,14 @@ from pathlib import Path
 import pytest
 
 from tests.integration.commands import SHORT_TRAINING, Trained, run
-from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from tests.support.boxed_scene import write_boxed_scene
+from thermoxels_ns.synthetic.scene_folder import make_scene
 
 
 @pytest.fixture(scope="session")
 def tiny_scene(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("scene") / "hot"
-    return write_scene(make_scene("hot-object"), folder, 10, 2, width=64, height=48, progress=False)
+    return write_boxed_scene(make_scene("hot-object"), folder, 10, 2, width=64, height=48)
 
 
 @pytest.fixture(scope="session")

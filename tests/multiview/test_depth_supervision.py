@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.boxed_scene import write_boxed_scene
 from tests.support.plane_photographs import EYES, LATTICE, PLANE, SIZE, photographs
 from tests.support.short_training import train
 from thermoxels_ns.core.feature_rays import FeatureRays
@@ -19,7 +20,7 @@ from thermoxels_ns.multiview.stereo import (
     feature_rays_of_photographs,
     feature_rays_to_depths,
 )
-from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.synthetic.scene_folder import make_scene
 from thermoxels_ns.training.callbacks import SHORTEST_RUN_WITH_DEPTHS, follow_depths
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler, feature_ray_loss
 
@@ -27,7 +28,7 @@ from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler, featu
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene") / "pipes"
-    write_scene(make_scene("pipes"), folder, 18, 2, 160, 120, progress=False)
+    write_boxed_scene(make_scene("pipes"), folder, 18, 2, width=160, height=120)
     return folder
 
 

@@ -10,6 +10,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.reference.two_renderers import random_grid, random_request
+from tests.support.boxed_scene import write_boxed_scene
 from tests.support.short_training import train_with_optimizers
 from thermoxels_ns.core import threads
 from thermoxels_ns.core.lattice import Lattice
@@ -17,7 +18,7 @@ from thermoxels_ns.core.threads import num_threads, set_num_threads
 from thermoxels_ns.field.background import SkyTemperature, SphereImage, seen_behind
 from thermoxels_ns.render.ray_render import RenderOptions
 from thermoxels_ns.render.renderers import fused_render, sample_rays
-from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.synthetic.scene_folder import make_scene
 from thermoxels_ns.training.optimizers import RowAdam, RowRMSprop
 
 
@@ -115,7 +116,7 @@ def test_updates(make):
 
 def test_a_training_that_refines_and_prunes(tmp_path):
     """What a checkpoint holds, model and optimisers, after steps on both sides of refinement, pruning and thinning."""
-    scene = write_scene(make_scene("sphere"), tmp_path / "scene", 6, 1, width=40, height=30, progress=False)
+    scene = write_boxed_scene(make_scene("sphere"), tmp_path / "scene", 6, 1, width=40, height=30)
     schedule = {"resolutions": [8, 16], "refine_at": [6], "prune_at": [9], "thin_at": [11], "distortion_ramp": [2, 4]}
     # So few steps form no surface: rays end in a fog, of which pruning and thinning take the thinnest parts.
     schedule |= {"start_density": 3.0, "prune_threshold": 0.02, "thin_threshold": 0.04, "prune_dilation": 0}
@@ -167,7 +168,7 @@ class NoProductOfLongVectors(TorchDispatchMode):
 
 def test_a_training_with_large_batches(tmp_path):
     """Every tensor with a row per ray is one that torch splits among its threads."""
-    scene = write_scene(make_scene("sphere"), tmp_path / "scene", 6, 1, width=40, height=30, progress=False)
+    scene = write_boxed_scene(make_scene("sphere"), tmp_path / "scene", 6, 1, width=40, height=30)
     settings = {"resolutions": [8], "refine_at": [], "start_density": 3.0, "prune_at": [3], "prune_threshold": 0.02}
     settings |= {"per_image_offset": True, "thermal_background": "learned", "background": "on"}
     results = []

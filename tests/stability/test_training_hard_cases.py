@@ -9,15 +9,16 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.support.boxed_scene import write_boxed_scene
 from tests.support.short_training import train
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.ray_streams import RGB_STREAM
 from thermoxels_ns.synthetic.raycast import render_view
-from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.synthetic.scene_folder import make_scene
 
 
 def sphere(folder, views=12, **options):
-    return write_scene(make_scene("sphere"), folder, views, 2, width=40, height=30, progress=False, **options)
+    return write_boxed_scene(make_scene("sphere"), folder, views, 2, width=40, height=30, **options)
 
 
 def all_finite(pipeline) -> bool:
@@ -119,9 +120,7 @@ def test_near_transparent_start_keeps_the_air_before_two_cameras_clearer_than_fo
 
 
 def test_thermal_sensor_twenty_times_coarser(tmp_path):
-    scene = write_scene(
-        make_scene("sphere"), tmp_path / "scene", 12, 2, width=160, height=120, thermal_width=8, progress=False
-    )
+    scene = write_boxed_scene(make_scene("sphere"), tmp_path / "scene", 12, 2, width=160, height=120, thermal_width=8)
     pipeline = train(scene, 120)
     assert all_finite(pipeline)
     _, batch = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
@@ -132,7 +131,7 @@ def test_thermal_sensor_twenty_times_coarser(tmp_path):
 
 def test_drift_is_found_by_the_offsets(tmp_path):
     scene = sphere(tmp_path / "scene", views=16, drift_k=4.0)
-    drift = np.array(json.loads((scene / "transforms.json").read_text())["truth"]["drift_k"])
+    drift = np.array(json.loads((scene / "truth.json").read_text())["drift_k"])
     pipeline = train(scene, 250, {"per_image_offset": True}, rate=2.0)
     offset = pipeline.model.thermal_offset.detach()
     found = ((offset - offset.mean()) * pipeline.model.temperature_range.span_k).numpy()

@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 import tyro
 
+from tests.support.boxed_scene import write_boxed_scene
 from thermoxels_ns.config import thermoxels
 from thermoxels_ns.core.errors import CheckpointError
-from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.synthetic.scene_folder import make_scene
 from thermoxels_ns.training.schedule import QUALITIES, schedule_for
 from thermoxels_ns.training.trainer import ThermoxelsTrainer, writer
 
@@ -20,7 +21,7 @@ DRAFT = ("--quality", "draft")
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("trainer") / "scene"
-    return write_scene(make_scene("sphere"), folder, 6, 1, width=40, height=30, progress=False)
+    return write_boxed_scene(make_scene("sphere"), folder, 6, 1, width=40, height=30)
 
 
 @pytest.fixture(autouse=True)

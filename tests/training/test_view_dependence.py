@@ -13,10 +13,11 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.engine.optimizers import Optimizers
 
+from tests.support.boxed_scene import write_boxed_scene
 from thermoxels_ns.config import thermoxels
 from thermoxels_ns.core.errors import CheckpointError
 from thermoxels_ns.core.yaml_records import with_overrides
-from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.synthetic.scene_folder import make_scene
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig
 from thermoxels_ns.training.pipeline import ThermoxelsPipeline
 
@@ -31,7 +32,7 @@ COURSE |= {"view_dependence_from": RISES}
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("view-dependence")
-    return write_scene(make_scene("sphere"), folder / "scene", 6, 1, width=40, height=30, progress=False)
+    return write_boxed_scene(make_scene("sphere"), folder / "scene", 6, 1, width=40, height=30)
 
 
 @pytest.fixture

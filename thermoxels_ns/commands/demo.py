@@ -201,7 +201,7 @@ def assemble_page(
 
     bar = _colour_bar(folder / "scene")
     renders = folder / "renders" / "test"
-    names = sorted(path.name for path in (folder / "scene" / "images").glob("frame_eval_*.png"))
+    names = sorted(f"{path.stem}.png" for path in (folder / "scene" / "images").glob("frame_eval_*"))
     export = folder / "export"
     before, after, change = _panels(export / "heat.png", 3)
     pairs = tuple(_training_pairs(folder / "scene"))
@@ -335,12 +335,12 @@ def _training_pairs(scene: Path) -> Iterator[tuple[bytes, bytes]]:
     from matplotlib import colormaps
     from PIL import Image
 
-    names = sorted(path.name for path in (scene / "images").glob("frame_train_*.png"))
+    photographs = sorted((scene / "images").glob("frame_train_*"))
     for number in range(_INPUTS_SHOWN):
-        name = names[number * len(names) // _INPUTS_SHOWN]
-        with Image.open(scene / "images" / name) as photograph:
+        path = photographs[number * len(photographs) // _INPUTS_SHOWN]
+        with Image.open(path) as photograph:
             rgb = np.asarray(photograph.convert("RGB"))
-        with Image.open(scene / "thermal" / name) as counts:  # 16 bits that span the bounds
+        with Image.open(scene / "thermal" / f"{path.stem}.png") as counts:  # 16 bits that span the bounds
             normalised = np.asarray(counts, dtype=np.float64) / 65535.0
         colours = np.round(255.0 * colormaps[_COLOUR_MAP](normalised)[..., :3]).astype(np.uint8)
         yield _jpeg(rgb), _jpeg(colours)

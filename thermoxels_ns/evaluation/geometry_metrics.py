@@ -71,7 +71,9 @@ def geometry_metrics(
     voxel_m = lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(transform[:3, :3]))))
     common_voxel_m = voxel_m * max(lattice.cell_shape) / COMMON_RESOLUTION
     own, common = (
-        surface_fscore(cells, lattice, known.scene, seen, TOLERANCE_VOXELS * size_m, transform)
+        surface_fscore(
+            *(cells, lattice, known.scene, seen, TOLERANCE_VOXELS * size_m, transform), surroundings=known.surroundings
+        )
         for size_m in (voxel_m, common_voxel_m)
     )
     result = {

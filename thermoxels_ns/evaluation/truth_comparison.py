@@ -67,18 +67,25 @@ def sample_facets(points: FloatArray, facets: IntArray, count: int) -> FloatArra
 
 
 def surface_distances(
-    mesh: TetMesh, truth: TrueShape, true_points: FloatArray, metres_per_unit: float = 1.0
+    mesh: TetMesh,
+    truth: TrueShape,
+    true_points: FloatArray,
+    metres_per_unit: float = 1.0,
+    surroundings: TrueShape | None = None,
+    tolerance: float = 0.0,
 ) -> SurfaceDistances | None:
-    """Measure a mesh against a body whose shape is known exactly; None if all of the boundary is cut by the box.
+    """Measure a mesh against a body whose shape is known exactly; None if nothing of the boundary is left to measure.
 
-    Cuts by the scene box are not surface and are left out. Distances from the mesh are those of 20,000 points of it;
-    those from the truth go to the nearest point of any triangle.
+    Cuts by the scene box, and what lies in the surroundings or within the tolerance of them, are left out. Distances
+    from the mesh are those of 20,000 points of it; those from the truth go to the nearest point of any triangle.
 
     Args:
         mesh: The mesh, [m].
         truth: The true body, [truth units].
         true_points: Points of the true surface that a mesh can be expected to have, shape (m, 3), m at least 1.
         metres_per_unit: Scale of the mesh, metres per truth unit, above 0.
+        surroundings: What truly stands beside the body, if anything does.
+        tolerance: Distance that counts as agreement, [truth units].
     """
     import pyvista as pv
 
@@ -86,7 +93,12 @@ def surface_distances(
     facets = mesh.facets[mesh.facet_tags != FACET_BOX]
     if len(facets) == 0:
         return None
-    outwards = np.abs(truth.signed_distance(sample_facets(points, facets, 20_000)))
+    samples = sample_facets(points, facets, 20_000)
+    outwards = np.abs(truth.signed_distance(samples))
+    if surroundings is not None:
+        outwards = outwards[(outwards <= tolerance) | (surroundings.signed_distance(samples) > tolerance)]
+        if len(outwards) == 0:
+            return None
     surface = pv.PolyData.from_regular_faces(points, facets)
     cell, closest = surface.find_closest_cell(true_points, return_closest_point=True)  # type: ignore[misc]
     inwards = np.linalg.norm(closest - true_points, axis=1)
@@ -125,6 +137,11 @@ class KnownTruth:
     """Training cameras, camera to world (OpenGL), shape (c, 4, 4), [m]."""
     camera: Camera
     """Intrinsics of all training photographs."""
+
+    @property
+    def surroundings(self) -> TrueShape | None:
+        """What stands around the scene and is not scored."""
+        return None if self.scene.around is None else self.scene.around.solid
 
 
 def load_known_truth(scene_folder: Path | str) -> KnownTruth | None:
@@ -215,7 +232,10 @@ def compare_with_truth(
     voxel_m = lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(transform[:3, :3]))))
     tolerance_m = TOLERANCE_VOXELS * voxel_m
     seen = points_seen(known)
-    score = surface_fscore(cells, lattice, known.scene, seen, tolerance_m, transform, _training_views(known, transform))
+    views = _training_views(known, transform)
+    score = surface_fscore(
+        cells, lattice, known.scene, seen, tolerance_m, transform, views, surroundings=known.surroundings
+    )
     assert score.seen is not None
     solid = np.asarray(cells, dtype=bool)
     result: dict[str, Any] = {
@@ -239,7 +259,7 @@ def compare_with_truth(
         "true_area_m2": float(known.scene.area_m2),
     }
     if mesh is not None:
-        result |= _mesh_errors(known.scene, mesh, seen, voxel_m, metres_per_unit)
+        result |= _mesh_errors(known, mesh, seen, voxel_m, metres_per_unit)
         result |= _temperature_errors(known.scene, mesh, tolerance_m, metres_per_unit)
     return {name: _scaled(name, value, metres_per_unit) for name, value in result.items()}
 
@@ -283,7 +303,7 @@ def _num_faces(cells: BoolArray) -> int:
 
 
 def _mesh_errors(
-    scene: SyntheticScene, mesh: TetMesh, seen: FloatArray, voxel_m: float, metres_per_unit: float
+    known: KnownTruth, mesh: TetMesh, seen: FloatArray, voxel_m: float, metres_per_unit: float
 ) -> dict[str, Any]:
     """Size of the mesh, its distance to the true surface, and temperature errors where they meet."""
     area = facet_areas(mesh.points_m, mesh.facets)
@@ -293,11 +313,12 @@ def _mesh_errors(
         "mesh_volume_m3": float(signed_volumes(mesh.points_m, mesh.tets).sum()) / metres_per_unit**3,
         "mesh_area_m2": float(area.sum()) / metres_per_unit**2,
     }
-    distances = surface_distances(mesh, scene, seen, metres_per_unit)
+    tolerance_m = TOLERANCE_VOXELS * voxel_m
+    distances = surface_distances(mesh, known.scene, seen, metres_per_unit, known.surroundings, tolerance_m)
     if distances is None:
         return result
-    reached = distances.closest_distance <= TOLERANCE_VOXELS * voxel_m
-    error_k = np.abs(distances.closest_temperature_c - scene.surface_temperature_c(seen))[reached]
+    reached = distances.closest_distance <= tolerance_m
+    error_k = np.abs(distances.closest_temperature_c - known.scene.surface_temperature_c(seen))[reached]
     return result | {
         "chamfer_voxels": distances.chamfer / voxel_m,
         "chamfer_m": distances.chamfer,

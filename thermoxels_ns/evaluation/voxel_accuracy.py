@@ -70,6 +70,7 @@ def surface_fscore(
     tolerance: float,
     world_to_truth: FloatArray | None = None,
     views: Views | None = None,
+    surroundings: TrueShape | None = None,
 ) -> SurfaceScore:
     """Compare the boundary of the solid voxels with the true surface.
 
@@ -89,6 +90,8 @@ def surface_fscore(
             vectors); the identity if left out.
         views: The training cameras, in the coordinates of the lattice. With them the part of the boundary that they
             see is scored too, which takes a few passes over the lattice per camera.
+        surroundings: What truly stands beside the body. Boundary in it, or within the tolerance of it, is neither right
+            nor wrong: photographs do not say where the body ends and its surroundings begin.
     """
     cells = check_shape("cells", cells, lattice.cell_shape, "Pass the solid voxels of this lattice.", MeshError)
     seen = np.asarray(true_points_seen, dtype=np.float64)
@@ -104,19 +107,23 @@ def surface_fscore(
     samples = apply_transform(transform, lattice.index_to_world(samples))
     recall = float(np.mean(KDTree(samples).query(seen)[0] <= tolerance))
     inner = samples[~on_border]
-    if len(inner) == 0:
+    scored = np.ones(len(inner), dtype=bool)
+    if surroundings is not None:
+        scored = (surroundings.signed_distance(inner) > tolerance) | (np.abs(truth.signed_distance(inner)) <= tolerance)
+    if not scored.any():
         return SurfaceScore(precision=0.0, recall=recall, fscore=0.0, mean_distance=None, seen=of_seen)
     distance = np.abs(truth.signed_distance(inner))
-    precision = float(np.mean(distance <= tolerance))
+    precision = float(np.mean(distance[scored] <= tolerance))
     if views is not None and len(views.focal):
         free = count_cameras(solid, lattice, views).free >= MIN_VIEWS
         shown = np.concatenate([free[tuple(f.empty[~f.on_border].T)] for f in faces]).repeat(_PER_SIDE**2)
+        shown &= scored
         of_seen = _seen_score(inner[shown], distance[shown] <= tolerance, float(shown.mean()), seen, tolerance)
     return SurfaceScore(
         precision=precision,
         recall=recall,
         fscore=_harmonic_mean(precision, recall),
-        mean_distance=float(distance.mean()),
+        mean_distance=float(distance[scored].mean()),
         seen=of_seen,
     )
 

@@ -1,4 +1,4 @@
-"""Camera poses on rings that look at a point."""
+"""Camera poses on rings that look at a point, and on lines that walk past something."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.synthetic.solids import Vector
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -45,6 +46,11 @@ class CameraRing:
     span_deg: float = 360.0
     """Length of the arc [degrees]; 360 closes the ring."""
 
+    @property
+    def closed(self) -> bool:
+        """Whether the last camera is a neighbour of the first."""
+        return self.span_deg >= 360.0
+
     def pose(self, share: float) -> FloatArray:
         """Pose (4, 4) at a share of the arc, 0 to 1."""
         azimuth = math.radians(self.start_deg + self.span_deg * share)
@@ -53,7 +59,26 @@ class CameraRing:
         return look_at((x, y, self.height_m), self.target)
 
 
-def ring_poses(rings: Sequence[CameraRing], num_train: int, num_eval: int) -> tuple[FloatArray, FloatArray]:
+@dataclass(frozen=True)
+class CameraWalk:
+    """A straight line of cameras, each of which looks at a point of another line."""
+
+    ends: tuple[Vector, Vector]
+    """Where the line of cameras begins and ends [m]."""
+    aims: tuple[Vector, Vector]
+    """What the first and the last camera look at [m]."""
+    closed: bool = False
+    """A line is open."""
+
+    def pose(self, share: float) -> FloatArray:
+        """Pose (4, 4) at a share of the line, 0 to 1."""
+        position, aim = (np.add(a, share * np.subtract(b, a)) for a, b in (self.ends, self.aims))
+        return look_at(position, aim)
+
+
+def ring_poses(
+    rings: Sequence[CameraRing | CameraWalk], num_train: int, num_eval: int
+) -> tuple[FloatArray, FloatArray]:
     """Spread training cameras evenly over rings and put evaluation cameras half-way between neighbours.
 
     Cameras go to the rings in turn; each ring starts a fraction of a step later than the one before, so that
@@ -69,7 +94,7 @@ def ring_poses(rings: Sequence[CameraRing], num_train: int, num_eval: int) -> tu
     for number, ring in enumerate(used):
         slots, wanted = len(range(number, num_train, len(used))), len(range(number, num_eval, len(used)))
         phase = 0.25 + 0.5 * (number + 0.5) / len(used)
-        gaps = slots if ring.span_deg >= 360.0 else max(slots - 1, 1)
+        gaps = slots if ring.closed else max(slots - 1, 1)
         for slot in range(slots):
             train[number + slot * len(used)] = ring.pose((slot + phase) / slots)
         chosen = [int((q + 0.5) * gaps / wanted) for q in range(wanted)]

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
+import zlib
+from collections.abc import Callable
 from functools import cache
 from typing import Annotated
 
@@ -14,11 +18,13 @@ from thermoxels_ns.synthetic.appearance import Paint, SolidTexture, SunLight, pa
 from thermoxels_ns.synthetic.box_solid import BoxSolid, distance_to_box
 from thermoxels_ns.synthetic.camera_rings import CameraRing
 from thermoxels_ns.synthetic.courtyard import courtyard
+from thermoxels_ns.synthetic.development_scenes import facade, street, wall_object
 from thermoxels_ns.synthetic.house_corner import house_corner
 from thermoxels_ns.synthetic.random_scene import RANDOM_NAME, random_scene, random_seed
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 from thermoxels_ns.synthetic.solid_union import SolidUnion
 from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere
+from thermoxels_ns.synthetic.surroundings import plain, with_room, with_street
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -28,6 +34,7 @@ _THICK = Cylinder((-0.55, -0.28, 0.0), radius=0.13, length=1.6, axis=2)
 _MIDDLE = Cylinder((0.05, -0.60, 0.3), radius=0.075, length=2.3, axis=0)
 _THIN = Cylinder((0.5, -0.2, 0.0), radius=0.04, length=1.7, axis=2)
 _ROOM_C = 16.0
+_HOUSE = "house-corner"
 
 
 def pipes() -> SyntheticScene:
@@ -149,16 +156,28 @@ def _sphere() -> SyntheticScene:
     )
 
 
-_BUILDERS = {
+_BUILDERS: dict[str, Callable[..., SyntheticScene]] = {
     "hot-object": _hot_object,
     "house-corner": house_corner,
     "sphere": _sphere,
     "courtyard": courtyard,
     "pipes": pipes,
 }
+_DEVELOPMENT: dict[str, Callable[..., SyntheticScene]] = {
+    "wall-object": wall_object,
+    "facade": facade,
+    "street": street,
+}
 
 SCENE_NAMES = tuple(_BUILDERS)
-"""Names of the scenes that were built by hand; `make_scene` also knows `random-N`."""
+"""Names of the scenes that were built by hand; `make_scene` also knows `DEVELOPMENT_NAMES` and `random-N`."""
+DEVELOPMENT_NAMES = tuple(_DEVELOPMENT)
+"""Names of scenes that are hard to reconstruct, for development."""
+
+VARIANTS = "+sky=R,G,B, +white, +street, +room"
+"""What a name may end in, in any order: a sky of one colour (0 to 1); white plaster under a white sky (house-corner);
+houses and trees around; a room around."""
+_SKY = re.compile(r"sky=((?:0?\.\d+|[01](?:\.0*)?)(?:,(?:0?\.\d+|[01](?:\.0*)?)){2})")
 
 
 def check_scene_name(name: str) -> str:
@@ -170,9 +189,14 @@ def check_scene_name(name: str) -> str:
     >>> check_scene_name("random-17")
     'random-17'
     """
-    if name not in _BUILDERS and random_seed(name) is None:
-        expected = f"{RANDOM_NAME} with a whole number N from 0 on, or one of {', '.join(_BUILDERS)}"
-        remedy = "Choose one of these names, or a seed as in random-17."
+    base, *variants = name.split("+")
+    kinds = {variant.split("=")[0] for variant in variants}
+    known = base in _BUILDERS or base in _DEVELOPMENT or random_seed(base) is not None
+    known &= all(variant in ("white", "street", "room") or _SKY.fullmatch(variant) for variant in variants)
+    if not known or len(kinds) < len(variants) or kinds >= {"street", "room"} or ("white" in kinds and base != _HOUSE):
+        every = ", ".join((*_BUILDERS, *_DEVELOPMENT))
+        expected = f"{RANDOM_NAME} with a whole number N from 0 on, or one of {every}; with {VARIANTS} if you like"
+        remedy = f"Choose one of these names, or write random-17 or {_HOUSE}+sky=0.55,0.57,0.60."
         raise SceneError("synthetic scene", expected=expected, got=repr(name), remedy=remedy)
     return name
 
@@ -181,7 +205,7 @@ SceneWord = Annotated[
     str,
     PrimitiveConstructorSpec(
         nargs=1,
-        metavar=f"{{{','.join((*SCENE_NAMES, RANDOM_NAME))}}}",
+        metavar=f"{{{','.join((*SCENE_NAMES, *DEVELOPMENT_NAMES, RANDOM_NAME))}}}",
         instance_from_str=lambda words: check_scene_name(words[0]),
         is_instance=lambda value: isinstance(value, str),
         str_from_instance=lambda value: [value],
@@ -192,7 +216,8 @@ SceneWord = Annotated[
 
 @cache
 def make_scene(name: str) -> SyntheticScene:
-    """Make a synthetic scene by one of `SCENE_NAMES`, or by ``random-`` and a seed without leading zeros.
+    """Make a synthetic scene by its name: one of `SCENE_NAMES` or `DEVELOPMENT_NAMES`, or ``random-`` and a seed
+    without leading zeros; then, if you like, some of `VARIANTS`, such as ``sphere+sky=1,1,1`` or ``random-3+street``.
 
     Raises:
         SceneError: No scene has that name; the message lists those there are.
@@ -200,5 +225,13 @@ def make_scene(name: str) -> SyntheticScene:
     >>> make_scene("sphere").temperature_bounds_c
     (10.0, 40.0)
     """
-    seed = random_seed(check_scene_name(name))
-    return _BUILDERS[name]() if seed is None else random_scene(seed)
+    base, *variants = check_scene_name(name).split("+")
+    seed = random_seed(base)
+    white = {"white": True} if "white" in variants else {}
+    scene = random_scene(seed) if seed is not None else (_BUILDERS | _DEVELOPMENT)[base](**white)
+    for variant in sorted(variants):
+        if sky := _SKY.fullmatch(variant):
+            scene = dataclasses.replace(scene, background_rgb=plain([float(c) for c in sky[1].split(",")]))
+        elif variant != "white":
+            scene = (with_street if variant == "street" else with_room)(scene, seed=zlib.crc32(base.encode()))
+    return dataclasses.replace(scene, name=name)

@@ -10,6 +10,7 @@ from thermoxels_ns.synthetic.box_solid import BoxSolid, distance_to_box, recesse
 from thermoxels_ns.synthetic.camera_rings import CameraRing
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 from thermoxels_ns.synthetic.solids import Box
+from thermoxels_ns.synthetic.surroundings import plain
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -39,10 +40,13 @@ _OPENINGS = (
 _WALL_C, _BRIDGE_K = 5.0, 3.0
 _BRIDGE_Z, _BRIDGE_WIDTH_M = 0.5 * (_BALCONY[0][2] + _BALCONY[1][2]), 0.35
 _AIR_C, _SKY_DROP_K = 0.0, 20.0
+_WHITE_SKY = (0.94, 0.94, 0.94)
 
 
-def house_corner() -> SyntheticScene:
+def house_corner(white: bool = False) -> SyntheticScene:
     """Build the house: recessed warm windows, a door, a balcony slab, a roof, ground around, sky above.
+
+    `white`: walls of white plaster without texture, in the even light of a white sky.
 
     The wall is 5 C, the panes 12 to 14.5 C with a smooth fall over the reveals, the storey slab shows as a band
     3 K warmer, the balcony cools like a fin towards the air, and the sky falls from 0 C at the horizon to -20 C
@@ -50,9 +54,10 @@ def house_corner() -> SyntheticScene:
     """
     cut, panes = recesses(_OPENINGS, _RECESS_M, _PANE_M)
     panes_c, pane_paints = [opening[5] for opening in _OPENINGS], [opening[6] for opening in _OPENINGS]
-    texture, light = SolidTexture(_BOX, seed=7), SunLight(towards=(0.75, -0.45, 0.5))
+    texture = SolidTexture(_BOX, seed=7)
+    light = SunLight(towards=(0.75, -0.45, 0.5), ambient=0.88 if white else SunLight.ambient)
     paints = (
-        Paint((0.74, 0.64, 0.47), 0.22),  # plaster
+        Paint((0.93, 0.93, 0.92), 0.0) if white else Paint((0.74, 0.64, 0.47), 0.22),  # plaster
         Paint((0.36, 0.42, 0.27), 0.24),  # grass
         Paint((0.45, 0.27, 0.24), 0.20),  # roof
         Paint((0.58, 0.58, 0.57), 0.22),  # balcony
@@ -99,7 +104,7 @@ def house_corner() -> SyntheticScene:
         temperature_bounds_c=(_AIR_C - _SKY_DROP_K, 15.0),
         colour=lambda points, normals: painted(points, normals, part(points, normals), paints, texture, light),
         surface_temperature_c=temperature_c,
-        background_rgb=sky_rgb,
+        background_rgb=plain(_WHITE_SKY) if white else sky_rgb,
         background_temperature_c=lambda directions: sky_temperature_c(directions, _AIR_C, _SKY_DROP_K),
         rings=tuple(
             CameraRing((0.4, -0.7, aim), radius, height, start_deg=-145.0, span_deg=200.0)

@@ -81,6 +81,10 @@ class Plan:
     """Paints by number."""
     unit: float = 1.0
     """Length of a voxel of the plan in the unit that the plan is in."""
+    plain_walls: bool = False
+    """Whether walls that are painted from now on are plain plaster, without texture."""
+    mirror: float = 0.0
+    """Share of light that panes painted from now on reflect as mirrors do."""
 
     def u(self, low: float, high: float) -> float:
         """Draw a number between two, `low` if they are in the wrong order."""
@@ -96,7 +100,13 @@ class Plan:
         mixed = np.clip(base + self.u(-_SHADE, _SHADE) + self.draw.uniform(-0.03, 0.03, 3), 0.12, 0.85)
         red, green, blue = mixed.tolist()
         contrast = _LIGHTEST * (_STRONGEST / _LIGHTEST) ** float(self.draw.random())
-        self.paints.append(Paint((red, green, blue), contrast))
+        if material == "wall" and self.plain_walls:
+            contrast = 0.0
+        return self.add_paint(Paint((red, green, blue), contrast, self.mirror if material == "glass" else 0.0))
+
+    def add_paint(self, paint: Paint) -> int:
+        """Number of a paint that is new to the plan."""
+        self.paints.append(paint)
         return len(self.paints) - 1
 
     def put(self, shape: Shape, paint: int, warmth: float) -> None:

@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -138,11 +139,36 @@ def random_scene(seed: int) -> SyntheticScene:
     lo, hi = plan.solid().bounds
     extent = float(np.subtract(hi, lo).max())
     plan = plan.scaled(float(np.round(draw.uniform(*family.size_m), 2)) / extent)
+    texture_seed, light = int(draw.integers(2**31)), _light(draw)
+    background_rgb, background_c, surface_c, bounds_c = _surroundings(draw, outdoors=draw.random() < family.outdoors)
+    focal_share = round(float(draw.uniform(0.78, 1.05)), 3)
+    span = 360.0 if family.arc_deg is None else round(float(draw.uniform(*family.arc_deg)), 1)
+    start = round(float(draw.uniform(0.0, 360.0)), 1) if family.arc_deg is None else -90.0 - 0.5 * span
+    rings = random_rings(draw, plan.boxes_around(), focal_share, (start, span))
+    return scene_of_plan(
+        f"random-{seed}",
+        plan,
+        texture_seed,
+        light,
+        surface_c,
+        temperature_bounds_c=bounds_c,
+        background_rgb=background_rgb,
+        background_temperature_c=background_c,
+        rings=rings,
+        focal_share=focal_share,
+    )
+
+
+def scene_of_plan(
+    name: str, plan: Plan, texture_seed: int, light: SunLight, surface_c: tuple[float, float], **rest: Any
+) -> SyntheticScene:
+    """Make a scene of a plan in metres, whose warmth becomes temperatures from its coldest to its hottest surface [C].
+
+    The scene's other fields are passed by name.
+    """
     solid = plan.solid()
     box = _box_around(solid.bounds)
-    texture = SolidTexture(box, seed=int(draw.integers(2**31)))
-    light = _light(draw)
-    background_rgb, background_c, surface_c, bounds_c = _surroundings(draw, outdoors=draw.random() < family.outdoors)
+    texture = SolidTexture(box, seed=texture_seed)
     sampled = plan.warmth(solid.surface_points(_SURFACE_SAMPLES, seed=1)[0])
     coldest, hottest = round(float(sampled.min()), 6), round(float(sampled.max()), 6)
 
@@ -150,22 +176,17 @@ def random_scene(seed: int) -> SyntheticScene:
         share = np.clip((plan.warmth(points) - coldest) / (hottest - coldest), 0.0, 1.0)
         return (1.0 - share) * surface_c[0] + share * surface_c[1]
 
-    focal_share = round(float(draw.uniform(0.78, 1.05)), 3)
-    span = 360.0 if family.arc_deg is None else round(float(draw.uniform(*family.arc_deg)), 1)
-    start = round(float(draw.uniform(0.0, 360.0)), 1) if family.arc_deg is None else -90.0 - 0.5 * span
+    mirrors = np.array([paint.mirror for paint in plan.paints], dtype=np.float32)
     return SyntheticScene(
-        name=f"random-{seed}",
+        name=name,
         solid=solid,
         scene_box=box,
-        temperature_bounds_c=bounds_c,
         colour=lambda points, normals: painted(
             points, normals, plan.part(points, normals), plan.paints, texture, light
         ),
         surface_temperature_c=temperature_c,
-        background_rgb=background_rgb,
-        background_temperature_c=background_c,
-        rings=random_rings(draw, plan.boxes_around(), focal_share, (start, span)),
-        focal_share=focal_share,
+        mirror=(lambda points, normals: mirrors[plan.part(points, normals)]) if mirrors.any() else None,
+        **rest,
     )
 
 

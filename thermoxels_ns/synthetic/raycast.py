@@ -9,7 +9,8 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.synthetic.scene_truth import SyntheticScene
+from thermoxels_ns.synthetic.scene_truth import Surroundings, SyntheticScene
+from thermoxels_ns.synthetic.solids import Hits
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -27,9 +28,10 @@ class RenderedView:
     temperature_c: FloatArray
     """Mean temperature of each pixel's samples [degrees Celsius], shape (height, width)."""
     depth_m: FloatArray
-    """Distance along the ray through the pixel's centre [m], infinite for background, shape (height, width)."""
+    """Distance along the ray through the pixel's centre [m], infinite where it does not meet the solid first, shape
+    (height, width)."""
     hit: npt.NDArray[np.bool_]
-    """Whether the ray through the pixel's centre meets the solid, shape (height, width)."""
+    """Whether the ray through the pixel's centre meets the solid first, shape (height, width)."""
 
 
 def render_view(scene: SyntheticScene, pose: npt.ArrayLike, camera: Camera, samples_per_axis: int = 2) -> RenderedView:
@@ -45,10 +47,9 @@ def render_view(scene: SyntheticScene, pose: npt.ArrayLike, camera: Camera, samp
     origin = _position_outside(scene, pose)
     shape = (camera.height, camera.width)
     directions = camera.directions(pose, samples_per_axis)
-    rgb, temperature_c, distance = _look(scene, origin, directions.reshape(-1, 3))
-    if samples_per_axis > 1:
-        distance = scene.solid.intersect(origin, camera.directions(pose).reshape(-1, 3)).distance
-    depth = distance.reshape(shape)
+    rgb, temperature_c = _look(scene, origin, directions.reshape(-1, 3))
+    hits, first = _first_hits(scene, origin, camera.directions(pose).reshape(-1, 3))
+    depth = np.where(first == 0, hits[0].distance, np.inf).reshape(shape)
     return RenderedView(
         rgb.reshape(*shape, -1, 3).mean(axis=2),
         temperature_c.reshape(*shape, -1).mean(axis=2),
@@ -82,29 +83,56 @@ def visible_surface_points(
         candidate &= np.einsum("ij,ij->i", ray, normals) < -_GRAZING_COSINE * distance
         index = np.flatnonzero(candidate)
         # Unnormalised directions: a free line of sight hits at 1.
-        first = scene.solid.intersect(origin, ray[index]).distance
-        views[index[first >= 1.0 - _VISIBLE_TOLERANCE]] += 1
+        nearest = np.min([hits.distance for hits in _first_hits(scene, origin, ray[index])[0]], axis=0)
+        views[index[nearest >= 1.0 - _VISIBLE_TOLERANCE]] += 1
     return views >= min_views
 
 
+def _bodies(scene: SyntheticScene) -> tuple[SyntheticScene | Surroundings, ...]:
+    """The scene and what stands around it."""
+    return (scene,) if scene.around is None else (scene, scene.around)
+
+
+def _first_hits(
+    scene: SyntheticScene, origins: FloatArray, directions: FloatArray
+) -> tuple[list[Hits], npt.NDArray[np.int64]]:
+    """Where rays enter each of the bodies, and the number of the one they meet first (n,); -1 where they meet none."""
+    hits = [body.solid.intersect(origins, directions) for body in _bodies(scene)]
+    distance = np.array([one.distance for one in hits])
+    return hits, np.where(np.isfinite(distance.min(axis=0)), distance.argmin(axis=0), -1)
+
+
 def _look(
-    scene: SyntheticScene, origin: FloatArray, directions: FloatArray
-) -> tuple[npt.NDArray[np.float32], FloatArray, FloatArray]:
-    """Colour (n, 3), temperature (n,) and distance (n,) along rays from one origin."""
+    scene: SyntheticScene, origins: FloatArray, directions: FloatArray, mirrors: bool = True
+) -> tuple[npt.NDArray[np.float32], FloatArray]:
+    """Colour (n, 3) and temperature (n,) along rays from one origin (3,) or from one each (n, 3).
+
+    A mirroring surface adds the colour along the reflected ray, on which mirrors show their paint only.
+    """
     rgb = np.empty((len(directions), 3), dtype=np.float32)
     temperature_c = np.empty(len(directions))
-    distance = np.empty(len(directions))
     for start in range(0, len(directions), _RAYS_PER_CHUNK):
         part = slice(start, start + _RAYS_PER_CHUNK)
-        hits = scene.solid.intersect(origin, directions[part])
-        distance[part] = hits.distance
-        met, missed = start + np.flatnonzero(hits.hit), start + np.flatnonzero(~hits.hit)
-        points = origin + distance[met, None] * directions[met]
-        rgb[met] = scene.colour(points, hits.normal[hits.hit])
-        rgb[missed] = scene.background_rgb(directions[missed])
-        temperature_c[met] = scene.surface_temperature_c(points)
-        temperature_c[missed] = scene.background_temperature_c(directions[missed])
-    return rgb, temperature_c, distance
+        ray = directions[part]
+        origin = np.broadcast_to(origins if origins.ndim == 1 else origins[part], ray.shape)
+        hits, first = _first_hits(scene, origin, ray)
+        for number, body in enumerate(_bodies(scene)):
+            met = np.flatnonzero(first == number)
+            normals = hits[number].normal[met]
+            points = origin[met] + hits[number].distance[met, None] * ray[met]
+            colour = body.colour(points, normals)
+            if mirrors and number == 0 and scene.mirror is not None:
+                share = scene.mirror(points, normals)
+                shiny = np.flatnonzero(share)
+                towards, normal = ray[met[shiny]], normals[shiny]
+                reflected = towards - 2.0 * np.einsum("ij,ij->i", towards, normal)[:, None] * normal
+                seen, _ = _look(scene, points[shiny], reflected, mirrors=False)
+                colour[shiny] += share[shiny, None] * (seen - colour[shiny])
+            rgb[start + met], temperature_c[start + met] = colour, body.surface_temperature_c(points)
+        missed = np.flatnonzero(first < 0)
+        rgb[start + missed] = scene.background_rgb(ray[missed])
+        temperature_c[start + missed] = scene.background_temperature_c(ray[missed])
+    return rgb, temperature_c
 
 
 def _position_outside(scene: SyntheticScene, pose: FloatArray) -> FloatArray:

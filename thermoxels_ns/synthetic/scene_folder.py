@@ -31,10 +31,15 @@ __all__ = [
 
 ThermalFormat = Literal["png16", "tiff", "npy"]
 """16-bit PNG that spans the temperature bounds; uint16 TIFF of centikelvin counts; float32 numpy in Celsius."""
+PhotoFormat = Literal["jpeg", "png"]
+"""JPEG of quality 92, as cameras write it; PNG, which loses nothing."""
 
 FloatArray = npt.NDArray[np.float64]
 
 _SUFFIXES = {"png16": ".png", "tiff": ".tiff", "npy": ".npy"}
+_PHOTO_SUFFIXES: dict[str, str] = {"jpeg": ".jpg", "png": ".png"}
+_JPEG_QUALITY = 92
+_TRUTH = "truth.json"
 _LARGEST_COUNT = 65535
 _CENTIKELVIN = {"celsius_per_count": 0.01, "celsius_offset": -273.15}
 _NOISE_SIGMAS = 6.0
@@ -57,13 +62,14 @@ def write_scene(
     drift_k: float = 0.0,
     seed: int = 0,
     own_thermal_camera: bool = False,
+    photo_format: PhotoFormat = "jpeg",
     progress: bool = True,
 ) -> Path:
     """Photograph a scene in both bands and write the folder; ``transforms.json`` comes last.
 
     The layout is that of ThermoScenes: ``images/``, ``thermal/``, ``transforms.json`` and ``temperature_bounds.json``,
-    with ``frame_train_`` and ``frame_eval_`` names. The scene box, the scale (metres), up (z) and the name of the truth
-    are added to the json.
+    with ``frame_train_`` and ``frame_eval_`` names. Scale (metres) and up (z) are added to the json, as a capture finds
+    them. The scene's name, its exact box and the errors of each image go to ``truth.json``, which training never reads.
 
     Args:
         scene: What to photograph.
@@ -81,6 +87,7 @@ def write_scene(
         seed: Seed of noise and drift. The same seed writes the same bytes.
         own_thermal_camera: Take the thermal images with a second camera beside the first, with its own lens. Its
             intrinsics and poses are written under ``thermal_camera`` and ``thermal_transform_matrix``.
+        photo_format: How photographs are stored.
         progress: Show a progress bar.
 
     Returns:
@@ -91,7 +98,7 @@ def write_scene(
         OutputError: The folder cannot be written to.
     """
     thermal_size = _thermal_size(width, height, thermal_width, own_thermal_camera)
-    _check_options(thermal_format, noise_k, drift_k)
+    _check_options(photo_format, thermal_format, noise_k, drift_k)
     camera = scene.camera(width, height)
     thermal_camera = _second_camera(scene, *thermal_size) if own_thermal_camera else scene.camera(*thermal_size)
     train, held_out = scene.poses(num_train, num_eval)
@@ -114,14 +121,14 @@ def write_scene(
             thermal_view = render_view(scene, thermal_pose, thermal_camera)
         measured_c = _measured(thermal_view, float(drifts[number]), noise_k, np.random.default_rng([seed, 1, number]))
         frame: dict[str, Any] = {
-            "file_path": f"images/{name}.png",
+            "file_path": f"images/{name}{_PHOTO_SUFFIXES[photo_format]}",
             "thermal_file_path": f"thermal/{name}{_SUFFIXES[thermal_format]}",
             "transform_matrix": pose.tolist(),
         }
         if own_thermal_camera:
             frame["thermal_transform_matrix"] = thermal_pose.tolist()
         with replace_when_done(target / frame["file_path"]) as path:
-            Image.fromarray(np.round(view.rgb * 255.0).astype(np.uint8)).save(path)
+            Image.fromarray(np.round(view.rgb * 255.0).astype(np.uint8)).save(path, quality=_JPEG_QUALITY)
         with replace_when_done(target / frame["thermal_file_path"]) as path:
             _save_thermal(path, measured_c, unit)
         frames.append(frame)
@@ -135,27 +142,27 @@ def write_scene(
         transforms["thermal_camera"] = _intrinsics(thermal_camera)
     if thermal_format == "tiff":  # a 16-bit PNG has its unit in the bounds, and count 0 is a temperature there
         transforms["thermal_unit"] = unit
-    transforms |= {"metres_per_unit": 1.0, "up": [0, 0, 1]}
-    transforms["scene_box"] = [list(corner) for corner in scene.scene_box]
-    transforms["truth"] = {"synthetic_scene": scene.name, "seed": seed, "noise_k": noise_k, "drift_k": drifts.tolist()}
-    transforms["frames"] = frames
+    transforms |= {"metres_per_unit": 1.0, "up": [0, 0, 1], "frames": frames}
+    truth = {"synthetic_scene": scene.name, "scene_box": scene.scene_box, "seed": seed, "noise_k": noise_k}
+    _write_json(target / _TRUTH, truth | {"drift_k": drifts.tolist()})
     _write_json(target / "transforms.json", transforms)
     return target
 
 
 def load_truth(scene_folder: Path | str) -> SyntheticScene | None:
-    """Get the exact scene that a folder was written from; None for real photographs (no ``truth`` in the json).
+    """Get the exact scene that a folder was written from; None for real photographs (no ``truth.json``).
 
     Raises:
-        SceneError: The json is missing or unreadable, or names a scene that does not exist.
+        SceneError: The json is unreadable, or names a scene that does not exist.
     """
-    truth = _read_transforms(Path(scene_folder) / "transforms.json").get("truth")
-    if truth is None:
+    path = Path(scene_folder) / _TRUTH
+    if not path.is_file():
         return None
-    if not (isinstance(truth, dict) and isinstance(truth.get("synthetic_scene"), str)):
+    truth = _read_json(path)
+    if not isinstance(truth.get("synthetic_scene"), str):
         expected = 'an object with the text "synthetic_scene"'
-        remedy = "Write the scene again, or remove the key for real photographs."
-        raise SceneError("transforms.json: truth", expected=expected, got=json.dumps(truth), remedy=remedy)
+        remedy = "Write the scene again, or remove the file for real photographs."
+        raise SceneError(_TRUTH, expected=expected, got=json.dumps(truth), remedy=remedy)
     return make_scene(truth["synthetic_scene"])
 
 
@@ -176,11 +183,12 @@ def _thermal_size(width: int, height: int, thermal_width: int | None, own_camera
     return chosen, height * chosen // width
 
 
-def _check_options(thermal_format: str, noise_k: float, drift_k: float) -> None:
-    if thermal_format not in get_args(ThermalFormat):
-        expected = f"one of {', '.join(get_args(ThermalFormat))}"
-        remedy = "Choose one of these formats."
-        raise SceneError("thermal_format", expected=expected, got=repr(thermal_format), remedy=remedy)
+def _check_options(photo_format: str, thermal_format: str, noise_k: float, drift_k: float) -> None:
+    formats = (("photo_format", photo_format, PhotoFormat), ("thermal_format", thermal_format, ThermalFormat))
+    for name, text, known in formats:
+        if text not in get_args(known):
+            expected = f"one of {', '.join(get_args(known))}"
+            raise SceneError(name, expected=expected, got=repr(text), remedy="Choose one of these formats.")
     for name, value in (("noise_k", noise_k), ("drift_k", drift_k)):
         if not (np.isfinite(value) and value >= 0.0):
             raise SceneError(name, expected="a finite number of at least 0", got=value, remedy="Pass 0.")
@@ -194,8 +202,8 @@ def _prepared_folder(folder: Path | str) -> Path:
     target = writable_folder(folder)
     old = target / "transforms.json"
     if old.exists():
-        content = _read_transforms(old)
-        if content.get("truth") is None:
+        content = _read_json(old)
+        if "truth" not in content and not (target / _TRUTH).is_file():  # earlier checkouts wrote it there
             expected = "an empty folder or one with an earlier synthetic scene"
             got = f"{target}, whose transforms.json describes other photographs"
             remedy = "Choose another folder."
@@ -282,7 +290,7 @@ def _intrinsics(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _read_transforms(path: Path) -> dict[str, Any]:
+def _read_json(path: Path) -> dict[str, Any]:
     return read_json_object(path, "Check the scene folder, or write the scene again.", SceneError)
 
 

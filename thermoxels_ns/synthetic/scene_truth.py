@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.synthetic.camera_rings import CameraRing, ring_poses
+from thermoxels_ns.synthetic.camera_rings import CameraRing, CameraWalk, ring_poses
 from thermoxels_ns.synthetic.solid_union import Solid
 from thermoxels_ns.synthetic.solids import Box
 
@@ -17,6 +17,18 @@ FloatArray = npt.NDArray[np.float64]
 RgbFunction = Callable[..., npt.NDArray[np.float32]]
 
 _ASPECT = 4.0 / 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """Solid things outside the scene box that photographs show too: houses opposite, trees, a room's walls."""
+
+    solid: Solid
+    """All of them [m]; not part of what is scored."""
+    colour: RgbFunction
+    """(points (n, 3), normals (n, 3)) to red, green, blue in [0, 1] (n, 3)."""
+    surface_temperature_c: Callable[[npt.ArrayLike], FloatArray]
+    """Points (n, 3) to temperatures (n,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +40,7 @@ class SyntheticScene:
     solid: Solid
     """Everything that is not air."""
     scene_box: Box
-    """Lower and upper corner of the box to reconstruct [m]; the solid lies inside it."""
+    """Lower and upper corner of the exact box [m]: the solid lies inside it, the surroundings outside."""
     temperature_bounds_c: tuple[float, float]
     """No surface and no background is colder than the first or hotter than the second."""
     colour: RgbFunction
@@ -39,10 +51,14 @@ class SyntheticScene:
     """Unit directions (n, 3), away from the camera, to red, green, blue in [0, 1] (n, 3)."""
     background_temperature_c: Callable[[npt.ArrayLike], FloatArray]
     """Unit directions (n, 3), away from the camera, to apparent temperatures (n,)."""
-    rings: tuple[CameraRing, ...]
+    rings: tuple[CameraRing | CameraWalk, ...]
     """Where the photographs are taken from."""
     focal_share: float
     """Focal length over the image width, for a 4:3 image."""
+    around: Surroundings | None = None
+    """What stands between the scene and what lies at infinity (`background_rgb`)."""
+    mirror: Callable[[npt.ArrayLike, npt.ArrayLike], npt.NDArray[np.float32]] | None = None
+    """(points (n, 3), normals (n, 3)) to the share of light (n,) that a surface reflects as a mirror does."""
 
     @property
     def area_m2(self) -> float:
