@@ -12,7 +12,7 @@ from tests.support.camera_card import counts, jpeg_bytes, photograph
 from tests.support.flir_file import FlirFile
 from thermoxels_ns.capture.frames import CaptureFrames, read_frames
 from thermoxels_ns.capture.pairs import Pair
-from thermoxels_ns.radiometry.camera_file import RadiometryOptions
+from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
 RADIOMETRY = RadiometryOptions()
 

@@ -10,7 +10,7 @@ import pytest
 
 from tests.support.camera_card import counts, photograph
 from tests.support.flir_file import picture_bytes, segment
-from thermoxels_ns.capture.camera_files import scan_folder, shown_name
+from thermoxels_ns.capture.folder_scan import scan_folder, shown_name
 from thermoxels_ns.capture.pairs import find_pairs
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.commands.capture import capture_folder

@@ -10,7 +10,7 @@ import pytest
 
 from tests.support.camera_card import counts, jpeg_bytes, photograph
 from tests.support.flir_file import FlirFile
-from thermoxels_ns.capture.camera_files import CameraFile, CameraFolder, scan_folder
+from thermoxels_ns.capture.folder_scan import CameraFile, CameraFolder, scan_folder
 from thermoxels_ns.capture.pairs import PairOptions, PairSearch, find_pairs, read_pair_list
 from thermoxels_ns.core.errors import SceneError
 

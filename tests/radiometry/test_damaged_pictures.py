@@ -16,13 +16,13 @@ from PIL import Image
 
 from tests.support.camera_card import counts, photograph
 from tests.support.flir_file import FlirFile, picture_bytes, segment, smooth_counts
-from thermoxels_ns.capture.camera_files import identify
+from thermoxels_ns.capture.folder_scan import identify
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
 from thermoxels_ns.core.errors import SceneError, ThermalFileError, ThermoxelsError
-from thermoxels_ns.radiometry.camera_file import RadiometryOptions, read_thermogram
 from thermoxels_ns.radiometry.decoders import LARGEST_SIDE, errors_name
 from thermoxels_ns.radiometry.flir_rjpeg import read_flir_jpeg
 from thermoxels_ns.radiometry.jpeg_segments import DamagedJpegError, check_jpeg, jpeg_segments
+from thermoxels_ns.radiometry.thermogram import RadiometryOptions, read_thermogram
 
 READERS: tuple[Callable[[Path], object], ...] = (
     lambda path: identify(path, path.parent),

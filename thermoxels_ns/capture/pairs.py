@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoxels_ns.capture.camera_files import ROLE_WORDS, CameraFile, CameraFolder, natural_key, shown_name, words_of
+from thermoxels_ns.capture.folder_scan import ROLE_WORDS, CameraFile, CameraFolder, natural_key, shown_name, words_of
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.transforms_json import path_inside
 

@@ -15,7 +15,7 @@ from thermoxels_ns.capture.settings import CaptureSettings
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from thermoxels_ns.capture.run import CaptureResult
+    from thermoxels_ns.capture.stages import CaptureResult
 
 _LISTED = 10
 
@@ -50,7 +50,7 @@ def capture_folder(
     source: Path, output: Path, settings: CaptureSettings, say: Callable[[str], None] = lambda _: None
 ) -> CaptureResult:
     """Turn a folder of camera files into a scene and write the page about it; raises what `run_capture` does."""
-    from thermoxels_ns.capture.run import run_capture
+    from thermoxels_ns.capture.stages import run_capture
     from thermoxels_ns.reports.capture_pictures import write_capture_page
 
     return run_capture(source, output, settings, write_capture_page, say)

@@ -19,7 +19,7 @@ from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.data.transforms_json import DAMAGED_PHOTOGRAPH
 from thermoxels_ns.radiometry.decoders import errors_name
-from thermoxels_ns.radiometry.thermal_files import PixelReport, read_thermal_file
+from thermoxels_ns.radiometry.thermal_pixels import PixelReport, read_thermal_file
 
 
 class ThermalDataset(InputDataset):

@@ -14,7 +14,7 @@ from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.data.transforms_json import read_intrinsics, read_pose
-from thermoxels_ns.radiometry.thermal_files import THERMAL_SUFFIXES, ThermalUnit
+from thermoxels_ns.radiometry.thermal_pixels import THERMAL_SUFFIXES, ThermalUnit
 
 JSON_NAMES = ("transforms.json", "transforms_thermal.json")
 BOUNDS_NAME = "temperature_bounds.json"

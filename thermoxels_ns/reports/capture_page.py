@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.capture.camera_files import shown_name
+from thermoxels_ns.capture.folder_scan import shown_name
 from thermoxels_ns.capture.frames import measurement_rows
 from thermoxels_ns.capture.rig.explanation import turn_deg, turn_error_deg, why_turn_is_unsure, with_error
 from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
-from thermoxels_ns.capture.run import CaptureResult
 from thermoxels_ns.capture.scene_writer import Scene, scene_names
+from thermoxels_ns.capture.stages import CaptureResult
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.radiometry.dead_pixels import MIN_FRAMES
 from thermoxels_ns.reports.charts import bars, histogram

@@ -13,9 +13,9 @@ from PIL import Image
 from thermoxels_ns.capture.photograph import open_photograph
 from thermoxels_ns.capture.rig.start import rig_frames
 from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame
-from thermoxels_ns.capture.run import CaptureResult
 from thermoxels_ns.capture.scene_writer import scene_names
 from thermoxels_ns.capture.sfm.sparse_depth import SparseDepth
+from thermoxels_ns.capture.stages import CaptureResult
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.reports.capture_page import CapturePage, Overlay, build_page
 from thermoxels_ns.reports.page import write_page

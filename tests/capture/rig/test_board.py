@@ -16,7 +16,7 @@ from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.metric_scale import MetricScale
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.radiometry.camera_file import RadiometryOptions
+from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
 VISIBLE = Camera(640, 480, 600.0, 600.0, 322.0, 238.0, k1=-0.05)
 THERMAL = Camera(160, 128, 150.0, 150.0, 81.0, 63.0)

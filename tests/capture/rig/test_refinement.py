@@ -12,8 +12,8 @@ from tests.support.known_rig import KnownCapture, painted_sky
 from thermoxels_ns.capture.rig.explanation import turn_errors_deg
 from thermoxels_ns.capture.rig.images import prepare_frames
 from thermoxels_ns.capture.rig.parameters import RigModel, prior_sigmas
-from thermoxels_ns.capture.rig.patches import THERMAL_BLUR_PX, PatchScore, SmoothThermal, patch_design
 from thermoxels_ns.capture.rig.refinement import RefinedRig, inflate_centre_covariance, refine
+from thermoxels_ns.capture.rig.windows import THERMAL_BLUR_PX, SmoothThermal, WindowScore, window_design
 from thermoxels_ns.capture.rig_types import RigStart
 
 NEAR = np.array([0.003, -0.004, 0.002, 0.0, 0.0, 0.0, 0.004, 0.0, 0.0, 0.0])
@@ -58,7 +58,7 @@ def test_noise_and_other_pictures_are_left_alone(sky: KnownCapture) -> None:
     assert polished(sky, images(sky)[1:] + images(sky)[:1]) is None
 
 
-def score_of(image: np.ndarray, sky: KnownCapture) -> PatchScore:
+def score_of(image: np.ndarray, sky: KnownCapture) -> WindowScore:
     """Windows of a picture against itself, seen by one camera."""
     camera = sky.thermal
     rows, columns = np.mgrid[: camera.height, : camera.width]
@@ -66,8 +66,8 @@ def score_of(image: np.ndarray, sky: KnownCapture) -> PatchScore:
     usable = np.zeros((camera.height, camera.width), dtype=bool)
     usable[8:-8, 8:-8] = True
     seen = cv2.GaussianBlur(image.astype(np.float32), (0, 0), THERMAL_BLUR_PX).astype(np.float32)
-    design = patch_design(seen, rays, usable, 1.0, 1.5, 400)
-    return PatchScore([design], [SmoothThermal((3.0 - 2.0 * image).astype(np.float32))], RigModel(camera, np.eye(4)))
+    design = window_design(seen, rays, usable, 1.0, 1.5, 400)
+    return WindowScore([design], [SmoothThermal((3.0 - 2.0 * image).astype(np.float32))], RigModel(camera, np.eye(4)))
 
 
 def test_slopes_are_the_derivatives_of_the_likelihood(sky: KnownCapture) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
-from thermoxels_ns.capture.camera_files import scan_folder
+from thermoxels_ns.capture.folder_scan import scan_folder
 from thermoxels_ns.capture.frames import read_frames
 from thermoxels_ns.capture.pairs import PairOptions, find_pairs
 from thermoxels_ns.capture.photograph import open_photograph
@@ -23,7 +23,7 @@ from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.metric_scale import MetricScale
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.radiometry.camera_file import RadiometryOptions
+from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
 _SIZE = re.compile(r"(\d{1,3})\s*[xX]\s*(\d{1,3})")
 _SHIFTS = slice(3, 6)

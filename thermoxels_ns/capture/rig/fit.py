@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize
 
-from thermoxels_ns.capture.rig.patches import PatchScore
 from thermoxels_ns.capture.rig.score import RigScore
+from thermoxels_ns.capture.rig.windows import WindowScore
 from thermoxels_ns.capture.rig_types import FloatArray
 
 _DIFFERENCE_PX = 0.05
@@ -38,7 +38,7 @@ class RigMaximizer:
     """
 
     def __init__(
-        self, score: RigScore | PatchScore, sigmas: FloatArray, median_depth: float, correlated: float = 1.0
+        self, score: RigScore | WindowScore, sigmas: FloatArray, median_depth: float, correlated: float = 1.0
     ) -> None:
         """Take a score, the prior standard deviations, the scene's median depth and how many parts are correlated."""
         self._correlated = correlated

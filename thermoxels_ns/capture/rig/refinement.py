@@ -11,7 +11,7 @@ import numpy.typing as npt
 from thermoxels_ns.capture.rig.fit import RigMaximizer
 from thermoxels_ns.capture.rig.images import FARTHEST_FROM_POINT, SURE_DISTANCE, PreparedFrame, PreparedFrames
 from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel
-from thermoxels_ns.capture.rig.patches import THERMAL_BLUR_PX, PatchDesign, PatchScore, SmoothThermal, patch_design
+from thermoxels_ns.capture.rig.windows import THERMAL_BLUR_PX, SmoothThermal, WindowDesign, WindowScore, window_design
 from thermoxels_ns.capture.rig_types import FloatArray
 
 _PITCH = 1.3
@@ -72,7 +72,7 @@ def refine(prepared: PreparedFrames, rig: RigModel, change: FloatArray, sigmas: 
     few = [prepared.frames[number] for number in some]
     smooth = [SmoothThermal(frame.contrast) for frame in few]
     trials = {
-        blur_px: PatchScore([_design(frame, prepared, view, blur_px, _BLUR_WINDOWS) for frame in few], smooth, rig)
+        blur_px: WindowScore([_design(frame, prepared, view, blur_px, _BLUR_WINDOWS) for frame in few], smooth, rig)
         for blur_px in _LENS_BLURS_PX
     }
     blur_px = max(trials, key=lambda tried: _explained(trials[tried], change))
@@ -80,7 +80,7 @@ def refine(prepared: PreparedFrames, rig: RigModel, change: FloatArray, sigmas: 
         return None
     thermal = [SmoothThermal(frame.contrast) for frame in prepared.frames]
     designs = [_design(frame, prepared, view, blur_px, _MOST_WINDOWS) for frame in prepared.frames]
-    score = PatchScore(designs, thermal, rig)
+    score = WindowScore(designs, thermal, rig)
     start, chosen, maximizer = change, score, RigMaximizer(score, sigmas, prepared.median_depth)
     for reach_px in _REACHES_PX:
         chosen = score.selected(_agreeing(score, change, reach_px))
@@ -121,20 +121,20 @@ def _positive_part(symmetric: FloatArray) -> FloatArray:
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T, dtype=np.float64)
 
 
-def _agreeing(score: PatchScore, change: FloatArray, reach_px: float) -> list[npt.NDArray[np.bool_]]:
+def _agreeing(score: WindowScore, change: FloatArray, reach_px: float) -> list[npt.NDArray[np.bool_]]:
     """Which windows of each frame agree at their place or near it."""
     steps = (-reach_px, 0.0, reach_px) if reach_px > 0.0 else (0.0,)
     around = [score.agreement(change, (x, y)) for x in steps for y in steps]
     return [np.max(found, axis=0) > _AGREEMENT for found in zip(*around)]
 
 
-def _explained(score: PatchScore, change: FloatArray) -> float:
+def _explained(score: WindowScore, change: FloatArray) -> float:
     """How well the windows that agree do so: the sum of -log(1 - R2)."""
     counted = [found[found > _AGREEMENT] for found in score.agreement(change)]
     return float(np.sum(-np.log1p(-np.concatenate([np.zeros(0), *counted]))))
 
 
-def _agrees(score: PatchScore, change: FloatArray, fewest: float) -> bool:
+def _agrees(score: WindowScore, change: FloatArray, fewest: float) -> bool:
     """Whether enough windows agree here, and clearly more than some pixels away."""
 
     def count(shift_px: tuple[float, float]) -> int:
@@ -170,7 +170,9 @@ class _View:
         return cls(size, scale / same, rays, inside.reshape(size[1], size[0]))
 
 
-def _design(frame: PreparedFrame, prepared: PreparedFrames, view: _View, lens_blur_px: float, most: int) -> PatchDesign:
+def _design(
+    frame: PreparedFrame, prepared: PreparedFrames, view: _View, lens_blur_px: float, most: int
+) -> WindowDesign:
     """Windows of a photograph, reduced and blurred to what the thermal camera sees of it."""
     pitch = view.pitch
     small = cv2.resize(frame.grey, view.size, interpolation=cv2.INTER_AREA)
@@ -178,5 +180,5 @@ def _design(frame: PreparedFrame, prepared: PreparedFrames, view: _View, lens_bl
     variance = THERMAL_BLUR_PX**2 + lens_blur_px**2 + (1.0 - 1.0 / pitch**2) / 12.0
     small = cv2.GaussianBlur(small, (0, 0), np.sqrt(max(variance, 0.01)) * pitch, borderType=cv2.BORDER_REPLICATE)
     window_px = float(np.hypot(_WINDOW_PX, lens_blur_px))
-    design = patch_design(small.astype(np.float32), view.rays, view.inside, pitch, window_px, most)
+    design = window_design(small.astype(np.float32), view.rays, view.inside, pitch, window_px, most)
     return design.at_depth(*frame.depth.at(design.points), FARTHEST_FROM_POINT, SURE_DISTANCE)

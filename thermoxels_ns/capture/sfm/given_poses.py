@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.capture.sfm.colmap_model import model_of_colmap, read_colmap
+from thermoxels_ns.capture.sfm.colmap_conversion import model_of_colmap, read_colmap
 from thermoxels_ns.capture.sfm.model import SfmModel
 from thermoxels_ns.capture.sfm.poses import Poses, common_size
 from thermoxels_ns.core.errors import SceneError

@@ -14,7 +14,7 @@ from PIL import Image
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.photograph import open_photograph, read_photograph_facts
 from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
-from thermoxels_ns.capture.sfm.colmap_model import model_of_colmap
+from thermoxels_ns.capture.sfm.colmap_conversion import model_of_colmap
 from thermoxels_ns.capture.sfm.colmap_process import quiet_colmap, run_in_process
 from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, ReducedPhotographs, fill_database, lens_parameters
 from thermoxels_ns.capture.sfm.model import SfmModel

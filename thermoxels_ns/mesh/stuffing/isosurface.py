@@ -12,7 +12,7 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.stuffing.bcc_lattice import DIRECTIONS, BccLattice, bcc_lattice
-from thermoxels_ns.mesh.stuffing.interior import CoarseInterior, coarse_interior
+from thermoxels_ns.mesh.stuffing.coarse_interior import CoarseInterior, coarse_interior
 from thermoxels_ns.mesh.stuffing.stencils import (
     BUNDLE_EDGES,
     BUNDLE_POINTS,

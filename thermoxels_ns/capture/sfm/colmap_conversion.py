@@ -1,4 +1,4 @@
-"""COLMAP's models as ours."""
+"""Turns COLMAP's models into ours."""
 
 from __future__ import annotations
 

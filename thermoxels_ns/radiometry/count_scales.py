@@ -1,4 +1,4 @@
-"""Files of counts or degrees without calibration: TIFF, PNG, NPY and CSV."""
+"""What counts of TIFF, PNG and NPY files mean: the scales of cameras."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from PIL import Image
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.radiometry.decoders import check_thermal_size, errors_name
 from thermoxels_ns.radiometry.exif import ExifFacts, read_exif_facts
-from thermoxels_ns.radiometry.thermal_files import ThermalImage, ThermalUnit, read_thermal_file
+from thermoxels_ns.radiometry.thermal_pixels import ThermalImage, ThermalUnit, read_thermal_file
 
 CameraName = Literal["workswell", "flir-high-gain", "flir-low-gain", "flir-duo", "sensefly"]
 _SAMPLE_BITS = 258
@@ -34,7 +34,7 @@ class CountScale:
 
     @property
     def unit(self) -> ThermalUnit:
-        """The same for `thermal_files`."""
+        """The same for `read_thermal_file`."""
         return ThermalUnit.linear(self.celsius_per_count, self.celsius_offset)
 
 

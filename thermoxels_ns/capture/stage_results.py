@@ -9,7 +9,7 @@ from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 
-from thermoxels_ns.capture.camera_files import shown_name
+from thermoxels_ns.capture.folder_scan import shown_name
 from thermoxels_ns.capture.pairs import Pair, PairSearch
 from thermoxels_ns.capture.sfm.gravity import Up
 from thermoxels_ns.capture.sfm.metric_scale import MetricScale

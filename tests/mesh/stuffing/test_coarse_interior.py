@@ -15,7 +15,7 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import check_mesh, dihedral_range_deg
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.stuffing.bcc_lattice import bcc_lattice
-from thermoxels_ns.mesh.stuffing.interior import balanced_octree, coarse_interior, split_in_eight
+from thermoxels_ns.mesh.stuffing.coarse_interior import balanced_octree, coarse_interior, split_in_eight
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
 
 

@@ -1,4 +1,4 @@
-"""Reads all thermal camera files as degrees; the format is found by content."""
+"""Any thermal camera file as degrees and what it says beside; found by content."""
 
 from __future__ import annotations
 
@@ -12,13 +12,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.radiometry.conditions import ConditionOverrides, Conditions
-from thermoxels_ns.radiometry.decoders import check_file_size, errors_name
-from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg, read_dji_rjpeg
-from thermoxels_ns.radiometry.flir_records import PictureInPicture
-from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
-from thermoxels_ns.radiometry.jpeg_segments import JPEG_START, check_jpeg
-from thermoxels_ns.radiometry.measurement_model import corrected_temperature_c
-from thermoxels_ns.radiometry.stored_temperatures import (
+from thermoxels_ns.radiometry.count_scales import (
     COUNT_SCALES,
     NPY_START,
     CameraName,
@@ -26,7 +20,13 @@ from thermoxels_ns.radiometry.stored_temperatures import (
     read_count_image,
     read_npy,
 )
-from thermoxels_ns.radiometry.thermal_files import (
+from thermoxels_ns.radiometry.decoders import check_file_size, errors_name
+from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg, read_dji_rjpeg
+from thermoxels_ns.radiometry.flir_records import PictureInPicture
+from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
+from thermoxels_ns.radiometry.jpeg_segments import JPEG_START, check_jpeg
+from thermoxels_ns.radiometry.measurement_model import corrected_temperature_c
+from thermoxels_ns.radiometry.thermal_pixels import (
     PixelReport,
     ThermalImage,
     ThermalUnit,

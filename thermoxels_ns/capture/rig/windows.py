@@ -27,7 +27,7 @@ _BLOCKS = 4
 
 
 @dataclass(frozen=True, eq=False)
-class PatchDesign:
+class WindowDesign:
     """Windows of one photograph as points in front of its camera, with what temperatures are fitted by in each."""
 
     points: FloatArray
@@ -43,7 +43,7 @@ class PatchDesign:
     trust: FloatArray
     """How much each window counts, shape (windows,)."""
 
-    def at_depth(self, depth: FloatArray, distance: FloatArray, farthest: float, sure: float) -> PatchDesign:
+    def at_depth(self, depth: FloatArray, distance: FloatArray, farthest: float, sure: float) -> WindowDesign:
         """Move the points from depth 1 to their own and leave windows out that have a point of unknown depth.
 
         `distance` says how far each point lies from what its depth is known by: beyond `farthest` it is not known, up
@@ -53,13 +53,13 @@ class PatchDesign:
         known = (np.isfinite(depth) & (distance < farthest))[self.index].all(axis=1)
         middle = distance[self.index[:, self.index.shape[1] // 2]]
         trust = 1.0 / (1.0 + np.where(known, middle / sure, 0.0) ** 4)
-        return PatchDesign(points, self.index, self.plain, self.bright, self.weight, trust).chosen(known)
+        return WindowDesign(points, self.index, self.plain, self.bright, self.weight, trust).chosen(known)
 
-    def chosen(self, keep: npt.NDArray) -> PatchDesign:
+    def chosen(self, keep: npt.NDArray) -> WindowDesign:
         """Some of the windows only, by mask or number."""
         used, index = np.unique(self.index[keep], return_inverse=True)
         index = index.reshape(-1, self.index.shape[1])
-        return PatchDesign(self.points[used], index, self.plain, self.bright[keep], self.weight, self.trust[keep])
+        return WindowDesign(self.points[used], index, self.plain, self.bright[keep], self.weight, self.trust[keep])
 
 
 class SmoothThermal:
@@ -99,7 +99,7 @@ class SmoothThermal:
         return np.column_stack(rises) / (2.0 * _STEP_PX)
 
 
-class PatchScore:
+class WindowScore:
     """The log likelihood of rigs, from the windows of all frames.
 
     In a window of about three thermal pixels a photograph mostly shows two materials, and so does the thermal image:
@@ -110,7 +110,7 @@ class PatchScore:
     nowhere.
     """
 
-    def __init__(self, designs: Sequence[PatchDesign], thermal: Sequence[SmoothThermal], rig: RigModel) -> None:
+    def __init__(self, designs: Sequence[WindowDesign], thermal: Sequence[SmoothThermal], rig: RigModel) -> None:
         """Take windows of photographs, thermal images of the same frames and what changes count from."""
         self.designs, self.thermal, self.rig = list(designs), list(thermal), rig
         # The same floor for all windows: no window counts as known better than the noise allows.
@@ -131,9 +131,9 @@ class PatchScore:
             result.append(np.where(inside[design.index].all(axis=1), gain**2 / spread, 0.0))
         return result
 
-    def selected(self, keep: Sequence[npt.NDArray]) -> PatchScore:
+    def selected(self, keep: Sequence[npt.NDArray]) -> WindowScore:
         """Some windows of each frame only."""
-        return PatchScore([design.chosen(mask) for design, mask in zip(self.designs, keep)], self.thermal, self.rig)
+        return WindowScore([design.chosen(mask) for design, mask in zip(self.designs, keep)], self.thermal, self.rig)
 
     def value(self, change: FloatArray) -> float:
         """Log likelihood per window."""
@@ -163,7 +163,7 @@ class PatchScore:
                 rows.append(self.rig.pull_back(change, design.points[touched], summed[touched, None] * slope[touched]))
         return total, np.array(rows).reshape(-1, 10)
 
-    def _fit(self, design: PatchDesign, temperature: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _fit(self, design: WindowDesign, temperature: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Temperatures in each window without their plane (weighted), how much of the photograph is in them, and their
         sum of squares with the noise that is in it at least."""
         value = temperature[design.index] * design.weight
@@ -173,9 +173,9 @@ class PatchScore:
         return value, gain, np.sum(value * value, axis=1) + floor
 
 
-def patch_design(
+def window_design(
     photograph: FloatImage, rays: FloatArray, usable: npt.NDArray[np.bool_], pitch: float, window_px: float, most: int
-) -> PatchDesign:
+) -> WindowDesign:
     """Choose the windows of a photograph with most contrast; their points lie at depth 1.
 
     Args:
@@ -207,7 +207,7 @@ def patch_design(
     length = np.sqrt(np.sum(bright * bright, axis=1))
     index, bright, length = (each[length > _SMALLEST_VARIANCE] for each in (index, bright, length))
     used, number = np.unique(index, return_inverse=True)
-    return PatchDesign(
+    return WindowDesign(
         rays[used], number.reshape(-1, len(down)), plain, bright / length[:, None], weight, np.ones(len(index))
     )
 

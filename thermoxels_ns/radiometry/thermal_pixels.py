@@ -1,4 +1,4 @@
-"""Thermal files to degrees Celsius, NaN where the camera measured nothing."""
+"""Pixels of thermal files by a known unit: degrees Celsius, NaN where nothing was measured."""
 
 from __future__ import annotations
 

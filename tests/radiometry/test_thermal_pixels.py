@@ -12,7 +12,7 @@ from PIL import Image
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.data.dataparser import survey_thermal_files
 from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
-from thermoxels_ns.radiometry.thermal_files import ThermalUnit, read_thermal_file
+from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, read_thermal_file
 
 BOUNDS = ThermalUnit.bounds(-10.0, 40.0)
 COUNTS = ThermalUnit.linear(0.025, -100.0)

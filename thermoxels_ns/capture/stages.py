@@ -10,8 +10,8 @@ from typing import TypeVar
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from thermoxels_ns.capture import results
-from thermoxels_ns.capture.camera_files import SUFFIXES, files_below, scan_folder, shown_name
+from thermoxels_ns.capture import stage_results
+from thermoxels_ns.capture.folder_scan import SUFFIXES, files_below, scan_folder, shown_name
 from thermoxels_ns.capture.frames import CaptureFrame, CaptureFrames, read_frames
 from thermoxels_ns.capture.masks import PhotographMasks, find_masks, mask_files, user_masks
 from thermoxels_ns.capture.pairs import Pair, PairOptions, PairSearch, find_pairs, no_pairs, read_pair_list
@@ -47,7 +47,7 @@ from thermoxels_ns.capture.stage_cache import (
 from thermoxels_ns.core.checks import remove_stale_temporaries
 from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import write_json
-from thermoxels_ns.radiometry.camera_file import RadiometryOptions
+from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
 PAGE_NAME = "capture.html"
 """Of the page, in the output folder."""
@@ -193,7 +193,7 @@ class _Capture:
 
         def work(folder: Path) -> None:
             search, unreadable = self._searched_pairs(options)
-            results.save_pairs(folder, search, self.source)
+            stage_results.save_pairs(folder, search, self.source)
             write_json(folder / "unreadable.json", {shown_name(path): why for path, why in unreadable.items()})
             self.say(f"pairs: {len(search.pairs)}, files without a partner: {len(search.unpaired)}")
             left_out = [(shown_name(path), why) for path, why in (unreadable | search.unpaired).items()]
@@ -203,8 +203,8 @@ class _Capture:
                 self.say(f"left out: {len(left_out) - _MOST_NAMED} more; {PAGE_NAME} names all")
 
         folder = self.cache.run("pairs", depends, work)
-        pairs, unpaired = results.load_pairs(folder, self.source)
-        self.dropped |= results.load_json(folder / "unreadable.json") | unpaired
+        pairs, unpaired = stage_results.load_pairs(folder, self.source)
+        self.dropped |= stage_results.load_json(folder / "unreadable.json") | unpaired
         return pairs
 
     def _searched_pairs(self, options: PairOptions) -> tuple[PairSearch, dict[Path, str]]:
@@ -271,13 +271,13 @@ class _Capture:
                 model = poses.model
                 if not len(model.points):
                     model = add_points(model, photographs, folder, masks, options, self.say)
-            results.save(folder / "model.npz", model)
+            stage_results.save(folder / "model.npz", model)
             write_json(folder / "dropped.json", dict(poses.dropped))
             self.say(f"poses: {len(model.frames)} of {len(read.frames)} frames, {len(model.points)} points")
 
         folder = self.cache.run("poses", depends, work)
-        self.dropped |= results.load_json(folder / "dropped.json")
-        return results.load(folder / "model.npz", SfmModel)
+        self.dropped |= stage_results.load_json(folder / "dropped.json")
+        return stage_results.load(folder / "model.npz", SfmModel)
 
     def photograph_masks(self, frames: list[CaptureFrame], model: SfmModel) -> PhotographMasks:
         """What the stage of the poses found drawn over the photographs, and the user's masks."""
@@ -309,12 +309,12 @@ class _Capture:
                 origin = np.median(found.points, axis=0) if len(found.points) else found.centres.mean(axis=0)
                 model = found.moved(rotation, origin)
                 up = Up(rotation @ up.direction, up.source, up.spread_deg)
-            results.save(folder / "model.npz", model)
-            results.save_scale(folder, scale, missing, up)
+            stage_results.save(folder / "model.npz", model)
+            stage_results.save_scale(folder, scale, missing, up)
             self.say(f"scale: {missing}" if scale is None else f"scale: {scale.metres_per_unit:.5g} m per unit")
 
         folder = self.cache.run("scale", depends, work)
-        return results.load(folder / "model.npz", SfmModel), *results.load_scale(folder)
+        return stage_results.load(folder / "model.npz", SfmModel), *stage_results.load_scale(folder)
 
     def _metric_scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[MetricScale | None, str]:
         """Metres per unit from the surest source that there is; where there is none, why."""
@@ -345,9 +345,9 @@ class _Capture:
             rig = rig_from_board_photos(
                 pictures, board, model.camera, read.thermal_size, folder, settings, radiometry, self.say
             )
-            results.save(folder / "rig.npz", rig)
+            stage_results.save(folder / "rig.npz", rig)
 
-        return results.load(self.cache.run("board", depends, work) / "rig.npz", RigEstimate)
+        return stage_results.load(self.cache.run("board", depends, work) / "rig.npz", RigEstimate)
 
     def rig(
         self,
@@ -365,7 +365,7 @@ class _Capture:
         def work(folder: Path) -> None:
             metres = None if scale is None else scale.metres_per_unit
             begin = rig_start(frames, model.camera, read.thermal_size, settings.thermal_field_of_view_deg, metres)
-            results.save(folder / "start.npz", kept_start(begin, "Where the search begins."))
+            stage_results.save(folder / "start.npz", kept_start(begin, "Where the search begins."))
             if settings.rig is not None:
                 rig = read_rig(settings.rig, read.thermal_size, metres)
             elif board is not None:
@@ -379,12 +379,12 @@ class _Capture:
                     begin,
                     lambda message, share: self.say(f"rig: {message} ({100 * share:.0f} %)"),
                 )
-            results.save(folder / "rig.npz", rig)
+            stage_results.save(folder / "rig.npz", rig)
             for line in rig_lines(rig, metres):
                 self.say(f"rig: {line}")
 
         folder = self.cache.run("rig", depends, work)
-        rig, start = (results.load(folder / f"{name}.npz", RigEstimate) for name in ("rig", "start"))
+        rig, start = (stage_results.load(folder / f"{name}.npz", RigEstimate) for name in ("rig", "start"))
         return rig, start
 
     def drift(self, model: SfmModel, frames: list[CaptureFrame], rig: RigEstimate) -> DriftEstimate:
@@ -396,8 +396,8 @@ class _Capture:
                 drift = DriftEstimate(np.zeros(len(frames)), (), np.nan, np.nan, False, why)
             else:
                 drift = estimate_drift(rig_frames(model, frames), rig.thermal_camera, rig.visible_to_thermal)
-            results.save(folder / "drift.npz", drift)
+            stage_results.save(folder / "drift.npz", drift)
             self.say(f"drift: {drift.explanation}")
 
         folder = self.cache.run("drift", {"drift": self.settings.drift}, work)
-        return results.load(folder / "drift.npz", DriftEstimate)
+        return stage_results.load(folder / "drift.npz", DriftEstimate)

@@ -13,10 +13,10 @@ from PIL import Image
 
 from tests.support.flir_file import FlirFile, picture_bytes, smooth_counts
 from thermoxels_ns.core.errors import SceneError, ThermalFileError, ThermoxelsError
-from thermoxels_ns.radiometry.camera_file import RadiometryOptions, detect_format, read_thermogram
 from thermoxels_ns.radiometry.conditions import Conditions
+from thermoxels_ns.radiometry.count_scales import COUNT_SCALES, recognised_camera
 from thermoxels_ns.radiometry.measurement_model import corrected_temperature_c
-from thermoxels_ns.radiometry.stored_temperatures import COUNT_SCALES, recognised_camera
+from thermoxels_ns.radiometry.thermogram import RadiometryOptions, detect_format, read_thermogram
 
 WALL_C = np.array([[18.25, 19.5, 20.75], [21.0, 22.25, 23.5]])
 
