@@ -15,7 +15,7 @@ from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.boundary.patch_rules import PatchRules
 from thermoxels_ns.mesh.boundary.patches import apply_regions
 from thermoxels_ns.mesh.boundary.tags import BoundaryMode, tag_boundary
-from thermoxels_ns.mesh.quality.topology import part_labels
+from thermoxels_ns.mesh.quality.topology import component_of
 from thermoxels_ns.mesh.solid.morphology import bounding_box, connected, face_connected
 from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, select_solid
 from thermoxels_ns.mesh.stuffing.isosurface import check_coarsest, stuff
@@ -66,9 +66,9 @@ class BuiltMesh:
     solid: SolidCells
     """The solid voxels it was made from."""
     unobserved_parts: int
-    """Parts left out because no thermal ray saw any of their nodes."""
+    """Connected components left out because no thermal ray saw any of their nodes."""
     unobserved_voxels: int
-    """Voxels of these parts; they count in `solid.component_sizes`, but are not in `solid.cells`."""
+    """Their voxels, which count in `solid.component_sizes`, but are not in `solid.cells`."""
     observed_range_c: tuple[float, float]
     """Lowest and highest temperature of the measured corners, [degrees Celsius]; no node lies outside."""
     idle_rules: tuple[str, ...] = ()
@@ -108,7 +108,7 @@ def build_mesh(
     least = max(options.min_observed_weight, float(np.finfo(np.float32).tiny))
     scale = float(np.cbrt(abs(np.linalg.det(transform[:3, :3]))))
     solid = select_solid(snapshot, selection, scale, makes_up_volume=options.boundary == "conforming")
-    solid, num_parts, num_voxels = _without_unobserved_parts(solid, snapshot.observed_weight >= least)
+    solid, num_parts, num_voxels = _without_unobserved(solid, snapshot.observed_weight >= least)
 
     if options.boundary == "voxel":
         shape = _voxel_shape(solid.cells)
@@ -191,19 +191,19 @@ def _colour(snapshot: GridSnapshot, points: FloatArray) -> Float32Array | None:
 
 
 def _with_a_measurement(shape: _Shape, observed: BoolArray) -> tuple[BoolArray, int]:
-    """Nodes of the parts of a mesh that have an observed node, or all if none has, and how many parts are left out.
+    """Nodes of the components of a mesh that have an observed node, or all if none has, and how many are left out.
 
-    Voxels that touch by a corner only are one part as voxels, but may be two once their surface is smooth.
+    Voxels that touch by a corner only are one component as voxels, but may be two once their surface is smooth.
     """
-    part = part_labels(len(shape.points), shape.tets[:, :3].ravel(), shape.tets[:, 1:].ravel())
-    seen = np.bincount(part[observed], minlength=int(part.max()) + 1) > 0
+    component = component_of(len(shape.points), shape.tets[:, :3].ravel(), shape.tets[:, 1:].ravel())
+    seen = np.bincount(component[observed], minlength=int(component.max()) + 1) > 0
     if not seen.any():
         seen[:] = True
     return seen[part], int(np.count_nonzero(~seen))
 
 
 def _kept(shape: _Shape, stays: BoolArray) -> _Shape:
-    """The parts of a mesh whose nodes stay."""
+    """The components of a mesh whose nodes stay."""
     number = np.cumsum(stays, dtype=np.int64) - 1
     facet_stays = stays[shape.facets[:, 0]]
     return _Shape(
@@ -215,15 +215,15 @@ def _kept(shape: _Shape, stays: BoolArray) -> _Shape:
 
 
 def _without_voxels_of(solid: SolidCells, points: FloatArray) -> tuple[SolidCells, int]:
-    """Leave out the voxels that parts of a mesh with these nodes were made from; also their number.
+    """Leave out the voxels that components of a mesh with these nodes were made from; also their number.
 
-    Centres of solid voxels near the surface are nodes, and voxels that share a face are in one part.
+    Centres of solid voxels near the surface are nodes, and voxels that share a face are in one component.
     """
-    part = face_connected(solid.cells)
+    component = face_connected(solid.cells)
     voxel = np.floor(points).astype(np.int64)
     centres = voxel[np.all(points == voxel + 0.5, axis=1)]
-    goes = np.zeros(int(part.max()) + 1, dtype=bool)
-    goes[part[tuple(centres.T)]] = True
+    goes = np.zeros(int(component.max()) + 1, dtype=bool)
+    goes[component[tuple(centres.T)]] = True
     goes[0] = False
     return _without(solid, goes[part])
 
@@ -234,17 +234,17 @@ def _without(solid: SolidCells, goes: BoolArray) -> tuple[SolidCells, int]:
     return replace(solid, cells=solid.cells & ~goes, level=level), int(np.count_nonzero(goes))
 
 
-def _without_unobserved_parts(solid: SolidCells, observed_corners: BoolArray) -> tuple[SolidCells, int, int]:
-    """Leave out bodies without an observed corner, unless that is all of them; also their number and their voxels."""
+def _without_unobserved(solid: SolidCells, observed_corners: BoolArray) -> tuple[SolidCells, int, int]:
+    """Leave out components without an observed corner, unless all are; also their number and that of their voxels."""
     # Voxels share a node if they touch by a face, an edge or a corner.
     box = bounding_box(solid.cells)
     cells = solid.cells[box]
-    part = connected(cells)
+    component = connected(cells)
     touched = np.zeros(cells.shape, dtype=bool)
     for offset in CORNER_OFFSETS:
         shifted = tuple(slice(s.start + int(d), s.stop + int(d)) for s, d in zip(box, offset))
         touched |= observed_corners[shifted]
-    seen = np.bincount(part[cells & touched], minlength=int(part.max()) + 1) > 0
+    seen = np.bincount(component[cells & touched], minlength=int(component.max()) + 1) > 0
     if seen[1:].all() or not seen.any():
         return solid, 0, 0
     goes = np.zeros_like(solid.cells)

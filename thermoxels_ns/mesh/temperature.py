@@ -22,7 +22,7 @@ _DIRECT_SOLVE_UNKNOWNS = 4000
 _RELATIVE_RESIDUAL = 1e-7
 _MOST_ROUNDS = 100_000
 _LEAST_CONDUCTANCE = 1e-6
-"""Share of the mean conductance that every edge has at least: it keeps the matrix an M-matrix, and parts connected."""
+"""Least conductance of an edge, as a share of the mean: keeps the matrix an M-matrix, and components connected."""
 
 
 def interpolate_corners(
@@ -80,8 +80,8 @@ def extend_harmonically(
 
     Observed nodes keep their value. Every other node i solves sum_j w_ij (T_i - T_j) = 0 over its edges: steady heat
     conduction in an insulated body. The matrix is an M-matrix, so the maximum principle holds: no filled-in value
-    leaves the observed range of its connected part. What rounding adds beyond it is clipped. An edge whose weights add
-    up to 0 or less gets next to none, so that this holds for any mesh.
+    leaves the observed range of its connected component. What rounding adds beyond it is clipped. An edge whose weights
+    add up to 0 or less gets next to none, so that this holds for any mesh.
 
     Args:
         edges: Node pairs, shape (e, 2); the weights of a pair that comes more than once add up.
@@ -92,7 +92,7 @@ def extend_harmonically(
             tetrahedra.
 
     Raises:
-        MeshError: A connected part has no observed node, or the solver did not converge.
+        MeshError: A connected component has no observed node, or the solver did not converge.
 
     >>> chain = np.array([[0, 1], [1, 2]])
     >>> extend_harmonically(chain, np.array([10.0, -99.0, 30.0]), np.array([True, False, True])).tolist()
@@ -111,7 +111,7 @@ def extend_harmonically(
     links = sparse.coo_array((weights, (start, end)), shape=(num_nodes, num_nodes)).tocsr()
     links = (links + links.T).tocsr()
     links.data = np.maximum(links.data, _LEAST_CONDUCTANCE * float(np.abs(links.data).mean()))
-    parts = _parts_with_measurement(links, observed)
+    component = _measured_components(links, observed)
 
     free = np.flatnonzero(~observed)
     fixed = np.flatnonzero(observed)
@@ -122,10 +122,10 @@ def extend_harmonically(
     load = rows[:, fixed] @ (temperature[fixed] - middle)
     temperature[free] = middle + _solve(matrix, load, degree)
 
-    labels = np.arange(parts.max() + 1)
-    low = np.asarray(ndimage.minimum(temperature[fixed], parts[fixed], labels))
-    high = np.asarray(ndimage.maximum(temperature[fixed], parts[fixed], labels))
-    temperature[free] = np.clip(temperature[free], low[parts[free]], high[parts[free]])
+    labels = np.arange(component.max() + 1)
+    low = np.asarray(ndimage.minimum(temperature[fixed], component[fixed], labels))
+    high = np.asarray(ndimage.maximum(temperature[fixed], component[fixed], labels))
+    temperature[free] = np.clip(temperature[free], low[component[free]], high[component[free]])
     return temperature
 
 
@@ -142,19 +142,19 @@ def tet_conductances(points: FloatArray, tets: IntArray) -> tuple[IntArray, Floa
     return tets[:, TET_EDGES].reshape(-1, 2), conductances.ravel()
 
 
-def _parts_with_measurement(links: sparse.csr_array, observed: BoolArray) -> IntArray:
-    """Connected part of every node, shape (n,); raise if a part has no observed node."""
-    count, parts = connected_components(links, directed=False)
-    measured = np.bincount(parts[observed], minlength=count)
+def _measured_components(links: sparse.csr_array, observed: BoolArray) -> IntArray:
+    """Connected component of every node, shape (n,); raise if one has no observed node."""
+    count, component = connected_components(links, directed=False)
+    measured = np.bincount(component[observed], minlength=count)
     blind = np.flatnonzero(measured == 0)
     if len(blind):
-        sizes, first = np.bincount(parts, minlength=count), np.unique(parts, return_index=True)[1]
+        sizes, first = np.bincount(component, minlength=count), np.unique(component, return_index=True)[1]
         shown = ", ".join(f"part {p} ({sizes[p]} nodes, the first is node {first[p]})" for p in blind[:3])
         expected = "at least one node seen by a thermal ray in each connected part of the mesh"
         got = f"none in {len(blind)} of {count} parts: {shown}{', ...' if len(blind) > 3 else ''}"
         remedy = "Train with thermal images that show this part."
         raise MeshError("observed temperatures", expected=expected, got=got, remedy=remedy)
-    return parts.astype(np.int64)
+    return component.astype(np.int64)
 
 
 def _conjugate_gradients(

@@ -78,7 +78,7 @@ def test_the_threshold_stays_within_bounds(scale, bound):
     density[0] = 1.0  # so that something is solid at the lower bound
     chosen = automatic(field(density, MET * scale))
     assert chosen.density == pytest.approx(OPTICAL_DEPTH_BOUNDS[bound] / VOXEL)
-    assert ("the least that is not fog", "the most that is asked")[bound] in chosen.explanation
+    assert ("the least that is not half-transparent", "the most that is asked")[bound] in chosen.explanation
 
 
 def test_the_voxel_whose_density_is_the_threshold_is_solid():

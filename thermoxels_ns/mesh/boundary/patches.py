@@ -83,14 +83,14 @@ def apply_patches(
     """
     patch, names = default_patches(normals, up, seen, on_box)
     direction = facing(normals, up)
-    parts = {
+    surfaces = {
         "exterior": ~on_box & seen,
         "interior": ~on_box & ~seen,
         "cut": on_box,
         "all": np.ones(len(patch), dtype=bool),
     }
     allowed = [
-        parts[rule.only] & (True if rule.facing == "any" else direction == FACINGS.index(rule.facing))
+        surfaces[rule.only] & (True if rule.facing == "any" else direction == FACINGS.index(rule.facing))
         for rule in rules.patches
     ]
     owner = _rule_of_each(rules.patches, "patch", allowed, len(patch), centroids_m, colours)

@@ -36,10 +36,9 @@ def tag_boundary(
     up: tuple[float, float, float],
     rules: PatchRules,
 ) -> tuple[Boundary, tuple[str, ...]]:
-    """Find out what physics needs to know of every boundary triangle, and the rules that no triangle follows.
+    """Normal, area factor, visibility and patch of every boundary triangle, and the rules that no triangle follows.
 
-    Nodes are given as fractional corner indices (n, 3) too. Without `views` nothing is known to be hidden: every
-    triangle counts as seen.
+    `points_index` are the nodes as fractional corner indices, (n, 3). Without `views` every triangle counts as seen.
     """
     linear = world_to_metres[:3, :3] / np.cbrt(abs(np.linalg.det(world_to_metres[:3, :3])))
     on_box = mesh.facet_tags == FACET_BOX

@@ -122,10 +122,10 @@ def _set_names(name: str, names: Sequence[str]) -> list[str]:
     return written
 
 
-def _parts(index: IntArray, names: Sequence[str]) -> Iterator[tuple[str, IntArray]]:
-    """Name and members, rising, of every part that is not empty."""
-    for part, name in enumerate(names):
-        members = np.flatnonzero(index == part)
+def _sets(index: IntArray, names: Sequence[str]) -> Iterator[tuple[str, IntArray]]:
+    """Name and members, rising, of every patch or region that is not empty."""
+    for number, name in enumerate(names):
+        members = np.flatnonzero(index == number)
         if len(members):
             yield name, members
 
@@ -149,7 +149,7 @@ def _number_lines(values: IntArray) -> Iterator[str]:
 def _nodes_and_elements(content: FileContent, observed: BoolArray, regions: Sequence[str]) -> Iterator[str]:
     yield "*NODE, NSET=NALL\n"
     yield from _rows(f"%d, {_REAL}, {_REAL}, {_REAL}\n", np.arange(1, len(content.points_m) + 1), *content.points_m.T)
-    used = list(_parts(content.region, regions))
+    used = list(_sets(content.region, regions))
     for name, members in used:
         yield f"*ELEMENT, TYPE=DC3D4, ELSET=REGION-{name}\n"
         yield from _rows("%d, %d, %d, %d, %d\n", members + 1, *(content.tets[members] + 1).T)
@@ -162,7 +162,7 @@ def _nodes_and_elements(content: FileContent, observed: BoolArray, regions: Sequ
 
 def _surfaces(content: FileContent, patches: Sequence[str], owner: IntArray, face: IntArray) -> Iterator[str]:
     areas = np.linalg.norm(facet_area_vectors(content.points_m, content.facets), axis=1)
-    for name, members in _parts(content.patch, patches):
+    for name, members in _sets(content.patch, patches):
         mesh_m2 = float(areas[members].sum())
         true_m2 = float((areas[members] * content.area_factor[members]).sum())
         yield f"** PATCH-{name}: true area {true_m2:.9g} m2, area of its triangles {mesh_m2:.9g} m2\n"
@@ -174,7 +174,7 @@ def _surfaces(content: FileContent, patches: Sequence[str], owner: IntArray, fac
 
 
 def _materials(content: FileContent, regions: Sequence[str], step: HeatStep) -> Iterator[str]:
-    used = [name for name, _ in _parts(content.region, regions)]
+    used = [name for name, _ in _sets(content.region, regions)]
     yield f"*PHYSICAL CONSTANTS, ABSOLUTE ZERO={-ZERO_CELSIUS_K}, STEFAN BOLTZMANN={STEFAN_BOLTZMANN_W_M2K4:.9E}\n"
     for name in used:
         yield f"*MATERIAL, NAME=MATERIAL-{name}\n"

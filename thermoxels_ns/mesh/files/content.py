@@ -32,7 +32,7 @@ _FAR_SIZES = 16.0
 
 @dataclass(frozen=True)
 class FileContent:
-    """A mesh's arrays, checked, with a temperature for every node and a name for every part."""
+    """A mesh's arrays, checked, with a temperature for every node and a name for every patch and region."""
 
     points_m: FloatArray
     """Nodes, shape (n, 3), [m]."""
@@ -63,7 +63,7 @@ def file_content(mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None =
 
     Raises:
         MeshError: An array has another shape than the mesh asks for, is not finite or points at what is not there,
-            or two parts have one name.
+            or two patches or regions have one name.
     """
     points = check_shape("points_m", np.asarray(mesh.points_m, dtype=np.float64), (None, 3), _REMEDY, MeshError)
     check_finite("points_m", points, _REMEDY, MeshError)
@@ -127,11 +127,11 @@ def node_arrays(mesh: TetMesh, content: FileContent) -> dict[str, npt.NDArray]:
     return arrays
 
 
-def write_bytes(path: Path, parts: Iterable[bytes]) -> None:
+def write_bytes(path: Path, chunks: Iterable[bytes]) -> None:
     """Write a file, whole or not at all; its folder is made if need be."""
     writable_folder(path.parent)
     with replace_when_done(path) as temporary, open(temporary, "wb") as file:
-        file.writelines(parts)
+        file.writelines(chunks)
 
 
 def check_suffix(path: Path | str, suffix: str) -> Path:

@@ -60,13 +60,13 @@ def write_msh(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
     with replace_when_done(path) as temporary, open(temporary, "wb") as file:
         file.write(b"$MeshFormat\n4.1 1 8\n" + _ints(1) + b"\n$EndMeshFormat\n")
         file.write(_physical_names(content))
-        for section, parts in (
+        for section, chunks in (
             ("Entities", _entities(content, owner)),
             ("Nodes", _nodes(blocks, content)),
             ("Elements", _elements(content, tag)),
         ):
             file.write(f"${section}\n".encode())
-            file.writelines(parts)
+            file.writelines(chunks)
             file.write(f"\n$End{section}\n".encode())
         file.writelines(_node_data(content.temperature_c[order]))
         if np.any(content.area_factor != 1.0):
@@ -83,13 +83,13 @@ def _sizes(*values: int) -> bytes:
 
 
 def _used(index: IntArray) -> list[int]:
-    """Numbers of the parts that are not empty."""
+    """Numbers of the patches or regions that are not empty."""
     return np.flatnonzero(np.bincount(index)).tolist() if len(index) else []
 
 
 def _physical_names(content: FileContent) -> bytes:
-    lines = [f'2 {part + 1} "{content.patch_names[part]}"' for part in _used(content.patch)]
-    lines += [f'3 {part + 1} "{content.region_names[part]}"' for part in _used(content.region)]
+    lines = [f'2 {group + 1} "{content.patch_names[group]}"' for group in _used(content.patch)]
+    lines += [f'3 {group + 1} "{content.region_names[group]}"' for group in _used(content.region)]
     return "\n".join(["$PhysicalNames", str(len(lines)), *lines, "$EndPhysicalNames", ""]).encode()
 
 
@@ -102,13 +102,13 @@ def _entities(content: FileContent, owner: IntArray) -> Iterator[bytes]:
     """One surface per patch and one volume per region, each in the physical group of its own number."""
     patches, regions = _used(content.patch), _used(content.region)
     yield _sizes(0, 0, len(patches), len(regions))
-    for part in patches:
-        yield _ints(part + 1) + _bounds(content, content.facets[content.patch == part])
-        yield _sizes(1) + _ints(part + 1) + _sizes(0)
-    for part in regions:
-        around = _used(content.patch[content.region[owner] == part])
-        yield _ints(part + 1) + _bounds(content, content.tets[content.region == part])
-        yield _sizes(1) + _ints(part + 1) + _sizes(len(around)) + _ints(*(patch + 1 for patch in around))
+    for group in patches:
+        yield _ints(group + 1) + _bounds(content, content.facets[content.patch == group])
+        yield _sizes(1) + _ints(group + 1) + _sizes(0)
+    for group in regions:
+        around = _used(content.patch[content.region[owner] == group])
+        yield _ints(group + 1) + _bounds(content, content.tets[content.region == group])
+        yield _sizes(1) + _ints(group + 1) + _sizes(len(around)) + _ints(*(patch + 1 for patch in around))
 
 
 def _node_blocks(content: FileContent) -> list[tuple[int, int, IntArray]]:
@@ -120,14 +120,14 @@ def _node_blocks(content: FileContent) -> list[tuple[int, int, IntArray]]:
     regions = _used(content.region)
     # A node in no tetrahedron goes with the first region.
     entity = np.full(len(content.points_m), num_patches + regions[0])
-    for part in reversed(regions):
-        entity[content.tets[content.region == part]] = num_patches + part
-    for part in reversed(_used(content.patch)):
-        entity[content.facets[content.patch == part]] = part
+    for group in reversed(regions):
+        entity[content.tets[content.region == group]] = num_patches + group
+    for group in reversed(_used(content.patch)):
+        entity[content.facets[content.patch == group]] = group
     blocks = []
     for block in _used(entity):
-        dimension, part = (2, block) if block < num_patches else (3, block - num_patches)
-        blocks.append((dimension, part + 1, np.flatnonzero(entity == block)))
+        dimension, group = (2, block) if block < num_patches else (3, block - num_patches)
+        blocks.append((dimension, group + 1, np.flatnonzero(entity == block)))
     return blocks
 
 
@@ -146,13 +146,13 @@ def _elements(content: FileContent, tag: IntArray) -> Iterator[bytes]:
     patches, regions = _used(content.patch), _used(content.region)
     count = len(content.tets) + len(content.facets)
     yield _sizes(len(patches) + len(regions), count, 1, count)
-    for dimension, kind, parts, cells, index, before in (
+    for dimension, kind, groups, cells, index, before in (
         (2, _TRIANGLE, patches, content.facets, content.patch, len(content.tets)),
         (3, _TETRAHEDRON, regions, content.tets, content.region, 0),
     ):
-        for part in parts:
-            rows = np.flatnonzero(index == part)
-            yield _ints(dimension, part + 1, kind) + _sizes(len(rows))
+        for group in groups:
+            rows = np.flatnonzero(index == group)
+            yield _ints(dimension, group + 1, kind) + _sizes(len(rows))
             table = np.empty((len(rows), 1 + cells.shape[1]), dtype=_SIZE)
             table[:, 0] = rows + (before + 1)
             table[:, 1:] = tag[cells[rows]]

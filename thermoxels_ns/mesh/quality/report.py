@@ -88,7 +88,7 @@ class QualityReport:
     genus: int | None
     """Handles of all boundary components together; None if one of them is not a closed manifold."""
     components: tuple[SurfaceComponent, ...]
-    """Boundary components (triangles that hang together by edges), largest first."""
+    """Connected components of the boundary (triangles that share edges), largest first."""
     num_non_manifold_edges: int
     """Boundary edges with more than two boundary triangles."""
     num_non_manifold_vertices: int
@@ -243,7 +243,7 @@ def _observed_range(mesh: TetMesh, given: tuple[float, float] | None) -> tuple[f
 
 
 def _bodies_by_node(tets: IntArray, edges: IntArray) -> int:
-    """Parts that share no node; nodes without a tetrahedron are no part."""
+    """Connected components by nodes; nodes without a tetrahedron are none."""
     used = np.zeros(int(tets.max()) + 1, dtype=bool)
     used[tets.ravel()] = True
     return count_bodies(len(used), edges) - int(np.count_nonzero(~used))

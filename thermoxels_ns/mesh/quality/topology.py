@@ -49,8 +49,8 @@ def group_sides(facets: IntArray) -> Groups:
 
 
 def count_bodies(num: int, pairs: IntArray) -> int:
-    """Number of connected parts of the things 0 to `num` - 1, given which pairs of them hang together (p, 2)."""
-    return int(part_labels(num, pairs[:, 0], pairs[:, 1]).max(initial=-1)) + 1
+    """Number of connected components of the things 0 to `num` - 1, given which pairs of them hang together (p, 2)."""
+    return int(component_of(num, pairs[:, 0], pairs[:, 1]).max(initial=-1)) + 1
 
 
 def tets_across_faces(face_groups: Groups) -> IntArray:
@@ -73,7 +73,7 @@ def surface_topology(points: FloatArray, facets: IntArray, sides: Groups | None 
     num_open = int(np.count_nonzero(sides.sums(np.where(upwards, 1, -1))))
 
     left, right = _neighbours(sides)
-    part = part_labels(len(facets), left // 3, right // 3)
+    component = component_of(len(facets), left // 3, right // 3)
     # Corner 3 f + s of triangle f lies at its node s. Two corners at one node are in one fan if an edge with just two
     # triangles lies between them.
     two_only = (uses == 2)[sides.of_row[left]]
@@ -81,21 +81,21 @@ def surface_topology(points: FloatArray, facets: IntArray, sides: Groups | None 
     rows = np.arange(len(start))
     next_corner = rows - rows % 3 + (rows + 1) % 3
     low, high = np.where(upwards, rows, next_corner), np.where(upwards, next_corner, rows)
-    fan = part_labels(len(start), np.concatenate([low[left], high[left]]), np.concatenate([low[right], high[right]]))
+    fan = component_of(len(start), np.concatenate([low[left], high[left]]), np.concatenate([low[right], high[right]]))
     a_corner = np.zeros(int(fan.max(initial=-1)) + 1, dtype=np.int64)
     a_corner[fan] = rows
     fans_at_node = np.bincount(start[a_corner], minlength=1)
 
-    edge_part = part[sides.first // 3]
-    vertices = group_pairs(part[rows // 3], start)
-    count = int(part.max(initial=-1)) + 1
-    num_triangles = np.bincount(part, minlength=count)
-    num_vertices = np.bincount(part[vertices.first // 3], minlength=count)
-    euler = num_vertices - np.bincount(edge_part, minlength=count) + num_triangles
-    odd_edges = np.bincount(edge_part, weights=uses != 2, minlength=count)
-    closed = (odd_edges == 0) & (np.bincount(part[a_corner // 3], minlength=count) == num_vertices)
-    is_open = np.bincount(edge_part, weights=uses % 2, minlength=count) > 0
-    cavity = ~is_open & (np.bincount(part, weights=_cone_volumes(points, facets), minlength=count) < 0.0)
+    edge_component = component[sides.first // 3]
+    vertices = group_pairs(component[rows // 3], start)
+    count = int(component.max(initial=-1)) + 1
+    num_triangles = np.bincount(component, minlength=count)
+    num_vertices = np.bincount(component[vertices.first // 3], minlength=count)
+    euler = num_vertices - np.bincount(edge_component, minlength=count) + num_triangles
+    odd_edges = np.bincount(edge_component, weights=uses != 2, minlength=count)
+    closed = (odd_edges == 0) & (np.bincount(component[a_corner // 3], minlength=count) == num_vertices)
+    is_open = np.bincount(edge_component, weights=uses % 2, minlength=count) > 0
+    cavity = ~is_open & (np.bincount(component, weights=_cone_volumes(points, facets), minlength=count) < 0.0)
     order = np.argsort(-num_triangles, kind="stable")
     return SurfaceTopology(
         num_open_edges=num_open,
@@ -122,8 +122,8 @@ def _neighbours(groups: Groups) -> tuple[IntArray, IntArray]:
     return groups.order[at - 1], groups.order[at]
 
 
-def part_labels(num: int, first: IntArray, second: IntArray) -> IntArray:
-    """Number of the connected part that each of `num` things is in, shape (num,)."""
+def component_of(num: int, first: IntArray, second: IntArray) -> IntArray:
+    """Number of the connected component that each of `num` things is in, shape (num,)."""
     if num == 0:
         return np.zeros(0, dtype=np.int64)
     links = sparse.coo_array((np.ones(len(first), dtype=bool), (first, second)), shape=(num, num))

@@ -11,8 +11,9 @@ from scipy import ndimage
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 
 LEAST_STRAIGHTNESS = 0.5
-"""Beside the surface a ramp goes on with at least this share of its slope at the surface; a jump has none of it, the
-share of each voxel that is inside a quarter: a level that stops half a voxel from the surface makes it rough."""
+"""Least mean slope of the density beside the surface, as a share of its slope at the surface, that makes it a ramp.
+A jump has 0. A density that is the share of each voxel inside the body has a quarter, too little: a level made of it
+would end half a voxel from the surface, and the mesh would be rough."""
 ROUGHNESS = (0.04, 0.08)
 """Noise, as a shift of the surface, [voxels]: a voxel counts as smooth up to the first, as rough from the second on."""
 ROUGH_SHARE = (0.5, 0.8)

@@ -17,8 +17,8 @@ SHARE_OF_RAYS = 0.95
 """Share of the rays that end on something that are to meet a solid voxel where they end."""
 OPTICAL_DEPTH_BOUNDS = (0.02, math.log(2.0))
 """The automatic threshold times the voxel edge stays within these. Below the first a ray needs 35 voxels to lose half
-of its light: fog, not a surface. From the second on a single voxel stops half of it: a surface, whatever stands behind
-it."""
+of its light: half-transparent space, no surface. From the second on a single voxel stops half of it: a surface,
+whatever stands behind it."""
 OPAQUE_OPTICAL_DEPTH = 2.0
 """Density times voxel edge from which on a voxel is solid even though no ray ends in it: it stops 86 %."""
 SHARE_THAT_ENDS = 0.5
@@ -74,7 +74,7 @@ def automatic_threshold(snapshot: GridSnapshot, density: FloatArray) -> Threshol
     weight = evidence.voxel_weight
     held = float(weight[cells].sum(dtype=np.float64) / max(weight.sum(dtype=np.float64), 1e-300))
     share = float(np.mean(met >= np.float32(threshold)))
-    bound = {low: ", the least that is not fog", high: ", the most that is asked"}.get(threshold, "")
+    bound = {low: ", the least that is not half-transparent", high: ", the most that is asked"}.get(threshold, "")
     count = np.count_nonzero(dense) - np.count_nonzero(cells)
     left_out = (
         f"{count} voxels that dense are left out: hardly any ray ends in them and they are not opaque by themselves. "

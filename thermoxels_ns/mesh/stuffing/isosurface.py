@@ -83,11 +83,11 @@ def stuff(level: npt.NDArray[np.floating], coarsest: int = 4) -> StuffedSolid:
     interior = coarse_interior(lattice, coarsest)
     warped = warp(lattice, None if interior is None else interior.buried(lattice))
     nodes = _number_nodes(lattice, warped, interior)
-    parts = [_fill(bundles, warped.sign, nodes) for bundles in _solid_bundles(lattice, warped.sign, interior)]
-    tets, facets = (list(part) for part in zip(*parts))
+    filled = [_fill_bundles(bundles, warped.sign, nodes) for bundles in _solid_bundles(lattice, warped.sign, interior)]
+    tets, facets = (list(arrays) for arrays in zip(*filled))
     if interior is not None:
         tets.append(nodes.of_point[interior.tets])
-    tets, facets = (np.concatenate(part, dtype=np.int64) for part in (tets, facets))
+    tets, facets = (np.concatenate(arrays, dtype=np.int64) for arrays in (tets, facets))
     on_surface = np.zeros(len(nodes.points), dtype=bool)
     on_surface[facets] = True
     on_box = boundary_tags(facets, nodes.points, tuple(n + 1 for n in level.shape)) == FACET_BOX
@@ -195,7 +195,7 @@ def _solid_bundles(
             yield _Bundles(below[start : start + _CHUNK] + offsets[:, None], SIDES_OUTWARD @ strides, directions)
 
 
-def _fill(
+def _fill_bundles(
     bundles: _Bundles, sign: npt.NDArray[np.int8], nodes: _Nodes
 ) -> tuple[npt.NDArray[np.integer], npt.NDArray[np.integer]]:
     """Tetrahedra and boundary triangles in the bundles."""

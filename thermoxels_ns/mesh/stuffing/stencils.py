@@ -74,9 +74,9 @@ def stencil_table() -> StencilTable:
         signs = reversed_signs[::-1]
         for side in range(4):
             points = (0, 1, 2 + side, 2 + (side + 1) % 4)
-            pieces = _fill(points, tuple(signs[v] for v in points))
-            tets += pieces
-            for facet, where in _surface_faces(pieces, side, signs):
+            found = _fill_tet(points, tuple(signs[v] for v in points))
+            tets += found
+            for facet, where in _surface_faces(found, side, signs):
                 facets.append(facet)
                 behind.append(where)
         tet_start.append(len(tets))
@@ -91,7 +91,7 @@ def stencil_table() -> StencilTable:
 
 
 @cache
-def _fill(points: _Tet, signs: tuple[int, ...]) -> list[_Tet]:
+def _fill_tet(points: _Tet, signs: tuple[int, ...]) -> list[_Tet]:
     """Fill the solid part of one lattice tetrahedron (the stencils of Labelle and Shewchuk 2007)."""
     plus = [v for v, sign in zip(points, signs) if sign > 0]
     zero = [v for v, sign in zip(points, signs) if sign == 0]
@@ -149,10 +149,10 @@ def _diagonal_first(a: int, b: int, outside: int) -> tuple[int, int]:
     return (low, high) if odd else (high, low)
 
 
-def _surface_faces(pieces: list[_Tet], side: int, signs: tuple[int, ...]) -> list[tuple[tuple[int, int, int], int]]:
+def _surface_faces(filled: list[_Tet], side: int, signs: tuple[int, ...]) -> list[tuple[tuple[int, int, int], int]]:
     """Faces of the filled part of one lattice tetrahedron that lie on the surface, and what decides about them."""
     found = []
-    for tet in pieces:
+    for tet in filled:
         for opposite, face in enumerate(OUTWARD_FACES.tolist()):
             facet = (tet[face[0]], tet[face[1]], tet[face[2]])
             if any(v < 6 and signs[v] > 0 for v in facet):
