@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import json
 import math
 import os
 import re
@@ -23,6 +22,7 @@ from thermoxels_ns import __version__
 from thermoxels_ns.commands.installed_commands import ProcessCost, Watch, run_command
 from thermoxels_ns.core.checks import check_positive, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
+from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.reports.cost_report import (
     FIGURES,
     CostRun,
@@ -422,10 +422,10 @@ def training_seconds(run_folder: Path) -> float:
 
 def read_evaluation(path: Path) -> dict[str, float]:
     """The figures that ns-eval wrote; NaN for those that the scene or the method does not have."""
+    expected, remedy = "the results of ns-eval", "Start the command again; finished runs are kept."
+    content = read_json(path, expected, remedy)
     try:
-        results = json.loads(path.read_text(encoding="utf-8"))["results"]
-        return {name: float(results.get(name, math.nan)) for name in _EVALUATED}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as problem:
-        remedy = "Start the command again; finished runs are kept."
+        return {name: float(content["results"].get(name, math.nan)) for name in _EVALUATED}
+    except (ValueError, KeyError, TypeError, AttributeError) as problem:
         got = f"{type(problem).__name__}: {problem}"
-        raise ThermoxelsError(str(path), expected="the results of ns-eval", got=got, remedy=remedy) from problem
+        raise ThermoxelsError(str(path), expected=expected, got=got, remedy=remedy) from problem

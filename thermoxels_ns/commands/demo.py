@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 # Only light imports at the top, so that ``thermoxels --help`` answers at once.
-import json
 import shutil
 import time
 import webbrowser
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Literal
 
 from thermoxels_ns.core.checks import writable_folder
 from thermoxels_ns.core.errors import OutputError, ThermoxelsError
+from thermoxels_ns.core.json_values import read_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -320,7 +320,7 @@ def _colour_bar(scene: Path) -> ColourBar:
 
     from thermoxels_ns.reports.demo_page import ColourBar
 
-    bounds = json.loads((scene / "temperature_bounds.json").read_text())
+    bounds = read_json(scene / "temperature_bounds.json")
     stops = (n / (_COLOUR_STOPS - 1) for n in range(_COLOUR_STOPS))
     return ColourBar(
         tuple(to_hex(colormaps[_COLOUR_MAP](stop)) for stop in stops),

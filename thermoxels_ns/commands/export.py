@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 # Only light imports at the top: nerfstudio's exporter reads this module for ``--help`` of every subcommand.
-import json
 import pickle
 import traceback
 from collections.abc import Callable
@@ -17,7 +16,8 @@ from threadpoolctl import threadpool_limits
 
 from thermoxels_ns.commands.export_options import ExportOptions, Viewpoint, check_options, scale_of, up_of
 from thermoxels_ns.commands.export_snapshot import export_snapshot, prepare_folder
-from thermoxels_ns.core.errors import CheckpointError, ThermoxelsError
+from thermoxels_ns.core.errors import CheckpointError, SceneError, ThermoxelsError
+from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.core.lattice import input_from_world
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ def scene_json(scene_folder: Path) -> dict[str, Any]:
     names = [scene_folder] if scene_folder.is_file() else [folder / name for name in JSON_NAMES]
     for path in names:
         if path.is_file():
-            content = json.loads(path.read_text(encoding="utf-8-sig"))
+            content = read_json(path, error=SceneError)
             return content if isinstance(content, dict) else {}
     return {}
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import shlex
 import time as clock
 from dataclasses import asdict, fields, replace
@@ -21,6 +20,7 @@ from thermoxels_ns.core.checks import (
     writable_folder,
 )
 from thermoxels_ns.core.errors import HeatError, MeshError
+from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.fem.solution import Solution, SteadySolution
 from thermoxels_ns.heat.run import HeatRun, run_scene
 from thermoxels_ns.heat.scene_file import load_heat_scene
@@ -76,13 +76,10 @@ def _export_summary(mesh: Path, say: Say) -> dict[str, Any]:
     if not path.is_file():
         say(f"Warning: {path} is missing; the mesh is taken to be in metres.")
         return {}
-    try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(summary, dict):
-            raise ValueError(repr(summary)[:40])
-    except (OSError, ValueError) as problem:
-        remedy = "Export the mesh again, or move the file away."
-        raise MeshError(str(path), expected="the summary of an export", got=problem, remedy=remedy) from problem
+    expected, remedy = "the summary of an export", "Export the mesh again, or move the file away."
+    summary = read_json(path, expected, remedy, MeshError)
+    if not isinstance(summary, dict):
+        raise MeshError(str(path), expected=expected, got=repr(summary)[:40], remedy=remedy)
     if summary.get("length_unit", "m") != "m":
         remedy = "Export again with --metres-per-unit or --known-distance."
         got = f"one in {summary['length_unit']}s"

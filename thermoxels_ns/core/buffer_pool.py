@@ -43,21 +43,10 @@ class BufferPool:
             block = waiting.pop()[0] if waiting else np.empty(length, np.uint8)
         return np.asarray(_Loan(self, block))[:size].view(wanted).reshape(shape)
 
-    def zeros(self, shape: int | tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-        """An array of zeros."""
-        array = self.empty(shape, dtype)
-        array.fill(0)
-        return array
-
     def release(self) -> None:
         """Give back to the system what is not lent."""
         with self._lock:
             self._free.clear()
-
-    def held_bytes(self) -> int:
-        """Memory that waits to be lent again, [bytes]."""
-        with self._lock:
-            return sum(length * len(blocks) for length, blocks in self._free.items())
 
     def _take_back(self, block: npt.NDArray[np.uint8]) -> None:
         with self._lock:

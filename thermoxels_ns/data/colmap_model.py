@@ -6,6 +6,9 @@ import struct
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.errors import SceneError
 
 COLMAP_FOLDERS = ("colmap/sparse/0", "colmap/sparse", "colmap", "sparse/0", "sparse")
@@ -35,6 +38,13 @@ def read_model(folder: Path) -> Any:
         return pycolmap.Reconstruction(str(folder))
     except Exception as problem:  # pycolmap raises RuntimeError, ValueError, IndexError by version
         raise SceneError(f"it cannot be read, {(str(problem).strip() or repr(problem)).splitlines()[-1]}") from problem
+
+
+def camera_to_world(image: Any) -> FloatArray:
+    """Pose of a pycolmap image, camera axes x right, y up, z back as transforms.json has them, shape (4, 4)."""
+    pose = np.eye(4)
+    pose[:3] = image.cam_from_world().inverse().matrix()
+    return pose @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def check_complete(folder: Path) -> None:

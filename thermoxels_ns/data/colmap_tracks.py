@@ -12,7 +12,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.feature_rays import FeatureRays, FloatArray, IntArray
-from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, read_model
+from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, camera_to_world, read_model
 from thermoxels_ns.data.scene_file import Frame, SceneFile
 from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, SparseTracks, feature_rays, read_tracks
 from thermoxels_ns.data.transforms_json import path_inside
@@ -23,7 +23,6 @@ photograph is left out."""
 LEAST_AGREEING = 0.7
 """Share of the photographs in common whose poses must agree; with fewer the model belongs to other poses."""
 _PARTS = ("cameras", "images", "points3D")
-_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 _ROUNDS = 20
 _FEWEST = 3
 """Cameras from which a similarity is found; fewer cannot outvote a wrong one."""
@@ -112,7 +111,7 @@ def _tracks(scene: SceneFile, folder: str) -> SparseTracks:
         )
     frames = [scene.frames[frame] for _, frame in pairs]
     place = {numbers[image]: number for number, (image, _) in enumerate(pairs)}
-    source = np.stack([_pose(images[number]) for number in place])
+    source = np.stack([camera_to_world(images[number]) for number in place])
     target = np.stack([frame.pose for frame in frames])
     found = align_poses(source, target)
     if found is None:
@@ -142,13 +141,6 @@ def _tracks(scene: SceneFile, folder: str) -> SparseTracks:
         CONSOLE.print(f"Tracks: other poses than COLMAP's, left out: {', '.join(strays)}", style="bold yellow")
     kept = agree[frame]
     return SparseTracks(moved, error_px, tuple(one.name for one in frames), frame[kept], point[kept])
-
-
-def _pose(image: Any) -> FloatArray:
-    """Camera to world, OpenGL axes, shape (4, 4)."""
-    pose = np.eye(4)
-    pose[:3] = image.cam_from_world().inverse().matrix()
-    return pose @ _OPENGL_FROM_OPENCV
 
 
 def _matched(images: Sequence[str], frames: Sequence[str]) -> list[tuple[int, int]]:

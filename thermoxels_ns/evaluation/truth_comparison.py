@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import MeshError, SceneError
+from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.evaluation.voxel_accuracy import MIN_VIEWS, TrueShape, surface_fscore
@@ -158,7 +158,7 @@ def load_known_truth(scene_folder: Path | str) -> KnownTruth | None:
     scene = load_truth(folder)
     if scene is None:
         return None
-    content = json.loads(path.read_text(encoding="utf-8-sig"))
+    content = read_json(path, error=SceneError)
     try:
         poses = [
             frame["transform_matrix"]

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
 from thermoxels_ns.capture.sfm.model import SfmModel
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.data.colmap_model import camera_to_world
 
 _FIELDS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -59,9 +59,7 @@ def model_of_colmap(
     number = {i: n for n, i in enumerate(ids)}
     poses, frames, seen, pixels = [], [], [], []
     for index, image in enumerate(posed.values()):
-        pose = np.eye(4)
-        pose[:3] = image.cam_from_world().inverse().matrix()
-        poses.append(pose @ OPENGL_FROM_OPENCV)
+        poses.append(camera_to_world(image))
         # A track may hold two features of one photograph; the first one is kept.
         own = {number[f.point3D_id]: f.xy for f in reversed(image.points2D) if f.has_point3D()}
         order = sorted(own)
