@@ -14,7 +14,7 @@ from tests.support.posed_model import ring_model
 from tests.support.textured_room import VISIBLE
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, ReducedPhotographs, fill_database
-from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.capture.stage_cache import StageCache, locked, prepare_output
 from thermoxels_ns.capture.stage_results import load, save
 from thermoxels_ns.commands.capture import capture_folder

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.synthetic.camera_rings import look_at
 

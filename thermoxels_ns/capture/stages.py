@@ -33,8 +33,8 @@ from thermoxels_ns.capture.sfm.metric_scale import (
     scale_from_gps,
     scale_from_markers,
 )
-from thermoxels_ns.capture.sfm.model import SfmModel
 from thermoxels_ns.capture.sfm.poses import add_points, find_poses
+from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.capture.stage_cache import (
     CACHE_FOLDER,
     StageCache,

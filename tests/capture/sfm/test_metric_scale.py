@@ -18,7 +18,7 @@ from thermoxels_ns.capture.sfm.metric_scale import (
     scale_from_gps,
     scale_from_markers,
 )
-from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.errors import ThermoxelsError
 
 UNIT_M = 0.37

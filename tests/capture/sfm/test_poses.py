@@ -11,8 +11,8 @@ from PIL import Image
 from tests.support.textured_room import VISIBLE, alignment, write_card
 from thermoxels_ns.capture.masks import PhotographMasks
 from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, image_pairs
-from thermoxels_ns.capture.sfm.model import SfmModel
 from thermoxels_ns.capture.sfm.poses import add_points, find_poses
+from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.errors import SceneError
 
 OPTIONS = PoseOptions(max_features=500)

@@ -12,7 +12,7 @@ import numpy as np
 
 from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.rig_types import RigEstimate, RigFrame, RigStart
-from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.colmap_model import camera_to_world

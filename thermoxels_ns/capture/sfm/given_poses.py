@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from thermoxels_ns.capture.sfm.colmap_conversion import model_of_colmap, read_colmap
-from thermoxels_ns.capture.sfm.model import SfmModel
 from thermoxels_ns.capture.sfm.poses import Poses, common_size
+from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.data.transforms_json import path_inside, read_intrinsics, read_pose

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.capture.photograph import GpsFix, open_photograph
 from thermoxels_ns.capture.rig_types import FloatArray
-from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import SceneError
 

@@ -17,7 +17,7 @@ from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
 from thermoxels_ns.capture.sfm.colmap_conversion import model_of_colmap
 from thermoxels_ns.capture.sfm.colmap_process import quiet_colmap, run_in_process
 from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, ReducedPhotographs, fill_database, lens_parameters
-from thermoxels_ns.capture.sfm.model import SfmModel
+from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 
