@@ -35,8 +35,9 @@ from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.scene_file import load_heat_scene
 from thermoxels_ns.heat.screening import screen
 from thermoxels_ns.mesh.boundary.patches import default_patches
+from thermoxels_ns.mesh.quality.face_count import boundary_facets
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
-from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
+from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 TOLERANCE = 1e-12
 Z_UP = (0.0, 0.0, 1.0)

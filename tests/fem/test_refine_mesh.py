@@ -9,8 +9,8 @@ from tests.support.heat_meshes import box_mesh
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.fem.p1_kernels import TET_EDGES, stiffness_matrix
 from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
+from thermoxels_ns.mesh.quality.face_count import boundary_facets
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-from thermoxels_ns.mesh.voxel_tets import boundary_facets
 
 
 def volumes(mesh: TetMesh) -> np.ndarray:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas
+from thermoxels_ns.mesh.quality.face_count import boundary_facets
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
-from thermoxels_ns.mesh.voxel_tets import boundary_facets, boundary_tags, kuhn_tets, lattice_edges, voxel_facets
+from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, lattice_edges, voxel_facets
 
 
 def exposed_faces(cells: np.ndarray) -> int:

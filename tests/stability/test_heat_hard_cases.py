@@ -9,8 +9,9 @@ from tests.support.heat_matrices import assemble
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.materials import Material
+from thermoxels_ns.mesh.quality.face_count import boundary_facets
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
+from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
 

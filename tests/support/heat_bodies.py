@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from thermoxels_ns.heat.materials import Material
+from thermoxels_ns.mesh.quality.face_count import boundary_facets
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
+from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 
 def make_body(cells: np.ndarray, voxel_m: float, temperature_c: Callable[[np.ndarray], np.ndarray]) -> TetMesh:

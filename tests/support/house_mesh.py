@@ -7,9 +7,10 @@ from itertools import permutations
 import numpy as np
 
 from thermoxels_ns.mesh.quality.checks import facet_normals
+from thermoxels_ns.mesh.quality.face_count import boundary_facets
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
-from thermoxels_ns.mesh.voxel_tets import boundary_facets, boundary_tags, kuhn_tets
+from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets
 
 
 def house_mesh() -> TetMesh:

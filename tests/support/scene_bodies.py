@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from thermoxels_ns.mesh.boundary.patches import default_patches
+from thermoxels_ns.mesh.quality.face_count import boundary_facets
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
-from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
+from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 Z_UP = (0.0, 0.0, 1.0)
 

@@ -13,10 +13,11 @@ from tests.support.house_mesh import house_mesh
 from thermoxels_ns.core.lattice import CORNER_OFFSETS, Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh
+from thermoxels_ns.mesh.quality.face_count import boundary_facets
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-from thermoxels_ns.mesh.voxel_tets import boundary_facets, boundary_tags, kuhn_tets
+from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets
 
 
 @pytest.fixture

@@ -10,7 +10,6 @@ import numpy.typing as npt
 from thermoxels_ns.core.arrays import BoolArray, IntArray
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
-from thermoxels_ns.mesh.quality.face_count import faces_of_rows, group_faces
 from thermoxels_ns.mesh.solid.morphology import bounding_box
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
 
@@ -80,7 +79,7 @@ def voxel_facets(cells: BoolArray) -> IntArray:
     """Boundary triangles of `kuhn_tets` (f, 3), normals outwards, taken from the voxel faces between solid and empty.
 
     Kuhn's tetrahedra cut every voxel face along the diagonal from its lowest to its highest corner. The triangles of a
-    face follow each other; `boundary_facets` finds the same ones among all tetrahedra, in another order.
+    face follow each other; `face_count.boundary_facets` finds the same ones among all tetrahedra, in another order.
 
     >>> voxel_facets(np.ones((1, 1, 1), dtype=bool)).shape
     (12, 3)
@@ -99,16 +98,6 @@ def voxel_facets(cells: BoolArray) -> IntArray:
             pair = [(a, c, b), (a, d, c)] if turned else [(a, b, c), (a, c, d)]
             facets.append(np.stack([np.stack(triangle, axis=-1) for triangle in pair], axis=1).reshape(-1, 3))
     return np.concatenate(facets)
-
-
-def boundary_facets(tets: IntArray) -> IntArray:
-    """Triangles that belong to exactly one tetrahedron, outwards, shape (f, 3), ordered by their sorted node numbers.
-
-    >>> boundary_facets(np.array([[0, 1, 2, 3], [1, 3, 2, 4]])).shape
-    (6, 3)
-    """
-    groups = group_faces(tets)
-    return faces_of_rows(tets, groups.first[groups.sizes == 1])
 
 
 def boundary_tags(facets: IntArray, points_index: npt.NDArray, lattice_shape: tuple[int, ...]) -> IntArray:

@@ -10,10 +10,11 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
+from thermoxels_ns.mesh.quality.face_count import boundary_facets
 from thermoxels_ns.mesh.quality.picture import picture_of_quality
 from thermoxels_ns.mesh.quality.report import QualityReport, quality_report
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
+from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 
 @dataclass(frozen=True)

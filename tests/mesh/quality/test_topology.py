@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from thermoxels_ns.mesh.quality.face_count import group_faces
+from thermoxels_ns.mesh.quality.face_count import boundary_facets, group_faces
 from thermoxels_ns.mesh.quality.topology import SurfaceComponent, count_bodies, surface_topology, tets_across_faces
-from thermoxels_ns.mesh.voxel_tets import boundary_facets, kuhn_tets
+from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 
 def topology_of(cells: np.ndarray):

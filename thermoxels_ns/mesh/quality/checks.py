@@ -9,7 +9,7 @@ import numpy as np
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.quality.face_count import Groups, faces_of_rows, group_faces, group_pairs
+from thermoxels_ns.mesh.quality.face_count import Groups, boundary_facets, group_faces, group_pairs
 from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
 from thermoxels_ns.mesh.quality.topology import group_sides
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
@@ -161,7 +161,7 @@ def count_wrong_facets(mesh: TetMesh, faces: Groups) -> int:
 
     A triangle turned over counts twice. `faces` is `face_count.group_faces(mesh.tets)`.
     """
-    wanted = faces_of_rows(mesh.tets, faces.order[faces.start[faces.sizes == 1]])
+    wanted = boundary_facets(mesh.tets, faces)
     both = np.concatenate([_smallest_first(wanted), _smallest_first(mesh.facets)])
     same = group_pairs(both[:, 0], both[:, 1] * len(mesh.points_m) + both[:, 2])
     return int(np.abs(same.sums(np.repeat([1, -1], [len(wanted), len(mesh.facets)]))).sum())

@@ -93,6 +93,18 @@ def faces_of_rows(tets: IntArray, rows: IntArray) -> IntArray:
     return tets.ravel().take((rows & ~3)[:, None] + OUTWARD_FACES[rows & 3])
 
 
+def boundary_facets(tets: IntArray, faces: Groups | None = None) -> IntArray:
+    """Triangles that belong to exactly one tetrahedron, outwards, shape (f, 3), ordered by their sorted node numbers.
+
+    `faces` is `group_faces(tets)` where that is already known.
+
+    >>> boundary_facets(np.array([[0, 1, 2, 3], [1, 3, 2, 4]])).shape
+    (6, 3)
+    """
+    faces = group_faces(tets) if faces is None else faces
+    return faces_of_rows(tets, faces.first[faces.sizes == 1])
+
+
 def group_edges(tets: IntArray) -> Groups:
     """Find the edges that tetrahedra share; row 6 t + e is edge `TET_EDGES[e]` of tetrahedron t."""
     ends = [tets[:, TET_EDGES[:, side]] for side in range(2)]
