@@ -45,17 +45,13 @@ NAMES = ("density", "sh", "temperature")
 def samples_without_gaps(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RecordedSamples:
     """March rays and record their samples without gaps and without colour, for statistics; no gradients.
 
-    Returns:
-        The samples; ``records.offset`` has a last entry, the number of all records.
-
     Raises:
         ThermoxelsError: A density on the way is NaN.
     """
     recorded, spans = _recorded_samples(grid, None, request, options)
     records = recorded.records
     listed = [np.concatenate([field[:0], *(field[a:b] for a, b in spans)]) for field in records[2:]]
-    offset = np.concatenate((np.zeros(1, np.int64), np.cumsum(records.used)))
-    return replace(recorded, records=Records(offset, records.used, *listed))
+    return replace(recorded, records=Records(np.cumsum(records.used) - records.used, records.used, *listed))
 
 
 def _recorded_samples(

@@ -195,15 +195,11 @@ def sample_rays(grid: VoxelGrid, request: RayRequest, options: RenderOptions, ba
         request = RayRequest(request.origins, request.directions, request.near, request.far, nothing, nothing)
         recorded = samples_without_gaps(grid, request, options)
         records = recorded.records
-        offset, used = torch.from_numpy(records.offset), torch.from_numpy(records.used)
-        ray = torch.repeat_interleave(torch.arange(len(used)), offset.diff())
-        reached = torch.arange(len(ray)) - offset[ray] < used[ray]
-        number, fraction = torch.from_numpy(records.number)[reached].long(), torch.from_numpy(records.fraction)[reached]
+        ray = torch.repeat_interleave(torch.from_numpy(records.used))
+        number, fraction = torch.from_numpy(records.number).long(), torch.from_numpy(records.fraction)
+        weight, left = torch.from_numpy(records.weight), torch.from_numpy(records.transmittance)
         at = TrilinearPoints.placed(grid.voxels, number, fraction)
-        ray = ray[reached]
-        weight = torch.from_numpy(records.weight)[reached]
-        before = 1.0 - torch.from_numpy(records.transmittance)[reached] - weight
-        return GridSamples(ray, at, weight, before, torch.from_numpy(recorded.sums.transmittance))
+        return GridSamples(ray, at, weight, 1.0 - left - weight, torch.from_numpy(recorded.sums.transmittance))
     marched = reference_march(grid, request, options)
     weights = marched.along.weights
     before = torch.cumsum(weights, -1) - weights
