@@ -113,7 +113,7 @@ def _with_mesh_export(commands: Any) -> Any:
 
 
 def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
-    """How well a trained surface agrees with the exact scene, see `evaluation.geometry_metrics`; empty if unknown.
+    """How well a trained surface agrees with the exact scene, see `geometry_metrics`; empty if unknown.
 
     It stands here because `training` knows no evaluation.
     """
@@ -121,7 +121,7 @@ def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
     from rich.markup import escape
 
     from thermoxels_ns.core.lattice import input_from_world
-    from thermoxels_ns.evaluation.geometry_metrics import geometry_metrics, has_truth
+    from thermoxels_ns.evaluation.truth_comparison import geometry_metrics, has_truth
 
     def say(line: str) -> None:
         CONSOLE.print(escape(line))

@@ -12,8 +12,7 @@ from tests.support.boxed_scene import write_boxed_scene
 from tests.support.short_training import train
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
-from thermoxels_ns.evaluation.geometry_metrics import geometry_metrics
-from thermoxels_ns.evaluation.truth_comparison import KnownTruth, compare_with_truth
+from thermoxels_ns.evaluation.truth_comparison import KnownTruth, compare_with_truth, geometry_metrics
 from thermoxels_ns.synthetic.scene_folder import make_scene
 
 IDENTITY = np.eye(4)

@@ -17,8 +17,6 @@ from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 from thermoxels_ns.core.json_values import read_json
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
     from rich.console import Console
 
     from thermoxels_ns.commands.demo_results import DemoResults
@@ -343,15 +341,4 @@ def _training_pairs(scene: Path) -> Iterator[tuple[bytes, bytes]]:
         with Image.open(scene / "thermal" / f"{path.stem}.png") as counts:  # 16 bits that span the bounds
             normalised = np.asarray(counts, dtype=np.float64) / 65535.0
         colours = np.round(255.0 * colormaps[_COLOUR_MAP](normalised)[..., :3]).astype(np.uint8)
-        yield _jpeg(rgb), _jpeg(colours)
-
-
-def _jpeg(pixels: npt.NDArray[np.uint8]) -> bytes:
-    """Encode an image for a small picture on the page."""
-    from io import BytesIO
-
-    from PIL import Image
-
-    stream = BytesIO()
-    Image.fromarray(pixels).save(stream, format="JPEG", quality=88)
-    return stream.getvalue()
+        yield jpeg_of(rgb, 88), jpeg_of(colours, 88)

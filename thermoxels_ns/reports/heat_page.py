@@ -17,8 +17,7 @@ from thermoxels_ns.heat.materials import materials_by_region
 from thermoxels_ns.heat.results import Spot
 from thermoxels_ns.heat.run import HeatRun
 from thermoxels_ns.heat.solving import Accuracy
-from thermoxels_ns.reports.heat_numbers import RoundOff, coordinate, degrees, round_off_of, unit_signs
-from thermoxels_ns.reports.heat_numbers import figure as _figure
+from thermoxels_ns.reports.heat_numbers import RoundOff, coordinate, degrees, figure, round_off_of, unit_signs
 from thermoxels_ns.reports.heat_pictures import in_words, plot_over_time
 from thermoxels_ns.reports.page import Gallery, Page, Picture, Section, Table
 
@@ -121,7 +120,7 @@ def _results(run: HeatRun) -> Section:
         ),
         tuple(
             (
-                *(patch.patch, _figure(patch.area_m2)),
+                *(patch.patch, figure(patch.area_m2)),
                 *(round_off.flow(patch.heat_w), round_off.per_area(patch.heat_w_m2, patch.heat_w)),
                 *(() if steady else (round_off.flow(patch.last_heat_w),)),
                 *(degrees(patch.mean_c), _warm_and_where(patch.coldest), _warm_and_where(patch.hottest)),
@@ -138,7 +137,7 @@ def _results(run: HeatRun) -> Section:
         ),
         tuple(
             (
-                *(region.region, region.material, _figure(region.volume_m3), _figure(region.area_m2)),
+                *(region.region, region.material, figure(region.volume_m3), figure(region.area_m2)),
                 *(round_off.flow(region.heat_w), round_off.per_area(region.heat_w_m2, region.heat_w)),
                 *(degrees(region.mean_c), degrees(region.min_c), degrees(region.max_c)),
             )
@@ -156,17 +155,17 @@ def _wall(run: HeatRun) -> list[Section]:
     wall = run.wall
     words = (
         f"Between {wall.inside_c:g} °C inside and {wall.outside_c:g} °C outside, "
-        f"{_figure(wall.heat_w)} W flow into the inner surface of {_figure(wall.area_m2)} m²: a "
-        f"thermal coupling of {_figure(wall.coupling_w_k)} W/K. The inner surface is worst at "
+        f"{figure(wall.heat_w)} W flow into the inner surface of {figure(wall.area_m2)} m²: a "
+        f"thermal coupling of {figure(wall.coupling_w_k)} W/K. The inner surface is worst at "
         f"{degrees(wall.coldest.temperature_c)} °C {_place(wall.coldest)}, which is a temperature factor "
         f"of {wall.temperature_factor:.3f} (1: as warm as the air inside). For the risk of mould ISO 13788 asks for "
         "it with a resistance of the inner surface of 0.25 m² K/W, coefficient_w_m2k: 4.",
     )
     columns = ("Inner surface", "area m²", "W", "U-value W/(m² K)")
-    rows = [(p.name, _figure(p.area_m2), _figure(p.heat_w), f"{p.u_value_w_m2k:.4f}") for p in wall.patches]
+    rows = [(p.name, figure(p.area_m2), figure(p.heat_w), f"{p.u_value_w_m2k:.4f}") for p in wall.patches]
     if len(wall.regions) > 1:
         rows += [
-            (f"region {p.name}", _figure(p.area_m2), _figure(p.heat_w), f"{p.u_value_w_m2k:.4f}") for p in wall.regions
+            (f"region {p.name}", figure(p.area_m2), figure(p.heat_w), f"{p.u_value_w_m2k:.4f}") for p in wall.regions
         ]
     note = "Heat flow per area of the inner surface and difference of the airs."
     return [Section("As a wall", words=words, tables=(Table(columns, tuple(rows), note=note),))]
@@ -193,10 +192,10 @@ def _balance(run: HeatRun) -> Section:
     round_off = _round_off(run).below_w * (1.0 if balance.unit == "W" else _duration_s(run))
     left = 0.0 if abs(balance.residual) < round_off else balance.residual
     rows = (
-        ("into the body", f"{_figure(balance.into_body / scale)} {unit}"),
-        ("out of the body", f"{_figure(balance.out_of_body / scale)} {unit}"),
-        ("stored in it", f"{_figure(balance.stored / scale)} {unit}"),
-        ("stored - in + out: accounted for by nothing", f"{_figure(left / scale)} {unit}"),
+        ("into the body", f"{figure(balance.into_body / scale)} {unit}"),
+        ("out of the body", f"{figure(balance.out_of_body / scale)} {unit}"),
+        ("stored in it", f"{figure(balance.stored / scale)} {unit}"),
+        ("stored - in + out: accounted for by nothing", f"{figure(left / scale)} {unit}"),
         ("the same as a share", f"{balance.relative_residual:.1e}"),
     )
     return Section("Energy balance", tables=(Table(("", ""), rows),))
@@ -220,7 +219,7 @@ def _asked(run: HeatRun, mesh_name: str) -> Section:
     rows = []
     for name, what in materials_by_region(run.problem).items():
         figures = (what.conductivity_w_mk, what.density_kg_m3, what.specific_heat_j_kgk)
-        rows.append((name, what.name, *(f"{figure:g}" for figure in figures)))
+        rows.append((name, what.name, *(f"{value:g}" for value in figures)))
     columns = ("Region", "material", "W/(m K)", "kg/m³", "J/(kg K)")
     materials = Table(columns, tuple(rows), figures_from=2)
     selection = Selection(mesh, run.problem.up)
@@ -347,7 +346,7 @@ def _up_to(bound_k: float | None) -> str:
 
 
 def _optional(value: float | None) -> str:
-    return "" if value is None else _figure(value)
+    return "" if value is None else figure(value)
 
 
 def _accuracy(accuracy: Accuracy | None) -> list[Section]:
