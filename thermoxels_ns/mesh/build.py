@@ -199,7 +199,7 @@ def _with_a_measurement(shape: _Shape, observed: BoolArray) -> tuple[BoolArray, 
     seen = np.bincount(component[observed], minlength=int(component.max()) + 1) > 0
     if not seen.any():
         seen[:] = True
-    return seen[part], int(np.count_nonzero(~seen))
+    return seen[component], int(np.count_nonzero(~seen))
 
 
 def _kept(shape: _Shape, stays: BoolArray) -> _Shape:
@@ -225,7 +225,7 @@ def _without_voxels_of(solid: SolidCells, points: FloatArray) -> tuple[SolidCell
     goes = np.zeros(int(component.max()) + 1, dtype=bool)
     goes[component[tuple(centres.T)]] = True
     goes[0] = False
-    return _without(solid, goes[part])
+    return _without(solid, goes[component])
 
 
 def _without(solid: SolidCells, goes: BoolArray) -> tuple[SolidCells, int]:
@@ -248,7 +248,7 @@ def _without_unobserved(solid: SolidCells, observed_corners: BoolArray) -> tuple
     if seen[1:].all() or not seen.any():
         return solid, 0, 0
     goes = np.zeros_like(solid.cells)
-    goes[box] = cells & ~seen[part]
+    goes[box] = cells & ~seen[component]
     kept, num_voxels = _without(solid, goes)
     return kept, int(np.count_nonzero(~seen[1:])), num_voxels
 

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
-from thermoxels_ns.mesh.quality.topology import part_labels
+from thermoxels_ns.mesh.quality.topology import component_of
 from thermoxels_ns.mesh.stuffing.edge_planes import Planes, Surface, edge_planes, is_near
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid
 
@@ -113,7 +113,7 @@ def _same_corners(to: FloatArray, is_corner: BoolArray) -> IntArray:
     corners = np.flatnonzero(is_corner)
     if len(corners):
         pairs = KDTree(to[corners]).query_pairs(_ONE_CORNER, output_type="ndarray")
-        number[corners] = part_labels(len(corners), *pairs.T)
+        number[corners] = component_of(len(corners), *pairs.T)
     return number
 
 
