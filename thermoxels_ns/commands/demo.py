@@ -333,6 +333,8 @@ def _training_pairs(scene: Path) -> Iterator[tuple[bytes, bytes]]:
     from matplotlib import colormaps
     from PIL import Image
 
+    from thermoxels_ns.reports.capture_pictures import jpeg_of
+
     photographs = sorted((scene / "images").glob("frame_train_*"))
     for number in range(_INPUTS_SHOWN):
         path = photographs[number * len(photographs) // _INPUTS_SHOWN]
