@@ -56,7 +56,7 @@ def test_a_seed_in_the_name_makes_the_scene() -> None:
     ["random", "random-", "random-017", "random--1", "random-1.5", "random-x", "Random-1", "random-1 ", "random-²"],
 )
 def test_other_names_are_refused_with_the_names_there_are(name: str) -> None:
-    with pytest.raises(SceneError, match=r"random-N .* house-corner.*got '[Rr]andom") as problem:
+    with pytest.raises(SceneError, match=r"random-N or wild-N .* house-corner.*got '[Rr]andom") as problem:
         make_scene(name)
     assert repr(name) in str(problem.value)
 
@@ -151,6 +151,38 @@ def test_every_camera_stands_outside_and_has_the_scene_in_half_of_its_picture(se
         assert inside.all()
         shares.append(np.prod(np.ptp(pixel, axis=0)) / (320 * 240))
     assert np.mean(shares) > 0.4 and min(shares) > 0.2
+
+
+@pytest.mark.parametrize("seed", range(20, 35))
+def test_wild_scenes_stand_free_before_each_kind_of_surroundings_and_fill_the_picture(seed: int) -> None:
+    scene = make_scene(f"wild-{seed}")
+    camera, points = scene.camera(320, 240), scene.surface_points(1000)[0]
+    poses = np.concatenate(scene.poses(42, 6))
+    assert scene.signed_distance(poses[:, :3, 3]).min() > 0.3 * size(scene)
+    assert all(camera.contains(camera.project_world(pose, points)).all() for pose in poses)
+    inside = np.random.default_rng(1).uniform(*scene.scene_box, (2000, 3))
+    if scene.around is not None:
+        assert min(scene.around.solid.signed_distance(at).min() for at in (poses[:, :3, 3], inside)) > 0.0
+    sky = scene.background_rgb([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    kind = "around" if scene.around else "plain" if (sky[0] == sky[1]).all() else "smooth"
+    assert kind == ("smooth", "plain", "around")[seed % 3]
+    points, normals = scene.surface_points(2000)
+    assert scene.colour(points, normals).std(axis=0).max() > 0.05
+
+
+def test_wild_scenes_have_plain_walls_mirrors_and_railings_and_random_ones_have_not() -> None:
+    plain, mirrors, thinnest = [], [], []
+    for seed in range(20, 40):
+        scene = make_scene(f"wild-{seed}")
+        mirrors.append(scene.mirror is not None)
+        lo, hi = boxes_of(scene).filled_boxes
+        thinnest.append(127 / size(scene) * (hi - lo).min(axis=1).min())
+        wall = Plan(np.random.default_rng(0), plain_walls=seed % 2 == 0)
+        plain.append(wall.paints[wall.paint("wall")].contrast == 0.0)
+    assert 3 <= sum(mirrors) <= 14 and plain == [True, False] * 10
+    assert make_scene("random-20").mirror is None and not np.isclose(
+        make_scene("wild-20").volume_m3, random_scene(20).volume_m3
+    )
 
 
 @pytest.mark.parametrize("seed", MANY)

@@ -29,7 +29,7 @@ from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 TOLERANCE_VOXELS = 1.5
 """Surfaces closer than this agree, [voxels]."""
 COMMON_RESOLUTION = 128
-"""Voxels along the longest side of the lattice whose voxel size `fscore_128` is measured with."""
+"""Voxels along the longest side of the exact box whose size `fscore_128` is measured with."""
 
 _SURFACE_POINTS = 20_000
 _TRAINING_PREFIX = "frame_train_"
@@ -297,8 +297,8 @@ def geometry_metrics(
 
     Returns:
         Nothing for real photographs. Else ``fscore``, ``precision``, ``recall``, 0 to 1, at 1.5 voxels of the
-        snapshot's lattice; ``fscore_128``, at 1.5 voxels of a lattice of 128 voxels over the same box, to compare
-        resolutions; ``surface_distance_voxels`` and ``surface_distance_m``, the mean distance to the true surface.
+        snapshot's lattice; ``fscore_128``, at 1.5 voxels of 128 along the exact box, to compare resolutions
+        and boxes; ``surface_distance_voxels`` and ``surface_distance_m``, the mean distance to the true surface.
         Without any solid voxel the scores are 0 and there is no distance.
     """
     try:
@@ -318,7 +318,7 @@ def geometry_metrics(
     lattice = snapshot.lattice
     transform = check_similarity("world_to_input", world_to_input)
     voxel_m = lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(transform[:3, :3]))))
-    common_voxel_m = voxel_m * max(lattice.cell_shape) / COMMON_RESOLUTION
+    common_voxel_m = float(np.subtract(known.scene.scene_box[1], known.scene.scene_box[0]).max()) / COMMON_RESOLUTION
     own, common = (
         surface_fscore(
             *(cells, lattice, known.scene, seen, TOLERANCE_VOXELS * size_m, transform), surroundings=known.surroundings

@@ -20,7 +20,7 @@ from thermoxels_ns.synthetic.camera_rings import CameraRing
 from thermoxels_ns.synthetic.courtyard import courtyard
 from thermoxels_ns.synthetic.development_scenes import facade, street, wall_object
 from thermoxels_ns.synthetic.house_corner import house_corner
-from thermoxels_ns.synthetic.random_scene import RANDOM_NAME, random_scene, random_seed
+from thermoxels_ns.synthetic.random_scene import RANDOM_NAMES, random_scene, random_seed
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 from thermoxels_ns.synthetic.solid_union import SolidUnion
 from thermoxels_ns.synthetic.solids import Box, Cylinder, Sphere
@@ -170,7 +170,7 @@ _DEVELOPMENT: dict[str, Callable[..., SyntheticScene]] = {
 }
 
 SCENE_NAMES = tuple(_BUILDERS)
-"""Names of the scenes that were built by hand; `make_scene` also knows `DEVELOPMENT_NAMES` and `random-N`."""
+"""Names of the scenes that were built by hand; `make_scene` also knows `DEVELOPMENT_NAMES`, `random-N` and `wild-N`."""
 DEVELOPMENT_NAMES = tuple(_DEVELOPMENT)
 """Names of scenes that are hard to reconstruct, for development."""
 
@@ -195,7 +195,8 @@ def check_scene_name(name: str) -> str:
     known &= all(variant in ("white", "street", "room") or _SKY.fullmatch(variant) for variant in variants)
     if not known or len(kinds) < len(variants) or kinds >= {"street", "room"} or ("white" in kinds and base != _HOUSE):
         every = ", ".join((*_BUILDERS, *_DEVELOPMENT))
-        expected = f"{RANDOM_NAME} with a whole number N from 0 on, or one of {every}; with {VARIANTS} if you like"
+        seeded = " or ".join(RANDOM_NAMES)
+        expected = f"{seeded} with a whole number N from 0 on, or one of {every}; with {VARIANTS} if you like"
         remedy = f"Choose one of these names, or write random-17 or {_HOUSE}+sky=0.55,0.57,0.60."
         raise SceneError("synthetic scene", expected=expected, got=repr(name), remedy=remedy)
     return name
@@ -205,7 +206,7 @@ SceneWord = Annotated[
     str,
     PrimitiveConstructorSpec(
         nargs=1,
-        metavar=f"{{{','.join((*SCENE_NAMES, *DEVELOPMENT_NAMES, RANDOM_NAME))}}}",
+        metavar=f"{{{','.join((*SCENE_NAMES, *DEVELOPMENT_NAMES, *RANDOM_NAMES))}}}",
         instance_from_str=lambda words: check_scene_name(words[0]),
         is_instance=lambda value: isinstance(value, str),
         str_from_instance=lambda value: [value],
@@ -216,8 +217,10 @@ SceneWord = Annotated[
 
 @cache
 def make_scene(name: str) -> SyntheticScene:
-    """Make a synthetic scene by its name: one of `SCENE_NAMES` or `DEVELOPMENT_NAMES`, or ``random-`` and a seed
-    without leading zeros; then, if you like, some of `VARIANTS`, such as ``sphere+sky=1,1,1`` or ``random-3+street``.
+    """Make a synthetic scene by its name.
+
+    One of `SCENE_NAMES` or `DEVELOPMENT_NAMES`, or ``random-`` or ``wild-`` and a seed without leading zeros; then, if
+    you like, some of `VARIANTS`, such as ``sphere+sky=1,1,1`` or ``random-3+street``.
 
     Raises:
         SceneError: No scene has that name; the message lists those there are.
@@ -228,7 +231,10 @@ def make_scene(name: str) -> SyntheticScene:
     base, *variants = check_scene_name(name).split("+")
     seed = random_seed(base)
     white = {"white": True} if "white" in variants else {}
-    scene = random_scene(seed) if seed is not None else (_BUILDERS | _DEVELOPMENT)[base](**white)
+    if seed is not None:
+        scene = random_scene(seed, wild=base.startswith("wild"))
+    else:
+        scene = (_BUILDERS | _DEVELOPMENT)[base](**white)
     for variant in sorted(variants):
         if sky := _SKY.fullmatch(variant):
             scene = dataclasses.replace(scene, background_rgb=plain([float(c) for c in sky[1].split(",")]))

@@ -170,6 +170,21 @@ def facade(plan: Plan) -> None:
     _spots(plan, (body, post), high)
 
 
+def railing(plan: Plan) -> None:
+    """Thin bars under a rail along the front edge of the ground, which is the plan's first piece."""
+    u = plan.u
+    ground = plan.pieces[0].shape
+    assert isinstance(ground, tuple)
+    (x0, y0, _), (x1, _, _) = ground
+    thick, apart, high, paint = u(0.2, 0.45), u(2.2, 3.2), u(8, 12), plan.paint("metal")
+    count = int(u(0.4, 0.65) * (x1 - x0) / apart)
+    x, y = u(x0 + 1.0, x1 - count * apart - 2.0), y0 + u(1.0, 2.0)
+    for number in range(count + 1):
+        at = x + number * apart
+        plan.put(((at, y, 0.0), (at + thick, y + thick, high)), paint, u(0.1, 0.2))
+    plan.put(((x, y, high), (x + count * apart + thick, y + thick, high + thick)), paint, u(0.1, 0.2))
+
+
 def _stepped_roof(plan: Plan, body: Box, paint: int) -> Box:
     """Eaves and steps that shrink to a ridge along x; returns the last step."""
     u = plan.u

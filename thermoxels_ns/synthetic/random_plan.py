@@ -181,10 +181,11 @@ class Plan:
         """Paint of the last piece that holds a point just below the surface: points and normals (n, 3) to (n,)."""
         inner = np.asarray(points, dtype=np.float64) - 0.01 * self.unit * np.asarray(normals, dtype=np.float64)
         number = np.zeros(len(inner), dtype=np.int64)
+        x, y, z = np.ascontiguousarray(inner.T)
         for piece in self.pieces:
             if isinstance(piece.shape, tuple):
                 lo, hi = piece.shape
-                held = np.all((inner > lo) & (inner < hi), axis=1)
+                held = (x > lo[0]) & (x < hi[0]) & (y > lo[1]) & (y < hi[1]) & (z > lo[2]) & (z < hi[2])
             else:
                 held = piece.shape.contains(inner)
             number[held] = piece.paint

@@ -1,7 +1,8 @@
-"""Synthetic scenes from a seed, `random-17`: arrangements that nobody chose."""
+"""Synthetic scenes from a seed, `random-17` and `wild-17`: arrangements that nobody chose."""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 import re
@@ -15,11 +16,12 @@ import numpy.typing as npt
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.appearance import SolidTexture, SunLight, painted, room_rgb, sky_rgb, sky_temperature_c
 from thermoxels_ns.synthetic.camera_rings import CameraRing
-from thermoxels_ns.synthetic.random_buildings import detached_house, facade, wings
+from thermoxels_ns.synthetic.random_buildings import detached_house, facade, railing, wings
 from thermoxels_ns.synthetic.random_plan import Plan
 from thermoxels_ns.synthetic.random_plant import machinery, pipes_and_radiators
 from thermoxels_ns.synthetic.scene_truth import RgbFunction, SyntheticScene
 from thermoxels_ns.synthetic.solids import Box
+from thermoxels_ns.synthetic.surroundings import plain, with_room, with_street
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -75,11 +77,14 @@ def _nearest(relative: FloatArray, elevation: float, focal_share: float, arc_deg
     return float((relative @ back.T + np.maximum(beside, above / _PICTURE_ASPECT) / half).max())
 
 
-RANDOM_NAME = "random-N"
+RANDOM_NAMES = ("random-N", "wild-N")
 """How the names of these scenes are written where all names are listed; N is the seed."""
 
-_NAME = re.compile(r"random-(0|[1-9][0-9]{0,17})")
-_STREAM = 7411
+_NAME = re.compile(r"(?:random|wild)-(0|[1-9][0-9]{0,17})")
+_STREAM, _WILD_STREAM = 7411, 7413
+_HARDSHIP_SHARE = 0.4
+_MIRROR = (0.4, 0.7)
+_WHITE, _MID_GREY = (0.94, 0.94, 0.94), (0.5, 0.5, 0.5)
 _MARGIN_SHARE = 0.04
 _SURFACE_SAMPLES = 20_000
 _RANGE_K = (15.0, 60.0)
@@ -112,17 +117,20 @@ FAMILIES = (
 
 
 def random_seed(name: str) -> int | None:
-    """Seed of a scene's name; None if it is not the name of a random scene.
+    """Seed of a scene's name; None if it is not the name of a random or a wild scene.
 
-    >>> random_seed("random-17"), random_seed("random-017"), random_seed("house-corner")
-    (17, None, None)
+    >>> random_seed("random-17"), random_seed("wild-3"), random_seed("random-017"), random_seed("house-corner")
+    (17, 3, None, None)
     """
     found = _NAME.fullmatch(name)
     return int(found[1]) if found else None
 
 
-def random_scene(seed: int) -> SyntheticScene:
-    """Make the scene of a seed, named ``random-`` and the seed; the same seed makes the same scene.
+def random_scene(seed: int, wild: bool = False) -> SyntheticScene:
+    """Make the scene of a seed, named ``random-`` or ``wild-`` and the seed; the same seed makes the same scene.
+
+    Random scenes have textured walls before smooth gradients. Some wild ones have plain walls, mirroring panes or a
+    thin railing; behind a third of them each lie smooth gradients, one plain colour, and a street or a room.
 
     Raises:
         SceneError: The seed is below 0.
@@ -132,21 +140,27 @@ def random_scene(seed: int) -> SyntheticScene:
     """
     if seed < 0:
         raise SceneError("seed", expected="a whole number from 0 on", got=seed, remedy="Pass a seed such as 17.")
-    draw = np.random.default_rng([_STREAM, seed])
+    draw = np.random.default_rng([_WILD_STREAM if wild else _STREAM, seed])
     family = FAMILIES[seed % len(FAMILIES)]
     plan = Plan(draw)
+    if wild:
+        plan.plain_walls = plan.chance(_HARDSHIP_SHARE)
+        plan.mirror = plan.u(*_MIRROR) if plan.chance(_HARDSHIP_SHARE) else 0.0
     family.lay_out(plan)
+    if wild and plan.chance(_HARDSHIP_SHARE):
+        railing(plan)
     lo, hi = plan.solid().bounds
     extent = float(np.subtract(hi, lo).max())
     plan = plan.scaled(float(np.round(draw.uniform(*family.size_m), 2)) / extent)
     texture_seed, light = int(draw.integers(2**31)), _light(draw)
-    background_rgb, background_c, surface_c, bounds_c = _surroundings(draw, outdoors=draw.random() < family.outdoors)
+    outdoors = draw.random() < family.outdoors
+    background_rgb, background_c, surface_c, bounds_c = _surroundings(draw, outdoors)
     focal_share = round(float(draw.uniform(0.78, 1.05)), 3)
     span = 360.0 if family.arc_deg is None else round(float(draw.uniform(*family.arc_deg)), 1)
     start = round(float(draw.uniform(0.0, 360.0)), 1) if family.arc_deg is None else -90.0 - 0.5 * span
     rings = random_rings(draw, plan.boxes_around(), focal_share, (start, span))
-    return scene_of_plan(
-        f"random-{seed}",
+    scene = scene_of_plan(
+        f"{'wild' if wild else 'random'}-{seed}",
         plan,
         texture_seed,
         light,
@@ -157,6 +171,15 @@ def random_scene(seed: int) -> SyntheticScene:
         rings=rings,
         focal_share=focal_share,
     )
+    kind = seed % 3  # beside seed % 5 of the families: 15 seeds in a row show every pair
+    if not wild or kind == 0:
+        return scene
+    if kind == 1:
+        points, normals = scene.surface_points(_SURFACE_SAMPLES, seed=1)
+        colours = (scene.colour(points, normals).mean(axis=0), _MID_GREY, _WHITE, draw.uniform(0.05, 1.0, 3))
+        rgb = np.asarray(colours[int(draw.integers(len(colours)))]).tolist()
+        return dataclasses.replace(scene, background_rgb=plain(rgb))
+    return (with_street if outdoors else with_room)(scene, int(draw.integers(2**31)))
 
 
 def scene_of_plan(
