@@ -85,7 +85,7 @@ def test_the_verdict_is_the_same_in_any_world_and_in_pieces(monkeypatch: pytest.
     turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
     assert 0.05 < (~whole).mean() < 0.3
     assert np.array_equal(agrees_with_neighbours(lines.moved(turn, np.array([5.0, -3.0, 1.0]), 250.0)), whole)
-    monkeypatch.setattr(module, "_LINES_AT_ONCE", 37)
+    monkeypatch.setattr(module, "_RAYS_AT_ONCE", 37)
     assert np.array_equal(agrees_with_neighbours(lines), whole)
 
 
