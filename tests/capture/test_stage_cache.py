@@ -188,7 +188,7 @@ def test_a_second_capture_is_refused_and_changes_nothing(tmp_path, output):
     half.write_text("being written by the first one")
     with locked(output):
         before = sorted(output.rglob("*"))
-        with pytest.raises(OutputError, match=r"no other capture.*process \d+ is at work.*--output"):
+        with pytest.raises(OutputError, match=r"no other command.*process \d+ is at work.*--output"):
             capture_folder(tmp_path / "card", output, CaptureSettings())
         assert sorted(output.rglob("*")) == before
         with locked(prepare_output(tmp_path / "another")):

@@ -488,6 +488,15 @@ def test_every_format_is_written_and_leaves_with_the_next_export(ball, tmp_path)
     assert summary["files"] == ["mesh.stl", "quality.json", "summary.json"]
 
 
+@pytest.mark.parametrize("name", ["answers.json", "heat.pvd", "mesh.stl"])
+def test_files_of_others_are_not_removed(ball, tmp_path, name) -> None:
+    """Those of a heat run, or of the user."""
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(OutputError, match=rf"of an earlier run of this command in .*, got {name}"):
+        export_snapshot(ball, np.eye(4), ExportOptions(pictures=False), tmp_path)
+    assert (tmp_path / name).read_text() == "mine"
+
+
 def test_scale_from_a_known_distance(ball, tmp_path) -> None:
     options = ExportOptions(known_distance=(0.0, 0.0, 0.0, 0.0, 3.0, 4.0, 10.0), pictures=False, steps=1)
     summary = export_snapshot(ball, np.eye(4), options, tmp_path)

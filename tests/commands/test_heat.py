@@ -157,6 +157,17 @@ def test_a_failing_run_leaves_the_old_results(folder, tmp_path) -> None:
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+@pytest.mark.parametrize("name", ["quality.json", "heat.pvd", "heat/step-0001.vtu", "report.html"])
+def test_files_of_others_are_not_removed(folder, tmp_path, name) -> None:
+    """Those of an export, or of the user."""
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("mine")
+    options = Heat(folder / "room" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path, pictures=False)
+    with pytest.raises(OutputError, match=rf"of an earlier run .*, got {name.split('/')[0]}. Choose"):
+        run_heat(options)
+    assert (tmp_path / name).read_text() == "mine"
+
+
 def test_an_export_without_scale_is_refused_and_its_up_is_used(folder, tmp_path) -> None:
     write_mesh(tmp_path / "mesh.vtu", wall())
     options = Heat(tmp_path / "mesh.vtu", str(folder / "steady.yaml"), tmp_path / "out")
@@ -254,6 +265,7 @@ def test_a_tolerance_in_time_keeps_the_scenes_times(folder, tmp_path) -> None:
         ({"tolerance": -1.0}, "tolerance: expected a finite number above 0"),
         ({"flow_tolerance": 0.1}, "flow-tolerance: expected --tolerance beside it"),
         ({"tolerance": 0.1, "leave_out_below_k": 0.1}, "leave-out-below-k: expected less than the tolerance of 0.1 K"),
+        ({"memory_gb": 1e-7}, "memory of the heat problem: expected at most .*fewer steps or outputs"),
         ({"memory_gb": 1e-5}, "memory of the heat problem: expected at most .*Pass a larger --memory-gb"),
         ({"tolerance": 1e-6, "memory_gb": 0.002}, "Not within 1e-06 K|memory_bytes: expected room"),
     ],
@@ -312,7 +324,7 @@ def test_no_u_value_where_more_than_two_airs_acts(folder, tmp_path) -> None:
 @pytest.mark.parametrize(
     ("summary", "message"),
     [
-        ("[1, 2]", "summary.json: expected the summary of an export, got \\[1, 2\\]"),
+        ("[1, 2]", "summary.json: expected a json object, got list"),
         ('{"up": [0, 1]}', "summary.json: up: expected three numbers, got \\[0, 1\\]"),
     ],
 )

@@ -18,7 +18,7 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from thermoxels_ns import config
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.core.yaml_records import read_preset, with_overrides
+from thermoxels_ns.core.yaml_records import read_preset, read_yaml, with_overrides
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -161,3 +161,10 @@ def test_an_installed_package_brings_the_presets(tmp_path: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         held = {Path(name).stem for name in archive.namelist() if name.startswith("thermoxels_ns/configs/")}
     assert set(FILES) <= held
+
+
+@pytest.mark.parametrize("text", ["a: " + "[" * 5000, "[a]: 1\n[a]: 2", "k: 1\nk: 2", "- a"])
+def test_yaml_that_cannot_be_used_is_refused(tmp_path, text):
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(ThermoxelsError, match=r"a\.yaml: expected"):
+        read_yaml(tmp_path / "a.yaml")

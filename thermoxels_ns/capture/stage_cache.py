@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
-from filelock import FileLock, Timeout
-
 from thermoxels_ns import __version__
 from thermoxels_ns.capture.settings import StageName
-from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import hold_folder, remove_file, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import OutputError, SceneError
 from thermoxels_ns.core.json_values import write_json
 
@@ -136,26 +133,10 @@ def prepare_output(folder: Path) -> Path:
 
 @contextmanager
 def locked(output: Path, say: Callable[[str], None] = lambda _: None) -> Iterator[None]:
-    """Hold the output folder of a capture for the block; an `OutputError` where another capture holds it.
-
-    The system ends the lock with the process that holds it, however that ends. Where the drive has no locks the block
-    runs all the same, and `say` is told so.
-    """
-    file = output / CACHE_FOLDER / LOCK_FILE
-    lock = FileLock(file)
-    try:
-        lock.acquire(blocking=False)
-        with suppress(OSError):  # the number is for the message below alone
-            file.write_text(str(os.getpid()))
-    except Timeout as problem:
-        number = _read(file) or ""
-        expected = "a folder that no other capture is working in"
-        got = f"{output}, where process {number} is at work" if number.isdigit() else f"{output}, where one is"
-        remedy = "Wait until it ends, or pass another folder with --output."
-        raise OutputError("output", expected=expected, got=got, remedy=remedy) from problem
-    except OSError as problem:
-        drive = f"the drive of the output folder ({problem.strerror})"
-        say(f"output: {drive} does not tell whether another capture works in the folder; start one at a time")
+    """Hold the output folder of a capture for the block; an `OutputError` where another capture holds it."""
+    lock = hold_folder(
+        output / CACHE_FOLDER / LOCK_FILE, "Wait until it ends, or pass another folder with --output.", say
+    )
     try:
         yield
     finally:

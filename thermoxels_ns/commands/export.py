@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 # Only light imports at the top: nerfstudio's exporter reads this module for ``--help`` of every subcommand.
-import pickle
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from threadpoolctl import threadpool_limits
 from thermoxels_ns.commands.export_options import ExportOptions, Viewpoint, check_options, scale_of, up_of
 from thermoxels_ns.commands.export_snapshot import export_snapshot, prepare_folder
 from thermoxels_ns.core.errors import CheckpointError, SceneError, ThermoxelsError
-from thermoxels_ns.core.json_values import read_json
+from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.core.lattice import input_from_world
 
 if TYPE_CHECKING:
@@ -79,7 +78,7 @@ class ExportThermoxelsMesh(ExportOptions):
             """Refuse a wrong scale or up, and what needs a scale, before photographs and checkpoint are loaded."""
             try:
                 content = scene_json(scene_folder)
-            except (OSError, ValueError):
+            except SceneError:
                 return  # whoever reads the scene says what is wrong with it
             if content or scene_folder.is_dir():
                 scale_of(self, checked, content)
@@ -113,8 +112,7 @@ def scene_json(scene_folder: Path) -> dict[str, Any]:
     names = [scene_folder] if scene_folder.is_file() else [folder / name for name in JSON_NAMES]
     for path in names:
         if path.is_file():
-            content = read_json(path, error=SceneError)
-            return content if isinstance(content, dict) else {}
+            return read_json_object(path, "Write the file again.", SceneError)
     return {}
 
 
@@ -148,7 +146,7 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
         got = f"{load_config}, which cannot be read ({_reason(load_config, problem)})"
         remedy = "Pass the config.yml of the training run."
         raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy) from problem
-    except (RuntimeError, pickle.UnpicklingError, EOFError) as problem:
+    except RuntimeError as problem:
         expected = "the parameters of the model that config.yml describes"
         got = f"{type(problem).__name__}: {problem}"
         remedy = "Use the config.yml and the checkpoint of one and the same training run."

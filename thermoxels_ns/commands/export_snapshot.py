@@ -12,7 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.commands.export_options import ExportOptions, Viewpoint, check_options, scale_of, up_of
-from thermoxels_ns.core.checks import refuse_what_is_in_the_way, remove_file, remove_stale_temporaries, writable_folder
+from thermoxels_ns.core.checks import (
+    refuse_files_of_others,
+    refuse_what_is_in_the_way,
+    remove_file,
+    remove_stale_temporaries,
+    writable_folder,
+)
 from thermoxels_ns.core.errors import ThermoxelsError
 
 if TYPE_CHECKING:
@@ -45,6 +51,7 @@ def prepare_folder(output_dir: Path | str, *, heat: bool) -> Path:
     names = (*_mesh_files(MESH_FORMATS), *_MESH_PICTURES, _HEAT, _HEAT_PICTURE, _QUALITY, _SUMMARY)
     series = folder / Path(_HEAT).stem
     refuse_what_is_in_the_way(folder, names, [series.name] if heat else [])
+    refuse_files_of_others(folder, (*names, series.name), (_QUALITY, _SUMMARY), ("answers.json", "series.csv"))
     remove_stale_temporaries(folder, names)
     remove_stale_temporaries(series, [STEP_PATTERN])
     return folder
@@ -152,6 +159,7 @@ def export_snapshot(
     summary_text(summary)  # raises if json cannot hold it
 
     remove_file(folder / _SUMMARY)
+    write_summary(folder / _QUALITY, report.as_mapping())  # first: it tells the next export that the rest is one's, too
     for name in {*_mesh_files(MESH_FORMATS), *_MESH_PICTURES, _HEAT_PICTURE} - set(files):
         remove_file(folder / name)
     if solution is None:
@@ -161,7 +169,6 @@ def export_snapshot(
     )
     for suffix in suffixes:
         write_mesh(folder / f"{_MESH_STEM}{suffix}", mesh, heat_step=heat_step, up=up)
-    write_summary(folder / _QUALITY, report.as_mapping())
     if solution is not None:
         write_heat_series(folder / _HEAT, mesh, solution)
     if options.pictures:

@@ -13,6 +13,7 @@ import numpy as np
 
 from thermoxels_ns.commands.heat_options import HeatOptions
 from thermoxels_ns.core.checks import (
+    refuse_files_of_others,
     refuse_what_is_in_the_way,
     remove_file,
     remove_stale_temporaries,
@@ -20,7 +21,7 @@ from thermoxels_ns.core.checks import (
     writable_folder,
 )
 from thermoxels_ns.core.errors import HeatError, MeshError
-from thermoxels_ns.core.json_values import read_json
+from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.fem.solution import Solution, SteadySolution
 from thermoxels_ns.heat.run import HeatRun, run_scene
 from thermoxels_ns.heat.scene_file import load_heat_scene
@@ -76,10 +77,7 @@ def _export_summary(mesh: Path, say: Say) -> dict[str, Any]:
     if not path.is_file():
         say(f"Warning: {path} is missing; the mesh is taken to be in metres.")
         return {}
-    expected, remedy = "the summary of an export", "Export the mesh again, or move the file away."
-    summary = read_json(path, expected, remedy, MeshError)
-    if not isinstance(summary, dict):
-        raise MeshError(str(path), expected=expected, got=repr(summary)[:40], remedy=remedy)
+    summary = read_json_object(path, "Export the mesh again, or move the file away.", MeshError)
     if summary.get("length_unit", "m") != "m":
         remedy = "Export again with --metres-per-unit or --known-distance."
         got = f"one in {summary['length_unit']}s"
@@ -140,6 +138,7 @@ def prepared_folder(output_dir: Path) -> Path:
     names = (ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY, *PICTURES)
     series = folder / Path(THROUGH_TIME).stem
     refuse_what_is_in_the_way(folder, names, [series.name])
+    refuse_files_of_others(folder, (*names, series.name), (ANSWERS, SERIES), ("summary.json", "quality.json"))
     remove_stale_temporaries(folder, names)
     remove_stale_temporaries(series, [STEP_PATTERN])
     return folder
@@ -155,6 +154,7 @@ def write_heat_files(folder: Path, options: HeatOptions, run: HeatRun, say: Say)
     summary_text(answers)  # raises if json cannot hold it
     shown, pictures = run.nodes, list[str]()
     remove_file(folder / ANSWERS)
+    _write_series(folder / SERIES, run)  # first: it tells the next run that the rest is a heat run's, too
     for name in (PAGE, STEADY, *PICTURES):
         remove_file(folder / name)
     if isinstance(run.solution, SteadySolution):
@@ -162,7 +162,6 @@ def write_heat_files(folder: Path, options: HeatOptions, run: HeatRun, say: Say)
         write_vtu(folder / STEADY, shown.mesh, temperature_c=shown.states_c[-1])
     else:
         write_heat_series(folder / THROUGH_TIME, shown.mesh, run.solution)
-    _write_series(folder / SERIES, run)
     if options.pictures:
         pictures = draw_surface(folder, shown.mesh, shown.states_c, shown.times_s, run.problem.up)
     drawn = {name: (folder / name).read_bytes() for name in pictures}

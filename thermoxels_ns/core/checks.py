@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 import os
 import re
+import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from filelock import FileLock, Timeout
 
 from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 
@@ -22,6 +25,18 @@ def check_positive(name: str, value: float, remedy: str, error: type[ThermoxelsE
     if not (number and math.isfinite(value) and value > 0):
         raise error(name, expected="a finite number above 0", got=repr(value), remedy=remedy)
     return float(value)
+
+
+def check_ranges(prefix: str, values: Mapping[str, tuple[Any, float, float, str]]) -> None:
+    """Check options, by what follows `prefix` in their names: the value, its least and largest one, and that in words.
+
+    Raises:
+        ThermoxelsError: A value is outside its range.
+    """
+    for name, (value, low, high, expected) in values.items():
+        if not low <= value <= high:  # NaN fails too
+            remedy = f"Correct {prefix}{name.replace('_', '-')}."
+            raise ThermoxelsError(name.rpartition(".")[2], expected=expected, got=value, remedy=remedy)
 
 
 def check_finite(
@@ -60,8 +75,8 @@ def check_direction(
     return array
 
 
-def writable_folder(path: Path | str) -> Path:
-    """Make `path` a folder that can be written to, or raise `OutputError`.
+def writable_folder(path: Path | str, room_bytes: float = 0.0) -> Path:
+    """Make `path` a folder that can be written to, on a disk with some room, or raise `OutputError`.
 
     The proof is a temporary file written and removed again, because permission bits lie (root, network drives).
     """
@@ -69,13 +84,56 @@ def writable_folder(path: Path | str) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
-            pass
+            free = shutil.disk_usage(folder).free
     except OSError as problem:
         expected = f"a folder that can be written to at {folder}"
         got = problem.strerror or str(problem)
         remedy = "Choose another folder or change its permissions."
         raise OutputError("output folder", expected=expected, got=got, remedy=remedy) from problem
+    if free < room_bytes:
+        expected = f"{room_bytes / 1e6:.3g} MB of space for results in {folder}"
+        got, remedy = f"{free / 1e6:.3g} MB of free space", "Free space on that disk, or choose another folder."
+        raise OutputError("output folder", expected=expected, got=got, remedy=remedy)
     return folder
+
+
+@contextmanager
+def plain_os_errors(
+    what: Path | str,
+    expected: str = "files that can be read and written",
+    remedy: str = "Check free space, permissions and the length of names.",
+    error: type[ThermoxelsError] = OutputError,
+) -> Iterator[None]:
+    """Turn an error of the operating system in the block into one of ours that names the file, else `what`."""
+    try:
+        yield
+    except ThermoxelsError:
+        raise
+    except OSError as problem:
+        name, got = str(problem.filename or what)[:300], problem.strerror or str(problem)
+        raise error(name, expected=expected, got=got, remedy=remedy) from problem
+
+
+def hold_folder(file: Path, remedy: str, say: Callable[[str], None]) -> FileLock:
+    """Lock a file in an output folder for this process, or raise `OutputError` if another one holds it.
+
+    The system ends the lock with the process, however that ends. On a drive without locks none is held; `say` says so.
+    """
+    lock = FileLock(file)
+    try:
+        lock.acquire(blocking=False)
+        with suppress(OSError):  # the number is for the message below alone
+            file.write_text(str(os.getpid()))
+    except Timeout as problem:
+        number = ""
+        with suppress(OSError):
+            number = file.read_text(encoding="utf-8")
+        got = f"{file.parent}, where process {number or 'of unknown number'} is at work"
+        expected = "a folder that no other command is working in"
+        raise OutputError("output folder", expected=expected, got=got, remedy=remedy) from problem
+    except OSError as problem:
+        say(f"The drive of {file.parent} ({problem.strerror}) does not tell whether another command works there.")
+    return lock
 
 
 @contextmanager
@@ -139,6 +197,21 @@ def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Itera
         expected = f"no folder in the place of a file, and no file in the place of a folder, in {folder}"
         remedy = "Move it away, or choose another folder."
         raise OutputError("output folder", expected=expected, got=", ".join(blocked), remedy=remedy)
+
+
+def refuse_files_of_others(folder: Path, files: Iterable[str], own: Sequence[str], others: Sequence[str]) -> None:
+    """Raise `OutputError` where a command that writes or removes `files` would take what it did not write.
+
+    `own` are names that it writes first and last, without any of which the others are not the command's; `others` tell
+    the results of another command.
+    """
+    found = [name for name in others if (folder / name).exists()]
+    if not any((folder / name).exists() for name in own):
+        found += [name for name in files if (folder / name).exists()]
+    if found:
+        expected = f"no files but those of an earlier run of this command in {folder}"
+        remedy = "Choose another folder with --output-dir, or move them away."
+        raise OutputError("output folder", expected=expected, got=", ".join(dict.fromkeys(found)), remedy=remedy)
 
 
 def _output_error(path: Path, expected: str, problem: OSError) -> OutputError:

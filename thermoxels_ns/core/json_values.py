@@ -74,6 +74,8 @@ def read_json(
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as problem:
+        if isinstance(problem, OSError) and path.exists():
+            expected, remedy = "a file that can be read", "Check its permissions and the disk."
         raise error(str(path), expected=expected, got=str(problem), remedy=remedy) from problem
 
 

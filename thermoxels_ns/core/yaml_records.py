@@ -51,7 +51,10 @@ def read_yaml(path: Path) -> dict[str, Any]:
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)
     except OSError as problem:
-        raise wrong(str(path), "a yaml file", problem.strerror or problem, "Correct the path.") from problem
+        remedy = "Correct the path, or the permissions."
+        raise wrong(str(path), "a yaml file", problem.strerror or problem, remedy) from problem
+    except RecursionError as problem:
+        raise wrong(path.name, "a yaml file", "entries nested too deeply to read") from problem
     except (yaml.YAMLError, UnicodeDecodeError) as problem:
         raise wrong(path.name, "a yaml file", problem) from problem
     except ValueError as problem:  # a date such as 2025-13-01
@@ -199,10 +202,12 @@ class _UniqueKeyLoader(yaml.SafeLoader):
     """Refuses a key that stands twice in one mapping, where yaml forgets the first."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = [key.value for key, _ in node.value]
-        twice = next((key for number, (key, _) in enumerate(node.value) if key.value in keys[:number]), None)
-        if twice is not None:
-            raise yaml.constructor.ConstructorError(None, None, f"the key {twice.value} twice", twice.start_mark)
+        seen = set[str]()
+        for key, _ in node.value:
+            name = key.value if isinstance(key, yaml.ScalarNode) else yaml.serialize(key)
+            if name in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"the key {name} twice", key.start_mark)
+            seen.add(name)
         return super().construct_mapping(node, deep)
 
 

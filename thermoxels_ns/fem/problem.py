@@ -19,6 +19,9 @@ from thermoxels_ns.fem.p1_kernels import refuse_flat_tets
 from thermoxels_ns.fem.terms import Effect
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
+_MOST = 10_000_000
+"""Steps or kept times; a minute each for nineteen years."""
+
 
 @dataclass(frozen=True)
 class TimeSteps:
@@ -128,8 +131,8 @@ class GivenSteps:
 
 
 def _check_count(name: str, value: int, remedy: str) -> None:
-    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
-        raise HeatError(name, expected="a whole number of at least 1", got=repr(value), remedy=remedy)
+    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or not 1 <= value <= _MOST:
+        raise HeatError(name, expected=f"a whole number from 1 to {_MOST:,}", got=repr(value), remedy=remedy)
 
 
 @runtime_checkable

@@ -306,6 +306,7 @@ class _Screener:
         self._mass: Vector = np.ones(0)
         if time is not None:
             self._mass = lumped_mass(mesh.points_m, mesh.tets, problem.heat_capacity_j_m3k)
+        self._holds = [bool(heat.held_w_k.any()) for heat in self.heats]
         self._free = ~np.logical_or.reduce([heat.fixed for heat in self.heats])
         self._stiffness: sparse.csr_matrix | None = None
         self._obtuse = False
@@ -325,7 +326,9 @@ class _Screener:
         if self._stiffness is None:
             return left
         for number in sorted(range(len(self.heats)), key=lambda n: self._alone_bounds[n].value_k):
-            tried = {n: self._bound(n, {*left, number}) for n in (*left, number)}
+            # Bounds of what is left already change only with the convection that is kept.
+            again = (*left, number) if self._holds[number] else (number,)
+            tried = {**left, **{n: self._bound(n, {*left, number}) for n in again}}
             total = sum(bound.value_k for bound in tried.values())
             if total <= self._tolerance and self._still_held({*left, number}):
                 left = tried
@@ -397,7 +400,7 @@ class _Screener:
 
     def _held(self, left: set[int]) -> Vector:
         """Convection that is kept at each node, [W / K]."""
-        kept = (heat.held_w_k for number, heat in enumerate(self.heats) if number not in left)
+        kept = [self.heats[number].held_w_k for number in np.flatnonzero(self._holds) if number not in left]
         return sum(kept, np.zeros(self._space.num_nodes))
 
     def _even_rise(self, heat_w: Vector, held_w_k: Vector) -> _Bound:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.memory import check_memory, describe_bytes, peak_bytes
+from thermoxels_ns.fem.memory import DEFAULT_MEMORY_BYTES, check_memory, describe_bytes, peak_bytes
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Bounds
 from thermoxels_ns.fem.solution import Solution
@@ -151,6 +151,10 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
         HeatError: The problem needs more memory than allowed, its solver fails, or the tolerance cannot be met.
     """
     goals.check_fits(time)
+    if time is not None:
+        allowed = DEFAULT_MEMORY_BYTES if goals.memory_gb is None else goals.memory_gb * 2**30
+        remedy = "Keep temperatures at fewer times: fewer steps or outputs; or pass a larger --memory-gb."
+        check_memory(8.0 * time.num_times * len(problem.mesh.points_m), allowed, remedy)
     screening = screen(problem, time, goals.left_out_k)
     _say_what_is_built(screening, say)
     kept, memory_bytes = screening.problem, np.inf if goals.memory_gb is None else goals.memory_gb * 2**30

@@ -115,3 +115,11 @@ def test_a_file_without_our_arrays_is_refused(tmp_path, box_mesh) -> None:
     grid.save(tmp_path / "box.vtu")
     with pytest.raises(MeshError, match=r"box\.vtu: expected an array temperature_c, got none"):
         read_mesh(tmp_path / "box.vtu")
+
+
+def test_a_tetrahedron_listed_again_is_refused(tmp_path, box_mesh) -> None:
+    tets = np.concatenate([box_mesh.tets, box_mesh.tets[:1]])
+    again = dataclasses.replace(box_mesh, tets=tets, region=np.concatenate([box_mesh.region, box_mesh.region[:1]]))
+    write_mesh(tmp_path / "mesh.vtu", again)
+    with pytest.raises(MeshError, match=r"mesh.vtu: expected every tetrahedron once, got 1 of \d+ listed again"):
+        read_mesh(tmp_path / "mesh.vtu")

@@ -140,6 +140,8 @@ def test_a_wall_thickness_needs_a_scale_and_cameras(facade):
         select_solid(facade, selection)
     with pytest.raises(MeshError, match="metres_per_world_unit"):
         select_solid(facade, selection, 0.0)
+    with pytest.raises(MeshError, match=r"wall_thickness: expected at most the scene box, .* m, got 50 m"):
+        select_solid(facade, SolidSelection(wall_thickness=50.0), 0.2)
     with pytest.raises(MeshError, match=r"wall_thickness.*training cameras.*leave out --wall-thickness"):
         select_solid(replace(facade, views=None), selection, 1.0)
 

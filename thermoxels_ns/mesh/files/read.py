@@ -36,6 +36,9 @@ def read_mesh(path: Path | str) -> TetMesh:
     if others:
         raise _wrong(path.name, "tetrahedra only", f"{others} cells of other kinds", _REMEDY)
     tets = np.array(body.cell_connectivity, dtype=np.int64).reshape(-1, 4)
+    doubled = len(tets) - len(np.unique(np.sort(tets, axis=1), axis=0))
+    if doubled:
+        raise _wrong(path.name, "every tetrahedron once", f"{doubled} of {len(tets)} listed again", _REMEDY)
     names = _region_names(body, path.name)
     region = _cell_numbers(body, "region", path.name, len(names))
     colour = body.point_data.get("colour")

@@ -248,4 +248,9 @@ def _wall_voxels(
         expected = "training cameras, which tell the side that is seen"
         remedy = "Export from a trained scene, or leave out --wall-thickness."
         raise MeshError("wall_thickness", expected=expected, got="a field without cameras", remedy=remedy)
-    return selection.wall_thickness / (metres_per_world_unit * snapshot.lattice.voxel_size)
+    voxels = selection.wall_thickness / (metres_per_world_unit * snapshot.lattice.voxel_size)
+    if voxels > max(snapshot.lattice.cell_shape):
+        longest = selection.wall_thickness * max(snapshot.lattice.cell_shape) / voxels
+        got, remedy = f"{selection.wall_thickness:g} m", "Pass it in metres, and check --metres-per-unit."
+        raise MeshError("wall_thickness", expected=f"at most the scene box, {longest:.3g} m", got=got, remedy=remedy)
+    return voxels
