@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -48,11 +49,11 @@ def test_frames_are_sorted_by_name_with_their_own_poses(scene_folder):
 
 
 def test_box_goes_to_plus_minus_one(scene_folder):
-    scene = scene_folder(scene_box=[[1.0, 2.0, 3.0], [5.0, 4.0, 4.0]])
+    scene = scene_folder(scene_box=[[-1.0, -2.0, 0.0], [3.0, 0.0, 1.0]])
     outputs = parse(scene.path)
     torch.testing.assert_close(outputs.scene_box.aabb, torch.tensor([[-1, -0.5, -0.25], [1, 0.5, 0.25]]))
     assert outputs.dataparser_scale == pytest.approx(0.5)
-    torch.testing.assert_close(outputs.dataparser_transform[:, 3], torch.tensor([-3.0, -3.0, -3.5]))
+    torch.testing.assert_close(outputs.dataparser_transform[:, 3], torch.tensor([-1.0, 1.0, -0.5]))
     doubled = parse(scene.path, scale_factor=2.0)
     torch.testing.assert_close(doubled.scene_box.aabb, 2 * outputs.scene_box.aabb)
 
@@ -377,6 +378,11 @@ def test_no_json_and_broken_json(scene_folder, tmp_path):
         (lambda f: f.update(thermal_camera={"w": 9, "h": 9}), "frame 3.*no fl_x"),
         (lambda f: f.update(thermal_camera=dict(w=13, h=10, fl_x=9, fl_y=9, cx=6, cy=5)), "13 x 10"),
         (lambda f: f.update(mask_path=None), "frame 3.*mask_path.*None"),
+        (lambda f: f.update(cx=1e9), "frame 3.*principal point in or near the image.*got cx 1e"),
+        (lambda f: f.update(k1=1e6), r"frame 3.*where they can be, got k1 1e\+06"),
+        (lambda f: f.update(fl_x=True), "frame 3.*numbers as intrinsics.*got true or false"),
+        (lambda f: f["transform_matrix"][0].__setitem__(3, 1e30), r"frame 3.*within 1e\+08 units of the origin"),
+        (lambda f: f.update(file_path="a" * 300), "a{200}.*File name too long. Check permissions and names"),
     ],
 )
 def test_bad_frames_are_named(scene_folder, change, message):
@@ -384,6 +390,76 @@ def test_bad_frames_are_named(scene_folder, change, message):
     change(scene.meta["frames"][3])
     scene.rewrite()
     with pytest.raises(SceneError, match=message):
+        parse(scene.path)
+
+
+def look_away(scene) -> None:
+    for frame in scene.meta["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([-1.0, 1.0, -1.0, 1.0])).tolist()
+
+
+def turn_photograph(scene) -> None:
+    """As a phone stores it that was held upright."""
+    scene.meta["frames"][3]["file_path"] = "images/turned.jpg"
+    tags = Image.Exif()
+    tags[0x0112] = 6
+    Image.new("RGB", (18, 24)).save(scene.path / "images" / "turned.jpg", exif=tags)
+    (scene.path / "thermal" / "frame_train_003.png").rename(scene.path / "thermal" / "turned.png")
+
+
+def half_in_kelvin(scene) -> None:
+    (scene.path / "temperature_bounds.json").unlink()
+    for number, frame in enumerate(scene.meta["frames"]):
+        name = Path(frame["file_path"]).stem
+        frame["thermal_file_path"] = f"thermal/{name}.npy"
+        np.save(scene.path / "thermal" / f"{name}.npy", np.eye(18, 24) + 20.0 + 273.15 * (number >= 5))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            look_away,
+            r"cameras: expected photographs that look at the scene box, from .*got 0.0% of .*and 100% of the 8",
+        ),
+        (turn_photograph, "frame 3.*EXIF orientation 6: it is stored on its side.*mogrify -auto-orient"),
+        (half_in_kelvin, "one unit in all files, got 4 of 8 files 273 degrees above the others.*Subtract 273.15"),
+    ],
+)
+def test_what_is_odd_is_named_as_what_it_is(scene_folder, change, message):
+    scene = scene_folder()
+    change(scene)
+    scene.rewrite()
+    with pytest.raises(SceneError, match=message):
+        parse(scene.path)
+
+
+def test_kelvins_that_are_meant_are_read(scene_folder):
+    scene = scene_folder()
+    half_in_kelvin(scene)
+    scene.rewrite()
+    found = parse(scene.path, valid_range_c=(-100.0, 1999.0)).metadata["temperature_range"]
+    assert found.max_c == pytest.approx(294.15)
+
+
+def test_nested_json_is_refused(scene_folder):
+    scene = scene_folder()
+    (scene.path / "transforms.json").write_text("[" * 200_000)
+    with pytest.raises(SceneError, match="expected a readable json file"):
+        parse(scene.path)
+
+
+def test_a_file_that_may_not_be_read_is_not_called_damaged(scene_folder, monkeypatch):
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    scene = scene_folder()
+    monkeypatch.setattr(Path, "read_text", refuse)
+    with pytest.raises(SceneError, match=r"transforms.json: expected a file that can be read.*Check its permissions"):
+        parse(scene.path)
+    monkeypatch.undo()
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    with pytest.raises(SceneError, match=r"scene folder: expected a file or folder that can be read.*permissions"):
         parse(scene.path)
 
 
@@ -447,6 +523,9 @@ def test_bad_options(scene_folder):
     for option in ({"downscale_factor": 0}, {"scale_factor": 0.0}, {"eval_mode": "interval", "eval_interval": 1}):
         with pytest.raises(SceneError, match=next(iter(option)) if len(option) == 1 else "eval_interval"):
             parse(scene.path, **option)
+    for limits in ((math.nan, 30.0), (30.0, -100.0), (-300.0, 10.0)):
+        with pytest.raises(SceneError, match="valid_range_c: expected a lower and a higher temperature"):
+            parse(scene.path, valid_range_c=limits)
 
 
 def test_config_is_read_from_the_command_line():

@@ -19,7 +19,6 @@ from nerfstudio.data.utils.dataloaders import FixedIndicesEvalDataloader, RandIn
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.dataset import ThermalDataset
@@ -167,10 +166,6 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
         return self.config.train_num_rays_per_batch if sampler is None else sampler.num_rays_per_batch
 
     def _sampler(self, dataset: ThermalDataset) -> RaySampler:
-        if self.config.seed < 0:
-            raise SceneError(
-                "seed", expected="0 or more", got=self.config.seed, remedy="Pass --pipeline.datamanager.seed 42."
-            )
         storage = self.device if self.config.images_on_gpu else "cpu"
         return RaySampler(dataset, self.config.streams, storage, self.device)
 

@@ -19,7 +19,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError, ThermalFileError
 from thermoxels_ns.core.feature_rays import FeatureRays
-from thermoxels_ns.core.units import TemperatureRange
+from thermoxels_ns.core.units import ZERO_CELSIUS_K, TemperatureRange
 from thermoxels_ns.data.colmap_tracks import TrackSource, find_feature_rays
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
@@ -32,6 +32,10 @@ SCENE_SIZE = 2.0
 _FAR_SIDES = 16.0
 """Farther from the origin than this many times its longest side, as in national coordinates, a box is far: shifts in
 single precision are then off by more than a millionth of it."""
+_LEAST_THAT_MEETS = 0.01
+"""Share of the rays that must meet the scene box."""
+_LEAST_OF_KELVINS, _SAME_PLACE_K = 200.0, 40.0
+"""Median from which on a file may hold kelvins, and how far it may then be from the other files."""
 _MOST_FRAMES = 64
 """Frames per resolution that the search for dead pixels keeps in memory."""
 
@@ -192,6 +196,11 @@ class ThermalDataParser(DataParser):
 
     def _read_scene(self) -> _Scene:
         config = self.config
+        low, high = config.valid_range_c
+        if not -ZERO_CELSIUS_K <= low < high:
+            expected, got = "a lower and a higher temperature in degrees Celsius", f"{low} and {high}"
+            remedy = "Pass --valid-range-c -100 2000."
+            raise SceneError("valid_range_c", expected=expected, got=got, remedy=remedy)
         file = read_scene_file(Path(config.data), config.missing_thermal)
         names = [frame.name for frame in file.frames]
         split = split_frames(
@@ -205,10 +214,12 @@ class ThermalDataParser(DataParser):
             file.bounds_c,
             {file.frames[index].thermal for index in split.train},
         )
+        met = _share_that_meets([file.frames[index] for index in split.train], world, box, box_source)
         evaluation = set(split.val) | set(split.test)
         CONSOLE.print(
             f"Scene {file.folder.resolve().name}: {len(names)} frames, {len(split.train)} train, {len(evaluation)} "
-            f"evaluate ({split.how}); box from {box_source}; {survey.temperature_range.min_c:.2f} to "
+            f"evaluate ({split.how}); box from {box_source}, which {met:.0%} of the "
+            f"rays meet; {survey.temperature_range.min_c:.2f} to "
             f"{survey.temperature_range.max_c:.2f} C."
         )
         if file.left_out:
@@ -262,6 +273,52 @@ class ThermalDataParser(DataParser):
         )
 
 
+def _share_that_meets(frames: list[Frame], world: _World, box: SceneBox, source: str) -> float:
+    """Share of the rays of photographs that meet the scene box, on a grid of 8 x 8 rays each.
+
+    Lenses other than perspective ones count as seeing it.
+
+    Raises:
+        SceneError: Next to none does: nothing could be learned.
+    """
+    corners, shares = box.aabb.double().numpy(), []
+    poses = world.poses(np.stack([frame.pose for frame in frames])).double().numpy()
+    x, y = (each.ravel() for each in np.meshgrid(*2 * [(np.arange(8) + 0.5) / 8]))
+    for frame, pose in zip(frames, poses):
+        lens = frame.intrinsics
+        if lens.lens != "perspective":
+            return 1.0
+        rays = (lens.rays(np.column_stack([x * lens.width, y * lens.height])) * (1.0, -1.0, -1.0)) @ pose[:, :3].T
+        rays = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
+        enter, leave = np.sort((corners[:, None] - pose[:, 3]) / rays, axis=0)
+        shares.append(np.mean(np.maximum(enter.max(axis=1), 0.0) <= leave.min(axis=1)))
+    share = float(np.mean(shares))
+    if share < _LEAST_THAT_MEETS:
+        away = float(np.mean(np.array(shares) == 0.0))
+        raise SceneError(
+            "cameras",
+            expected=f"photographs that look at the scene box, from {source}",
+            got=f"{share:.1%} of their rays meeting it, and {away:.0%} of the {len(frames)} cameras looking past it",
+            remedy="Check that poses are camera to world with x right, y up, z back, or pass --scene-box with its "
+            "corners in their coordinates: xmin ymin zmin xmax ymax zmax.",
+        )
+    return share
+
+
+def _refuse_mixed_units(middles_c: dict[Path, float]) -> None:
+    """Refuse files that read 273 K more than the others, by their medians: they hold kelvins."""
+    usual = [middle for middle in middles_c.values() if middle < _LEAST_OF_KELVINS]
+    shifted = [
+        path.name
+        for path, middle in middles_c.items()
+        if usual and middle >= _LEAST_OF_KELVINS and abs(middle - ZERO_CELSIUS_K - np.median(usual)) < _SAME_PLACE_K
+    ]
+    if shifted:
+        got = f"{len(shifted)} of {len(middles_c)} files 273 degrees above the others, such as {shifted[0]}"
+        remedy = "Subtract 273.15 in these files. If they are as hot as that, pass --valid-range-c -100 1999."
+        raise ThermalFileError("thermal images", expected="one unit in all files", got=got, remedy=remedy)
+
+
 def survey_thermal_files(
     paths: Sequence[Path],
     unit: ThermalUnit,
@@ -280,6 +337,7 @@ def survey_thermal_files(
     """
     shapes: dict[Path, tuple[int, int]] = {}
     extremes: dict[Path, tuple[float, float]] = {}
+    middles: dict[Path, float] = {}
     kept: dict[tuple[int, int], list[npt.NDArray[np.float32]]] = {}
     trains = [training is None or path in training for path in paths]
     # Counted among the training files: every other file of all may be an evaluation's.
@@ -297,6 +355,9 @@ def survey_thermal_files(
         if len(extremes) % step == 0:
             kept.setdefault((height, width), []).append(temperature_c)
         extremes[path] = (float(np.nanmin(temperature_c)), float(np.nanmax(temperature_c)))
+        middles[path] = float(np.nanmedian(temperature_c))
+    if tuple(valid_range_c) == ThermalDataParserConfig.valid_range_c:
+        _refuse_mixed_units(middles)
     dead = {shape: find_dead_pixels(np.stack(frames)) for shape, frames in kept.items()}
     dead = {shape: mask for shape, mask in dead.items() if mask.any()}
     for path in extremes:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, read_model
 from thermoxels_ns.data.scene_file import Frame, SceneFile
+from thermoxels_ns.data.transforms_json import read_pose
 
 Box = npt.NDArray[np.float64]
 """Lowest and highest corner, shape (2, 3)."""
@@ -153,10 +154,9 @@ def _read_colmap(folder: str, scene: SceneFile) -> npt.NDArray[np.float64]:
     centres = {Path(image.name).name: np.asarray(image.projection_center()) for image in model.images.values()}
     known = [(centres[frame.image.name], frame.pose[:3, 3]) for frame in scene.frames if frame.image.name in centres]
     in_colmap, in_json = (np.array(side).reshape(-1, 3) for side in (zip(*known) if known else ([], [])))
-    given = scene.meta.get("applied_transform")
-    candidates = (
-        [np.array(given, dtype=np.float64)[:3, :4]] if given is not None else [np.eye(4)[:3], _LEGACY_TRANSFORM]
-    )
+    candidates = [np.eye(4)[:3], _LEGACY_TRANSFORM]
+    if "applied_transform" in scene.meta:
+        candidates = [read_pose(scene.meta["applied_transform"], "applied_transform", turned=False)[:3]]
     for transform in candidates if known else []:
         off = np.linalg.norm(in_colmap @ transform[:, :3].T + transform[:, 3] - in_json, axis=1)
         spread = np.linalg.norm(in_json - in_json.mean(axis=0), axis=1).max()

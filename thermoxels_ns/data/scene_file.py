@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.camera import Camera
+from thermoxels_ns.core.checks import plain_os_errors
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.data.transforms_json import read_intrinsics, read_pose
@@ -54,6 +55,7 @@ class SceneFile:
     """Names of frames and files that missing_thermal="skip" left out."""
 
 
+@plain_os_errors("scene folder", "a file or folder that can be read", "Check permissions and names.", SceneError)
 def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "error") -> SceneFile:
     """Read a scene folder (or the json in it) and check all that can be checked without decoding images.
 

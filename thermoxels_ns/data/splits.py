@@ -77,7 +77,11 @@ def _by_lists(names: Sequence[str], meta: Mapping[str, Any], left_out: Sequence[
     position = {Path(name).as_posix(): i for i, name in enumerate(names)}
     found: dict[str, list[int] | None] = {}
     for side, key in _KEYS.items():
-        listed = [Path(str(name)).as_posix() for name in meta[key]] if key in meta else None
+        given = meta.get(key, [])
+        if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
+            remedy = 'Write ["images/a.jpg", "images/b.jpg"], for example.'
+            raise SceneError(key, expected="a list of file names", got=repr(given)[:80], remedy=remedy)
+        listed = [Path(name).as_posix() for name in given] if key in meta else None
         listed = None if listed is None else [name for name in listed if name not in left_out]
         unknown = [name for name in listed or [] if name not in position]
         if unknown:

@@ -13,6 +13,12 @@ from thermoxels_ns.core.camera import Camera, Lens
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.decoders import errors_name
 
+_NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
+_ORIENTATION = 0x0112
+_MOST_DISTORTION = 10.0
+"""Most that a term of the distortion may move a corner of the image, in distances from the corner to the middle."""
+MOST_UNITS = 1e8
+"""Farthest that a camera may be from the origin of its coordinates: the earth is 6.4e6 m in radius."""
 DAMAGED_PHOTOGRAPH = "The file is damaged; copy it again or remove the frame."
 _LENS_OF_MODEL: dict[str, Lens] = {
     "SIMPLE_PINHOLE": "perspective",
@@ -26,8 +32,11 @@ _LENS_OF_MODEL: dict[str, Lens] = {
 """nerfstudio's camera models whose rays start in one point."""
 
 
-def read_pose(values: Any, where: str) -> npt.NDArray[np.float64]:
-    """Check a camera-to-world matrix (3 x 4 or 4 x 4): finite, and a rotation in its upper left."""
+def read_pose(values: Any, where: str, turned: bool = True) -> npt.NDArray[np.float64]:
+    """Check a camera-to-world matrix (3 x 4 or 4 x 4): finite, within `MOST_UNITS`, a rotation in its upper left.
+
+    With `turned` False it may be any linear map there.
+    """
     try:
         matrix = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
@@ -39,8 +48,11 @@ def read_pose(values: Any, where: str) -> npt.NDArray[np.float64]:
     remedy = "Remove the frame or run structure from motion again."
     if not np.isfinite(pose).all():
         raise SceneError(where, expected="finite numbers", got="NaN or infinity", remedy=remedy)
+    if np.abs(pose[:3, 3]).max() > MOST_UNITS:
+        expected = f"coordinates within {MOST_UNITS:.0e} units of the origin"
+        raise SceneError(where, expected=expected, got=pose[:3, 3].tolist(), remedy=remedy)
     rotation = pose[:3, :3]
-    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-2 or np.linalg.det(rotation) < 0:
+    if turned and (np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-2 or np.linalg.det(rotation) < 0):
         raise SceneError(where, expected="a rotation in the upper left 3 x 3", got=rotation.tolist(), remedy=remedy)
     return pose
 
@@ -60,6 +72,8 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
         )
     size = _image_size(image, where) if image is not None else None
     try:
+        if any(isinstance(value, bool) for key, value in values.items() if key in _NUMBERS):
+            raise ValueError("true or false")
         width, height = (
             int(values[key]) if size is None else int(values.get(key, size[i])) for i, key in enumerate("wh")
         )
@@ -79,6 +93,14 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
     except (TypeError, ValueError, OverflowError) as problem:
         expected = "numbers as intrinsics, six of them for distortion_params"
         raise SceneError(where, expected=expected, got=problem, remedy=remedy) from problem
+    _refuse_odd(camera, where)
+    if size is not None and (height, width) == size and _orientation(image) > 4:
+        raise SceneError(
+            where,
+            expected=f"a photograph stored as {width} x {height} pixels, as the intrinsics say",
+            got=f"{size[0]} x {size[1]} and EXIF orientation {_orientation(image)}: it is stored on its side",
+            remedy="Turn the photographs themselves: mogrify -auto-orient images/* (ImageMagick) does.",
+        )
     if size is not None and (width, height) != size:
         raise SceneError(
             where,
@@ -87,6 +109,27 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
             remedy="Use the photographs that the poses were computed from, or scale the intrinsics.",
         )
     return camera
+
+
+def _refuse_odd(camera: Camera, where: str) -> None:
+    """Refuse a principal point or a distortion that no lens has."""
+    if camera.lens == "equirectangular":
+        return
+    corner = 0.5 * float(np.hypot(camera.width / camera.fl_x, camera.height / camera.fl_y))
+    shifts = {"cx": camera.cx / camera.width, "cy": camera.cy / camera.height}
+    odd = [name for name, shift in shifts.items() if not -1.0 <= shift <= 2.0]
+    odd += [f"k{n}" for n in (1, 2, 3, 4) if abs(camera.distortion[n - 1]) * corner ** (2 * n) > _MOST_DISTORTION]
+    if odd:
+        expected = "a principal point in or near the image, and distortion that leaves the corners where they can be"
+        got = ", ".join(f"{name} {getattr(camera, name):g}" for name in odd)
+        remedy = "Correct the json; lengths are in pixels, k1 to k4 as in OpenCV."
+        raise SceneError(where, expected=expected, got=got, remedy=remedy)
+
+
+def _orientation(path: Path | None) -> int:
+    """EXIF orientation of a photograph, 1 where it has none; above 4 it is stored on its side."""
+    with errors_name(str(path), "a readable photograph", DAMAGED_PHOTOGRAPH), Image.open(str(path)) as image:
+        return int(image.getexif().get(_ORIENTATION, 1))
 
 
 def _image_size(path: Path, where: str) -> tuple[int, int]:
