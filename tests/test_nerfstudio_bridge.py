@@ -15,9 +15,13 @@ import numpy as np
 import pytest
 import torch
 import tyro
+import yaml
+from nerfstudio.configs.method_configs import all_methods
 
 from thermoxels_ns import nerfstudio_bridge
 from thermoxels_ns.commands.export import ExportThermoxelsMesh
+from thermoxels_ns.core.errors import CheckpointError, OutputError
+from thermoxels_ns.training.pipeline import load_checkpoint
 
 STOCK = ("pointcloud", "tsdf", "poisson", "marching-cubes", "cameras", "gaussian-splat")
 HEAVY = ("pyvista", "skfem", "vtkmodules", "pycolmap", "open3d", "thermoxels_ns.mesh", "thermoxels_ns.fem")
@@ -169,9 +173,9 @@ def entrypoint(args):
 def test_hook_keeps_members_and_markers(monkeypatch) -> None:
     exporter = stand_in_exporter()
     monkeypatch.setitem(sys.modules, "nerfstudio.scripts.exporter", exporter)
-    nerfstudio_bridge.extend_exporter()
+    nerfstudio_bridge.extend_commands()
     hooked = exporter.tyro
-    nerfstudio_bridge.extend_exporter()
+    nerfstudio_bridge.extend_commands()
     assert exporter.tyro is hooked is not tyro
     assert exporter.entrypoint(["two", "--size", "5"]) == exporter.Two(5)
     # FlagConversionOff: booleans take a value, for the stock subcommands and for ours.
@@ -198,9 +202,96 @@ def test_numpy_scalars_load_with_weights_only(tmp_path, number) -> None:
     assert loaded == number and type(loaded) is type(number)
 
 
+def stand_in_evaluation() -> ModuleType:
+    """A module with the options of ``ns-eval``."""
+    script = ModuleType("nerfstudio.scripts.eval")
+    code = """
+import tyro
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Optional
+
+@dataclass
+class ComputePSNR:
+    output_path: Path = Path("output.json")
+    render_output_path: Optional[Path] = None
+
+    def main(self):
+        pass
+"""
+    exec(compile(code, "eval.py", "exec", dont_inherit=True), vars(script))
+    return script
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--output-path", "file/e.json"], "a folder that can be written to at file"),
+        (["--output-path", "folder.json"], "no folder in the place of a file"),
+        (["--output-path", "results"], r"a name that ends in .json, got 'results'"),
+        (["--render-output-path", "file"], "a folder that can be written to at file"),
+    ],
+)
+def test_an_evaluation_finds_out_first_that_it_cannot_write(tmp_path, monkeypatch, options, message):
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    Path("folder.json").mkdir()
+    script = stand_in_evaluation()
+    monkeypatch.setitem(sys.modules, script.__name__, script)
+    nerfstudio_bridge.extend_commands()
+    assert script.tyro.cli(script.ComputePSNR, args=["--output-path", "new/e.json"]).output_path.name == "e.json"
+    with pytest.raises(OutputError, match=message):
+        script.tyro.cli(script.ComputePSNR, args=options)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "!!python/object/apply:os.mkdir [harmful]",
+        "{fine: 1, ? !!python/object/apply:os.mkdir [harmful] : 1}",
+        "!<tag:yaml.org,2002:python/object/apply:os.mkdir> [harmful]",
+        "!!python/object/new:os.mkdir [harmful]",
+        "!!python/object/apply:eval [1]",
+        "!!python/object:subprocess.Popen {}",
+        "!!python/object:nerfstudio.engine.trainer.Trainer {}",
+        "!!python/object/apply:nerfstudio.utils.scripts.run_command [mkdir harmful]",
+        "!!python/name:nerfstudio.utils.scripts.run_command",
+        "!!python/name:nerfstudio.utils.writer.Path",
+        "!!python/name:thermoxels_ns.no_such_module.Config",
+        "!!python/module:this",
+        "[" * 5000,
+    ],
+)
+def test_a_config_that_could_run_code_is_refused(tmp_path, monkeypatch, line):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(CheckpointError, match=r"load_config: expected a config\.yml that"):
+        yaml.load(line, Loader=yaml.Loader)
+    assert not Path("harmful").exists()
+
+
+def test_configs_of_all_methods_are_read():
+    for config in all_methods.values():
+        assert yaml.load(yaml.dump(config), Loader=yaml.Loader) == config
+
+
 class Harmful:
     def __reduce__(self):
         return (os.mkdir, ("harmful",))
+
+
+@pytest.mark.parametrize("content", ["harmful", "damaged", "empty"])
+def test_a_refused_checkpoint_is_one_line_whatever_the_default_of_torch(tmp_path, monkeypatch, content):
+    """Torch up to 2.5 loads anything by default, and newer ones advise to."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")
+    torch.save({"lr": Harmful()}, "bad.ckpt")
+    if content != "harmful":
+        Path("bad.ckpt").write_bytes(b"PK" if content == "damaged" else b"")
+    with pytest.raises(CheckpointError, match=r"^bad.ckpt: expected a checkpoint") as caught:
+        load_checkpoint(Path("bad.ckpt"), map_location="cpu")
+    said = str(caught.value)
+    assert "weights" not in said and "\n" not in said and not Path("harmful").exists()
+    assert (content == "harmful") == ("mkdir, which could run code" in said)
 
 
 def test_other_objects_are_still_refused(tmp_path, monkeypatch) -> None:

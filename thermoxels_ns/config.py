@@ -17,7 +17,7 @@ from thermoxels_ns.training.model_config import ThermoxelsModelConfig
 from thermoxels_ns.training.optimizers import FusedAdamConfig, RowAdamConfig, RowRMSpropConfig
 from thermoxels_ns.training.pipeline import ThermoxelsPipeline, ThermoxelsPipelineConfig
 from thermoxels_ns.training.schedule import QUALITIES
-from thermoxels_ns.training.trainer import ThermoxelsTrainerConfig
+from thermoxels_ns.training.trainer import LOCAL_HOST, ThermoxelsTrainerConfig
 
 nerfstudio_bridge.install()
 ThermoxelsPipeline.compare_with_truth = nerfstudio_bridge.compare_with_truth
@@ -58,7 +58,7 @@ def _trainer(
             "background": _group(0.05, 0.005, dense),
             "thermal_offset": _group(0.002, 0.0002, dense),
         },
-        viewer=ViewerConfig(quit_on_train_completion=True),
+        viewer=ViewerConfig(websocket_host=LOCAL_HOST, quit_on_train_completion=True),
         vis="viewer",
     )
 

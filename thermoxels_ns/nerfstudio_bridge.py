@@ -2,29 +2,41 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import warnings
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
 from types import ModuleType, TracebackType
 from typing import TYPE_CHECKING, Annotated, Any, Union, get_args
 
 import numpy as np
 import torch
 import tyro
+import yaml
 
-from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.checks import refuse_what_is_in_the_way, writable_folder
+from thermoxels_ns.core.config_loader import ConfigLoader
+from thermoxels_ns.core.errors import OutputError, ThermoxelsError
+from thermoxels_ns.core.module_with import ModuleWith
 from thermoxels_ns.core.option_help import join_help_lines
 
 if TYPE_CHECKING:
     from thermoxels_ns.training.pipeline import ThermoxelsPipeline
 
-_EXPORTER = "nerfstudio.scripts.exporter"
-_SUBCOMMAND = "thermoxels-mesh"
+_EXPORTER, _TRAIN = "nerfstudio.scripts.exporter", "nerfstudio.scripts.train"
+_EVALUATIONS = ("nerfstudio.scripts.eval", "nerfstudio.scripts.render")
+_SUBCOMMAND, _DATAPARSER = "thermoxels-mesh", "thermal-data"
+METHODS = ("thermoxels", "thermoxels-paper", "thermoxels-arco", "plenoxels-t")
+"""Names of our methods."""
 
 
 def install() -> None:
     """Add what nerfstudio lacks; calling it again changes nothing."""
     allow_checkpoint_globals()
-    extend_exporter()
+    yaml.Loader = ConfigLoader  # nerfstudio says yaml.load(..., Loader=yaml.Loader), which would run code from a file
+    extend_commands()
     print_our_errors_plainly()
     # nerfstudio 1.1.5 indexes rays with lists; recent torch says so several times per camera.
     warnings.filterwarnings("ignore", message="Using a non-tuple sequence for multidimensional indexing")
@@ -52,52 +64,77 @@ def print_our_errors_plainly() -> None:
 def allow_checkpoint_globals() -> None:
     """Let ``torch.load(weights_only=True)`` read the numpy scalars that nerfstudio's checkpoints hold.
 
-    Learning-rate schedulers save numpy numbers beside the tensors. Since torch 2.6 `torch.load` refuses any type
-    that is not registered as harmless; these are: a scalar, its dtype and the classes of the plain number types.
-    Torch without the registry loads them anyway.
+    Learning-rate schedulers save numpy numbers beside the tensors, and it refuses any type that is not registered as
+    harmless; these are: a scalar, its dtype and the classes of the plain number types.
     """
-    register = getattr(torch.serialization, "add_safe_globals", None)
-    if register is None:
-        return
     numbers = (
         *(np.bool_, np.int8, np.int16, np.int32, np.int64, np.uint8, np.uint16, np.uint32, np.uint64),
         *(np.float16, np.float32, np.float64),
     )
     # The function that pickle names: numpy.core.multiarray.scalar in numpy 1, numpy._core.multiarray.scalar in 2.
-    rebuild_scalar = np.float64(0).__reduce__()[0]
+    rebuild_scalar: Any = np.float64(0).__reduce__()[0]
+    register = torch.serialization.add_safe_globals
     register([rebuild_scalar, np.dtype, *dict.fromkeys(type(np.dtype(number)) for number in numbers)])
 
 
-def extend_exporter() -> None:
-    """Make ``thermoxels-mesh`` a subcommand of nerfstudio's ``ns-export``, beside all of its own.
+def extend_commands() -> None:
+    """Make ``thermoxels-mesh`` a subcommand of ``ns-export``, and let commands find out first where they cannot write.
 
-    nerfstudio's exporter hands its union of subcommands to ``tyro.cli`` when it starts. Its module gets a `tyro` of
-    its own whose `cli` extends that union and whose everything else is tyro's. Only a process that has the
-    exporter loaded, or is loading it while it imports this plugin, is touched: the other commands never load it.
+    nerfstudio's scripts hand what they can be told to ``tyro.cli`` when they start. Their modules get a `tyro` of their
+    own with another `cli`. Only a process that has such a script loaded, or is loading it while it imports this plugin,
+    is touched: the other commands never load it.
     """
     main = sys.modules.get("__main__")
-    candidates = [sys.modules.get(_EXPORTER)]
-    if getattr(getattr(main, "__spec__", None), "name", None) == _EXPORTER:  # python -m nerfstudio.scripts.exporter
-        candidates.append(main)
-    for exporter in candidates:
-        if exporter is not None and getattr(exporter, "tyro", None) is tyro:
-            vars(exporter)["tyro"] = _ExporterTyro(exporter)
+    for name in (_EXPORTER, _TRAIN, *_EVALUATIONS):
+        candidates = [sys.modules.get(name)]
+        if getattr(getattr(main, "__spec__", None), "name", None) == name:  # python -m nerfstudio.scripts.exporter
+            candidates.append(main)
+        for script in candidates:
+            if script is not None and getattr(script, "tyro", None) is tyro:
+                vars(script)["tyro"] = ModuleWith(tyro, cli=partial(_cli, script, name))
 
 
-class _ExporterTyro(ModuleType):
-    """Tyro, as nerfstudio's exporter sees it."""
+def _cli(script: ModuleType, name: str, f: Any, *, args: Sequence[str] | None = None, **kwargs: Any) -> Any:
+    """Call `tyro.cli` with what our commands need, and see that results can be written before there are any.
 
-    def __init__(self, exporter: ModuleType) -> None:
-        super().__init__("tyro", doc=tyro.__doc__)
-        self._exporter = exporter
+    The exporter's own union has our subcommand too; options of our dataparser may stand anywhere behind ns-train.
+    """
+    words = sys.argv[1:] if args is None else list(args)
+    stock = name == _EXPORTER and f is vars(script).get("Commands")
+    words = _with_dataparser_last(words) if name == _TRAIN else words
+    command = tyro.cli(_with_mesh_export(f) if stock else f, args=words, **kwargs)
+    for name in ("output_path", "output_dir", "render_output_path"):
+        path = getattr(command, name, None)
+        if isinstance(path, Path) and callable(getattr(command, "main", None)):
+            file = path if path.suffix and name == "output_path" else None
+            refuse_what_is_in_the_way(writable_folder(path.parent if file else path), [file.name] if file else [])
+    if hasattr(command, "render_output_path") and command.output_path.suffix != ".json":
+        got, remedy = repr(command.output_path.name), "Pass --output-path eval.json."
+        raise OutputError("output_path", expected="a name that ends in .json", got=got, remedy=remedy)
+    return command
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(tyro, name)
 
-    def cli(self, f: Any, *args: Any, **kwargs: Any) -> Any:
-        """Call `tyro.cli`, with our subcommand added where the exporter's own union is asked for."""
-        stock = vars(self._exporter).get("Commands")
-        return tyro.cli(_with_mesh_export(f) if f is stock else f, *args, **kwargs)
+def _with_dataparser_last(words: list[str]) -> list[str]:
+    """Move options of our dataparser behind the word thermal-data, where tyro wants them.
+
+    >>> " ".join(_with_dataparser_last("thermoxels --missing-thermal skip --data SCENE".split()))
+    'thermoxels --data SCENE thermal-data --missing-thermal skip'
+    """
+    from nerfstudio.configs.dataparser_configs import all_dataparsers
+
+    from thermoxels_ns.data.dataparser import ThermalDataParserConfig
+
+    ours = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(ThermalDataParserConfig)} - {"--data"}
+    if not words or words[0] not in METHODS or (all_dataparsers.keys() - {_DATAPARSER}) & set(words):
+        return words
+    kept, moved, behind = list[str](), list[str](), False
+    for word in words:
+        if word.startswith("--"):
+            behind = word.partition("=")[0].replace("_", "-") in ours
+        elif word == _DATAPARSER:
+            behind = False
+        (moved if behind else kept).append(word)
+    return [*kept, *([_DATAPARSER] if moved and _DATAPARSER not in kept else []), *moved]
 
 
 def _with_mesh_export(commands: Any) -> Any:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import resource
+import time
 from copy import deepcopy
 from pathlib import Path
+from typing import Any
 
 import pytest
 import tyro
+from nerfstudio.configs.base_config import ViewerConfig
+from numba import njit
 
 from tests.support.boxed_scene import write_boxed_scene
 from thermoxels_ns.config import thermoxels
-from thermoxels_ns.core.errors import CheckpointError
+from thermoxels_ns.core.errors import CheckpointError, OutputError, ThermoxelsError
 from thermoxels_ns.synthetic.scene_folder import make_scene
+from thermoxels_ns.training import pipeline
 from thermoxels_ns.training.schedule import QUALITIES, schedule_for
 from thermoxels_ns.training.trainer import ThermoxelsTrainer, writer
 
@@ -33,13 +39,18 @@ def one_writer_at_a_time(monkeypatch) -> None:
 
 def trainer(scene: Path, folder: Path, *options: str) -> ThermoxelsTrainer:
     """The trainer that ns-train would make."""
+    return configured(scene, folder, *options).setup(local_rank=0, world_size=1)
+
+
+def configured(scene: Path, folder: Path, *options: str) -> Any:
+    """What ns-train reads from its command line."""
     fixed = ["--vis", "tensorboard", "--machine.device-type", "cpu"]
     fixed += ["--output-dir", str(folder), "--experiment-name", "e", "--timestamp", "run", "--data", str(scene)]
     before = deepcopy(thermoxels.config)
     settings = (tyro.conf.FlagConversionOff,)
     config = tyro.cli(type(before), default=before, args=[*fixed, *options], config=settings)
     config.pipeline.datamanager.data = config.data
-    return config.setup(local_rank=0, world_size=1)
+    return config
 
 
 @pytest.fixture(scope="module")
@@ -138,3 +149,111 @@ def test_a_quality_sets_resolution_and_length_and_leaves_the_defaults_alone(qual
     assert config.pipeline.model.thin_at == schedule_for(resolution, steps).thin_at
     assert thermoxels.config.max_num_iterations == QUALITIES["standard"][1]
     assert thermoxels.config.pipeline.model.resolutions[-1] == QUALITIES["standard"][0]
+
+
+@pytest.mark.parametrize(
+    ("words", "host"),
+    [((), "127.0.0.1"), (("--viewer.websocket-host", "0.0.0.0"), "0.0.0.0"), (("--vis",), "127.0.0.1")],
+)
+def test_the_viewer_listens_on_this_machine_unless_told_otherwise(monkeypatch, words, host):
+    """ns-viewer replaces the viewer of a training by that of its own command line."""
+    monkeypatch.setattr("sys.argv", ["ns-viewer", *words])
+    config = deepcopy(thermoxels.config)
+    assert config.viewer.websocket_host == "127.0.0.1"
+    config.viewer = ViewerConfig()
+    assert config.viewer.websocket_host == host
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            ["--max-num-iterations", "0"],
+            r"max_num_iterations: expected 1 or more, got 0. Correct --max-num-iterations.",
+        ),
+        (["--max-num-iterations", "-5"], "max_num_iterations: expected 1 or more, got -5"),
+        (["--machine.seed", "-1"], "seed: expected from 0 .*, got -1. Correct --machine.seed."),
+        (["--pipeline.model.seed", "-1"], "seed: expected from 0 .*, got -1. Correct --pipeline.model.seed."),
+        (["--pipeline.datamanager.train-num-rays-per-batch", "0"], "train_num_rays_per_batch: expected 1 or more"),
+        (["--pipeline.datamanager.thermal-num-rays-per-batch", "-1"], "thermal_num_rays_per_batch: expected 1 or more"),
+        (
+            ["--optimizers.density.optimizer.lr", "-0.3"],
+            r"lr: expected above 0, got -0.3. Correct --optimizers.density",
+        ),
+        (["--optimizers.sh.scheduler.lr-final", "0"], "lr_final: expected above 0, got 0"),
+        (["--pipeline.model.loss-overrides", "rgb", "nan"], "expected a finite number, 0 or more, got nan"),
+        (
+            ["--machine.device-type", "cuda"],
+            "device_type: expected one of cpu.*got cuda. Pass --machine.device-type cpu",
+        ),
+        (["--experiment-name", "e" * 300], "File name too long"),
+    ],
+)
+def test_what_cannot_work_is_refused_before_anything_is_written(scene, tmp_path, monkeypatch, options, message):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(ThermoxelsError, match=message):
+        configured(scene, tmp_path / "out", *options).save_config()
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_two_trainings_into_one_folder_are_refused(scene, tmp_path):
+    configured(scene, tmp_path).save_config()
+    with pytest.raises(
+        OutputError, match=r"no other command is working in, got .*where process \d+ is at work.*--time"
+    ):
+        configured(scene, tmp_path, "--max-num-iterations", "7").save_config()
+    assert "max_num_iterations: 7" not in (tmp_path / "e" / "thermoxels" / "run" / "config.yml").read_text()
+
+
+def test_a_finished_training_goes_on_as_it_was_without_its_options(scene, tmp_path, monkeypatch):
+    """The remedy of a finished quality: leave it out and pass a number of steps."""
+    options = ["--pipeline.model.resolutions", "32", "--pipeline.model.refine-at", "--max-num-iterations", "800"]
+    made = trainer(scene, tmp_path, *options, "--optimizers.sh.scheduler.max-steps", "800")
+    made.config.save_config()
+    made.setup()
+    made.save_checkpoint(799)
+    again = trainer(scene, tmp_path / "again", "--load-dir", str(made.checkpoint_dir), "--max-num-iterations", "400")
+    again.setup()
+    assert again.config.pipeline.model.resolutions == (32,) and again._start_step == 800
+    assert again.config.optimizers["sh"]["scheduler"].max_steps == 800
+    monkeypatch.setattr("sys.argv", ["ns-train", "--pipeline.model.resolutions", "32", "64", "128"])
+    with pytest.raises(CheckpointError, match="expected at least 128 voxels at step 800"):
+        trainer(scene, tmp_path / "other", "--load-dir", str(made.checkpoint_dir)).setup()
+
+
+def test_a_full_disk_is_one_line_and_loses_no_checkpoint(scene, tmp_path):
+    made = trainer(scene, tmp_path)
+    made.setup()
+    made.save_checkpoint(10)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        with pytest.raises(
+            OutputError,
+            match=r"step-000000020.ckpt: expected room for it, got .*MB of free space. Free space, then .*--load-dir",
+        ):
+            made.save_checkpoint(20)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [path.name for path in made.checkpoint_dir.iterdir()] == ["step-000000010.ckpt"]
+    assert not list(made.checkpoint_dir.parent.glob(".*.part"))
+
+
+def test_a_disk_without_room_for_a_checkpoint_is_refused_first(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 1_000_000}))
+    with pytest.raises(
+        OutputError, match=r"output folder: expected .* MB of space for results in .*, got 1 MB of free"
+    ):
+        configured(scene, tmp_path).save_config()
+
+
+def test_kernels_are_said_to_compile_only_when_they_do(monkeypatch):
+    said: list[str] = []
+    pipeline.compile_kernels(said.append)  # perhaps for the first time
+    render, said = pipeline.fused_render, []
+    monkeypatch.setattr(pipeline, "fused_render", lambda *given: (time.sleep(1.2), render(*given))[1])
+    pipeline.compile_kernels(said.append)
+    assert said == []
+    monkeypatch.setattr(pipeline, "fused_render", lambda *given: (njit(lambda x: x + 1)(1), render(*given))[1])
+    pipeline.compile_kernels(said.append)
+    assert said == ["compiling the kernels for this processor: 10 to 30 s, the first time"]

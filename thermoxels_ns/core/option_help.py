@@ -1,10 +1,11 @@
-"""Texts of options as whole paragraphs, which ``--help`` breaks at the terminal's width."""
+"""Options of the command line: their texts as paragraphs for ``--help``, and which of them were typed."""
 
 from __future__ import annotations
 
 import ast
 import dataclasses
 import inspect
+import sys
 import textwrap
 from collections.abc import Iterator, Mapping
 from types import MappingProxyType
@@ -26,6 +27,12 @@ def join_help_lines(*configs: Any) -> None:
             if field.name in texts:
                 # Where tyro looks first. Fields are shared with the classes that inherit them.
                 field.metadata = MappingProxyType({**field.metadata, "help": joined_lines(texts[field.name])})
+
+
+def typed(option: str) -> bool:
+    """Whether this process was started with an option, or with one whose name goes on after it."""
+    start = option.replace("_", "-")
+    return any(word.replace("_", "-").startswith(start) for word in sys.argv[1:])
 
 
 def joined_lines(text: str) -> str:

@@ -9,6 +9,7 @@ from typing import ClassVar, Literal
 
 from nerfstudio.models.base_model import ModelConfig
 
+from thermoxels_ns.core.checks import check_ranges
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.field.harmonics import MAX_DEGREE, num_coefficients
 from thermoxels_ns.field.voxel_grid import DensityActivation
@@ -160,6 +161,8 @@ class ThermoxelsModelConfig(ModelConfig):
             "thin_threshold": (0.0, 1.0, "from 0 to 1"),
             "prune_dilation": (0, 100, "from 0 to 100"),
             "temperature_degree": (0, 2, "0, 1 or 2"),
+            "seed": (0, 2**32 - 1, "from 0 to 2^32 - 1"),
+            "eval_num_rays_per_chunk": (1, 1e9, "at least 1"),
             "track_rays": (1, 1e9, "at least 1"),
             "start_density": (1e-30, 1e30, "a finite number above 0"),
             "steps_per_voxel": (0.1, 1000.0, "from 0.1 to 1000"),
@@ -171,17 +174,14 @@ class ThermoxelsModelConfig(ModelConfig):
             "thermal_l2_share": (0.0, 1.0, "from 0 to 1"),
             "tv_share": (1e-6, 1.0, "above 0, at most 1"),
         }
-        values = {name: (float(getattr(self, name)), *limits) for name, limits in ranges.items()}
+        values = {name: (getattr(self, name), *limits) for name, limits in ranges.items()}
         if self.sh_degree is not None:
-            values["sh_degree"] = (float(self.sh_degree), 0, MAX_DEGREE, "None, 0, 1 or 2")
+            values["sh_degree"] = (self.sh_degree, 0, MAX_DEGREE, "None, 0, 1 or 2")
         values |= {
-            f"loss weight {name}": (float(weight), 0.0, 1e30, "a finite number, 0 or more")
+            f"loss_overrides {name}": (weight, 0.0, 1e30, "a finite number, 0 or more")
             for name, weight in vars(self.loss_weights()).items()
         }
-        for name, (value, low, high, expected) in values.items():
-            if not low <= value <= high:  # NaN fails too
-                option = name.replace("_", "-")
-                raise ThermoxelsError(name, expected=expected, got=value, remedy=f"Correct --pipeline.model.{option}.")
+        check_ranges("--pipeline.model.", values)
         for name, at in (("prune_at", self.prune_at), ("thin_at", self.thin_at)):
             if at and min(at) < 1:
                 raise ThermoxelsError(name, expected="steps of at least 1", got=at, remedy="Correct the steps.")

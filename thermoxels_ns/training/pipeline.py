@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-import threading
+import pickle
+import re
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -16,6 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from thermoxels_ns.core.errors import CheckpointError, SceneError
 from thermoxels_ns.core.lattice import Lattice
+from thermoxels_ns.core.module_with import ModuleWith
 from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.core.threads import set_num_threads
@@ -27,8 +30,6 @@ from thermoxels_ns.training.model import ThermoxelsModel
 from thermoxels_ns.training.optimizers import RowAdam
 
 _GRID = "_model.field.grid."
-SILENT_SECONDS = 1.0
-"""Loading kernels that were compiled before takes less."""
 _ACTIVATION = "_model.field.grid.activation_index"
 
 
@@ -58,6 +59,9 @@ class ThermoxelsPipeline(VanillaPipeline):
         if config.cpu_threads is not None and config.cpu_threads < 1:
             raise SceneError("cpu_threads", expected="1 or more", got=config.cpu_threads, remedy="Leave it out.")
         set_num_threads(config.cpu_threads)
+        for module in map(sys.modules.get, ("nerfstudio.engine.trainer", "nerfstudio.utils.eval_utils")):
+            if module is not None:  # they say torch.load(path, map_location="cpu")
+                vars(module)["torch"] = ModuleWith(torch, load=load_checkpoint)
         if "OMP_NUM_THREADS" not in os.environ:
             torch.set_num_threads(max(1, (os.cpu_count() or 2) // 2))
         super().__init__(config, *args, **kwargs)
@@ -186,18 +190,48 @@ class ThermoxelsPipeline(VanillaPipeline):
         return self.model.grid_snapshot(rays, datamanager.training_views())
 
 
+def load_checkpoint(path: Any, **options: Any) -> dict[str, Any]:
+    """Call `torch.load` with ``weights_only=True``, whatever the default of this version of torch is.
+
+    Raises:
+        CheckpointError: The file is damaged, cannot be read, or holds something else than tensors and plain values.
+    """
+    try:
+        return torch.load(path, **{**options, "weights_only": True})
+    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError) as problem:
+        named = re.search(r"GLOBAL ([\w.]+)", str(problem))
+        got = (
+            f"one that names {named[1]}, which could run code" if named else f"a damaged one ({type(problem).__name__})"
+        )
+        remedy = "Use a checkpoint that ns-train of this installation wrote, such as an earlier one beside it."
+        if isinstance(problem, OSError) and problem.errno is not None:
+            got, remedy = problem.strerror, "Check its permissions and the disk."
+        expected = "a checkpoint that can be read, of tensors and numbers"
+        raise CheckpointError(str(path), expected=expected, got=got, remedy=remedy) from problem
+
+
 def _columns(grid: dict[str, tuple[int, ...]]) -> str:
     return ", ".join(f"{name.removeprefix(_GRID)} {' or '.join(map(str, n))}" for name, n in sorted(grid.items()))
 
 
 def compile_kernels(say: Callable[[str], None]) -> None:
-    """Run every kernel once on a few rays; numba keeps the compiled result. What takes long is said."""
-    notice = threading.Timer(
-        SILENT_SECONDS, say, ("compiling the kernels for this processor: 10 to 30 s, the first time",)
-    )
-    notice.daemon = True
-    notice.start()
-    try:
+    """Run every kernel once on a few rays; numba keeps the compiled result. That it compiles is said."""
+    from numba.core import event
+
+    class Once(event.Listener):
+        """Told when numba compiles, not when it loads what it kept."""
+
+        told = False
+
+        def on_start(self, event: Any) -> None:
+            if not self.told:
+                say("compiling the kernels for this processor: 10 to 30 s, the first time")
+            self.told = True
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    with event.install_listener("numba:compile", Once()):
         grid = VoxelGrid(Lattice((-1.0, -1.0, -1.0), 1.0, (3, 3, 3)))
         generator = torch.Generator().manual_seed(0)
         origins = 3.0 * torch.nn.functional.normalize(torch.randn(4, 3, generator=generator), dim=-1)
@@ -207,5 +241,3 @@ def compile_kernels(say: Callable[[str], None]) -> None:
         assert seen.rgb is not None
         (seen.rgb.sum() + seen.thermal.sum() + sum(seen.variation.values())).backward()
         RowAdam(list(grid.parameters())).step()
-    finally:
-        notice.cancel()

@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+import shlex
+import shutil
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
 import tyro
+import yaml
+from filelock import FileLock
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from thermoxels_ns.core.errors import CheckpointError
+from thermoxels_ns.core.checks import check_ranges, hold_folder, plain_os_errors, writable_folder
+from thermoxels_ns.core.config_loader import ConfigLoader
+from thermoxels_ns.core.errors import CheckpointError, OutputError, ThermoxelsError
+from thermoxels_ns.core.option_help import typed
 from thermoxels_ns.training.schedule import QUALITIES, Quality, Schedule, schedule_for
+
+LOCAL_HOST = "127.0.0.1"
+_HELD: list[FileLock] = []
+"""Locks of the folders of this process's trainings."""
+_SCHEDULE = ("resolutions", "refine_at", "prune_at", "thin_at", "distortion_ramp", "view_dependence_from")
+"""Options of the model that depend on the resolution and the number of steps."""
 
 
 @dataclass
@@ -30,12 +43,78 @@ class ThermoxelsTrainerConfig(TrainerConfig):
     replaced: tyro.conf.Suppress[str] = ""
     """What the quality replaced, for the log."""
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Keep the viewer on this machine where ns-viewer replaces it by its own default; what was typed stays."""
+        if name == "viewer" and not typed("--viewer.websocket-host"):
+            value = replace(value, websocket_host=LOCAL_HOST)
+        super().__setattr__(name, value)
+
     def __post_init__(self) -> None:
         if self.quality is None:
             return
         model: Any = self.pipeline.model
         self.replaced = f"{max(model.resolutions)} voxels and {self.max_num_iterations} steps"
         self.follow_schedule(schedule_for(*QUALITIES[self.quality]))
+
+    def save_config(self) -> None:
+        """Check what can be checked, hold the run's folder while this process lives, and write config.yml.
+
+        Raises:
+            ThermoxelsError: An option is out of range, the folder cannot be written to, or another training is in it.
+        """
+        self.follow_checkpoint()
+        self.check()
+        model: Any = self.pipeline.model
+        first = (model.resolutions[0] + 1) ** 3 * 4 * model.row_channels(model.resolutions[0])
+        with plain_os_errors(self.output_dir):
+            # Values and two moments of the first lattice, in the last checkpoint and in the one that replaces it.
+            folder = writable_folder(self.get_base_dir(), min(6 * first, 1e9 * model.memory_budget_gb))
+            _HELD.append(hold_folder(folder / ".lock", "Wait until it ends, or pass another --timestamp.", CONSOLE.log))
+            super().save_config()
+
+    def check(self) -> None:
+        """Raise `ThermoxelsError` for numbers that cannot work, and for a device that is not there."""
+        manager: Any = self.pipeline.datamanager
+        count, seed, rate = (1, 1e9, "1 or more"), (0, 2**32 - 1, "from 0 to 2^32 - 1"), (1e-30, 1e6, "above 0")
+        values = {
+            "max_num_iterations": (self.max_num_iterations, *count),
+            "machine.seed": (self.machine.seed, *seed),
+            "machine.num_devices": (self.machine.num_devices, *count),
+            "pipeline.datamanager.seed": (manager.seed, *seed),
+        }
+        for name in ("train_num_rays_per_batch", "thermal_num_rays_per_batch", "eval_num_rays_per_batch"):
+            values[f"pipeline.datamanager.{name}"] = (getattr(manager, name), *count)
+        for name, group in self.optimizers.items():
+            values[f"optimizers.{name}.optimizer.lr"] = (group["optimizer"].lr, *rate)
+            if group.get("scheduler") is not None:
+                scheduler = f"optimizers.{name}.scheduler"
+                values[f"{scheduler}.max_steps"] = (group["scheduler"].max_steps, *count)
+                final = group["scheduler"].lr_final
+                values[f"{scheduler}.lr_final"] = (1.0 if final is None else final, *rate)
+        check_ranges("--", values)
+        model: Any = self.pipeline.model
+        model.check()
+        there = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+        if not there[self.machine.device_type]:
+            expected = f"one of {', '.join(name for name in there if there[name])}, which PyTorch finds here"
+            remedy = "Pass --machine.device-type cpu, or install the driver and a PyTorch that is built for it."
+            raise ThermoxelsError("device_type", expected=expected, got=self.machine.device_type, remedy=remedy)
+
+    def follow_checkpoint(self) -> None:
+        """Take resolutions and schedule from the config.yml of the run that is resumed, but for what was typed."""
+        folder = self.load_dir or (self.load_checkpoint.parent if self.load_checkpoint else None)
+        if self.quality is not None or folder is None or not (folder.parent / "config.yml").is_file():
+            return
+        earlier = yaml.load((folder.parent / "config.yml").read_text(encoding="utf-8"), Loader=ConfigLoader)
+        if not isinstance(earlier, ThermoxelsTrainerConfig):
+            return
+        if not any(typed(f"--pipeline.model.{item}") for item in _SCHEDULE):
+            for item in _SCHEDULE:
+                setattr(self.pipeline.model, item, getattr(earlier.pipeline.model, item))
+        for name, group in self.optimizers.items():
+            before = earlier.optimizers.get(name, {}).get("scheduler")
+            if before is not None and not typed(f"--optimizers.{name}.scheduler"):
+                group["scheduler"] = before
 
     def follow_schedule(self, schedule: Schedule) -> None:
         """Set everything that depends on the resolution and the number of steps."""
@@ -44,7 +123,7 @@ class ThermoxelsTrainerConfig(TrainerConfig):
             if group.get("scheduler") is not None:
                 group["scheduler"].max_steps = schedule.steps
         model: Any = self.pipeline.model
-        for item in ("resolutions", "refine_at", "prune_at", "thin_at", "distortion_ramp", "view_dependence_from"):
+        for item in _SCHEDULE:
             setattr(model, item, getattr(schedule, item))
 
 
@@ -66,9 +145,16 @@ class ThermoxelsTrainer(Trainer):
             CONSOLE.log(
                 f"quality {quality}: {said}" + (f", in place of {replaced}" if replaced not in ("", said) else "")
             )
-        super().setup(test_mode)
+        self.config.follow_checkpoint()
+        with plain_os_errors(self.base_dir):
+            super().setup(test_mode)
         # nerfstudio takes the shares and times that it shows from the number of steps without those before.
         writer.GLOBAL_BUFFER["max_iter"] = self._start_step + self.config.max_num_iterations
+
+    def train(self) -> None:
+        """Train; an `OutputError` where results cannot be written."""
+        with plain_os_errors(self.base_dir):
+            super().train()
 
     def _load_checkpoint(self) -> None:
         """Load a checkpoint if one is named, and say to which step the training goes on."""
@@ -80,7 +166,7 @@ class ThermoxelsTrainer(Trainer):
         quality = self.config.quality
         if quality is not None and first >= steps:
             expected = f"one from before step {steps}, where quality {quality} ends"
-            remedy = "Pass --max-num-iterations, how many more steps to take, in place of --quality."
+            remedy = "Leave --quality out and pass --max-num-iterations 400, how many more steps to take."
             raise CheckpointError("checkpoint", expected=expected, got=f"step {first}", remedy=remedy)
         self._check_lattice(first)
         if quality is not None:
@@ -139,6 +225,11 @@ class ThermoxelsTrainer(Trainer):
                 unfinished,
             )
             os.replace(unfinished, final)
+        except (OSError, RuntimeError) as problem:
+            free = shutil.disk_usage(final.parent).free
+            got = f"{type(problem).__name__} with {free / 1e6:.3g} MB of free space"
+            remedy = f"Free space, then go on from the one before it: --load-dir {shlex.quote(str(final.parent))}"
+            raise OutputError(f"checkpoint {final}", expected="room for it", got=got, remedy=remedy) from problem
         finally:
             unfinished.unlink(missing_ok=True)
         if self.config.save_only_latest_checkpoint:

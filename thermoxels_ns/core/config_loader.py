@@ -1,0 +1,89 @@
+"""Reads nerfstudio's config.yml without running code from it."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import importlib
+import os
+from collections.abc import Iterator
+from importlib.metadata import entry_points
+from typing import Any
+
+import yaml
+
+from thermoxels_ns.core.errors import CheckpointError
+
+_PYTHON_TAG = "tag:yaml.org,2002:python/"
+_HARMLESS_TAGS = {
+    "name:nerfstudio.data.utils.nerfstudio_collate.nerfstudio_collate",  # the one function in stock configurations
+    "object/apply:_operator.getitem",  # VanillaDataManager[DepthDataset]
+    "object/apply:pathlib.PosixPath",
+    "object/apply:pathlib.WindowsPath",
+}
+
+
+class ConfigLoader(yaml.Loader):
+    """Reads what ``ns-train`` writes to config.yml, and nothing that could run code.
+
+    Python objects are limited to configuration dataclasses, enumerations and paths, python names to classes, of
+    nerfstudio and of packages that are installed as its plugins. The whole file is looked at before anything is made.
+    """
+
+    def get_single_data(self) -> Any:
+        """Read the file; a `CheckpointError` says what it names that it must not, and where."""
+        expected = "a config.yml that names only configuration classes of nerfstudio and its installed plugins"
+        remedy = "Do not use this file: it could run code. If you trust it, install the package that it names."
+        try:
+            node = self.get_single_node()
+        except RecursionError as problem:
+            got, remedy = "entries nested too deeply to read", "Pass the config.yml of a training run."
+            raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy) from problem
+        for place in _nodes(node):
+            tag = place.tag.removeprefix(_PYTHON_TAG)
+            if place.tag != tag and not _harmless(tag):
+                got = f"{tag} in line {place.start_mark.line + 1}"
+                raise CheckpointError("load_config", expected=expected, got=got, remedy=remedy)
+        return None if node is None else self.construct_document(node)
+
+
+def _nodes(root: yaml.Node | None) -> Iterator[yaml.Node]:
+    """A node and all below, each once."""
+    seen, waiting = set[int](), [root] if root is not None else []
+    while waiting:
+        node = waiting.pop()
+        if id(node) in seen:
+            continue
+        seen.add(id(node))
+        yield node
+        if isinstance(node, yaml.MappingNode):
+            waiting += [part for pair in node.value for part in pair]
+        elif isinstance(node, yaml.SequenceNode):
+            waiting += node.value
+
+
+def _harmless(tag: str) -> bool:
+    """Whether a tag ``kind:name`` makes plain data, or names a class that a configuration may be made of."""
+    kind, _, name = tag.partition(":")
+    if not name or tag in _HARMLESS_TAGS:
+        return True
+    module, _, attribute = name.rpartition(".")
+    if module.split(".")[0] not in _plugin_packages() and not (kind == "name" and module.startswith("torch.optim.")):
+        return False
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError):
+        return False
+    if not isinstance(found, type) or found.__module__.split(".")[0] != module.split(".")[0]:
+        return False
+    made_of = {"name": True, "object": dataclasses.is_dataclass(found), "object/apply": issubclass(found, enum.Enum)}
+    return made_of.get(kind, False)
+
+
+def _plugin_packages() -> set[str]:
+    """Names of nerfstudio's package, ours, and those that say in their metadata that they extend nerfstudio."""
+    groups = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
+    values = [entry.value for group in groups for entry in entry_points(group=group)]
+    for name in ("NERFSTUDIO_METHOD_CONFIGS", "NERFSTUDIO_DATAPARSER_CONFIGS"):
+        values += [word.partition("=")[2] for word in os.environ.get(name, "").split(",")]
+    return {"nerfstudio", "thermoxels_ns", *(value.split(":")[0].split(".")[0] for value in values)} - {""}
