@@ -23,9 +23,9 @@ MAY_IMPORT = {
     "core": set(),
     "synthetic": {"core"},
     "radiometry": {"core"},
-    "data": {"core", "radiometry"},
-    "capture": {"core", "radiometry", "data"},
     "multiview": {"core"},
+    "data": {"core", "radiometry", "multiview"},  # the scene box is where photographs agree that something is
+    "capture": {"core", "radiometry", "data"},
     "field": {"core"},
     "render": {"core", "field"},
     "training": {"core", "field", "render", "data", "multiview"},

@@ -106,8 +106,9 @@ def test_the_box_too_is_found_wherever_a_model_may_lie(scene_folder, where):
     scene.rewrite()
     add_model(scene, where, moved=False)
     file = read_scene_file(scene.path)
-    box, origin = find_scene_box(file, None, np.eye(3))
-    assert origin == f"the points of {where}"
+    evidence = find_scene_box(file, None, range(len(NAMES)))
+    box = evidence.box(np.eye(3))
+    assert evidence.source == f"the points of {where}"
     assert (box[0] < POINTS.min(axis=0)).all() and (box[1] > POINTS.max(axis=0)).all()
 
 

@@ -166,7 +166,7 @@ def test_box_from_sparse_points_ignores_strays(scene_folder):
     write_ply(scene.path / "points.ply", points)
     outputs = parse(scene.path)
     sides = (outputs.scene_box.aabb[1] - outputs.scene_box.aabb[0]) / outputs.dataparser_scale
-    torch.testing.assert_close(sides, torch.tensor([2.2, 1.2, 0.7]), atol=0.05, rtol=0)
+    torch.testing.assert_close(sides, torch.tensor([2.32, 1.32, 0.82]), atol=0.05, rtol=0)
 
 
 def test_points_behind_all_cameras_do_not_count(scene_folder):
@@ -181,7 +181,7 @@ def test_flat_scene_gets_some_depth(scene_folder):
     frames = read_scene_file(scene_folder().path).frames
     wall = np.random.default_rng(0).uniform(-1, 1, (500, 3)) * [1, 1, 0]
     box = box_of_points(wall, frames, np.eye(3))
-    assert box[1, 2] == pytest.approx(0.1, abs=0.01) and box[0, 2] == -box[1, 2]
+    assert box[1, 2] == pytest.approx(0.16, abs=0.01) and box[0, 2] == -box[1, 2]
 
 
 def test_box_from_cameras_is_where_they_look(scene_folder):
@@ -195,23 +195,15 @@ def test_box_from_cameras_is_where_they_look(scene_folder):
     torch.testing.assert_close(parse(scene.path).scene_box.aabb, torch.tensor([[-1.0] * 3, [1.0] * 3]))
 
 
-def test_parallel_or_diverging_cameras_need_a_box(scene_folder):
+def test_parallel_cameras_need_a_box(scene_folder):
     scene = scene_folder()
     del scene.meta["scene_box"]
-    original = json.loads(json.dumps(scene.meta["frames"]))
     for frame in scene.meta["frames"]:
         matrix = np.array(frame["transform_matrix"])
         matrix[:3, :3] = np.eye(3)
         frame["transform_matrix"] = matrix.tolist()
     scene.rewrite()
     with pytest.raises(SceneError, match=r"parallel.*--scene-box"):
-        parse(scene.path)
-    for frame, kept in zip(scene.meta["frames"], original):
-        matrix = np.array(kept["transform_matrix"])
-        matrix[:3, [0, 2]] *= -1
-        frame["transform_matrix"] = matrix.tolist()
-    scene.rewrite()
-    with pytest.raises(SceneError, match=r"away.*--scene-box"):
         parse(scene.path)
 
 
@@ -238,7 +230,7 @@ def test_box_from_colmap_follows_the_worlds_axes(scene_folder, legacy):
     scene.rewrite()
     outputs = parse(scene.path)
     sides = (outputs.scene_box.aabb[1] - outputs.scene_box.aabb[0]) / outputs.dataparser_scale
-    torch.testing.assert_close(sides, torch.tensor([2.2, 1.4, 0.8]), atol=0.05, rtol=0)
+    torch.testing.assert_close(sides, torch.tensor([2.32, 1.52, 0.92]), atol=0.05, rtol=0)
     for frame in scene.meta["frames"]:
         frame["transform_matrix"][0][3] += 1.0
     scene.rewrite()

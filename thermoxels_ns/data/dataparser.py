@@ -21,7 +21,7 @@ from thermoxels_ns.core.errors import SceneError, ThermalFileError
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, TemperatureRange
 from thermoxels_ns.data.colmap_tracks import TrackSource, find_feature_rays
-from thermoxels_ns.data.scene_box import find_scene_box
+from thermoxels_ns.data.scene_box import BoxEvidence, find_scene_box
 from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
 from thermoxels_ns.data.splits import Split, split_frames
 from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
@@ -64,7 +64,7 @@ class ThermalDataParserConfig(DataParserConfig):
     """Scale the world so that the scene box's longest side is 2. Off: input units."""
     scene_box: Optional[tuple[tuple[float, float, float], tuple[float, float, float]]] = None  # noqa: UP045
     """Box to reconstruct, in the coordinates of the input poses: xmin ymin zmin xmax ymax zmax. Default: scene_box in
-    the json, else from the sparse points, else from the cameras."""
+    the json, else from the sparse points, else from depths that photographs agree on, else from the cameras."""
     eval_mode: Literal["auto", "filename", "lists", "interval"] = "auto"
     """Which frames evaluate. auto takes the first that the scene has: names with frame_train_ / frame_eval_, the lists
     train_filenames / val_filenames / test_filenames in the json, every eval_interval-th frame."""
@@ -206,7 +206,8 @@ class ThermalDataParser(DataParser):
         split = split_frames(
             names, file.meta, config.eval_mode, config.eval_interval, config.eval_offset, file.left_out
         )
-        world, box, box_source = self._place(file)
+        evidence = find_scene_box(file, config.scene_box, split.train)
+        world, box = self._place(file, evidence)
         survey = survey_thermal_files(
             [frame.thermal for frame in file.frames],
             file.unit,
@@ -214,13 +215,16 @@ class ThermalDataParser(DataParser):
             file.bounds_c,
             {file.frames[index].thermal for index in split.train},
         )
-        met = _share_that_meets([file.frames[index] for index in split.train], world, box, box_source)
+        met = _share_that_meets([file.frames[index] for index in split.train], world, box, evidence.source)
         evaluation = set(split.val) | set(split.test)
+        metres = file.meta.get("metres_per_unit")
+        unit, scale = ("m", float(metres)) if isinstance(metres, (int, float)) else ("units", 1.0)
+        sides = (box.aabb[1] - box.aabb[0]).double() * scale / world.scale
+        size = f"{' x '.join(f'{side:.3g}' for side in sides.tolist())} {unit}"
         CONSOLE.print(
             f"Scene {file.folder.resolve().name}: {len(names)} frames, {len(split.train)} train, {len(evaluation)} "
-            f"evaluate ({split.how}); box from {box_source}, which {met:.0%} of the "
-            f"rays meet; {survey.temperature_range.min_c:.2f} to "
-            f"{survey.temperature_range.max_c:.2f} C."
+            f"evaluate ({split.how}); box from {evidence.source}, {size}, which {met:.0%} of the rays meet; "
+            f"{survey.temperature_range.min_c:.2f} to {survey.temperature_range.max_c:.2f} C."
         )
         if file.left_out:
             CONSOLE.print(f"Left out, no pair: {', '.join(file.left_out)}", style="bold yellow")
@@ -244,16 +248,16 @@ class ThermalDataParser(DataParser):
             raise SceneError("orientation_method, center_method", expected=expected, got=got, remedy=remedy)
         return oriented
 
-    def _place(self, file: SceneFile) -> tuple[_World, SceneBox, str]:
+    def _place(self, file: SceneFile, evidence: BoxEvidence) -> tuple[_World, SceneBox]:
         """Choose orientation, origin and scale, and express the scene box in the new world."""
         config = self.config
         oriented = self._oriented(np.stack([frame.pose for frame in file.frames]))
         rotation = _nearest_rotation(oriented[:, :3].numpy().astype(np.float64))
-        box, source = find_scene_box(file, config.scene_box, rotation)
+        box = evidence.box(rotation)
         far = bool(np.abs(box).max() > _FAR_SIDES * (box[1] - box[0]).max())
         if far:
             rotation = _as_kept(rotation)
-            box, source = find_scene_box(file, config.scene_box, rotation)
+            box = evidence.box(rotation)
         if config.center_method == "box":
             translation = -box.mean(axis=0)
         else:
@@ -269,7 +273,6 @@ class ThermalDataParser(DataParser):
         return (
             _World(rotation, translation, scale),
             SceneBox(aabb=torch.from_numpy(placed.astype(np.float32))),
-            source,
         )
 
 

@@ -1,90 +1,223 @@
-"""The box of the voxel lattice: given, or found from points or cameras."""
+"""The box of the voxel lattice: given, or found from sparse points, depths of photographs, or cameras."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, read_model
 from thermoxels_ns.data.scene_file import Frame, SceneFile
-from thermoxels_ns.data.transforms_json import read_pose
+from thermoxels_ns.data.transforms_json import DAMAGED_PHOTOGRAPH, read_pose
+from thermoxels_ns.radiometry.decoders import errors_name
 
-Box = npt.NDArray[np.float64]
+FloatArray = npt.NDArray[np.float64]
+Box = FloatArray
 """Lowest and highest corner, shape (2, 3)."""
 
 _REMEDY = "Pass --scene-box with two corners in the coordinates of the input poses: xmin ymin zmin xmax ymax zmax."
-_PERCENTILES = (0.5, 99.5)
-_MARGIN = 0.05
-_FAR = 10.0
-"""Points farther from the median point than this many median distances are strays."""
-_MOST_POINTS = 50_000
+_TAIL_OF_POINTS, _TAIL_OF_DEPTHS = 0.5, 0.1
+"""Points that may lie outside at either end of an axis, [%]; tracks have more strays than depths."""
+_MARGIN = 0.08
+_ROUNDED = 2.0**-8
+_MOST_POINTS = 20_000
+_MOST_PHOTOGRAPHS = 64
+"""Photographs in which points are looked at."""
+_STEREO_PHOTOGRAPHS, _STEREO_SIDE = 32, 96
+"""Photographs whose depths are compared, and pixels along their longer side: some seconds."""
+_FEWEST_VIEWS = 2
+"""Other photographs that a depth must agree with: within a room hardly a place is in view of more."""
+_FEWEST_POINTS = 10
+_FEWEST_DEPTHS = 200
+_LEAST_SHOWN, _MOST_WITHOUT = 0.15, 0.1
+"""What is close up fills this share of a photograph's points, except in this share of the photographs."""
+_WORTH_LEAVING_OUT = 1.5
+"""Points per length that a box without the distant points must gain."""
+_NEARLY_BEST = 0.9
+_FEW_IN_VIEW = 0.05
+"""Points in view relative to the most that one has, below which a photograph tells nothing."""
+_CONVERGING = 0.5
+"""Distance to where cameras look, relative to their spread, below which they look outwards."""
 # The axes that ns-process-data swapped in old versions, before it wrote applied_transform into the json.
 _LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
 
 
-def find_scene_box(
-    scene: SceneFile, option: Sequence[Sequence[float]] | None, rotation: npt.NDArray[np.float64]
-) -> tuple[Box, str]:
-    """Find the scene's box, axis-parallel after the world's `rotation`, and say in words where it came from.
+@dataclass(frozen=True, eq=False)
+class BoxEvidence:
+    """What says where the scene's box is, in input coordinates: the box itself, else points, else the cameras."""
+
+    source: str
+    """Where it comes from, in words."""
+    frames: Sequence[Frame]
+    corners: Box | None = None
+    points: FloatArray | None = None
+    tail: float = _TAIL_OF_POINTS
+
+    def box(self, rotation: FloatArray) -> Box:
+        """The box, axis-parallel after the world's `rotation`.
+
+        Raises:
+            SceneError: It has no volume, or what there is does not tell it.
+        """
+        if self.corners is not None:
+            return _rotated(self.corners, rotation)
+        if self.points is not None:
+            return box_of_points(self.points, self.frames, rotation, self.tail)
+        return box_of_cameras(self.frames, rotation)
+
+
+def find_scene_box(scene: SceneFile, option: Sequence[Sequence[float]] | None, training: Sequence[int]) -> BoxEvidence:
+    """Find what says where the scene's box is.
 
     In order: the option, ``scene_box`` in the json (both in input coordinates), sparse points (``ply_file_path``, or a
-    COLMAP model in one of `COLMAP_FOLDERS`), the cameras.
+    COLMAP model in one of `COLMAP_FOLDERS`), depths about which photographs that train agree, the cameras. The same
+    folder and split give the same.
 
     Raises:
-        SceneError: The box has no volume or is not finite, or none can be found.
+        SceneError: A given box has no volume or is not finite, or a file cannot be read.
     """
+    frames = scene.frames
     if option is not None:
-        return _rotated(_checked(option, "scene_box"), rotation), "the option scene_box"
+        return BoxEvidence("the option scene_box", frames, _checked(option, "scene_box"))
     if "scene_box" in scene.meta:
         name = f"{scene.json_path.name}: scene_box"
-        return _rotated(_checked(scene.meta["scene_box"], name), rotation), name
+        return BoxEvidence(name, frames, _checked(scene.meta["scene_box"], name))
     if "ply_file_path" in scene.meta:
         path = scene.folder / str(scene.meta["ply_file_path"])
-        return box_of_points(_read_ply(path) @ rotation.T, scene.frames, rotation), f"the points of {path.name}"
+        return BoxEvidence(f"the points of {path.name}", frames, points=_read_ply(path))
     for folder in COLMAP_FOLDERS:
         if any((scene.folder / folder / f"points3D.{suffix}").is_file() for suffix in ("bin", "txt")):
-            points = _read_colmap(folder, scene)
-            return box_of_points(points @ rotation.T, scene.frames, rotation), f"the points of {folder}"
-    return box_of_cameras(scene.frames, rotation), "the cameras (no scene_box and no sparse points found)"
+            return BoxEvidence(f"the points of {folder}", frames, points=_read_colmap(folder, scene))
+    points, photographs = _points_of_photographs([frames[index] for index in training])
+    if len(points) < _FEWEST_DEPTHS:
+        return BoxEvidence("the cameras (no scene_box, no sparse points, no depths that photographs agree on)", frames)
+    source = f"{len(points)} depths on which {photographs} photographs agree"
+    return BoxEvidence(source, frames, points=points, tail=_TAIL_OF_DEPTHS)
 
 
-def box_of_points(points: npt.NDArray[np.float64], frames: Sequence[Frame], rotation: npt.NDArray[np.float64]) -> Box:
-    """Enclose sparse points: per axis the 0.5 and 99.5 percentiles, and 5 % of the longest extent more on
-    every side (so that a flat scene keeps some depth).
+def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
+    """What photographs agree to see, (points, 3), in input coordinates, and how many were compared."""
+    from thermoxels_ns.multiview import photographs, stereo  # its kernels are slow to load and only needed here
 
-    Points that are not finite, behind every camera, or ten times farther from the median point than the median
-    distance are strays of the reconstruction and do not count.
+    frames = [frame for frame in frames if frame.intrinsics.lens == "perspective"]
+    frames = _spread(frames, _STEREO_PHOTOGRAPHS)
+    if not frames:
+        return np.zeros((0, 3)), 0
+    pinholes = []
+    for frame in frames:
+        with errors_name(frame.image, "a readable photograph", DAMAGED_PHOTOGRAPH), Image.open(frame.image) as opened:
+            opened.draft("RGB", (2 * _STEREO_SIDE, 2 * _STEREO_SIDE))  # a large JPEG is decoded at a part of its size
+            picture = np.array(opened.convert("RGB"))
+        mask = None
+        if frame.mask is not None:
+            with errors_name(frame.mask, "a readable mask", "Write the mask again."), Image.open(frame.mask) as opened:
+                mask = np.array(opened.convert("L").resize(picture.shape[1::-1], Image.Resampling.NEAREST)) > 0
+        camera = frame.intrinsics.resized(picture.shape[1], picture.shape[0])
+        pinholes.append(photographs.pinhole(picture, mask, camera, frame.pose, _STEREO_SIDE))
+    seen = photographs.gathered(pinholes, [frame.pose[:3, 3] for frame in frames])
+    return stereo.feature_rays_to_depths(stereo.depths_of(seen, fewest_views=_FEWEST_VIEWS)).points, len(frames)
+
+
+def box_of_points(
+    points: FloatArray, frames: Sequence[Frame], rotation: FloatArray, tail: float = _TAIL_OF_POINTS
+) -> Box:
+    """Enclose what photographs show close up of points (n, 3) in input coordinates.
+
+    Per axis of the rotated world all but `tail` [%] of them at either end, and 8 % of the longest extent more on every
+    side (parts without texture have no points, and a flat scene keeps some depth). Points that are not finite or in no
+    photograph's view do not count; nor do those that lie far behind others, or that few photographs have in view, where
+    they cost too much, see `_worth_keeping`. A photograph with hardly any of what is left in view, as of a plain wall,
+    is taken to show something as far away as in the others.
     """
     points = points[np.isfinite(points).all(axis=1)]
-    points = points[:: max(len(points) // _MOST_POINTS, 1)]
-    if len(points):
-        poses = np.stack([rotation @ frame.pose[:3] for frame in frames])
-        forward = -poses[:, :, 2]
-        depth = points @ forward.T - (forward * poses[:, :, 3]).sum(axis=1)
-        points = points[(depth > 0).any(axis=1)]
-    if len(points):
-        distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-        points = points[distance <= _FAR * max(np.median(distance), 1e-12)]
-    if len(points) < 10:
-        expected = "at least 10 points in front of the cameras to find the scene box"
-        remedy = _REMEDY
-        raise SceneError("sparse points", expected=expected, got=len(points), remedy=remedy)
-    low, high = np.percentile(points, _PERCENTILES, axis=0)
-    extent = high - low
-    margin = _MARGIN * extent.max()
-    return _checked(np.stack([low - margin, high + margin]), "box of the sparse points")
+    points, frames = points[:: max(len(points) // _MOST_POINTS, 1)], _spread(frames, _MOST_PHOTOGRAPHS)
+    depth = _depths_in_view(points, frames)
+    seen = np.isfinite(depth).any(axis=0)
+    points, depth = points[seen] @ rotation.T, depth[:, seen]
+    for figure in (_rarity, _distance_behind) if len(points) >= _FEWEST_POINTS else ():
+        kept = _worth_keeping(points, depth, figure(depth), tail)
+        points, depth = points[kept], depth[:, kept]
+    if len(points) < _FEWEST_POINTS:
+        expected = f"at least {_FEWEST_POINTS} points in front of the cameras to find the scene box"
+        raise SceneError("sparse points", expected=expected, got=len(points), remedy=_REMEDY)
+    low, high = np.percentile(points, (tail, 100.0 - tail), axis=0)
+    margin = _MARGIN * (high - low).max()
+    shown = np.isfinite(depth).sum(axis=1)
+    few = shown < _FEW_IN_VIEW * shown.max()
+    if few.any():
+        ahead = np.median([np.nanmedian(row) for row in depth[~few]])
+        ends = np.stack([f.pose[:3, 3] - ahead * f.pose[:3, 2] for f, blind in zip(frames, few) if blind]) @ rotation.T
+        low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
+    # Rounded outwards: another processor, on which a few depths differ, shall find the same.
+    step = _ROUNDED * 2.0 ** np.floor(np.log2(max((high - low).max(), 1e-300)))
+    low, high = np.floor((low - margin) / step) * step, np.ceil((high + margin) / step) * step
+    return _checked(np.stack([low, high]), "box of the points")
 
 
-def box_of_cameras(frames: Sequence[Frame], rotation: npt.NDArray[np.float64]) -> Box:
-    """Guess a cube from the cameras alone: centred where they look, as large as they see there.
+def _depths_in_view(points: FloatArray, frames: Sequence[Frame]) -> npt.NDArray[np.float32]:
+    """Depth of each point for each photograph, (photographs, points); NaN where it is not in view."""
+    depth = np.full((len(frames), len(points)), np.nan, dtype=np.float32)
+    for row, frame in zip(depth, frames):
+        camera, local = frame.intrinsics, (points - frame.pose[:3, 3]) @ frame.pose[:3, :3] * (1.0, -1.0, -1.0)
+        shown = local[:, 2] > 0.0
+        if camera.lens == "perspective":
+            shown &= camera.contains(camera.project(local))
+        row[shown] = local[shown, 2]
+    return depth
 
-    The centre is the point nearest to all optical axes (least squares). Half the side is the median over the cameras
-    of distance times the tangent of half the field of view: what an average photograph shows at that distance.
+
+def _distance_behind(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Depth of each point, relative to the median of each photograph, in the one where that is smallest."""
+    depth = depth[np.isfinite(depth).any(axis=1)]
+    return np.nanmin(depth / np.nanmedian(depth, axis=1, keepdims=True), axis=0)
+
+
+def _rarity(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """One over the number of photographs that have each point in view."""
+    return 1.0 / np.isfinite(depth).sum(axis=0, dtype=np.float32)
+
+
+def _worth_keeping(
+    points: FloatArray, depth: npt.NDArray[np.float32], figure: npt.NDArray[np.float32], tail: float
+) -> npt.NDArray[np.bool_]:
+    """Which points have so small a figure that they belong to the body, not to what lies around it.
+
+    All do, unless a limit of the figure exists that gives half as many more points per length of the box; of the limits
+    nearly as good, the largest counts. Hardly any photograph may lose most of its points.
+    """
+    seen = np.isfinite(depth)
+    seen = seen[seen.any(axis=1)]
+    limits, worth = np.quantile(figure, np.linspace(0.1, 1.0, 46)), []
+    for limit in limits:
+        kept = figure <= limit
+        low, high = np.percentile(points[kept], (tail, 100.0 - tail), axis=0)
+        fair = np.quantile(seen[:, kept].sum(axis=1) / seen.sum(axis=1), _MOST_WITHOUT) >= _LEAST_SHOWN
+        worth.append(fair * kept.mean() / max((high - low).max(), 1e-12))
+    if max(worth) < _WORTH_LEAVING_OUT * worth[-1]:
+        return np.ones(len(points), dtype=bool)
+    return figure <= limits[np.flatnonzero(np.array(worth) >= _NEARLY_BEST * max(worth))[-1]]
+
+
+def _spread(frames: Sequence[Frame], most: int) -> list[Frame]:
+    """At most so many frames, at equal distances in the list."""
+    return [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))]
+
+
+def box_of_cameras(frames: Sequence[Frame], rotation: FloatArray) -> Box:
+    """Guess a cube from the cameras alone.
+
+    Where they look at one place: its centre is the point nearest to all optical axes (least squares), half its side the
+    median over the cameras of distance times the tangent of half the field of view, what an average photograph shows at
+    that distance. Where they look outwards, as in a room: the cube around them, four times their extent.
+
+    Raises:
+        SceneError: All look into one direction, or outwards from one place.
     """
     poses = np.stack([rotation @ frame.pose[:3] for frame in frames])
     axes, origins = -poses[:, :, 2], poses[:, :, 3]
@@ -94,14 +227,14 @@ def box_of_cameras(frames: Sequence[Frame], rotation: npt.NDArray[np.float64]) -
         raise SceneError("scene box", expected="cameras that look at one place", got="parallel views", remedy=_REMEDY)
     centre = np.linalg.solve(normal, np.einsum("nij,nj->i", across, origins) / len(frames))
     depth = ((centre - origins) * axes).sum(axis=1)
-    if np.median(depth) <= 0:
-        remedy = _REMEDY
-        got = "cameras that look away from each other"
-        raise SceneError("scene box", expected="cameras that look at one place", got=got, remedy=remedy)
-    half_view = np.array(
-        [max(f.intrinsics.width / f.intrinsics.fl_x, f.intrinsics.height / f.intrinsics.fl_y) / 2 for f in frames]
-    )
-    half = np.median(depth[depth > 0] * half_view[depth > 0])
+    low, high = origins.min(axis=0), origins.max(axis=0)
+    if np.median(depth) <= _CONVERGING * np.sqrt(((origins - origins.mean(axis=0)) ** 2).sum(axis=1).mean()):
+        centre, half = 0.5 * (low + high), 2.0 * (high - low).max()
+    else:
+        half_view = np.array(
+            [max(f.intrinsics.width / f.intrinsics.fl_x, f.intrinsics.height / f.intrinsics.fl_y) / 2 for f in frames]
+        )
+        half = np.median(depth[depth > 0] * half_view[depth > 0])
     return _checked(np.stack([centre - half, centre + half]), "box of the cameras")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -53,44 +54,65 @@ def read_photographs(
         usable = usable[np.linspace(0, len(usable) - 1, most).round().astype(int)]
     if not len(usable):
         return None
-    pictures, matrices = zip(*(_pinhole(dataset, cameras, int(index), longest_side) for index in usable))
-    sizes = np.array([(picture.shape[1], picture.shape[0]) for picture in pictures], dtype=np.int64)
+    pinholes = [_photograph(dataset, cameras, int(index), longest_side) for index in usable]
+    return gathered(pinholes, cameras.camera_to_worlds[usable, :, 3].double().numpy(), near)
+
+
+Pinhole = tuple[npt.NDArray[np.float32], npt.NDArray[np.float64]]
+"""A photograph without distortion, shape (h, w, 3), NaN where masked, and world -> homogeneous pixels, (3, 4)."""
+
+
+def gathered(pinholes: Sequence[Pinhole], centres: npt.ArrayLike, near: float = 0.0) -> Photographs:
+    """Put pinhole photographs and their cameras' centres (photographs, 3) into the arrays of `Photographs`."""
+    sizes = np.array([picture.shape[1::-1] for picture, _ in pinholes], dtype=np.int64)
     return Photographs(
-        np.stack(matrices),
-        cameras.camera_to_worlds[usable, :, 3].double().numpy(),
+        np.stack([matrix for _, matrix in pinholes]),
+        np.asarray(centres, dtype=np.float64),
         sizes,
         np.concatenate(([0], np.cumsum(np.prod(sizes, axis=1))[:-1])),
-        np.concatenate([picture.reshape(-1, 3) for picture in pictures]),
+        np.concatenate([picture.reshape(-1, 3) for picture, _ in pinholes]),
         near,
     )
 
 
-def _pinhole(
-    dataset: Any, cameras: Cameras, index: int, longest_side: int
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float64]]:
-    """A photograph averaged down and without distortion, shape (h, w, 3), and world -> homogeneous pixels, (3, 4)."""
-    picture = dataset.get_image_uint8(index).numpy().astype(np.float32)
+def _photograph(dataset: Any, cameras: Cameras, index: int, longest_side: int) -> Pinhole:
+    picture, mask = dataset.get_image_uint8(index).numpy(), dataset.get_mask(index)
+    distortion = [0.0] * 6 if cameras.distortion_params is None else cameras.distortion_params[index].double().tolist()
+    named: dict[str, Any] = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), distortion))
+    fx, fy, cx, cy = (float(getattr(cameras, name)[index, 0]) for name in ("fx", "fy", "cx", "cy"))
+    camera = Camera(picture.shape[1], picture.shape[0], fx, fy, cx, cy, **named)
+    pose = np.asarray(cameras.camera_to_worlds[index], dtype=np.float64)
+    return pinhole(picture, None if mask is None else mask.numpy()[..., 0], camera, pose, longest_side)
+
+
+def pinhole(
+    photograph: npt.NDArray[np.uint8],
+    mask: npt.NDArray[np.bool_] | None,
+    camera: Camera,
+    pose: npt.NDArray[np.float64],
+    longest_side: int = LONGEST_SIDE,
+) -> Pinhole:
+    """Average a photograph (h, w, 3) down to `longest_side` [pixels] and remove its camera's distortion.
+
+    Only pixels of its `mask` (h, w) are used. The pose is camera to world, (3, 4) or (4, 4), OpenGL axes.
+    """
+    picture = photograph.astype(np.float32)
     picture /= np.float32(255.0)
-    mask = dataset.get_mask(index)
-    shown = np.ones(picture.shape[:2], np.float32) if mask is None else mask.numpy()[..., 0].astype(np.float32)
+    shown = np.ones(picture.shape[:2], np.float32) if mask is None else mask.astype(np.float32)
     height, width = picture.shape[:2]
     shrink = max(1.0, max(height, width) / longest_side)
     size = (max(2, round(width / shrink)), max(2, round(height / shrink)))
     if shrink > 1.0:
         picture, shown = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (picture, shown))
-    distortion = [0.0] * 6 if cameras.distortion_params is None else cameras.distortion_params[index].double().tolist()
-    named: dict[str, Any] = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), distortion))
-    fx, fy, cx, cy = (float(getattr(cameras, name)[index, 0]) for name in ("fx", "fy", "cx", "cy"))
-    camera = Camera(width, height, fx, fy, cx, cy, **named).resized(picture.shape[1], picture.shape[0])
+    camera = camera.resized(picture.shape[1], picture.shape[0])
     if any(camera.distortion):
         places = _distorted_places(camera)
         picture = cv2.remap(picture, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         shown = cv2.remap(shown, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0.0,))
     picture = np.where(shown[..., None] < 0.999, np.float32(np.nan), picture).astype(np.float32)
-    pose = np.asarray(cameras.camera_to_worlds[index], dtype=np.float64)
-    turned = pose[:, :3].T * np.array([[1.0], [-1.0], [-1.0]])  # x right, y down, z forward
+    turned = pose[:3, :3].T * np.array([[1.0], [-1.0], [-1.0]])  # x right, y down, z forward
     intrinsics = np.array([[camera.fl_x, 0.0, camera.cx], [0.0, camera.fl_y, camera.cy], [0.0, 0.0, 1.0]])
-    return picture, intrinsics @ np.column_stack((turned, -turned @ pose[:, 3]))
+    return picture, intrinsics @ np.column_stack((turned, -turned @ pose[:3, 3]))
 
 
 def _distorted_places(camera: Camera) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:

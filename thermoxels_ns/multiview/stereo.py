@@ -59,6 +59,8 @@ _PROBES = (5, 4)
 """Pixels along each side and depths at which neighbours are looked for."""
 _FEWEST_PROBES = 0.1
 """Share of these that a neighbour must see."""
+_DEPTHS_PER_SPREAD = 2.0 ** np.arange(-6.0, 6.5, 0.5)
+"""Depths tried where no box is known, relative to the root of the cameras' mean squared distance from their middle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +80,13 @@ class Depths:
         return float(np.mean(np.isfinite(self.depth)))
 
 
-def depths_of(photographs: Photographs, lo: npt.ArrayLike, hi: npt.ArrayLike) -> Depths:
-    """Find the depths of photographs within a box.
+def depths_of(
+    photographs: Photographs,
+    lo: npt.ArrayLike | None = None,
+    hi: npt.ArrayLike | None = None,
+    fewest_views: int = FEWEST_VIEWS,
+) -> Depths:
+    """Find the depths of photographs within a box, or wherever they look at the same from different directions.
 
     For each photograph, its neighbours are drawn onto planes parallel to it, one behind the other, and compared with it
     patch by patch (plane sweep, Collins 1996; normalised cross-correlation). The plane on which they agree best is the
@@ -88,13 +95,14 @@ def depths_of(photographs: Photographs, lo: npt.ArrayLike, hi: npt.ArrayLike) ->
 
     Args:
         photographs: Pinhole photographs, best some 160 pixels wide: cost grows with the third power of their size.
-        lo: Lower corner of the box, [world units].
+        lo: Lower corner of the box, [world units]. None: no box.
         hi: Upper corner.
+        fewest_views: Photographs whose own depths must lie where a sure one does.
 
     Returns:
         Depths; not known anywhere where no photograph has a neighbour.
     """
-    low, high = np.asarray(lo, dtype=np.float64), np.asarray(hi, dtype=np.float64)
+    corners = None if lo is None or hi is None else (np.asarray(lo, np.float64), np.asarray(hi, np.float64))
     views = [_View.of(photographs, number) for number in range(len(photographs))]
     total = len(photographs.colours)
     depth, correlation, error = (np.full(total, value, np.float32) for value in (np.nan, -1.0, np.nan))
@@ -102,7 +110,7 @@ def depths_of(photographs: Photographs, lo: npt.ArrayLike, hi: npt.ArrayLike) ->
     def work(begin: int, end: int) -> None:
         for number in range(begin, end):
             view = views[number]
-            span = _span(view, low, high, photographs.near)
+            span = _overlap(number, views) if corners is None else _span(view, *corners, photographs.near)
             near = [] if span is None else _neighbours(number, views, *span)
             if span is not None and near:
                 first = int(photographs.firsts[number])
@@ -121,7 +129,7 @@ def depths_of(photographs: Photographs, lo: npt.ArrayLike, hi: npt.ArrayLike) ->
         )
 
     run_ranges(compare, total, 4096)
-    sure = (agreeing >= FEWEST_VIEWS) & (agreeing >= VIEWS_PER_CONTRADICTION * looking_through)
+    sure = (agreeing >= fewest_views) & (agreeing >= VIEWS_PER_CONTRADICTION * looking_through)
     depth[~sure] = np.nan
     for view, first in zip(views, firsts):
         shape = view.brightness.shape
@@ -187,24 +195,44 @@ def _span(view: _View, low: FloatArray, high: FloatArray, near: float) -> tuple[
     return max(float(depth.min()), near, _NEAREST * far), far
 
 
-def _neighbours(number: int, views: list[_View], near: float, far: float) -> list[_View]:
-    """Photographs that see most of what one sees, from directions that tell how far it is."""
-    view = views[number]
+def _overlap(number: int, views: list[_View]) -> tuple[float, float] | None:
+    """Least and largest depth at which enough others look at the same from useful directions; None: nowhere."""
+    centres = np.stack([view.centre for view in views])
+    depths = np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()) * _DEPTHS_PER_SPREAD
+    points = _probes(views[number], depths)
+    others = sum(
+        (_usefully_seen(views[number], seen, points)[0].astype(int) for k, seen in enumerate(views) if k != number),
+        np.zeros(len(points), int),
+    )
+    enough = (others >= 2).reshape(len(depths), -1).mean(1) >= _FEWEST_PROBES
+    return (float(depths[enough][0]), float(depths[enough][-1])) if enough.sum() > 1 else None
+
+
+def _probes(view: _View, depths: FloatArray) -> FloatArray:
+    """Points that a photograph sees, spread over it at each of the depths."""
     height, width = view.brightness.shape
     columns, rows = ((np.arange(_PROBES[0]) + 0.5) * side / _PROBES[0] for side in (width, height))
     pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
-    depths = 1.0 / np.linspace(1.0 / far, 1.0 / near, _PROBES[1] + 2)[1:-1]
-    points = np.concatenate([view.points(pixels, np.full(len(pixels), depth)) for depth in depths])
-    towards = view.centre - points
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    return np.concatenate([view.points(pixels, np.full(len(pixels), depth)) for depth in depths])
+
+
+def _usefully_seen(view: _View, seen: _View, points: FloatArray) -> tuple[npt.NDArray[np.bool_], FloatArray]:
+    """Which points of one photograph another shows from a direction that tells how far they are; angles in degrees."""
+    towards, away = view.centre - points, seen.centre - points
+    lengths = np.linalg.norm(towards, axis=1) * np.linalg.norm(away, axis=1)
+    cosine = np.einsum("ni,ni->n", away, towards) / np.maximum(lengths, 1e-12)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return seen.shows(*seen.pixels(points)) & (angle > ANGLES_DEG[0]) & (angle < ANGLES_DEG[1]), angle
+
+
+def _neighbours(number: int, views: list[_View], near: float, far: float) -> list[_View]:
+    """Photographs that see most of what one sees, from directions that tell how far it is."""
+    points = _probes(views[number], 1.0 / np.linspace(1.0 / far, 1.0 / near, _PROBES[1] + 2)[1:-1])
     worth = np.zeros(len(views))
     for other, seen in enumerate(views):
         if other == number:
             continue
-        away = seen.centre - points
-        cosine = np.einsum("ni,ni->n", away, towards) / np.maximum(np.linalg.norm(away, axis=1), 1e-12)
-        angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        useful = seen.shows(*seen.pixels(points)) & (angle > ANGLES_DEG[0]) & (angle < ANGLES_DEG[1])
+        useful, angle = _usefully_seen(views[number], seen, points)
         if useful.mean() >= _FEWEST_PROBES:
             worth[other] = np.sum(useful * np.exp(-0.5 * (np.log(np.maximum(angle, 1e-3) / BEST_ANGLE_DEG)) ** 2))
     best = np.argsort(-worth, kind="stable")[:NEIGHBOURS]
