@@ -17,7 +17,7 @@ from thermoxels_ns.multiview.stereo import (
     ERROR_PLANES,
     Depths,
     depths_of,
-    feature_rays_of_photographs,
+    evidence_of_photographs,
     feature_rays_to_depths,
 )
 from thermoxels_ns.synthetic.scene_folder import make_scene
@@ -39,7 +39,8 @@ def untrained(scene):
 
 def rays_of(pipeline, say=print) -> FeatureRays | None:
     lattice = pipeline.model.grid.lattice
-    return feature_rays_of_photographs(pipeline.datamanager.train_dataset, 0.0, lattice.lo, lattice.hi, say)
+    found = evidence_of_photographs(pipeline.datamanager.train_dataset, 0.0, lattice.lo, lattice.hi, say)
+    return None if found is None else found.feature_rays
 
 
 def test_lines_run_from_each_camera_to_what_its_sure_pixels_show():
@@ -85,7 +86,7 @@ def asked_boxes(monkeypatch, found=None) -> list:
         boxes.append((lo, hi))
         return found
 
-    monkeypatch.setattr("thermoxels_ns.training.callbacks.feature_rays_of_photographs", recorded)
+    monkeypatch.setattr("thermoxels_ns.training.callbacks.evidence_of_photographs", recorded)
     return boxes
 
 
@@ -144,7 +145,7 @@ def test_light_may_pass_depths_but_not_tracks_while_the_lattice_is_coarse(scene,
     def with_tracks(model):
         populate(model)
         model.feature_ray_sampler = FeatureRaySampler(
-            FeatureRays(np.zeros((1, 3)), np.zeros(1, int), np.ones((1, 3)), np.zeros(1))
+            FeatureRays(np.zeros((1, 3)), np.zeros(1, int), np.ones((1, 3)), np.zeros(1)), model.scene_box.aabb
         )
 
     def recorded(accumulation, transmittance, tolerated):
@@ -153,5 +154,6 @@ def test_light_may_pass_depths_but_not_tracks_while_the_lattice_is_coarse(scene,
 
     monkeypatch.setattr(ThermoxelsModel, "populate_modules", with_tracks)
     monkeypatch.setattr("thermoxels_ns.training.losses.feature_ray_loss", recorded)
-    train(scene, 6, {"resolutions": [8, 16], "refine_at": [4], "photo_depth": depths})
+    course = {"resolutions": [8, 16], "refine_at": [4], "loss_overrides": {"backdrop": 0.0}}
+    train(scene, 6, {**course, "photo_depth": depths})
     assert asked == [light] * 4 + [0.0] * 2

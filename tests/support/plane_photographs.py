@@ -37,4 +37,5 @@ def photographs(eyes=EYES, gains: np.ndarray | None = None) -> Photographs:
         np.full((len(eyes), 2), SIZE),
         np.arange(len(eyes)) * SIZE * SIZE,
         np.concatenate(pictures).reshape(-1, 3).astype(np.float32),
+        np.full(len(eyes) * SIZE * SIZE, np.nan, np.float32),
     )

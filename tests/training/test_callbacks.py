@@ -16,6 +16,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from thermoxels_ns.core.errors import MemoryBudgetError, PruningError
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.units import TemperatureRange
+from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
 from thermoxels_ns.training.callbacks import coarse_to_fine_callbacks, prune_by_rays
 from thermoxels_ns.training.free_space_carving import empty_voxels
 from thermoxels_ns.training.model import ThermoxelsModel
@@ -93,7 +94,10 @@ def attributes(model: ThermoxelsModel, steps: int) -> TrainingCallbackAttributes
     groups = model.get_param_groups()
     rows = model.grid.row_parameters()
     optimizers: Any = SimpleNamespace(
-        optimizers={name: RowAdam(groups[name], lr=0.1) for name in rows}, parameters=dict(groups)
+        optimizers={
+            name: RowAdam(groups[name], lr=0.1) for name in groups if name.removeprefix("surroundings_") in rows
+        },
+        parameters=dict(groups),
     )
     pipeline: Any = SimpleNamespace(datamanager=Rays(), model=model)
     trainer: Any = SimpleNamespace(_start_step=0, config=SimpleNamespace(max_num_iterations=steps))
@@ -121,6 +125,32 @@ def test_optimisers_follow_the_schedule():
     # The slab fills 4 of 16 layers; its front with a neighbour on either side, then what a surface alone needs.
     assert sizes[:3] == [512] * 3 and sizes[3:5] == [192 * 8] * 2 and sizes[5] == sizes[6] < sizes[4]
     assert sizes[7] == sizes[9] < sizes[6] and model.step == 9
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_surroundings_are_split_where_rays_see_some_and_dropped_where_infinity_explains_all(there):
+    model = model_of(resolutions=(8, 16), refine_at=(3,), prune_at=(5,))
+    assert model.surroundings is not None
+    grid = model.surroundings.grid
+    given = attributes(model, 10)
+    callbacks = coarse_to_fine_callbacks(model, given)
+    sizes = []
+    for step in range(6):
+        for callback in callbacks:
+            callback.run_callback(step)
+        if there and step == 0:
+            grid.density.data.fill_(1.0)
+        sizes.append(len(grid.voxels))
+        for name, parameter in grid.row_parameters().items():
+            optimizer = given.optimizers.optimizers[f"surroundings_{name}"]
+            assert optimizer.param_groups[0]["params"] == [parameter]
+            parameter.grad = torch.ones_like(parameter) * 1e-9
+            optimizer.step()
+    assert 0 < sizes[0] < 0.5 * 6 * 48 * 48 * 12, "only what rays cross is kept"
+    assert (model.seen_surroundings is not None) == there
+    assert sizes[3] > sizes[2] if there else sizes[3] == 1
+    seen = model.render_rays(RayRequest(torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.0]])), RenderOptions())[2]
+    assert (seen.surroundings is not None) == there
 
 
 @pytest.mark.parametrize("carve", ["auto", "off"])

@@ -108,7 +108,7 @@ def track_rays(uncertainty: float = 0.0, count: int = 40) -> tuple[FeatureRaySam
     origins = np.column_stack((np.full(count, -0.9), side))
     points = np.column_stack((np.full(count, 0.2), side))
     lines = FeatureRays(origins, np.arange(count), points, np.full(count, uncertainty))
-    return FeatureRaySampler(lines), lines
+    return FeatureRaySampler(lines, (LATTICE.lo, LATTICE.hi)), lines
 
 
 def wall(at: float, backend: str) -> float:
@@ -127,7 +127,7 @@ def test_rays_end_before_and_behind_their_points_by_margin_and_uncertainty() -> 
     request = rays.request(25, 0.1, 0.05, torch.Generator().manual_seed(3), CPU)
     margin = MARGIN_VOXELS * 0.05 + MARGIN_ERRORS * 0.01
     assert request.far is not None
-    assert request.far[:25] == pytest.approx(1.1 - margin, abs=1e-6)
+    assert request.far[:25] == pytest.approx(1.1**2 / (1.1 + margin), abs=1e-6)
     assert request.far[25:] == pytest.approx(1.1 + margin, abs=1e-6)
     assert torch.equal(request.origins[:25], request.origins[25:])
     on = np.linalg.norm(lines.origins[:, None] - request.origins[:25].numpy(), axis=2).min(axis=0)
@@ -153,3 +153,14 @@ def test_the_gradient_thins_what_is_before_the_points_and_thickens_what_is_at_th
     x = torch.linspace(-1, 1, 21)
     assert bool((by_x[(x > 0.15) & (x < 0.25)] < 0).all())
     assert float(by_x[(x > -0.9) & (x < 0.0)].sum()) > float(by_x[(x > 0.15) & (x < 0.25)].sum())
+
+
+def test_a_ray_to_a_point_outside_the_box_asks_for_air_up_to_it_and_for_no_wall() -> None:
+    rays = FeatureRays(np.zeros((1, 3)), np.zeros(1, np.int64), np.array([[4.0, 0.0, 0.0]]), np.full(1, 0.05))
+    generator = torch.Generator().manual_seed(0)
+    alone = FeatureRaySampler(rays, (LATTICE.lo, LATTICE.hi)).request(1, 0.0, 0.1, generator, CPU)
+    beyond = FeatureRaySampler(rays, (LATTICE.lo, LATTICE.hi), True).request(1, 0.0, 0.1, generator, CPU, 0.01)
+    assert alone.far is not None and beyond.far is not None
+    assert alone.far[0] > 3.7 and alone.far[1] == 0.0
+    margin = MARGIN_VOXELS * (0.1 + 0.01 * 4.0**2) + MARGIN_ERRORS * 0.05
+    assert beyond.far.tolist() == pytest.approx([4.0**2 / (4.0 + margin), 4.0 + margin])

@@ -71,6 +71,7 @@ def test_only_rays_that_meet_the_box_ahead_are_in_it():
 def test_only_terms_of_non_zero_weight_are_computed(recipe):
     model = make(LINES, recipe=recipe, distortion_ramp=(0, 1)).train()
     model.update_to_step(10)
+    model.backdrop_ray_sampler = model.feature_ray_sampler
     terms = set(model.get_loss_dict(model(rays()), targets()))
     weights = LOSS_RECIPES[recipe]
     assert terms == {f"{name}_loss" for name in vars(weights) if getattr(weights, name)}
@@ -139,11 +140,11 @@ def test_temperature_does_not_move_geometry_unless_asked():
 
 def test_decisions_about_the_background_are_in_the_checkpoint():
     model = make()
-    assert model.backdrop_on.tolist() == [True, True]
-    model.backdrop_on[:] = torch.tensor([False, True])
+    assert model.backdrop_on.tolist() == [True, True, True]
+    model.backdrop_on[:] = torch.tensor([False, True, False])
     loaded = make()
     loaded.load_state_dict(model.state_dict())
-    assert loaded.backdrop_on.tolist() == [False, True]
+    assert loaded.backdrop_on.tolist() == [False, True, False]
     model.eval(), loaded.eval()
     assert torch.equal(model(rays())["rgb"], loaded(rays())["rgb"])
 

@@ -297,8 +297,9 @@ def geometry_metrics(
 
     Returns:
         Nothing for real photographs. Else ``fscore``, ``precision``, ``recall``, 0 to 1, at 1.5 voxels of the
-        snapshot's lattice; ``fscore_128``, at 1.5 voxels of 128 along the exact box, to compare resolutions
-        and boxes; ``surface_distance_voxels`` and ``surface_distance_m``, the mean distance to the true surface.
+        snapshot's lattice; ``fscore_128``, at 1.5 voxels of 128 along the exact box, to compare resolutions and boxes;
+        ``fscore_seen`` and ``fscore_128_seen``, of the part of the boundary that training cameras see (the rest is a
+        guess); ``surface_distance_voxels`` and ``surface_distance_m``, the mean distance to the true surface.
         Without any solid voxel the scores are 0 and there is no distance.
     """
     try:
@@ -319,17 +320,22 @@ def geometry_metrics(
     transform = check_similarity("world_to_input", world_to_input)
     voxel_m = lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(transform[:3, :3]))))
     common_voxel_m = float(np.subtract(known.scene.scene_box[1], known.scene.scene_box[0]).max()) / COMMON_RESOLUTION
+    views = _training_views(known, transform)
     own, common = (
         surface_fscore(
-            *(cells, lattice, known.scene, seen, TOLERANCE_VOXELS * size_m, transform), surroundings=known.surroundings
+            *(cells, lattice, known.scene, seen, TOLERANCE_VOXELS * size_m, transform, views),
+            surroundings=known.surroundings,
         )
         for size_m in (voxel_m, common_voxel_m)
     )
+    assert own.seen is not None and common.seen is not None
     result = {
         "fscore": own.fscore,
         "precision": own.precision,
         "recall": own.recall,
         f"fscore_{COMMON_RESOLUTION}": common.fscore,
+        "fscore_seen": own.seen.fscore,
+        f"fscore_{COMMON_RESOLUTION}_seen": common.seen.fscore,
     }
     if own.mean_distance is not None:
         result["surface_distance_voxels"] = own.mean_distance / voxel_m

@@ -21,6 +21,9 @@ DensityActivation = Literal["relu", "softplus", "exp"]
 COLOUR_CHANNELS = tuple(3 * num_coefficients(degree) for degree in range(MAX_DEGREE + 1))
 """Columns of colour by the degree of its harmonics."""
 
+_PALEST = 0.02
+"""Colours nearer to 0 or 1 are stored as this far from them: a sigmoid reaches neither."""
+
 
 def activate_density(raw: Tensor, kind: DensityActivation) -> Tensor:
     """Map interpolated raw density to density >= 0, [1 / world unit], after interpolation.
@@ -115,6 +118,15 @@ class VoxelGrid(nn.Module):
         """The parameters that have one row per stored corner, by name."""
         rows = {"density": self.density, "sh": self.sh, "temperature": self.temperature}
         return {name: p for name, p in rows.items() if p is not None}
+
+    @torch.no_grad()
+    def paint(self, colours: Float[Tensor, "rows 3"]) -> None:
+        """Give the stored corners a colour, the same from all directions."""
+        assert self.sh is not None
+        constant = harmonics(self.sh.new_tensor([[0.0, 0.0, 1.0]]), 0)  # the same in all directions
+        by_channel = self.sh.view(len(self.sh), 3, -1)
+        by_channel.zero_()
+        by_channel[..., 0] = torch.logit(colours.to(self.sh), _PALEST) / constant
 
     def replace_voxels(self, voxels: KeptVoxels, rows: dict[str, Tensor], keep_identity: bool = False) -> None:
         """Exchange the kept voxels and the rows of every parameter.

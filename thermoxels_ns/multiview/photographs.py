@@ -33,6 +33,8 @@ class Photographs:
     """Row of `colours` with each photograph's upper left pixel, shape (photographs,)."""
     colours: npt.NDArray[np.float32]
     """Channels in [0, 1], photograph after photograph, row after row, shape (pixels, 3); NaN where masked."""
+    thermal: npt.NDArray[np.float32]
+    """Normalised temperature, shape (pixels,); NaN where unknown, or measured by a camera of its own."""
     near: float = 0.0
     """Depth up to which a photograph shows nothing, [world units]."""
 
@@ -58,19 +60,21 @@ def read_photographs(
     return gathered(pinholes, cameras.camera_to_worlds[usable, :, 3].double().numpy(), near)
 
 
-Pinhole = tuple[npt.NDArray[np.float32], npt.NDArray[np.float64]]
-"""A photograph without distortion, shape (h, w, 3), NaN where masked, and world -> homogeneous pixels, (3, 4)."""
+Pinhole = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.float64]]
+"""A photograph without distortion, shape (h, w, 3), NaN where masked, its normalised temperature (h, w), NaN where
+unknown, and world -> homogeneous pixels, (3, 4)."""
 
 
 def gathered(pinholes: Sequence[Pinhole], centres: npt.ArrayLike, near: float = 0.0) -> Photographs:
     """Put pinhole photographs and their cameras' centres (photographs, 3) into the arrays of `Photographs`."""
-    sizes = np.array([picture.shape[1::-1] for picture, _ in pinholes], dtype=np.int64)
+    sizes = np.array([picture.shape[1::-1] for picture, _, _ in pinholes], dtype=np.int64)
     return Photographs(
-        np.stack([matrix for _, matrix in pinholes]),
+        np.stack([matrix for _, _, matrix in pinholes]),
         np.asarray(centres, dtype=np.float64),
         sizes,
         np.concatenate(([0], np.cumsum(np.prod(sizes, axis=1))[:-1])),
-        np.concatenate([picture.reshape(-1, 3) for picture, _ in pinholes]),
+        np.concatenate([picture.reshape(-1, 3) for picture, _, _ in pinholes]),
+        np.concatenate([thermal.ravel() for _, thermal, _ in pinholes]),
         near,
     )
 
@@ -82,7 +86,11 @@ def _photograph(dataset: Any, cameras: Cameras, index: int, longest_side: int) -
     fx, fy, cx, cy = (float(getattr(cameras, name)[index, 0]) for name in ("fx", "fy", "cx", "cy"))
     camera = Camera(picture.shape[1], picture.shape[0], fx, fy, cx, cy, **named)
     pose = np.asarray(cameras.camera_to_worlds[index], dtype=np.float64)
-    return pinhole(picture, None if mask is None else mask.numpy()[..., 0], camera, pose, longest_side)
+    thermal = None
+    if dataset.thermal_cameras is None:
+        warm, valid = (values.numpy()[..., 0] for values in dataset.get_thermal(index))
+        thermal = np.where(valid, warm, np.nan).astype(np.float32)
+    return pinhole(picture, None if mask is None else mask.numpy()[..., 0], camera, pose, longest_side, thermal)
 
 
 def pinhole(
@@ -91,10 +99,12 @@ def pinhole(
     camera: Camera,
     pose: npt.NDArray[np.float64],
     longest_side: int = LONGEST_SIDE,
+    thermal: npt.NDArray[np.float32] | None = None,
 ) -> Pinhole:
     """Average a photograph (h, w, 3) down to `longest_side` [pixels] and remove its camera's distortion.
 
-    Only pixels of its `mask` (h, w) are used. The pose is camera to world, (3, 4) or (4, 4), OpenGL axes.
+    Only pixels of its `mask` (h, w) are used. `thermal`, of any size, is what the same camera saw; the pose is camera
+    to world, (3, 4) or (4, 4), OpenGL axes.
     """
     picture = photograph.astype(np.float32)
     picture /= np.float32(255.0)
@@ -104,15 +114,20 @@ def pinhole(
     size = (max(2, round(width / shrink)), max(2, round(height / shrink)))
     if shrink > 1.0:
         picture, shown = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (picture, shown))
+    warm = np.full(size[::-1], np.nan, np.float32)
+    if thermal is not None:
+        warm = np.asarray(cv2.resize(thermal, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
     camera = camera.resized(picture.shape[1], picture.shape[0])
     if any(camera.distortion):
         places = _distorted_places(camera)
         picture = cv2.remap(picture, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         shown = cv2.remap(shown, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0.0,))
+        warm = cv2.remap(warm, *places, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=(np.nan,))
     picture = np.where(shown[..., None] < 0.999, np.float32(np.nan), picture).astype(np.float32)
     turned = pose[:3, :3].T * np.array([[1.0], [-1.0], [-1.0]])  # x right, y down, z forward
     intrinsics = np.array([[camera.fl_x, 0.0, camera.cx], [0.0, camera.fl_y, camera.cy], [0.0, 0.0, 1.0]])
-    return picture, intrinsics @ np.column_stack((turned, -turned @ pose[:3, 3]))
+    to_pixels = intrinsics @ np.column_stack((turned, -turned @ pose[:3, 3]))
+    return picture, np.asarray(warm, dtype=np.float32), to_pixels
 
 
 def _distorted_places(camera: Camera) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:

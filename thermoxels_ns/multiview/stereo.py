@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.threads import run_ranges
+from thermoxels_ns.multiview.backdrop import plain_backdrop
 from thermoxels_ns.multiview.photographs import Photographs, read_photographs
 from thermoxels_ns.multiview.stereo_kernels import OUTSIDE, agreeing_views, correlate, weigh_patches
 
@@ -52,7 +53,7 @@ LEAST_SHARE = 0.01
 ERROR_PLANES = 0.25
 """Standard error of a depth, in planes of the sweep."""
 _NEAREST = 0.1
-"""Distance of the nearest plane relative to the farthest."""
+"""Distance of the nearest plane in the box relative to the farthest."""
 _OUTSIDE = -100.0
 """Brightness that stands for a pixel that a photograph does not show: where it is mixed in, the rest is negative."""
 _PROBES = (5, 4)
@@ -86,7 +87,7 @@ def depths_of(
     hi: npt.ArrayLike | None = None,
     fewest_views: int = FEWEST_VIEWS,
 ) -> Depths:
-    """Find the depths of photographs within a box, or wherever they look at the same from different directions.
+    """Find the depths of photographs: in a box and behind it, or wherever they see the same from different directions.
 
     For each photograph, its neighbours are drawn onto planes parallel to it, one behind the other, and compared with it
     patch by patch (plane sweep, Collins 1996; normalised cross-correlation). The plane on which they agree best is the
@@ -115,7 +116,7 @@ def depths_of(
             if span is not None and near:
                 first = int(photographs.firsts[number])
                 pixels = slice(first, first + view.brightness.size)
-                depth[pixels], correlation[pixels], error[pixels] = _sweep(view, near, *span)
+                depth[pixels], correlation[pixels], error[pixels] = _sweep(view, near, *span, corners is not None)
 
     run_ranges(work, len(views), 1)
     depth[~(correlation >= LEAST_CORRELATION)] = np.nan
@@ -239,9 +240,14 @@ def _neighbours(number: int, views: list[_View], near: float, far: float) -> lis
     return [views[other] for other in best if worth[other] > 0.0]
 
 
-def _sweep(view: _View, others: list[_View], near: float, far: float) -> tuple[npt.NDArray[np.float32], ...]:
-    """Depth, correlation and distance of planes for every pixel, each of shape (pixels,)."""
+def _sweep(
+    view: _View, others: list[_View], near: float, far: float, endless: bool
+) -> tuple[npt.NDArray[np.float32], ...]:
+    """Depth, correlation and distance of planes for every pixel; if `endless`, on planes behind `far` too."""
     inverse_depths = np.linspace(1.0 / far, 1.0 / near, _num_planes(view, others, near, far))
+    beyond = min(len(inverse_depths), int(inverse_depths[0] / (inverse_depths[1] - inverse_depths[0]))) * endless
+    farthest = 0.5 * inverse_depths[0] / max(1, beyond)
+    inverse_depths = np.concatenate((np.linspace(farthest, inverse_depths[0], beyond, endpoint=False), inverse_depths))
     shape, noise = view.brightness.shape, np.float32(SMALLEST_CONTRAST**2)
     weights = np.empty((*shape, (2 * RADIUS + 1) ** 2), dtype=np.float32)
     means, variances = (np.empty(shape, dtype=np.float32) for _ in range(2))
@@ -256,12 +262,12 @@ def _sweep(view: _View, others: list[_View], near: float, far: float) -> tuple[n
         half = -(-len(others) // 2)
         correlate(view.brightness, moved, RADIUS, weights, means, variances, noise, half, agreement[plane])
     best = agreement.argmax(0)
-    found = inverse_depths[0] + (best + _between(agreement, best)) * (inverse_depths[1] - inverse_depths[0])
+    apart = np.diff(inverse_depths, append=2.0 * inverse_depths[-1] - inverse_depths[-2])[best]
+    found = np.maximum(inverse_depths[best] + _between(agreement, best) * apart, inverse_depths[0])
     depth = (1.0 / found).astype(np.float32).ravel()
-    error = (depth * depth * (inverse_depths[1] - inverse_depths[0])).astype(np.float32)
-    # What lies beyond the box agrees best on the last plane within it.
+    error = (depth * depth * apart.ravel()).astype(np.float32)
     reached = np.take_along_axis(agreement, best[None], 0)[0]
-    reached[(best == 0) | (best == len(agreement) - 1)] = OUTSIDE
+    reached[(best == len(agreement) - 1) | ((best == 0) & (beyond == 0))] = OUTSIDE
     return depth, reached.ravel(), error
 
 
@@ -325,25 +331,46 @@ def feature_rays_to_depths(depths: Depths) -> FeatureRays:
     The rays stand photograph after photograph [world units]. A ray's uncertainty is `ERROR_PLANES` times the distance
     between the planes of its sweep, along the ray.
     """
-    photographs = depths.photographs
     (sure,) = np.nonzero(np.isfinite(depths.depth))
-    number = np.searchsorted(photographs.firsts, sure, side="right") - 1
-    place, width = sure - photographs.firsts[number], photographs.sizes[number, 0]
-    pixel = np.column_stack((place % width + 0.5, place // width + 0.5, np.ones(len(sure))))
+    depth, error = (values[sure].astype(np.float64) for values in (depths.depth, depths.error))
+    return _rays_through(depths.photographs, sure, depth, ERROR_PLANES * error)
+
+
+def _rays_through(
+    photographs: Photographs, chosen: npt.NDArray[np.int64], depth: FloatArray, error: FloatArray
+) -> FeatureRays:
+    """Feature rays through the pixels `chosen` (n,) to depths (n,) with standard errors (n,), [world units]."""
+    number = np.searchsorted(photographs.firsts, chosen, side="right") - 1
+    place, width = chosen - photographs.firsts[number], photographs.sizes[number, 0]
+    pixel = np.column_stack((place % width + 0.5, place // width + 0.5, np.ones(len(chosen))))
     inverses = np.linalg.inv(photographs.matrices[:, :, :3])
     along = np.einsum("nij,nj->ni", inverses[number], pixel)  # of depth 1
     origins = photographs.centres[number]
-    points = origins + depths.depth[sure, None].astype(np.float64) * along
-    error = ERROR_PLANES * depths.error[sure].astype(np.float64) * np.linalg.norm(along, axis=1)
-    return FeatureRays(origins, np.arange(len(sure)), points, error)
+    return FeatureRays(
+        origins, np.arange(len(chosen)), origins + depth[:, None] * along, error * np.linalg.norm(along, axis=1)
+    )
 
 
-def feature_rays_of_photographs(
+@dataclass(frozen=True, eq=False)
+class PhotographEvidence:
+    """What training photographs say before there is a model."""
+
+    photographs: Photographs
+    """The photographs, small."""
+    backdrop: npt.NDArray[np.bool_]
+    """Which of their pixels show a plain backdrop, shape (pixels,)."""
+    feature_rays: FeatureRays | None
+    """Rays to each depth that several photographs agree about; None where these are too few to tell anything."""
+    backdrop_rays: FeatureRays | None
+    """Rays through the backdrop, to points far outside the box; None where hardly any pixel shows one."""
+
+
+def evidence_of_photographs(
     dataset: Any, near: float, lo: npt.ArrayLike, hi: npt.ArrayLike, say: Callable[[str], None]
-) -> FeatureRays | None:
-    """Feature rays to each depth that several training photographs agree about; None where they say too little.
+) -> PhotographEvidence | None:
+    """Compare training photographs with each other, and say what was found; None without perspective photographs.
 
-    Depths are looked for in the box from `lo` to `hi`, and behind `near`, [world units]; what was found is said.
+    Depths are looked for behind `near`, in the box from `lo` to `hi` and beyond it, [world units].
     """
     began = time.perf_counter()
     photographs = read_photographs(dataset, near)
@@ -351,8 +378,16 @@ def feature_rays_of_photographs(
         return None
     depths = depths_of(photographs, lo, hi)
     few = "" if depths.share >= LEAST_SHARE else ", too few to tell anything"
+    backdrop = plain_backdrop(photographs, depths.depth)
     say(
         f"depths: {len(photographs)} photographs agree about {depths.share:.1%} of their pixels{few}; "
-        f"{time.perf_counter() - began:.1f} s"
+        f"a plain backdrop fills {backdrop.mean():.1%}; {time.perf_counter() - began:.1f} s"
     )
-    return None if few else feature_rays_to_depths(depths)
+    (chosen,) = np.nonzero(backdrop)
+    far = np.full(len(chosen), 1e3 * np.linalg.norm(np.subtract(hi, lo)))
+    return PhotographEvidence(
+        photographs,
+        backdrop,
+        None if few else feature_rays_to_depths(depths),
+        _rays_through(photographs, chosen, far, np.zeros(len(chosen))) if backdrop.mean() >= LEAST_SHARE else None,
+    )

@@ -74,6 +74,8 @@ class RayRender:
     """Sum of log(1 + 2 density^2) over each ray's samples."""
     variation: dict[str, Float[Tensor, ""]] = field(default_factory=dict)
     """Total variation of the blocks asked for."""
+    surroundings: Float[Tensor, " rays"] | None = None
+    """Share of the light from infinity that the surroundings keep from each ray; None without any."""
 
     def with_background(
         self, rgb: Tensor | None, thermal: Tensor | None, request: RayRequest, thermal_moves_density: bool = False

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -14,11 +15,13 @@ from torch.nn import Parameter
 from thermoxels_ns.core.errors import PruningError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
-from thermoxels_ns.field.refine import RowChange, prune
-from thermoxels_ns.multiview.stereo import feature_rays_of_photographs
+from thermoxels_ns.field.refine import RowChange, prune, refine
+from thermoxels_ns.field.voxel_grid import VoxelGrid
+from thermoxels_ns.multiview.backdrop import mean_colours
+from thermoxels_ns.multiview.stereo import evidence_of_photographs
 from thermoxels_ns.training.free_space_carving import carve_free_space
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler
-from thermoxels_ns.training.model import ThermoxelsModel
+from thermoxels_ns.training.model import SurroundingsSampler, ThermoxelsModel
 from thermoxels_ns.training.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
 
 FEWEST_OPEN_RAYS = 0.002
@@ -59,14 +62,36 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         if change is not None:
             follow(old, change)
 
-    def follow(old: dict[str, Parameter], change: RowChange) -> None:
+    def follow(old: dict[str, Parameter], change: RowChange, grid: VoxelGrid = model.grid, prefix: str = "") -> None:
         """Point the optimisers to the rows that took the place of `old`; their state changes as the rows did."""
         assert attributes.optimizers is not None
-        for name, new in model.grid.row_parameters().items():
+        for name, new in grid.row_parameters().items():
             if new is not old[name]:
-                optimizer: Any = attributes.optimizers.optimizers[name]
+                optimizer: Any = attributes.optimizers.optimizers[prefix + name]
                 optimizer.change_rows(old[name], new, change)
-                attributes.optimizers.parameters[name] = [new]
+                attributes.optimizers.parameters[prefix + name] = [new]
+
+    def change_surroundings(step: int) -> None:
+        """Drop voxels of the surroundings that training rays give no weight, and split the others with the box's."""
+        if model.seen_surroundings is None:
+            return
+        assert attributes.pipeline is not None
+        datamanager: Any = attributes.pipeline.datamanager
+        grid, prefix = model.seen_surroundings.grid, "surroundings_"
+        rays = datamanager.training_rays(RGB_STREAM | THERMAL_STREAM, RAYS_PER_IMAGE)
+        largest = voxel_weights(SurroundingsSampler(model), rays).largest.cpu().numpy()
+        keep = grid.voxels.dilated(largest > (model.config.prune_threshold if step else 0.0), 1)
+        if not keep.any():
+            model.backdrop_on[2], keep[0] = False, True  # a parameter without rows is none
+        old = grid.row_parameters()
+        follow(old, prune(grid, keep), grid, prefix)
+        if model.seen_surroundings is None:
+            CONSOLE.log(f"step {step}: surroundings dropped, all that is outside the box lies at infinity")
+            return
+        if step in factors:
+            old = grid.row_parameters()
+            follow(old, refine(grid, factors[step]), grid, prefix)
+        CONSOLE.log(f"step {step}: surroundings of {len(grid.voxels):,} voxels")
 
     def change_lattice(step: int) -> None:
         assert attributes.pipeline is not None and attributes.optimizers is not None
@@ -80,6 +105,8 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             report, change = prune_by_rays(model, datamanager, threshold, 0 if thin else model.config.prune_dilation)
             follow(old, change)
             CONSOLE.log(f"step {step}: {'thinning' if thin else 'pruning'} {report}")
+        if step in steps:
+            change_surroundings(step)
         if step in factors:
             old = model.grid.row_parameters()
             follow(old, model.split(factors[step]))
@@ -99,6 +126,7 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     return [
         TrainingCallback(before, model.update_to_step),
         TrainingCallback(before, carve, iters=(0,)),
+        TrainingCallback(before, change_surroundings, iters=(0,)),
         TrainingCallback(before, change_lattice, iters=tuple(sorted(steps | decisions))),
         TrainingCallback(before, widen),
     ]
@@ -122,12 +150,20 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
     box = model.scene_box.aabb.double().numpy()
     lattice = Lattice.covering(box[0], box[1], config.resolutions[0])  # the same in a resumed training
     near = config.near_plane * model.unit
-    depths = feature_rays_of_photographs(datamanager.train_dataset, near, lattice.lo, lattice.hi, CONSOLE.log)
-    if depths is not None:
-        tracks = model.feature_rays
-        model.feature_ray_sampler = (
-            FeatureRaySampler(depths, COARSE_LIGHT) if tracks is None else FeatureRaySampler(tracks.joined_with(depths))
-        )
+    found = evidence_of_photographs(datamanager.train_dataset, near, lattice.lo, lattice.hi, CONSOLE.log)
+    if found is None:
+        return
+    tracks, depths, far = model.feature_rays, found.feature_rays, model.seen_surroundings is not None
+    if depths is not None and tracks is None:
+        model.feature_ray_sampler = FeatureRaySampler(depths, box, far, COARSE_LIGHT)
+    elif depths is not None and tracks is not None:
+        model.feature_ray_sampler = FeatureRaySampler(tracks.joined_with(depths), box, far)
+    if found.backdrop_rays is not None:
+        model.backdrop_ray_sampler = FeatureRaySampler(found.backdrop_rays, box)
+
+    if trainer is None or trainer._start_step == 0:
+        points = model.grid.voxels.corner_index() * lattice.voxel_size + np.asarray(lattice.lo)
+        model.grid.paint(torch.from_numpy(mean_colours(found.photographs, found.backdrop, points)))
 
 
 @dataclass(frozen=True)
@@ -187,7 +223,7 @@ def decide_backdrop(model: ThermoxelsModel, datamanager) -> None:
     Asked again at every change of the lattice: what was kept before surfaces had formed can still go.
     """
     config = model.config
-    rgb_on, thermal_on = model.backdrop_on.tolist()
+    rgb_on, thermal_on, _ = model.backdrop_on.tolist()
     if config.background == "auto" and rgb_on:
         unsaturated, _ = backdrop_evidence(model, datamanager.training_rays(RGB_STREAM, RAYS_PER_IMAGE))
         keep = unsaturated >= FEWEST_OPEN_RAYS

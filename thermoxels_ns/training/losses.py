@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -13,6 +15,8 @@ from thermoxels_ns.render.ray_render import RayRequest
 
 MARGIN_VOXELS = 1.5
 """Voxels before and behind a point between which the surface may lie."""
+LARGEST_ERROR = 0.25
+"""Share of a ray's length that the margin may be for it to end in the surroundings."""
 MARGIN_ERRORS = 2.0
 """Standard errors of a ray's length by which that is widened."""
 
@@ -59,28 +63,53 @@ class FeatureRaySampler:
 
     Args:
         rays: Feature rays, world units; at least one.
+        box: Lower and upper corner, (2, 3). A ray to a point that lies outside ends on nothing in it.
+        surroundings: There are surroundings, in which such a ray ends if its length is known well enough.
         coarse_light: Share of the light that may pass a point while the lattice is coarse.
     """
 
-    def __init__(self, rays: FeatureRays, coarse_light: float = 0.0) -> None:
+    def __init__(
+        self, rays: FeatureRays, box: npt.ArrayLike, surroundings: bool = False, coarse_light: float = 0.0
+    ) -> None:
         self.coarse_light = coarse_light
+        lo, hi = np.asarray(box, dtype=np.float64)
+        self._ends = torch.from_numpy(((rays.points > lo) & (rays.points < hi)).all(1)[rays.point])
         along = torch.from_numpy(rays.points[rays.point] - rays.origins)
         self._length = torch.linalg.norm(along, dim=-1)
+        # How much farther one voxel of the surroundings reaches there, per share of the way to infinity that it spans.
+        times = (np.abs(rays.points - 0.5 * (lo + hi)) / (0.5 * (hi - lo))).max(1)[rays.point]
+        self._growth = torch.from_numpy(np.where(times > 1.0, times * times, 0.0) * 0.5 * (hi - lo).max())
+        if surroundings:
+            uncertainty = torch.from_numpy(rays.uncertainty)
+            self._ends |= (uncertainty > 0) & (MARGIN_ERRORS * uncertainty < LARGEST_ERROR * self._length)
         self._directions = (along / self._length[:, None].clamp(min=1e-12)).float()
         self._origins = torch.from_numpy(rays.origins).float()
         self._uncertainty = torch.from_numpy(rays.uncertainty)
 
     def request(
-        self, count: int, near: float, voxel_size: float, generator: torch.Generator, device: torch.device
+        self,
+        count: int,
+        near: float,
+        voxel_size: float,
+        generator: torch.Generator,
+        device: torch.device,
+        surroundings_step: float = 0.0,
     ) -> RayRequest:
         """Choose `count` feature rays at random and make two of each: first all that end before their points.
 
-        They want neither colour nor temperature. Lengths are in world units; the generator is on the CPU.
+        Behind them those that end behind their points, empty where nothing is known to be there. They want neither
+        colour nor temperature. Lengths are in world units; the generator is on the CPU. `surroundings_step` is the
+        share of the way from the box to infinity that a voxel of the surroundings spans.
         """
         chosen = torch.randint(len(self._length), (count,), generator=generator)
-        margin = MARGIN_VOXELS * voxel_size + MARGIN_ERRORS * self._uncertainty[chosen]
+        margin = (
+            MARGIN_VOXELS * (voxel_size + surroundings_step * self._growth[chosen])
+            + MARGIN_ERRORS * self._uncertainty[chosen]
+        )
         length = self._length[chosen]
-        far = torch.cat(((length - margin).clamp(min=0.0), length + margin)).float()
+        # Errors are of the inverse length: one as large as the length leaves half of it.
+        before = length * length / (length + margin).clamp(min=1e-12)
+        far = torch.cat((before, (length + margin) * self._ends[chosen])).float()
         nothing = torch.zeros(2 * count, dtype=torch.bool, device=device)
         origins, directions = (v[chosen].repeat(2, 1).to(device) for v in (self._origins, self._directions))
         return RayRequest(origins, directions, near, far.to(device), nothing, nothing)
@@ -89,8 +118,8 @@ class FeatureRaySampler:
 def feature_ray_loss(accumulation: Tensor, transmittance: Tensor, tolerated: float = 0.0) -> Tensor:
     """Mean share of light that a feature ray loses before its point, plus that which passes the point.
 
-    Both are 0 where the surface lies at the point. The rays are those of `FeatureRaySampler.request`, shape (2 n,); the
-    share `tolerated` of the light may pass without counting.
+    Both are 0 where the surface lies at the point; for an empty ray the second is constant. The rays are those of
+    `FeatureRaySampler.request`, shape (2 n,); the share `tolerated` of the light may pass without counting.
 
     >>> float(feature_ray_loss(torch.tensor([0.25, 0.9]), torch.tensor([0.75, 0.1])))
     0.3499999940395355

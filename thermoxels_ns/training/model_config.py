@@ -41,6 +41,10 @@ class LossWeights:
     """Gather each ray's weight in one short interval."""
     tracks: float = 0.05
     """Feature rays end at their points: tracks of structure from motion, depths on which photographs agree."""
+    backdrop: float = 0.02
+    """Rays through a plain backdrop (sky, a wall far behind) meet nothing in the box."""
+    surroundings: float = 1e-3
+    """What infinity explains is not in the surroundings before it."""
 
 
 LOSS_RECIPES: Mapping[str, LossWeights] = {
@@ -48,7 +52,14 @@ LOSS_RECIPES: Mapping[str, LossWeights] = {
     "default": LossWeights(),
     # The published training configuration of the original code (TV, sparsity and beta as there).
     "paper": LossWeights(
-        tv_density=5e-3, tv_sh=5e-2, tv_temperature=1e-6, sparsity=1e-11, beta=1e-5, distortion=0.0, tracks=0.0
+        tv_density=5e-3,
+        tv_sh=5e-2,
+        tv_temperature=1e-6,
+        sparsity=1e-11,
+        beta=1e-5,
+        distortion=0.0,
+        tracks=0.0,
+        backdrop=0.0,
     ),
 }
 
@@ -125,11 +136,15 @@ class ThermoxelsModelConfig(ModelConfig):
     thermal_background: Literal["auto", "minimum", "learned"] = "auto"
     """Temperature behind the box: the scene's minimum (the paper), or a learned low-order sky."""
 
+    surroundings: Literal["on", "off"] = "on"
+    """What lies outside the box, with parallax: coarse lattices from the box to infinity. They are not exported. off:
+    all that is outside lies at infinity."""
+
     recipe: Literal["default", "paper"] = "default"
     """Set of loss weights; paper: the published one."""
     loss_overrides: dict[str, float] = field(default_factory=dict)
     """Loss weights that replace the recipe's, by name: rgb, thermal, tv_density, tv_sh, tv_temperature, sparsity,
-    beta, distortion, tracks."""
+    beta, distortion, tracks, backdrop, surroundings."""
     thermal_l2_share: float = 0.5
     """lambda of the paper's eq. 4."""
     distortion_ramp: tuple[int, int] = _STANDARD.distortion_ramp

@@ -1,0 +1,93 @@
+"""Which pixels show a plain backdrop, on drawn photographs of a house under a sky."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.multiview.backdrop import mean_colours, plain_backdrop
+from thermoxels_ns.multiview.photographs import Photographs
+
+WIDTH, HEIGHT, FOCAL = 60, 48, 50.0
+SKY, WALL, GROUND, DARK = (0.55, 0.57, 0.6), (0.9, 0.88, 0.85), (0.3, 0.35, 0.2), (0.1, 0.1, 0.15)
+
+
+def house(sky=SKY, wall=WALL, wall_warmth=np.nan, turns: int = 0) -> tuple[Photographs, np.ndarray]:
+    """Six photographs of a plain wall with a dark roof and window above plain ground, and where the sky is.
+
+    With `turns` the camera was held turned by that many quarter turns.
+    """
+    picture = np.empty((HEIGHT, WIDTH, 3), np.float32)
+    warm = np.full((HEIGHT, WIDTH), 0.1 if np.isfinite(wall_warmth) else np.nan, np.float32)
+    picture[:], picture[36:] = sky, GROUND
+    picture[14:36, 15:45], picture[12:14, 13:47], picture[20:28, 24:34] = wall, DARK, DARK
+    warm[12:36, 15:45] = wall_warmth
+    is_sky = np.ones((HEIGHT, WIDTH), dtype=bool)
+    is_sky[12:14, 13:47] = is_sky[14:36, 15:45] = is_sky[36:] = False
+    noise = np.random.default_rng(0).normal(0.0, 0.004, (6, HEIGHT, WIDTH, 3))
+    level = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # x right, y down, z forward; z up in world
+    matrices, pictures, warmths = [], [], []
+    for number in range(6):
+        bearing = 0.1 * number
+        turn = np.array([[np.cos(bearing), np.sin(bearing), 0], [-np.sin(bearing), np.cos(bearing), 0], [0, 0, 1.0]])
+        quarter = np.linalg.matrix_power(np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), turns)
+        shown = np.rot90(picture + noise[number], turns)
+        middle = np.array([[FOCAL, 0, shown.shape[1] / 2], [0, FOCAL, shown.shape[0] / 2], [0, 0, 1]])
+        centre = np.array([0.2 * number, -3.0, 1.0])
+        rotation = quarter @ level @ turn
+        matrices.append(middle @ np.column_stack((rotation, -rotation @ centre)))
+        pictures.append(shown.reshape(-1, 3))
+        warmths.append(np.rot90(warm, turns).ravel())
+    sizes = np.full((6, 2), np.rot90(picture, turns).shape[1::-1])
+    seen = Photographs(
+        np.stack(matrices),
+        np.array([[0.2 * number, -3.0, 1.0] for number in range(6)]),
+        sizes,
+        np.arange(6) * WIDTH * HEIGHT,
+        np.concatenate(pictures).astype(np.float32),
+        np.concatenate(warmths).astype(np.float32),
+    )
+    return seen, np.tile(np.rot90(is_sky, turns).ravel(), 6)
+
+
+def found(seen: Photographs) -> np.ndarray:
+    return plain_backdrop(seen, np.full(len(seen.colours), np.nan, np.float32))
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+def test_the_sky_is_found_and_neither_wall_nor_ground(turns):
+    seen, is_sky = house(turns=turns)
+    backdrop = found(seen)
+    assert not backdrop[~is_sky].any()
+    assert backdrop[is_sky].mean() > 0.9
+
+
+def test_a_white_wall_under_a_white_sky_is_none():
+    seen, is_sky = house(sky=(0.95, 0.95, 0.95), wall=(0.95, 0.95, 0.95), wall_warmth=0.6)
+    backdrop = found(seen)
+    assert backdrop[~is_sky].mean() < 0.01 and backdrop[is_sky].mean() > 0.8
+
+
+def test_a_pixel_whose_depth_is_known_is_none():
+    seen, _ = house()
+    depth = np.full(len(seen.colours), np.nan, np.float32)
+    depth[: WIDTH * 6] = 2.0  # the upper rows of the first photograph
+    assert not plain_backdrop(seen, depth)[: WIDTH * 6].any()
+
+
+def test_points_get_the_colour_that_photographs_show_there_and_not_that_of_the_sky():
+    seen, _ = house()
+    inverse = np.linalg.inv(seen.matrices[0][:, :3])
+    at = [seen.centres[0] + 4.0 * inverse @ np.array([x, y, 1.0]) for x, y in ((30.0, 32.0), (30.0, 5.0))]
+    alone = Photographs(
+        seen.matrices[:1],
+        seen.centres[:1],
+        seen.sizes[:1],
+        seen.firsts[:1],
+        *(values[: WIDTH * HEIGHT] for values in (seen.colours, seen.thermal)),
+    )
+    backdrop = found(seen)[: WIDTH * HEIGHT]
+    wall, sky = mean_colours(alone, backdrop, np.array(at))
+    assert wall == pytest.approx(WALL, abs=0.02)
+    rest = alone.colours[~backdrop].mean(0)
+    assert sky == pytest.approx(rest, abs=1e-4)

@@ -1,0 +1,134 @@
+"""Which pixels of photographs show a plain backdrop: a sky, the wall behind an object."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.multiview.photographs import Photographs
+
+FloatArray = npt.NDArray[np.float64]
+
+PLAIN = 0.03
+"""Difference of a channel from one pixel to the next, of 1, up to which a photograph is plain."""
+STEEPEST = 0.9
+"""Cosine between the optical axis and the vertical above which a photograph has no top."""
+COLOUR_TOLERANCE = 0.06
+"""Difference from the backdrop's colour up to which a pixel shows it, of 1."""
+THERMAL_TOLERANCE = 0.1
+"""Difference from its temperature, of the scene's range."""
+_WIDEST, _ROUNDS = 0.3, 8
+"""Difference up to which colours count in the first of some fits; it shrinks to the tolerance."""
+
+
+def plain_backdrop(photographs: Photographs, depth: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+    """Which pixels show nothing but a plain backdrop, shape (pixels,).
+
+    No photograph tells how far away a plain area is. It is taken for a backdrop if plain pixels lead up from it to the
+    edge of the photograph (a wall ends at a roof, at windows, at the ground), and if its colour and temperature are
+    those that most such pixels have, as a function of direction (harmonics of degree 2, fitted to the pixels that agree
+    with it); and so are plain pixels that look the same and touch it, those below an object among them.
+
+    Args:
+        photographs: Pinhole photographs.
+        depth: Depths of their pixels, NaN where unknown, shape (pixels,).
+    """
+    open_above, plain = (np.zeros(len(photographs.colours), dtype=bool) for _ in range(2))
+    directions = np.empty((len(open_above), 3))
+    for number in range(len(photographs)):
+        (width, height), first = photographs.sizes[number], photographs.firsts[number]
+        pixels, shape = slice(first, first + width * height), (height, width)
+        inverse = np.linalg.inv(photographs.matrices[number][:, :3])
+        columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        along = np.column_stack((columns.ravel(), rows.ravel(), np.ones(width * height))) @ inverse.T
+        directions[pixels] = along / np.linalg.norm(along, axis=1, keepdims=True)
+        even = _even(photographs.colours[pixels].reshape(*shape, 3)) & np.isnan(depth[pixels]).reshape(shape)
+        plain[pixels] = even.ravel()
+        turns = _turns(inverse)
+        if turns is not None:
+            open_above[pixels] = np.rot90(np.logical_and.accumulate(np.rot90(even, turns), axis=0), -turns).ravel()
+    if open_above.mean() < 1e-3:
+        return np.zeros_like(open_above)
+    values = np.column_stack((photographs.colours, photographs.thermal))
+    alike = plain & _alike(values, directions, open_above)
+    open_above &= alike
+    for (width, height), first in zip(photographs.sizes, photographs.firsts):
+        pixels = slice(first, first + width * height)
+        picture = alike[pixels].reshape(height, width).astype(np.uint8)
+        label = np.asarray(cv2.connectedComponents(picture, connectivity=4)[1], dtype=np.int64).ravel()
+        touched = np.bincount(label, open_above[pixels], label.max() + 1) > 0
+        alike[pixels] &= touched[label]
+    return alike
+
+
+def _turns(inverse: FloatArray) -> int | None:
+    """Quarter turns (of `np.rot90`) that bring the side of a photograph at which the sky is to its top."""
+    right, down, forward = (inverse[:, axis] / np.linalg.norm(inverse[:, axis]) for axis in range(3))
+    if abs(forward[2]) > STEEPEST:
+        return None
+    if abs(down[2]) >= abs(right[2]):
+        return 0 if down[2] < 0 else 2
+    return 1 if right[2] > 0 else 3
+
+
+def _even(picture: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+    """Which pixels differ little from the four around them, (h, w); those at a mask do not."""
+    even = np.ones(picture.shape[:2], dtype=bool)
+    for axis in (0, 1):
+        small = np.abs(np.diff(picture, axis=axis)).max(-1) <= PLAIN
+        one, other = [slice(None)] * 2, [slice(None)] * 2
+        one[axis], other[axis] = slice(1, None), slice(None, -1)
+        even[tuple(one)] &= small
+        even[tuple(other)] &= small
+    return even
+
+
+def _alike(
+    values: npt.NDArray[np.float32], directions: FloatArray, chosen: npt.NDArray[np.bool_]
+) -> npt.NDArray[np.bool_]:
+    """Which pixels look as most of the chosen do, by colour and, where it is known, temperature (pixels, 4)."""
+    x, y, z = directions.T
+    basis = np.column_stack((np.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3.0 * z * z - 1.0))
+    tolerance = np.array([COLOUR_TOLERANCE] * 3 + [THERMAL_TOLERANCE])
+    some = np.flatnonzero(chosen)
+    some = some[:: max(1, len(some) // 20_000)]
+    seen = values[some].astype(np.float64)
+    bins = np.unique((np.nan_to_num(seen) / (2.0 * tolerance)).astype(np.int64), axis=0, return_inverse=True)[1]
+    bins = bins.reshape(-1)
+    middle = np.median(seen[bins == np.bincount(bins).argmax()], axis=0)
+    expected = np.broadcast_to(middle, (len(some), 4))
+    fitted = np.zeros((basis.shape[1], 4))
+    for widest in np.geomspace(_WIDEST / COLOUR_TOLERANCE, 1.0, _ROUNDS):
+        off = np.abs(seen - expected) / tolerance
+        near = (np.nan_to_num(off) <= widest).all(1)
+        for channel in range(4):
+            used = near & np.isfinite(seen[:, channel])
+            rows = basis[some[used]]
+            ridge = 1e-3 * max(1, len(rows)) * np.diag([0.0] + [1.0] * (basis.shape[1] - 1))
+            fitted[:, channel] = np.linalg.lstsq(rows.T @ rows + ridge, rows.T @ seen[used, channel], rcond=None)[0]
+        expected = basis[some] @ fitted
+    off = np.abs(values - basis @ fitted) / tolerance
+    return (np.nan_to_num(off) <= 1.0).all(1)
+
+
+def mean_colours(
+    photographs: Photographs, backdrop: npt.NDArray[np.bool_], points: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float32]:
+    """Mean colour of the pixels onto which points (n, 3) fall, without those of the backdrop, shape (n, 3).
+
+    Where all photographs show the backdrop or none shows the point, it is the mean over all other pixels.
+    """
+    shown = np.isfinite(photographs.colours).all(1) & ~backdrop
+    colours = np.where(shown[:, None], photographs.colours, 0.0)
+    total, count = np.zeros((len(points), 3)), np.zeros(len(points))
+    for matrix, (width, height), first in zip(photographs.matrices, photographs.sizes, photographs.firsts):
+        seen = points @ matrix[:, :3].T + matrix[:, 3]
+        (front,) = np.nonzero(seen[:, 2] > photographs.near)
+        place = np.floor(seen[front, :2] / seen[front, 2:]).astype(np.int64)
+        inside = ((place >= 0) & (place < (width, height))).all(1)
+        front, pixel = front[inside], first + place[inside, 1] * width + place[inside, 0]
+        total[front] += colours[pixel]
+        count[front] += shown[pixel]
+    everywhere = colours.sum(0) / max(1, shown.sum())
+    return np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None], everywhere).astype(np.float32)
