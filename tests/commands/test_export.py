@@ -468,7 +468,7 @@ def test_garbage_config_file(tmp_path) -> None:
         ("", "the file is empty"),
         ("# a comment", "holds no TrainerConfig of nerfstudio"),
         ("a: [", "ParserError: "),
-        ("!!python/object:no.such.Thing {}", "ConstructorError: "),
+        ("!!python/object:no.such.Thing {}", "got object:no.such.Thing in line 1"),
     ):
         path = tmp_path / "config.yml"
         path.write_text(text)

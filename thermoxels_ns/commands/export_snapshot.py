@@ -51,7 +51,8 @@ def prepare_folder(output_dir: Path | str, *, heat: bool) -> Path:
     names = (*_mesh_files(MESH_FORMATS), *_MESH_PICTURES, _HEAT, _HEAT_PICTURE, _QUALITY, _SUMMARY)
     series = folder / Path(_HEAT).stem
     refuse_what_is_in_the_way(folder, names, [series.name] if heat else [])
-    refuse_files_of_others(folder, (*names, series.name), (_QUALITY, _SUMMARY), ("answers.json", "series.csv"))
+    steps = f"{series.name}/{STEP_PATTERN}"
+    refuse_files_of_others(folder, (*names, steps), (_QUALITY, _SUMMARY), ("answers.json", "series.csv"))
     remove_stale_temporaries(folder, names)
     remove_stale_temporaries(series, [STEP_PATTERN])
     return folder

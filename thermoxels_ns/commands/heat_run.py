@@ -138,7 +138,8 @@ def prepared_folder(output_dir: Path) -> Path:
     names = (ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY, *PICTURES)
     series = folder / Path(THROUGH_TIME).stem
     refuse_what_is_in_the_way(folder, names, [series.name])
-    refuse_files_of_others(folder, (*names, series.name), (ANSWERS, SERIES), ("summary.json", "quality.json"))
+    steps = f"{series.name}/{STEP_PATTERN}"
+    refuse_files_of_others(folder, (*names, steps), (ANSWERS, SERIES), ("summary.json", "quality.json"))
     remove_stale_temporaries(folder, names)
     remove_stale_temporaries(series, [STEP_PATTERN])
     return folder

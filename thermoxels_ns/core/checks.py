@@ -202,12 +202,12 @@ def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Itera
 def refuse_files_of_others(folder: Path, files: Iterable[str], own: Sequence[str], others: Sequence[str]) -> None:
     """Raise `OutputError` where a command that writes or removes `files` would take what it did not write.
 
-    `own` are names that it writes first and last, without any of which the others are not the command's; `others` tell
-    the results of another command.
+    A star in a name stands for anything. `own` are names that it writes first and last, without any of which the others
+    are not the command's; `others` tell the results of another command.
     """
     found = [name for name in others if (folder / name).exists()]
     if not any((folder / name).exists() for name in own):
-        found += [name for name in files if (folder / name).exists()]
+        found += [next(folder.glob(name)).relative_to(folder).as_posix() for name in files if any(folder.glob(name))]
     if found:
         expected = f"no files but those of an earlier run of this command in {folder}"
         remedy = "Choose another folder with --output-dir, or move them away."
