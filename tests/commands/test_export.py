@@ -14,8 +14,10 @@ import pytest
 import pyvista
 import torch
 import tyro
+from nerfstudio.cameras.cameras import Cameras
 from PIL import Image
 
+from tests.support.looking_cameras import looking_at
 from thermoxels_ns.commands.export import ExportThermoxelsMesh, _check_config, scene_json, viewpoint_of_cameras
 from thermoxels_ns.commands.export_options import ExportOptions, Viewpoint, check_options
 from thermoxels_ns.commands.export_snapshot import export_snapshot
@@ -24,6 +26,7 @@ from thermoxels_ns.core.lattice import Lattice, input_from_world
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.fem.problem import TimeSteps
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
+from thermoxels_ns.multiview.photographs import Photographs
 
 UNSEEN = 0.35
 
@@ -365,9 +368,16 @@ def test_up_can_be_given(ball, tmp_path) -> None:
 
 def stand_in_run(monkeypatch, ball: GridSnapshot, fail: Exception | None = None) -> None:
     """Put a trained model in place of nerfstudio's loading."""
-    cameras = SimpleNamespace(camera_to_worlds=torch.eye(4)[None, :3])
-    outputs = SimpleNamespace(dataparser_transform=torch.eye(4)[:3], dataparser_scale=0.5, cameras=cameras)
-    datamanager = SimpleNamespace(train_dataparser_outputs=outputs, get_datapath=lambda: Path("no-scene"))
+    cameras = Cameras(torch.eye(4)[None, :3], 60.0, 60.0, 20.0, 20.0, 40, 40)
+    cameras.camera_to_worlds[:, 2, 3] = 2.0
+    outputs = SimpleNamespace(
+        dataparser_transform=torch.eye(4)[:3], dataparser_scale=0.5, cameras=cameras, metadata={"feature_rays": None}
+    )
+    grey = torch.full((40, 40, 3), 128, dtype=torch.uint8)
+    dataset = SimpleNamespace(cameras=cameras, get_image_uint8=lambda _: grey, get_mask=lambda _: None)
+    datamanager = SimpleNamespace(
+        train_dataparser_outputs=outputs, get_datapath=lambda: Path("no-scene"), train_dataset=dataset
+    )
     pipeline = SimpleNamespace(datamanager=datamanager, grid_snapshot=lambda: ball)
 
     def eval_setup(*_, **__):
@@ -393,6 +403,8 @@ def test_run_undoes_the_dataparser_s_scale(ball, tmp_path, config_file, monkeypa
     summary = command.run(lambda _: None)
     assert summary["mesh"]["volume"] == pytest.approx(summary["mesh"]["voxels"] * 0.2**3)
     assert summary["options"]["load_config"] == config_file
+    shares = summary["mesh"]["share_of_area_by_support"]
+    assert 0.2 < shares["smooth"] < 0.5 and shares["smooth"] + shares["filled"] == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(
@@ -554,3 +566,27 @@ def test_quality_says_which_promises_hold(ball, tmp_path, boundary) -> None:
     true_area = 4.0 * np.pi * 0.5**2
     assert summary["mesh"]["area"] == pytest.approx(true_area, rel=0.1)
     assert (summary["mesh"]["area_of_triangles"] > 1.3 * true_area) == (boundary == "voxel")
+
+
+def test_surfaces_that_photographs_do_not_support_say_so(ball, tmp_path) -> None:
+    """Grey photographs from one side see half of the ball and place nothing."""
+    views = looking_at((0, 0, 0), [(2.0, y, 0.2) for y in (-0.6, 0.0, 0.6)], focal=60.0, size=40)
+    grey = np.full((3 * 40 * 40, 3), 0.5, dtype=np.float32)
+    centres = views.camera_to_world[:, :, 3]
+    photographs = Photographs(views.matrices(), centres, views.size, np.arange(3) * 1600, grey)
+    lines: list[str] = []
+    summary = export_snapshot(ball, np.eye(4), ExportOptions(), tmp_path, lines.append, photographs=photographs)
+    shares = summary["mesh"]["share_of_area_by_support"]
+    assert shares["supported"] == shares["weak"] == 0.0
+    assert shares["smooth"] + shares["filled"] == pytest.approx(1.0) and 0.3 < shares["smooth"] < 0.6
+    assert any(line.startswith("0% of the surface is supported by three photographs or more") for line in lines)
+    boundary = pyvista.read(tmp_path / "mesh-boundary.vtp")
+    seen, supporting = (boundary.cell_data[f"photographs_{name}"] for name in ("seen", "supporting"))
+    assert set(seen) == {0, 1, 2, 3} and not supporting.any()
+    assert seen[boundary.cell_centers().points[:, 0] < -0.3].max() == 0
+    with Image.open(tmp_path / "quality.png") as picture:
+        below = np.asarray(picture.convert("RGB"))[-picture.width // 2 :, : picture.width // 2].astype(int)
+    assert np.mean((below[..., 0] > 120) & (below[..., 1:].max(axis=2) < 40)) > 0.05  # red: seen, not placed
+
+    assert export_snapshot(ball, np.eye(4), ExportOptions(), tmp_path)["mesh"]["share_of_area_by_support"] is None
+    assert "photographs_seen" not in pyvista.read(tmp_path / "mesh-boundary.vtp").cell_data

@@ -53,7 +53,8 @@ def test_unobserved_surface_is_grey(tmp_path, box_mesh):
     half = replace(box_mesh, observed=box_mesh.points_m[:, 0] < 0.1)
     shares = []
     for grey in (False, True):
-        picture_of_mesh(tmp_path / "g.png", half, grey_unobserved=grey, window_size=SIZE, view_direction=(1, 0.5, -0.5))
+        painted = [("no thermal ray", "grey", ~half.observed[half.facets].all(axis=1))] if grey else []
+        picture_of_mesh(tmp_path / "g.png", half, painted=painted, window_size=SIZE, view_direction=(1, 0.5, -0.5))
         inside = stage(pixels(tmp_path / "g.png"))
         body = inside[np.any(inside < 230, axis=-1)]
         shares.append(np.mean(np.ptp(body, axis=-1) < 8))

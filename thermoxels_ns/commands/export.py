@@ -22,9 +22,14 @@ from thermoxels_ns.core.lattice import input_from_world
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
 
+    from thermoxels_ns.core.feature_rays import FeatureRays
     from thermoxels_ns.core.snapshot import GridSnapshot
     from thermoxels_ns.mesh.solid.voxels import SolidCells
     from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+MOST_PHOTOGRAPHS, LONGEST_SIDE = 128, 400
+"""Photographs that are asked whether they support the mesh, taken evenly from their list, and the longer side to which
+they are averaged down for it, [pixels]."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,10 @@ class TrainedScene:
     """From where pictures show most of what the cameras saw."""
     scene_folder: Path
     """The photographs' folder."""
+    dataset: Any
+    """The training photographs, a `ThermalDataset`."""
+    tracks: FeatureRays | None
+    """Lines from photographs to points that they see, in the trained scene; None: it has no tracks."""
 
 
 @dataclass(kw_only=True)
@@ -85,6 +94,7 @@ class ExportThermoxelsMesh(ExportOptions):
                 up_of(self, content, Viewpoint())
 
         scene = load_trained_scene(self.load_config, check_scale)
+        from thermoxels_ns.multiview.photographs import read_photographs
 
         def compare(solid: SolidCells, mesh: TetMesh, scale: float) -> dict[str, Any] | None:
             from thermoxels_ns.evaluation.truth_comparison import compare_with_truth
@@ -101,6 +111,8 @@ class ExportThermoxelsMesh(ExportOptions):
             scene.viewpoint,
             compare,
             scene_json(scene.scene_folder),
+            read_photographs(scene.dataset, most=MOST_PHOTOGRAPHS, longest_side=LONGEST_SIDE),
+            scene.tracks,
         )
 
 
@@ -159,6 +171,8 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
         world_to_input,
         viewpoint_of_cameras(outputs.cameras.camera_to_worlds.numpy(), world_to_input),
         Path(pipeline_of_ours.datamanager.get_datapath()),
+        pipeline_of_ours.datamanager.train_dataset,
+        outputs.metadata["feature_rays"],
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 # Imports at the top are light; the mesher, the solver and pyvista load when they run.
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,10 +22,13 @@ from thermoxels_ns.core.checks import (
 from thermoxels_ns.core.errors import ThermoxelsError
 
 if TYPE_CHECKING:
+    from thermoxels_ns.core.feature_rays import FeatureRays
+    from thermoxels_ns.core.lattice import Lattice
     from thermoxels_ns.core.snapshot import GridSnapshot
     from thermoxels_ns.mesh.build import BuiltMesh
     from thermoxels_ns.mesh.solid.voxels import SolidCells
     from thermoxels_ns.mesh.tetrahedra import TetMesh
+    from thermoxels_ns.multiview.photographs import Photographs
 
 Say = Callable[[str], None]
 
@@ -67,6 +70,8 @@ def export_snapshot(
     viewpoint: Viewpoint = OBLIQUE,
     compare: Callable[[SolidCells, TetMesh, float], dict[str, Any] | None] | None = None,
     scene_file: Mapping[str, Any] | None = None,
+    photographs: Photographs | None = None,
+    tracks: FeatureRays | None = None,
 ) -> dict[str, Any]:
     """Write the mesh in the formats asked for, quality.json, summary.json, and as asked pictures and the heat series.
 
@@ -84,6 +89,8 @@ def export_snapshot(
         compare: Compares solid voxels and mesh in metres (last: metres per unit) with a known truth; its
             `ThermoxelsError` goes into the summary. Asked only if the scale is known.
         scene_file: The scene's json, which may know the scale and up.
+        photographs: What the cameras saw, to count how many photographs support each boundary triangle.
+        tracks: Lines from photographs to points that they see, which support surfaces too.
 
     Raises:
         ThermoxelsError: An option is out of range, nothing is solid, the folder cannot be written to, or heat fails.
@@ -92,6 +99,7 @@ def export_snapshot(
     from thermoxels_ns.fem.solution import HeatSolution
     from thermoxels_ns.heat.solving import Goals, solve_problem
     from thermoxels_ns.heat.vtk_series import heat_series_paths, remove_heat_series, write_heat_series
+    from thermoxels_ns.mesh.boundary.tags import support_of_facets
     from thermoxels_ns.mesh.build import MeshOptions, build_mesh
     from thermoxels_ns.mesh.files.abaqus import HeatStep
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS, check_format, write_mesh
@@ -99,7 +107,7 @@ def export_snapshot(
     from thermoxels_ns.mesh.quality.checks import check_mesh
     from thermoxels_ns.mesh.quality.picture import picture_of_quality
     from thermoxels_ns.mesh.quality.report import quality_report
-    from thermoxels_ns.reports.mesh_pictures import draw_heat, draw_mesh
+    from thermoxels_ns.reports.mesh_pictures import add_support, draw_heat, draw_mesh
 
     checked = check_options(options)
     scale = scale_of(options, checked, scene_file)
@@ -113,6 +121,8 @@ def export_snapshot(
         to_mesh,
         MeshOptions(options.boundary, options.coarsest_cell, up=up, rules=checked.rules),
     )
+    if photographs is not None:
+        built = _with_support(built, photographs, tracks, snapshot.lattice, to_mesh)
     mesh = built.mesh
     suffixes = [f".{name}" for name in options.formats]
     for suffix in suffixes:
@@ -176,6 +186,8 @@ def export_snapshot(
         look = {"up": up, "view_direction": viewpoint.view_direction}
         draw_mesh([folder / name for name in _MESH_PICTURES[:2]], mesh, look, unit)
         picture_of_quality(folder / _MESH_PICTURES[2], report)
+        if support_of_facets(mesh) is not None:
+            add_support(folder / _MESH_PICTURES[2], mesh, look)
         if solution is not None:
             draw_heat(folder / _HEAT_PICTURE, mesh, solution, look)
     write_summary(folder / _SUMMARY, summary)
@@ -201,8 +213,36 @@ def volume_in_words(volume_m3: float) -> str:
     return f"{volume_m3:.3g} m^3" if volume_m3 < 1e3 else f"{volume_m3:,.0f} m^3"
 
 
+def _with_support(
+    built: BuiltMesh,
+    photographs: Photographs,
+    tracks: FeatureRays | None,
+    lattice: Lattice,
+    to_mesh: npt.NDArray[np.float64],
+) -> BuiltMesh:
+    """Count for each boundary triangle the photographs that see it, and those that support it.
+
+    See `facet_views` and `supporting_photographs`. `to_mesh` takes the trained scene to the mesh's coordinates.
+    """
+    from thermoxels_ns.mesh.boundary.visibility import facet_views
+    from thermoxels_ns.mesh.build import apply_transform
+    from thermoxels_ns.multiview.surface_support import supporting_photographs
+
+    mesh = built.mesh
+    assert mesh.boundary is not None
+    middle = apply_transform(np.linalg.inv(to_mesh), mesh.points_m[mesh.facets].mean(axis=1))
+    normal = mesh.boundary.normal @ to_mesh[:3, :3] / np.cbrt(abs(np.linalg.det(to_mesh[:3, :3])))
+    cameras = photographs.matrices, photographs.centres, photographs.sizes
+    views = facet_views(built.solid.cells, lattice, *cameras, middle, normal)
+    found = supporting_photographs(photographs, views.middle, views.normal, views.seen, lattice.voxel_size, tracks)
+    count = np.stack((views.seen.sum(axis=1), found.sum(axis=1)), axis=1)[views.group]
+    return replace(built, mesh=replace(mesh, boundary=replace(mesh.boundary, photographs=count)))
+
+
 def _tell(built: BuiltMesh, volume: float, unit: str, voxel_size: float | None, say: Say) -> None:
     """Say how the solid was found, step by step, and what the mesh has."""
+    from thermoxels_ns.commands.export_summary import support_shares
+
     for step in built.solid.steps:
         amounts = []
         for sign, voxels in (("+", step.added), ("-", step.removed)):
@@ -216,6 +256,13 @@ def _tell(built: BuiltMesh, volume: float, unit: str, voxel_size: float | None, 
         say(
             f"Left out because no thermal ray saw them: {built.unobserved_parts} parts of the mesh, "
             f"{built.unobserved_voxels} voxels in all."
+        )
+    shares = support_shares(mesh)
+    if shares is not None:
+        supported, weak, smooth, filled = shares.values()
+        say(
+            f"{supported:.0%} of the surface is supported by three photographs or more, {weak:.0%} by one or two; "
+            f"{smooth:.0%} is seen, but placed by smoothness alone; {filled:.0%} is seen by no photograph."
         )
     for rule in built.idle_rules:
         say(

@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from thermoxels_ns import __version__
+from thermoxels_ns.mesh.boundary.tags import SUPPORT, support_of_facets
+from thermoxels_ns.mesh.quality.checks import facet_areas
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 
 if TYPE_CHECKING:
     from thermoxels_ns.commands.scene_scale import SceneScale
@@ -90,6 +93,7 @@ def mesh_summary(
         "voxels_without_thermal_rays_left_out": built.unobserved_voxels,
         "share_of_nodes_observed": float(np.mean(mesh.observed)),
         "share_of_area_not_fully_observed": _share_of_area_unobserved(mesh),
+        "share_of_area_by_support": support_shares(mesh),
         "rules_without_effect": built.idle_rules,
         "patches": patch_areas(mesh),
         "regions": region_volumes(mesh),
@@ -106,8 +110,7 @@ def patch_areas(mesh: TetMesh) -> dict[str, float]:
     """True area of each patch that has a triangle, [unit^2]."""
     boundary = mesh.boundary
     assert boundary is not None
-    corner = mesh.points_m[mesh.facets]
-    area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    area = facet_areas(mesh.points_m, mesh.facets)
     number = len(boundary.patch_names)
     total = np.bincount(boundary.patch, weights=area * boundary.area_factor, minlength=number)
     used = np.bincount(boundary.patch, minlength=number) > 0
@@ -116,12 +119,20 @@ def patch_areas(mesh: TetMesh) -> dict[str, float]:
 
 def region_volumes(mesh: TetMesh) -> dict[str, float]:
     """Volume of each region that has a tetrahedron, [unit^3]."""
-    corner = mesh.points_m[mesh.tets]
-    edges = corner[:, 1:] - corner[:, :1]
-    volume = np.einsum("ti,ti->t", edges[:, 0], np.cross(edges[:, 1], edges[:, 2])) / 6.0
-    total = np.bincount(mesh.region, weights=volume, minlength=len(mesh.region_names))
+    total = np.bincount(mesh.region, weights=signed_volumes(mesh.points_m, mesh.tets), minlength=len(mesh.region_names))
     used = np.bincount(mesh.region, minlength=len(mesh.region_names)) > 0
     return {name: float(total[n]) for n, name in enumerate(mesh.region_names) if used[n]}
+
+
+def support_shares(mesh: TetMesh) -> dict[str, float] | None:
+    """Share of the true area, without what the scene box cuts, in each class of `SUPPORT`; None if not known."""
+    support = support_of_facets(mesh)
+    if support is None or not (support >= 0).any():
+        return None
+    assert mesh.boundary is not None
+    area = facet_areas(mesh.points_m, mesh.facets) * mesh.boundary.area_factor
+    total = np.bincount(support + 1, weights=area, minlength=len(SUPPORT) + 1)[1:]
+    return dict(zip(SUPPORT, (total / total.sum()).tolist()))
 
 
 def _percentile_summary(solid: SolidCells, selection: SolidSelection) -> dict[str, float]:
@@ -138,8 +149,7 @@ def _percentile_summary(solid: SolidCells, selection: SolidSelection) -> dict[st
 
 def _share_of_area_unobserved(mesh: TetMesh) -> float:
     """Share of the boundary's area whose triangles have a node that no thermal ray saw, 0 to 1."""
-    corner = mesh.points_m[mesh.facets]
-    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    area = facet_areas(mesh.points_m, mesh.facets)
     return float(area[~mesh.observed[mesh.facets].all(axis=1)].sum() / area.sum())
 
 

@@ -25,6 +25,13 @@ class Views:
     size: npt.NDArray[np.int64]
     """Image widths and heights, shape (c, 2), [pixels]."""
 
+    def matrices(self) -> npt.NDArray[np.float64]:
+        """World to homogeneous pixels (columns, rows, depth, positive in front), shape (c, 3, 4)."""
+        turned = self.camera_to_world[:, :, :3].transpose(0, 2, 1) * [[1.0], [-1.0], [-1.0]]
+        local = np.concatenate((turned, -turned @ self.camera_to_world[:, :, 3:]), axis=2)
+        local[:, :2] = self.focal[..., None] * local[:, :2] + self.centre[..., None] * local[:, 2:]
+        return local
+
 
 @dataclass(frozen=True)
 class RayEvidence:

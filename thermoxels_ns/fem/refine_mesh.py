@@ -48,6 +48,7 @@ def refine_mesh(mesh: TetMesh) -> TetMesh:
             area_factor=np.repeat(tags.area_factor, 4),
             seen=np.repeat(tags.seen, 4),
             patch=np.repeat(tags.patch, 4),
+            photographs=None if tags.photographs is None else np.repeat(tags.photographs, 4, axis=0),
         ),
         colour=None if colour is None else np.concatenate([colour, 0.5 * (colour[low] + colour[high])]),
     )

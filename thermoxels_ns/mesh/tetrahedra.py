@@ -23,6 +23,9 @@ class Boundary:
     """Index into `patch_names`, shape (f,)."""
     patch_names: tuple[str, ...]
     """Names of the patches, all different; some may have no triangle."""
+    photographs: IntArray | None = None
+    """Training photographs that see each triangle, and those of them that support it: by texture and parallax, or by
+    tracks, they say that the surface lies there. Shape (f, 2); None: not known."""
 
 
 @dataclass(frozen=True)

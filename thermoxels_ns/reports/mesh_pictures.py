@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import tempfile
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.arrays import FloatArray
+from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.checks import check_direction, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
+from thermoxels_ns.mesh.boundary.tags import SUPPORT, support_of_facets
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 if TYPE_CHECKING:
@@ -27,8 +29,8 @@ if TYPE_CHECKING:
 # The part of the picture that the mesh may fill, as (left, bottom, right, top) shares of width and height: the title
 # is above, the colour bar to the right, the axes and the size below.
 _MESH_AREA = (0.04, 0.16, 0.80, 0.90)
-_GREY = "#b8b8b8"
 _INK = "#202020"
+_SUPPORT_COLOURS: tuple[str, ...] = ("green", "gold", "red", "grey")
 BAR_TITLE = "temperature [°C]"
 """What a colour bar says unless told otherwise."""
 _LEAST_CHANGE_K = 1e-3
@@ -47,7 +49,7 @@ def picture_of_mesh(
     clim: tuple[float, float] | None = None,
     up: Sequence[float] = (0.0, 0.0, 1.0),
     view_direction: Sequence[float] | None = None,
-    grey_unobserved: bool = False,
+    painted: Sequence[tuple[str, str, BoolArray]] = (),
     length_unit: str = "m",
     colour_map: str = "inferno",
     bar_title: str = BAR_TITLE,
@@ -67,7 +69,8 @@ def picture_of_mesh(
             give the extremes.
         up: Direction that points up in the picture, in mesh coordinates.
         view_direction: Direction from the camera to the mesh; obliquely from above if left out.
-        grey_unobserved: Draw triangles with a node that no thermal ray saw in grey.
+        painted: Boundary triangles that do not show values: what they are, their colour, and a boolean for each
+            triangle of the mesh. The words below the picture say which colour is what.
         length_unit: Name of the unit of the node positions, written below the picture.
         colour_map: Name of a colour map of matplotlib, such as "coolwarm" for changes to both sides of 0.
         bar_title: Quantity and unit, written beside the colour bar.
@@ -90,7 +93,7 @@ def picture_of_mesh(
     beyond = clim is None and (float(shown.min()) < low or float(shown.max()) > high)
     extremes = (float(shown.min()), float(shown.max())) if beyond else None
 
-    unseen = ~mesh.observed[mesh.facets].all(axis=1) if grey_unobserved else np.zeros(len(mesh.facets), dtype=bool)
+    plain = np.any([which for *_, which in painted], axis=0) if painted else np.zeros(len(mesh.facets), dtype=bool)
     folder = writable_folder(path.parent)
     with _quiet_vtk(), replace_when_done(folder / path.name) as temporary:
         plotter = pv.Plotter(off_screen=True, window_size=list(window_size), lighting="none")
@@ -99,8 +102,8 @@ def picture_of_mesh(
             _add_lights(plotter, right, true_up, towards_camera)
             font = _font_file()
             matter = {"ambient": 0.62, "diffuse": 0.45, "specular": 0.0, "smooth_shading": False}
-            if not unseen.all():
-                surface = pv.PolyData.from_regular_faces(mesh.points_m, mesh.facets[~unseen])
+            if not plain.all():
+                surface = pv.PolyData.from_regular_faces(mesh.points_m, mesh.facets[~plain])
                 surface.point_data["temperature_c"] = values
                 plotter.add_mesh(
                     surface,
@@ -111,10 +114,12 @@ def picture_of_mesh(
                     **matter,
                 )
                 _add_colour_bar(plotter, font, bar_title, high - low)
-            if unseen.any():
-                surface = pv.PolyData.from_regular_faces(mesh.points_m, mesh.facets[unseen])
-                plotter.add_mesh(surface, color=_GREY, **matter)
-            _add_words(plotter, mesh, title, font, length_unit, note, unseen=bool(unseen.any()), extremes=extremes)
+            for _, colour, which in painted:
+                if which.any():
+                    surface = pv.PolyData.from_regular_faces(mesh.points_m, mesh.facets[which])
+                    plotter.add_mesh(surface, color=colour, **matter)
+            words = "; ".join(f"{colour}: {what}" for what, colour, which in painted if which.any())
+            _add_words(plotter, mesh, title, font, length_unit, note, words, None if plain.all() else extremes)
             _frame(plotter, mesh.points_m[np.unique(mesh.facets)], right, true_up, towards_camera)
             plotter.screenshot(str(temporary), return_img=False)
         finally:
@@ -236,19 +241,18 @@ def _add_words(
     font: str,
     length_unit: str,
     note: str,
-    *,
-    unseen: bool,
+    painted: str,
     extremes: tuple[float, float] | None,
 ) -> None:
-    """Title, size of the mesh, axes, what grey means, and extremes that the colours do not reach."""
+    """Title, size of the mesh, axes, what plain colours mean, and extremes that the others do not reach."""
     height = plotter.window_size[1]
     how: Any = {"viewport": True, "color": _INK, "font_file": font}
     if title:
         plotter.add_text(title, position=(0.04, 0.925), font_size=round(height / 60), **how)
     size = mesh.points_m.max(axis=0) - mesh.points_m.min(axis=0)
     words = f"{size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} {length_unit}, {len(mesh.tets):,} tetrahedra"
-    if unseen:
-        words += "; grey: no thermal ray"
+    if painted:
+        words += "\n" + textwrap.fill(painted, 58)
     if extremes is not None:
         words += f"\ncolours: middle 99 %; all: {extremes[0]:.1f} to {extremes[1]:.1f}"
     if note:
@@ -308,8 +312,9 @@ def draw_mesh(paths: Sequence[Path], mesh: TetMesh, look: Mapping[str, Any], len
     """
     every, measured = paths
     picture_of_mesh(every, mesh, title="Surface temperature", length_unit=length_unit, **look)
+    painted = [("no thermal ray", "grey", ~mesh.observed[mesh.facets].all(axis=1))]
     title = "Measured surface temperature"
-    picture_of_mesh(measured, mesh, title=title, grey_unobserved=True, length_unit=length_unit, **look)
+    picture_of_mesh(measured, mesh, title=title, painted=painted, length_unit=length_unit, **look)
 
 
 def draw_heat(path: Path, mesh: TetMesh, solution: HeatSolution, look: Mapping[str, Any]) -> None:
@@ -326,18 +331,49 @@ def draw_heat(path: Path, mesh: TetMesh, solution: HeatSolution, look: Mapping[s
     diverging, note = change_colours(change[shown])
     first, last = f"{solution.times_s[0]:g} s", f"{solution.times_s[-1]:g} s"
     same: Any = {"clim": (float(ends.min()), float(ends.max()))}
-    panels = []
-    with tempfile.TemporaryDirectory() as scratch:
-        for number, (title, values, colours) in enumerate(
-            (
-                (f"Surface temperature at {first}", before, same),
-                (f"Surface temperature at {last}", after, same),
-                (f"Change from {first} to {last}", change, {**diverging, "note": note}),
-            )
-        ):
-            panel_path = Path(scratch) / f"{number}.png"
-            picture_of_mesh(panel_path, mesh, values, title=title, **colours, **look)
-            with Image.open(panel_path) as image:
-                panels.append(np.asarray(image.convert("RGB")))
+    panels = [
+        _panel(mesh, values, title=title, **colours, **look)
+        for title, values, colours in (
+            (f"Surface temperature at {first}", before, same),
+            (f"Surface temperature at {last}", after, same),
+            (f"Change from {first} to {last}", change, {**diverging, "note": note}),
+        )
+    ]
     with replace_when_done(path) as temporary:
         Image.fromarray(np.concatenate(panels, axis=1)).save(temporary)
+
+
+def add_support(path: Path, mesh: TetMesh, look: Mapping[str, Any]) -> None:
+    """Add to a picture of a mesh's quality two views, from opposite sides, of how photographs support its surface.
+
+    `look` are the arguments `up` and `view_direction` of `picture_of_mesh`. The mesh must know its photographs.
+    """
+    from PIL import Image
+
+    support = support_of_facets(mesh)
+    assert support is not None
+    painted = [(*of, support == number) for number, of in enumerate(zip(SUPPORT.values(), _SUPPORT_COLOURS))]
+    painted.append(("cut by the scene box", "white", support < 0))
+    with Image.open(path) as image:
+        above = np.asarray(image.convert("RGB"))
+    width, up = above.shape[1], _unit("up", look["up"])
+    ahead = -_view_axes(look["up"], look["view_direction"])[2]
+    beside = {"painted": painted, "up": up, "window_size": (width // 2, width // 2)}
+    panels = [
+        _panel(mesh, title="Support by photographs", view_direction=ahead, **beside),
+        _panel(mesh, title="From the other side", view_direction=2.0 * (ahead @ up) * up - ahead, **beside),
+    ]
+    row = np.full((panels[0].shape[0], *above.shape[1:]), 255, dtype=np.uint8)
+    row[:, : 2 * (width // 2)] = np.concatenate(panels, axis=1)
+    with replace_when_done(path) as temporary:
+        Image.fromarray(np.concatenate((above, row))).save(temporary)
+
+
+def _panel(mesh: TetMesh, temperature_c: FloatArray | None = None, **how: Any) -> npt.NDArray[np.uint8]:
+    """A picture of the mesh as an array, shape (h, w, 3); the arguments are those of `picture_of_mesh`."""
+    from PIL import Image
+
+    with tempfile.TemporaryDirectory() as scratch:
+        picture_of_mesh(Path(scratch) / "panel.png", mesh, temperature_c, **how)
+        with Image.open(Path(scratch) / "panel.png") as image:
+            return np.asarray(image.convert("RGB"))

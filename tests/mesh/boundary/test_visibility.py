@@ -11,7 +11,7 @@ from tests.support.looking_cameras import looking_at
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.boundary.tags import voxel_surface as surface_of_voxels
-from thermoxels_ns.mesh.boundary.visibility import _EmptySpace, _is_free, seen_facets
+from thermoxels_ns.mesh.boundary.visibility import _EmptySpace, _is_free, facet_views, seen_facets
 from thermoxels_ns.mesh.quality.checks import facet_normals
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets, voxel_facets
 
@@ -195,6 +195,11 @@ def test_more_cameras_see_more_and_their_order_does_not_matter() -> None:
     assert np.array_equal(seen_facets(cells, views(*positions), LATTICE, centroids, normals), together)
     assert np.array_equal(seen_facets(cells, views(*positions[::-1]), LATTICE, centroids, normals), together)
     assert together.sum() > max(s.sum() for s in each)
+    cameras = views(*positions)
+    found = facet_views(
+        cells, LATTICE, cameras.matrices(), cameras.camera_to_world[:, :, 3], cameras.size, centroids, normals
+    )
+    assert np.array_equal(found.seen[found.group].T, each)
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -21,6 +21,14 @@ from thermoxels_ns.mesh.tetrahedra import FACET_BOX, Boundary, TetMesh
 BoundaryMode = Literal["conforming", "voxel"]
 """How the boundary of a mesh runs: along the level set of the density, or along voxel faces."""
 
+SUPPORT = {
+    "supported": "three photographs or more",
+    "weak": "one or two photographs",
+    "smooth": "seen, but placed by smoothness alone",
+    "filled": "seen by no photograph",
+}
+"""Classes of boundary triangles by the photographs that support them, see `Boundary.photographs`."""
+
 LEAST_AREA_FACTOR = 0.05
 """Lower bound of a triangle's area factor: none that convection or radiation acts on is without area."""
 
@@ -64,6 +72,18 @@ def tag_boundary(
         colours=None if mesh.colour is None else mesh.colour[mesh.facets].mean(axis=1),
     )
     return Boundary(normal=normal, area_factor=factor, seen=seen, patch=patch, patch_names=names), idle
+
+
+def support_of_facets(mesh: TetMesh) -> IntArray | None:
+    """Place in `SUPPORT` of each boundary triangle, -1 where the scene box cuts the solid, shape (f,).
+
+    None if photographs were not compared.
+    """
+    if mesh.boundary is None or mesh.boundary.photographs is None:
+        return None
+    seen, supporting = mesh.boundary.photographs.T
+    on_box = mesh.facet_tags == FACET_BOX
+    return np.select([on_box, supporting >= 3, supporting > 0, seen > 0], [-1, 0, 1, 2], default=3)
 
 
 def voxel_surface(

@@ -1,8 +1,11 @@
-"""Which boundary triangles some training camera has a free line of sight to."""
+"""Which training cameras have a free line of sight to boundary triangles."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+import numpy.typing as npt
 from scipy import ndimage
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
@@ -25,38 +28,76 @@ _NUDGE = 1e-4
 def seen_facets(
     cells: BoolArray, views: Views, lattice: Lattice, centroids_world: FloatArray, normals_world: FloatArray
 ) -> BoolArray:
-    """Tell which boundary triangles at least one training camera sees, shape (f,).
+    """Tell which boundary triangles at least one training camera sees, shape (f,); arguments as in `facet_views`."""
+    order = _spread(views.camera_to_world[:, :, 3])
+    centres = views.camera_to_world[order, :, 3]
+    cameras = views.matrices()[order], centres, views.size[order]
+    found = facet_views(cells, lattice, *cameras, centroids_world, normals_world, enough=1)
+    return found.seen.any(axis=1)[found.group]
+
+
+@dataclass(frozen=True)
+class FacetViews:
+    """Which cameras see boundary triangles, for groups of triangles that share one answer."""
+
+    group: IntArray
+    """Group of each triangle, shape (f,)."""
+    middle: FloatArray
+    """Mean centroid of each group, shape (g, 3), [world units]."""
+    normal: FloatArray
+    """Unit mean normal of each group, shape (g, 3)."""
+    seen: BoolArray
+    """Whether each camera sees it, shape (g, cameras)."""
+
+
+def facet_views(
+    cells: BoolArray,
+    lattice: Lattice,
+    matrices: FloatArray,
+    centres: FloatArray,
+    sizes: npt.NDArray[np.int64],
+    centroids_world: FloatArray,
+    normals_world: FloatArray,
+    enough: int | None = None,
+) -> FacetViews:
+    """Tell which cameras see boundary triangles.
 
     A camera sees a triangle that faces it, lies in its image and has no solid voxel on the straight line between
     them. Triangles that lie in the same voxel and face the same of the six sides share one answer, taken at their mean.
 
     Args:
         cells: True where a voxel is solid, shape `lattice.cell_shape`.
-        views: The training cameras.
         lattice: Where the voxels are.
+        matrices: World to homogeneous pixels of each camera, depth positive in front, shape (cameras, 3, 4).
+        centres: Where the cameras stand, shape (cameras, 3), [world units].
+        sizes: Widths and heights of their images, shape (cameras, 2), [pixels].
         centroids_world: Middle of each triangle, shape (f, 3), [world units].
         normals_world: Outward unit normals of the true surface, shape (f, 3), in world axes.
+        enough: Cameras that see a triangle after which no others are tried. None: all are.
     """
     group, middle, normal = _grouped(lattice.world_to_index(centroids_world), normals_world, lattice.cell_shape)
     space = _EmptySpace(cells)
     start = middle + START_ABOVE_SURFACE[0] * normal
     inside = space.solid_at(start)
     start[inside] = (middle + START_ABOVE_SURFACE[1] * normal)[inside]
-
-    centres = lattice.world_to_index(views.camera_to_world[:, :, 3])
-    order = _spread(centres)
-    seen = _seen_by_any(
+    index_centres = lattice.world_to_index(centres)
+    index_to_world = np.diag([lattice.voxel_size] * 3 + [1.0])
+    index_to_world[:3, 3] = lattice.index_to_world(np.zeros(3))
+    seen = np.zeros((len(middle), len(centres)), dtype=np.bool_)
+    _find_cameras(
         space.block,
         space.lowest,
         middle,
         normal,
         start,
-        ~space.solid_at(start) & ~space.enclosed_at(start, centres),
-        np.ascontiguousarray(centres[order]),
-        np.ascontiguousarray(views.camera_to_world[order, :, :3], dtype=np.float64),
-        np.concatenate([views.focal, views.centre, views.size], axis=1, dtype=np.float64)[order],
+        ~space.solid_at(start) & ~space.enclosed_at(start, index_centres),
+        index_centres,
+        np.ascontiguousarray(matrices @ index_to_world),
+        np.asarray(sizes, dtype=np.float64),
+        len(centres) if enough is None else enough,
+        seen,
     )
-    return seen[group]
+    return FacetViews(group, lattice.index_to_world(middle), normal, seen)
 
 
 def _grouped(
@@ -179,12 +220,11 @@ def _is_free(block, origin, x1, y1, z1):
 
 
 @kernel
-def _seen_by_any(block, lowest, middle, normal, start, open_start, centres, rotations, lenses):
-    """Whether some camera that each point faces has it in its image, with a free line from the point's start.
+def _find_cameras(block, lowest, middle, normal, start, open_start, centres, matrices, sizes, enough, seen):
+    """Mark the cameras that each point faces, that have it in the image, and with a free line from the point's start.
 
-    Lenses are focal length, principal point and size, x and y each, shape (cameras, 6), [pixels].
+    All in corner indices; `seen` is filled, shape (points, cameras), at most `enough` of each row.
     """
-    seen = np.zeros(len(middle), np.bool_)
     origin = np.empty(3)
     likely = 0
     for p in range(len(middle)):
@@ -192,40 +232,28 @@ def _seen_by_any(block, lowest, middle, normal, start, open_start, centres, rota
             continue
         for axis in range(3):
             origin[axis] = start[p, axis] - lowest[axis]
+        x, y, z = middle[p, 0], middle[p, 1], middle[p, 2]
+        first, count = likely, 0
         for turn in range(len(centres)):
             # The camera that saw the point before often sees this one.
-            camera = likely if turn == 0 else turn - 1 if turn <= likely else turn
-            tx, ty, tz = (
-                centres[camera, 0] - middle[p, 0],
-                centres[camera, 1] - middle[p, 1],
-                centres[camera, 2] - middle[p, 2],
-            )
-            if normal[p, 0] * tx + normal[p, 1] * ty + normal[p, 2] * tz <= 0.0:
+            camera = first if turn == 0 else turn - 1 if turn <= first else turn
+            cx, cy, cz = centres[camera, 0], centres[camera, 1], centres[camera, 2]
+            if normal[p, 0] * (cx - x) + normal[p, 1] * (cy - y) + normal[p, 2] * (cz - z) <= 0.0:
                 continue
-            depth = 0.0
-            right, up = 0.0, 0.0
-            for axis in range(3):
-                offset = middle[p, axis] - centres[camera, axis]
-                right += offset * rotations[camera, axis, 0]
-                up += offset * rotations[camera, axis, 1]
-                depth -= offset * rotations[camera, axis, 2]
+            m = matrices[camera]
+            depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
             if depth <= 0.0:
                 continue
-            column = lenses[camera, 2] + lenses[camera, 0] * right / depth
-            row = lenses[camera, 3] - lenses[camera, 1] * up / depth
-            if not (0.0 <= column <= lenses[camera, 4] and 0.0 <= row <= lenses[camera, 5]):
+            column = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
+            row = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
+            if not (0.0 <= column <= sizes[camera, 0] and 0.0 <= row <= sizes[camera, 1]):
                 continue
-            if _is_free(
-                block,
-                origin,
-                centres[camera, 0] - lowest[0],
-                centres[camera, 1] - lowest[1],
-                centres[camera, 2] - lowest[2],
-            ):
-                seen[p] = True
+            if _is_free(block, origin, cx - lowest[0], cy - lowest[1], cz - lowest[2]):
+                seen[p, camera] = True
                 likely = camera
-                break
-    return seen
+                count += 1
+                if count == enough:
+                    break
 
 
 def _any_of_pairs(cells: BoolArray) -> BoolArray:

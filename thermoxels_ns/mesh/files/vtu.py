@@ -119,7 +119,8 @@ def write_boundary_vtp(
 
     Cell arrays: `normal` (outward, of the true surface), `area_m2` (of the true surface that the triangle stands
     for), `area_factor` (that over the triangle's own area), `seen` (1: a camera saw it), `patch` (an index into the
-    field array `patch_names`) and `on_box` (1: where the scene box cuts the solid). Point arrays: `temperature_c`,
+    field array `patch_names`), `on_box` (1: where the scene box cuts the solid) and, where photographs were compared,
+    `photographs_seen` and `photographs_supporting`, see `Boundary.photographs`. Point arrays: `temperature_c`,
     `observed`, `node` (number in the mesh, from 0) and, if the mesh has colours, `colour` as bytes.
 
     A mesh without boundary tags is written with the triangles' own normals and areas, one patch "boundary", and
@@ -145,6 +146,9 @@ def write_boundary_vtp(
         remedy = "Give every boundary triangle a value."
         seen = check_shape("boundary.seen", mesh.boundary.seen, (len(content.facets),), remedy, MeshError)
         arrays["seen"] = seen.astype(np.uint8)
+        if mesh.boundary.photographs is not None:
+            count = check_shape("boundary.photographs", mesh.boundary.photographs, (len(seen), 2), remedy, MeshError)
+            arrays["photographs_seen"], arrays["photographs_supporting"] = count.T.astype(np.int32)
 
     data = pv.PolyData.from_regular_faces(surface.points_m, surface.triangles)
     data.point_data["temperature_c"] = content.temperature_c[surface.nodes]
