@@ -49,7 +49,7 @@ class Rays:
             yield RayBundle(part, torch.tensor([-1.0, 0.0, 0.0]).expand_as(part), torch.ones(len(part), 1))
 
 
-@pytest.mark.parametrize("dilation, layers", [(0, [2]), (1, [1, 2, 3]), (2, [0, 1, 2, 3, 4])])
+@pytest.mark.parametrize("dilation, layers", [(0, [1, 2]), (1, [1, 2, 3]), (2, [0, 1, 2, 3, 4])])
 def test_pruning_keeps_what_rays_see_and_its_neighbours(dilation, layers):
     model = model_of()
     old = model.grid.voxels
@@ -60,6 +60,21 @@ def test_pruning_keeps_what_rays_see_and_its_neighbours(dilation, layers):
     assert report.opened == 0.0 and report.threshold == 0.01
     assert change(torch.arange(old.num_rows)[:, None].float()).shape == (model.grid.voxels.num_rows, 1)
     assert str(report).startswith(f"kept {64 * len(layers)} of 512 voxels")
+
+
+def test_no_hole_opens_where_no_ray_was_drawn():
+    """One ray in four of a fine surface: the voxels between are opaque, and stay."""
+    model = model_of(resolutions=(16,))
+
+    class Few(Rays):
+        def training_rays(self, stream: int, most: int) -> Iterator[RayBundle]:
+            y, z = torch.meshgrid(*[torch.arange(-0.9375, 1.0, 0.25)] * 2, indexing="ij")
+            origins = torch.stack((torch.full_like(y, 3.0), y, z), -1).reshape(-1, 3)
+            yield RayBundle(origins, torch.tensor([-1.0, 0.0, 0.0]).expand_as(origins), torch.ones(len(origins), 1))
+
+    prune_by_rays(model, Few(), 0.01, 0)
+    first = int(model.grid.kept.any(-1).any(-1).nonzero().max())
+    assert bool(model.grid.kept[first - 1].all()), "the first layer that is solid throughout"
 
 
 def fog(model: ThermoxelsModel, density: float) -> None:

@@ -30,6 +30,8 @@ FEWEST_SKY_DIFFERENCE = 0.01
 """Share of the temperature range by which the learned sky must differ from the scene's minimum to be kept."""
 MOST_OPENED_RAYS = 0.01
 """Share of the rays that end on something which pruning may open."""
+OPAQUE_DEPTH = 0.7
+"""Optical depth across a voxel from which it is opaque: half of the light is lost."""
 PRUNING_ATTEMPTS = 4
 """Thresholds tried before pruning fails."""
 RAYS_PER_IMAGE = 4096
@@ -190,7 +192,8 @@ def prune_by_rays(
     """Keep voxels to which some training ray of either stream gives more than `threshold` of its weight.
 
     So stay voxels in which rays that end on something have spent half of their weight, so that no surface opens where
-    it is still soft, and neighbours up to `dilation` voxels away. Where that would open more than 1 % of the rays that
+    it is still soft, neighbours up to `dilation` voxels away, and neighbours that are opaque themselves: a few thousand
+    rays of an image miss some voxels of a fine surface, and each would be a hole. Where that would open more than 1 % of the rays that
     end on something, the threshold is lowered, fourfold at a time.
 
     Raises:
@@ -201,12 +204,14 @@ def prune_by_rays(
         return datamanager.training_rays(RGB_STREAM | THERMAL_STREAM, RAYS_PER_IMAGE)
 
     weights, voxels, opened = voxel_weights(model, rays()), model.grid.voxels, 1.0
+    density = model.grid.voxel_density().view(-1)[model.grid.cells].cpu().numpy()
+    opaque = density * voxels.lattice.voxel_size > OPAQUE_DEPTH
     for attempt in range(PRUNING_ATTEMPTS):
         threshold = threshold / 4 if attempt else threshold
         chosen = ((weights.largest > threshold) | weights.ends).cpu().numpy()
         if not chosen.any():
             continue
-        keep = voxels.dilated(chosen, dilation)
+        keep = voxels.dilated(chosen, dilation) | (voxels.dilated(chosen, 1) & opaque)
         opened = share_of_rays_opened(model, rays(), torch.from_numpy(keep).to(weights.largest.device))
         if opened <= MOST_OPENED_RAYS:
             total = math.prod(voxels.lattice.cell_shape)
