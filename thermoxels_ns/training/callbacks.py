@@ -193,8 +193,8 @@ def prune_by_rays(
 
     So stay voxels in which rays that end on something have spent half of their weight, so that no surface opens where
     it is still soft, neighbours up to `dilation` voxels away, and neighbours that are opaque themselves: a few thousand
-    rays of an image miss some voxels of a fine surface, and each would be a hole. Where that would open more than 1 % of the rays that
-    end on something, the threshold is lowered, fourfold at a time.
+    rays of an image miss some voxels of a fine surface, and each would be a hole. Where that would open more than 1 %
+    of the rays that end on something, the threshold is lowered, fourfold at a time.
 
     Raises:
         PruningError: Even the lowest threshold would open more; the grid is left as it was.
