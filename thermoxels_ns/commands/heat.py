@@ -19,11 +19,7 @@ class Heat(HeatOptions):
     heat.vtu of a steady state) and pictures."""
 
     def main(self) -> None:
-        """Run it.
-
-        Raises:
-            ThermoxelsError: The mesh, the scene or an option cannot be used, or the solver fails.
-        """
+        """Run it; raises `ThermoxelsError` if the mesh, the scene or an option cannot be used, or the solver fails."""
         from rich.console import Console
 
         from thermoxels_ns.commands.heat_run import run_heat

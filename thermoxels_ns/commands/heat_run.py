@@ -38,11 +38,7 @@ ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY = "answers.json", "series.csv", "rep
 
 
 def run_heat(options: HeatOptions, say: Say = lambda _: None) -> HeatRun:
-    """Compute everything, then write it; answers.json comes last, so that files beside one belong together.
-
-    Raises:
-        ThermoxelsError: The mesh, the scene or an option cannot be used, or the solver fails.
-    """
+    """Compute everything, then write it; answers.json comes last, so that files beside one belong together."""
     folder = prepared_folder(options.output_dir)
     run = compute_heat(options, say)
     write_heat_files(folder, options, run, say)
@@ -129,11 +125,7 @@ def answers_of(options: HeatOptions, run: HeatRun) -> dict[str, Any]:
 
 
 def prepared_folder(output_dir: Path) -> Path:
-    """Make the folder, and find out what is in the way before anything is computed.
-
-    Raises:
-        OutputError: It cannot be written to, or something has the name of what is to be written.
-    """
+    """Make the folder, and raise `OutputError` for what is in the way before anything is computed."""
     folder = writable_folder(output_dir)
     names = (ANSWERS, SERIES, PAGE, THROUGH_TIME, STEADY, *PICTURES)
     series = folder / Path(THROUGH_TIME).stem
@@ -146,11 +138,7 @@ def prepared_folder(output_dir: Path) -> Path:
 
 
 def write_heat_files(folder: Path, options: HeatOptions, run: HeatRun, say: Say) -> None:
-    """Write everything into the folder of `prepared_folder`; answers.json comes last.
-
-    Raises:
-        OutputError: A file cannot be written.
-    """
+    """Write everything into the folder of `prepared_folder`, answers.json last, or raise `OutputError`."""
     answers = answers_of(options, run)
     summary_text(answers)  # raises if json cannot hold it
     shown, pictures = run.nodes, list[str]()

@@ -28,11 +28,7 @@ def check_positive(name: str, value: float, remedy: str, error: type[ThermoxelsE
 
 
 def check_ranges(prefix: str, values: Mapping[str, tuple[Any, float, float, str]]) -> None:
-    """Check options, by what follows `prefix` in their names: the value, its least and largest one, and that in words.
-
-    Raises:
-        ThermoxelsError: A value is outside its range.
-    """
+    """Check options by what follows `prefix` in their names: the value, its least and largest, and that in words."""
     for name, (value, low, high, expected) in values.items():
         if not low <= value <= high:  # NaN fails too
             remedy = f"Correct {prefix}{name.replace('_', '-')}."
@@ -170,14 +166,9 @@ def remove_file(path: Path | str) -> None:
 
 
 def remove_stale_temporaries(folder: Path | str, names: Iterable[str]) -> None:
-    """Remove what a killed process left of files that `replace_when_done` was to make.
+    """Remove what a killed process left of files of these names that `replace_when_done` was to make.
 
-    Args:
-        folder: Where they are; it need not exist.
-        names: The files' final names; a star stands for anything, as in ``step-*.vtu``.
-
-    Raises:
-        OutputError: One cannot be removed.
+    A star in a name stands for anything, as in ``step-*.vtu``; the folder need not exist.
     """
     for name in map(Path, names):
         for path in sorted(Path(folder).glob(f".{name.stem}.*.part{name.suffix}")):
@@ -186,11 +177,7 @@ def remove_stale_temporaries(folder: Path | str, names: Iterable[str]) -> None:
 
 
 def refuse_what_is_in_the_way(folder: Path, files: Iterable[str], folders: Iterable[str] = ()) -> None:
-    """Refuse an output folder in which a folder has the name of a file to write, or a file that of a folder.
-
-    Raises:
-        OutputError: Something is in the way; the message lists it.
-    """
+    """Raise `OutputError` where a folder has the name of a file to write, or a file that of a folder."""
     blocked = [name for name in files if (folder / name).is_dir()]
     blocked += [name for name in folders if (folder / name).exists() and not (folder / name).is_dir()]
     if blocked:

@@ -2,14 +2,7 @@
 
 
 class ThermoxelsError(Exception):
-    """Base of all errors that are the input's, not the program's.
-
-    Args:
-        what: Name of what is wrong, or the whole sentence if nothing else is given.
-        expected: What it should have been.
-        got: What it was.
-        remedy: What helps, as a sentence.
-    """
+    """Base of all errors that are the input's, not the program's: what is wrong, or the whole sentence alone."""
 
     def __init__(self, what: str, *, expected: str | None = None, got: object = None, remedy: str = "") -> None:
         super().__init__(what if expected is None else explain(what, expected=expected, got=got, remedy=remedy))

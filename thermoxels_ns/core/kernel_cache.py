@@ -20,11 +20,8 @@ def kernel(function: Callable | None = None, **options: Any) -> Any:
 
     A kernel may call kernels of its own room and of ``core``: numba watches only the file that a kernel stands in,
     so what was compiled in a room is thrown away when any file of the room or of ``core`` changed: kernels freeze
-    constants of other files too.
-
-    Args:
-        function: A function in numba's subset of Python; plain use as ``@kernel``.
-        options: For `numba.njit`, such as ``fastmath={"contract"}``. Division by zero gives inf or NaN, as in numpy.
+    constants of other files too. Plain use is ``@kernel``; options are those of `numba.njit`, such as
+    ``fastmath={"contract"}``. Division by zero gives inf or NaN, as in numpy.
     """
     import numba
 

@@ -17,9 +17,8 @@ _PACKAGE = __name__.partition(".")[0]
 def join_help_lines(*configs: Any) -> None:
     """Hand tyro the strings below fields with the lines of each paragraph joined; calling it again changes nothing.
 
-    Args:
-        configs: Dataclasses, with what they inherit from this package; or instances of them: then also what their
-            fields hold, as far as it is of this package. The texts of others stay as they are.
+    Of dataclasses, what they inherit from this package counts too; of instances also what their fields hold, as far as
+    it is of this package. The texts of others stay as they are.
     """
     for kind in {kind: None for config in configs for kind in _dataclasses_in(config)}:
         texts = _texts_below_fields(kind)

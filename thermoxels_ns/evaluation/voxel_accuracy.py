@@ -43,13 +43,12 @@ class _Score:
 
 @dataclass(frozen=True)
 class SeenScore(_Score):
-    """Agreement of the part of a reconstructed surface that cameras see with the true one.
+    """Agreement of the part of a reconstructed surface that cameras see, and its share of the whole, 0 to 1.
 
     Against the whole surface's score it tells what photographs could have shown from what was guessed behind it.
     """
 
     share: float
-    """Share of the reconstructed boundary that at least `MIN_VIEWS` cameras see, 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -83,13 +82,12 @@ def surface_fscore(
     Args:
         cells: Solid voxels, shape `lattice.cell_shape`.
         lattice: Where they are, [world units].
-        truth: The true body; only its `signed_distance` is asked.
+        truth: The true body.
         true_points_seen: True surface that enough training cameras see, shape (m, 3), m at least 1, [truth units].
         tolerance: Distance that counts as agreement, above 0, [truth units]; 1.5 voxels by custom.
-        world_to_truth: Similarity, shape (4, 4), from the lattice's world to truth coordinates (homogeneous column
-            vectors); the identity if left out.
-        views: The training cameras, in the coordinates of the lattice. With them the part of the boundary that they
-            see is scored too, which takes a few passes over the lattice per camera.
+        world_to_truth: Similarity, shape (4, 4), from the lattice's world to truth coordinates; None: the identity.
+        views: The training cameras, in the coordinates of the lattice: the part of the boundary that they see is scored
+            too, which takes a few passes over the lattice per camera.
         surroundings: What truly stands beside the body. Boundary in it, or within the tolerance of it, is neither right
             nor wrong: photographs do not say where the body ends and its surroundings begin.
     """

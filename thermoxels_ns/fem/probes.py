@@ -41,14 +41,7 @@ class Probes:
 
 
 def place_probes(mesh: TetMesh, points_m: npt.ArrayLike) -> Probes:
-    """Find the tetrahedron around each point.
-
-    Args:
-        mesh: The body.
-        points_m: Positions in the mesh's coordinates, shape (p, 3), [m].
-
-    Raises:
-        HeatError: The array has another shape, or a point lies outside the body.
+    """Find the tetrahedron around each point, shape (p, 3), [m]; raises `HeatError` if one lies outside the body.
 
     >>> corner, none = np.vstack([np.zeros(3), np.eye(3)]), np.zeros((0, 3), np.int64)
     >>> tets, seen = np.array([[0, 1, 2, 3]]), np.ones(4, bool)

@@ -51,14 +51,8 @@ def tabulated(times_s: npt.ArrayLike, values: npt.ArrayLike) -> Varying:
     """Make a quantity that changes with time as a table says, in straight lines from entry to entry.
 
     It is held at the first and the last entry before and after them. Adaptive steps are no longer than the shortest
-    time between two entries, so that none is stepped over.
-
-    Args:
-        times_s: Times, ascending, at least two, shape (k,), [s].
-        values: What it is at these times, shape (k,).
-
-    Raises:
-        HeatError: The table is none.
+    time between two entries, so that none is stepped over. Times, [s], ascend, at least two, shape (k,), as the values;
+    raises `HeatError` otherwise.
 
     >>> tabulated([0.0, 3600.0, 7200.0], [10.0, 20.0, 10.0]).resolution_s
     3600.0
@@ -83,16 +77,12 @@ Quantity: TypeAlias = float | Varying
 
 @dataclass(frozen=True)
 class Bounds:
-    """The values that a quantity may have, by its name and unit."""
+    """The values that a quantity may have, from the smallest to the largest; name and unit are for messages."""
 
     name: str
-    """Name of the field, for messages."""
     unit: str
-    """Its unit, for messages."""
     low: float = -math.inf
-    """Smallest value."""
     high: float = math.inf
-    """Largest value."""
     above_low: bool = False
     """Whether `low` itself is refused."""
     varies: bool = True
@@ -140,9 +130,7 @@ class Bounded:
     """A quantity with its range, ready to be asked."""
 
     quantity: Quantity
-    """A number or a function."""
     bounds: Bounds
-    """What it may be."""
 
     @property
     def in_time(self) -> bool:
@@ -160,11 +148,7 @@ class Bounded:
         return self.quantity.resolution_s if isinstance(self.quantity, Varying) and self.in_time else math.inf
 
     def at(self, places: Places, time_s: float) -> npt.NDArray[np.float64]:
-        """Compute the quantity at places, shape (k,).
-
-        Raises:
-            HeatError: A function returned the wrong shape, or values out of range.
-        """
+        """Compute the quantity at places, shape (k,); raises `HeatError` for a wrong shape or values out of range."""
         if not isinstance(self.quantity, Varying):
             return np.full(len(places), self.quantity, dtype=np.float64)
         value = self.quantity.function(places, time_s if self.in_time else 0.0)

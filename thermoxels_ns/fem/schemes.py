@@ -19,7 +19,6 @@ class Scheme:
     """
 
     name: str
-    """Name for reports."""
     order: int
     """Order of the error at the end as a power of the step length."""
     nodes: tuple[float, ...]
@@ -36,13 +35,7 @@ class Scheme:
 
 
 def theta_scheme(theta: float) -> Scheme:
-    """Make the theta method: theta = 1 is backward Euler, 1/2 is Crank-Nicolson.
-
-    Args:
-        theta: Weight of the end of the step, 0.5 to 1: below, a scheme is unstable for long steps.
-
-    Raises:
-        HeatError: It is out of range.
+    """Make the theta method, theta from 0.5 (Crank-Nicolson) to 1 (backward Euler); below, it is unstable: `HeatError`.
 
     >>> theta_scheme(0.5).ends
     (0.5, 0.5)

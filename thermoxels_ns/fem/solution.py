@@ -67,7 +67,7 @@ class EffectHeat:
 
 @dataclass(frozen=True)
 class HeatSolution:
-    """Temperatures over time and the account of the heat."""
+    """Temperatures over time and the account of the heat; converged: every step was solved to tolerance."""
 
     times_s: npt.NDArray[np.float64]
     """Time of each state, the start first, shape (s + 1,), [s]."""
@@ -86,9 +86,7 @@ class HeatSolution:
     """The same change relative to the heat stored in the initial differences, sum m_i |T_i - mean T|, plus all heat
     exchanged: the stricter measure. 0 where nothing is unaccounted for."""
     status: str
-    """The outcome as a sentence."""
     converged: bool
-    """Whether every step was solved to tolerance."""
     iterations: npt.NDArray[np.int64]
     """Iterations of the linear solver in each interval, shape (s,)."""
     skipped_effects: tuple[str, ...]
@@ -98,13 +96,11 @@ class HeatSolution:
     newton_iterations: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     """Steps of Newton's method in each interval, shape (s,); all 0 without radiation."""
     steps: int = 0
-    """Number of time steps taken."""
     step_lengths_s: tuple[npt.NDArray[np.float64], ...] = ()
     """Lengths of the steps in each interval, [s]."""
     time_error_k: float = float("nan")
     """Estimated largest error of the steps at any temperature, their estimates added up, [K]; NaN for fixed steps."""
     assembled: Assembled = field(default_factory=Assembled)
-    """What was assembled."""
 
 
 @dataclass(frozen=True)
@@ -118,11 +114,8 @@ class SteadySolution:
     energy_residual: float
     """Sum of all heat flows, which should be 0, relative to the sum of their sizes."""
     status: str
-    """The outcome as a sentence."""
     converged: bool
-    """Whether the equations were solved to tolerance."""
     iterations: int
-    """Iterations of the linear solver."""
     newton_iterations: int
     """Steps of Newton's method; 0 without radiation."""
     assembled: Assembled
@@ -158,7 +151,7 @@ _CHILD_FACETS = 4
 
 @dataclass(frozen=True)
 class SolutionNodes:
-    """A mesh with a temperature at every node."""
+    """A mesh with a temperature at every node, and whether the tetrahedra that were solved are quadratic."""
 
     mesh: TetMesh
     """The mesh that was solved; of quadratic tetrahedra the same with all edges halved, whose new nodes are where their
@@ -168,7 +161,6 @@ class SolutionNodes:
     states_c: Vector
     """Nodal temperatures, shape (s, n), [degrees Celsius]."""
     quadratic: bool
-    """Whether the tetrahedra that were solved are quadratic."""
 
     def of_facets(self, values: npt.NDArray) -> npt.NDArray:
         """Give values of the boundary triangles that were solved to those of the mesh, shape (f, ...)."""

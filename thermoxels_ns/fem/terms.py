@@ -27,9 +27,7 @@ class ConvectionTerm(_OnFacets):
     """Convection or ground contact, q = h (T_ambient - T) through boundary triangles, positive into the body."""
 
     coefficient_w_m2k: Bounded
-    """h, [W / (m2 K)]."""
     ambient_c: Bounded
-    """T_ambient, [degrees Celsius]."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +43,8 @@ class RadiationTerm(_OnFacets):
     """q = sigma eps (T_s^4 - T^4) through boundary triangles, temperatures in kelvin, positive into the body."""
 
     emissivity: Bounded
-    """eps, [1]."""
     surroundings_c: Bounded
-    """T_s, [degrees Celsius]."""
     stefan_boltzmann_w_m2k4: float
-    """sigma, [W / (m2 K4)]."""
 
 
 @dataclass(frozen=True)
@@ -57,11 +52,8 @@ class SourceTerm:
     """A given heat source in tetrahedra."""
 
     effect: str
-    """Label of the effect that it comes from."""
     tets: npt.NDArray[np.int64]
-    """Numbers of tetrahedra, shape (k,)."""
     source_w_m3: Bounded
-    """Heat source, [W / m3]."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +61,6 @@ class FixedTerm(_OnFacets):
     """Given temperatures at the nodes of boundary triangles."""
 
     temperature_c: Bounded
-    """Temperature, [degrees Celsius]."""
 
 
 Term: TypeAlias = ConvectionTerm | FluxTerm | RadiationTerm | SourceTerm | FixedTerm
@@ -110,11 +101,7 @@ class Effect(ABC):
 
     @abstractmethod
     def terms(self, selection: Selection) -> tuple[Term, ...]:
-        """Give the terms that it adds to the heat equation of a body.
-
-        Raises:
-            HeatError: The body has no such patch or region.
-        """
+        """Give the terms that it adds to the heat equation of a body; `HeatError` if that lacks a patch or region."""
 
 
 def _checked_names(field: str, names: object) -> tuple[str, ...]:

@@ -103,21 +103,15 @@ class HeatScene:
         return self.time is None
 
     def problem(self, mesh: TetMesh, *, up: Vector | None = None) -> HeatProblem:
-        """Put the scene around a body; `up` counts if the scene does not say, None: z.
-
-        Raises:
-            HeatError: The mesh lacks a patch or region that the scene names, or has one that the scene says nothing
-                about.
-        """
+        """Put the scene around a body; `up` counts if the scene does not say, None: z. Raises what `effects` does."""
         initial = None if self.initial_c is None else np.full(len(mesh.points_m), self.initial_c)
         return HeatProblem(mesh, self._material(mesh), initial, self.effects(mesh), self.up or up or _Z_UP)
 
     def effects(self, mesh: TetMesh) -> tuple[Effect, ...]:
         """Build what the scene names, and nothing else.
 
-        Raises:
-            HeatError: The mesh lacks a patch that the scene names, a patch has nothing act on it and is not named
-                adiabatic, or two entries count the same exchange.
+        Raises `HeatError` if the mesh lacks a patch that the scene names, a patch has nothing act on it and is not
+        named adiabatic, or two entries count the same exchange.
         """
         patches = ScenePatches(mesh)
         named = self._named_effects(patches)

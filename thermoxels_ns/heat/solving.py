@@ -42,11 +42,7 @@ _BOUNDS = {
 
 @dataclass(frozen=True)
 class Goals:
-    """How exact a solution must be, and what it may take.
-
-    Raises:
-        HeatError: A number is out of range, or more may be left out than the tolerance.
-    """
+    """How exact a solution must be, and what it may take; raises `HeatError` if a number is out of range."""
 
     tolerance_k: float | None = None
     """Largest error of any temperature, [K]; None: any."""
@@ -83,11 +79,7 @@ class Goals:
         return LEAVE_OUT_BELOW_K if self.tolerance_k is None else LEFT_OUT_SHARE * self.tolerance_k
 
     def check_fits(self, time: Time) -> None:
-        """Refuse goals that do not say how to choose the steps in time.
-
-        Raises:
-            HeatError: There is a tolerance for heat flows alone, and a duration.
-        """
+        """Raise `HeatError` for a tolerance of heat flows alone beside a duration: it does not choose the steps."""
         if time is not None and self.flow_tolerance is not None and self.tolerance_k is None:
             expected = "--tolerance beside it if the scene has a duration"
             remedy = "Pass --tolerance too: steps in time are chosen by it."
@@ -103,7 +95,6 @@ class Accuracy:
     flow_tolerance: float | None
     """Error of the mean heat flow of any effect that was allowed, as a share of all heat; None: any."""
     met: bool
-    """Whether the estimates are within it."""
     estimated_k: float
     """Estimated largest error of a temperature, what is left out included, [K]."""
     estimated_flow: float
@@ -117,38 +108,26 @@ class Accuracy:
     step_tolerance_k: float | None
     """Tolerance of the time steps, [K]; None without steps."""
     seconds: float
-    """Time for all solutions and estimates, [s]."""
     status: str
-    """The outcome as a sentence."""
     levels: tuple[dict[str, Any], ...]
     """All solutions on the way with their estimates and seconds, the one that counts last."""
 
 
 @dataclass(frozen=True)
 class SolvedProblem:
-    """A solution and what it is one of."""
+    """A solution, what it is one of, and what is known of its error (None without a tolerance)."""
 
     problem: HeatProblem
     """What was solved last: without what is left out, and perhaps on a finer mesh than the given one."""
     solution: Solution
-    """Temperatures and heat flows."""
     screening: Screening
-    """What was built."""
     accuracy: Accuracy | None
-    """What is known of the error; None if no tolerance was given."""
 
 
 def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lambda _: None) -> SolvedProblem:
-    """Leave out what does not matter, and solve the rest.
+    """Leave out what does not matter, and solve the rest; `say` gets one line of progress at a time.
 
-    Args:
-        problem: Body, materials and all effects that the scene names.
-        time: How the body is followed; None: its steady state.
-        goals: How exact the solution must be, and what it may take.
-        say: Called with one line of progress at a time.
-
-    Raises:
-        HeatError: The problem needs more memory than allowed, its solver fails, or the tolerance cannot be met.
+    Raises `HeatError` if it needs more memory than allowed, the solver fails, or the tolerance cannot be met.
     """
     goals.check_fits(time)
     if time is not None:

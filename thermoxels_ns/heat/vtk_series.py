@@ -19,10 +19,7 @@ def write_heat_series(pvd: Path | str, mesh: TetMesh, solution: HeatSolution) ->
     """Write ``NAME.pvd`` and ``NAME/step-0000.vtu`` and so on, which ParaView and pyvista open as one series.
 
     The .pvd is written last, so it never lists a file that is not there. Steps left over from a longer earlier
-    series are removed. Returns all paths, the .pvd first.
-
-    Raises:
-        OutputError: A file cannot be written.
+    series are removed. Returns all paths, the .pvd first; raises `OutputError` if a file cannot be written.
     """
     pvd = Path(pvd)
     writable_folder(pvd.parent)
@@ -50,11 +47,7 @@ def heat_series_paths(pvd: Path | str, num_states: int) -> list[Path]:
 
 
 def remove_heat_series(pvd: Path | str) -> None:
-    """Remove a series written by `write_heat_series`, if there is one.
-
-    Raises:
-        OutputError: A file cannot be removed.
-    """
+    """Remove a series written by `write_heat_series`, if there is one, or raise `OutputError`."""
     pvd = Path(pvd)
     remove_file(pvd)
     folder = pvd.with_suffix("")

@@ -59,17 +59,9 @@ def write_capture_page(result: CaptureResult) -> None:
 def thermal_in_photograph(
     frame: RigFrame, temperature_c: npt.NDArray, visible: Camera, rig: RigEstimate, width: int = _WIDTH
 ) -> npt.NDArray[np.float32]:
-    """Carry a thermal image into the photograph's view, through the depth of the scene points.
+    """Carry a thermal image, [degrees C], into the photograph's view, through the depth of the scene points.
 
-    Args:
-        frame: The pair.
-        temperature_c: Its temperatures, [degrees C].
-        visible: The photographs' camera.
-        rig: The thermal camera and where it is.
-        width: Of the result, [pixels].
-
-    Returns:
-        Temperatures by pixel of the reduced photograph, [degrees C], NaN where the thermal image does not reach.
+    Returns temperatures by pixel of the photograph reduced to a width, NaN where the thermal image does not reach.
     """
     height = max(1, round(visible.height * width / visible.width))
     rays = _grid_rays(visible, width, height)

@@ -20,13 +20,7 @@ INK, SOFT, LINE, ACCENT = "#1d2430", "#9aa3ae", "#e1e5ea", "#b3431e"
 
 @contextmanager
 def chart(width: float, height: float, rows: int = 1) -> Iterator[tuple[Figure, list[Axes]]]:
-    """Give a figure whose axes stand one above the other, in the look of the pages.
-
-    Args:
-        width: In units of 1/10 of the font's height.
-        height: The same.
-        rows: Number of axes.
-    """
+    """Give a figure whose axes stand one above the other, in the look of the pages; sizes in font heights / 10."""
     from matplotlib import rc_context
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
@@ -52,17 +46,7 @@ def svg_text(figure: Figure) -> str:
 
 
 def histogram(values: npt.NDArray, label: str, bins: int = 60, limits: tuple[float, float] | None = None) -> str:
-    """Draw how often values occur.
-
-    Args:
-        values: Numbers of any shape; those that are not finite do not count.
-        label: What the horizontal axis is, with its unit.
-        bins: Number of bars.
-        limits: From and to; None: all values.
-
-    Returns:
-        An svg element; empty without values.
-    """
+    """Draw how often finite values occur between limits, None: all, as an svg element; empty without values."""
     values = values[np.isfinite(values)]
     if not values.size:
         return ""
@@ -73,15 +57,7 @@ def histogram(values: npt.NDArray, label: str, bins: int = 60, limits: tuple[flo
 
 
 def bars(values: Sequence[float], label: str) -> str:
-    """Draw one bar per item, from zero up or down.
-
-    Args:
-        values: Finite numbers in order.
-        label: What the axis along the items is; the numbers' unit belongs in it.
-
-    Returns:
-        An svg element; empty without values.
-    """
+    """Draw one bar per item, from zero up or down, as an svg element; empty without values."""
     if not len(values):
         return ""
     with chart(7.0, 2.2) as (figure, (axis,)):
@@ -99,18 +75,10 @@ def curves_over_time(
     steps: Sequence[tuple[str, npt.NDArray]],
     labels: tuple[str, str],
 ) -> str:
-    """Draw curves, and below them means over the intervals between the times.
+    """Draw curves, and below them means over the intervals between the times, as an svg element.
 
-    Args:
-        times: Shape (s + 1,).
-        unit: Of the times.
-        curves: Name and values, shape (s + 1,), the most important one first.
-        band: Name, lowest and highest values, shape (s + 1,) each.
-        steps: Name and means, shape (s,), the most important one last.
-        labels: Of the upper and the lower vertical axis.
-
-    Returns:
-        An svg element, the same for the same figures.
+    Times and `curves`, the most important one first, have shape (s + 1,), as lowest and highest values of `band`;
+    means, the most important one last, have shape (s,). `labels` are those of the upper and the lower vertical axis.
     """
     with chart(10.5, 7.0, rows=2) as (figure, (above, below)):
         name, low, high = band

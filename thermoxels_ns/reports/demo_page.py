@@ -14,31 +14,22 @@ class Check:
     """A measured figure and whether it meets its target, as text."""
 
     name: str
-    """What was measured."""
     measured: str
-    """The figure with its unit."""
     target: str
-    """What it should be, with its unit."""
     met: bool
-    """Whether it is."""
     meaning: str = ""
     """What the figure says, for somebody who meets it for the first time."""
 
 
 @dataclass(frozen=True)
 class HeldOutView:
-    """One view that took no part in training, as PNG or JPEG files."""
+    """One view that took no part in training, as PNG or JPEG files; thermal images in the page's colours."""
 
     name: str
-    """Name of the frame."""
     measured_rgb: bytes
-    """The photograph."""
     rendered_rgb: bytes
-    """The model's colour image."""
     measured_thermal: bytes
-    """The thermal image in the colours of the page's colour bar."""
     rendered_thermal: bytes
-    """The model's thermal image in the same colours."""
 
     @property
     def pictures(self) -> tuple[tuple[str, bytes], ...]:
@@ -80,22 +71,18 @@ class ColourBar:
 
 @dataclass(frozen=True)
 class DemoPage:
-    """Everything the page says."""
+    """Everything the page says; steps in order with the time each took, [s]."""
 
     title: str
-    """Heading."""
     summary: str
     """One or two sentences on what the page shows."""
     at_a_glance: tuple[Picture, ...]
     """What went in and what came out, side by side."""
     checks: tuple[Check, ...]
-    """The figures that have a target."""
     more_figures: Table
-    """Further figures: name and value with unit."""
     training_pairs: tuple[tuple[bytes, bytes], ...]
     """Some of the photographs that went in, each with its thermal image."""
     views: tuple[HeldOutView, ...]
-    """The held-out views."""
     colour_bar: ColourBar
     """Colours of all thermal images of the page, but not of the mesh pictures, which have their own."""
     mesh_pictures: tuple[Picture, ...]
@@ -103,17 +90,11 @@ class DemoPage:
     next_steps: tuple[tuple[str, str], ...]
     """Commands to try next, and what each does."""
     seconds: tuple[tuple[str, float], ...]
-    """Steps in order and the time each took, [s]."""
     commands: tuple[str, ...]
-    """The commands that reproduce it, as they are typed."""
     files: tuple[tuple[str, str], ...]
     """Files and folders relative to the page, and what they hold."""
 
 
 def build_page(page: DemoPage) -> str:
-    """Build the html text; it depends on `page` alone.
-
-    Raises:
-        ThermoxelsError: An image is neither PNG nor JPEG.
-    """
+    """Build the html text, which depends on `page` alone; raises `ThermoxelsError` for an image not PNG or JPEG."""
     return build_html(page, "demo.html.j2")

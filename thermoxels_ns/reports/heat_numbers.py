@@ -74,14 +74,10 @@ class RoundOff:
 
 
 def round_off_of(flows_w: Sequence[float], area_m2: float) -> RoundOff:
-    """Say which flows are round-off in a body.
+    """Say which of the heat flows of everything that acts, [W], are round-off in a body of so much surface, [m^2].
 
     It is less than a billionth of the largest flow, which a balance need not close to, or less than a billionth of a
     watt per square metre, which is what rounding makes of a surface as warm as the air beside it.
-
-    Args:
-        flows_w: Heat flows of everything that acts, [W].
-        area_m2: Area of the surface, [m^2].
 
     >>> f"{round_off_of((1e3, -1e3), 200.0).below_w:g} {round_off_of((), 200.0).below_w:g}"
     '1e-06 2e-07'

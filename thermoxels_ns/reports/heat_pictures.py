@@ -27,17 +27,8 @@ def draw_surface(
 ) -> list[str]:
     """Draw the surface at the start, at the end, and the change (of a steady state once), and a cut through the body.
 
-    Colours of the surface span what photographs show of it: inside a heated building it is far warmer.
-
-    Args:
-        folder: Where to.
-        mesh: The body.
-        states_c: Nodal temperatures, shape (s, n), [degrees Celsius].
-        times_s: Their times, shape (s,), [s].
-        up: Direction that points up.
-
-    Returns:
-        Names of the files.
+    Colours of the surface span what photographs show of it: inside a heated building it is far warmer. States are nodal
+    temperatures, shape (s, n), [degrees Celsius], at times of shape (s,), [s]. Returns the names of the files.
     """
     from thermoxels_ns.reports.mesh_pictures import change_colours, picture_of_mesh
 
@@ -78,15 +69,8 @@ def _colour_ends(values: Vector) -> tuple[tuple[float, float], bool]:
 def cut_open(mesh: TetMesh, nodal_c: Vector, up: tuple[float, float, float]) -> tuple[TetMesh, Vector, Vector]:
     """Take away the half of a body in front of an upright plane through its middle.
 
-    Args:
-        mesh: The body.
-        nodal_c: Nodal values, shape (n,).
-        up: Direction that points up.
-
-    Returns:
-        half: What is left, as a mesh to draw: its nodes and boundary triangles are real, its tetrahedra only a number.
-        values: Values at its nodes.
-        view: Direction to look in, shape (3,).
+    Returns what is left, as a mesh to draw (its nodes and boundary triangles are real, its tetrahedra only a number),
+    the values at its nodes, and the direction to look in, shape (3,).
     """
     import pyvista as pv
     from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
@@ -120,16 +104,9 @@ def cut_open(mesh: TetMesh, nodal_c: Vector, up: tuple[float, float, float]) -> 
 
 
 def plot_over_time(solution: HeatSolution, mean_c: Vector, probes_c: Vector, probe_names: Sequence[str]) -> str:
-    """Plot temperatures and heat flows over time.
+    """Plot temperatures and heat flows over time as an svg element.
 
-    Args:
-        solution: Temperatures and heat flows.
-        mean_c: Mean temperature of the volume at each time, shape (s + 1,), [degrees Celsius].
-        probes_c: Temperatures at the probes, shape (s + 1, p), [degrees Celsius].
-        probe_names: Their names.
-
-    Returns:
-        An svg element, the same for the same figures.
+    `mean_c` is that of the volume, shape (s + 1,), `probes_c` has shape (s + 1, p), [degrees Celsius].
     """
     unit, seconds = time_unit(float(solution.times_s[-1]))
     probes = [(name, probes_c[:, column]) for column, name in enumerate(probe_names)][:_MOST_LINES]
