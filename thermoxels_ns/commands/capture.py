@@ -32,11 +32,7 @@ class Capture(CaptureSettings):
     stopped."""
 
     def main(self) -> None:
-        """Run the capture.
-
-        Raises:
-            ThermoxelsError: A file cannot be read, there are no pairs or no poses, or an option is out of range.
-        """
+        """Run the capture; raises `ThermoxelsError` for what cannot be used, and without pairs or poses."""
         from rich.console import Console
 
         console = Console(highlight=False)

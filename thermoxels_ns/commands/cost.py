@@ -88,11 +88,7 @@ class Cost:
     """Measure again what runs.csv already holds, for instance after a change of the program."""
 
     def main(self) -> None:
-        """Measure and report.
-
-        Raises:
-            ThermoxelsError: An option or the scene cannot be used, or a run failed.
-        """
+        """Measure and report; raises `ThermoxelsError` if an option or the scene cannot be used, or a run failed."""
         from rich.console import Console
 
         run_cost(self, Console(highlight=False))
@@ -255,7 +251,6 @@ class _Display:
         self._done = 0
 
     def say(self, line: str) -> None:
-        """Print a line."""
         self._console.print(line, markup=False, soft_wrap=True)
 
     @contextmanager

@@ -49,11 +49,7 @@ class Demo:
     """Show the page in a web browser at the end."""
 
     def main(self) -> None:
-        """Run the demo.
-
-        Raises:
-            ThermoxelsError: The folder holds something else, a command failed, or a target was missed.
-        """
+        """Run the demo; raises `ThermoxelsError` for another's folder, a command that failed, or a target missed."""
         from rich.console import Console
 
         run_demo(self, Console(highlight=False))
@@ -119,10 +115,8 @@ def run_demo(demo: Demo, console: Console) -> None:
 def prepare_folder(path: Path) -> Path:
     """Make the folder of a demo, without the results of an earlier demo.
 
-    Only what a demo writes is deleted, and only in a folder that a demo has marked as its own.
-
-    Raises:
-        OutputError: The folder holds something and is not a demo's, or cannot be written to.
+    Only what a demo writes is deleted, and only in a folder that a demo has marked as its own; raises `OutputError` for
+    one that holds something else, or cannot be written to.
     """
     folder = writable_folder(path)
     marker = folder / _MARKER
@@ -188,11 +182,7 @@ def print_results(results: DemoResults, console: Console) -> None:
 def assemble_page(
     folder: Path, scene: str, results: DemoResults, seconds: Sequence[tuple[str, float]], commands: Sequence[str]
 ) -> DemoPage:
-    """Gather the pictures of a demo run for its page.
-
-    Raises:
-        ThermoxelsError: A picture that a command should have written is missing.
-    """
+    """Gather the pictures of a demo run for its page; raises `ThermoxelsError` if one is missing."""
     from thermoxels_ns.commands.installed_commands import command_line
     from thermoxels_ns.reports.demo_page import Check, DemoPage, HeldOutView
     from thermoxels_ns.reports.page import Picture, Table

@@ -19,11 +19,9 @@ class Target:
     """A measured figure and the bound it should keep."""
 
     name: str
-    """What was measured."""
     measured: float
     """The figure; NaN if it could not be measured."""
     bound: float
-    """The bound."""
     at_least: bool
     """True: the figure should be at least the bound. False: at most."""
     form: str
@@ -49,20 +47,15 @@ class Target:
 
 @dataclass(frozen=True)
 class DemoResults:
-    """What a demo run achieved."""
+    """What a demo run achieved: the figures with a target, and others."""
 
     targets: tuple[Target, ...]
-    """The figures with a target."""
     others: tuple[tuple[str, str], ...]
     """Further figures: name and value with unit."""
 
 
 def read_results(eval_json: Path, summary_json: Path) -> DemoResults:
-    """Read the figures that ``ns-eval`` (on held-out views) and ``ns-export thermoxels-mesh`` wrote.
-
-    Raises:
-        ThermoxelsError: A file is missing or lacks a figure.
-    """
+    """Read what ``ns-eval`` (on held-out views) and ``ns-export thermoxels-mesh`` wrote, or raise `ThermoxelsError`."""
     images = _Section(eval_json, "results")
     truth, heat, mesh = (_Section(summary_json, name) for name in ("truth", "heat", "mesh"))
     tolerance = truth.number("tolerance_voxels")

@@ -34,16 +34,14 @@ they are averaged down for it, [pixels]."""
 
 @dataclass(frozen=True)
 class TrainedScene:
-    """A trained field and where it lies."""
+    """A trained field, where it lies, and the folder of its photographs."""
 
     snapshot: GridSnapshot
-    """The field."""
     world_to_input: npt.NDArray[np.float64]
     """Takes homogeneous column vectors of the trained scene to the coordinates of the input poses, shape (4, 4)."""
     viewpoint: Viewpoint
     """From where pictures show most of what the cameras saw."""
     scene_folder: Path
-    """The photographs' folder."""
     dataset: Any
     """The training photographs, a `ThermalDataset`."""
     tracks: FeatureRays | None
@@ -73,11 +71,7 @@ class ExportThermoxelsMesh(ExportOptions):
             raise SystemExit(1) from None
 
     def run(self, say: Any = print) -> dict[str, Any]:
-        """Run the export and return the summary that summary.json holds.
-
-        Raises:
-            ThermoxelsError: If an option, the checkpoint, the mesh or the heat problem is not usable.
-        """
+        """Run the export and return the summary that summary.json holds, or raise `ThermoxelsError`."""
         checked = check_options(self)
         scaled = checked.distance is not None or self.metres_per_unit is not None
         prepare_folder(self.output_dir, heat=scaled)
@@ -129,13 +123,9 @@ def scene_json(scene_folder: Path) -> dict[str, Any]:
 
 
 def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] = lambda _: None) -> TrainedScene:
-    """Load a trained Thermoxels model through nerfstudio.
+    """Load a trained Thermoxels model through nerfstudio; raises `CheckpointError` for what is none.
 
     `check_scene` is called with the photographs' folder before anything slow; what it raises is raised.
-
-    Raises:
-        CheckpointError: If the file is missing or not a nerfstudio config, if there is no checkpoint, or if it was
-            trained with another method.
     """
     if not load_config.is_file():
         remedy = "Pass --load-config outputs/<scene>/thermoxels/<time>/config.yml."
@@ -191,12 +181,8 @@ def _reason(load_config: Path, problem: Exception) -> str:
 def viewpoint_of_cameras(camera_to_worlds: npt.ArrayLike, world_to_input: npt.ArrayLike) -> Viewpoint:
     """Choose a view for pictures: up as the photographer held the camera, from the side the cameras stood on.
 
-    Args:
-        camera_to_worlds: Poses in the trained scene (x right, y up, z back), shape (n, 3, 4) or (n, 4, 4).
-        world_to_input: Takes the trained scene to the coordinates of the input poses, shape (4, 4).
-
-    Returns:
-        The view. If the cameras stood all around, it is the usual one, obliquely from above.
+    Takes poses in the trained scene (x right, y up, z back), shape (n, 3, 4) or (n, 4, 4). If the cameras stood all
+    around, the view is the usual one, obliquely from above.
     """
     rotation = np.asarray(world_to_input, np.float64)[:3, :3]
     axes = np.einsum("ij,njk->nik", rotation / np.cbrt(np.linalg.det(rotation)), np.asarray(camera_to_worlds)[:, :, :3])

@@ -118,7 +118,6 @@ class CheckedOptions:
     """What the options say, once they are known to be in range."""
 
     selection: SolidSelection
-    """Which voxels are solid."""
     scene: HeatScene
     """The scene of the heat step with the options' changes applied."""
     material: Material
@@ -126,17 +125,12 @@ class CheckedOptions:
     time: TimeSteps
     """How long it says the body is followed."""
     rules: PatchRules
-    """Patches and regions of the user."""
     distance: SceneScale | None
     """The scale that the known distance gives."""
 
 
 def check_options(options: ExportOptions) -> CheckedOptions:
-    """Check every option, so that a wrong one is refused before anything slow runs.
-
-    Raises:
-        ThermoxelsError: An option is out of range, or a file cannot be read.
-    """
+    """Check every option, so that a wrong one is refused (`ThermoxelsError`) before anything slow runs."""
     from thermoxels_ns.mesh.boundary.patch_rules import PatchRules, load_patch_rules
     from thermoxels_ns.mesh.build import MeshOptions
     from thermoxels_ns.mesh.solid.voxels import SolidSelection
@@ -169,8 +163,7 @@ def scale_of(
 ) -> SceneScale | None:
     """The scale of an export: what the user gives, else what the scene's json says; None if nobody does.
 
-    Raises:
-        ThermoxelsError: Something about the scale is out of range, or a format or option needs one and there is none.
+    Raises `ThermoxelsError` for a scale out of range, or for a format or option that needs one where there is none.
     """
     scale = choose_scale(options.metres_per_unit, checked.distance, scene_file)
     needs = [f"--formats {name}" for name in ("inp",) if name in options.formats]
@@ -184,11 +177,7 @@ def scale_of(
 
 
 def up_of(options: ExportOptions, scene_file: Mapping[str, Any] | None, viewpoint: Viewpoint) -> tuple[Vector, str]:
-    """Up, a unit vector, and where it comes from: the user, else the scene's json, else the cameras.
-
-    Raises:
-        ThermoxelsError: What the user or the json says is no direction.
-    """
+    """Up, a unit vector, and where it comes from: the user, else the scene's json, else the cameras."""
     if options.up is not None:
         length = math.sqrt(sum(value * value for value in options.up))
         if not (math.isfinite(length) and length > 0.0):

@@ -42,11 +42,7 @@ _HEAT_PICTURE = "heat.png"
 
 
 def prepare_folder(output_dir: Path | str, *, heat: bool) -> Path:
-    """Make the folder of an export, find out what is in the way, and remove what killed exports left half-written.
-
-    Raises:
-        OutputError: The folder cannot be written to, or a folder has the name of a file of the export.
-    """
+    """Make the folder of an export, refuse what is in the way, and remove what killed exports left half-written."""
     from thermoxels_ns.heat.vtk_series import STEP_PATTERN
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS
 
@@ -79,21 +75,10 @@ def export_snapshot(
     new one comes last, so the files in a folder with a summary.json belong together; what this export does not
     make is removed.
 
-    Args:
-        snapshot: The trained field.
-        world_to_input: From the trained scene to the coordinates of the input poses, shape (4, 4).
-        options: What to make.
-        output_dir: Folder for the results; made if it does not exist.
-        say: Called with one line of progress at a time.
-        viewpoint: How pictures look at the mesh; its up is the mesh's unless the scene's json has one.
-        compare: Compares solid voxels and mesh in metres (last: metres per unit) with a known truth; its
-            `ThermoxelsError` goes into the summary. Asked only if the scale is known.
-        scene_file: The scene's json, which may know the scale and up.
-        photographs: What the cameras saw, to count how many photographs support each boundary triangle.
-        tracks: Lines from photographs to points that they see, which support surfaces too.
-
-    Raises:
-        ThermoxelsError: An option is out of range, nothing is solid, the folder cannot be written to, or heat fails.
+    `world_to_input`, shape (4, 4), takes the trained scene to the input poses; the up of `viewpoint` is the mesh's
+    unless the scene's json has one. If the scale is known, `compare` compares solid voxels and mesh in metres (last:
+    metres per unit) with a known truth; its `ThermoxelsError` goes into the summary. All other errors are raised.
+    `photographs` and `tracks`, lines from them to points that they see, say which boundary triangles are supported.
     """
     from thermoxels_ns.commands.export_summary import HEAT_SKIPPED, heat_summary, mesh_summary, versions
     from thermoxels_ns.fem.solution import HeatSolution

@@ -136,9 +136,7 @@ def support_shares(mesh: TetMesh) -> dict[str, float] | None:
 
 
 def _percentile_summary(solid: SolidCells, selection: SolidSelection) -> dict[str, float]:
-    """What a percentile asked for and what it got before small bodies were dropped: voxels without density, such as
-    pruned ones, are never solid.
-    """
+    """What a percentile asked for, and got before small bodies were dropped (what has no density never counts)."""
     if selection.density_percentile is None or selection.density_threshold is not None:
         return {}
     return {

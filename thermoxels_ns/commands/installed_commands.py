@@ -64,17 +64,10 @@ def command_line(arguments: Sequence[str | Path]) -> str:
 def run_command(
     arguments: Sequence[str | Path], log: Path, console: Console | None = None, watch: Watch = lambda _: None
 ) -> ProcessCost:
-    """Run a command of this installation with its output in a file, and measure it.
+    """Run a command of this installation with its output in a file, whose folder exists, and measure it.
 
-    Args:
-        arguments: The command's name, found beside the running Python, and its arguments.
-        log: File for the output; its folder exists.
-        console: Where the output is shown as it comes, progress bars included; elsewhere than on a terminal a line says
-            now and then that a quiet command still runs. None: it is not shown.
-        watch: Called now and then while it runs.
-
-    Raises:
-        ThermoxelsError: There is no such command, or it failed; the message holds its last lines.
+    `console` shows the output as it comes, progress bars included; elsewhere than on a terminal a line says now and
+    then that a quiet command still runs. Raises `ThermoxelsError` with the last lines if it failed or does not exist.
     """
     words = [str(argument) for argument in arguments]
     program = _installed_command(words[0])

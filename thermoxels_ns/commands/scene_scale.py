@@ -58,11 +58,7 @@ class SceneScale:
 
 
 def scale_from_option(metres_per_unit: float) -> SceneScale:
-    """Take the scale as the user gives it; its error is not known.
-
-    Raises:
-        ThermoxelsError: It is no finite number above 0.
-    """
+    """Take the scale as the user gives it, or raise `ThermoxelsError`; its error is not known."""
     check_positive(_KEY, metres_per_unit, "Pass the length of one input unit in metres, such as 1.")
     return SceneScale(float(metres_per_unit), None, f"Given by the user: {metres_per_unit:g} m per unit.")
 
@@ -74,10 +70,7 @@ def scale_from_known_distance(
 
     scale = D / d with the measured distance D and the distance d between the points; its relative standard
     error is that of D, which includes how far the points may lie from the ends of what was measured. None:
-    nobody knows.
-
-    Raises:
-        ThermoxelsError: A number is out of range, or the points coincide.
+    nobody knows. Raises `ThermoxelsError` if a number is out of range, or the points coincide.
 
     >>> scale_from_known_distance((0, 0, 0), (0, 3, 4), 10.0, standard_error_m=0.1).standard_error
     0.02
@@ -99,11 +92,7 @@ def scale_from_known_distance(
 
 
 def scale_from_scene_file(meta: Mapping[str, Any]) -> SceneScale | None:
-    """Read scale and standard error from a scene's json; None if it has none.
-
-    Raises:
-        SceneError: A value is no such number, or there is a standard error without a scale.
-    """
+    """Read scale and standard error from a scene's json, None if it has none; raises `SceneError` for wrong values."""
     value, error = meta.get(_KEY), meta.get(_ERROR_KEY)
     if value is None:
         if error is not None:
@@ -117,10 +106,7 @@ def scale_from_scene_file(meta: Mapping[str, Any]) -> SceneScale | None:
 
 
 def up_from_scene_file(meta: Mapping[str, Any]) -> Vector | None:
-    """Read the direction that is up from a scene's json and make it a unit vector; None if the json has none.
-
-    Raises:
-        SceneError: "up" is not three finite numbers, or all of them are 0.
+    """Read the unit vector that is up from a scene's json, None if it has none; raises `SceneError` for a wrong one.
 
     >>> up_from_scene_file({"up": [0, 0, 2]})
     (0.0, 0.0, 1.0)
@@ -143,10 +129,8 @@ def choose_scale(
 ) -> SceneScale | None:
     """Choose between what the user gives and what the scene's json says; the user goes before the json.
 
-    Returns the scale, whose source says what it was preferred to; None if nobody gives one.
-
-    Raises:
-        ThermoxelsError: The user gives both a scale and a distance, or a value is out of range.
+    Returns the scale, whose source says what it was preferred to, None if nobody gives one; raises `ThermoxelsError` if
+    the user gives both a scale and a distance.
     """
     if option is not None and known_distance is not None:
         remedy = "Leave one of them out."

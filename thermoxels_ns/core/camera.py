@@ -20,7 +20,7 @@ _UNDISTORT_STEPS = 20
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera's projection; its fields are named as in transforms.json.
+    """One camera's projection, lengths in pixels; its fields are named as in transforms.json.
 
     Poses beside it are camera to world with x right, y up, z back (OpenGL), as in transforms.json. Points in camera
     axes have x right, y down, z ahead (OpenCV). The centre of the top left pixel is at (0.5, 0.5). Only for perspective
@@ -28,17 +28,11 @@ class Camera:
     """
 
     width: int
-    """Image width [pixels]."""
     height: int
-    """Image height [pixels]."""
     fl_x: float
-    """Focal length along x [pixels]."""
     fl_y: float
-    """Focal length along y [pixels]."""
     cx: float
-    """Principal point, x [pixels]."""
     cy: float
-    """Principal point, y [pixels]."""
     k1: float = 0.0
     """Radial distortion, second order, as in OpenCV; k2, k3, k4 are the fourth, sixth and eighth order."""
     k2: float = 0.0
@@ -116,12 +110,7 @@ class Camera:
     def directions(self, pose: npt.ArrayLike, samples_per_axis: int = 1) -> FloatArray:
         """Unit ray directions in the world through a regular grid of points in every pixel, without distortion.
 
-        Args:
-            pose: Camera to world, shape (3, 4) or (4, 4).
-            samples_per_axis: Grid points per pixel along each axis; 1 is the pixel's centre.
-
-        Returns:
-            Directions, shape (height, width, samples_per_axis ** 2, 3).
+        `pose` is camera to world, shape (3, 4) or (4, 4). Returns shape (height, width, samples_per_axis ** 2, 3).
         """
         s = samples_per_axis
         x = (np.arange(self.width * s) + 0.5) / s

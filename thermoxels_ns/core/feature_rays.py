@@ -60,17 +60,12 @@ class FeatureRays:
 def agrees_with_neighbours(rays: FeatureRays) -> npt.NDArray[np.bool_]:
     """Which points lie where the points around them in the photographs do: wrong matches put theirs anywhere.
 
-    A photograph vouches for a point if at least half of the `NEIGHBOURS` points that it sees nearest to it are as far
-    away, give or take the largest of three lengths: `STEEPEST` times how far apart the two are across the ray, the
-    share `LEAST_TOLERANCE` of the distance, and `TOLERANCE_ERRORS` standard errors. So where neighbours are few and
-    far, much may differ, and among many little. Points agree that half of their photographs vouch for. A point on
-    something thin before other things may fail; it is then unknown, not wrong.
-
-    Args:
-        rays: Feature rays; those with one origin are one photograph's.
-
-    Returns:
-        One boolean per point; True for a point without rays, or which too few others are near to say.
+    A photograph (all rays of one origin) vouches for a point if at least half of the `NEIGHBOURS` points that it sees
+    nearest to it are as far away, give or take the largest of three lengths: `STEEPEST` times how far apart the two are
+    across the ray, the share `LEAST_TOLERANCE` of the distance, and `TOLERANCE_ERRORS` standard errors. So where
+    neighbours are few and far, much may differ, and among many little. Points agree that half of their photographs
+    vouch for, and those without rays or neighbours. A point on something thin before other things may fail; it is then
+    unknown, not wrong.
     """
     from scipy.spatial import KDTree  # slow to import and only needed here
 

@@ -18,14 +18,7 @@ from thermoxels_ns.core.errors import ThermoxelsError
 def plain_values(value: Any, name: str = "value", error: type[ThermoxelsError] = ThermoxelsError) -> Any:
     """Turn dataclasses, mappings, arrays, tuples and paths, nested as you like, into what json knows.
 
-    Args:
-        value: What to convert.
-        name: What it is called in messages.
-        error: Type to raise.
-
-    Raises:
-        ThermoxelsError: A number is NaN or infinite (json has neither), or a value has no place in json; the message
-            says where it is.
+    Raises `error`, which says where in `name` it is, for what has no place in json, as NaN and infinity.
 
     >>> plain_values({"sizes": (1, 2.5), "file": Path("a.npy")})
     {'sizes': [1, 2.5], 'file': 'a.npy'}
@@ -50,11 +43,7 @@ def plain_values(value: Any, name: str = "value", error: type[ThermoxelsError] =
 
 
 def write_json(path: Path, content: Any, error: type[ThermoxelsError] = ThermoxelsError) -> None:
-    """Write json, whole or not at all; converts and refuses as `plain_values` does.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write json, whole or not at all (`OutputError`); converts and refuses as `plain_values` does."""
     text = json.dumps(plain_values(content, path.stem, error), indent=1, allow_nan=False)
     with replace_when_done(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -66,11 +55,7 @@ def read_json(
     remedy: str = "Write it again, or pass another file.",
     error: type[ThermoxelsError] = ThermoxelsError,
 ) -> Any:
-    """Read json.
-
-    Raises:
-        ThermoxelsError: The file is missing or damaged.
-    """
+    """Read json, or raise `error` if the file is missing or damaged."""
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as problem:

@@ -110,16 +110,7 @@ class Lattice:
 
 
 def input_from_world(transform: npt.ArrayLike, scale: float) -> npt.NDArray[np.float64]:
-    """Undo a nerfstudio dataparser's recentring, rotation and scaling.
-
-    The dataparser maps poses by p_world = scale * (R p_input + t); this is the inverse.
-
-    Args:
-        transform: [R | t], shape (3, 4), R orthonormal.
-        scale: Above 0.
-
-    Returns:
-        The 4x4 that takes homogeneous column vectors of the trained scene to the coordinates of the input poses.
+    """Invert a nerfstudio dataparser's p_world = scale * (R p_input + t), [R | t] of shape (3, 4); shape (4, 4).
 
     >>> input_from_world([[1, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]], 2.0) @ [12, 0, 4, 1]
     array([1., 0., 2., 1.])

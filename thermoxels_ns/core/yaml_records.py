@@ -43,11 +43,7 @@ def raising(error: type[ThermoxelsError]) -> Iterator[None]:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a yaml file whose content is a mapping.
-
-    Raises:
-        ThermoxelsError: There is no such file, it is no yaml, a key stands twice in it, or it is no mapping.
-    """
+    """Read a yaml file whose content is a mapping without a key twice, or raise `ThermoxelsError`."""
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)
     except OSError as problem:
@@ -73,15 +69,10 @@ def as_mapping(name: str, content: object) -> dict[str, Any]:
 
 
 def as_record(name: str, content: object, target: type[Record]) -> Record:
-    """Turn a mapping into a dataclass.
+    """Turn a mapping into a dataclass, whose fields without a default are required.
 
-    Args:
-        name: Where the mapping stands, for messages, such as "winter.yaml: sky".
-        content: What was read.
-        target: The dataclass. Fields without a default are required; its own checks may raise `ThermoxelsError`.
-
-    Raises:
-        ThermoxelsError: A key is unknown or missing, or a value is of the wrong kind or out of range.
+    `name` says where the mapping stands, for messages, such as "winter.yaml: sky". Raises `ThermoxelsError` if a key is
+    unknown or missing, or a value is of the wrong kind or out of range.
     """
     content = as_mapping(name, content)
     hints = get_type_hints(target)
@@ -107,13 +98,10 @@ def check_keys(name: str, content: dict[str, Any], known: tuple[str, ...]) -> No
 
 
 def as_value(name: str, content: object, hint: Any) -> Any:
-    """Turn what was read into a value of the type that a dataclass field has.
+    """Turn what was read into a value of the type that a dataclass field has, or raise `ThermoxelsError`.
 
     Numbers (`Real`: as written, whole or not), truth values, texts, moments, choices (Literal), tuples of fixed or any
     length, and dataclasses are known; of a union, a field takes the first of these kinds.
-
-    Raises:
-        ThermoxelsError: It is of another kind.
     """
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
@@ -218,11 +206,7 @@ _PATTERNS = ("plenoxels*.yaml", "thermoxels*.yaml")
 
 
 def read_preset(name: str) -> dict[str, Any]:
-    """Read ``configs/<name>.yaml``.
-
-    Raises:
-        ThermoxelsError: There is no such preset, or it is not a mapping.
-    """
+    """Read ``configs/<name>.yaml``, or raise `ThermoxelsError` if there is no such preset or it is not a mapping."""
     path = configs_folder() / f"{name}.yaml"
     if not path.is_file():
         known = ", ".join(sorted(p.stem for pattern in _PATTERNS for p in configs_folder().glob(pattern))) or "none"
@@ -233,8 +217,7 @@ def read_preset(name: str) -> dict[str, Any]:
 def with_overrides(config: Config, overrides: Mapping[str, Any], name: str = "preset") -> Config:
     """A copy of a (nested) dataclass, or of a dict of such, with some fields replaced; lists replace tuples as tuples.
 
-    Raises:
-        ThermoxelsError: A name that the configuration does not have, or a value of another kind.
+    Raises `ThermoxelsError` for a name that the configuration does not have, or a value of another kind.
     """
     if isinstance(config, Mapping):
         fields = dict(config)

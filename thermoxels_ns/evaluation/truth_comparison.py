@@ -38,20 +38,17 @@ _JSON_NAME = "transforms.json"
 
 @dataclass(frozen=True)
 class SurfaceDistances:
-    """Distances between two surfaces, [truth units], and what lies at the closest points."""
+    """Distances between two surfaces, [truth units]: means both ways, their mean, the largest, the closest ones."""
 
     mesh_to_truth: float
     """Mean distance of the mesh's surface, spread evenly by area, to the true surface."""
     truth_to_mesh: float
     """Mean distance of the given true points to the mesh's surface."""
     chamfer: float
-    """Mean of both."""
     hausdorff: float
-    """Largest of all these distances."""
     closest_temperature_c: FloatArray
     """Temperature of the mesh at its surface point closest to each true point, shape (m,), [degrees Celsius]."""
     closest_distance: FloatArray
-    """Distance to that point, shape (m,)."""
 
 
 def sample_facets(points: FloatArray, facets: IntArray, count: int) -> FloatArray:
@@ -80,16 +77,9 @@ def surface_distances(
 ) -> SurfaceDistances | None:
     """Measure a mesh against a body whose shape is known exactly; None if nothing of the boundary is left to measure.
 
-    Cuts by the scene box, and what lies in the surroundings or within the tolerance of them, are left out. Distances
-    from the mesh are those of 20,000 points of it; those from the truth go to the nearest point of any triangle.
-
-    Args:
-        mesh: The mesh, [m].
-        truth: The true body, [truth units].
-        true_points: Points of the true surface that a mesh can be expected to have, shape (m, 3), m at least 1.
-        metres_per_unit: Scale of the mesh, metres per truth unit, above 0.
-        surroundings: What truly stands beside the body, if anything does.
-        tolerance: Distance that counts as agreement, [truth units].
+    Cuts by the scene box, and what lies in the surroundings or within the tolerance, [truth units], of them, are left
+    out. Distances from the mesh, [m], are those of 20,000 points of it; those from the truth go from the points (m, 3),
+    which a mesh can be expected to have, to the nearest point of any triangle.
     """
     import pyvista as pv
 
@@ -136,11 +126,9 @@ class KnownTruth:
     """A synthetic scene and the cameras that its training photographs were taken with."""
 
     scene: SyntheticScene
-    """The exact scene."""
     training_poses: FloatArray
     """Training cameras, camera to world (OpenGL), shape (c, 4, 4), [m]."""
     camera: Camera
-    """Intrinsics of all training photographs."""
 
     @property
     def surroundings(self) -> TrueShape | None:
@@ -151,8 +139,7 @@ class KnownTruth:
 def load_known_truth(scene_folder: Path | str) -> KnownTruth | None:
     """Get the truth of a scene folder (or its ``transforms.json``) and its training cameras; None for real photographs.
 
-    Raises:
-        SceneError: The json is unreadable, names an unknown scene, or its cameras cannot be used.
+    Raises `SceneError` for a json that is unreadable or names an unknown scene, and for cameras that cannot be used.
     """
     folder = Path(scene_folder)
     folder = folder.parent if folder.is_file() else folder
@@ -210,19 +197,16 @@ def compare_with_truth(
             areas and volumes of the result, those of the exact scene too, are in the units of the mesh.
 
     Returns:
-        A mapping that json can write, or None if the truth is not known. ``precision``, ``recall``, ``fscore`` and
-        the same of what is seen are 0 to 1; ``mean_distance_voxels`` and ``mean_distance_m`` of the boundary to the
-        true surface are None without one; ``volume_m3``, ``filled_volume_m3`` (with cavities) and ``area_m2`` are
-        those of the voxels (a staircase: its area exceeds that of the slope it follows).
-
-        With a mesh also ``mesh_volume_m3`` and ``mesh_area_m2`` (of the true surface that its triangles stand for);
-        ``chamfer_voxels``, ``chamfer_m`` and ``hausdorff_m`` between its surface and the part of the true one that is
-        seen (`surface_distance`); ``temperature_seen_mae_c``, the mean absolute error [K] at the
-        surface points closest to those true points that lie within the tolerance, and ``share_of_seen_reached``, the
-        share of them that do; and of the boundary nodes within the tolerance of the true surface:
-        ``temperature_nodes``, the number that a thermal ray measured, and ``temperature_mae_c``, their mean absolute
-        error [K] (None without such a node); the same of the others (``..._unmeasured...``); and
-        ``temperature_p95_all_c``, the error [K] that 95 % of all of them stay below.
+        A mapping that json can write, or None if the truth is not known. Scores are 0 to 1; mean distances are of the
+        boundary to the true surface, None without one; volumes and ``area_m2`` are those of the voxels (a staircase:
+        its area exceeds that of the slope it follows), ``filled_volume_m3`` with cavities. With a mesh also its volume
+        and the area of the true surface that its triangles stand for; ``chamfer_...`` and ``hausdorff_m`` between its
+        surface and the part of the true one that is seen; ``temperature_seen_mae_c``, the mean absolute error [K] at
+        the surface points closest to those true points that lie within the tolerance, and ``share_of_seen_reached``,
+        the share that do; and of the boundary nodes within the tolerance: ``temperature_nodes``, the number that a
+        thermal ray measured, ``temperature_mae_c``, their mean absolute error [K] (None without such a node), the same
+        of the others (``..._unmeasured...``), and ``temperature_p95_all_c``, the error [K] that 95 % of all of them
+        stay below.
 
     Raises:
         SceneError: The scene folder cannot be used, or no true point is seen by enough training cameras.
@@ -285,22 +269,15 @@ def geometry_metrics(
 ) -> dict[str, float]:
     """Compare the surface that an export with default options has with the exact scene, if it is known.
 
-    The surface is the boundary of the voxels that `SolidSelection` chooses by default; precision, recall and F-score
-    are those of `compare_with_truth`.
-
-    Args:
-        snapshot: The trained field, with the evidence and the cameras that an export has.
-        world_to_input: Similarity, shape (4, 4), from the lattice's world to the coordinates of the input poses, in
-            which a synthetic scene is written in metres.
-        truth: The scene folder (or its ``transforms.json``), or its truth if it is at hand.
-        say: Called with the reason where a figure cannot be given.
+    The surface is the boundary of the voxels that `SolidSelection` chooses by default; precision, recall and F-score,
+    0 to 1, and the arguments are those of `compare_with_truth`. `say` gets the reason where a figure cannot be given.
 
     Returns:
-        Nothing for real photographs. Else ``fscore``, ``precision``, ``recall``, 0 to 1, at 1.5 voxels of the
-        snapshot's lattice; ``fscore_128``, at 1.5 voxels of 128 along the exact box, to compare resolutions and boxes;
+        Nothing for real photographs. Else ``fscore``, ``precision``, ``recall`` at 1.5 voxels of the snapshot's
+        lattice; ``fscore_128``, at 1.5 voxels of 128 along the exact box, to compare resolutions and boxes;
         ``fscore_seen`` and ``fscore_128_seen``, of the part of the boundary that training cameras see (the rest is a
-        guess); ``surface_distance_voxels`` and ``surface_distance_m``, the mean distance to the true surface.
-        Without any solid voxel the scores are 0 and there is no distance.
+        guess); and the mean distance to the true surface. Without any solid voxel the scores are 0 and there is no
+        distance.
     """
     try:
         known = truth if isinstance(truth, KnownTruth) else load_known_truth(truth)

@@ -40,18 +40,15 @@ _ROUND_OFF_OF_COARSEST = 1e-13
 
 @dataclass(frozen=True)
 class LinearSolution:
-    """A solution of A x = b and how well it solves it."""
+    """A solution x of A x = b, shape (n,), and how well it solves it; the status is a sentence."""
 
     x: Vector
-    """The solution, shape (n,)."""
     iterations: int
-    """Iterations it took."""
     residual: float
     """||b - A x|| / ||b|| computed from x itself, not from the recursion; 0 where b is 0."""
     converged: bool
     """Whether the residual is within the tolerance, or as small as double precision can make it."""
     status: str
-    """The outcome as a sentence."""
 
 
 class Preconditioner(Protocol):
@@ -101,12 +98,9 @@ class ConjugateGradients:
         relative_tolerance: float = 1e-12,
         max_iterations: int = 10_000,
     ) -> None:
-        """Check A, symmetric positive definite; the preconditioner is `Sweeps` if None.
+        """Check A, symmetric positive definite (`HeatError`); the preconditioner is `Sweeps` if None.
 
         Iterations end at ||b - A x|| <= relative_tolerance * ||b||.
-
-        Raises:
-            HeatError: If an entry is not finite or a diagonal entry is not above 0.
         """
         diagonal = matrix.diagonal()
         if not (np.all(np.isfinite(matrix.data)) and np.all(diagonal > 0)):
@@ -300,7 +294,6 @@ class Multigrid(_Plain):
     name = "multigrid"
 
     def __init__(self, matrix: sparse.csr_matrix) -> None:
-        """Set up the levels."""
         from pyamg import smoothed_aggregation_solver
 
         super().__init__(matrix)

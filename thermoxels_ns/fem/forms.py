@@ -295,7 +295,6 @@ class FixedNodes:
     """All nodes that any effect fixes."""
 
     def __init__(self, forms: Sequence[FixedForm], num_nodes: int) -> None:
-        """Merge the nodes of the forms, one for each effect that fixes temperatures."""
         self._forms = tuple(forms)
         self.nodes: npt.NDArray[np.int64] = np.unique(
             np.concatenate([np.zeros(0, np.int64), *(f.nodes for f in forms)])
@@ -332,11 +331,7 @@ class FixedNodes:
         return np.flatnonzero(free)
 
     def temperature_k(self, time_s: float) -> Vector:
-        """Temperatures of `nodes`, relative to the reference, shape (d,), [K].
-
-        Raises:
-            HeatError: Two effects fix different temperatures at one node.
-        """
+        """Temperatures of `nodes`, relative to the reference, shape (d,), [K]; `HeatError` if two effects differ."""
         return at_time(self._kept, time_s, self._temperature_k)
 
     def _temperature_k(self, time_s: float) -> Vector:
@@ -374,16 +369,12 @@ class FixedNodes:
 
 @dataclass(frozen=True)
 class EffectForms:
-    """Forms by what they do to the heat equation, each in the order of the effects."""
+    """Forms by what they do to the heat equation, each in the order of the effects; loads are given heat alone."""
 
     convection: tuple[ConvectionForm, ...]
-    """Convection and ground contact: a matrix and a load."""
     loads: tuple[FluxForm | SourceForm, ...]
-    """Loads that do not depend on the temperature."""
     radiation: tuple[RadiationForm, ...]
-    """Loads that depend on the fourth power of the temperature."""
     fixed: tuple[FixedForm, ...]
-    """Given temperatures of nodes."""
 
     @property
     def exchanging(self) -> tuple[Form, ...]:
@@ -402,10 +393,7 @@ def effect_forms(
     """Turn effects into terms and terms into forms; what acts nowhere has none.
 
     `assembled` counts fixed temperatures, which are ready at once. Effects are looked for in the patches and regions of
-    `where`, if others than those that `space` adds up heat by.
-
-    Raises:
-        HeatError: An effect names what the mesh does not have.
+    `where`, if others than those that `space` adds up heat by. Raises `HeatError` if the mesh lacks one of them.
     """
     convection: list[ConvectionForm] = []
     loads: list[FluxForm | SourceForm] = []

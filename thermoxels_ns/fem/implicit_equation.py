@@ -71,20 +71,16 @@ class Residual:
 
 @dataclass(frozen=True)
 class ImplicitSolution:
-    """Temperatures that solve an implicit equation."""
+    """Temperatures that solve an implicit equation to tolerance, if it converged; the status is a sentence."""
 
     relative_k: Vector
     """Relative to the system's reference, shape (n,), [K]."""
     change_k: Vector
     """T - T_0 as it was solved for, shape (n,), [K]: the difference of the temperatures has lost its last digits."""
     iterations: int
-    """Iterations of the linear solver."""
     newton_iterations: int
-    """Steps of Newton's method; 0 without radiation."""
     converged: bool
-    """Whether the equations hold to tolerance."""
     status: str
-    """The outcome as a sentence."""
 
 
 class ImplicitEquation:
@@ -119,11 +115,7 @@ class ImplicitEquation:
         self._rough_solver: SystemSolver | None = None
 
     def solve(
-        self,
-        start_k: Vector,
-        time_s: float,
-        given_w: Vector | None = None,
-        given_to_pieces_w: Vector | None = None,
+        self, start_k: Vector, time_s: float, given_w: Vector | None = None, given_to_pieces_w: Vector | None = None
     ) -> ImplicitSolution:
         """Find the temperatures at the end from T_0, shape (n,), [K].
 
@@ -330,20 +322,15 @@ class _Balance:
 
 @dataclass(frozen=True)
 class _NewtonSolution:
-    """A solution and how it was found."""
+    """A solution u, shape (m,), what it leaves, and how many Newton steps and linear iterations it took."""
 
     u: Vector
-    """The solution, shape (m,)."""
     residual: Residual
-    """What it leaves."""
     iterations: int
-    """Newton steps."""
     linear_iterations: int
-    """Iterations of the linear solver in all of them."""
     converged: bool
     """Whether the residual is within the tolerance or as small as round-off, or the next step would be."""
     status: str
-    """The outcome as a sentence."""
 
 
 def newton(balance: _Balance, num_unknowns: int, *, relative_tolerance: float) -> _NewtonSolution:

@@ -54,7 +54,6 @@ class PositiveOffDiagonals:
     """
 
     def __init__(self, system: HeatSystem) -> None:
-        """Find them; none is left out."""
         self._system = system
         upper, diagonal = sparse.triu(system.stiffness, k=1, format="coo"), system.stiffness.diagonal()
         positive = upper.data > _ROUND_OFF * np.minimum(diagonal[upper.row], diagonal[upper.col])
@@ -123,7 +122,6 @@ class AllowedRange:
     """
 
     def __init__(self, system: HeatSystem) -> None:
-        """Begin."""
         self._system, self._widest_k = system, 0.0
 
     def at(self, start_k: Vector, times_s: tuple[float, ...], slack_k: float = 0.0) -> tuple[float, float]:
@@ -160,7 +158,6 @@ class Limiter:
     """
 
     def __init__(self, system: HeatSystem, *, relative_tolerance: float) -> None:
-        """Prepare; what only some meshes need is made when it is needed."""
         self._system, self._relative_tolerance = system, relative_tolerance
         self._plain = RungeKutta(system, BACKWARD_EULER, relative_tolerance=relative_tolerance)
         self._range = AllowedRange(system)

@@ -38,15 +38,8 @@ def peak_bytes(
     between right angles. Interpreter and libraries, which need about 150 MB, come on top, and so does multigrid, which
     takes over where conjugate gradients are slow and needs about as much as the matrices.
 
-    Args:
-        problem: Body, materials and effects.
-        order: 1 for linear tetrahedra, 2 for quadratic ones.
-        refinements: How often the mesh size of the problem is halved first, which makes eight tetrahedra of each.
-        times: Number of times whose temperatures are kept; 1 for a steady state.
-        adaptive: Whether the length of the time steps changes, so that matrices of two lengths are kept.
-
-    Raises:
-        HeatError: The order or the number of times makes no sense.
+    Every refinement makes eight tetrahedra of each; `times` are those whose temperatures are kept, 1 for a steady
+    state; of `adaptive` time steps, matrices of two lengths are kept.
     """
     if order not in (1, 2):
         raise HeatError("order", expected="1 or 2", got=repr(order), remedy="Use 1 or 2.")
@@ -79,11 +72,7 @@ def describe_bytes(amount: float) -> str:
 
 
 def check_memory(needed: float, allowed: float, remedy: str) -> None:
-    """Refuse what needs more bytes than are allowed.
-
-    Raises:
-        HeatError: It is too much.
-    """
+    """Raise `HeatError` for what needs more bytes than are allowed."""
     if needed > allowed:
         expected, got = f"at most {describe_bytes(allowed)}", f"about {describe_bytes(needed)}"
         raise HeatError("memory of the heat problem", expected=expected, got=got, remedy=remedy)

@@ -60,9 +60,6 @@ class MeshEdges:
 def mesh_edges(tets: npt.NDArray[np.int64], num_nodes: int) -> MeshEdges:
     """Find the edges of a mesh in ascending order, in time and memory that grow with the number of tetrahedra.
 
-    Raises:
-        HeatError: If a node number is out of range.
-
     >>> edges = mesh_edges(np.array([[3, 0, 2, 1], [1, 2, 4, 3]]), 5)
     >>> np.column_stack([edges.smaller_nodes(), edges.other]).tolist()
     [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [1, 4], [2, 3], [2, 4], [3, 4]]
@@ -88,15 +85,9 @@ def stiffness_matrix(
     n_j, the entry is k n_i . n_j / (9 V), and 0 where the angle between the faces is right up to round-off of the
     coordinates.
 
-    Args:
-        points_m: Nodes, shape (n, 3), [m].
-        tets: Node numbers, shape (t, 4), positively oriented.
-        conductivity_w_mk: Thermal conductivity, [W / (m K)], one for all or one per tetrahedron, shape (t,).
-        edges: The edges of the mesh, if they have been found already.
-
-    Raises:
-        HeatError: If an array has the wrong shape, a conductivity is not above 0, a node number is out of range or a
-            tetrahedron is flat or inverted.
+    Nodes have shape (n, 3), [m], positively oriented tetrahedra (t, 4); the conductivity, [W / (m K)], is one for all
+    or one per tetrahedron, shape (t,). Raises `HeatError` if an array has the wrong shape, a conductivity is not above
+    0, a node number is out of range or a tetrahedron is flat or inverted.
 
     >>> corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     >>> (6 * stiffness_matrix(corner, np.array([[0, 1, 2, 3]]), 1.0)).toarray().round(12).tolist()
@@ -147,11 +138,7 @@ def mass_matrix(
 
 
 def refuse_flat_tets(points_m: npt.NDArray[np.float64], tets: npt.NDArray[np.int64]) -> None:
-    """Check a mesh.
-
-    Raises:
-        HeatError: Points or tetrahedra have the wrong shape or range, or tetrahedra are inverted or flat.
-    """
+    """Raise `HeatError` if points or tetrahedra have the wrong shape or range, or tetrahedra are inverted or flat."""
     points_m, tets, unit_m = _checked(points_m, tets)
     _refuse_flat(_count_flat(points_m, tets, 1.0 / unit_m), len(tets))
 

@@ -22,22 +22,18 @@ _SAME_LENGTH = 1e-12
 
 @dataclass(frozen=True)
 class Step:
-    """The outcome of a step."""
+    """The outcome of a step; converged: all stages were solved; the status is a sentence."""
 
     relative_k: Vector
     """Temperatures at its end, relative to the system's reference, shape (n,), [K]."""
     group_heat_w: Vector
     """Mean heat flow into the body of each group of the system, shape (g,), [W]."""
     iterations: int
-    """Iterations of the linear solver."""
     newton_iterations: int
-    """Steps of Newton's method."""
     error_k: float
     """Estimated largest error that the step made, [K]; NaN if the scheme has no estimate or none was asked for."""
     converged: bool
-    """Whether all stages were solved."""
     status: str
-    """The outcome as a sentence."""
     limited: bool = False
     """Whether the maximum-principle limiter changed the equations."""
     in_range: bool = True

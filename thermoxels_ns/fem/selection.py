@@ -59,20 +59,12 @@ class Selection:
         return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
 
     def facets(self, patterns: tuple[str, ...]) -> npt.NDArray[np.int64]:
-        """Number the boundary triangles of the patches that match any pattern; patches may be without triangles.
-
-        Raises:
-            HeatError: A pattern matches no patch.
-        """
+        """Number the boundary triangles of the patches that match any pattern; each must match one, or `HeatError`."""
         chosen = _matching("patches", patterns, self.patch_names)
         return np.flatnonzero(chosen[self.facet_patch])
 
     def tets(self, patterns: tuple[str, ...]) -> npt.NDArray[np.int64]:
-        """Number the tetrahedra of the regions that match any pattern.
-
-        Raises:
-            HeatError: A pattern matches no region.
-        """
+        """Number the tetrahedra of the regions that match any pattern; each must match one, or `HeatError`."""
         chosen = _matching("regions", patterns, self.mesh.region_names)
         return np.flatnonzero(chosen[self.mesh.region])
 

@@ -60,17 +60,10 @@ class Space:
     def __init__(
         self, selection: Selection, *, order: int = 1, lumped: bool = True, lumped_boundary: bool | None = None
     ) -> None:
-        """Choose the elements and how masses, convection and radiation are integrated.
+        """Choose the elements (order 1 or 2) and how masses, convection and radiation are integrated.
 
-        Args:
-            selection: The mesh and its parts.
-            order: 1 for linear tetrahedra, 2 for quadratic ones.
-            lumped: Put each node's mass on the diagonal; of linear tetrahedra only.
-            lumped_boundary: Evaluate convection and radiation at the nodes: diagonal matrices; False:
-                integrate it over each triangle; None: at the nodes of linear tetrahedra.
-
-        Raises:
-            HeatError: The order is another one, or quadratic tetrahedra are to be lumped.
+        Lumped masses are on the diagonal; `lumped_boundary` evaluates convection and radiation at the nodes; False:
+        over each triangle; None: at the nodes of linear tetrahedra. Raises `HeatError` for lumped quadratic ones.
         """
         if order not in (1, 2):
             remedy = "Use 1 for linear tetrahedra or 2 for quadratic ones."

@@ -53,11 +53,7 @@ def solve_steady(
             surroundings. False integrates them over each triangle: on smooth problems the error is smaller by a
             constant. None: at the nodes of linear tetrahedra; quadratic ones are always integrated.
         relative_tolerance: Of the linear solver, and of Newton's method if there is radiation.
-        allow_unconverged: Return what was computed, with `converged` False and the reason in `status`, instead of
-            raising.
-
-    Returns:
-        Temperatures and heat flows.
+        allow_unconverged: Return what was computed, with the reason in `status`, instead of raising.
 
     Raises:
         HeatError: A piece of the body exchanges heat with nothing whose temperature is known, two effects fix one node
@@ -90,16 +86,13 @@ def solve_steady(
 
 @dataclass(frozen=True)
 class _LimitedState:
-    """A steady state and what was done to keep it in range."""
+    """A steady state, the equations that it fulfils, positive off-diagonals left out and nodes outside, counted."""
 
     solution: ImplicitSolution
     """Temperatures and how they were found; iterations of all repetitions count."""
     system: HeatSystem
-    """The equations that they fulfil."""
     left_out: int
-    """Positive off-diagonals that were left out."""
     outside: int
-    """Nodes that are out of range all the same."""
     outside_k: float
     """By how much at most, [K]."""
 
@@ -209,11 +202,7 @@ def too_cold(system: HeatSystem, relative_k: np.ndarray) -> str:
 
 
 def check_held(system: HeatSystem, time_s: float) -> None:
-    """Refuse a body of which a piece may have any temperature in a steady state.
-
-    Raises:
-        HeatError: There is such a piece.
-    """
+    """Raise `HeatError` for a body of which a piece may have any temperature in a steady state."""
     loose = np.flatnonzero(~system.exchanging_pieces(time_s))
     if len(loose):
         remedy = "Remove the piece, give its boundary an effect, or follow it through time instead."
@@ -223,11 +212,7 @@ def check_held(system: HeatSystem, time_s: float) -> None:
 
 
 def check_stored(system: HeatSystem, duration_s: float) -> None:
-    """Refuse a piece without heat capacity into which more flows at the start than it passes on.
-
-    Raises:
-        HeatError: There is such a piece.
-    """
+    """Raise `HeatError` if more flows into a piece without heat capacity at the start than it passes on."""
     given_w = system.load(0.0)
     if not given_w.any():
         return

@@ -66,12 +66,8 @@ def solve_heat(
         lumped: Lump the mass matrix, which keeps temperatures within their range at any step length.
         lumped_boundary: Evaluate convection and radiation at the nodes, for the same reason.
         relative_tolerance: Of the linear solver in each step.
-        allow_unconverged: Return what was computed, with `converged` False and the reason in `status`, instead
-            of raising when a step cannot be solved.
+        allow_unconverged: Return what was computed, with the reason in `status`, instead of raising.
         progress: Called after every step with the share of the duration that is done and the number of steps.
-
-    Returns:
-        Temperatures at the start and after every step or interval, and the heat balance.
 
     Raises:
         HeatError: If the temperatures of all times do not fit into memory, an effect does not fit the mesh, heat flows

@@ -26,7 +26,6 @@ class Material:
     """
 
     name: str
-    """Name for reports."""
     conductivity_w_mk: float
     """Thermal conductivity, [W / (m K)], above 0."""
     density_kg_m3: float
@@ -58,14 +57,11 @@ class Material:
 
 @dataclass(frozen=True)
 class MaterialFigures:
-    """A material in a file, whose name is the key before it."""
+    """A material in a file, whose name is the key before it; fields as in `Material`."""
 
     conductivity_w_mk: float
-    """Thermal conductivity, [W / (m K)], above 0."""
     density_kg_m3: float
-    """Mass density, [kg / m3], above 0."""
     specific_heat_j_kgk: float
-    """Specific heat capacity, [J / (kg K)], above 0."""
 
     def __post_init__(self) -> None:
         self.named("it")
@@ -77,10 +73,9 @@ class MaterialFigures:
 
 @dataclass(frozen=True)
 class MaterialRow(MaterialFigures):
-    """A row of the table: design values for conditions as in a building."""
+    """A row of the table: design values for conditions as in a building, and where they come from."""
 
     source: str
-    """Where the figures come from."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -91,20 +86,13 @@ class MaterialRow(MaterialFigures):
 
 @raising(HeatError)
 def load_material_table(path: Path | str | None = None) -> dict[str, MaterialRow]:
-    """Read the rows of a yaml file of materials by name; without a path, of the one that the package brings.
-
-    Raises:
-        HeatError: There is no such file, or a row has an unknown or missing key or a figure out of range.
-    """
+    """Read the rows of a yaml file of materials by name, None: of our own; raises `HeatError` for a wrong one."""
     file = configs_folder() / "materials.yaml" if path is None else Path(path)
     return {name: as_record(f"{file.name}: {name}", row, MaterialRow) for name, row in read_yaml(file).items()}
 
 
 def material(name: str, table: Mapping[str, MaterialRow] | None = None) -> Material:
-    """Look up a building material by its name, in the table of the package or another.
-
-    Raises:
-        HeatError: The table has no such row.
+    """Look up a building material by its name in a table, None: our own; raises `HeatError` if there is no such row.
 
     >>> material("mineral-wool").conductivity_w_mk
     0.035

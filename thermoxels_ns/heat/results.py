@@ -36,54 +36,40 @@ Vector = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Spot:
-    """A node and its temperature."""
+    """A node, its temperature and place, and the patches that it lies on (none inside the body)."""
 
     temperature_c: float
-    """Its temperature, [degrees Celsius]."""
     point_m: tuple[float, float, float]
-    """Where it is, [m]."""
     time_s: float
     """When, [s]; 0 in a steady state."""
     node: int
     """Its number in the mesh, from 0."""
     patches: tuple[str, ...]
-    """Patches that it lies on; none inside the body."""
 
 
 @dataclass(frozen=True)
 class PatchResult:
-    """A part of the surface."""
+    """A part of the surface: true area, mean heat flow into the body over all times, temperatures at the end."""
 
     patch: str
-    """Its name."""
     area_m2: float
-    """Its true area, [m2]."""
     heat_w: float
-    """Mean heat flow into the body through it over all times, [W]; negative where heat is lost."""
     heat_w_m2: float
-    """The same per true area, [W / m2]."""
     last_heat_w: float
     """Mean heat flow into the body during the last interval, [W]."""
     mean_c: float
-    """Mean temperature of its area at the end, [degrees Celsius]."""
     coldest: Spot
-    """Where it is coldest at the end."""
     hottest: Spot
-    """Where it is hottest at the end."""
 
 
 @dataclass(frozen=True)
 class EffectResult:
-    """Something that acts on the body."""
+    """What acts on the body: mean heat flow into it over all times, true area it acts on (None: a source inside)."""
 
     effect: str
-    """What it is and where it acts."""
     heat_w: float
-    """Mean heat flow into the body over all times, [W]; negative where heat is lost."""
     area_m2: float | None
-    """True area it acts on, [m2]; None for a source inside."""
     heat_w_m2: float | None
-    """Heat flow per true area, [W / m2]; None for a source inside."""
     last_heat_w: float
     """Mean heat flow into the body during the last interval, [W]."""
     groups: dict[str, float]
@@ -92,26 +78,19 @@ class EffectResult:
 
 @dataclass(frozen=True)
 class RegionResult:
-    """A part of the volume, such as all that is made of one material."""
+    """A part of the volume, such as all of one material; heat flow and temperatures are those at the end."""
 
     region: str
-    """Its name."""
     material: str
-    """What it is made of."""
     volume_m3: float
-    """Its volume, [m3]."""
     area_m2: float
     """True area of its own surface, [m2]; where it touches other regions does not count."""
     heat_w: float
     """Heat flow into the body through its own surface at the end, [W]; negative where heat is lost."""
     heat_w_m2: float
-    """The same per true area, [W / m2]; 0 without a surface."""
     mean_c: float
-    """Mean temperature of its volume at the end, [degrees Celsius]."""
     min_c: float
-    """Lowest temperature at the end, [degrees Celsius]."""
     max_c: float
-    """Highest temperature at the end, [degrees Celsius]."""
 
 
 @dataclass(frozen=True)
@@ -121,9 +100,7 @@ class EnergyBalance:
     unit: str
     """J through time, W in a steady state."""
     into_body: float
-    """All that effects brought."""
     out_of_body: float
-    """All that effects took."""
     stored: float
     """Change of the body's heat content; 0 in a steady state."""
     residual: float
@@ -134,32 +111,21 @@ class EnergyBalance:
 
 @dataclass(frozen=True)
 class HeatResults:
-    """What people ask of a solution. Heat flows are positive into the body."""
+    """What people ask of a solution. Heat flows are positive into the body; spots are those of all nodes and times."""
 
     status: str
-    """The outcome of the computation as a sentence."""
     times_s: tuple[float, ...]
     """Times of the kept temperatures, [s]; 0 alone for a steady state."""
     patches: tuple[PatchResult, ...]
-    """Parts of the surface that have some area."""
     effects: tuple[EffectResult, ...]
-    """What acts, in the order of the problem."""
     regions: tuple[RegionResult, ...]
-    """Parts of the volume that have some."""
     balance: EnergyBalance
-    """Whether it adds up."""
     coldest: Spot
-    """The coldest node of all times."""
     hottest: Spot
-    """The hottest node of all times."""
 
 
 def heat_results(problem: HeatProblem, solution: Solution, nodes: SolutionNodes | None = None) -> HeatResults:
-    """Work out what people ask of a solution.
-
-    Temperatures are those of all its unknowns, heat flows those that its own tetrahedra, linear or quadratic,
-    bring.
-    """
+    """Work out what people ask: temperatures of all unknowns, heat flows that its own tetrahedra (P1 or P2) bring."""
     nodes = solution_nodes(problem, solution) if nodes is None else nodes
     times, states, selection = nodes.times_s, nodes.states_c, Selection(nodes.mesh, problem.up)
     lengths = np.diff(times) if len(times) > 1 else np.ones(1)
@@ -320,9 +286,7 @@ class WallPart:
     """A part of the inner surface."""
 
     name: str
-    """Name of the patch or region."""
     area_m2: float
-    """Its true area, [m2]."""
     heat_w: float
     """Heat flow into it from the inside, [W]."""
     u_value_w_m2k: float
@@ -331,16 +295,12 @@ class WallPart:
 
 @dataclass(frozen=True)
 class WallResult:
-    """A body as a wall between an inside and an outside."""
+    """A body as a wall between two airs; areas, heat flows and the coldest spot are those of its inner surface."""
 
     inside_c: float
-    """Temperature of the air inside, [degrees Celsius]."""
     outside_c: float
-    """Temperature of the air outside, [degrees Celsius]."""
     area_m2: float
-    """True area of the inner surface, [m2]."""
     heat_w: float
-    """Heat flow into the inner surface, [W]."""
     coupling_w_k: float
     """Thermal coupling coefficient, heat flow per difference of the airs (ISO 10211: L_3D), [W / K]."""
     u_value_w_m2k: float
@@ -351,11 +311,8 @@ class WallResult:
     It depends on the resistance of the inner surface; for the risk of mould ISO 13788 asks for 0.25 m2 K/W, a
     coefficient of 4 W/(m2 K), where ISO 6946 takes 0.10 to 0.17 for the loss of heat."""
     coldest: Spot
-    """The coldest spot of the inner surface."""
     patches: tuple[WallPart, ...]
-    """The inner surface by patch."""
     regions: tuple[WallPart, ...]
-    """The inner surface by region of the body behind it."""
 
 
 def wall_of_scene(
@@ -363,8 +320,8 @@ def wall_of_scene(
 ) -> WallResult | str:
     """See a body as a wall, if its steady state between two airs of different temperature is asked for.
 
-    `doubtful`: the surfaces that the airs act on are probably not those that were meant. Returns the wall; or
-    why there is none although there are two airs, a sentence; "" without two airs.
+    `doubtful`: the airs probably act on other surfaces than was meant. Returns the wall, or why there is none although
+    there are two airs, a sentence; "" without two airs.
     """
     inside, outside = scene.inside_air, scene.outside_air
     if not isinstance(solution, SteadySolution) or inside is None or outside is None:
@@ -439,31 +396,15 @@ def _faces_inside(problem: HeatProblem, inside: Sequence[str]) -> npt.NDArray[np
 
 
 def heat_by_part(
-    problem: HeatProblem,
-    temperature_c: Vector,
-    time_s: float,
-    part: npt.NDArray[np.int64],
-    part_names: Sequence[str],
+    problem: HeatProblem, temperature_c: Vector, time_s: float, part: npt.NDArray[np.int64], part_names: Sequence[str]
 ) -> tuple[EffectHeat, ...]:
-    """Evaluate the heat flow of each effect through parts of the surface at one moment.
+    """Evaluate the heat flow into the body of each effect, but sources, through parts of the surface at one moment.
 
     Fixed temperatures are counted as if their nodes stored nothing at that moment, which holds for constant ones.
     Convection and radiation are evaluated as the solvers do by default: at the nodes of linear tetrahedra, and
-    integrated over each triangle if they are quadratic.
-
-    Args:
-        problem: Body and effects.
-        temperature_c: Temperatures at that moment, shape (n,), [degrees Celsius]: of the mesh's nodes, or of them and
-            then the middles of its edges, in the order of `mesh_edges`, if tetrahedra are quadratic.
-        time_s: The moment, [s].
-        part: Index into `part_names` of each boundary triangle, shape (f,).
-        part_names: Names of the parts.
-
-    Returns:
-        Heat into the body, one row, for each effect that acts on the surface; sources are left out.
-
-    Raises:
-        HeatError: `part` does not have one entry per boundary triangle, or the temperatures are not those of this mesh.
+    integrated over each triangle if they are quadratic. `temperature_c`, shape (n,), is that of the mesh's nodes and,
+    if tetrahedra are quadratic, of the middles of `mesh_edges` after them; `part` is the index into `part_names` of
+    each boundary triangle, shape (f,). Raises `HeatError` if one has another shape.
     """
     remedy = "Give every boundary triangle of the mesh a part."
     part = check_shape("part", np.asarray(part), (len(problem.mesh.facets),), remedy, HeatError)

@@ -28,10 +28,9 @@ Vector = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class HeatRun:
-    """All that a run found out."""
+    """All that a run found out; warnings are what looks wrong about the scene on this mesh, a sentence or two each."""
 
     scene: HeatScene
-    """The scene."""
     problem: HeatProblem
     """The problem with all that the scene names, on the given mesh."""
     solved: HeatProblem
@@ -39,15 +38,11 @@ class HeatRun:
     nodes: SolutionNodes
     """All temperatures of the solution on a mesh that has a node for each."""
     screening: Screening
-    """What of it was built."""
     accuracy: Accuracy | None
     """What is known of the error; None if no tolerance was given."""
     warnings: tuple[str, ...]
-    """What looks wrong about the scene on this mesh, a sentence or two each."""
     solution: Solution
-    """Temperatures and heat flows."""
     results: HeatResults
-    """Heat flows by patch, effect and region, extremes and the energy balance."""
     wall: WallResult | None
     """The body as a wall, if its steady state between two airs was asked for and nothing else acts."""
     no_wall: str
@@ -55,7 +50,6 @@ class HeatRun:
     mean_c: Vector
     """Mean temperature of the volume at each time, shape (s,), [degrees Celsius]."""
     probes: Probes
-    """Where temperatures were followed."""
     probes_c: Vector
     """Temperatures there, shape (s, p), [degrees Celsius]."""
     seconds: Mapping[str, float]
@@ -74,17 +68,9 @@ def run_scene(
 ) -> HeatRun:
     """Put a scene around a body, solve it, and work out what people ask.
 
-    Args:
-        scene: What is around the body.
-        mesh: The body, [m].
-        goals: How exact the solution must be, and what it may take.
-        up: Direction that points up, if the scene does not say; None: z.
-        probes_m: Points whose temperature is followed, shape (p, 3), [m].
-        export: The summary of the export that the mesh comes from, for warnings.
-        say: Called with one line of progress at a time.
-
-    Raises:
-        HeatError: The scene does not fit the mesh, a probe lies outside, or the solver fails.
+    `up`, None: z, counts if the scene does not say. Temperatures are followed at `probes_m`, shape (p, 3); warnings
+    look at `export`, the summary of the export that the mesh comes from; `say` gets lines of progress. Raises
+    `HeatError` if the scene does not fit the mesh, a probe lies outside, or the solver fails.
     """
     start = clock.perf_counter()
     problem = scene.problem(mesh, up=up)

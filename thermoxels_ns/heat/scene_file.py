@@ -46,11 +46,8 @@ def load_heat_scene(name: Path | str) -> HeatScene:
 
     A file has the fields of `HeatScene` as keys, with three differences: materials are names of the table or
     three figures, the start is ``initial: photographs`` or ``initial: {temperature_c: 15}``, and a scene has
-    either ``steady: true`` or ``time:`` with the fields of `TimeSteps` or of `AdaptiveSteps`.
-
-    Raises:
-        HeatError: There is no such scene, or a key is unknown, missing or twice in the file, or a value is of the wrong
-            kind, out of range, or contradicts another.
+    either ``steady: true`` or ``time:`` with the fields of `TimeSteps` or of `AdaptiveSteps`. Raises `HeatError` for
+    what is wrong in it.
     """
     path = Path(name)
     if path.suffix not in (".yaml", ".yml"):

@@ -23,18 +23,14 @@ class ScenePatches:
     """The patches of a mesh by name, and how much surface each has."""
 
     def __init__(self, mesh: TetMesh) -> None:
-        """Read the tags of a mesh."""
+
         selection = Selection(mesh)
         area = np.bincount(selection.facet_patch, weights=selection.facet_area_m2, minlength=len(selection.patch_names))
         self.area_m2: dict[str, float] = dict(zip(selection.patch_names, area.tolist()))
         """True area of each patch by its name, [m2]."""
 
     def matching(self, name: str, patterns: Sequence[str]) -> set[str]:
-        """Give the patches that match any pattern; `name` is the entry that names them, for messages.
-
-        Raises:
-            HeatError: A pattern matches no patch.
-        """
+        """Give the patches that match any pattern of the entry `name`; raises `HeatError` if one matches none."""
         found: set[str] = set()
         for pattern in patterns:
             matches = {patch for patch in self.area_m2 if fnmatchcase(patch, pattern)}

@@ -33,9 +33,7 @@ class Span:
     """From a lowest to a highest value, each one number or one per place."""
 
     low: Vector
-    """Lowest."""
     high: Vector
-    """Highest."""
 
     def largest_distance(self, other: Span) -> Vector:
         """Largest difference between a value of this span and one of another."""
@@ -48,16 +46,13 @@ class Span:
 
 @dataclass(frozen=True)
 class _SurfaceExchange:
-    """Convection or radiation through boundary triangles: strength times a difference."""
+    """Strength times a difference of temperatures (`power` 1, convection) or their fourth powers; nodes (k, 3)."""
 
     nodes: npt.NDArray[np.int64]
-    """Nodes of the triangles, shape (k, 3)."""
     strength: Span
     """Coefficient times area, [W / K]; of radiation sigma eps times area, [W / K^4]."""
     surroundings_c: Span
-    """Temperatures of the surroundings."""
     power: int
-    """1 for convection, 4 for radiation."""
 
 
 class NodalHeat:
@@ -195,46 +190,37 @@ _OBTUSE_FACTOR, _OBTUSE_WIDENING = 2.0, 0.1
 
 @dataclass(frozen=True)
 class LeftOut:
-    """An effect that is not built."""
+    """An effect that is not built, and which bound says so."""
 
     effect: str
-    """What it is and where it would act."""
     bound_k: float
     """Largest difference that it could make to any temperature at any time, [K]."""
     bound_w: float
     """Largest heat flow that it could bring, [W]. Averaged since the start, no other effect's changes by more."""
     reason: str
-    """Which bound it is."""
 
 
 @dataclass(frozen=True)
 class Kept:
-    """An effect that is built."""
+    """An effect that is built, and why."""
 
     effect: str
-    """What it is and where it acts."""
     bound_k: float | None
     """Largest difference that it could make if nothing else were left out, [K]; None if no bound is known."""
     reason: str
-    """Why it is kept."""
 
 
 @dataclass(frozen=True)
 class Screening:
-    """What a problem needs."""
+    """What a problem needs: the problem without what is left out, and its effects in their order."""
 
     problem: HeatProblem
-    """The problem without what is left out."""
     kept: tuple[Kept, ...]
-    """Effects that are built, in the order of the problem."""
     left_out: tuple[LeftOut, ...]
-    """Effects that are not, in the order of the problem."""
     tolerance_k: float
     """Their bounds add up to no more than this, [K]."""
     note: str
-    """What the bounds hold for."""
     seconds: float
-    """Time it took, [s]."""
 
     @property
     def bound_k(self) -> float:
@@ -267,10 +253,8 @@ def screen(problem: HeatProblem, time: TimeSteps | AdaptiveSteps | None, toleran
     fluxes and sources. Where angles are obtuse, which the principle does not allow for, the range is widened and
     bounds are doubled.
 
-    A tolerance of 0 leaves out only what does nothing at all; without any effect nothing is computed.
-
-    Raises:
-        HeatError: The tolerance is negative, or an effect does not fit the mesh.
+    A tolerance of 0 leaves out only what does nothing at all; without any effect nothing is computed. Raises
+    `HeatError` if the tolerance is negative, or an effect does not fit the mesh.
     """
     if not tolerance_k >= 0.0:
         remedy = "Give a tolerance in kelvin, or 0 to keep everything."

@@ -24,19 +24,16 @@ _EPOCH = datetime(2000, 1, 1, 12, tzinfo=timezone.utc)
 
 @dataclass(frozen=True)
 class SunCoordinates:
-    """The sun among the stars."""
+    """The sun among the stars: apparent right ascension 0 to 360, declination, distance in astronomical units."""
 
     right_ascension_deg: float
-    """Apparent right ascension, [degrees], 0 to 360."""
     declination_deg: float
-    """Apparent declination, [degrees]."""
     distance_au: float
-    """Distance, [astronomical units]."""
 
 
 @dataclass(frozen=True)
 class SunPosition:
-    """The sun as seen from a place."""
+    """The sun as seen from a place; its distance in astronomical units."""
 
     azimuth_deg: float
     """Direction along the horizon, clockwise from north, [degrees], 0 to 360."""
@@ -44,7 +41,6 @@ class SunPosition:
     """Height over the horizon, [degrees]; refraction, which lifts it by 0.5 degrees at the horizon and by 0.1 at 10
     degrees, is left out."""
     distance_au: float
-    """Distance, [astronomical units]."""
 
 
 @dataclass(frozen=True)
@@ -95,8 +91,7 @@ def sun_position(moment: datetime, latitude_deg: float, longitude_deg: float) ->
 def towards_sun(position: SunPosition, up: Vector, north: Vector) -> Vector:
     """Turn a position into a unit vector from the mesh to the sun; the part of `north` along `up` is left out.
 
-    Raises:
-        HeatError: `up` and `north` are parallel.
+    Raises `HeatError` if they are parallel.
     """
     upward, northward = _unit(up), _unit(north)
     level = northward - (northward @ upward) * upward
@@ -169,13 +164,8 @@ def moving_sun(
 ) -> Varying:
     """Make the irradiance of facets by the sun at a date and place, for `AbsorbedSolar.irradiance_w_m2`.
 
-    Args:
-        start: Date and time, with a time zone, of the time 0.
-        latitude_deg: North positive, [degrees], -90 to 90.
-        longitude_deg: East positive, [degrees], -180 to 180.
-        north: Direction that points north in the coordinates of the mesh.
-        sunlight: How strong it is as long as the sun is up; None: as `meinel_clear_sky` estimates.
-        ground_reflectance: Share of the sunlight that the ground reflects, 0 to 1.
+    `start` is the date and time, with a time zone, of the time 0; north and east are positive; `north` points there in
+    the coordinates of the mesh; without `sunlight` it is as strong as `meinel_clear_sky` estimates.
     """
 
     def irradiance(places: Places, time_s: float) -> npt.NDArray[np.float64]:

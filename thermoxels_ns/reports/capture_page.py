@@ -27,29 +27,24 @@ _TOO_FEW = f"not looked for in fewer than {MIN_FRAMES} frames"
 
 @dataclass(frozen=True)
 class Overlay:
-    """One frame for a person to judge."""
+    """One frame for a person to judge: thermal colours over the photograph with the rig's start value and as found."""
 
     name: str
     start: bytes
-    """Thermal colours over the photograph with the rig's start value."""
     found: bytes
-    """The same with the rig that was found."""
     thermal: bytes
-    """The thermal image alone."""
     shown_c: tuple[float, float] | None = None
     """Temperatures of its darkest and its brightest colour, [degrees C]; None: it has none."""
 
 
 @dataclass(frozen=True)
 class CapturePage:
-    """What the page shows."""
+    """What the page shows; temperatures are a sample of all, corrected, and the share is that of all thermal pixels."""
 
     result: CaptureResult
     overlays: Sequence[Overlay]
     temperatures_c: npt.NDArray[np.float32]
-    """A sample of all temperatures, corrected, [degrees C]."""
     masked_share: float
-    """Of all thermal pixels."""
 
     @property
     def scene(self) -> Scene:

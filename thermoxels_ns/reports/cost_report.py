@@ -69,9 +69,7 @@ class CostSetting:
     name: str
     """What the user calls it, for instance ``64:800``, ``standard`` or ``standard, recipe paper``."""
     method: str
-    """Method of ns-train."""
     options: tuple[str, ...]
-    """Options of ns-train."""
     work: float = math.inf
     """Roughly how much there is to do, to find the cheapest before anything ran; infinite if not known."""
     beside: bool = False
@@ -94,18 +92,13 @@ class CostSetting:
 
 @dataclass(frozen=True)
 class CostRun:
-    """One finished run of a setting."""
+    """One finished run of a setting: its number from 1, fingerprint of the scene, our version, words of ns-train."""
 
     setting: str
-    """Name of the setting."""
     repeat: int
-    """Number of the run, from 1."""
     scene: str
-    """Fingerprint of the scene."""
     version: str
-    """Version of this package."""
     training: str
-    """The words of ns-train."""
     figures: Mapping[str, float]
     """What was measured, by the names in `FIGURES`; NaN where there is nothing to measure."""
 
@@ -117,12 +110,10 @@ class CostRun:
 
 @dataclass(frozen=True)
 class CostRow:
-    """A setting and the medians of its runs."""
+    """A setting and the medians of its runs, so many."""
 
     setting: CostSetting
-    """The setting."""
     repeats: int
-    """Runs that the medians are of."""
     figures: Mapping[str, float]
     """Medians by the names in `FIGURES`; NaN where there is nothing to measure."""
     time_ratio: float
@@ -263,10 +254,7 @@ def write_csv(path: Path, rows: Iterable[CostRow], baseline: str) -> None:
 
 
 def draw_plot(path: Path, rows: Sequence[CostRow], targets: Targets, title: str) -> None:
-    """Draw seconds against PSNR, temperature error, F-score (if the truth is known) and memory.
-
-    Filled marks are on the Pareto front of their panel.
-    """
+    """Draw seconds against what `_PANELS` names, as far as it is known; filled marks are on a panel's Pareto front."""
     from matplotlib.figure import Figure
 
     panels = [panel for panel in _PANELS if not all(math.isnan(row.figures[panel[0]]) for row in rows)]

@@ -32,22 +32,8 @@ _INTO_BODY = "Heat flows are positive into the body; what is lost is negative."
 
 
 def heat_page(run: HeatRun, pictures: Mapping[str, bytes], mesh_name: str, command: str, files: Sequence[str]) -> Page:
-    """Put a run into words.
-
-    Args:
-        run: What was computed.
-        pictures: PNG files by their names.
-        mesh_name: Name of the mesh's file.
-        command: The command that made it.
-        files: Names of the files beside the page.
-    """
-    sections = [
-        _results(run),
-        *_wall(run),
-        *_probes(run),
-        _balance(run),
-        *_accuracy(run.accuracy),
-    ]
+    """Put a run into words; `pictures` are PNG files by name, `command` made it, `files` lie beside the page."""
+    sections = [_results(run), *_wall(run), *_probes(run), _balance(run), *_accuracy(run.accuracy)]
     if isinstance(run.solution, HeatSolution):
         plot = plot_over_time(run.solution, run.mean_c, run.probes_c, _probe_names(run))
         words = ("Heat flows are means over each interval between two kept times.",)
@@ -350,11 +336,7 @@ def _optional(value: float | None) -> str:
 
 
 def _accuracy(accuracy: Accuracy | None) -> list[Section]:
-    """Say what the error is, what was chosen, and all solutions on the way; nothing without a tolerance.
-
-    Args:
-        accuracy: What is known of the error; None if no tolerance was given.
-    """
+    """Say what the error is, what was chosen, and all solutions on the way; nothing without a tolerance."""
     if accuracy is None:
         return []
     words = [f"{'Met' if accuracy.met else 'Not met'}: {_tolerance_asked(accuracy)}. {accuracy.status}"]

@@ -42,7 +42,6 @@ class Picture:
     image: bytes
     """Content of a PNG or JPEG file."""
     caption: str
-    """What it shows."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +61,8 @@ class Section:
     """A heading and what stands below it, in this order."""
 
     heading: str
-    """What it is about."""
     words: tuple[str, ...] = ()
-    """Paragraphs."""
     galleries: tuple[Gallery, ...] = ()
-    """Pictures."""
     svg: str = ""
     """A chart as an svg element."""
     tables: tuple[Table, ...] = ()
@@ -80,11 +76,9 @@ class Page:
     """Everything a page says."""
 
     title: str
-    """Heading of the page."""
     summary: str
     """One or two sentences below it."""
     sections: tuple[Section, ...]
-    """The rest."""
     figures: tuple[tuple[str, str], ...] = ()
     """The figures that matter most: value with unit, and what it is."""
     warnings: tuple[str, ...] = ()
@@ -92,14 +86,9 @@ class Page:
 
 
 def build_page(page: Any, template: str = "page.html.j2") -> str:
-    """Build the html text of a page; it depends on the arguments alone.
+    """Build the html text of a page, or of what a template in the folder ``templates`` asks for under this name.
 
-    Args:
-        page: A `Page`, or what the template asks for under this name.
-        template: File in the folder ``templates``.
-
-    Raises:
-        ThermoxelsError: A picture is neither PNG nor JPEG.
+    It depends on the arguments alone; raises `ThermoxelsError` for a picture that is neither PNG nor JPEG.
     """
     return _environment().get_template(template).render(page=page)
 
@@ -111,15 +100,7 @@ def write_page(path: Path, text: str) -> None:
 
 
 def image_address(image: bytes, words: str) -> str:
-    """Put an image into its own address.
-
-    Args:
-        image: Content of a PNG or JPEG file.
-        words: What it shows, for the error.
-
-    Raises:
-        ThermoxelsError: The content is neither.
-    """
+    """Put a PNG or JPEG file into its own address, or raise a `ThermoxelsError` that names it by `words`."""
     kind = next((kind for signature, kind in _SIGNATURES.items() if image.startswith(signature)), None)
     if kind is None:
         remedy = "Draw the picture again."
