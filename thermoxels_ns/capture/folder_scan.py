@@ -43,10 +43,8 @@ class CameraFile:
 
     path: Path
     role: Role
-    taken_at: datetime | None
-    """As the camera's clock showed it, without a zone."""
-    dji: bool = False
-    """Whether it is DJI's R-JPEG, which only DJI's own library reads."""
+    taken_at: datetime | None  # as the camera's clock showed it, without a zone
+    dji: bool = False  # whether it is DJI's R-JPEG, which only DJI's own library reads
 
 
 @dataclass(frozen=True)
@@ -55,10 +53,8 @@ class CameraFolder:
 
     folder: Path
     files: tuple[CameraFile, ...]
-    unreadable: dict[Path, str] = field(default_factory=dict)
-    """Why, by file."""
-    others: int = 0
-    """Files of other kinds, which were not looked at."""
+    unreadable: dict[Path, str] = field(default_factory=dict)  # why, by file
+    others: int = 0  # files of other kinds, which were not looked at
     passed_over: dict[Path, str] = field(default_factory=dict)
     """What is not followed or not opened (links that lead out, folders that are shut), and why."""
 

@@ -23,10 +23,8 @@ from thermoxels_ns.radiometry.flir_rjpeg import read_flir_jpeg
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions, read_thermogram
 
 _LIST = "frames.json"
-_MOST_LISTED = 4
-"""Kinds of measurements that are described."""
-_MOST_FOR_DEAD_PIXELS = 60
-"""Frames that stuck pixels are looked for in: more need memory and say nothing new."""
+_MOST_LISTED = 4  # kinds of measurements that are described
+_MOST_FOR_DEAD_PIXELS = 60  # frames that stuck pixels are looked for in: more need memory and say nothing new
 
 
 @dataclass(frozen=True)
@@ -34,38 +32,24 @@ class CaptureFrame:
     """One pair, read."""
 
     name: str
-    photograph: Path
-    """A file that holds the photograph alone."""
-    thermal: Path
-    """A .npy file of float32 degrees C, NaN where there is none."""
-    photograph_source: str
-    """The camera's file, relative to the capture."""
+    photograph: Path  # a file that holds the photograph alone
+    thermal: Path  # a .npy file of float32 degrees C, NaN where there is none
+    photograph_source: str  # the camera's file, relative to the capture
     thermal_source: str
-    camera: str | None = None
-    """Maker and model of the thermal camera."""
+    camera: str | None = None  # maker and model of the thermal camera
     lens: str | None = None
-    taken_at: str | None = None
-    """When the photograph was taken, as ISO 8601."""
-    focal_px: float | None = None
-    """Focal length that the photograph states, [pixels]."""
-    orientation: int = 1
-    """EXIF's orientation of the photograph."""
+    taken_at: str | None = None  # when the photograph was taken, as ISO 8601
+    focal_px: float | None = None  # focal length that the photograph states, [pixels]
+    orientation: int = 1  # EXIF's orientation of the photograph
     gps: GpsFix | None = None
-    gimbal_deg: tuple[float, float] | None = None
-    """Pitch and roll of the camera, [degrees]."""
-    thermal_focal_px: float | None = None
-    """Focal length that the thermal file states, [thermal pixels]."""
-    thermal_field_of_view_deg: float | None = None
-    """Horizontal, as the camera states it, [degrees]."""
-    picture_in_picture: PictureInPicture | None = None
-    """Factory alignment of FLIR cameras."""
+    gimbal_deg: tuple[float, float] | None = None  # pitch and roll of the camera, [degrees]
+    thermal_focal_px: float | None = None  # focal length that the thermal file states, [thermal pixels]
+    thermal_field_of_view_deg: float | None = None  # horizontal, as the camera states it, [degrees]
+    picture_in_picture: PictureInPicture | None = None  # factory alignment of FLIR cameras
     celsius_per_count: float | None = None
-    format: str | None = None
-    """Of the thermal file, by its content."""
-    conditions: Conditions | None = None
-    """Emissivity and the rest that the temperatures were computed with."""
-    masked: int = 0
-    """Thermal pixels without a temperature."""
+    format: str | None = None  # of the thermal file, by its content
+    conditions: Conditions | None = None  # emissivity and the rest that the temperatures were computed with
+    masked: int = 0  # thermal pixels without a temperature
 
 
 @dataclass(frozen=True)
@@ -73,12 +57,9 @@ class CaptureFrames:
     """The frames that could be read, and why the others could not."""
 
     frames: tuple[CaptureFrame, ...]
-    thermal_size: tuple[int, int]
-    """Width and height of all thermal images."""
-    dead_pixels: int
-    """Thermal pixels that are stuck at one value in all frames; they are NaN in every frame."""
-    dropped: dict[str, str] = field(default_factory=dict)
-    """Why, by the frame's name."""
+    thermal_size: tuple[int, int]  # width and height of all thermal images
+    dead_pixels: int  # thermal pixels that are stuck at one value in all frames; they are NaN in every frame
+    dropped: dict[str, str] = field(default_factory=dict)  # why, by the frame's name
 
     def save(self, folder: Path, root: Path) -> None:
         """Write the list of frames beside their images; both folders may be moved later."""

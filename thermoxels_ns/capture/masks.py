@@ -15,30 +15,21 @@ from thermoxels_ns.capture.frames import CaptureFrame
 from thermoxels_ns.capture.photograph import open_photograph, read_mask, read_photograph_facts
 from thermoxels_ns.core.errors import SceneError
 
-MIN_FRAMES = 8
-"""Fewer photographs cannot tell what is drawn over them from what they all happen to show."""
-_LOOKED_AT = 40
-"""Photographs that overlays are looked for in."""
-_SIDE = 800
-"""Longest side at which overlays are looked for, [pixels]."""
-_STILL = 10.0
-"""Grey levels (of 255) that what is drawn changes by, from JPEG's compression alone."""
-_ALIVE = 30.0
-"""Grey levels that the surroundings change by at least."""
-_EDGE = 25.0
-"""Grey levels by which what is drawn stands out from its surroundings in the mean picture."""
-_AROUND_SHARE = 0.12
-"""Width of the surroundings, as a share of the longest side."""
-_MOST_SHARE = 0.2
-"""More of the picture than this is no overlay but a scene that does not change."""
+MIN_FRAMES = 8  # fewer photographs cannot tell what is drawn over them from what they all happen to show
+_LOOKED_AT = 40  # photographs that overlays are looked for in
+_SIDE = 800  # longest side at which overlays are looked for, [pixels]
+_STILL = 10.0  # grey levels (of 255) that what is drawn changes by, from JPEG's compression alone
+_ALIVE = 30.0  # grey levels that the surroundings change by at least
+_EDGE = 25.0  # grey levels by which what is drawn stands out from its surroundings in the mean picture
+_AROUND_SHARE = 0.12  # width of the surroundings, as a share of the longest side
+_MOST_SHARE = 0.2  # more of the picture than this is no overlay but a scene that does not change
 
 
 @dataclass(frozen=True)
 class PhotographMasks:
     """Where photographs may be used: everywhere but under what the camera drew and what the user shut out."""
 
-    size: tuple[int, int]
-    """Width and height of the photographs, [pixels]."""
+    size: tuple[int, int]  # width and height of the photographs, [pixels]
     overlay: npt.NDArray[np.bool_] | None = None
     """False where the camera drew over all photographs, shape (height, width); None: nowhere."""
     files: Mapping[str, Path] = field(default_factory=dict)

@@ -17,8 +17,7 @@ from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.transforms_json import path_inside
 
 _DJI = re.compile(r"^(?P<head>.*?dji)_(?:(?P<time>\d{14})_)?(?P<number>\d{3,})_(?P<role>[a-z])(?P<tail>.*)$")
-_DJI_LATE_S = 3.0
-"""The two images of one shot may carry time stamps that differ by so much, [s]."""
+_DJI_LATE_S = 3.0  # the two images of one shot may carry time stamps that differ by so much, [s]
 _DJI_PHOTOGRAPHS = ("v", "w")
 """Letters of DJI's photographs in the order they are taken in; z is a zoom, whose focal length varies."""
 _LAST_LETTERS = frozenset({"t", "v", "w", "r"})
@@ -35,13 +34,10 @@ _DJI_LIBRARY = (
 class Pair:
     """One photograph and its thermal image."""
 
-    name: str
-    """Name of the frame, all different; letters, digits, dot, dash and underscore."""
+    name: str  # name of the frame, all different; letters, digits, dot, dash and underscore
     photograph: Path
-    thermal: Path
-    """The same file where the camera writes both into one."""
-    how: str
-    """How they were found to belong together."""
+    thermal: Path  # the same file where the camera writes both into one
+    how: str  # how they were found to belong together
 
     @property
     def in_one_file(self) -> bool:
@@ -53,10 +49,8 @@ class Pair:
 class PairSearch:
     """All pairs of a folder, and why the other files are in none."""
 
-    pairs: tuple[Pair, ...]
-    """In the order they were taken, as far as names tell."""
-    unpaired: dict[Path, str] = field(default_factory=dict)
-    """Why, by file."""
+    pairs: tuple[Pair, ...]  # in the order they were taken, as far as names tell
+    unpaired: dict[Path, str] = field(default_factory=dict)  # why, by file
 
 
 @dataclass(frozen=True)

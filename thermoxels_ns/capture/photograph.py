@@ -20,8 +20,7 @@ from thermoxels_ns.radiometry.exif import ExifFacts, read_exif_facts
 
 LARGEST_SIDE = 30000
 """Pixels along a side of a photograph that is believed; a header that claims more is damaged."""
-_LARGEST_PIXELS = 178_956_970
-"""In all; Pillow opens no more."""
+_LARGEST_PIXELS = 178_956_970  # in all; Pillow opens no more
 _EXPECTED = "a photograph that can be decoded"
 _REMEDY = "The file is damaged; copy it from the camera again, or go on without it with --skip-bad True."
 _EXIF, _GPS = 34665, 34853

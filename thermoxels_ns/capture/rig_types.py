@@ -26,18 +26,14 @@ class RigFrame:
     """One photograph with its thermal partner, its pose and the scene points that it sees."""
 
     name: str
-    """Name of the pair, for messages."""
     photograph: npt.NDArray | Path
     """Photograph as grey or RGB array of any number type, or its file. Its size is that of the visible camera, or
     smaller by one factor."""
     temperature_c: npt.NDArray | Path
     """Temperatures [degrees C], shape (height, width), NaN where there is none; or a .npy file of them."""
-    camera_to_world: FloatArray
-    """Pose of the visible camera, shape (4, 4), OpenGL axes."""
-    points_world: FloatArray
-    """Scene points that structure from motion saw in this photograph, shape (n, 3)."""
-    point_ids: npt.NDArray[np.int64]
-    """Which point each of them is, the same number in all frames, shape (n,)."""
+    camera_to_world: FloatArray  # pose of the visible camera, shape (4, 4), OpenGL axes
+    points_world: FloatArray  # scene points that structure from motion saw in this photograph, shape (n, 3)
+    point_ids: npt.NDArray[np.int64]  # which point each of them is, the same number in all frames, shape (n,)
 
     def points_visible(self) -> FloatArray:
         """Return the points in the visible camera's OpenCV axes, shape (n, 3)."""
@@ -50,21 +46,17 @@ class RigFrame:
 class RigStart:
     """What is known of the rig before the images are compared, and how well: a guess with standard deviations."""
 
-    thermal_camera: Camera
-    """Start value of the thermal intrinsics, at the thermal images' size."""
+    thermal_camera: Camera  # start value of the thermal intrinsics, at the thermal images' size
     visible_to_thermal: FloatArray = field(default_factory=lambda: np.eye(4))
     """x_thermal = visible_to_thermal @ x_visible, shape (4, 4), OpenCV axes, lengths in world units."""
-    focal_sigma: float = 0.08
-    """Standard deviation of the focal length, as a share of it."""
-    rotation_sigma_deg: float = 3.0
-    """Standard deviation of the rotation about each axis [degrees]."""
+    focal_sigma: float = 0.08  # standard deviation of the focal length, as a share of it
+    rotation_sigma_deg: float = 3.0  # standard deviation of the rotation about each axis [degrees]
     translation_sigma: float | None = None
     """Standard deviation of the shift along each axis [world units]. None: 3 % of the median depth of the points."""
     centre_sigma: float = 0.005
     """Standard deviation of the principal point, as a share of the image width. A turn moves the image of a narrow lens
     almost as the principal point does, so what is allowed here is what the rotation remains unsure by."""
-    k1_sigma: float = 0.05
-    """Standard deviation of the radial distortion; 0 keeps it as given."""
+    k1_sigma: float = 0.05  # standard deviation of the radial distortion; 0 keeps it as given
     source: str = "a guess: same place and direction as the visible camera"
     """Where the start comes from, for the report."""
 
@@ -74,13 +66,11 @@ class RigEstimate:
     """The rig as found, or the start where the images cannot tell."""
 
     thermal_camera: Camera
-    """Thermal intrinsics."""
     visible_to_thermal: FloatArray
     """x_thermal = visible_to_thermal @ x_visible, shape (4, 4), OpenCV axes, lengths in world units."""
     determined: bool
     """Whether it is known where the thermal camera is. False: camera and transform are those of the start."""
-    explanation: str
-    """One sentence for the report: what was found, or why nothing could be."""
+    explanation: str  # one sentence for the report: what was found, or why nothing could be
     parameters: tuple[str, ...] = ()
     """Names of the parameters that the covariance is of: rx, ry, rz [rad], tx, ty, tz [world units], log_focal, cx, cy
     [thermal pixels], k1. Empty: nothing was estimated."""
@@ -88,8 +78,7 @@ class RigEstimate:
     """Covariance of the parameters, shape (n, n)."""
     score_before: float = math.nan
     """Agreement of thermal and visible edges with the start value, -1 to 1; NaN: not compared."""
-    score_after: float = math.nan
-    """The same with the values returned."""
+    score_after: float = math.nan  # the same with the values returned
     projection_sigma_px: float = math.nan
     """Standard error of where a scene point falls in the thermal image, median over the points [thermal pixels]."""
 
@@ -112,14 +101,11 @@ class DriftEstimate:
     """To be subtracted from each frame's temperatures, in the order of the frames, mean 0, shape (frames,) [K]."""
     radial: tuple[float, ...]
     """Coefficients c of sum(c[i] * r ** (2 * i + 2)) [K], r = 1 in the image's corner; subtracted from all frames."""
-    before_k: float
-    """Median difference between two frames at the scene points that both see, uncorrected [K]."""
-    after_k: float
-    """The same after the correction, at points that it was not fitted to [K]."""
+    before_k: float  # median difference between two frames at the scene points that both see, uncorrected [K]
+    after_k: float  # the same after the correction, at points that it was not fitted to [K]
     used: bool
     """Whether the correction lowers the disagreement at held-out points; False: all offsets and coefficients are 0."""
     explanation: str
-    """One sentence for the report."""
 
     def radial_k(self, width: int, height: int) -> FloatArray:
         """Radial term at every pixel's centre, shape (height, width) [K]; 0 at the image's centre."""

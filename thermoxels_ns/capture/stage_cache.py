@@ -21,8 +21,7 @@ from thermoxels_ns.core.json_values import write_json
 STAGES: tuple[StageName, ...] = get_args(StageName)
 CACHE_FOLDER = ".capture"
 LOCK_FILE = "lock"
-_FORMAT = 2
-"""Of the results; raised when they are kept in another way, so that earlier ones are made again."""
+_FORMAT = 2  # of the results; raised when they are kept in another way, so that earlier ones are made again
 _KEY_FILE, _DONE_FILE = "key.txt", "done.json"
 
 
@@ -34,12 +33,9 @@ class StageCache:
     whose key is the same as last time is not run again. One that was interrupted finds its folder as it left it.
     """
 
-    folder: Path
-    """The capture's output folder."""
-    from_stage: StageName | None = None
-    """Run this stage and all later ones, also where nothing has changed."""
-    say: Callable[[str], None] = lambda _: None
-    """Told one line per stage."""
+    folder: Path  # the capture's output folder
+    from_stage: StageName | None = None  # run this stage and all later ones, also where nothing has changed
+    say: Callable[[str], None] = lambda _: None  # told one line per stage
     seconds: list[tuple[str, float]] = field(default_factory=list)
     """Stages in order and the time each took, also where it was taken from the cache, [s]."""
     _previous: str = ""

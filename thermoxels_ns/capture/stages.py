@@ -49,10 +49,8 @@ from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import write_json
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
-PAGE_NAME = "capture.html"
-"""Of the page, in the output folder."""
-_MOST_NAMED = 10
-"""Files left out that are named while the command runs."""
+PAGE_NAME = "capture.html"  # of the page, in the output folder
+_MOST_NAMED = 10  # files left out that are named while the command runs
 _LEAST_SIGHTINGS = 50
 """Sightings of scene points below which thermal images and photographs cannot be compared."""
 _OVERLAY_FILE = "overlay.npy"
@@ -67,17 +65,13 @@ class CaptureResult:
     source: Path
     output: Path
     pairs: Sequence[Pair]
-    dropped: dict[str, str]
-    """Files and frames that are not in the scene, and why."""
+    dropped: dict[str, str]  # files and frames that are not in the scene, and why
     read: CaptureFrames
     scene: Scene
-    start: RigEstimate
-    """Where the search for the rig began."""
-    scale_missing: str
-    """Why there is no scale, where there is none."""
+    start: RigEstimate  # where the search for the rig began
+    scale_missing: str  # why there is no scale, where there is none
     poses_source: str
-    seconds: Sequence[tuple[str, float]]
-    """Stages and the time each took, [s]."""
+    seconds: Sequence[tuple[str, float]]  # stages and the time each took, [s]
 
     @property
     def page(self) -> Path:
@@ -137,8 +131,7 @@ class _Capture:
     settings: CaptureSettings
     cache: StageCache
     say: Callable[[str], None]
-    board: CheckerBoard | None = None
-    """What the user's pictures of a checker board show."""
+    board: CheckerBoard | None = None  # what the user's pictures of a checker board show
     dropped: dict[str, str] = field(default_factory=dict)
     """Files and frames that are left out, and why; stages add to it."""
 

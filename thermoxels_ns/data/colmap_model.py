@@ -14,23 +14,16 @@ from thermoxels_ns.core.errors import SceneError
 COLMAP_FOLDERS = ("colmap/sparse/0", "colmap/sparse", "colmap", "sparse/0", "sparse")
 """Where a model may lie in a scene's folder, the first that does counts."""
 
-_LEAST_CAMERA_BYTES = 48
-"""Of a camera with three parameters; others have more."""
-_FRAME_BYTES, _DATUM_BYTES = 64, 16
-"""Of a frame before the number of its images, and of each of them."""
+_LEAST_CAMERA_BYTES = 48  # of a camera with three parameters; others have more
+_FRAME_BYTES, _DATUM_BYTES = 64, 16  # of a frame before the number of its images, and of each of them
 _POINT_BYTES, _SIGHTING_BYTES = 43, 8
 """Of a point before the length of its track, and of each element of the track."""
-_IMAGE_BYTES, _FEATURE_BYTES = 64, 24
-"""Of an image before its name, and of each of its features."""
+_IMAGE_BYTES, _FEATURE_BYTES = 64, 24  # of an image before its name, and of each of its features
 _LENGTH = struct.Struct("<Q")
 
 
 def read_model(folder: Path) -> Any:
-    """Read the COLMAP model in a folder as a `pycolmap.Reconstruction`.
-
-    Raises:
-        SceneError: A file ends too early or cannot be read.
-    """
+    """Read the COLMAP model in a folder as a `pycolmap.Reconstruction`; a `SceneError` where a file is not whole."""
     import pycolmap  # slow to import and only needed here
 
     check_complete(folder)
@@ -48,11 +41,7 @@ def camera_to_world(image: Any) -> FloatArray:
 
 
 def check_complete(folder: Path) -> None:
-    """Refuse a model whose files end before what they announce: pycolmap would read on behind the end.
-
-    Raises:
-        SceneError: A file is too short; names it.
-    """
+    """Refuse a model with a file (named) that ends before what it announces: pycolmap would read on behind the end."""
     for name in ("cameras", "frames", "images", "points3D"):
         path = folder / f"{name}.bin"
         if path.is_file() and not _complete(name, path):

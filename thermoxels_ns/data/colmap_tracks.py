@@ -24,10 +24,8 @@ LEAST_AGREEING = 0.7
 """Share of the photographs in common whose poses must agree; with fewer the model belongs to other poses."""
 _PARTS = ("cameras", "images", "points3D")
 _ROUNDS = 20
-_FEWEST = 3
-"""Cameras from which a similarity is found; fewer cannot outvote a wrong one."""
-_STRAY = 5.0
-"""Medians of the misfit above which a camera takes no part in the last fit."""
+_FEWEST = 3  # cameras from which a similarity is found; fewer cannot outvote a wrong one
+_STRAY = 5.0  # medians of the misfit above which a camera takes no part in the last fit
 
 TrackSource = Literal["auto", "given", "off"]
 
@@ -215,10 +213,8 @@ def _off_px(
 class Similarity:
     """Brings points of one world into another: scale * rotation p + translation."""
 
-    rotation: FloatArray
-    """Shape (3, 3)."""
-    translation: FloatArray
-    """Shape (3,)."""
+    rotation: FloatArray  # shape (3, 3)
+    translation: FloatArray  # shape (3,)
     scale: float
 
     def points(self, points: FloatArray) -> FloatArray:

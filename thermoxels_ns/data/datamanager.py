@@ -25,8 +25,7 @@ from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.data.ray_sampler import RaySampler, draw_generator
 
 _TRAIN, _EVAL, _EVAL_IMAGE = 0, 1, 2
-_WIDEST = np.deg2rad(80.0)
-"""Angle from the optical axis up to which a pinhole stands for a fisheye lens."""
+_WIDEST = np.deg2rad(80.0)  # angle from the optical axis up to which a pinhole stands for a fisheye lens
 _CUBE = np.array(
     [
         [[1, 0, 0], [0, 1, 0], [0, 0, 1]],

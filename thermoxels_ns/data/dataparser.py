@@ -32,12 +32,10 @@ SCENE_SIZE = 2.0
 _FAR_SIDES = 16.0
 """Farther from the origin than this many times its longest side, as in national coordinates, a box is far: shifts in
 single precision are then off by more than a millionth of it."""
-_LEAST_THAT_MEETS = 0.01
-"""Share of the rays that must meet the scene box."""
+_LEAST_THAT_MEETS = 0.01  # share of the rays that must meet the scene box
 _LEAST_OF_KELVINS, _SAME_PLACE_K = 200.0, 40.0
 """Median from which on a file may hold kelvins, and how far it may then be from the other files."""
-_MOST_FRAMES = 64
-"""Frames per resolution that the search for dead pixels keeps in memory."""
+_MOST_FRAMES = 64  # frames per resolution that the search for dead pixels keeps in memory
 
 
 @dataclass
@@ -87,8 +85,7 @@ class ThermalDataParserConfig(DataParserConfig):
 class ThermalSurvey:
     """What the thermal files of a scene have in common."""
 
-    shapes: dict[Path, tuple[int, int]]
-    """Height and width of every file."""
+    shapes: dict[Path, tuple[int, int]]  # height and width of every file
     temperature_range: TemperatureRange
     """From temperature_bounds.json and the extremes of the training files' valid pixels."""
     dead_pixels: dict[tuple[int, int], npt.NDArray[np.bool_]]
@@ -125,8 +122,7 @@ class _Scene:
     survey: ThermalSurvey
     world: _World
     box: SceneBox
-    feature_rays: FeatureRays | None
-    """What the training photographs see of the tracks; nerfstudio's world."""
+    feature_rays: FeatureRays | None  # what the training photographs see of the tracks; nerfstudio's world
 
 
 class ThermalDataParser(DataParser):

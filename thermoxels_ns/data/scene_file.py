@@ -25,16 +25,13 @@ BOUNDS_NAME = "temperature_bounds.json"
 class Frame:
     """One pair of photographs."""
 
-    name: str
-    """Name of the photograph as the json writes it, with forward slashes; frames are sorted by it."""
+    name: str  # name of the photograph as the json writes it, with forward slashes; frames are sorted by it
     image: Path
     thermal: Path
     mask: Path | None
-    pose: npt.NDArray[np.float64]
-    """Camera to world, shape (4, 4), OpenGL axes, input coordinates."""
+    pose: npt.NDArray[np.float64]  # camera to world, shape (4, 4), OpenGL axes, input coordinates
     intrinsics: Camera
-    thermal_pose: npt.NDArray[np.float64] | None
-    """Pose of the thermal camera; None: the photograph's."""
+    thermal_pose: npt.NDArray[np.float64] | None  # pose of the thermal camera; None: the photograph's
     thermal_intrinsics: Camera | None
     """The thermal camera's own projection; None: the photograph's at the thermal image's resolution."""
 
@@ -49,8 +46,7 @@ class SceneFile:
     unit: ThermalUnit
     bounds_c: tuple[float, float] | None
     """Lowest and highest temperature of temperature_bounds.json, [degrees Celsius]."""
-    meta: dict[str, Any]
-    """The json as it is (split lists, scene_box, ply_file_path, applied_transform)."""
+    meta: dict[str, Any]  # the json as it is (split lists, scene_box, ply_file_path, applied_transform)
     left_out: list[str] = field(default_factory=list)
     """Names of frames and files that missing_thermal="skip" left out."""
 

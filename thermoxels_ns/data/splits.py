@@ -20,8 +20,7 @@ class Split:
     train: list[int]
     val: list[int]
     test: list[int]
-    how: str
-    """How the split was made, for the report."""
+    how: str  # how the split was made, for the report
 
 
 def split_frames(

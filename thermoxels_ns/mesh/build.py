@@ -61,12 +61,9 @@ class MeshOptions:
 class BuiltMesh:
     """A mesh and what it was made from."""
 
-    mesh: TetMesh
-    """The mesh."""
-    solid: SolidCells
-    """The solid voxels it was made from."""
-    unobserved_parts: int
-    """Connected components left out because no thermal ray saw any of their nodes."""
+    mesh: TetMesh  # the mesh
+    solid: SolidCells  # the solid voxels it was made from
+    unobserved_parts: int  # connected components left out because no thermal ray saw any of their nodes
     unobserved_voxels: int
     """Their voxels, which count in `solid.component_sizes`, but are not in `solid.cells`."""
     observed_range_c: tuple[float, float]
@@ -79,8 +76,7 @@ class BuiltMesh:
 class _Shape:
     """Nodes and elements before they have temperatures."""
 
-    points: FloatArray
-    """Nodes as fractional corner indices, shape (n, 3)."""
+    points: FloatArray  # nodes as fractional corner indices, shape (n, 3)
     tets: IntArray
     facets: IntArray
     facet_tags: IntArray

@@ -160,11 +160,8 @@ def _measured_components(links: sparse.csr_array, observed: BoolArray) -> IntArr
 def _conjugate_gradients(
     matrix: sparse.csr_array, load: npt.NDArray, degree: npt.NDArray, tolerance: float
 ) -> FloatArray:
-    """Conjugate gradients with Jacobi, from 0 until the residual is at most `tolerance` of the load.
-
-    Sums are numpy's own: those of BLAS, which scipy's solver takes, depend in the last digits on how many threads it
-    has.
-    """
+    """Conjugate gradients with Jacobi, from 0 until the residual is at most `tolerance` of the load."""
+    # Sums are numpy's own: those of BLAS depend in the last digits on how many threads it has.
     solution, residual = np.zeros(len(load)), np.array(load, dtype=np.float64)
     enough = tolerance**2 * np.sum(residual * residual)
     direction = residual / degree

@@ -101,10 +101,7 @@ def voxel_facets(cells: BoolArray) -> IntArray:
 
 
 def boundary_tags(facets: IntArray, points_index: npt.NDArray, lattice_shape: tuple[int, ...]) -> IntArray:
-    """`FACET_BOX` where all three nodes of a triangle lie on one side of the lattice, else `FACET_SURFACE`; shape (f,).
-
-    Corner indices are whole or fractional; `lattice_shape` is the number of corners along x, y, z.
-    """
+    """`FACET_BOX` where a triangle lies on one side of a lattice with so many corners, else `FACET_SURFACE`; (f,)."""
     # One bit per side of the lattice; a triangle lies on the sides that its nodes have in common.
     sides = np.zeros(len(points_index), dtype=np.uint8)
     for axis, count in enumerate(lattice_shape):

@@ -29,8 +29,7 @@ class CountScale:
 
     celsius_per_count: float
     celsius_offset: float
-    cameras: str
-    """Which cameras write so, in words."""
+    cameras: str  # which cameras write so, in words
 
     @property
     def unit(self) -> ThermalUnit:
@@ -80,8 +79,7 @@ class CountImage:
 
     image: ThermalImage
     exif: ExifFacts
-    celsius_per_count: float | None
-    """None: the file holds degrees."""
+    celsius_per_count: float | None  # None: the file holds degrees
 
 
 def read_count_image(

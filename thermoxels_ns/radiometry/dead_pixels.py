@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-MIN_FRAMES = 5
-"""Fewer frames than this cannot tell a stuck pixel from a quiet one."""
-_WINDOW = 2
-"""Half width of the neighbourhood: 5 x 5, so that a dead column or row is still a minority of it."""
+MIN_FRAMES = 5  # fewer frames than this cannot tell a stuck pixel from a quiet one
+_WINDOW = 2  # half width of the neighbourhood: 5 x 5, so that a dead column or row is still a minority of it
 
 
 def find_dead_pixels(stack: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:

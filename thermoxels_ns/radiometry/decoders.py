@@ -13,8 +13,7 @@ from thermoxels_ns.core.errors import SceneError, ThermalFileError, ThermoxelsEr
 
 LARGEST_SIDE = 8192
 """Pixels along a side: four times the largest thermal sensors and super-resolution modes (about 2048)."""
-LARGEST_FILE_BYTES = 2**29
-"""A table of 4096 x 4096 numbers of 30 characters; camera files are far smaller."""
+LARGEST_FILE_BYTES = 2**29  # a table of 4096 x 4096 numbers of 30 characters; camera files are far smaller
 
 
 @contextmanager

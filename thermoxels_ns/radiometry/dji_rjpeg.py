@@ -66,8 +66,7 @@ class _Parameters(ctypes.Structure):
 class DjiImage:
     """One R-JPEG of a DJI camera after reading."""
 
-    temperature_c: npt.NDArray[np.float32]
-    """Shape (height, width), [degrees C]."""
+    temperature_c: npt.NDArray[np.float32]  # shape (height, width), [degrees C]
     camera_conditions: Conditions
     conditions: Conditions
     exif: ExifFacts

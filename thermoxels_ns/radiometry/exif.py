@@ -20,8 +20,7 @@ class ExifFacts:
     make: str | None
     model: str | None
     serial: str | None
-    taken_at: datetime | None
-    """Without a time zone, as the camera's clock showed it."""
+    taken_at: datetime | None  # without a time zone, as the camera's clock showed it
 
     @property
     def camera(self) -> str | None:

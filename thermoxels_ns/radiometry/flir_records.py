@@ -68,12 +68,9 @@ class PictureInPicture:
     What they mean is not published, and they hold for one distance: things nearer or farther lie elsewhere.
     """
 
-    real_to_thermal: float
-    """Real2IR: ratio of the two images' scales."""
-    offset_x: int
-    """Shift of the thermal image's centre to the right, roughly in pixels of the photograph."""
-    offset_y: int
-    """The same downwards."""
+    real_to_thermal: float  # Real2IR: ratio of the two images' scales
+    offset_x: int  # shift of the thermal image's centre to the right, roughly in pixels of the photograph
+    offset_y: int  # the same downwards
 
 
 @dataclass(frozen=True)
@@ -82,12 +79,9 @@ class CameraInfo:
 
     planck: PlanckConstants
     air: AirConstants
-    conditions: Conditions
-    """The camera's own settings when the picture was taken (or edited)."""
-    raw_range: tuple[int, int]
-    """Counts from and to which the calibration holds."""
-    field_of_view_deg: float | None
-    """Horizontal, as the camera states it; some state nonsense such as 180."""
+    conditions: Conditions  # the camera's own settings when the picture was taken (or edited)
+    raw_range: tuple[int, int]  # counts from and to which the calibration holds
+    field_of_view_deg: float | None  # horizontal, as the camera states it; some state nonsense such as 180
     model: str | None
     serial: str | None
     lens: str | None

@@ -34,16 +34,14 @@ _REMEDY = "Copy the file from the camera again; programs that edit pictures drop
 _FLIR_MARK = b"FLIR\0"
 _FLIR_HEADER_BYTES = 8
 _FIRST_SEGMENT = re.compile(rb"\xff\xe1..FLIR\0", re.DOTALL)
-_HEAD_BYTES = 2**18
-"""The first FLIR segment comes after the EXIF segments, each at most 64 KiB."""
+_HEAD_BYTES = 2**18  # the first FLIR segment comes after the EXIF segments, each at most 64 KiB
 
 
 @dataclass(frozen=True)
 class FlirImage:
     """One R-JPEG of a FLIR camera after reading."""
 
-    counts: npt.NDArray[np.uint16]
-    """What the sensor gave, shape (height, width)."""
+    counts: npt.NDArray[np.uint16]  # what the sensor gave, shape (height, width)
     camera: CameraInfo
     picture_in_picture: PictureInPicture | None
     visible: bytes | None

@@ -19,8 +19,7 @@ _LARGEST_ATTENUATION, _LARGEST_WEIGHT = 1.0, 10.0
 _LARGEST_EXPONENT = 700.0
 FIRST_RADIATION_W_UM4_M2_SR = 1.191042972e8
 """2 h c^2 (exact constants of the SI, rounded), [W um^4 / (m2 sr)]."""
-SECOND_RADIATION_UM_K = 14387.76877
-"""h c / k (exact constants of the SI, rounded), [um K]."""
+SECOND_RADIATION_UM_K = 14387.76877  # h c / k (exact constants of the SI, rounded), [um K]
 _COLDEST_K, _HOTTEST_K = 50.0, 6000.0
 _STEPS = 8192
 
@@ -43,16 +42,12 @@ class SensorCurve(Protocol):
 class PlanckConstants:
     """Calibration of a sensor: its signal as a function of a black body's temperature."""
 
-    r1: float
-    """Gain of the calibration."""
-    r2: float
-    """Second gain; only R1 / R2 matters."""
+    r1: float  # gain of the calibration
+    r2: float  # second gain; only R1 / R2 matters
     b: float
     """Second radiation constant over the effective wavelength, [K]; 1300 to 1600 for 7.5 to 14 micrometres."""
-    f: float
-    """Shape; 1 in Planck's law at one wavelength."""
-    o: float
-    """Offset of the counts (negative in camera files)."""
+    f: float  # shape; 1 in Planck's law at one wavelength
+    o: float  # offset of the counts (negative in camera files)
 
     def __post_init__(self) -> None:
         for name in ("r1", "r2", "b", "f"):
@@ -90,10 +85,8 @@ class PlanckBand:
     pieces can be read both ways, so there and back again is exact.
     """
 
-    shortest_um: float = 7.5
-    """Lower end of the band, [micrometres]."""
-    longest_um: float = 13.0
-    """Upper end of the band, [micrometres]."""
+    shortest_um: float = 7.5  # lower end of the band, [micrometres]
+    longest_um: float = 13.0  # upper end of the band, [micrometres]
 
     @cached_property
     def _table(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
@@ -126,24 +119,18 @@ class PlanckBand:
         return np.where(known, 1.0 / np.interp(falling, logarithm[::-1], inverse_k[::-1]), np.nan)
 
 
-LONG_WAVE = PlanckBand()
-"""7.5 to 13 micrometres, the band of microbolometer cameras."""
+LONG_WAVE = PlanckBand()  # 7.5 to 13 micrometres, the band of microbolometer cameras
 
 
 @dataclass(frozen=True)
 class AirConstants:
     """Transmission of humid air in the sensor's band; the defaults are those that FLIR's files of all cameras hold."""
 
-    alpha1: float = 0.006569
-    """Attenuation of the first part, [1/sqrt(m)]."""
-    alpha2: float = 0.01262
-    """Attenuation of the second part, [1/sqrt(m)]."""
-    beta1: float = -0.002276
-    """Part of the first attenuation that grows with the root of the water content."""
-    beta2: float = -0.00667
-    """Part of the second attenuation that grows with the root of the water content."""
-    x: float = 1.9
-    """Weight of the first part; the second has 1 - x."""
+    alpha1: float = 0.006569  # attenuation of the first part, [1/sqrt(m)]
+    alpha2: float = 0.01262  # attenuation of the second part, [1/sqrt(m)]
+    beta1: float = -0.002276  # part of the first attenuation that grows with the root of the water content
+    beta2: float = -0.00667  # part of the second attenuation that grows with the root of the water content
+    x: float = 1.9  # weight of the first part; the second has 1 - x
 
     def __post_init__(self) -> None:
         for field in fields(self):

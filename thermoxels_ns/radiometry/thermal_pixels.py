@@ -19,8 +19,7 @@ from thermoxels_ns.radiometry.decoders import check_thermal_size, errors_name
 from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-THERMAL_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".csv")
-"""File types that `read_thermal_file` knows."""
+THERMAL_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".csv")  # file types that `read_thermal_file` knows
 
 _LONGEST_LINE = 2**20
 """More characters in a line are no row of a thermal image: 8192 numbers of 30 characters are a quarter of it."""
@@ -38,10 +37,8 @@ class ThermalUnit:
 
     kind: Literal["bounds", "linear", "celsius"]
     """bounds: counts span min to max; linear: counts times a factor plus an offset; celsius: no conversion."""
-    scale: float = 1.0
-    """bounds: max minus min, [K]; linear: [K per count]."""
-    offset_c: float = 0.0
-    """Temperature of count zero, [degrees Celsius]."""
+    scale: float = 1.0  # bounds: max minus min, [K]; linear: [K per count]
+    offset_c: float = 0.0  # temperature of count zero, [degrees Celsius]
 
     def __post_init__(self) -> None:
         wrong_scale = not np.isfinite(self.scale) or (self.kind == "linear" and self.scale == 0)
@@ -71,16 +68,12 @@ class ThermalUnit:
 class PixelReport:
     """How many pixels were masked and why; reports add up with ``+``."""
 
-    pixels: int = 0
-    """All pixels read."""
-    nan: int = 0
-    """Not a number in the file (also: fully transparent)."""
+    pixels: int = 0  # all pixels read
+    nan: int = 0  # not a number in the file (also: fully transparent)
     saturated: int = 0
     """Counts at the end of a linear scale (0 and 65535 for 16 bit): the sensor saw more or less than it can say."""
-    out_of_range: int = 0
-    """Below absolute zero or outside the valid range."""
-    dead: int = 0
-    """Valid by themselves, but stuck at one value over the whole scene."""
+    out_of_range: int = 0  # below absolute zero or outside the valid range
+    dead: int = 0  # valid by themselves, but stuck at one value over the whole scene
 
     def __add__(self, other: PixelReport) -> PixelReport:
         return PixelReport(*map(sum, zip(astuple(self), astuple(other))))
@@ -102,8 +95,7 @@ class PixelReport:
 class ThermalImage:
     """One thermal file after reading."""
 
-    temperature_c: npt.NDArray[np.float32]
-    """Shape (height, width), [degrees Celsius], NaN where invalid."""
+    temperature_c: npt.NDArray[np.float32]  # shape (height, width), [degrees Celsius], NaN where invalid
     report: PixelReport
 
 
@@ -113,8 +105,7 @@ class _RawPixels:
 
     values: npt.NDArray[Any]
     no_data: npt.NDArray[np.bool_] | None = None
-    celsius: bool = False
-    """Whether they are degrees whatever the unit says."""
+    celsius: bool = False  # whether they are degrees whatever the unit says
 
 
 def read_thermal_file(

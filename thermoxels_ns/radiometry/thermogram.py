@@ -45,23 +45,17 @@ _TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 class ThermogramMetadata:
     """What a thermal file says besides its temperatures; None: it does not say."""
 
-    format: ThermogramFormat
-    """By content, not by name."""
-    camera: str | None = None
-    """Maker and model."""
-    serial: str | None = None
-    """Of the camera."""
+    format: ThermogramFormat  # by content, not by name
+    camera: str | None = None  # maker and model
+    serial: str | None = None  # of the camera
     lens: str | None = None
-    taken_at: datetime | None = None
-    """When; with a time zone where the file has one."""
+    taken_at: datetime | None = None  # when; with a time zone where the file has one
     field_of_view_deg: float | None = None
     """Horizontal, of the thermal lens, as the camera states it; some state nonsense such as 180."""
-    camera_conditions: Conditions | None = None
-    """Emissivity and the rest that the camera was set to."""
+    camera_conditions: Conditions | None = None  # emissivity and the rest that the camera was set to
     conditions: Conditions | None = None
     """Those that the temperatures were computed with: the camera's, with the user's in their place."""
-    picture_in_picture: PictureInPicture | None = None
-    """Factory alignment of photograph and thermal image."""
+    picture_in_picture: PictureInPicture | None = None  # factory alignment of photograph and thermal image
     celsius_per_count: float | None = None
     """Step of the file's counts, [K], where they are linear in temperature."""
 
@@ -73,8 +67,7 @@ class Thermogram:
     temperature_c: npt.NDArray[np.float32]
     """Shape (height, width), [degrees C], NaN where the camera measured nothing."""
     metadata: ThermogramMetadata
-    report: PixelReport
-    """How many pixels are NaN and why."""
+    report: PixelReport  # how many pixels are NaN and why
 
 
 @dataclass(frozen=True)

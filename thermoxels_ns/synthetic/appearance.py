@@ -62,10 +62,8 @@ class SolidTexture:
 class Paint:
     """A base colour and how strongly the texture shows on it."""
 
-    base: tuple[float, float, float]
-    """Red, green, blue, 0 to 1."""
-    contrast: float = 0.22
-    """Weight of the texture, 0 to about 0.4."""
+    base: tuple[float, float, float]  # red, green, blue, 0 to 1
+    contrast: float = 0.22  # weight of the texture, 0 to about 0.4
     mirror: float = 0.0
     """Share of the light that comes off it as off a mirror, 0 to 1; the rest shows the paint."""
 
@@ -74,10 +72,8 @@ class Paint:
 class SunLight:
     """Lambert shading by one distant light and an ambient part; there are no shadows."""
 
-    towards: tuple[float, float, float] = (0.45, -0.6, 0.66)
-    """Direction to the light, any length."""
-    ambient: float = 0.62
-    """Brightness of a surface that faces away from the light; one that faces it has 1."""
+    towards: tuple[float, float, float] = (0.45, -0.6, 0.66)  # direction to the light, any length
+    ambient: float = 0.62  # brightness of a surface that faces away from the light; one that faces it has 1
 
     def brightness(self, normals: npt.ArrayLike) -> RgbArray:
         """Brightness of surfaces with unit normals (n, 3), shape (n, 1)."""
@@ -112,10 +108,8 @@ _GROUND_RISE_K = 2.0
 
 
 def sky_temperature_c(directions: npt.ArrayLike, horizon_c: float, drop_k: float) -> FloatArray:
-    """Apparent temperature [C] of the sky, linear in the sine of the elevation; of the far ground below the horizon.
-
-    Unit directions (n, 3) away from the camera to (n,). The zenith is `drop_k` colder than the horizon, the ground
-    straight below 2 K warmer.
+    """Apparent temperature [C] of the sky along unit directions (n, 3), linear in the sine of the elevation; of the far
+    ground below the horizon. The zenith is `drop_k` colder than the horizon, the ground straight below 2 K warmer.
     """
     z = np.asarray(directions, dtype=np.float64)[:, 2]
     return horizon_c - drop_k * _rise(z) + _GROUND_RISE_K * _rise(-z)

@@ -34,8 +34,7 @@ class BoxSolid:
 
     boxes: Sequence[Box]
     """Lower and upper corners [m] of the boxes to join; rounded to 1e-12 m so that touching faces coincide."""
-    removed: Sequence[Box] = ()
-    """Lower and upper corners [m] of the boxes to cut out."""
+    removed: Sequence[Box] = ()  # lower and upper corners [m] of the boxes to cut out
 
     def __post_init__(self) -> None:
         for lo, hi in (*self.boxes, *self.removed):
@@ -165,14 +164,10 @@ class BoxSolid:
 class Rectangles:
     """A list of axis-aligned rectangles, each with an outward normal along one axis."""
 
-    lo: FloatArray
-    """Lower corners [m], shape (m, 3); equal to `hi` along the rectangle's own axis."""
-    hi: FloatArray
-    """Upper corners [m], shape (m, 3)."""
-    axis: npt.NDArray[np.int64]
-    """Axis each normal is parallel to (0, 1 or 2), shape (m,)."""
-    sign: npt.NDArray[np.int64]
-    """Direction of each normal along its axis (+1 or -1), shape (m,)."""
+    lo: FloatArray  # lower corners [m], shape (m, 3); equal to `hi` along the rectangle's own axis
+    hi: FloatArray  # upper corners [m], shape (m, 3)
+    axis: npt.NDArray[np.int64]  # axis each normal is parallel to (0, 1 or 2), shape (m,)
+    sign: npt.NDArray[np.int64]  # direction of each normal along its axis (+1 or -1), shape (m,)
 
     def __len__(self) -> int:
         return len(self.axis)

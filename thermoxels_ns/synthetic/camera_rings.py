@@ -35,16 +35,11 @@ def look_at(position: npt.ArrayLike, target: npt.ArrayLike) -> FloatArray:
 class CameraRing:
     """A horizontal circle, or a part of one, of cameras that look at one point."""
 
-    target: tuple[float, float, float]
-    """Point that all cameras look at and the axis goes through [m]."""
-    radius_m: float
-    """Horizontal distance from the axis [m]."""
-    height_m: float
-    """z of the cameras [m]."""
-    start_deg: float = 0.0
-    """Azimuth where the arc begins, counted from x towards y [degrees]."""
-    span_deg: float = 360.0
-    """Length of the arc [degrees]; 360 closes the ring."""
+    target: tuple[float, float, float]  # point that all cameras look at and the axis goes through [m]
+    radius_m: float  # horizontal distance from the axis [m]
+    height_m: float  # z of the cameras [m]
+    start_deg: float = 0.0  # azimuth where the arc begins, counted from x towards y [degrees]
+    span_deg: float = 360.0  # length of the arc [degrees]; 360 closes the ring
 
     @property
     def closed(self) -> bool:
@@ -63,12 +58,9 @@ class CameraRing:
 class CameraWalk:
     """A straight line of cameras, each of which looks at a point of another line."""
 
-    ends: tuple[Vector, Vector]
-    """Where the line of cameras begins and ends [m]."""
-    aims: tuple[Vector, Vector]
-    """What the first and the last camera look at [m]."""
-    closed: bool = False
-    """A line is open."""
+    ends: tuple[Vector, Vector]  # where the line of cameras begins and ends [m]
+    aims: tuple[Vector, Vector]  # what the first and the last camera look at [m]
+    closed: bool = False  # a line is open
 
     def pose(self, share: float) -> FloatArray:
         """Pose (4, 4) at a share of the line, 0 to 1."""

@@ -171,8 +171,7 @@ _DEVELOPMENT: dict[str, Callable[..., SyntheticScene]] = {
 
 SCENE_NAMES = tuple(_BUILDERS)
 """Names of the scenes that were built by hand; `make_scene` also knows `DEVELOPMENT_NAMES`, `random-N` and `wild-N`."""
-DEVELOPMENT_NAMES = tuple(_DEVELOPMENT)
-"""Names of scenes that are hard to reconstruct, for development."""
+DEVELOPMENT_NAMES = tuple(_DEVELOPMENT)  # names of scenes that are hard to reconstruct, for development
 
 VARIANTS = "+sky=R,G,B, +white, +street, +room"
 """What a name may end in, in any order: a sky of one colour (0 to 1); white plaster under a white sky (house-corner);

@@ -16,8 +16,7 @@ FloatArray = npt.NDArray[np.float64]
 Shape = Box | Sphere | Cylinder
 Range = tuple[float, float]
 
-SMALLEST = 3.1
-"""Lower bound of every thickness, gap and step of a plan [voxels of the plan]."""
+SMALLEST = 3.1  # lower bound of every thickness, gap and step of a plan [voxels of the plan]
 WIDEST = 116.0
 """Upper bound of a plan's extent [voxels of the plan]: with the margins of the scene box it is below 127."""
 HAIR = 0.002
@@ -41,50 +40,33 @@ class Piece:
     """One solid thing with its paint and warmth."""
 
     shape: Shape
-    """Where it is."""
     paint: int
-    """Number of its paint."""
-    warmth: float
-    """Warmth at its middle, about 0 (coldest of the scene) to 1 (hottest)."""
-    slope: FloatArray
-    """Change of the warmth along x, y and z [per unit of length]."""
+    warmth: float  # warmth at its middle, about 0 (coldest of the scene) to 1 (hottest)
+    slope: FloatArray  # change of the warmth along x, y and z [per unit of length]
 
 
 @dataclass(frozen=True, eq=False)
 class Glow:
     """A box, or a point, of one warmth that fades into what is around it."""
 
-    core: Box
-    """Where the warmth is reached; a point if both corners agree."""
+    core: Box  # where the warmth is reached; a point if both corners agree
     warmth: float
-    """Warmth of the core."""
-    reach: float
-    """How far from the core the surroundings are themselves again [units of length]."""
+    reach: float  # how far from the core the surroundings are themselves again [units of length]
 
 
 @dataclass(eq=False)
 class Plan:
-    """What an arrangement consists of.
-
-    Later pieces lie over earlier ones where they share volume: a point has the paint of the last piece that holds it.
-    """
+    """What an arrangement consists of; a point has the paint of the last piece that holds it."""
 
     draw: np.random.Generator
-    """Source of every random choice."""
     pieces: list[Piece] = field(default_factory=list)
     """Boxes (which may overlap and touch) and round things (which share no volume and no face)."""
-    removed: list[Box] = field(default_factory=list)
-    """Boxes cut out of all others."""
-    glows: list[Glow] = field(default_factory=list)
-    """What is warmer, or colder, than the piece it lies on."""
+    removed: list[Box] = field(default_factory=list)  # boxes cut out of all others
+    glows: list[Glow] = field(default_factory=list)  # what is warmer, or colder, than the piece it lies on
     paints: list[Paint] = field(default_factory=list)
-    """Paints by number."""
-    unit: float = 1.0
-    """Length of a voxel of the plan in the unit that the plan is in."""
-    plain_walls: bool = False
-    """Whether walls that are painted from now on are plain plaster, without texture."""
-    mirror: float = 0.0
-    """Share of light that panes painted from now on reflect as mirrors do."""
+    unit: float = 1.0  # length of a voxel of the plan in the unit that the plan is in
+    plain_walls: bool = False  # whether walls that are painted from now on are plain plaster, without texture
+    mirror: float = 0.0  # share of light that panes painted from now on reflect as mirrors do
 
     def u(self, low: float, high: float) -> float:
         """Draw a number between two, `low` if they are in the wrong order."""
@@ -164,10 +146,7 @@ class Plan:
         )
 
     def solid(self) -> BoxSolid | SolidUnion:
-        """The exact solid: all boxes joined, less what is cut out, beside the round things.
-
-        Panes are not joined: they lie within their walls, behind what is cut out.
-        """
+        """The exact solid: all boxes joined (panes lie within), less what is cut out, beside the round things."""
         boxes = [piece.shape for piece in self.pieces if isinstance(piece.shape, tuple)]
         round_things = [piece.shape for piece in self.pieces if not isinstance(piece.shape, tuple)]
         joined = BoxSolid(boxes, self.removed)

@@ -94,14 +94,10 @@ _RANGE_K = (15.0, 60.0)
 class Family:
     """A kind of arrangement."""
 
-    name: str
-    """What it shows."""
-    lay_out: Callable[[Plan], None]
-    """Puts its pieces into a plan."""
-    size_m: tuple[float, float]
-    """Longest side of the smallest and of the largest one [m]."""
-    outdoors: float
-    """Share of them that stand under the sky; the others stand in a room."""
+    name: str  # what it shows
+    lay_out: Callable[[Plan], None]  # puts its pieces into a plan
+    size_m: tuple[float, float]  # longest side of the smallest and of the largest one [m]
+    outdoors: float  # share of them that stand under the sky; the others stand in a room
     arc_deg: tuple[float, float] | None = None
     """Shortest and longest arc of cameras, in front of it (towards -y) [degrees]; None: all round."""
 

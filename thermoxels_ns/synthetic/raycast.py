@@ -23,8 +23,7 @@ _RAYS_PER_CHUNK = 16_384  # about what stays in a processor's cache
 class RenderedView:
     """What one camera sees."""
 
-    rgb: npt.NDArray[np.float32]
-    """Mean colour of each pixel's samples, 0 to 1, shape (height, width, 3)."""
+    rgb: npt.NDArray[np.float32]  # mean colour of each pixel's samples, 0 to 1, shape (height, width, 3)
     temperature_c: FloatArray
     """Mean temperature of each pixel's samples [degrees Celsius], shape (height, width)."""
     depth_m: FloatArray

@@ -31,8 +31,7 @@ __all__ = [
 
 ThermalFormat = Literal["png16", "tiff", "npy"]
 """16-bit PNG that spans the temperature bounds; uint16 TIFF of centikelvin counts; float32 numpy in Celsius."""
-PhotoFormat = Literal["jpeg", "png"]
-"""JPEG of quality 92, as cameras write it; PNG, which loses nothing."""
+PhotoFormat = Literal["jpeg", "png"]  # JPEG of quality 92, as cameras write it; PNG, which loses nothing
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -23,12 +23,9 @@ _ASPECT = 4.0 / 3.0
 class Surroundings:
     """Solid things outside the scene box that photographs show too: houses opposite, trees, a room's walls."""
 
-    solid: Solid
-    """All of them [m]; not part of what is scored."""
-    colour: RgbFunction
-    """(points (n, 3), normals (n, 3)) to red, green, blue in [0, 1] (n, 3)."""
-    surface_temperature_c: Callable[[npt.ArrayLike], FloatArray]
-    """Points (n, 3) to temperatures (n,)."""
+    solid: Solid  # all of them [m]; not part of what is scored
+    colour: RgbFunction  # (points (n, 3), normals (n, 3)) to red, green, blue in [0, 1] (n, 3)
+    surface_temperature_c: Callable[[npt.ArrayLike], FloatArray]  # points (n, 3) to temperatures (n,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,15 +33,12 @@ class SyntheticScene:
     """A scene whose every answer is exact. Lengths in metres, temperatures in degrees Celsius, z up."""
 
     name: str
-    """Name in the registry."""
-    solid: Solid
-    """Everything that is not air."""
+    solid: Solid  # everything that is not air
     scene_box: Box
     """Lower and upper corner of the exact box [m]: the solid lies inside it, the surroundings outside."""
     temperature_bounds_c: tuple[float, float]
     """No surface and no background is colder than the first or hotter than the second."""
-    colour: RgbFunction
-    """(points (n, 3), normals (n, 3)) to red, green, blue in [0, 1] (n, 3)."""
+    colour: RgbFunction  # (points (n, 3), normals (n, 3)) to red, green, blue in [0, 1] (n, 3)
     surface_temperature_c: Callable[[npt.ArrayLike], FloatArray]
     """Points (n, 3) to temperatures (n,); the same from every direction. Off the surface it continues smoothly."""
     background_rgb: RgbFunction
@@ -52,9 +46,7 @@ class SyntheticScene:
     background_temperature_c: Callable[[npt.ArrayLike], FloatArray]
     """Unit directions (n, 3), away from the camera, to apparent temperatures (n,)."""
     rings: tuple[CameraRing | CameraWalk, ...]
-    """Where the photographs are taken from."""
-    focal_share: float
-    """Focal length over the image width, for a 4:3 image."""
+    focal_share: float  # focal length over the image width, for a 4:3 image
     around: Surroundings | None = None
     """What stands between the scene and what lies at infinity (`background_rgb`)."""
     mirror: Callable[[npt.ArrayLike, npt.ArrayLike], npt.NDArray[np.float32]] | None = None

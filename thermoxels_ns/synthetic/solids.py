@@ -22,8 +22,7 @@ class Hits:
     distance: FloatArray
     """Distance along the ray in multiples of its direction's length (metres for unit directions); infinite for a
     miss. Shape (n,)."""
-    normal: FloatArray
-    """Outward unit normal at the hit, zero for a miss. Shape (n, 3)."""
+    normal: FloatArray  # outward unit normal at the hit, zero for a miss. Shape (n, 3).
 
     @property
     def hit(self) -> npt.NDArray[np.bool_]:
@@ -33,12 +32,10 @@ class Hits:
 
 @dataclass(frozen=True, eq=False)
 class Sphere:
-    """A ball."""
+    """A ball; radius above 0 [m]."""
 
     centre: Vector
-    """Centre [m]."""
     radius: float
-    """Radius [m], above 0."""
 
     def __post_init__(self) -> None:
         assert np.isfinite(self.centre).all() and math.isfinite(self.radius) and self.radius > 0
@@ -99,13 +96,9 @@ class Cylinder:
     """
 
     centre: Vector
-    """Middle of the axis [m]."""
     radius: float
-    """Radius [m], above 0."""
-    length: float
-    """Length along the axis [m], above 0."""
-    axis: int
-    """Direction of the axis: 0 for x, 1 for y, 2 for z."""
+    length: float  # middle of the axis, radius and length along the axis [m], above 0
+    axis: int  # direction of the axis: 0 for x, 1 for y, 2 for z
 
     def __post_init__(self) -> None:
         finite = np.isfinite((*self.centre, self.radius, self.length)).all()

@@ -26,8 +26,7 @@ from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
 _SIZE = re.compile(r"(\d{1,3})\s*[xX]\s*(\d{1,3})")
-_SHIFTS = slice(3, 6)
-"""Of a rig's ten parameters, those that are lengths."""
+_SHIFTS = slice(3, 6)  # of a rig's ten parameters, those that are lengths
 
 _FEWEST_BOARDS = 3
 _CORNER_SIGMA_PX = 0.3
@@ -40,12 +39,9 @@ _LARGEST_ENLARGEMENT = 6
 class CheckerBoard:
     """A board of dark and light squares."""
 
-    columns: int
-    """Inner corners along the longer side; one less than squares."""
-    rows: int
-    """Inner corners along the shorter side."""
-    square_m: float
-    """Side of a square [m]."""
+    columns: int  # inner corners along the longer side; one less than squares
+    rows: int  # inner corners along the shorter side
+    square_m: float  # side of a square [m]
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or self.columns == self.rows or not self.square_m > 0.0:

@@ -28,8 +28,7 @@ _CHANCE_DRAWS = 3
 class CoarseRig:
     """One place where the coarse search found agreement."""
 
-    change: FloatArray
-    """The ten changes."""
+    change: FloatArray  # the ten changes
     score: float
 
 

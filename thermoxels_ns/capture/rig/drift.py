@@ -174,14 +174,10 @@ def _nothing(frames: int, before_k: float, reason: str) -> DriftEstimate:
 class DriftSamples:
     """Readings of scene points, sorted by point, then by frame. Only points with at least two readings."""
 
-    point: IntArray
-    """Number of the point, 0 to points - 1, shape (n,)."""
-    frame: IntArray
-    """Number of the frame, shape (n,)."""
-    temperature_c: FloatArray
-    """Reading [degrees C], shape (n,)."""
-    radius2: FloatArray
-    """Squared distance from the image's centre, 1 in the corner, shape (n,)."""
+    point: IntArray  # number of the point, 0 to points - 1, shape (n,)
+    frame: IntArray  # number of the frame, shape (n,)
+    temperature_c: FloatArray  # reading [degrees C], shape (n,)
+    radius2: FloatArray  # squared distance from the image's centre, 1 in the corner, shape (n,)
     num_frames: int
 
     @property

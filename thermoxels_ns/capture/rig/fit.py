@@ -18,10 +18,9 @@ _GRADIENT_TOLERANCE = 3e-2
 
 @dataclass(frozen=True, eq=False)
 class RigFit:
-    """A maximum of the score."""
+    """Ten changes of a rig and the score that they reach."""
 
     change: FloatArray
-    """The ten changes."""
     score: float
 
 

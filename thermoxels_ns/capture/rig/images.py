@@ -27,8 +27,7 @@ FARTHEST_FROM_POINT = 0.06
 """Distance on the plane at depth 1 to the next scene point, beyond which an edge's depth is not known."""
 SURE_DISTANCE = 0.01
 """Distance on that plane up to which an edge's depth is that of the scene points around it."""
-_EDGE_REACH = 2.0
-"""Half the width of an edge, in standard deviations of its blur."""
+_EDGE_REACH = 2.0  # half the width of an edge, in standard deviations of its blur
 _MARGIN_SHARE = 0.15
 _FINER = 1.23
 _ASPECT_TOLERANCE = 0.02
@@ -46,8 +45,7 @@ class PreparedFrame:
     """One frame, read and checked."""
 
     name: str
-    grey: FloatImage
-    """Photograph, shape (height, width)."""
+    grey: FloatImage  # photograph, shape (height, width)
     contrast: FloatImage
     """Local contrast of the temperatures, shape (height, width) of the thermal camera [K]."""
     depth: SparseDepth
@@ -60,8 +58,7 @@ class PreparedFrames:
     frames: tuple[PreparedFrame, ...]
     visible: Camera
     thermal: Camera
-    median_depth: float
-    """Of all scene points [world units]."""
+    median_depth: float  # of all scene points [world units]
 
     def sizes(self) -> list[tuple[int, int]]:
         """Sizes of the thermal images to go through, coarse to fine; the last one is the full size."""

@@ -35,10 +35,8 @@ class RigModel:
     x_thermal = Rz Ry Rx R_start x_visible + t_start + t, then the pinhole camera with radial distortion.
     """
 
-    camera: Camera
-    """Thermal camera of the start, resized to the level's pixels."""
-    transform: FloatArray
-    """Visible to thermal, shape (4, 4), OpenCV axes."""
+    camera: Camera  # thermal camera of the start, resized to the level's pixels
+    transform: FloatArray  # visible to thermal, shape (4, 4), OpenCV axes
     pixel_share: float = 1.0
     """Pixels of the level per pixel of the full thermal image; the changes of cx and cy are in the latter."""
 

@@ -14,16 +14,14 @@ from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel
 from thermoxels_ns.capture.rig.windows import THERMAL_BLUR_PX, SmoothThermal, WindowDesign, WindowScore, window_design
 from thermoxels_ns.capture.rig_types import FloatArray
 
-_PITCH = 1.3
-"""Pixels of the reduced photograph per thermal pixel."""
+_PITCH = 1.3  # pixels of the reduced photograph per thermal pixel
 _WINDOW_PX = 1.0
 _LENS_BLURS_PX = (0.0, 0.5, 0.8, 1.2, 1.6)
 """Blurs of the thermal camera that are tried, beside the pixel itself [thermal pixels]."""
 _BLUR_FRAMES, _BLUR_WINDOWS = 8, 1000
 """From how many frames and windows of each the blur is chosen, and whether windows agree at all is seen."""
 _MOST_WINDOWS = 3000
-_AGREEMENT = 0.9
-"""R2 from which on a window counts."""
+_AGREEMENT = 0.9  # R2 from which on a window counts
 _REACHES_PX = (0.5, 0.25, 0.0, 0.0)
 """How far around its place a window may agree to count, in every round [thermal pixels]."""
 _FEWEST_WINDOWS = 150
@@ -43,12 +41,9 @@ were one to two times what the scatter of the windows says, up to six times in o
 class RefinedRig:
     """The rig after the last step."""
 
-    change: FloatArray
-    """The ten changes."""
-    covariance: FloatArray
-    """Of the ten changes, shape (10, 10)."""
-    windows: int
-    """How many windows it rests on."""
+    change: FloatArray  # the ten changes
+    covariance: FloatArray  # of the ten changes, shape (10, 10)
+    windows: int  # how many windows it rests on
 
 
 def refine(prepared: PreparedFrames, rig: RigModel, change: FloatArray, sigmas: FloatArray) -> RefinedRig | None:
@@ -63,8 +58,7 @@ def refine(prepared: PreparedFrames, rig: RigModel, change: FloatArray, sigmas: 
     that thirty tell more than six. What the windows say of the principal point counts less still
     (`inflate_centre_covariance`).
 
-    Returns:
-        The better rig; None where too few windows agree, or hardly more than by chance.
+    None where too few windows agree, or hardly more than by chance.
     """
     view = _View.of(prepared, rig, change)
     count = len(prepared.frames)
@@ -149,14 +143,10 @@ def _agrees(score: WindowScore, change: FloatArray, fewest: float) -> bool:
 class _View:
     """The reduced photograph's pixels, the same for all photographs."""
 
-    size: tuple[int, int]
-    """Width and height."""
-    pitch: float
-    """Its pixels per thermal pixel."""
-    rays: FloatArray
-    """Points at depth 1 that the pixels see, shape (height * width, 3)."""
-    inside: npt.NDArray[np.bool_]
-    """Which of them the thermal camera sees too, shape (height, width)."""
+    size: tuple[int, int]  # width and height
+    pitch: float  # its pixels per thermal pixel
+    rays: FloatArray  # points at depth 1 that the pixels see, shape (height * width, 3)
+    inside: npt.NDArray[np.bool_]  # which of them the thermal camera sees too, shape (height, width)
 
     @classmethod
     def of(cls, prepared: PreparedFrames, rig: RigModel, change: FloatArray) -> _View:

@@ -20,10 +20,8 @@ _TINY = 1e-12
 class EdgePoints:
     """Edges of one photograph as points in front of its camera."""
 
-    points: FloatArray
-    """Shape (n, 3), the visible camera's OpenCV axes."""
-    value: npt.NDArray[np.complex64]
-    """Edge values, shape (n,)."""
+    points: FloatArray  # shape (n, 3), the visible camera's OpenCV axes
+    value: npt.NDArray[np.complex64]  # edge values, shape (n,)
 
 
 class ThermalEdges:

@@ -24,8 +24,7 @@ _FROM_LENS, _FROM_FLIR, _FROM_ANGLE, _FROM_USER, _GUESSED = 0.03, 0.06, 0.1, 0.0
 """Standard deviations of the thermal focal length by where it comes from, as shares of it."""
 BASELINE_SIGMA_M = 0.1
 """Standard deviation of the thermal lens's place beside the other one, along each axis, where metres are known, [m]."""
-_BELIEVED_DEG = (3.0, 150.0)
-"""Angles of view that are believed; some cameras state nonsense."""
+_BELIEVED_DEG = (3.0, 150.0)  # angles of view that are believed; some cameras state nonsense
 
 
 def rig_frames(model: SfmModel, frames: Sequence[CaptureFrame]) -> list[RigFrame]:

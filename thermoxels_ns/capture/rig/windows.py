@@ -30,18 +30,14 @@ _BLOCKS = 4
 class WindowDesign:
     """Windows of one photograph as points in front of its camera, with what temperatures are fitted by in each."""
 
-    points: FloatArray
-    """Shape (n, 3), the visible camera's OpenCV axes."""
-    index: IntArray
-    """Which points each window has, shape (windows, k)."""
+    points: FloatArray  # shape (n, 3), the visible camera's OpenCV axes
+    index: IntArray  # which points each window has, shape (windows, k)
     plain: FloatArray
     """Orthonormal basis of weighted planes a + b x + c y, the same in all windows, shape (k, 3)."""
     bright: FloatArray
     """The photograph in every window, orthogonal to the planes and of length 1, weighted, shape (windows, k)."""
-    weight: FloatArray
-    """Square roots of the weights of a window's points, shape (k,)."""
-    trust: FloatArray
-    """How much each window counts, shape (windows,)."""
+    weight: FloatArray  # square roots of the weights of a window's points, shape (k,)
+    trust: FloatArray  # how much each window counts, shape (windows,)
 
     def at_depth(self, depth: FloatArray, distance: FloatArray, farthest: float, sure: float) -> WindowDesign:
         """Move the points from depth 1 to their own and leave windows out that have a point of unknown depth.

@@ -21,10 +21,8 @@ from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 Say = Callable[[str], None]
 _Result = TypeVar("_Result")
 
-_MARK = b"\x1e"
-"""Begins a line that is a message of ours; all other lines are COLMAP's."""
-_LINES_KEPT = 400
-"""Of COLMAP's last words: it adds a stack of calls to the sentence that matters."""
+_MARK = b"\x1e"  # begins a line that is a message of ours; all other lines are COLMAP's
+_LINES_KEPT = 400  # of COLMAP's last words: it adds a stack of calls to the sentence that matters
 _KILLED = -int(getattr(signal, "SIGKILL", 9))
 _FATAL_ONLY = 3
 _FULL_BYTES = 1_000_000

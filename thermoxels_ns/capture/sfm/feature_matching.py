@@ -52,10 +52,8 @@ class PoseOptions:
 class ReducedPhotographs:
     """Photographs as COLMAP gets them, and the database of their features and matches."""
 
-    database: Path
-    """COLMAP's file, made where it does not exist; its folder is written to."""
-    images: Path
-    """Folder of the reduced photographs, all of one size."""
+    database: Path  # COLMAP's file, made where it does not exist; its folder is written to
+    images: Path  # folder of the reduced photographs, all of one size
     frame_of_image: Mapping[str, str]
     """Frame by the name of its photograph in that folder, in the order they were taken."""
     size: tuple[int, int]

@@ -18,13 +18,10 @@ from thermoxels_ns.core.checks import check_positive
 from thermoxels_ns.core.errors import SceneError
 
 _EARTH_RADIUS_M, _FLATTENING = 6378137.0, 1.0 / 298.257223563
-_WORST_GPS = 0.3
-"""Relative standard error above which GPS says nothing of the scale."""
+_WORST_GPS = 0.3  # relative standard error above which GPS says nothing of the scale
 _LEAST_FIXES = 4
-_NEAR_POINTS = 12
-"""Scene points around a pixel that its depth is taken from."""
-_NEAR_SHARE = 0.08
-"""How far they may lie from it, as a share of the photograph's longest side."""
+_NEAR_POINTS = 12  # scene points around a pixel that its depth is taken from
+_NEAR_SHARE = 0.08  # how far they may lie from it, as a share of the photograph's longest side
 _MARKER_DICTIONARY = cv2.aruco.DICT_4X4_50
 _MARKER_ERROR_PX = 2.0
 """Corners of a marker that miss their rays by more than this (median) are no marker at rest, [pixels]."""
@@ -35,20 +32,16 @@ class MetricScale:
     """Metres per unit of the model."""
 
     metres_per_unit: float
-    standard_error: float | None
-    """[m per unit]; None where nobody knows it."""
-    source: str
-    """A sentence."""
+    standard_error: float | None  # [m per unit]; None where nobody knows it
+    source: str  # a sentence
 
 
 @dataclass(frozen=True)
 class MeasuredDistance:
     """Two pixels of one photograph, and how far apart the points that they show are."""
 
-    photograph: str
-    """Name of the frame, or of its photograph."""
-    first: tuple[float, float]
-    """[pixels], x to the right and y down from the upper left corner."""
+    photograph: str  # name of the frame, or of its photograph
+    first: tuple[float, float]  # [pixels], x to the right and y down from the upper left corner
     second: tuple[float, float]
     distance_m: float
     standard_error_m: float | None = None

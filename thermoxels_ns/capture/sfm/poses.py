@@ -21,11 +21,9 @@ from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
 
-MIN_FRAMES = 3
-"""Fewer photographs are no reconstruction."""
+MIN_FRAMES = 3  # fewer photographs are no reconstruction
 _SAID_EVERY = 10
-_GUESSED_FOCAL = 1.0
-"""Of the longest side, where the photograph does not say: a lens of 53 degrees."""
+_GUESSED_FOCAL = 1.0  # of the longest side, where the photograph does not say: a lens of 53 degrees
 _JPEG_QUALITY = 95
 _DATABASE = "features.db"
 
@@ -35,8 +33,7 @@ class Poses:
     """The poses found, and the photographs without one."""
 
     model: SfmModel
-    dropped: Mapping[str, str]
-    """Why, by the frame's name."""
+    dropped: Mapping[str, str]  # why, by the frame's name
 
 
 @dataclass(frozen=True)
@@ -44,8 +41,7 @@ class _Mapped:
     """The largest group of photographs that fit together, and those of smaller groups."""
 
     model: SfmModel
-    elsewhere: Mapping[str, int]
-    """With how many others a frame of a smaller group fits together."""
+    elsewhere: Mapping[str, int]  # with how many others a frame of a smaller group fits together
 
 
 def find_poses(

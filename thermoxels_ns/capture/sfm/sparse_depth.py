@@ -11,8 +11,7 @@ _NEIGHBOURS = 12
 _NEAR_QUANTILE, _FAR_QUANTILE = 0.9, 0.1
 _ONE_SURFACE = 0.04
 """Scatter about a plane, as a share of the inverse depth, up to which points belong to one surface."""
-_SLOPE_RIDGE = 0.1
-"""Holds the slope of a plane through points that lie on a line, or far away on one side."""
+_SLOPE_RIDGE = 0.1  # holds the slope of a plane through points that lie on a line, or far away on one side
 
 
 class SparseDepth:
@@ -49,13 +48,7 @@ class SparseDepth:
 
 
 def _plane(offset: FloatArray, inverse: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Planes through weighted points: inverse depth where the offset is 0, and the scatter about them, shape (n,).
-
-    Args:
-        offset: Places of the points from where the depth is asked for, shape (n, k, 2).
-        inverse: Inverse depths, shape (n, k).
-        weight: 0 leaves a point out, shape (n, k).
-    """
+    """Inverse depth where the offset (n, k, 2) is 0 on planes through weighted points, and their scatter; (n,)."""
     reach = np.sqrt(np.mean(offset**2, axis=(1, 2)))[:, None, None] + 1e-12
     weight = weight / (1.0 + np.sum((offset / reach) ** 2, axis=2))
     total = weight.sum(axis=1)

@@ -17,15 +17,12 @@ from thermoxels_ns.core.units import celsius_to_kelvin
 from thermoxels_ns.mesh.quality.checks import facet_normals
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-UNTAGGED_PATCH = "boundary"
-"""Name of the one patch that a mesh without tags is written with."""
+UNTAGGED_PATCH = "boundary"  # name of the one patch that a mesh without tags is written with
 _REMEDY = "Build the mesh with thermoxels_ns.mesh.build."
 Colouring = Literal["temperature", "photographs"]
 """What the colours of a surface show: temperatures through a colour map, or what the photographs saw."""
-COLOUR_MAP = "inferno"
-"""Colour map of temperatures: perceptually uniform, readable in grey."""
-_DARKEST = 0.1
-"""Share of the colour map left out at its dark end, where shading could not be told from cold."""
+COLOUR_MAP = "inferno"  # colour map of temperatures: perceptually uniform, readable in grey
+_DARKEST = 0.1  # share of the colour map left out at its dark end, where shading could not be told from cold
 _FAR_SIZES = 16.0
 """Farther from the origin than this many times their own size, points lose in single precision what is seen of them."""
 
@@ -34,26 +31,16 @@ _FAR_SIZES = 16.0
 class FileContent:
     """A mesh's arrays, checked, with a temperature for every node and a name for every patch and region."""
 
-    points_m: FloatArray
-    """Nodes, shape (n, 3), [m]."""
-    tets: IntArray
-    """Node indices, shape (t, 4)."""
-    temperature_c: FloatArray
-    """Nodal temperature, shape (n,), [degrees Celsius]."""
-    region: IntArray
-    """Index into `region_names`, shape (t,)."""
-    region_names: tuple[str, ...]
-    """Names of the regions, all different; some may have no tetrahedron."""
-    facets: IntArray
-    """Boundary triangles, shape (f, 3), right-hand normals outwards."""
-    patch: IntArray
-    """Index into `patch_names`, shape (f,)."""
-    patch_names: tuple[str, ...]
-    """Names of the patches, all different; some may have no triangle."""
-    normal: FloatArray
-    """Outward unit normal of the true surface at each boundary triangle, shape (f, 3)."""
-    area_factor: FloatArray
-    """True area that each boundary triangle stands for, over its own, shape (f,)."""
+    points_m: FloatArray  # nodes, shape (n, 3), [m]
+    tets: IntArray  # node indices, shape (t, 4)
+    temperature_c: FloatArray  # nodal temperature, shape (n,), [degrees Celsius]
+    region: IntArray  # index into `region_names`, shape (t,)
+    region_names: tuple[str, ...]  # names of the regions, all different; some may have no tetrahedron
+    facets: IntArray  # boundary triangles, shape (f, 3), right-hand normals outwards
+    patch: IntArray  # index into `patch_names`, shape (f,)
+    patch_names: tuple[str, ...]  # names of the patches, all different; some may have no triangle
+    normal: FloatArray  # outward unit normal of the true surface at each boundary triangle, shape (f, 3)
+    area_factor: FloatArray  # True area that each boundary triangle stands for, over its own, shape (f,)
 
 
 def file_content(mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None = None) -> FileContent:
@@ -175,12 +162,9 @@ def _check_names(name: str, names: Sequence[str]) -> None:
 class Surface:
     """Triangles that use every one of their nodes."""
 
-    points_m: FloatArray
-    """Nodes on the boundary, shape (m, 3), [m]."""
-    triangles: IntArray
-    """Indices into `points_m`, shape (f, 3), right-hand normals outwards."""
-    nodes: IntArray
-    """Number of each node in the mesh, rising, shape (m,)."""
+    points_m: FloatArray  # nodes on the boundary, shape (m, 3), [m]
+    triangles: IntArray  # indices into `points_m`, shape (f, 3), right-hand normals outwards
+    nodes: IntArray  # number of each node in the mesh, rising, shape (m,)
 
 
 def surface_of(points_m: FloatArray, facets: IntArray) -> Surface:

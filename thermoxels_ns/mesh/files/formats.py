@@ -24,14 +24,10 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 class MeshFormat:
     """A way to write a mesh."""
 
-    description: str
-    """What it holds and who reads it, in one line."""
-    write: Callable[..., None]
-    """Writes the files; takes the path, the mesh and `options`."""
-    options: tuple[str, ...] = ("temperature_c",)
-    """Arguments of `write_mesh` that it looks at."""
-    companion: Callable[[Path], Path] | None = None
-    """Names the second file, if the format takes two."""
+    description: str  # what it holds and who reads it, in one line
+    write: Callable[..., None]  # writes the files; takes the path, the mesh and `options`
+    options: tuple[str, ...] = ("temperature_c",)  # arguments of `write_mesh` that it looks at
+    companion: Callable[[Path], Path] | None = None  # names the second file, if the format takes two
     refuse: Callable[[TetMesh], None] | None = None
     """Raises if the format cannot hold a mesh that others can; so an export knows before anything slow runs."""
 

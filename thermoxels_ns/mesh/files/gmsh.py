@@ -15,13 +15,10 @@ from thermoxels_ns.mesh.files.content import FileContent, check_suffix, file_con
 from thermoxels_ns.mesh.quality.face_count import facet_owners
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-TEMPERATURE_VIEW = "temperature_c"
-"""Name of the view of nodal temperatures, [degrees Celsius]."""
+TEMPERATURE_VIEW = "temperature_c"  # name of the view of nodal temperatures, [degrees Celsius]
 
-FACTOR_VIEW = "area_factor"
-"""Name of the view of true area over the triangle's own, for voxel meshes."""
-NORMAL_VIEW = "normal"
-"""Name of the view of the true surface's outward normals, for voxel meshes."""
+FACTOR_VIEW = "area_factor"  # name of the view of true area over the triangle's own, for voxel meshes
+NORMAL_VIEW = "normal"  # name of the view of the true surface's outward normals, for voxel meshes
 
 _LONGEST_NAME = 127
 _TRIANGLE, _TETRAHEDRON = 2, 4

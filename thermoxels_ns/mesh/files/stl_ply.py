@@ -23,8 +23,7 @@ from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _STL_HEADER = b"Surface of a tetrahedral mesh, metres".ljust(80)
-_ROUNDING_NOTICED = 0.01
-"""Share of a triangle's side by which rounding may move its corners."""
+_ROUNDING_NOTICED = 0.01  # share of a triangle's side by which rounding may move its corners
 _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 

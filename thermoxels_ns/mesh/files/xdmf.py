@@ -15,8 +15,7 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 BODY_GRID = "mesh"
 """Name of the grid of tetrahedra: what `read_mesh` of FEniCSx asks for unless told otherwise."""
-FACET_GRID = "facets"
-"""Name of the grid of boundary triangles."""
+FACET_GRID = "facets"  # name of the grid of boundary triangles
 
 _NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UChar"}
 

@@ -22,25 +22,16 @@ class MeshQuality:
     """Figures of a mesh that passed `check_mesh`: positive volumes, conforming, closed boundary."""
 
     num_nodes: int
-    """Nodes."""
     num_tets: int
-    """Tetrahedra."""
     num_facets: int
-    """Boundary triangles."""
-    num_box_facets: int
-    """Boundary triangles where the scene box cuts the solid."""
+    num_box_facets: int  # boundary triangles where the scene box cuts the solid
     num_non_manifold_edges: int
     """Boundary edges shared by more than two boundary triangles: voxels that touch along an edge only."""
-    volume_m3: float
-    """Sum of the tetrahedra's volumes, [m^3]."""
-    area_m2: float
-    """Area of the whole boundary, cuts by the scene box included, [m^2]."""
-    min_tet_volume_m3: float
-    """Volume of the smallest tetrahedron, [m^3]."""
-    min_dihedral_deg: float
-    """Smallest angle between two faces of a tetrahedron, [degrees]."""
-    max_dihedral_deg: float
-    """Largest angle between two faces of a tetrahedron, [degrees]."""
+    volume_m3: float  # sum of the tetrahedra's volumes, [m^3]
+    area_m2: float  # area of the whole boundary, cuts by the scene box included, [m^2]
+    min_tet_volume_m3: float  # volume of the smallest tetrahedron, [m^3]
+    min_dihedral_deg: float  # smallest angle between two faces of a tetrahedron, [degrees]
+    max_dihedral_deg: float  # largest angle between two faces of a tetrahedron, [degrees]
 
 
 def facet_area_vectors(points: FloatArray, facets: IntArray) -> FloatArray:
@@ -157,10 +148,8 @@ def count_twin_nodes(points: FloatArray) -> int:
 
 
 def count_wrong_facets(mesh: TetMesh, faces: Groups) -> int:
-    """Number of triangles to take from and add to `mesh.facets` to get the faces of one owner, normals outwards.
-
-    A triangle turned over counts twice. `faces` is `face_count.group_faces(mesh.tets)`.
-    """
+    """Number of triangles to take from and add to `mesh.facets` (one turned over counts twice) to get the faces of one
+    owner, normals outwards. `faces` is `face_count.group_faces(mesh.tets)`."""
     wanted = boundary_facets(mesh.tets, faces)
     both = np.concatenate([_smallest_first(wanted), _smallest_first(mesh.facets)])
     same = group_pairs(both[:, 0], both[:, 1] * len(mesh.points_m) + both[:, 2])

@@ -12,51 +12,38 @@ BoundaryMode = Literal["voxel", "conforming"]
 DIHEDRAL_BOUNDS_DEG: dict[BoundaryMode, tuple[float, float]] = {"voxel": (45.0, 90.0), "conforming": (10.7, 164.8)}
 """Bounds of the angles between two faces of a tetrahedron, [degrees]: six equal tetrahedra per voxel have angles of 45,
 60 and 90 degrees; for isosurface stuffing see Labelle and Shewchuk (2007)."""
-ANGLE_TOLERANCE_DEG = 1e-6
-"""What rounding may add to an angle, [degrees]."""
+ANGLE_TOLERANCE_DEG = 1e-6  # what rounding may add to an angle, [degrees]
 _BINS_WITHIN_BOUNDS: dict[BoundaryMode, int] = {"voxel": 10, "conforming": 30}
-TEMPERATURE_TOLERANCE_K = 1e-6
-"""What rounding may add to a temperature, [K]."""
+TEMPERATURE_TOLERANCE_K = 1e-6  # what rounding may add to a temperature, [K]
 
 
 @dataclass(frozen=True)
 class Criterion:
     """One quality criterion, and whether a mesh meets it."""
 
-    name: str
-    """Short name, the same for every mesh."""
-    sentence: str
-    """What it asks for."""
-    kept: bool
-    """Whether the mesh meets it."""
-    figure: float
-    """The number that decides."""
-    found: str
-    """The number in words."""
+    name: str  # short name, the same for every mesh
+    sentence: str  # what it asks for
+    kept: bool  # whether the mesh meets it
+    figure: float  # the number that decides
+    found: str  # the number in words
 
 
 @dataclass(frozen=True)
 class Figures:
     """Figures that decide about the criteria."""
 
-    min_volume_m3: float
-    """Smallest signed volume of a tetrahedron, [m^3]."""
-    num_non_positive: int
-    """Tetrahedra whose volume is not above 0."""
+    min_volume_m3: float  # smallest signed volume of a tetrahedron, [m^3]
+    num_non_positive: int  # tetrahedra whose volume is not above 0
     num_mismatches: int
     """Faces with more than two owners, pairs of boundary triangles upon each other, and nodes at one place."""
-    num_open_edges: int
-    """Edges that the boundary's triangles do not pass equally often in both directions."""
-    num_wrong_facets: int
-    """Boundary triangles that are missing, too many or turned over."""
+    num_open_edges: int  # edges that the boundary's triangles do not pass equally often in both directions
+    num_wrong_facets: int  # boundary triangles that are missing, too many or turned over
     dihedral_range_deg: tuple[float, float]
     """Smallest and largest angle between two faces of a tetrahedron, [degrees]."""
     temperature_excess_k: float
     """How far the hottest or coldest node lies outside the observed range, [K]; 0 or less if inside."""
-    share_obtuse: float
-    """Share of tetrahedra with an obtuse angle between two faces, 0 to 1."""
-    share_positive_edges: float
-    """Share of edges whose entry of the stiffness matrix is positive, 0 to 1."""
+    share_obtuse: float  # share of tetrahedra with an obtuse angle between two faces, 0 to 1
+    share_positive_edges: float  # share of edges whose entry of the stiffness matrix is positive, 0 to 1
     angle_rounding_deg: float = 0.0
     """How far rounding of nodes far from the origin may have turned angles, [degrees]."""
 
@@ -65,12 +52,9 @@ class Figures:
 class AngleBins:
     """Bins of one width for a histogram of angles from 0 to 180 degrees; both bounds of the criterion are edges."""
 
-    first_centre_deg: float
-    """Centre of the first bin, [degrees]; the bin may begin below 0."""
-    width_deg: float
-    """Width of each, [degrees]."""
-    number: int
-    """How many; the last may end above 180."""
+    first_centre_deg: float  # centre of the first bin, [degrees]; the bin may begin below 0
+    width_deg: float  # width of each, [degrees]
+    number: int  # how many; the last may end above 180
 
 
 def angle_bins(boundary_mode: BoundaryMode) -> AngleBins:

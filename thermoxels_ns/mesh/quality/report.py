@@ -28,41 +28,29 @@ from thermoxels_ns.mesh.quality.topology import (
 )
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 
-RATIO_BIN = 0.05
-"""Width of the bins of the radius ratio; 20 of them from 0 to 1, the last includes 1."""
+RATIO_BIN = 0.05  # width of the bins of the radius ratio; 20 of them from 0 to 1, the last includes 1
 
 _MOST_COMPONENTS = 20
-_CANCELLED = 1e-9
-"""Sums over an edge below this share of their terms' sizes are 0."""
+_CANCELLED = 1e-9  # sums over an edge below this share of their terms' sizes are 0
 
 
 @dataclass(frozen=True)
 class QualityReport:
     """Figures of a mesh and the criteria it meets."""
 
-    boundary_mode: BoundaryMode
-    """How the boundary was made, by which the criteria differ."""
-    length_unit: str
-    """Unit of the nodes' positions; if it is not "m", [m] below stands for it."""
+    boundary_mode: BoundaryMode  # how the boundary was made, by which the criteria differ
+    length_unit: str  # unit of the nodes' positions; if it is not "m", [m] below stands for it
     num_nodes: int
-    """Nodes."""
     num_tets: int
-    """Tetrahedra."""
     num_edges: int
-    """Edges."""
     num_facets: int
-    """Boundary triangles."""
-    num_box_facets: int
-    """Boundary triangles where the scene box cuts the solid."""
-    volume_m3: float
-    """Sum of the signed volumes, [m^3]."""
-    area_m2: float
-    """Sum of the boundary triangles' areas, [m^2]."""
+    num_box_facets: int  # boundary triangles where the scene box cuts the solid
+    volume_m3: float  # sum of the signed volumes, [m^3]
+    area_m2: float  # sum of the boundary triangles' areas, [m^2]
     true_area_m2: float | None
     """Area of the surface that the boundary triangles stand for: each times its area factor, [m^2]; None for a mesh
     whose boundary was not tagged."""
-    edge_length_m: tuple[float, float, float]
-    """Shortest, mean and longest edge, [m]."""
+    edge_length_m: tuple[float, float, float]  # shortest, mean and longest edge, [m]
     dihedral_range_deg: tuple[float, float]
     """Smallest and largest angle between two faces of a tetrahedron, [degrees]."""
     dihedral_counts: tuple[int, ...]
@@ -71,30 +59,23 @@ class QualityReport:
     """Smallest and largest of 3 r / R with the radii of the inscribed and the circumscribed sphere, 1 at best; 0 where
     the volume is not above 0."""
     radius_ratio_mean: float
-    """Mean radius ratio."""
     radius_ratio_counts: tuple[int, ...]
     """Number of tetrahedra by radius ratio in bins of 0.05 from 0 to 1; the last includes 1."""
-    share_obtuse: float
-    """Share of tetrahedra with an obtuse angle between two faces, 0 to 1."""
+    share_obtuse: float  # share of tetrahedra with an obtuse angle between two faces, 0 to 1
     share_positive_edges: float
     """Share of edges whose off-diagonal entry of the linear stiffness matrix, summed over the tetrahedra around the
     edge at conductivity 1, is positive: there the discrete maximum principle can fail, 0 to 1."""
-    bodies_by_node: int
-    """Parts of the mesh that share no node."""
+    bodies_by_node: int  # parts of the mesh that share no node
     bodies_by_face: int
     """Parts of the mesh between which no heat is conducted through a face: they share nodes or edges at most."""
-    euler_characteristic: int
-    """Vertices - edges + triangles of the boundary."""
+    euler_characteristic: int  # vertices - edges + triangles of the boundary
     genus: int | None
     """Handles of all boundary components together; None if one of them is not a closed manifold."""
     components: tuple[SurfaceComponent, ...]
     """Connected components of the boundary (triangles that share edges), largest first."""
-    num_non_manifold_edges: int
-    """Boundary edges with more than two boundary triangles."""
-    num_non_manifold_vertices: int
-    """Boundary vertices whose triangles are not one fan."""
-    criteria: tuple[Criterion, ...]
-    """Quality criteria of such a boundary, and whether this mesh meets them."""
+    num_non_manifold_edges: int  # boundary edges with more than two boundary triangles
+    num_non_manifold_vertices: int  # boundary vertices whose triangles are not one fan
+    criteria: tuple[Criterion, ...]  # quality criteria of such a boundary, and whether this mesh meets them
 
     @property
     def num_cavities(self) -> int:

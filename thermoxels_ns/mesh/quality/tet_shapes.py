@@ -9,12 +9,10 @@ import numpy as np
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 
-_CHUNK = 1 << 14
-"""Tetrahedra at a time: what is worked on stays in the processor's cache."""
+_CHUNK = 1 << 14  # tetrahedra at a time: what is worked on stays in the processor's cache
 _FACE_PAIRS = ((2, 3), (1, 3), (1, 2), (0, 3), (0, 2), (0, 1))
 """Faces (by the node opposite) that meet in edge e of `face_count.TET_EDGES`."""
-_RIGHT_ANGLE = 1e-9
-"""Cosines below this are those of a right angle, up to rounding."""
+_RIGHT_ANGLE = 1e-9  # cosines below this are those of a right angle, up to rounding
 _FAR_SIZES = 16.0
 """Farther from the origin than this many times its own size, a mesh has nodes whose rounding counts."""
 _ANGLE_PER_ROUNDING = 4.0
@@ -29,10 +27,8 @@ class TetShapes:
     """Vectors from node 0 to nodes 1, 2 and 3, each of shape (3, t), [m]."""
     normals: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
     """Inward normal of the face opposite each node, twice the face's area long, each of shape (3, t), [m^2]."""
-    six_volumes: FloatArray
-    """Six times the signed volume, shape (t,), [m^3]."""
-    rounding: float = 0.0
-    """How far rounding may have moved nodes, see `node_rounding`, [m]."""
+    six_volumes: FloatArray  # six times the signed volume, shape (t,), [m^3]
+    rounding: float = 0.0  # how far rounding may have moved nodes, see `node_rounding`, [m]
 
     @property
     def volumes(self) -> FloatArray:

@@ -17,9 +17,7 @@ class SurfaceComponent:
     """Triangles of the boundary that hang together by edges."""
 
     num_triangles: int
-    """Triangles."""
-    euler_characteristic: int
-    """Vertices - edges + triangles."""
+    euler_characteristic: int  # vertices - edges + triangles
     genus: int | None
     """Number of handles, (2 - Euler characteristic) / 2; None where the component is not a closed manifold."""
     is_cavity: bool
@@ -32,14 +30,11 @@ class SurfaceTopology:
 
     num_open_edges: int
     """Edges whose triangles do not pass them equally often in both directions; 0: the surface is closed."""
-    num_non_manifold_edges: int
-    """Edges with more than two triangles: bodies that touch along an edge."""
+    num_non_manifold_edges: int  # edges with more than two triangles: bodies that touch along an edge
     num_non_manifold_vertices: int
     """Vertices whose triangles are not one fan: bodies that touch at a point, and the ends of non-manifold edges."""
-    euler_characteristic: int
-    """Vertices - edges + triangles of the whole surface."""
-    components: tuple[SurfaceComponent, ...]
-    """Largest first."""
+    euler_characteristic: int  # vertices - edges + triangles of the whole surface
+    components: tuple[SurfaceComponent, ...]  # largest first
 
 
 def group_sides(facets: IntArray) -> Groups:
@@ -61,10 +56,7 @@ def tets_across_faces(face_groups: Groups) -> IntArray:
 def surface_topology(points: FloatArray, facets: IntArray, sides: Groups | None = None) -> SurfaceTopology:
     """Count the components of a triangulated surface, their handles, and where it is no manifold.
 
-    Args:
-        points: Nodes, shape (n, 3), [m].
-        facets: Triangles, shape (f, 3), right-hand normal out of the body.
-        sides: `group_sides(facets)` where it is already known.
+    Nodes (n, 3), [m]; triangles (f, 3), right-hand normal out of the body; `sides` is `group_sides(facets)` if known.
     """
     sides = group_sides(facets) if sides is None else sides
     uses = sides.sizes

@@ -11,8 +11,7 @@ from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 
-MOST_CAMERAS = 128
-"""More cameras than this are thinned out evenly, in their order."""
+MOST_CAMERAS = 128  # more cameras than this are thinned out evenly, in their order
 SEEN_SHARE = 0.1
 """A voxel is seen if at least this share of the cameras whose image holds it, and at least one, has a free line to it:
 a reconstruction has pinholes that single cameras look through."""
@@ -26,8 +25,7 @@ class CameraCounts:
 
     in_image: npt.NDArray[np.uint8]
     """Number of cameras whose image holds the voxel's centre, shape `lattice.cell_shape`."""
-    free: npt.NDArray[np.uint8]
-    """Number of them with a free line to it; the voxel itself may be solid."""
+    free: npt.NDArray[np.uint8]  # number of them with a free line to it; the voxel itself may be solid
 
     @property
     def seen(self) -> BoolArray:

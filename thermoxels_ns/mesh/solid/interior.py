@@ -28,8 +28,7 @@ STRAY_SHARE = 0.005
 """Share of a body's solid voxels that may lie beyond each side of the box that bounds its hull: a few strays below a
 slab would make the underside that no camera sees as deep as the deepest of them."""
 _fast_length = cast(Callable[[int], int], fft.next_fast_len)
-MARGIN = 0.25
-"""The potential is zero this share of the lattice's size beyond it, on each side."""
+MARGIN = 0.25  # the potential is zero this share of the lattice's size beyond it, on each side
 THINNEST_GROWN = 1.5
 """A wall thinner than this has the middle of no voxel behind the seen one, so none is added, [voxels]."""
 
@@ -38,12 +37,10 @@ THINNEST_GROWN = 1.5
 class Interior:
     """Empty voxels that lie inside a solid."""
 
-    enclosed: BoolArray
-    """Voxels of cavities: no way out through voxel faces, and no camera in them."""
+    enclosed: BoolArray  # voxels of cavities: no way out through voxel faces, and no camera in them
     hidden: BoolArray
     """Other voxels that cameras cannot look into, behind the surface and within the convex hull of a body."""
-    rooms: int
-    """Cavities left empty because a camera stands in them."""
+    rooms: int  # cavities left empty because a camera stands in them
 
 
 def interior(cells: BoolArray, lattice: Lattice, views: Views | None, seal: int) -> Interior:
@@ -207,10 +204,8 @@ def winding_number(solid: BoolArray, air: BoolArray) -> Float32Array:
 
 
 def _jumps(side: npt.NDArray[np.int8], axis: int) -> Float32Array:
-    """Jump from each block to the next along an axis: 1 where all faces are solid before air, -1 if air before solid.
-
-    A face in the middle of a block counts half at each of the block's ends.
-    """
+    """Jump from each block to the next along an axis: 1 where all faces are solid before air, -1 air before solid."""
+    # A face in the middle of a block counts half at each of the block's ends.
     near, far = [slice(None)] * 3, [slice(None)] * 3
     near[axis], far[axis] = slice(None, -1), slice(1, None)
     first, second = side[tuple(near)], side[tuple(far)]

@@ -13,20 +13,15 @@ from thermoxels_ns.mesh.solid.morphology import bounding_box
 from thermoxels_ns.mesh.solid.surface_ramp import surface_ramp
 from thermoxels_ns.mesh.solid.volume_keeping import keep_volume
 
-DEEP_QUANTILE = 0.95
-"""Before smoothing, a voxel as dense as this quantile of the dense ones has level 1 ..."""
-DEEP_RATIOS = (2.0, 100.0)
-"""... but that density is kept within these multiples of the threshold."""
+DEEP_QUANTILE = 0.95  # before smoothing, a voxel as dense as this quantile of the dense ones has level 1 ..
+DEEP_RATIOS = (2.0, 100.0)  # ... but that density is kept within these multiples of the threshold.
 LEAST_LEVEL = 0.02
 """No voxel is nearer to 0 than this before smoothing: a surface never passes through a voxel's centre."""
-LEAST_SMOOTH_LEVEL = 0.005
-"""The same where density is a smooth ramp."""
-LEAST_SHARE = 0.25
-"""Smoothing leaves at least this share of a voxel's level, with its sign."""
+LEAST_SMOOTH_LEVEL = 0.005  # the same where density is a smooth ramp
+LEAST_SHARE = 0.25  # smoothing leaves at least this share of a voxel's level, with its sign
 MARGIN = 4
 """Voxels farther from the solid than this, along an axis, have level -1 without a look at their density."""
-LEAST_SHARE_THIN = 0.5
-"""The same in walls and gaps one voxel thick; they keep their thickness."""
+LEAST_SHARE_THIN = 0.5  # the same in walls and gaps one voxel thick; they keep their thickness
 
 
 def level_of(

@@ -19,13 +19,11 @@ ROUGHNESS = (0.04, 0.08)
 ROUGH_SHARE = (0.5, 0.8)
 """A ramp is believed where fewer of the voxels around than the first share are rough, not at all from the second on.
 At sharp edges some always are."""
-WINDOW = 7
-"""Edge of the cube in which they are counted, [voxels]."""
+WINDOW = 7  # edge of the cube in which they are counted, [voxels]
 REACH = 1.5
 """The level reaches 1 no nearer to the surface than this, [voxels]; what ends nearer makes the mesh rough."""
 
-_FULLER = 0.01
-"""The logarithm is taken unless the density itself bends less by more than this."""
+_FULLER = 0.01  # the logarithm is taken unless the density itself bends less by more than this
 
 
 @dataclass(frozen=True)
@@ -34,20 +32,16 @@ class SurfaceRamp:
 
     level: Float32Array
     """In [-1, 1], about linear in the distance to the surface; its sign may be wrong where there is no ramp."""
-    belief: Float32Array
-    """From 0, where the density is rough or jumps, to 1."""
+    belief: Float32Array  # from 0, where the density is rough or jumps, to 1
 
 
 @dataclass(frozen=True)
 class _Crossings:
-    """How a function of the density runs along the axes through the surface: medians over all pairs of neighbours of
-    which one is solid.
-    """
+    """How a function of the density runs through the surface: medians over all pairs of a solid and an empty voxel."""
 
     bend: float
     """How much steeper it is outside than inside, as a share of its slope between the two, without its sign."""
-    straightness: float
-    """Mean slope on either side, as a share of the slope between the two."""
+    straightness: float  # mean slope on either side, as a share of the slope between the two
 
 
 def surface_ramp(

@@ -13,8 +13,7 @@ from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
 
 FALLBACK_OPTICAL_DEPTH = 0.5
 """Density times voxel edge from which on a voxel is solid where rays say nothing: it takes 39 % of the light."""
-SHARE_OF_RAYS = 0.95
-"""Share of the rays that end on something that are to meet a solid voxel where they end."""
+SHARE_OF_RAYS = 0.95  # share of the rays that end on something that are to meet a solid voxel where they end
 OPTICAL_DEPTH_BOUNDS = (0.02, math.log(2.0))
 """The automatic threshold times the voxel edge stays within these. Below the first a ray needs 35 voxels to lose half
 of its light: half-transparent space, no surface. From the second on a single voxel stops half of it: a surface,
@@ -27,8 +26,7 @@ that ends all rays that come it is 1; where light leaked past a surface, or was 
 LEAST_WEIGHT = 0.5
 """Weight that rays spent in a voxel, [rays], below which it does not tell whether any end there: a ray that ends in a
 voxel spends about half of its weight there. Where rays are few, density alone decides."""
-FEWEST_RAYS = 100
-"""With fewer rays than this that end on something, there is no evidence to choose by."""
+FEWEST_RAYS = 100  # with fewer rays than this that end on something, there is no evidence to choose by
 
 
 @dataclass(frozen=True)
@@ -37,10 +35,8 @@ class Threshold:
 
     cells: BoolArray
     """True where a voxel is dense enough, not empty and not ruled out by rays, shape `lattice.cell_shape`."""
-    density: float
-    """Density at the voxel centre from which on it is dense enough, [1 / world unit]."""
-    explanation: str
-    """Which rule chose it, and why, in one or two sentences."""
+    density: float  # density at the voxel centre from which on it is dense enough, [1 / world unit]
+    explanation: str  # which rule chose it, and why, in one or two sentences
 
 
 def automatic_threshold(snapshot: GridSnapshot, density: FloatArray) -> Threshold:

@@ -12,16 +12,13 @@ from thermoxels_ns.mesh.solid.surface_ramp import near_surface
 UNNOTICED = 0.12
 """Up to this share of the solid (for gaps: of the empty space) within a voxel may be lost. To that much, edges of large
 bodies and single bumps of noise are rounded off, which is what smoothing is for."""
-ROUNDS = 5
-"""How often what is missing is looked for and made up."""
+ROUNDS = 5  # how often what is missing is looked for and made up
 
-_RATE = 1.5
-"""Share of what is missing that each round makes up, if all of the surface moves alike."""
+_RATE = 1.5  # share of what is missing that each round makes up, if all of the surface moves alike
 _LEAST_SLOPE = 0.6
 """Levels change by at least this much per voxel of shift, [1 / voxel]; else a speck that smoothing left nearly nothing
 of would never grow."""
-_CHUNK = 1 << 14
-"""Voxels at a time: what is worked on stays in the processor's cache."""
+_CHUNK = 1 << 14  # voxels at a time: what is worked on stays in the processor's cache
 
 _AROUND = np.indices((3, 3, 3)).reshape(3, 27).T - 1
 
@@ -113,10 +110,8 @@ def _wanted(sharp: Float32Array, index: IntArray, strides: IntArray) -> tuple[Fl
 class _Found:
     """What the trilinear level makes of some voxels, arrays of shape (n,)."""
 
-    share: Float32Array
-    """Solid share, 0 to 1."""
-    slope: Float32Array
-    """Mean slope, [1 / voxel]."""
+    share: Float32Array  # solid share, 0 to 1
+    slope: Float32Array  # mean slope, [1 / voxel]
 
 
 def _found(levels: Float32Array, index: IntArray, steps: IntArray) -> _Found:

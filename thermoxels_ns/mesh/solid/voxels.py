@@ -99,31 +99,23 @@ _BOUNDS: dict[str, tuple[Any, float, float, float | None]] = {
 class SolidStep:
     """What one step on the way from density to solid did."""
 
-    name: str
-    """Which step: threshold, close gaps, small bodies, largest body, wall or interior."""
-    added: int
-    """Voxels that it made solid."""
-    removed: int
-    """Voxels that it made empty."""
-    remark: str
-    """How and why, in a sentence or two."""
+    name: str  # threshold, close gaps, small bodies, largest body, wall or interior
+    added: int  # voxels that it made solid
+    removed: int  # voxels that it made empty
+    remark: str  # how and why, in a sentence or two
 
 
 @dataclass(frozen=True)
 class SolidCells:
     """The solid voxels and how they were found."""
 
-    cells: BoolArray
-    """True where a voxel is solid, shape (nx-1, ny-1, nz-1); at least one is."""
+    cells: BoolArray  # True where a voxel is solid, shape (nx-1, ny-1, nz-1); at least one is
     level: Float32Array
     """Above 0 in solid voxels, below 0 in empty ones, in [-1, 1]; its trilinear zero between voxel centres is the
     surface. Shape of `cells`."""
-    threshold: float
-    """Density at voxel centres from which on a voxel counted as solid, [1 / world unit]."""
-    explanation: str
-    """Which rule chose the threshold, and why."""
-    steps: tuple[SolidStep, ...]
-    """What each step did, in order; the first is the threshold."""
+    threshold: float  # density at voxel centres from which on a voxel counted as solid, [1 / world unit]
+    explanation: str  # which rule chose the threshold, and why
+    steps: tuple[SolidStep, ...]  # what each step did, in order; the first is the threshold
     component_sizes: IntArray
     """Voxels in each body once gaps are closed, largest first; they touch by nothing, or (`largest_component`) by no
     face."""
@@ -138,13 +130,9 @@ def select_solid(
 ) -> SolidCells:
     """Choose the solid voxels of a trained field, by the density at their centres.
 
-    A voxel without density is solid only if a step after the threshold makes it so.
+    A voxel without density is solid only if a step after the threshold makes it so. Only a wall thickness needs
+    `metres_per_world_unit`; `makes_up_volume` as in `level_of`.
 
-    Args:
-        snapshot: The trained field on its corner lattice.
-        selection: Threshold and what to do with gaps, floaters and interiors.
-        metres_per_world_unit: Length of one unit of the lattice's world, [m]; only a wall thickness needs it.
-        makes_up_volume: As in `level_of`.
 
     Raises:
         MeshError: No voxel is solid, density does not tell solid from empty, or a wall thickness is asked for but the

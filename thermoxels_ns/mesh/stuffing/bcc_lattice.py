@@ -17,8 +17,7 @@ _DIAGONALS = (np.arange(8)[:, None] >> np.array([2, 1, 0]) & 1) - 0.5
 
 DIRECTIONS: FloatArray = np.concatenate([_AXES, _DIAGONALS])
 """Steps to the 14 neighbours, shape (14, 3), [voxels]: +x, -x, +y, -y, +z, -z, then the diagonals (---) to (+++)."""
-LENGTHS: FloatArray = np.linalg.norm(DIRECTIONS, axis=1)
-"""Lengths of the 14 edges, [voxels]."""
+LENGTHS: FloatArray = np.linalg.norm(DIRECTIONS, axis=1)  # lengths of the 14 edges, [voxels]
 OPPOSITE: IntArray = np.array([1, 0, 3, 2, 5, 4, 13, 12, 11, 10, 9, 8, 7, 6])
 """Number of the direction that points the other way, shape (14,)."""
 NUM_DIRECTIONS = 14
@@ -42,10 +41,8 @@ class BccLattice:
     level: npt.NDArray[np.floating]
     """Level of every point: the padded centres, then the padded corners; above 0 is solid. Points above 0 have all
     their neighbours in the array and lie strictly inside the box."""
-    shape: tuple[int, int, int]
-    """Shape of each of the two padded blocks."""
-    first_cell: IntArray
-    """Index of the voxel whose centre has index (1, 1, 1) in its block."""
+    shape: tuple[int, int, int]  # shape of each of the two padded blocks
+    first_cell: IntArray  # index of the voxel whose centre has index (1, 1, 1) in its block
 
     @property
     def num_centres(self) -> int:

@@ -176,14 +176,11 @@ def _at_all_corners(corners: BoolArray) -> BoolArray:
 class _Cubes:
     """The cubes of one size, in arrays with one more cube on each side."""
 
-    size: int
-    """Edge of a cube, [voxels]."""
-    whole: BoolArray
-    """True where nothing inside the cube is smaller."""
+    size: int  # edge of a cube, [voxels]
+    whole: BoolArray  # True where nothing inside the cube is smaller
     joined: BoolArray
     """True where the cube is part of a larger one, which is twice as large wherever a single one touches it."""
-    single: BoolArray
-    """True where the cube is one of the octree: whole, but not joined."""
+    single: BoolArray  # True where the cube is one of the octree: whole, but not joined
 
 
 def _each_size(octree: tuple[BoolArray, ...], shape: tuple[int, ...]) -> Iterator[_Cubes]:
@@ -203,16 +200,11 @@ def _each_size(octree: tuple[BoolArray, ...], shape: tuple[int, ...]) -> Iterato
 class _Points:
     """Where in the lattice the points of cubes of one size are, and those of their faces across one axis."""
 
-    origin: int
-    """Flat index of the lowest corner of cube (0, 0, 0)."""
-    per_cube: IntArray
-    """Flat steps from a cube to the next along x, y, z."""
-    centre: int
-    """Flat step from a cube's lowest corner to its centre."""
-    ahead: int
-    """Flat step from a cube to the one ahead: one edge along the axis."""
-    corners: IntArray
-    """Flat steps from a cube's lowest corner to the corners of the face behind, shape (4,)."""
+    origin: int  # flat index of the lowest corner of cube (0, 0, 0)
+    per_cube: IntArray  # flat steps from a cube to the next along x, y, z
+    centre: int  # flat step from a cube's lowest corner to its centre
+    ahead: int  # flat step from a cube to the one ahead: one edge along the axis
+    corners: IntArray  # flat steps from a cube's lowest corner to the corners of the face behind, shape (4,)
 
     @classmethod
     def around(cls, lattice: BccLattice, first: IntArray, axis: int, size: int) -> _Points:

@@ -18,46 +18,32 @@ LEAST_TURN_DEG = 50.0
 TURN_OVER_SPREAD = 8.0
 """They differ by this many times the spread of the normals in either: 3.5 is a pipe, 15 the rim of a cylinder."""
 
-_FLAT_DEG = 8.0
-"""A node is flat if the normals around it spread by less than this (root mean square)."""
+_FLAT_DEG = 8.0  # a node is flat if the normals around it spread by less than this (root mean square)
 _LEAST_FLAT_SHARE = 0.08
 """Nodes are looked at where flat triangles are at least this share of the surface around. At clean edges it is above
 0.1, on most of a noisy surface below 0.05."""
-_SHARE_RINGS = 8
-"""Rings of triangles over which that share is averaged."""
-_REACH = 3.0
-"""Planes are made of flat triangles this near, [voxels] ..."""
-_NEAREST = 48
-"""... and of no more than this many of them ..."""
-_FARTHEST = 1.2
-"""... whose own plane passes the node within this distance, [voxels]."""
-_LEAST_FACETS = 3
-"""No plane is made of fewer triangles."""
-_SPREAD_DEG = 9.0
-"""Most that the normals in one plane may spread (root mean square)."""
-_OFFSET_SPREAD = 0.2
-"""Most that triangles in one plane may be off it, [voxels] (root mean square)."""
-_CHUNK = 1 << 10
-"""Nodes at a time: what is worked on stays in the processor's cache."""
+_SHARE_RINGS = 8  # rings of triangles over which that share is averaged
+_REACH = 3.0  # planes are made of flat triangles this near, [voxels] ..
+_NEAREST = 48  # ... and of no more than this many of them ...
+_FARTHEST = 1.2  # ... whose own plane passes the node within this distance, [voxels].
+_LEAST_FACETS = 3  # no plane is made of fewer triangles
+_SPREAD_DEG = 9.0  # most that the normals in one plane may spread (root mean square)
+_OFFSET_SPREAD = 0.2  # most that triangles in one plane may be off it, [voxels] (root mean square)
+_CHUNK = 1 << 10  # nodes at a time: what is worked on stays in the processor's cache
 
 
 @dataclass(frozen=True)
 class Surface:
     """The boundary without what lies on the border of the lattice."""
 
-    points: FloatArray
-    """All nodes, shape (n, 3)."""
-    facets: IntArray
-    """Triangles, shape (f, 3)."""
-    areas: FloatArray
-    """Shape (f,)."""
-    normals: FloatArray
-    """Unit normals, shape (f, 3)."""
+    points: FloatArray  # all nodes, shape (n, 3)
+    facets: IntArray  # triangles, shape (f, 3)
+    areas: FloatArray  # shape (f,)
+    normals: FloatArray  # unit normals, shape (f, 3)
     node_normals: FloatArray
     """Mean normals of the triangles around each node, weighted by area, not of unit length: shorter where they differ,
     0 where there are none. Shape (n, 3)."""
-    on_border: BoolArray
-    """True for nodes on the border of the lattice, shape (n,)."""
+    on_border: BoolArray  # True for nodes on the border of the lattice, shape (n,)
 
     @classmethod
     def of(cls, solid: StuffedSolid) -> Surface:
@@ -97,16 +83,11 @@ class Surface:
 class Planes:
     """None, two or three planes beside each node."""
 
-    nodes: IntArray
-    """Node numbers, shape (m,)."""
-    there: BoolArray
-    """Which of them there are, shape (m, 3)."""
-    normals: FloatArray
-    """Unit normals, shape (m, 3, 3)."""
-    distances: FloatArray
-    """How far the node lies below each plane, [voxels], shape (m, 3)."""
-    centres: FloatArray
-    """Middle of the triangles that lie in it, from the node, shape (m, 3, 3)."""
+    nodes: IntArray  # node numbers, shape (m,)
+    there: BoolArray  # which of them there are, shape (m, 3)
+    normals: FloatArray  # unit normals, shape (m, 3, 3)
+    distances: FloatArray  # how far the node lies below each plane, [voxels], shape (m, 3)
+    centres: FloatArray  # middle of the triangles that lie in it, from the node, shape (m, 3, 3)
 
 
 def edge_planes(surface: Surface) -> Planes:

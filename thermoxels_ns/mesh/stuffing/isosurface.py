@@ -34,12 +34,9 @@ class StuffedSolid:
 
     points: FloatArray
     """Nodes, shape (n, 3), all different and all used; each coordinate is from 0 to the number of voxels."""
-    tets: IntArray
-    """Node numbers, shape (t, 4), positively oriented."""
-    facets: IntArray
-    """Boundary triangles, shape (f, 3), right-hand normal out of the solid."""
-    on_surface: BoolArray
-    """True for nodes of boundary triangles, shape (n,)."""
+    tets: IntArray  # node numbers, shape (t, 4), positively oriented
+    facets: IntArray  # boundary triangles, shape (f, 3), right-hand normal out of the solid
+    on_surface: BoolArray  # True for nodes of boundary triangles, shape (n,)
     on_box: BoolArray
     """True for boundary triangles on the border of the voxel lattice, exactly on its plane, shape (f,)."""
 
@@ -119,10 +116,8 @@ def _checked(level: npt.NDArray) -> npt.NDArray[np.floating]:
 class _Nodes:
     """The nodes: points inside that have cuts, other points inside, points on the surface, cuts."""
 
-    points: FloatArray
-    """Positions, shape (n, 3)."""
-    of_point: npt.NDArray[np.integer]
-    """Node number of every lattice point, -1 where it is no node."""
+    points: FloatArray  # positions, shape (n, 3)
+    of_point: npt.NDArray[np.integer]  # node number of every lattice point, -1 where it is no node
     of_cut: npt.NDArray[np.integer]
     """Node numbers of the cuts on the 14 edges of the first nodes, -1 where no cut is."""
 
@@ -160,12 +155,9 @@ def _number_nodes(lattice: BccLattice, warped: WarpedLattice, interior: CoarseIn
 class _Bundles:
     """Some of the voxel faces of one axis, each with the four lattice tetrahedra around it."""
 
-    points: IntArray
-    """Flat lattice indices of the six points of each bundle, shape (6, b)."""
-    sides: IntArray
-    """Flat steps from a centre to the one beyond each side of the face, shape (4,)."""
-    directions: IntArray
-    """Lattice direction of each edge of a bundle, there and back, shape (13, 2)."""
+    points: IntArray  # flat lattice indices of the six points of each bundle, shape (6, b)
+    sides: IntArray  # flat steps from a centre to the one beyond each side of the face, shape (4,)
+    directions: IntArray  # lattice direction of each edge of a bundle, there and back, shape (13, 2)
 
 
 def _solid_bundles(

@@ -17,19 +17,16 @@ from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid
 ANGLES_DEG = (13.0, 160.0)
 """No move is made that leaves a dihedral angle outside this range. It is narrower than the range of stuffing itself,
 and wins back nearly as much: with 10.9 to 163.8 degrees the area of tilted boxes would be nearer by 0.05 %."""
-LONGEST_MOVE = 1.0
-"""Nodes farther than this from the edge stay, [voxels]."""
+LONGEST_MOVE = 1.0  # nodes farther than this from the edge stay, [voxels]
 
 _LEAST_DETERMINANT = 0.15
 """Smallest determinant of the inner products of the normals of two or three planes; two that meet at 157 degrees have
 it. Below, where they meet is uncertain."""
-_WRONG_SIDE = 0.15
-"""How far a node may seem to lie beyond a plane of its edge, [voxels]."""
+_WRONG_SIDE = 0.15  # how far a node may seem to lie beyond a plane of its edge, [voxels]
 _CLEARANCE = 2.5
 """Nodes do not move towards a facing surface nearer than this, [voxels], so the two do not cross: both may move by
 `LONGEST_MOVE`, and triangles are half a voxel wide."""
-_ONE_CORNER = 0.5
-"""Corners that two nodes could move to are the same if they are this near, [voxels]."""
+_ONE_CORNER = 0.5  # corners that two nodes could move to are the same if they are this near, [voxels]
 
 
 def sharpen(solid: StuffedSolid, shape: tuple[int, ...]) -> StuffedSolid:
@@ -64,10 +61,8 @@ def sharpen(solid: StuffedSolid, shape: tuple[int, ...]) -> StuffedSolid:
 class _Moves:
     """Where nodes could move to, those to be tried first in front."""
 
-    node: IntArray
-    """Node numbers, shape (m,); a node may have several places to go to."""
-    to: FloatArray
-    """Positions, shape (m, 3)."""
+    node: IntArray  # node numbers, shape (m,); a node may have several places to go to
+    to: FloatArray  # positions, shape (m, 3)
     corner: IntArray
     """Moves with the same number, if it is not negative, lead to the same corner of the body; shape (m,)."""
 
@@ -136,11 +131,9 @@ def _clear(surface: Surface, moves: _Moves) -> BoolArray:
 
 
 def _carry_out(points: FloatArray, tets: IntArray, moves: _Moves) -> FloatArray:
-    """Make one move after another if the tetrahedra around the node stay sound.
-
-    A move may be made at once with others if it is the first in the order of all that wait for the tetrahedra around
-    its node; so the result is that of making them one by one.
-    """
+    """Make one move after another if the tetrahedra around the node stay sound."""
+    # A move may be made at once with others if it is the first in the order of all that wait for the tetrahedra around
+    # its node; so the result is that of making them one by one.
     touched = np.zeros(len(points), dtype=bool)
     touched[moves.node] = True
     used = touched[tets[:, 0]]

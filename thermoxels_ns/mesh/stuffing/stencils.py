@@ -51,14 +51,11 @@ class StencilTable:
     The same numbers serve the faces of all three axes: nothing changes when x, y, z are turned into y, z, x.
     """
 
-    tets: IntArray
-    """Bundle numbers, positively oriented, shape (t, 4)."""
-    tet_start: IntArray
-    """Shape (730,)."""
+    tets: IntArray  # bundle numbers, positively oriented, shape (t, 4)
+    tet_start: IntArray  # shape (730,)
     facets: IntArray
     """Bundle numbers of triangles on the surface, right-hand normal out of the solid, shape (f, 3)."""
-    facet_start: IntArray
-    """Shape (730,)."""
+    facet_start: IntArray  # shape (730,)
     facet_behind: IntArray
     """-1: always on the boundary. 4 * c + s: only if the centre beyond side s, seen from centre c (0 or 1), is not
     inside the solid, because the lattice tetrahedron on the other side is then empty. Shape (f,)."""

@@ -23,11 +23,9 @@ levels then goes down to 9.6 degrees.
 
 
 def _contractible_links() -> BoolArray:
-    """For every set of neighbours, as 14 bits: is what the lattice spans between them one piece without holes?
-
-    The neighbours of a point span a sphere of 24 triangles. A part of a sphere can be shrunk to a point if neither it
-    nor the rest of the sphere is empty or in several pieces.
-    """
+    """For every set of neighbours, as 14 bits: is what the lattice spans between them one piece without holes?"""
+    # The neighbours of a point span a sphere of 24 triangles. A part of a sphere can be shrunk to a point if neither it
+    # nor the rest of the sphere is empty or in several pieces.
     steps = DIRECTIONS[:, None, :] - DIRECTIONS[None, :, :]
     joined = (np.abs(steps[:, :, None, :] - DIRECTIONS).max(axis=-1) < 0.25).any(axis=-1)
     around = joined @ (1 << np.arange(NUM_DIRECTIONS))
@@ -52,14 +50,10 @@ class WarpedLattice:
 
     sign: npt.NDArray[np.int8]
     """+1 inside the solid, 0 on its surface, -1 outside, one per point of the lattice."""
-    moved: IntArray
-    """Points that moved, shape (m,)."""
-    moved_to: FloatArray
-    """Where they are now, fractional corner indices, shape (m, 3)."""
-    inner: IntArray
-    """Points with sign +1 that are not buried, ascending; shape (p,)."""
-    cut_points: IntArray
-    """Those of them that have a cut edge, ascending; shape (s,)."""
+    moved: IntArray  # points that moved, shape (m,)
+    moved_to: FloatArray  # where they are now, fractional corner indices, shape (m, 3)
+    inner: IntArray  # points with sign +1 that are not buried, ascending; shape (p,)
+    cut_points: IntArray  # those of them that have a cut edge, ascending; shape (s,)
     cuts: FloatArray
     """How far along each of their edges the surface is, as a share of the edge, NaN where no cut is; shape (s, 14)."""
 
@@ -137,12 +131,10 @@ def _cut_shares(lattice: BccLattice, sign: npt.NDArray[np.int8], points: IntArra
 
 
 def _move_onto_surface(lattice: BccLattice, sign: npt.NDArray[np.int8], points: IntArray, own: int) -> BoolArray:
-    """Set the sign of points to 0 where that keeps the topology of all points of sign `own`; tell which.
-
-    Taking a point away leaves the topology as it is if its neighbours of the same sign can be shrunk to a point. No
-    two points of one of the four classes (centre or corner, even or odd sum of indices) are neighbours, so each class
-    may be decided at once.
-    """
+    """Set the sign of points to 0 where that keeps the topology of all points of sign `own`; tell which."""
+    # Taking a point away leaves the topology as it is if its neighbours of the same sign can be shrunk to a point. No
+    # two points of one of the four classes (centre or corner, even or odd sum of indices) are neighbours, so each class
+    # may be decided at once.
     free = np.zeros(len(points), dtype=bool)
     group = 2 * lattice.is_corner(points) + lattice.block_index(points).sum(axis=1) % 2
     bits = 1 << np.arange(NUM_DIRECTIONS)
