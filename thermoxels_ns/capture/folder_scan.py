@@ -150,12 +150,9 @@ def shown_name(path: Path) -> str:
 
 def _check_name(name: Path) -> None:
     if any(unicodedata.category(each) in _UNPRINTED for each in str(name)):
-        raise SceneError(
-            "/".join(shown_name(Path(part)) for part in name.parts),
-            expected="a name that can be printed",
-            got="one with line breaks, control characters or bytes of no encoding",
-            remedy="Rename the file.",
-        )
+        shown = "/".join(shown_name(Path(part)) for part in name.parts)
+        got = "one with line breaks, control characters or bytes of no encoding"
+        raise SceneError(shown, expected="a name that can be printed", got=got, remedy="Rename the file.")
 
 
 def identify(path: Path, folder: Path) -> CameraFile:
@@ -180,8 +177,7 @@ def _identify(path: Path, folder: Path) -> CameraFile:
         if is_dji_rjpeg(head) or is_dji_rjpeg(path.read_bytes()):
             return CameraFile(path, "thermal", read_photograph_facts(path).taken_at, dji=True)
     else:
-        with errors_name(path, "a TIFF or PNG that can be decoded"):
-            found = _count_image(path)
+        found = _count_image(path)
         if found is not None:
             return found
     facts = read_photograph_facts(path)
@@ -190,7 +186,7 @@ def _identify(path: Path, folder: Path) -> CameraFile:
 
 def _count_image(path: Path) -> CameraFile | None:
     """A TIFF or PNG of one channel of more than 8 bits, which no photograph is; None for others."""
-    with Image.open(path) as image:
+    with errors_name(path, "a TIFF or PNG that can be decoded"), Image.open(path) as image:
         if image.mode != "F" and not image.mode.startswith("I"):
             return None
         check_thermal_size(path, *image.size)

@@ -121,10 +121,8 @@ def read_frames(
     height, width = Counter(sizes).most_common(1)[0][0]
     for frame, shape in zip(frames, sizes):
         if shape != (height, width):
-            dropped[frame.name] = (
-                f"{frame.thermal_source} has {shape[1]} x {shape[0]} pixels, most have {width} x {height}: another "
-                "thermal camera"
-            )
+            got, most = f"{shape[1]} x {shape[0]} pixels", f"{width} x {height}"
+            dropped[frame.name] = f"{frame.thermal_source} has {got}, most have {most}: another thermal camera"
     kept = [frame for frame in frames if frame.name not in dropped]
     dead, kept = _without_stuck_pixels(kept, (height, width), thermal_mask)
     result = CaptureFrames(tuple(kept), (width, height), dead, dropped)
@@ -215,9 +213,9 @@ def _frame_of(row: dict[str, Any]) -> CaptureFrame:
 def measurement_rows(frames: Sequence[CaptureFrame]) -> list[tuple[str, str]]:
     """File formats and the settings behind degrees, as names and texts; the most frequent kind first."""
     formats = [
-        frame.format + ("" if frame.celsius_per_count is None else f" with {frame.celsius_per_count:.4g} K per count")
-        for frame in frames
-        if frame.format
+        f.format + ("" if f.celsius_per_count is None else f" with {f.celsius_per_count:.4g} K per count")
+        for f in frames
+        if f.format
     ]
     conditions = [conditions_text(frame.conditions) for frame in frames if frame.conditions]
     listed = {"thermal files": formats, "computed with": conditions}

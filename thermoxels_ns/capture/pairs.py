@@ -106,16 +106,14 @@ def read_pair_list(file: Path, folder: Path) -> PairSearch:
     try:
         rows = [row for row in csv.reader(file.read_text(encoding="utf-8-sig").splitlines()) if any(row)]
     except (OSError, UnicodeDecodeError, csv.Error) as problem:
-        raise SceneError(
-            str(file), expected="a CSV file of pairs", got=str(problem), remedy="Write it again."
-        ) from problem
+        got, remedy = str(problem), "Write it again."
+        raise SceneError(str(file), expected="a CSV file of pairs", got=got, remedy=remedy) from problem
     pairs = []
     for number, row in enumerate(rows, start=1):
         where = f"{file.name}: line {number}"
         if len(row) != 2:
-            raise SceneError(
-                where, expected="photograph,thermal", got=",".join(row), remedy="Write two names per line."
-            )
+            got, remedy = ",".join(row), "Write two names per line."
+            raise SceneError(where, expected="photograph,thermal", got=got, remedy=remedy)
         photograph, thermal = (path_inside(folder, name.strip(), where) for name in row)
         missing = [path for path in (photograph, thermal) if not path.is_file()]
         if missing and number == 1 and len(missing) == 2:
@@ -126,8 +124,8 @@ def read_pair_list(file: Path, folder: Path) -> PairSearch:
     twice = [path.name for side in zip(*pairs) for path, count in Counter(side).items() if count > 1]
     if twice or not pairs:
         expected = "at least one pair, and every file in one pair only"
-        remedy = "Correct the list."
-        raise SceneError(str(file), expected=expected, got=f"{twice[0]} twice" if twice else "no pair", remedy=remedy)
+        got = f"{twice[0]} twice" if twice else "no pair"
+        raise SceneError(str(file), expected=expected, got=got, remedy="Correct the list.")
     root = folder.resolve()
     names = _names([photograph for photograph, _ in pairs], root)
     return PairSearch(tuple(Pair(n, p, t, f"listed in {file.name}") for n, (p, t) in zip(names, pairs)))
@@ -248,15 +246,12 @@ def _by_time(photographs: Sequence[CameraFile], thermal: Sequence[CameraFile], o
             second = float(table[index, order[1]]) if len(order) > 1 else np.inf
             partner = other_files[order[0]]
             if nearest > options.time_limit_s:
-                explained[file.path] = (
-                    f"no partner of this name; the nearest in time, {partner.path.name}, is {nearest:.1f} s away"
-                )
+                late = f"{partner.path.name}, is {nearest:.1f} s away"
+                explained[file.path] = f"no partner of this name; the nearest in time, {late}"
             elif second <= _CLEARLY_NEARER * nearest + _CLOCK_STEP_S and second <= options.time_limit_s:
                 other = other_files[order[1]]
-                explained[file.path] = (
-                    f"ambiguous: {partner.path.name} ({nearest:.1f} s) and {other.path.name} ({second:.1f} s) are "
-                    "about as near in time"
-                )
+                two = f"{partner.path.name} ({nearest:.1f} s) and {other.path.name} ({second:.1f} s)"
+                explained[file.path] = f"ambiguous: {two} are about as near in time"
             elif table[:, order[0]].argmin() != index:
                 explained[file.path] = f"{partner.path.name}, the nearest in time, is nearer to another"
             elif side == "rows":
@@ -280,12 +275,8 @@ def _names(photographs: Sequence[Path], folder: Path) -> list[str]:
 
     stems = [slug(_without_role(path.stem)) for path in photographs]
     counted = Counter(stem.lower() for stem in stems)
-    longer = [
-        stem
-        if counted[stem.lower()] == 1
-        else slug("-".join((*path.relative_to(folder).parts[:-1], _without_role(path.stem))))
-        for stem, path in zip(stems, photographs)
-    ]
+    places = ["-".join((*path.relative_to(folder).parts[:-1], _without_role(path.stem))) for path in photographs]
+    longer = [stem if counted[stem.lower()] == 1 else slug(place) for stem, place in zip(stems, places)]
     # Files are named by them, and some disks take A and a for one.
     names, taken, used = [], set[str](), Counter[str]()
     for name in longer:
@@ -300,7 +291,7 @@ def _names(photographs: Sequence[Path], folder: Path) -> list[str]:
 
 def _without_role(stem: str) -> str:
     cut = re.split(r"([\W_]+)", stem)
-    words = [word for word in cut[::2]]
+    words = cut[::2]
     while len(words) > 1 and (words[-1].lower() in ROLE_WORDS or words[-1].lower() in _LAST_LETTERS):
         words.pop()
         cut = cut[:-2]

@@ -58,10 +58,8 @@ def scene_names(count: int) -> list[str]:
     """
     offset = min(EVAL_INTERVAL // 2, max(count - 2, 0)) if count > 1 else -1
     digits = max(5, len(str(count)))
-    return [
-        f"frame_{'eval' if number % EVAL_INTERVAL == offset else 'train'}_{number + 1:0{digits}d}"
-        for number in range(count)
-    ]
+    sets = ["eval" if number % EVAL_INTERVAL == offset else "train" for number in range(count)]
+    return [f"frame_{kind}_{number:0{digits}d}" for number, kind in enumerate(sets, start=1)]
 
 
 def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = lambda _: None) -> None:

@@ -105,9 +105,8 @@ def given_fingerprints(paths: Sequence[Path | None]) -> list[tuple[str, int, int
     there = [path for path in paths if path is not None]
     for path in there:
         if not path.is_file():
-            raise SceneError(
-                str(path), expected="a file", got="nothing there", remedy="Check the path, or leave it out."
-            )
+            remedy = "Check the path, or leave it out."
+            raise SceneError(str(path), expected="a file", got="nothing there", remedy=remedy)
     return fingerprint(there, Path("/")) if there else []
 
 
@@ -120,8 +119,7 @@ def prepare_output(folder: Path) -> Path:
     """Make the output folder, or take that of an earlier capture; an `OutputError` where it holds other files."""
     folder = writable_folder(folder)
     if not (folder / CACHE_FOLDER).is_dir() and any(folder.iterdir()):
-        remedy = "Pass another folder with --output."
-        got = f"{folder}, which holds other files"
+        remedy, got = "Pass another folder with --output.", f"{folder}, which holds other files"
         raise OutputError("output", expected="an empty folder or one of an earlier capture", got=got, remedy=remedy)
     writable_folder(folder / CACHE_FOLDER)
     return folder
@@ -130,9 +128,8 @@ def prepare_output(folder: Path) -> Path:
 @contextmanager
 def locked(output: Path, say: Callable[[str], None] = lambda _: None) -> Iterator[None]:
     """Hold the output folder of a capture for the block; an `OutputError` where another capture holds it."""
-    lock = hold_folder(
-        output / CACHE_FOLDER / LOCK_FILE, "Wait until it ends, or pass another folder with --output.", say
-    )
+    remedy = "Wait until it ends, or pass another folder with --output."
+    lock = hold_folder(output / CACHE_FOLDER / LOCK_FILE, remedy, say)
     try:
         yield
     finally:

@@ -42,9 +42,8 @@ def load(path: Path, kind: type[_Record]) -> _Record:
         with np.load(path, allow_pickle=False) as opened:
             arrays = {name: opened[name] for name in opened.files}
     except (OSError, ValueError, KeyError) as problem:
-        raise ThermoxelsError(
-            str(path), expected=_EXPECTED, got=str(problem) or type(problem).__name__, remedy=_REMEDY
-        ) from problem
+        got = str(problem) or type(problem).__name__
+        raise ThermoxelsError(str(path), expected=_EXPECTED, got=got, remedy=_REMEDY) from problem
     return kind(**{name: _value(arrays[name], hint) for name, hint in get_type_hints(kind).items()})
 
 
@@ -66,10 +65,10 @@ def _value(array: np.ndarray, hint: Any) -> Any:
 def save_pairs(folder: Path, search: PairSearch, root: Path) -> None:
     """Write pairs with names relative to the capture's folder."""
     real = root.resolve()
-    rows = [
-        [p.name, *(file.resolve().relative_to(real).as_posix() for file in (p.photograph, p.thermal)), p.how]
-        for p in search.pairs
-    ]
+    rows = []
+    for pair in search.pairs:
+        files = (file.resolve().relative_to(real).as_posix() for file in (pair.photograph, pair.thermal))
+        rows.append([pair.name, *files, pair.how])
     unpaired = {_relative_name(path, root): why for path, why in search.unpaired.items()}
     write_json(folder / "pairs.json", {"pairs": rows, "unpaired": unpaired})
 

@@ -97,10 +97,9 @@ def run_capture(
     if not source.is_dir():
         scan_folder(source)  # says what is wrong
     if source.resolve().is_relative_to(output.resolve()):
+        expected = "another folder than the input, which does not hold it either"
         remedy = "Pass a new folder with --output; the camera's files stay as they are."
-        raise SceneError(
-            "output", expected="another folder than the input, which does not hold it either", got=output, remedy=remedy
-        )
+        raise SceneError("output", expected=expected, got=output, remedy=remedy)
     board = board_of(settings)
     if settings.board_photos is not None and not settings.board_photos.is_dir():
         scan_folder(settings.board_photos)
@@ -114,12 +113,9 @@ def run_capture(
     except ThermoxelsError:
         raise
     except OSError as problem:
-        raise OutputError(
-            str(problem.filename2 or problem.filename or folder),
-            expected="a file that can be read or written",
-            got=problem.strerror or str(problem),
-            remedy="Check free space and permissions, and run the command again: finished stages are kept.",
-        ) from problem
+        what, got = str(problem.filename2 or problem.filename or folder), problem.strerror or str(problem)
+        remedy = "Check free space and permissions, and run the command again: finished stages are kept."
+        raise OutputError(what, expected="a file that can be read or written", got=got, remedy=remedy) from problem
 
 
 @dataclass
@@ -150,17 +146,10 @@ class _Capture:
         written = [self.output / name for name in SCENE_CONTENT]
         self.cache.run("scene", {}, lambda _: write_scene_folder(scene, self.output, self.say), written)
         given = self.settings.poses
+        source = f"Given in {given.name}." if given else "Structure from motion on the photographs (COLMAP)."
+        left_out, seconds = self.dropped, self.cache.seconds
         result = CaptureResult(
-            source=self.source,
-            output=self.output,
-            pairs=pairs,
-            dropped=self.dropped,
-            read=read,
-            scene=scene,
-            start=start,
-            scale_missing=scale_missing,
-            poses_source=f"Given in {given.name}." if given else "Structure from motion on the photographs (COLMAP).",
-            seconds=self.cache.seconds,
+            self.source, self.output, pairs, left_out, read, scene, start, scale_missing, source, seconds
         )
         self.cache.run("page", {}, lambda _: write_page(result), [result.page])
         return result
@@ -293,9 +282,8 @@ class _Capture:
 
         def work(folder: Path) -> None:
             scale, missing = self._metric_scale(found, frames)
-            up = find_up(
-                found.camera_to_world, [frame.gimbal_deg for frame in frames], [frame.orientation for frame in frames]
-            )
+            gimbal, orientation = [frame.gimbal_deg for frame in frames], [frame.orientation for frame in frames]
+            up = find_up(found.camera_to_world, gimbal, orientation)
             model = found
             if settings.poses is None:
                 rotation = level_rotation(up.direction, -found.camera_to_world[:, :3, 2].mean(axis=0))
@@ -327,17 +315,12 @@ class _Capture:
         if board is None or pictures is None:
             self.cache.leave_out("board", "no --board-photos")
             return None
-        depends = {
-            "board": board,
-            "files": fingerprint(files_of(pictures), pictures),
-            "angle": settings.thermal_field_of_view_deg,
-        }
+        angle = settings.thermal_field_of_view_deg
+        depends = {"board": board, "files": fingerprint(files_of(pictures), pictures), "angle": angle}
 
         def work(folder: Path) -> None:
-            radiometry = self.options(RadiometryOptions)
-            rig = rig_from_board_photos(
-                pictures, board, model.camera, read.thermal_size, folder, settings, radiometry, self.say
-            )
+            radiometry, size = self.options(RadiometryOptions), read.thermal_size
+            rig = rig_from_board_photos(pictures, board, model.camera, size, folder, settings, radiometry, self.say)
             stage_results.save(folder / "rig.npz", rig)
 
         return stage_results.load(self.cache.run("board", depends, work) / "rig.npz", RigEstimate)
@@ -366,12 +349,11 @@ class _Capture:
             elif len(model.sighting_frame) < _LEAST_SIGHTINGS:
                 rig = kept_start(begin, "There are no scene points to compare the images at.")
             else:
-                rig = estimate_rig(
-                    rig_frames(model, frames),
-                    model.camera,
-                    begin,
-                    lambda message, share: self.say(f"rig: {message} ({100 * share:.0f} %)"),
-                )
+
+                def tell(message: str, share: float) -> None:
+                    self.say(f"rig: {message} ({100 * share:.0f} %)")
+
+                rig = estimate_rig(rig_frames(model, frames), model.camera, begin, tell)
             stage_results.save(folder / "rig.npz", rig)
             for line in rig_lines(rig, metres):
                 self.say(f"rig: {line}")

@@ -49,9 +49,8 @@ class CameraRays:
         self.has_table = int(model_sizes.sum()) * _BYTES_PER_PIXEL <= table_limit_bytes
         if self.has_table:
             starts = torch.cat([torch.zeros(1, dtype=torch.int64), model_sizes.cumsum(0)])[:-1]
-            self._table_shift = (starts[torch.from_numpy(self_model.reshape(-1))] - self.first_pixel[:-1]).to(
-                self.device
-            )
+            shift = starts[torch.from_numpy(self_model.reshape(-1))] - self.first_pixel[:-1]
+            self._table_shift = shift.to(self.device)
             tables = [self._camera_axes(int(index)) for index in first]
             self._directions = torch.cat([directions for directions, _ in tables]).to(self.device)
             self._pixel_area = torch.cat([area for _, area in tables]).to(self.device)
@@ -138,18 +137,16 @@ def _mend_optical_axis(
 ) -> None:
     """Give the ray on the optical axis of a fisheye lens its limit, where nerfstudio divides 0 by 0.
 
-    Raises:
-        SceneError: A ray is lost elsewhere: the distortion cannot be undone there.
+    A `SceneError` is raised where a ray is lost elsewhere: the distortion cannot be undone there.
     """
     axis = torch.cat([cameras.cy, cameras.cx], dim=-1)[image]
     on_axis = ((coords - axis).abs().amax(dim=1) < 1e-3) & (cameras.camera_type.view(-1)[image] == _FISHEYE)
     if bool((lost & ~on_axis).any()):
-        raise SceneError(
-            f"camera of photograph {int(image[lost & ~on_axis][0])}",
-            expected="a lens distortion that can be undone in every pixel",
-            got=f"{int((lost & ~on_axis).sum())} pixels without a finite ray",
-            remedy="Check k1 to p2, or undistort the photographs.",
-        )
+        what = f"camera of photograph {int(image[lost & ~on_axis][0])}"
+        remedy = "Check k1 to p2, or undistort the photographs."
+        expected = "a lens distortion that can be undone in every pixel"
+        got = f"{int((lost & ~on_axis).sum())} pixels without a finite ray"
+        raise SceneError(what, expected=expected, got=got, remedy=remedy)
     rays.directions[lost] = -cameras.camera_to_worlds[image[lost], :, 2]
     area = 1.0 / (cameras.fx * cameras.fy)[image]
     rays.pixel_area = torch.where(torch.isfinite(rays.pixel_area), rays.pixel_area, area)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -49,10 +50,9 @@ def find_feature_rays(scene: SceneFile, training: Sequence[int], source: TrackSo
     found = read_colmap_tracks(scene) if source == "auto" else None
     if found is None:
         return None
+    remedy = "Give it the photographs and poses of the json, or move it away."
     try:
-        return feature_rays(
-            found, frames, "its tracks", "Give it the photographs and poses of the json, or move it away."
-        )
+        return feature_rays(found, frames, "its tracks", remedy)
     except SceneError as problem:
         warn_unused("the scene's folder", str(problem))
         return None
@@ -103,10 +103,9 @@ def _tracks(scene: SceneFile, folder: str) -> SparseTracks:
     numbers = list(images)
     pairs = _matched([image.name for image in images.values()], [frame.name for frame in scene.frames])
     if not pairs:
-        names = (next((image.name for image in images.values()), "none"), scene.frames[0].name)
-        raise SceneError(
-            f"it has no photograph of this scene, or several of one name (such as {names[0]} there and {names[1]} here)"
-        )
+        there, here = next((image.name for image in images.values()), "none"), scene.frames[0].name
+        names = f"such as {there} there and {here} here"
+        raise SceneError(f"it has no photograph of this scene, or several of one name ({names})")
     frames = [scene.frames[frame] for _, frame in pairs]
     place = {numbers[image]: number for number, (image, _) in enumerate(pairs)}
     source = np.stack([camera_to_world(images[number]) for number in place])
@@ -142,17 +141,13 @@ def _tracks(scene: SceneFile, folder: str) -> SparseTracks:
 
 
 def _matched(images: Sequence[str], frames: Sequence[str]) -> list[tuple[int, int]]:
-    """Numbers of image and frame that are the same photograph.
-
-    Same name of the file; where several have it, the one whose folders too are those of the frame's name, and of more
-    than one such that with most folders.
+    """Numbers of image and frame that are the same photograph, by the name of the file; where several have it, the one
+    whose folders too are those of the frame's name, and of more than one such that with most folders.
     """
     of_name: dict[str, list[int]] = {}
     for number, image in enumerate(images):
         of_name.setdefault(PurePosixPath(image).name, []).append(number)
-    shared: dict[str, int] = {}
-    for frame in frames:
-        shared[PurePosixPath(frame).name] = shared.get(PurePosixPath(frame).name, 0) + 1
+    shared = Counter(PurePosixPath(frame).name for frame in frames)
     pairs = []
     for number, frame in enumerate(frames):
         name = PurePosixPath(frame).name
@@ -163,9 +158,7 @@ def _matched(images: Sequence[str], frames: Sequence[str]) -> list[tuple[int, in
             found = [one for one in found if len(images[one]) == longest]
         if len(found) == 1:
             pairs.append((found[0], number))
-    once = {image: 0 for image, _ in pairs}
-    for image, _ in pairs:
-        once[image] += 1
+    once = Counter(image for image, _ in pairs)
     return [pair for pair in pairs if once[pair[0]] == 1]
 
 
@@ -189,8 +182,8 @@ def _points(model: Any, place: dict[int, int]) -> tuple[FloatArray, FloatArray, 
 
 def _off_px(
     frames: Sequence[Frame],
-    model: tuple[FloatArray, FloatArray],
-    given: tuple[FloatArray, FloatArray],
+    model: tuple[FloatArray, ...],
+    given: tuple[FloatArray, ...],
     frame: IntArray,
     point: IntArray,
 ) -> FloatArray:
@@ -213,8 +206,8 @@ def _off_px(
 class Similarity:
     """Brings points of one world into another: scale * rotation p + translation."""
 
-    rotation: FloatArray  # shape (3, 3)
-    translation: FloatArray  # shape (3,)
+    rotation: FloatArray
+    translation: FloatArray  # shapes (3, 3) and (3,)
     scale: float
 
     def points(self, points: FloatArray) -> FloatArray:

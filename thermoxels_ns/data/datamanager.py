@@ -153,12 +153,8 @@ class ThermalDataManager(VanillaDataManager[ThermalDataset]):
     def get_train_rays_per_batch(self) -> int:
         """Return how many rays `next_train` gives."""
         thermal = 0 if self.train_dataset.shares_camera else self.config.thermal_num_rays_per_batch
-        by_stream = {
-            "both": self._rgb_rays() + thermal,
-            "rgb": self._rgb_rays(),
-            "thermal": thermal or self._rgb_rays(),
-        }
-        return by_stream[self.config.streams]
+        rgb = self._rgb_rays()
+        return {"both": rgb + thermal, "rgb": rgb, "thermal": thermal or rgb}[self.config.streams]
 
     def _rgb_rays(self) -> int:
         sampler = self.train_pixel_sampler
@@ -181,10 +177,8 @@ def views_of_cameras(cameras: Sequence[Cameras]) -> Views:
     axes, at most 80 degrees to each side; a panorama (equirectangular) becomes the six sides of a cube.
     """
     parts = [_views_of_one(each.to("cpu")) for each in cameras]
-    return Views(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in ("camera_to_world", "focal", "centre")),
-        size=np.concatenate([part.size for part in parts]),
-    )
+    names = ("camera_to_world", "focal", "centre", "size")
+    return Views(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def _views_of_one(cameras: Cameras) -> Views:

@@ -155,10 +155,8 @@ class ThermalDataParser(DataParser):
         colour = [frame.intrinsics.scaled(factor) for frame in frames]
         thermal = [_thermal_intrinsics(frame, shape) for frame, shape in zip(frames, shapes)]
         cameras = _cameras(colour, scene.world.poses(np.stack([frame.pose for frame in frames])))
-        thermal_cameras = _cameras(
-            thermal,
-            scene.world.poses(np.stack([f.pose if f.thermal_pose is None else f.thermal_pose for f in frames])),
-        )
+        thermal_poses = np.stack([f.pose if f.thermal_pose is None else f.thermal_pose for f in frames])
+        thermal_cameras = _cameras(thermal, scene.world.poses(thermal_poses))
         masks = [frame.mask for frame in frames if frame.mask is not None]
         return DataparserOutputs(
             image_filenames=[frame.image for frame in frames],
@@ -185,9 +183,8 @@ class ThermalDataParser(DataParser):
         if factor is None:
             return 1.0
         if not factor >= 1:
-            raise SceneError(
-                "downscale_factor", expected="a number of at least 1", got=factor, remedy="Pass 2, 4 or 8."
-            )
+            expected = "a number of at least 1"
+            raise SceneError("downscale_factor", expected=expected, got=factor, remedy="Pass 2, 4 or 8.")
         return float(factor)
 
     def _read_scene(self) -> _Scene:
@@ -195,22 +192,15 @@ class ThermalDataParser(DataParser):
         low, high = config.valid_range_c
         if not -ZERO_CELSIUS_K <= low < high:
             expected, got = "a lower and a higher temperature in degrees Celsius", f"{low} and {high}"
-            remedy = "Pass --valid-range-c -100 2000."
-            raise SceneError("valid_range_c", expected=expected, got=got, remedy=remedy)
+            raise SceneError("valid_range_c", expected=expected, got=got, remedy="Pass --valid-range-c -100 2000.")
         file = read_scene_file(Path(config.data), config.missing_thermal)
         names = [frame.name for frame in file.frames]
-        split = split_frames(
-            names, file.meta, config.eval_mode, config.eval_interval, config.eval_offset, file.left_out
-        )
+        every = config.eval_interval, config.eval_offset
+        split = split_frames(names, file.meta, config.eval_mode, *every, file.left_out)
         evidence = find_scene_box(file, config.scene_box, split.train)
         world, box = self._place(file, evidence)
-        survey = survey_thermal_files(
-            [frame.thermal for frame in file.frames],
-            file.unit,
-            config.valid_range_c,
-            file.bounds_c,
-            {file.frames[index].thermal for index in split.train},
-        )
+        paths, training = [f.thermal for f in file.frames], {file.frames[index].thermal for index in split.train}
+        survey = survey_thermal_files(paths, file.unit, config.valid_range_c, file.bounds_c, training)
         met = _share_that_meets([file.frames[index] for index in split.train], world, box, evidence.source)
         evaluation = set(split.val) | set(split.test)
         metres = file.meta.get("metres_per_unit")
@@ -263,22 +253,16 @@ class ThermalDataParser(DataParser):
             translation = _as_kept(translation)
         scale = (SCENE_SIZE / longest if config.auto_scale_poses else 1.0) * config.scale_factor
         if not (np.isfinite(scale) and scale > 0):
-            remedy = "Pass --scale-factor 1."
-            raise SceneError("scale_factor", expected="a finite number above 0", got=config.scale_factor, remedy=remedy)
+            got, remedy = config.scale_factor, "Pass --scale-factor 1."
+            raise SceneError("scale_factor", expected="a finite number above 0", got=got, remedy=remedy)
         placed = scale * (box + translation)
-        return (
-            _World(rotation, translation, scale),
-            SceneBox(aabb=torch.from_numpy(placed.astype(np.float32))),
-        )
+        return _World(rotation, translation, scale), SceneBox(aabb=torch.from_numpy(placed.astype(np.float32)))
 
 
 def _share_that_meets(frames: list[Frame], world: _World, box: SceneBox, source: str) -> float:
     """Share of the rays of photographs that meet the scene box, on a grid of 8 x 8 rays each.
 
-    Lenses other than perspective ones count as seeing it.
-
-    Raises:
-        SceneError: Next to none does: nothing could be learned.
+    Lenses other than perspective ones count as seeing it. A `SceneError` is raised where next to no ray does.
     """
     corners, shares = box.aabb.double().numpy(), []
     poses = world.poses(np.stack([frame.pose for frame in frames])).double().numpy()
@@ -294,13 +278,13 @@ def _share_that_meets(frames: list[Frame], world: _World, box: SceneBox, source:
     share = float(np.mean(shares))
     if share < _LEAST_THAT_MEETS:
         away = float(np.mean(np.array(shares) == 0.0))
-        raise SceneError(
-            "cameras",
-            expected=f"photographs that look at the scene box, from {source}",
-            got=f"{share:.1%} of their rays meeting it, and {away:.0%} of the {len(frames)} cameras looking past it",
-            remedy="Check that poses are camera to world with x right, y up, z back, or pass --scene-box with its "
-            "corners in their coordinates: xmin ymin zmin xmax ymax zmax.",
+        expected = f"photographs that look at the scene box, from {source}"
+        got = f"{share:.1%} of their rays meeting it, and {away:.0%} of the {len(frames)} cameras looking past it"
+        remedy = (
+            "Check that poses are camera to world with x right, y up, z back, or pass --scene-box with its corners in "
+            "their coordinates: xmin ymin zmin xmax ymax zmax."
         )
+        raise SceneError("cameras", expected=expected, got=got, remedy=remedy)
     return share
 
 

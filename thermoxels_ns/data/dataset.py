@@ -60,8 +60,7 @@ class ThermalDataset(InputDataset):
                 raise SceneError(str(path), expected="an opaque photograph", got="transparent pixels", remedy=remedy)
             picture = picture.convert("RGB")
         elif picture.mode not in ("RGB", "L", "CMYK", "YCbCr"):
-            remedy = "Convert it to 8-bit RGB."
-            got = f"image mode {picture.mode}"
+            got, remedy = f"image mode {picture.mode}", "Convert it to 8-bit RGB."
             raise SceneError(str(path), expected="a photograph with 8 bits per channel", got=got, remedy=remedy)
         return np.array(self._resized(picture.convert("RGB"), image_idx, Image.Resampling.BOX))
 
@@ -105,11 +104,9 @@ class ThermalDataset(InputDataset):
 
     def _read_thermal(self, image_idx: int) -> tuple[Tensor, Tensor, PixelReport]:
         if image_idx not in self._thermal:
-            image = read_thermal_file(
-                self.metadata["thermal_filenames"][image_idx],
-                self.metadata["thermal_unit"],
-                self.metadata["valid_range_c"],
-            )
+            given = self.metadata
+            path, valid_range_c = given["thermal_filenames"][image_idx], given["valid_range_c"]
+            image = read_thermal_file(path, given["thermal_unit"], valid_range_c)
             valid = np.isfinite(image.temperature_c)
             report = image.report
             dead = self.metadata["thermal_dead_pixels"].get(valid.shape)
@@ -119,11 +116,8 @@ class ThermalDataset(InputDataset):
             # float64: a narrow range far from 0 C would lose 16-bit steps in float32.
             normalised = self.temperature_range.normalise(image.temperature_c.astype(np.float64))
             thermal = np.where(valid, normalised, 0.0).astype(np.float32)
-            self._thermal[image_idx] = (
-                torch.from_numpy(thermal)[..., None],
-                torch.from_numpy(valid)[..., None],
-                report,
-            )
+            tensors = torch.from_numpy(thermal)[..., None], torch.from_numpy(valid)[..., None]
+            self._thermal[image_idx] = (*tensors, report)
         return self._thermal[image_idx]
 
     def _resized(self, picture: Image.Image, image_idx: int, filter_: Image.Resampling) -> Image.Image:

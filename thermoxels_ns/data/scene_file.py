@@ -83,13 +83,12 @@ def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "err
             continue
         frames.append(_frame(meta, entry, name, image, thermal, folder, where))
     if missing_thermal == "error" and left_out:
-        raise SceneError(
-            json_path.name,
-            expected=f"a thermal partner for each of the {len(entries)} frames (thermal_file_path, or the same stem in "
-            "thermal/)",
-            got=f"none for {len(left_out)}: {_some(left_out)} ({partners.count} files in thermal/)",
-            remedy="Restore the thermal images, remove these frames, or pass --missing-thermal skip.",
+        expected = (
+            f"a thermal partner for each of the {len(entries)} frames (thermal_file_path, or the same stem in thermal/)"
         )
+        got = f"none for {len(left_out)}: {_some(left_out)} ({partners.count} files in thermal/)"
+        remedy = "Restore the thermal images, remove these frames, or pass --missing-thermal skip."
+        raise SceneError(json_path.name, expected=expected, got=got, remedy=remedy)
     orphans = partners.orphans(folder, [frame.image for frame in frames])
     if missing_thermal == "error" and orphans:
         expected = "one photograph in images/ for every thermal image"
@@ -179,9 +178,8 @@ def _unit(meta: dict[str, Any], json_path: Path, bounds: tuple[float, float] | N
         try:
             return ThermalUnit.linear(float(unit["celsius_per_count"]), float(unit["celsius_offset"]))
         except (KeyError, TypeError, ValueError) as problem:
-            expected = "numbers celsius_per_count (not 0) and celsius_offset"
-            remedy = "Correct the json."
-            raise SceneError(f"{json_path.name}: thermal_unit", expected=expected, got=unit, remedy=remedy) from problem
+            expected, where = "numbers celsius_per_count (not 0) and celsius_offset", f"{json_path.name}: thermal_unit"
+            raise SceneError(where, expected=expected, got=unit, remedy="Correct the json.") from problem
     return ThermalUnit.bounds(*bounds) if bounds else ThermalUnit.celsius()
 
 
@@ -222,9 +220,8 @@ def _mask(folder: Path, entry: dict[str, Any], where: str) -> Path | None:
 def _existing(path: Path, where: str, key: str) -> Path:
     if path.is_file():
         return path
-    raise SceneError(
-        where, expected=f"the file of '{key}'", got=f"nothing at {path}", remedy="Restore it or remove the frame."
-    )
+    remedy = "Restore it or remove the frame."
+    raise SceneError(where, expected=f"the file of '{key}'", got=f"nothing at {path}", remedy=remedy)
 
 
 def _refuse_duplicates(json_path: Path, frames: list[Frame]) -> None:
@@ -239,8 +236,7 @@ def _refuse_duplicates(json_path: Path, frames: list[Frame]) -> None:
 def _refuse_half_masks(json_path: Path, frames: list[Frame]) -> None:
     masks = sum(frame.mask is not None for frame in frames)
     if masks not in (0, len(frames)):
-        expected = "a mask for every frame or for none"
-        got = f"{masks} masks for {len(frames)} frames"
+        expected, got = "a mask for every frame or for none", f"{masks} masks for {len(frames)} frames"
         remedy = "Add the missing ones (white: use the pixel)."
         raise SceneError(f"{json_path.name}: mask_path", expected=expected, got=got, remedy=remedy)
 

@@ -33,16 +33,12 @@ class SparseTracks:
     point_error_px: FloatArray
     """Mean reprojection error of each point, shape (n,), [pixels of the photographs]."""
     frames: tuple[str, ...]  # ``file_path`` of the photographs, as transforms.json has it
-    sighting_frame: IntArray  # index into `frames`, shape (s,)
-    sighting_point: IntArray  # index into `points`, shape (s,)
+    sighting_frame: IntArray
+    sighting_point: IntArray  # indices into `frames` and `points`, each shape (s,)
 
 
 def write_tracks(path: Path, tracks: SparseTracks) -> None:
-    """Write tracks as a compressed .npz, put together in memory, because numpy's half-made files complain later.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write tracks as a compressed .npz, put together in memory, because numpy's half-made files complain later."""
     packed = io.BytesIO()
     np.savez_compressed(
         packed,
@@ -57,19 +53,14 @@ def write_tracks(path: Path, tracks: SparseTracks) -> None:
 
 
 def read_tracks(path: Path) -> SparseTracks:
-    """Read and check a file of tracks.
-
-    Raises:
-        SceneError: It is missing, no such file, or contradicts itself.
-    """
+    """Read and check a file of tracks; a `SceneError` where it is missing, no such file, or contradicts itself."""
     names = ("points", "point_error_px", "frames", "sighting_frame", "sighting_point")
     try:
         with np.load(path, allow_pickle=False) as file:
             points, error, frames, frame, point = (file[name] for name in names)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, AttributeError, TypeError) as problem:
-        raise SceneError(
-            path.name, expected=f"an .npz with {', '.join(names)}", got=problem, remedy=_REMEDY
-        ) from problem
+        expected = f"an .npz with {', '.join(names)}"
+        raise SceneError(path.name, expected=expected, got=problem, remedy=_REMEDY) from problem
     good = (
         points.ndim == 2
         and points.shape[1] == 3
@@ -87,13 +78,8 @@ def read_tracks(path: Path) -> SparseTracks:
         arrays = (points, error, frames, frame, point)
         shapes = ", ".join(f"{name} {array.dtype}{array.shape}" for name, array in zip(names, arrays))
         raise SceneError(path.name, expected="points, frames and pairs of their numbers", got=shapes, remedy=_REMEDY)
-    return SparseTracks(
-        points.astype(np.float64),
-        error.astype(np.float64),
-        tuple(str(name) for name in frames),
-        frame.astype(np.int64),
-        point.astype(np.int64),
-    )
+    places = points.astype(np.float64), error.astype(np.float64)
+    return SparseTracks(*places, tuple(map(str, frames)), frame.astype(np.int64), point.astype(np.int64))
 
 
 def feature_rays(
@@ -113,12 +99,8 @@ def feature_rays(
     place = {frame.name: number for number, frame in enumerate(frames)}
     number = np.array([place.get(known, -1) for known in tracks.frames], dtype=np.int64)
     if len(frames) and not (number >= 0).any():
-        raise SceneError(
-            name,
-            expected="photographs of this scene",
-            got=f"{len(tracks.frames)} others, such as {', '.join(tracks.frames[:2]) or 'none'}",
-            remedy=remedy,
-        )
+        got = f"{len(tracks.frames)} others, such as {', '.join(tracks.frames[:2]) or 'none'}"
+        raise SceneError(name, expected="photographs of this scene", got=got, remedy=remedy)
     known = np.isfinite(tracks.points).all(axis=1) & (tracks.point_error_px <= MOST_ERROR_PX)
     known &= tracks.point_error_px >= 0.0  # COLMAP writes -1 for an error that it did not compute
     used = (number[tracks.sighting_frame] >= 0) & known[tracks.sighting_point]
@@ -130,12 +112,9 @@ def feature_rays(
     line = tracks.points[point] - poses[frame, :3, 3]
     behind = (line * -poses[frame, :3, 2]).sum(axis=1) <= 0.0
     if behind.sum() > MOST_BEHIND * len(behind):
-        raise SceneError(
-            name,
-            expected="points in front of the photographs that see them",
-            got=f"{behind.mean():.0%} of the sightings behind: the poses are others",
-            remedy=remedy,
-        )
+        expected = "points in front of the photographs that see them"
+        got = f"{behind.mean():.0%} of the sightings behind: the poses are others"
+        raise SceneError(name, expected=expected, got=got, remedy=remedy)
     frame, point, line = frame[~behind], point[~behind], line[~behind]
     length = np.linalg.norm(line, axis=1)
     angle = _parallax(line / np.maximum(length, 1e-300)[:, None], point, len(tracks.points))
@@ -144,11 +123,8 @@ def feature_rays(
     chosen = good[point]
     renumbered = np.cumsum(good) - 1
     frame, point, length = frame[chosen], point[chosen], length[chosen]
-    error = (
-        np.maximum(tracks.point_error_px[point], LEAST_ERROR_PX)
-        / focal[frame]
-        / np.sin(np.minimum(angle[point], np.pi / 2))
-    )
+    error_px = np.maximum(tracks.point_error_px[point], LEAST_ERROR_PX)
+    error = error_px / focal[frame] / np.sin(np.minimum(angle[point], np.pi / 2))
     found = FeatureRays(poses[frame, :3, 3], renumbered[point], tracks.points[good], error * length)
     return found.of_points(agrees_with_neighbours(found))
 

@@ -64,8 +64,7 @@ def split_frames(
 def _by_name(names: Sequence[str], tagged: list[tuple[bool, bool]]) -> Split:
     unclear = [name for name, (train, evaluate) in zip(names, tagged) if train == evaluate]
     if unclear:
-        expected = "frame_train_ or frame_eval_ in every name"
-        got = f"{unclear[0]} ({len(unclear)} such)"
+        expected, got = "frame_train_ or frame_eval_ in every name", f"{unclear[0]} ({len(unclear)} such)"
         remedy = "Rename them or pass --eval-mode interval."
         raise SceneError("split by file name", expected=expected, got=got, remedy=remedy)
     evaluate = [i for i, (_, test) in enumerate(tagged) if test]
@@ -102,9 +101,8 @@ def _by_lists(names: Sequence[str], meta: Mapping[str, Any], left_out: Sequence[
 def _by_interval(names: Sequence[str], interval: int, offset: int | None) -> Split:
     start = interval // 2 if offset is None else offset
     if interval < 2 or not 0 <= start < interval:
-        expected = "an interval of at least 2 and an offset from 0 to interval - 1"
-        remedy = "Pass --eval-interval 8."
-        raise SceneError("eval_interval, eval_offset", expected=expected, got=f"{interval}, {start}", remedy=remedy)
+        expected, got = "an interval of at least 2 and an offset from 0 to interval - 1", f"{interval}, {start}"
+        raise SceneError("eval_interval, eval_offset", expected=expected, got=got, remedy="Pass --eval-interval 8.")
     evaluate = list(range(start, len(names), interval))
     train = [i for i in range(len(names)) if i % interval != start]
     return Split(train, evaluate, evaluate, f"every {interval}th frame from number {start}")

@@ -64,50 +64,39 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
     model = values.get("camera_model", "OPENCV")
     lens = _LENS_OF_MODEL.get(model) if isinstance(model, str) else None
     if lens is None:
-        raise SceneError(
-            f"{where}: camera_model",
-            expected="PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, OPENCV_FISHEYE or EQUIRECTANGULAR",
-            got=model,
-            remedy="Undistort the photographs to a pinhole camera.",
-        )
+        expected = "PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, OPENCV_FISHEYE or EQUIRECTANGULAR"
+        undistort = "Undistort the photographs to a pinhole camera."
+        raise SceneError(f"{where}: camera_model", expected=expected, got=model, remedy=undistort)
     size = _image_size(image, where) if image is not None else None
     try:
         if any(isinstance(value, bool) for key, value in values.items() if key in _NUMBERS):
             raise ValueError("true or false")
-        width, height = (
-            int(values[key]) if size is None else int(values.get(key, size[i])) for i, key in enumerate("wh")
-        )
+        own = values if size is None else dict(zip("wh", size)) | values
+        width, height = int(own["w"]), int(own["h"])
         numbers: dict[str, Any] = {key: float(values[key]) for key in ("fl_x", "fl_y", "cx", "cy")}
         names = ("k1", "k2", "k3", "k4", "p1", "p2")
         listed = values.get("distortion_params", [values.get(key, 0.0) for key in names])
         numbers |= {key: float(value) for key, value in zip(names, listed, strict=True)}
         camera = Camera(width, height, **numbers, lens=lens)
     except KeyError as problem:
-        raise SceneError(
-            where, expected="intrinsics fl_x, fl_y, cx, cy, w, h", got=f"no {problem.args[0]}", remedy=remedy
-        ) from problem
+        expected, got = "intrinsics fl_x, fl_y, cx, cy, w, h", f"no {problem.args[0]}"
+        raise SceneError(where, expected=expected, got=got, remedy=remedy) from problem
     except SceneError as problem:
-        raise SceneError(
-            where, expected="finite intrinsics, positive focal lengths and size", got=problem, remedy=remedy
-        ) from problem
+        expected = "finite intrinsics, positive focal lengths and size"
+        raise SceneError(where, expected=expected, got=problem, remedy=remedy) from problem
     except (TypeError, ValueError, OverflowError) as problem:
         expected = "numbers as intrinsics, six of them for distortion_params"
         raise SceneError(where, expected=expected, got=problem, remedy=remedy) from problem
     _refuse_odd(camera, where)
     if size is not None and (height, width) == size and _orientation(image) > 4:
-        raise SceneError(
-            where,
-            expected=f"a photograph stored as {width} x {height} pixels, as the intrinsics say",
-            got=f"{size[0]} x {size[1]} and EXIF orientation {_orientation(image)}: it is stored on its side",
-            remedy="Turn the photographs themselves: mogrify -auto-orient images/* (ImageMagick) does.",
-        )
+        expected = f"a photograph stored as {width} x {height} pixels, as the intrinsics say"
+        got = f"{size[0]} x {size[1]} and EXIF orientation {_orientation(image)}: it is stored on its side"
+        remedy = "Turn the photographs themselves: mogrify -auto-orient images/* (ImageMagick) does."
+        raise SceneError(where, expected=expected, got=got, remedy=remedy)
     if size is not None and (width, height) != size:
-        raise SceneError(
-            where,
-            expected=f"a photograph of {width} x {height} pixels as the intrinsics say",
-            got=f"{size[0]} x {size[1]}",
-            remedy="Use the photographs that the poses were computed from, or scale the intrinsics.",
-        )
+        expected, got = f"a photograph of {width} x {height} pixels as the intrinsics say", f"{size[0]} x {size[1]}"
+        remedy = "Use the photographs that the poses were computed from, or scale the intrinsics."
+        raise SceneError(where, expected=expected, got=got, remedy=remedy)
     return camera
 
 

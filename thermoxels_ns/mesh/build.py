@@ -61,8 +61,8 @@ class MeshOptions:
 class BuiltMesh:
     """A mesh and what it was made from."""
 
-    mesh: TetMesh  # the mesh
-    solid: SolidCells  # the solid voxels it was made from
+    mesh: TetMesh
+    solid: SolidCells
     unobserved_parts: int  # connected components left out because no thermal ray saw any of their nodes
     unobserved_voxels: int
     """Their voxels, which count in `solid.component_sizes`, but are not in `solid.cells`."""
@@ -140,17 +140,8 @@ def build_mesh(
         region_names=region_names,
         colour=colour,
     )
-    boundary, idle_patches = tag_boundary(
-        mesh,
-        shape.points,
-        solid,
-        snapshot.lattice,
-        snapshot.views,
-        transform,
-        options.boundary,
-        options.up,
-        options.rules,
-    )
+    place = shape.points, solid, snapshot.lattice, snapshot.views, transform
+    boundary, idle_patches = tag_boundary(mesh, *place, options.boundary, options.up, options.rules)
     measured_c = snapshot.temperature_c[snapshot.observed_weight >= least]
     observed_range_c = float(measured_c.min()), float(measured_c.max())
     return BuiltMesh(
@@ -171,9 +162,7 @@ def _stuffed_shape(level: npt.NDArray[np.floating], coarsest_cell: int) -> _Shap
 
 
 def _measured(snapshot: GridSnapshot, points: FloatArray, least: float) -> tuple[FloatArray, FloatArray]:
-    """Temperature at points given by fractional corner indices from measured corners alone, and the ray weight of these
-    that reaches the point, each shape (n,).
-    """
+    """Temperature at fractional corner indices from measured corners alone, and their ray weight there, shape (n,)."""
     weight = np.where(snapshot.observed_weight >= least, snapshot.observed_weight, 0.0)
     return interpolate_corners(points, snapshot.temperature_c, weight)
 
@@ -187,10 +176,7 @@ def _colour(snapshot: GridSnapshot, points: FloatArray) -> Float32Array | None:
 
 
 def _with_a_measurement(shape: _Shape, observed: BoolArray) -> tuple[BoolArray, int]:
-    """Nodes of the components of a mesh that have an observed node, or all if none has, and how many are left out.
-
-    Voxels that touch by a corner only are one component as voxels, but may be two once their surface is smooth.
-    """
+    """Nodes (mask) of the components of a mesh that have an observed node, or all if none has; number left out."""
     component = component_of(len(shape.points), shape.tets[:, :3].ravel(), shape.tets[:, 1:].ravel())
     seen = np.bincount(component[observed], minlength=int(component.max()) + 1) > 0
     if not seen.any():
@@ -211,10 +197,8 @@ def _kept(shape: _Shape, stays: BoolArray) -> _Shape:
 
 
 def _without_voxels_of(solid: SolidCells, points: FloatArray) -> tuple[SolidCells, int]:
-    """Leave out the voxels that components of a mesh with these nodes were made from; also their number.
-
-    Centres of solid voxels near the surface are nodes, and voxels that share a face are in one component.
-    """
+    """Leave out the voxels that components of a mesh with these nodes were made from; also their number."""
+    # Centres of solid voxels near the surface are nodes, and voxels that share a face are in one component.
     component = face_connected(solid.cells)
     voxel = np.floor(points).astype(np.int64)
     centres = voxel[np.all(points == voxel + 0.5, axis=1)]

@@ -48,25 +48,20 @@ class Conditions:
                 low, high = (_COLDEST_AIR_C, _HOTTEST_AIR_C) if name == "air_c" else (-ZERO_CELSIUS_K, 5000.0)
                 check_between(name, value, low, high, f"from {low:g} to {high:g} degrees C")
             elif needed:
+                expected = f"a temperature, because {why} needs one"
                 remedy = f"Pass --{name.replace('_', '-')} in degrees C; indoors the room's is a good guess."
-                got = "none"
-                raise ThermoxelsError(name, expected=f"a temperature, because {why} needs one", got=got, remedy=remedy)
+                raise ThermoxelsError(name, expected=expected, got="none", remedy=remedy)
 
 
 @dataclass(frozen=True)
 class ConditionOverrides:
-    """What the user knows better than the camera; None keeps what the file says."""
+    """What the user knows better than the camera; None keeps what the file says. Units as in `Conditions`."""
 
     emissivity: float | None = None
-    """Emissivity of the objects in the picture, above 0, at most 1 (None: the camera's setting)."""
     reflected_c: float | None = None
-    """Apparent temperature of what the objects mirror, [degrees C] (None: the camera's setting)."""
     distance_m: float | None = None
-    """From the camera to the objects, [m] (None: the camera's setting)."""
     relative_humidity: float | None = None
-    """Of the air, 0 to 1 (None: the camera's setting)."""
     air_c: float | None = None
-    """Air temperature, [degrees C] (None: the camera's setting)."""
 
     def __post_init__(self) -> None:
         # With temperatures for all that may need one, only wrong values raise.
@@ -112,6 +107,5 @@ def check_between(name: str, value: float, low: float, high: float, expected: st
     """Raise a `ThermoxelsError` that names the setting if it is no number from `low` to `high` (0 only if `zero`)."""
     number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
     if not (number and low <= value <= high and (zero or value > 0)):
-        raise ThermoxelsError(
-            name, expected=expected, got=repr(value), remedy=f"Pass a right --{name.replace('_', '-')}."
-        )
+        remedy = f"Pass a right --{name.replace('_', '-')}."
+        raise ThermoxelsError(name, expected=expected, got=repr(value), remedy=remedy)

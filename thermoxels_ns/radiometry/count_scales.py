@@ -68,11 +68,6 @@ def recognised_camera(make: str | None, model: str | None) -> CameraName | None:
     return None
 
 
-def known_cameras() -> str:
-    """The presets in one line, for messages."""
-    return ", ".join(f"{name} ({scale.cameras})" for name, scale in COUNT_SCALES.items())
-
-
 @dataclass(frozen=True)
 class CountImage:
     """A TIFF or PNG after reading."""
@@ -108,15 +103,13 @@ def read_count_image(
     if unit is None:
         camera = camera or recognised_camera(exif.make, exif.model)
         if camera is None:
-            remedy = f"Pass --camera with one of {known_cameras()}; or --celsius-per-count and --celsius-offset."
+            known = ", ".join(f"{name} ({scale.cameras})" for name, scale in COUNT_SCALES.items())
+            remedy = f"Pass --camera with one of {known}; or --celsius-per-count and --celsius-offset."
             got = f"counts of {exif.camera or 'an unnamed camera'}, which may mean several things"
             raise ThermalFileError(str(path), expected="counts with a known unit", got=got, remedy=remedy)
         unit = COUNT_SCALES[camera].unit
-    return CountImage(
-        image=read_thermal_file(path, unit, valid_range_c, suffix),
-        exif=exif,
-        celsius_per_count=unit.scale if unit.kind == "linear" else None,
-    )
+    step = unit.scale if unit.kind == "linear" else None
+    return CountImage(read_thermal_file(path, unit, valid_range_c, suffix), exif, step)
 
 
 def _depth(image: Image.Image) -> str:
@@ -139,11 +132,7 @@ def looks_like_csv(head: bytes) -> bool:
 
 
 def read_npy(path: Path, unit: ThermalUnit | None, valid_range_c: tuple[float, float]) -> ThermalImage:
-    """Read an array: degrees C where it holds fractions, else counts of this unit.
-
-    Raises:
-        ThermalFileError: Whole numbers without a unit, or an array that is no image.
-    """
+    """Read an array: degrees C where it holds fractions, else counts of this unit; a `ThermalFileError` without one."""
     try:
         kind = np.load(path, mmap_mode="r", allow_pickle=False).dtype.kind
     except Exception:  # the reader below says what is wrong with it

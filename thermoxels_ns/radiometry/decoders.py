@@ -18,10 +18,7 @@ LARGEST_FILE_BYTES = 2**29  # a table of 4096 x 4096 numbers of 30 characters; c
 
 @contextmanager
 def quiet_decoders() -> Iterator[None]:
-    """Drop Pillow's warnings in the block: of damaged tags that nothing is read from, and of large pictures.
-
-    What is wrong with a file is an error that names it; a warning would be a line that names none.
-    """
+    """Drop Pillow's warnings in the block: they name no file; what is wrong with one is an error that does."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module=r"PIL\.")
         yield
@@ -45,29 +42,20 @@ def errors_name(
         raise
     except Image.DecompressionBombError as problem:
         limit = 2 * (Image.MAX_IMAGE_PIXELS or 0)
-        raise error(
-            str(path),
-            expected=f"a picture of at most {limit} pixels",
-            got=f"a header that says more ({problem})",
-            remedy="Reduce the picture; or copy the file again, if it is not so large: its header is damaged.",
-        ) from problem
+        expected, got = f"a picture of at most {limit} pixels", f"a header that says more ({problem})"
+        remedy = "Reduce the picture; or copy the file again, if it is not so large: its header is damaged."
+        raise error(str(path), expected=expected, got=got, remedy=remedy) from problem
     except Exception as problem:  # decoders raise OSError, SyntaxError, KeyError, TypeError, struct.error and others
         # The operating system's errors have a number, those of decoders have none.
-        refused = isinstance(problem, OSError) and problem.errno is not None
-        raise error(
-            str(path),
-            expected="a file that can be read" if refused else expected,
-            got=(problem.strerror if isinstance(problem, OSError) else None) or str(problem) or type(problem).__name__,
-            remedy="Check its permissions and the disk, or copy it again." if refused else remedy,
-        ) from problem
+        strerror = problem.strerror if isinstance(problem, OSError) else None
+        if isinstance(problem, OSError) and problem.errno is not None:
+            expected, remedy = "a file that can be read", "Check its permissions and the disk, or copy it again."
+        got = strerror or str(problem) or type(problem).__name__
+        raise error(str(path), expected=expected, got=got, remedy=remedy) from problem
 
 
 def check_thermal_size(path: Path | str, width: int, height: int) -> None:
-    """Raise if a thermal file says that it is larger than thermal cameras make them, or has no pixels.
-
-    Raises:
-        ThermalFileError: A side is zero or longer than `LARGEST_SIDE`.
-    """
+    """Raise a `ThermalFileError` if a thermal file says that it is larger than cameras make them, or has no pixels."""
     if not (0 < width <= LARGEST_SIDE and 0 < height <= LARGEST_SIDE):
         expected = f"a thermal image of 1 to {LARGEST_SIDE} pixels a side"
         got = f"a header that says {width} x {height}"
@@ -76,11 +64,7 @@ def check_thermal_size(path: Path | str, width: int, height: int) -> None:
 
 
 def check_file_size(path: Path) -> None:
-    """Raise if a thermal file is empty or larger than any camera writes.
-
-    Raises:
-        ThermalFileError: It has no bytes or more than `LARGEST_FILE_BYTES`.
-    """
+    """Raise a `ThermalFileError` if a thermal file is empty or larger than any camera writes."""
     size = path.stat().st_size
     if size == 0:
         remedy = "Copy it from the camera again, or remove it."

@@ -88,12 +88,8 @@ def read_dji_rjpeg(path: Path, library: Path | None, overrides: ConditionOverrid
     """Read a DJI R-JPEG with `libdirp`.
 
     How DJI's counts become degrees is not public: the Thermal SDK's `libdirp` does it, may not be passed on with other
-    programs, and is free to download. So the user names the library; without it the file is refused and says what to
-    do.
-
-    Raises:
-        ThermalFileError: The file is cut off; there is no library, it is another one, or it refuses the file or the
-            parameters.
+    programs, and is free to download. So the user names the library. A `ThermalFileError` is raised where there is
+    none, it is another one, it refuses the file or the parameters, or the file is cut off.
     """
     content = path.read_bytes()
     whole = "a whole DJI R-JPEG, as the drone wrote it"
@@ -139,8 +135,7 @@ def _measure(path: Path, call: Callable[..., None], handle: ctypes.c_void_p, ove
             air_c=parameters.air_c if knows_air else parameters.reflected_c,
         )
     except ThermoxelsError as problem:
-        expected = "possible measurement parameters"
-        remedy = "Copy the file from the drone again, unedited."
+        expected, remedy = "possible measurement parameters", "Copy the file from the drone again, unedited."
         raise ThermalFileError(str(path), expected=expected, got=str(problem), remedy=remedy) from problem
     after = before
     if overrides.given():

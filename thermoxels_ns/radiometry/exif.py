@@ -33,10 +33,10 @@ def read_exif_facts(image: Image.Image) -> ExifFacts:
     exif = image.getexif()
     tags: Mapping[int, Any] = {**exif, **exif.get_ifd(_EXIF)}
     return ExifFacts(
-        make=_text(tags.get(_MAKE)),
-        model=_text(tags.get(_MODEL)),
-        serial=_text(tags.get(_BODY_SERIAL)) or _text(tags.get(_DNG_SERIAL)),
-        taken_at=_time(tags.get(_TAKEN_AT)) or _time(tags.get(_CHANGED_AT)),
+        _text(tags.get(_MAKE)),
+        _text(tags.get(_MODEL)),
+        _text(tags.get(_BODY_SERIAL)) or _text(tags.get(_DNG_SERIAL)),
+        _time(tags.get(_TAKEN_AT)) or _time(tags.get(_CHANGED_AT)),
     )
 
 

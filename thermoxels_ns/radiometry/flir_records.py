@@ -51,9 +51,8 @@ class Record:
         try:
             return struct.unpack_from(self.order + codes, self.content, offset)
         except struct.error as problem:
-            raise DamagedRecordError(
-                f"a {self.name} record of {len(self.content)} bytes without byte {offset}"
-            ) from problem
+            length = len(self.content)
+            raise DamagedRecordError(f"a {self.name} record of {length} bytes without byte {offset}") from problem
 
     def text(self, offset: int, length: int) -> str | None:
         """Text up to the first zero byte; None where there is none."""
@@ -112,9 +111,8 @@ def fff_records(fff: bytes) -> Iterator[tuple[int, memoryview]]:
         if kind == 0:
             continue
         if offset + length > len(fff):
-            raise DamagedRecordError(
-                f"record {number} (type {kind:#04x}) up to byte {offset + length} of {len(fff)}: the file is cut off"
-            )
+            beyond = f"up to byte {offset + length} of {len(fff)}: the file is cut off"
+            raise DamagedRecordError(f"record {number} (type {kind:#04x}) {beyond}")
         yield kind, memoryview(fff)[offset : offset + length]
 
 
@@ -155,11 +153,7 @@ def _roughness(counts: npt.NDArray[np.uint16]) -> float:
 
 
 def read_camera_info(content: bytes) -> CameraInfo:
-    """Read calibration and settings.
-
-    Raises:
-        DamagedRecordError: A value is missing or cannot be (an emissivity of 0, no Planck constants).
-    """
+    """Read calibration and settings; a `DamagedRecordError` where a value is missing or cannot be."""
     record = Record(content, "camera info")
     emissivity, distance, reflected, air, window, window_transmission = record.numbers(0x20, "6f")
     (humidity,) = record.numbers(0x3C, "f")
@@ -204,8 +198,7 @@ def _taken_at(record: Record) -> datetime | None:
     """Time of the shutter with its zone; None where the clock was never set or the record is of an old kind."""
     try:
         seconds, milliseconds, zone = record.numbers(0x384, "IIh")
-        minutes_east = -int(zone)
-        east = timezone(timedelta(minutes=minutes_east))
+        east = timezone(timedelta(minutes=-int(zone)))
         return datetime.fromtimestamp(int(seconds) + (int(milliseconds) & 0xFFFF) / 1000.0, east) if seconds else None
     except (DamagedRecordError, ValueError, OverflowError, OSError):
         return None

@@ -88,10 +88,10 @@ def read_flir_jpeg(path: Path) -> FlirImage:
         pip = records.get(PICTURE_IN_PICTURE)
         picture = records.get(EMBEDDED_PICTURE)
         return FlirImage(
-            counts=read_counts(path, records[RAW_DATA]),
-            camera=read_camera_info(records[CAMERA_INFO]),
-            picture_in_picture=None if pip is None else read_picture_in_picture(pip),
-            visible=None if picture is None else read_embedded_picture(picture),
+            read_counts(path, records[RAW_DATA]),
+            read_camera_info(records[CAMERA_INFO]),
+            None if pip is None else read_picture_in_picture(pip),
+            None if picture is None else read_embedded_picture(picture),
         )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -22,20 +21,9 @@ FIRST_RADIATION_W_UM4_M2_SR = 1.191042972e8
 SECOND_RADIATION_UM_K = 14387.76877  # h c / k (exact constants of the SI, rounded), [um K]
 _COLDEST_K, _HOTTEST_K = 50.0, 6000.0
 _STEPS = 8192
+_PLANCK_REMEDY = "Use the constants of the camera file."
 
 Floats = npt.NDArray[np.floating]
-
-
-class SensorCurve(Protocol):
-    """A sensor's signal for black bodies, and its inverse."""
-
-    def signal(self, temperature_k: npt.ArrayLike) -> Floats:
-        """Signal of a black body; rises with temperature, [K]."""
-        ...
-
-    def temperature_k(self, signal: npt.ArrayLike) -> Floats:
-        """Temperature of a black body, [K]; NaN where there is none."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -51,12 +39,9 @@ class PlanckConstants:
 
     def __post_init__(self) -> None:
         for name in ("r1", "r2", "b", "f"):
-            check_positive(
-                f"Planck constant {name.upper()}", getattr(self, name), "Use the constants of the camera file."
-            )
+            check_positive(f"Planck constant {name.upper()}", getattr(self, name), _PLANCK_REMEDY)
         if not math.isfinite(self.o):
-            remedy = "Use the constants of the camera file."
-            raise ThermoxelsError("Planck constant O", expected="a finite number", got=self.o, remedy=remedy)
+            raise ThermoxelsError("Planck constant O", expected="a finite number", got=self.o, remedy=_PLANCK_REMEDY)
 
     def signal(self, temperature_k: npt.ArrayLike) -> Floats:
         """Counts of a black body, S = R1 / (R2 (exp(B / T) - F)) - O, any shape, float64.
@@ -119,6 +104,7 @@ class PlanckBand:
         return np.where(known, 1.0 / np.interp(falling, logarithm[::-1], inverse_k[::-1]), np.nan)
 
 
+SensorCurve = PlanckConstants | PlanckBand  # a sensor's signal for black bodies, and its inverse
 LONG_WAVE = PlanckBand()  # 7.5 to 13 micrometres, the band of microbolometer cameras
 
 
@@ -191,9 +177,8 @@ class RadiometricModel:
     def _weights(self) -> tuple[float, float]:
         """Weight of the object's signal, and the signal of all else."""
         given = self.conditions
-        tau = self.air.transmission(
-            given.distance_m, 0.0 if given.air_c is None else given.air_c, given.relative_humidity
-        )
+        air_c = 0.0 if given.air_c is None else given.air_c
+        tau = self.air.transmission(given.distance_m, air_c, given.relative_humidity)
         optics = given.window_transmission
         background = 0.0
         for share, celsius in (

@@ -45,8 +45,7 @@ class ThermalUnit:
         if wrong_scale or not np.isfinite(self.offset_c):
             expected = "a finite offset and a finite scale (not zero for counts)"
             got = f"scale {self.scale}, offset {self.offset_c} C"
-            remedy = _UNIT_REMEDY
-            raise ThermalFileError("thermal unit", expected=expected, got=got, remedy=remedy)
+            raise ThermalFileError("thermal unit", expected=expected, got=got, remedy=_UNIT_REMEDY)
 
     @classmethod
     def bounds(cls, min_c: float, max_c: float) -> ThermalUnit:
@@ -85,10 +84,8 @@ class PixelReport:
 
     def __str__(self) -> str:
         share = 100.0 * self.masked / max(self.pixels, 1)
-        return (
-            f"{self.masked} of {self.pixels} pixels masked ({share:.2f} %): {self.nan} NaN, {self.saturated} "
-            f"saturated, {self.out_of_range} out of range, {self.dead} dead"
-        )
+        kinds = f"{self.nan} NaN, {self.saturated} saturated, {self.out_of_range} out of range, {self.dead} dead"
+        return f"{self.masked} of {self.pixels} pixels masked ({share:.2f} %): {kinds}"
 
 
 @dataclass(frozen=True)
@@ -149,8 +146,7 @@ def _to_celsius(
     else:
         expected = "counts with a known unit (bounds need unsigned 8 or 16 bit)"
         got = f"{values.dtype} counts and the unit '{unit.kind}'"
-        remedy = _UNIT_REMEDY
-        raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
+        raise ThermalFileError(str(path), expected=expected, got=got, remedy=_UNIT_REMEDY)
     if raw.no_data is not None:
         celsius[raw.no_data] = np.nan
     saturated &= np.isfinite(celsius)
@@ -258,8 +254,7 @@ def _read_image(path: Path) -> _RawPixels:
         return _RawPixels(pixels if pixels.dtype == bits else pixels.astype(bits))
     if mode in ("RGB", "RGBA", "LA"):
         return _one_channel(path, pixels, has_alpha=pixels.ndim == 3 and pixels.shape[-1] in (2, 4))
-    remedy = "Export the thermal image as 16-bit grey PNG or TIFF."
-    got = f"image mode {mode}"
+    got, remedy = f"image mode {mode}", "Export the thermal image as 16-bit grey PNG or TIFF."
     raise ThermalFileError(str(path), expected="a grey or floating-point image", got=got, remedy=remedy)
 
 

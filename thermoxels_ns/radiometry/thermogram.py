@@ -90,10 +90,10 @@ class RadiometryOptions(ConditionOverrides):
     def __post_init__(self) -> None:
         super().__post_init__()
         if (self.celsius_per_count is None) != (self.celsius_offset is None):
-            expected = "both or neither"
             got = f"{self.celsius_per_count} and {self.celsius_offset}"
             remedy = "Pass --celsius-per-count 0.04 --celsius-offset -273.15, for example."
-            raise ThermalFileError("celsius_per_count and celsius_offset", expected=expected, got=got, remedy=remedy)
+            what = "celsius_per_count and celsius_offset"
+            raise ThermalFileError(what, expected="both or neither", got=got, remedy=remedy)
         if self.celsius_per_count is not None and self.camera is not None:
             remedy = "Leave --camera or --celsius-per-count and --celsius-offset out."
             got = f"the preset {self.camera} and {self.celsius_per_count} K per count"
@@ -134,21 +134,15 @@ def read_thermogram(path: Path, options: RadiometryOptions | None = None) -> The
             return _read_dji(path, options)
         return _read_stored(path, found, options)
     except OSError as problem:
-        remedy = "Check its permissions, or copy it again."
-        got = problem.strerror or str(problem)
+        got, remedy = problem.strerror or str(problem), "Check its permissions, or copy it again."
         raise ThermalFileError(str(path), expected="a file that can be read", got=got, remedy=remedy) from problem
 
 
 def detect_format(path: Path) -> ThermogramFormat:
-    """Tell the format of a thermal file by its content.
-
-    Raises:
-        ThermalFileError: The file is missing, empty, a picture without temperatures or of no known format.
-    """
+    """Tell the format of a thermal file by its content; a `ThermalFileError` where it is none that holds degrees."""
     if not path.is_file():
-        raise ThermalFileError(
-            "thermal file", expected=f"a file at {path}", got="nothing there", remedy="Check the path."
-        )
+        got, remedy = "nothing there", "Check the path."
+        raise ThermalFileError("thermal file", expected=f"a file at {path}", got=got, remedy=remedy)
     check_file_size(path)
     with path.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)
@@ -222,26 +216,17 @@ def _read_stored(path: Path, found: ThermogramFormat, options: RadiometryOptions
     if found in ("TIFF", "PNG"):
         read = read_count_image(path, f".{found.lower()}", options.camera, options.given_unit, options.valid_range_c)
         image = read.image
+        exif, step = read.exif, read.celsius_per_count
         metadata = replace(
-            metadata,
-            camera=read.exif.camera,
-            serial=read.exif.serial,
-            taken_at=read.exif.taken_at,
-            celsius_per_count=read.celsius_per_count,
+            metadata, camera=exif.camera, serial=exif.serial, taken_at=exif.taken_at, celsius_per_count=step
         )
     elif found == "NPY":
         image = read_npy(path, options.given_unit, options.valid_range_c)
     else:
         image = read_thermal_file(path, ThermalUnit.celsius(), options.valid_range_c, ".csv")
-    if before != after:
-        image = _corrected(image, before, after, options.valid_range_c)
+    if before != after:  # pixels that are no temperature under other conditions count as out of range
+        again = masked_image(corrected_temperature_c(image.temperature_c, before, after), options.valid_range_c)
+        lost = again.report.masked - image.report.masked
+        report = replace(image.report, out_of_range=image.report.out_of_range + lost)
+        image = ThermalImage(again.temperature_c, report)
     return Thermogram(image.temperature_c, metadata, image.report)
-
-
-def _corrected(
-    image: ThermalImage, before: Conditions, after: Conditions, valid_range_c: tuple[float, float]
-) -> ThermalImage:
-    """Other conditions; pixels that are no temperature under them count as out of range."""
-    again = masked_image(corrected_temperature_c(image.temperature_c, before, after), valid_range_c)
-    lost = again.report.masked - image.report.masked
-    return ThermalImage(again.temperature_c, replace(image.report, out_of_range=image.report.out_of_range + lost))

@@ -92,10 +92,8 @@ class BoxSolid:
         padded = np.pad(self._cells, 1)
         inside = np.zeros(len(points), dtype=bool)
         # A point on a grid plane belongs to the cells on both sides: the solid is closed.
-        x, y, z = (
-            [np.searchsorted(e, points[:, a], side=side) for side in ("left", "right")]
-            for a, e in enumerate(self._edges)
-        )
+        sides = ("left", "right")
+        x, y, z = ([np.searchsorted(e, points[:, a], side=s) for s in sides] for a, e in enumerate(self._edges))
         for i in x:
             for j in y:
                 for k in z:
@@ -119,9 +117,8 @@ class BoxSolid:
         rectangle = np.empty(len(directions), dtype=np.int64)
         for start in range(0, len(directions), _RAYS_PER_CHUNK):
             part = slice(start, start + _RAYS_PER_CHUNK)
-            distance[part], rectangle[part] = self._first_rectangle(
-                np.ascontiguousarray(origins[part].T), np.ascontiguousarray(directions[part].T)
-            )
+            rays = np.ascontiguousarray(origins[part].T), np.ascontiguousarray(directions[part].T)
+            distance[part], rectangle[part] = self._first_rectangle(*rays)
         normals = np.concatenate([self.rectangles.normals, np.zeros((1, 3))])
         return Hits(distance, normals[rectangle])
 
@@ -258,12 +255,8 @@ def exposed_rectangles(cells: npt.NDArray[np.bool_], edges: tuple[FloatArray, Fl
                     corners_hi.append(hi)
                     axes.append(axis)
                     signs.append(sign)
-    return Rectangles(
-        np.reshape(corners_lo, (-1, 3)),
-        np.reshape(corners_hi, (-1, 3)),
-        np.array(axes, dtype=np.int64),
-        np.array(signs, dtype=np.int64),
-    )
+    corners = np.reshape(corners_lo, (-1, 3)), np.reshape(corners_hi, (-1, 3))
+    return Rectangles(*corners, np.array(axes, dtype=np.int64), np.array(signs, dtype=np.int64))
 
 
 def _merged_blocks(mask: npt.NDArray[np.bool_]) -> list[tuple[int, int, int, int]]:

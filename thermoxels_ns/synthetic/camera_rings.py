@@ -21,8 +21,8 @@ def look_at(position: npt.ArrayLike, target: npt.ArrayLike) -> FloatArray:
     back = position - np.asarray(target, dtype=np.float64)
     right = np.cross((0.0, 0.0, 1.0), back)
     if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(back):
-        remedy = "Move the camera to the side."
         got = f"position {position.tolist()}, target {np.asarray(target).tolist()}"
+        remedy = "Move the camera to the side."
         raise SceneError("camera", expected="a view direction that is not vertical", got=got, remedy=remedy)
     right /= np.linalg.norm(right)
     back /= np.linalg.norm(back)
@@ -60,7 +60,7 @@ class CameraWalk:
 
     ends: tuple[Vector, Vector]  # where the line of cameras begins and ends [m]
     aims: tuple[Vector, Vector]  # what the first and the last camera look at [m]
-    closed: bool = False  # a line is open
+    closed: bool = False
 
     def pose(self, share: float) -> FloatArray:
         """Pose (4, 4) at a share of the line, 0 to 1."""
@@ -78,9 +78,8 @@ def ring_poses(
     evenly. Poses have shapes (num_train, 4, 4) and (num_eval, 4, 4).
     """
     if num_train < 1 or num_eval < 0:
-        expected = "at least 1 for training and at least 0 for evaluation"
-        remedy = "Raise num_train or num_eval."
-        raise SceneError("number of views", expected=expected, got=f"{num_train} and {num_eval}", remedy=remedy)
+        expected, got = "at least 1 for training and at least 0 for evaluation", f"{num_train} and {num_eval}"
+        raise SceneError("number of views", expected=expected, got=got, remedy="Raise num_train or num_eval.")
     used = rings[: min(len(rings), num_train)]
     train, held_out = [np.eye(4)] * num_train, [np.eye(4)] * num_eval
     for number, ring in enumerate(used):

@@ -118,10 +118,9 @@ def _hot_object() -> SyntheticScene:
         surface_temperature_c=temperature_c,
         background_rgb=room_rgb,
         background_temperature_c=lambda directions: np.full(len(np.asarray(directions)), room_c),
-        rings=(
-            CameraRing((0.0, 0.0, 0.05), 1.45, 0.36),
-            CameraRing((0.0, 0.0, -0.02), 1.34, 0.80),
-            CameraRing((0.0, 0.0, -0.07), 1.03, 1.38),
+        rings=tuple(
+            CameraRing((0.0, 0.0, aim), radius, height)
+            for aim, radius, height in ((0.05, 1.45, 0.36), (-0.02, 1.34, 0.80), (-0.07, 1.03, 1.38))
         ),
         focal_share=1.0,
     )
@@ -147,27 +146,15 @@ def _sphere() -> SyntheticScene:
         surface_temperature_c=lambda points: np.clip(30.0 + 20.0 * np.asarray(points)[:, 2], 20.0, 40.0),
         background_rgb=lambda directions: np.full((len(np.asarray(directions)), 3), 0.75, dtype=np.float32),
         background_temperature_c=lambda directions: np.full(len(np.asarray(directions)), 10.0),
-        rings=(
-            CameraRing((0.0, 0.0, 0.0), 1.75, -0.75),
-            CameraRing((0.0, 0.0, 0.0), 1.90, 0.15),
-            CameraRing((0.0, 0.0, 0.0), 1.60, 1.05),
-        ),
+        rings=tuple(CameraRing((0.0, 0.0, 0.0), *ring) for ring in ((1.75, -0.75), (1.90, 0.15), (1.60, 1.05))),
         focal_share=1.15,
     )
 
 
-_BUILDERS: dict[str, Callable[..., SyntheticScene]] = {
-    "hot-object": _hot_object,
-    "house-corner": house_corner,
-    "sphere": _sphere,
-    "courtyard": courtyard,
-    "pipes": pipes,
-}
-_DEVELOPMENT: dict[str, Callable[..., SyntheticScene]] = {
-    "wall-object": wall_object,
-    "facade": facade,
-    "street": street,
-}
+_Builders = dict[str, Callable[..., SyntheticScene]]
+_BUILDERS: _Builders = {"hot-object": _hot_object, "house-corner": house_corner, "sphere": _sphere}
+_BUILDERS |= {"courtyard": courtyard, "pipes": pipes}
+_DEVELOPMENT: _Builders = {"wall-object": wall_object, "facade": facade, "street": street}
 
 SCENE_NAMES = tuple(_BUILDERS)
 """Names of the scenes that were built by hand; `make_scene` also knows `DEVELOPMENT_NAMES`, `random-N` and `wild-N`."""
@@ -180,10 +167,8 @@ _SKY = re.compile(r"sky=((?:0?\.\d+|[01](?:\.0*)?)(?:,(?:0?\.\d+|[01](?:\.0*)?))
 
 
 def check_scene_name(name: str) -> str:
-    """Return a name if `make_scene` knows it.
+    """Return a name if `make_scene` knows it, else raise a `SceneError` that lists the names there are.
 
-    Raises:
-        SceneError: No scene has that name; the message lists those there are.
 
     >>> check_scene_name("random-17")
     'random-17'

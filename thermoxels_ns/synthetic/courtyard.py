@@ -36,10 +36,8 @@ _BEAM_Z = 2.4
 _COLUMNS: tuple[Box, ...] = tuple(
     ((x, _COLUMN_Y, 0.0), (x + _COLUMN_M, _COLUMN_Y + _COLUMN_M, _BEAM_Z)) for x in _COLUMN_X
 )
-_BEAM: Box = (
-    (_WEST[1][0], _COLUMN_Y, _BEAM_Z),
-    (_COLUMN_X[-1] + _COLUMN_M, _COLUMN_Y + _COLUMN_M, _BEAM_Z + _COLUMN_M),
-)
+_END_M = _COLUMN_Y + _COLUMN_M
+_BEAM: Box = ((_WEST[1][0], _COLUMN_Y, _BEAM_Z), (_COLUMN_X[-1] + _COLUMN_M, _END_M, _BEAM_Z + _COLUMN_M))
 
 # A free-standing wall, 1.8 voxels thick where 128 of them span the scene.
 _GARDEN_WALL: Box = ((1.2, -4.4, 0.0), (4.8, -4.24, 1.6))
@@ -130,10 +128,7 @@ def courtyard() -> SyntheticScene:
 
     return SyntheticScene(
         name="courtyard",
-        solid=BoxSolid(
-            (_GROUND, *_WINGS, *_ROOFS, _CHIMNEY, *_COLUMNS, _BEAM, _GARDEN_WALL, _FLUE),
-            removed=cut,
-        ),
+        solid=BoxSolid((_GROUND, *_WINGS, *_ROOFS, _CHIMNEY, *_COLUMNS, _BEAM, _GARDEN_WALL, _FLUE), removed=cut),
         scene_box=_BOX,
         temperature_bounds_c=(_HORIZON_C - _SKY_DROP_K, 40.0),
         colour=lambda points, normals: painted(points, normals, part(points, normals), paints, texture, light),

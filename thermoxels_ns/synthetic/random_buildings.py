@@ -47,12 +47,8 @@ def detached_house(plan: Plan) -> None:
     annex = _against((axis, sign, plane), out, (middle - 0.5 * along, middle + 0.5 * along), (0.0, annex_high))
     plan.put(annex, plan.paint("wall"), u(0.15, 0.6))
     eaves = u(SMALLEST, 4.5)
-    cover = _against(
-        (axis, sign, plane),
-        out + eaves,
-        (middle - 0.5 * along - eaves, middle + 0.5 * along + eaves),
-        (annex_high, annex_high + u(3.4, 5)),
-    )
+    beside = (middle - 0.5 * along - eaves, middle + 0.5 * along + eaves)
+    cover = _against((axis, sign, plane), out + eaves, beside, (annex_high, annex_high + u(3.4, 5)))
     plan.put(cover, roof if plan.chance(0.5) else plan.paint("roof"), u(0.05, 0.3))
     _windows(plan, annex_wall, (middle - 0.5 * along, middle + 0.5 * along), (4.0, annex_high - 4.0), glass)
     for other in range(4):

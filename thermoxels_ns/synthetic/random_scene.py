@@ -20,7 +20,7 @@ from thermoxels_ns.synthetic.random_buildings import detached_house, facade, rai
 from thermoxels_ns.synthetic.random_plan import Plan
 from thermoxels_ns.synthetic.random_plant import machinery, pipes_and_radiators
 from thermoxels_ns.synthetic.scene_truth import RgbFunction, SyntheticScene
-from thermoxels_ns.synthetic.solids import Box
+from thermoxels_ns.synthetic.solids import Box, box_between
 from thermoxels_ns.synthetic.surroundings import plain, with_room, with_street
 
 FloatArray = npt.NDArray[np.float64]
@@ -29,10 +29,7 @@ _PICTURE_ASPECT = 0.75
 _RIM = 0.95
 _AZIMUTHS = 73
 _AIMS = 9
-_ELEVATIONS_DEG = {
-    2: ((10.0, 20.0), (38.0, 50.0)),
-    3: ((7.0, 15.0), (24.0, 36.0), (46.0, 60.0)),
-}
+_ELEVATIONS_DEG = {2: ((10.0, 20.0), (38.0, 50.0)), 3: ((7.0, 15.0), (24.0, 36.0), (46.0, 60.0))}
 _FARTHEST_SHARE = 1.10
 
 
@@ -94,7 +91,7 @@ _RANGE_K = (15.0, 60.0)
 class Family:
     """A kind of arrangement."""
 
-    name: str  # what it shows
+    name: str
     lay_out: Callable[[Plan], None]  # puts its pieces into a plan
     size_m: tuple[float, float]  # longest side of the smallest and of the largest one [m]
     outdoors: float  # share of them that stand under the sky; the others stand in a room
@@ -155,18 +152,10 @@ def random_scene(seed: int, wild: bool = False) -> SyntheticScene:
     span = 360.0 if family.arc_deg is None else round(float(draw.uniform(*family.arc_deg)), 1)
     start = round(float(draw.uniform(0.0, 360.0)), 1) if family.arc_deg is None else -90.0 - 0.5 * span
     rings = random_rings(draw, plan.boxes_around(), focal_share, (start, span))
-    scene = scene_of_plan(
-        f"{'wild' if wild else 'random'}-{seed}",
-        plan,
-        texture_seed,
-        light,
-        surface_c,
-        temperature_bounds_c=bounds_c,
-        background_rgb=background_rgb,
-        background_temperature_c=background_c,
-        rings=rings,
-        focal_share=focal_share,
-    )
+    rest: dict[str, Any] = {"background_rgb": background_rgb, "background_temperature_c": background_c}
+    rest |= {"temperature_bounds_c": bounds_c, "rings": rings, "focal_share": focal_share}
+    name = f"{'wild' if wild else 'random'}-{seed}"
+    scene = scene_of_plan(name, plan, texture_seed, light, surface_c, **rest)
     kind = seed % 3  # beside seed % 5 of the families: 15 seeds in a row show every pair
     if not wild or kind == 0:
         return scene
@@ -196,13 +185,12 @@ def scene_of_plan(
         return (1.0 - share) * surface_c[0] + share * surface_c[1]
 
     mirrors = np.array([paint.mirror for paint in plan.paints], dtype=np.float32)
+    look = plan.paints, texture, light
     return SyntheticScene(
         name=name,
         solid=solid,
         scene_box=box,
-        colour=lambda points, normals: painted(
-            points, normals, plan.part(points, normals), plan.paints, texture, light
-        ),
+        colour=lambda points, normals: painted(points, normals, plan.part(points, normals), *look),
         surface_temperature_c=temperature_c,
         mirror=(lambda points, normals: mirrors[plan.part(points, normals)]) if mirrors.any() else None,
         **rest,
@@ -213,15 +201,13 @@ def _box_around(bounds: Box) -> Box:
     """The box to reconstruct: the solid and a margin of 4 % of the longest side all round."""
     lo, hi = np.asarray(bounds[0]), np.asarray(bounds[1])
     margin = float((hi - lo).max()) * _MARGIN_SHARE / (1.0 - 2.0 * _MARGIN_SHARE)
-    (x0, y0, z0), (x1, y1, z1) = np.round(lo - margin, 3).tolist(), np.round(hi + margin, 3).tolist()
-    return (x0, y0, z0), (x1, y1, z1)
+    return box_between(np.round(lo - margin, 3), np.round(hi + margin, 3))
 
 
 def _light(draw: np.random.Generator) -> SunLight:
     azimuth, height = draw.uniform(0.0, 2.0 * np.pi), draw.uniform(0.35, 1.2)
-    return SunLight(
-        (float(np.cos(azimuth)), float(np.sin(azimuth)), float(height)), ambient=float(draw.uniform(0.5, 0.75))
-    )
+    towards = (float(np.cos(azimuth)), float(np.sin(azimuth)), float(height))
+    return SunLight(towards, ambient=float(draw.uniform(0.5, 0.75)))
 
 
 def _surroundings(
@@ -236,12 +222,8 @@ def _surroundings(
         return _dimmed(sky_rgb, brightness), lambda d: sky_temperature_c(d, air, drop), surface, bounds
     room = _degrees(draw.uniform(12.0, 25.0))
     surface = (room + float(draw.uniform(0.0, 1.5)), room + spread)
-    return (
-        _dimmed(room_rgb, brightness),
-        lambda directions: np.full(len(np.asarray(directions)), room),
-        surface,
-        (room, room + spread),
-    )
+    bounds = (room, room + spread)
+    return _dimmed(room_rgb, brightness), lambda d: np.full(len(np.asarray(d)), room), surface, bounds
 
 
 def _degrees(value: float) -> float:

@@ -49,12 +49,8 @@ def render_view(scene: SyntheticScene, pose: npt.ArrayLike, camera: Camera, samp
     rgb, temperature_c = _look(scene, origin, directions.reshape(-1, 3))
     hits, first = _first_hits(scene, origin, camera.directions(pose).reshape(-1, 3))
     depth = np.where(first == 0, hits[0].distance, np.inf).reshape(shape)
-    return RenderedView(
-        rgb.reshape(*shape, -1, 3).mean(axis=2),
-        temperature_c.reshape(*shape, -1).mean(axis=2),
-        depth,
-        np.isfinite(depth),
-    )
+    rgb, temperature_c = rgb.reshape(*shape, -1, 3).mean(axis=2), temperature_c.reshape(*shape, -1).mean(axis=2)
+    return RenderedView(rgb, temperature_c, depth, np.isfinite(depth))
 
 
 def visible_surface_points(
@@ -137,8 +133,7 @@ def _look(
 def _position_outside(scene: SyntheticScene, pose: FloatArray) -> FloatArray:
     origin = pose[:3, 3]
     if float(scene.signed_distance(origin[None])[0]) < 0.0:
-        expected = f"a point outside the solid of scene {scene.name}"
-        got = f"{origin.tolist()}, which is inside it"
+        expected, got = f"a point outside the solid of scene {scene.name}", f"{origin.tolist()}, which is inside it"
         remedy = "Move the camera out of the solid."
         raise SceneError("camera position", expected=expected, got=got, remedy=remedy)
     return origin

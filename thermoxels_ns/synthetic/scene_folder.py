@@ -76,8 +76,7 @@ def write_scene(
             scene which is not synthetic is refused.
         num_train: Number of training views.
         num_eval: Number of held-out views, half-way between training views.
-        width: Width of the photographs [pixels].
-        height: Height of the photographs [pixels].
+        width, height: Size of the photographs [pixels].
         thermal_width: Width of the thermal images [pixels]. None: that of the photographs, or half of it for a
             camera of their own. The height follows: the photographs' aspect, or 5:4 for a camera of their own.
         thermal_format: How temperatures are stored; the unit of TIFF counts is written under ``thermal_unit``.
@@ -89,9 +88,6 @@ def write_scene(
         photo_format: How photographs are stored.
         progress: Show a progress bar.
 
-    Returns:
-        The folder.
-
     Raises:
         SceneError: An option is out of range, or the folder holds somebody else's scene.
         OutputError: The folder cannot be written to.
@@ -101,9 +97,7 @@ def write_scene(
     camera = scene.camera(width, height)
     thermal_camera = _second_camera(scene, *thermal_size) if own_thermal_camera else scene.camera(*thermal_size)
     train, held_out = scene.poses(num_train, num_eval)
-    names = [f"frame_train_{i + 1:05d}" for i in range(num_train)] + [
-        f"frame_eval_{i + 1:05d}" for i in range(num_eval)
-    ]
+    names = [f"frame_{kind}_{i + 1:05d}" for kind, n in (("train", num_train), ("eval", num_eval)) for i in range(n)]
     poses = np.concatenate([train, held_out])
     thermal_poses = poses @ _second_camera_offset(scene) if own_thermal_camera else poses
     drifts = drift_k * np.random.default_rng([seed, 0]).standard_normal(len(poses))
@@ -132,10 +126,8 @@ def write_scene(
             _save_thermal(path, measured_c, unit)
         frames.append(frame)
 
-    _write_json(
-        target / "temperature_bounds.json",
-        {"absolute_min_temperature": bounds[0], "absolute_max_temperature": bounds[1]},
-    )
+    names_of_bounds = ("absolute_min_temperature", "absolute_max_temperature")
+    _write_json(target / "temperature_bounds.json", dict(zip(names_of_bounds, bounds)))
     transforms: dict[str, Any] = _intrinsics(camera)
     if own_thermal_camera:
         transforms["thermal_camera"] = _intrinsics(thermal_camera)
@@ -151,8 +143,7 @@ def write_scene(
 def load_truth(scene_folder: Path | str) -> SyntheticScene | None:
     """Get the exact scene that a folder was written from; None for real photographs (no ``truth.json``).
 
-    Raises:
-        SceneError: The json is unreadable, or names a scene that does not exist.
+    A `SceneError` is raised where the json is unreadable, or names a scene that does not exist.
     """
     path = Path(scene_folder) / _TRUTH
     if not path.is_file():
@@ -194,10 +185,8 @@ def _check_options(photo_format: str, thermal_format: str, noise_k: float, drift
 
 
 def _prepared_folder(folder: Path | str) -> Path:
-    """Make the folders and take away an earlier synthetic scene, so that nothing stale or half-written stays.
-
-    The json goes last: whatever interrupts this, the next call still knows what to take away.
-    """
+    """Make the folders and take away an earlier synthetic scene, so that nothing stale or half-written stays."""
+    # The json goes last: whatever interrupts this, the next call still knows what to take away.
     target = writable_folder(folder)
     old = target / "transforms.json"
     if old.exists():
@@ -205,8 +194,7 @@ def _prepared_folder(folder: Path | str) -> Path:
         if "truth" not in content and not (target / _TRUTH).is_file():  # earlier checkouts wrote it there
             expected = "an empty folder or one with an earlier synthetic scene"
             got = f"{target}, whose transforms.json describes other photographs"
-            remedy = "Choose another folder."
-            raise SceneError("output folder", expected=expected, got=got, remedy=remedy)
+            raise SceneError("output folder", expected=expected, got=got, remedy="Choose another folder.")
         for path in _listed_files(target, content):
             remove_file(path)
         remove_file(old)
@@ -276,17 +264,9 @@ def _save_thermal(path: Path, temperature_c: FloatArray, unit: dict[str, float] 
 
 
 def _intrinsics(camera: Camera) -> dict[str, Any]:
-    distortion = dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
-    return {
-        "camera_model": "OPENCV",
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": camera.fl_x,
-        "fl_y": camera.fl_y,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        **distortion,
-    }
+    names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+    values = {name: getattr(camera, name) for name in names}
+    return {"camera_model": "OPENCV", "w": camera.width, "h": camera.height, **values}
 
 
 def _read_json(path: Path) -> dict[str, Any]:

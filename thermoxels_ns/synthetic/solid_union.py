@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.box_solid import BoxSolid
-from thermoxels_ns.synthetic.solids import Box, Cylinder, Hits, Sphere
+from thermoxels_ns.synthetic.solids import Box, Cylinder, Hits, Sphere, box_between
 
 FloatArray = npt.NDArray[np.float64]
 Part = BoxSolid | Sphere | Cylinder
@@ -38,8 +38,7 @@ class SolidUnion:
     def bounds(self) -> Box:
         """Lower and upper corner of the smallest box around the solid [m]."""
         corners = np.array([part.bounds for part in self.parts])
-        (x0, y0, z0), (x1, y1, z1) = corners[:, 0].min(axis=0).tolist(), corners[:, 1].max(axis=0).tolist()
-        return (x0, y0, z0), (x1, y1, z1)
+        return box_between(corners[:, 0].min(axis=0), corners[:, 1].max(axis=0))
 
     @property
     def volume(self) -> float:
@@ -74,11 +73,10 @@ class SolidUnion:
         """Draw points uniformly by area: positions (count, 3) and outward normals (count, 3)."""
         areas = np.array([part.area for part in self.parts])
         shares = np.random.default_rng(seed).multinomial(count, areas / areas.sum())
-        drawn = [
-            part.surface_points(int(share), seed + 1 + number)
-            for number, (part, share) in enumerate(zip(self.parts, shares))
-        ]
-        return np.concatenate([points for points, _ in drawn]), np.concatenate([normals for _, normals in drawn])
+        parts = enumerate(zip(self.parts, shares), start=seed + 1)
+        drawn = zip(*(part.surface_points(int(share), own_seed) for own_seed, (part, share) in parts))
+        points, normals = (np.concatenate(each) for each in drawn)
+        return points, normals
 
 
 def _overlap(first: Part, second: Part) -> bool:

@@ -142,27 +142,20 @@ def _board_in_camera(pixels: FloatArray, camera: Camera, board: CheckerBoard) ->
 
 def board_of(settings: CaptureSettings) -> CheckerBoard | None:
     """The board that the options describe, None where they name none; a `SceneError` where one of them is missing."""
-    given = {
-        "--board-photos": settings.board_photos,
-        "--board": settings.board,
-        "--board-square-m": settings.board_square_m,
-    }
-    missing = [name for name, value in given.items() if value is None]
-    if len(missing) == len(given):
+    names = ("board_photos", "board", "board_square_m")
+    missing = [f"--{name.replace('_', '-')}" for name in names if getattr(settings, name) is None]
+    if len(missing) == len(names):
         return None
     if missing or settings.rig is not None:
-        raise SceneError(
-            "checker board",
-            expected="--board-photos, --board and --board-square-m together, and no --rig beside them",
-            got=("no " + " and no ".join(missing)) if missing else "all of them and --rig",
-            remedy="Pass --board-photos FOLDER --board 7x5 --board-square-m 0.03, or none of them.",
-        )
+        expected = "--board-photos, --board and --board-square-m together, and no --rig beside them"
+        got = ("no " + " and no ".join(missing)) if missing else "all of them and --rig"
+        remedy = "Pass --board-photos FOLDER --board 7x5 --board-square-m 0.03, or none of them."
+        raise SceneError("checker board", expected=expected, got=got, remedy=remedy)
     match = _SIZE.fullmatch(str(settings.board).strip())
     if match is None:
+        expected = "inner corners along both sides, such as 7x5"
         remedy = "Count the corners where four squares meet; one less than squares."
-        raise SceneError(
-            "--board", expected="inner corners along both sides, such as 7x5", got=repr(settings.board), remedy=remedy
-        )
+        raise SceneError("--board", expected=expected, got=repr(settings.board), remedy=remedy)
     sides = sorted(map(int, match.groups()), reverse=True)
     assert settings.board_square_m is not None
     return CheckerBoard(sides[0], sides[1], settings.board_square_m)
@@ -190,8 +183,8 @@ def rig_from_board_photos(
     if not search.pairs:
         example = next((f"{path.name}: {why}" for path, why in search.unpaired.items()), "no camera files")
         expected = "photographs with thermal images"
-        remedy = "Give both of a shot the same name or time."
-        raise SceneError(f"board pictures in {source}", expected=expected, got=f"none; {example}", remedy=remedy)
+        got, remedy = f"none; {example}", "Give both of a shot the same name or time."
+        raise SceneError(f"board pictures in {source}", expected=expected, got=got, remedy=remedy)
     read = read_frames(search.pairs, source, folder, radiometry, settings.skip_bad, settings.thermal_mask, say)
     if read.thermal_size != thermal_size:
         raise _another_camera("thermal images", thermal_size, read.thermal_size)
@@ -227,12 +220,9 @@ def in_scene_units(rig: RigEstimate, scale: MetricScale | None, missing: str) ->
 
 
 def _another_camera(name: str, wanted: Sequence[int], got: Sequence[int]) -> SceneError:
-    return SceneError(
-        f"board pictures: {name}",
-        expected=f"{wanted[0]} x {wanted[1]} pixels, as in the capture",
-        got=f"{got[0]} x {got[1]}",
-        remedy="Photograph the board with the same cameras in the same mode.",
-    )
+    expected = f"{wanted[0]} x {wanted[1]} pixels, as in the capture"
+    remedy = "Photograph the board with the same cameras in the same mode."
+    return SceneError(f"board pictures: {name}", expected=expected, got=f"{got[0]} x {got[1]}", remedy=remedy)
 
 
 def _listed(names: Sequence[str], most: int = 10) -> str:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy import fft
 
+from thermoxels_ns.capture.rig.fit import RigFit
 from thermoxels_ns.capture.rig.score import EdgePoints, RigScore
 from thermoxels_ns.capture.rig_types import FloatArray
 
@@ -22,14 +22,6 @@ _APART_PX = 3.0
 _SMALLEST_OVERLAP = 0.3
 _PADDING = 1.6
 _CHANCE_DRAWS = 3
-
-
-@dataclass(frozen=True, eq=False)
-class CoarseRig:
-    """One place where the coarse search found agreement."""
-
-    change: FloatArray  # the ten changes
-    score: float
 
 
 class CoarseSearch:
@@ -56,11 +48,11 @@ class CoarseSearch:
         self._focals = _steps(_REACH_SIGMAS * float(sigmas[6]), _STEP_PX / (0.5 * camera.width))
         self._rolls = _steps(_REACH_SIGMAS * float(sigmas[2]), _STEP_PX / corner_px)
 
-    def best(self) -> list[CoarseRig]:
+    def best(self) -> list[RigFit]:
         """Find the best few places that differ, best first."""
         found = self._found([self._spectra(edges.field, edges.weight) for edges in self._thermal])
         found.sort(key=lambda rig: -rig.score)
-        kept: list[CoarseRig] = []
+        kept: list[RigFit] = []
         for rig in found:
             apart = [np.abs((rig.change - other.change)[:2]).max() * self._rig.camera.fl_x for other in kept]
             if not apart or min(apart) >= _APART_PX:
@@ -70,11 +62,7 @@ class CoarseSearch:
         return kept
 
     def best_by_chance(self) -> float:
-        """Highest score that the same search finds if edges of the same scales lie anywhere.
-
-        The thermal edges are replaced by noise with their power spectrum (random phases): what the images show is
-        gone, how often chance agrees stays.
-        """
+        """Highest score that the same search finds if edges of the same scales lie anywhere (noise, random phases)."""
         draw = np.random.default_rng(0)
         highest = 0.0
         for _ in range(_CHANCE_DRAWS):
@@ -92,8 +80,8 @@ class CoarseSearch:
         planes = weight, (np.abs(field) ** 2 * weight).astype(np.float32)
         return (np.asarray(weighted), *(np.asarray(fft.rfft2(plane, s=self._shape)) for plane in planes))
 
-    def _found(self, spectra: Sequence[_Spectra]) -> list[CoarseRig]:
-        found: list[CoarseRig] = []
+    def _found(self, spectra: Sequence[_Spectra]) -> list[RigFit]:
+        found: list[RigFit] = []
         for log_focal in self._focals:
             for roll in self._rolls:
                 change = np.zeros(10)
@@ -117,10 +105,7 @@ class CoarseSearch:
         return np.asarray(fft.ifft2(product)).real / np.sqrt(norm)
 
     def _splat(self, edges: EdgePoints, change: FloatArray) -> tuple[npt.NDArray, npt.NDArray, npt.NDArray]:
-        """Edge values, their power and their number in each pixel of the padded image.
-
-        Shifts wrap around: points left of or above the thermal image lie at the far end of the padded one.
-        """
+        """Edge values, their power and their number in each pixel of the padded image, around which shifts wrap."""
         rows, columns = self._shape
         pixels = np.nan_to_num(self._rig.project(change, edges.points), nan=-1e6)
         x, y = np.floor(pixels[:, 0]).astype(np.int64), np.floor(pixels[:, 1]).astype(np.int64)
@@ -133,7 +118,7 @@ class CoarseSearch:
         )
         return real + np.complex64(1j) * imaginary, power, count
 
-    def _best_shifts(self, surface: FloatArray, change: FloatArray) -> list[CoarseRig]:
+    def _best_shifts(self, surface: FloatArray, change: FloatArray) -> list[RigFit]:
         """The highest places of one surface within reach, as turns of the camera."""
         across, down = (int(np.ceil(reach)) for reach in self._reach_px)
         window = np.roll(surface, (down, across), axis=(0, 1))[: 2 * down + 1, : 2 * across + 1]
@@ -143,7 +128,7 @@ class CoarseSearch:
             row, column = divmod(int(place), window.shape[1])
             shifted = change.copy()
             shifted[:2] = -(row - down) / focal[1], (column - across) / focal[0]
-            found.append(CoarseRig(shifted, float(window[row, column])))
+            found.append(RigFit(shifted, float(window[row, column])))
         return found
 
 

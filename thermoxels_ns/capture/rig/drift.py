@@ -49,11 +49,8 @@ def estimate_drift(
     loss, reweighted), the points' temperatures eliminated, mean offset 0. The correction is fitted to four fifths of
     the points and kept only if it lowers the disagreement at the others.
 
-    Returns:
-        The correction; all zeros with `used` False and the reason where there is nothing to gain.
-
-    Raises:
-        SceneError: A thermal image cannot be read or has not the camera's size.
+    Without anything to gain the correction is all zeros, with `used` False and the reason. A `SceneError` is raised
+    where a thermal image cannot be read or has not the camera's size.
     """
     if len(frames) < 2:
         return _nothing(len(frames), np.nan, f"{len(frames)} frame: there is nothing to compare it with")
@@ -74,11 +71,8 @@ def drift_of_samples(samples: DriftSamples) -> DriftEstimate:
     radial = full_k < (1.0 - _GAIN_OF_RADIAL) * plain_k
     after_k = full_k if radial else plain_k
     if not after_k < (1.0 - _GAIN_OF_OFFSETS) * before_k:
-        reason = (
-            f"two images differ by {before_k:.3g} K at shared points, and by {after_k:.3g} K with the best "
-            f"correction, at points it was not fitted to"
-        )
-        return _nothing(frames, before_k, reason)
+        after = f"{after_k:.3g} K with the best correction, at points it was not fitted to"
+        return _nothing(frames, before_k, f"two images differ by {before_k:.3g} K at shared points, and by {after}")
     best = _fit(samples, _RADIAL_TERMS if radial else 0)
     groups = _groups(samples)
     corner_k = sum(best.radial)
@@ -122,9 +116,8 @@ def _fit(samples: DriftSamples, radial_terms: int) -> _Fit:
 
         shared = incidence.T @ in_frame.multiply(weight[:, None]).tocsr()  # weight of frame f in point i
         normal = np.zeros((frames + radial_terms,) * 2)
-        normal[:frames, :frames] = (
-            np.diag(in_frame.T @ weight) - (shared.T @ shared.multiply(1 / mass[:, None])).toarray()
-        )
+        explained = (shared.T @ shared.multiply(1 / mass[:, None])).toarray()
+        normal[:frames, :frames] = np.diag(in_frame.T @ weight) - explained
         flat = centred(np.column_stack([design, samples.temperature_c]))
         side = in_frame.T @ (weight[:, None] * flat)
         normal[:frames, frames:], normal[frames:, :frames] = side[:, :-1], side[:, :-1].T
@@ -159,9 +152,8 @@ def _disagreement_k(samples: DriftSamples, wrong: FloatArray) -> float:
 def _groups(samples: DriftSamples) -> int:
     """How many groups of frames there are that share no point with another group."""
     frames, points = samples.num_frames, samples.num_points
-    links = csr_matrix(
-        (np.ones(len(samples.point)), (samples.frame, frames + samples.point)), shape=(frames + points,) * 2
-    )
+    ends = (samples.frame, frames + samples.point)
+    links = csr_matrix((np.ones(len(samples.point)), ends), shape=(frames + points,) * 2)
     _, label = connected_components(links, directed=False)
     return len(np.unique(label[:frames]))
 
@@ -224,9 +216,8 @@ def sample_shared_points(frames: Sequence[RigFrame], camera: Camera, visible_to_
 
 def _chosen_points(frames: Sequence[RigFrame]) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """World positions (n, 3) of the points that most frames share, some from every frame, and who tracks them."""
-    ids, first, inverse = np.unique(
-        np.concatenate([frame.point_ids for frame in frames]), return_index=True, return_inverse=True
-    )
+    every = np.concatenate([frame.point_ids for frame in frames])
+    ids, first, inverse = np.unique(every, return_index=True, return_inverse=True)
     world = np.concatenate([np.asarray(frame.points_world, dtype=np.float64).reshape(-1, 3) for frame in frames])[first]
     views = np.bincount(inverse.ravel(), minlength=len(ids))
     seen = np.split(inverse.ravel(), np.cumsum([len(frame.point_ids) for frame in frames])[:-1])

@@ -106,8 +106,7 @@ def uncertainty_text(covariance: FloatArray, sigmas: FloatArray) -> str:
     'The images say next to nothing about the distortion: it is as unsure as at the start.'
     """
     errors = np.sqrt(np.diag(covariance))
-    sentences = []
-    pairs = []
+    sentences, pairs = [], []
     for first, second in _EXCHANGED:
         a, b = PARAMETERS.index(first), PARAMETERS.index(second)
         if errors[a] > 0.0 and errors[b] > 0.0 and abs(covariance[a, b]) > _SAME * errors[a] * errors[b]:

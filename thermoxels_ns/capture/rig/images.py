@@ -77,10 +77,8 @@ class PreparedFrames:
         return RigScore(edges, thermal, level, change)
 
     def _edge_points(self, frame: PreparedFrame, level: RigModel, change: npt.NDArray, blur_px: float) -> EdgePoints:
-        """The strongest edges of a photograph, in pixels somewhat smaller than the thermal image's.
-
-        Pixels of the same size would fall onto each other at whole shifts, which interpolation then prefers.
-        """
+        """The strongest edges of a photograph, in pixels somewhat smaller than the thermal image's."""
+        # Pixels of the same size would fall onto each other at whole shifts, which interpolation then prefers.
         height, width = frame.grey.shape
         same = level.camera.fl_x / self.visible.resized(width, height).fl_x
         scale = min(_FINER * same, 1.0)
@@ -152,8 +150,7 @@ def read_photograph(frame: RigFrame, camera: Camera) -> FloatImage:
         encoded = np.frombuffer(source.read_bytes(), np.uint8)
         image = cv2.imdecode(encoded, flags) if len(encoded) else None
         if image is None:
-            remedy = "Copy it from the camera again or leave the frame out."
-            got = "a file that is damaged or no image"
+            remedy, got = "Copy it from the camera again or leave the frame out.", "a file that is damaged or no image"
             raise SceneError(f"{frame.name}: {source.name}", expected="a readable photograph", got=got, remedy=remedy)
     else:
         image = np.asarray(source)
@@ -161,8 +158,7 @@ def read_photograph(frame: RigFrame, camera: Camera) -> FloatImage:
     height, width = image.shape
     if abs(width * camera.height / (height * camera.width) - 1.0) > _ASPECT_TOLERANCE:
         expected = f"the aspect of the visible camera, {camera.width} x {camera.height}"
-        got = f"{width} x {height} pixels"
-        remedy = "Use the photographs that the poses were computed from."
+        got, remedy = f"{width} x {height} pixels", "Use the photographs that the poses were computed from."
         raise SceneError(f"{frame.name}: photograph", expected=expected, got=got, remedy=remedy)
     return image.astype(np.float32)
 
@@ -176,10 +172,8 @@ def edge_field(image: FloatImage, blur_px: float, pixels_per_pixel: float = 1.0)
     Strong edges all count as 1 and noise as little: z / (|z| + c) with c a multiple of the median of |z|, the
     level of noise in an image that is mostly flat. NaN pixels and what lies next to them count as no edge.
 
-    Args:
-        image: Shape (height, width).
-        blur_px: Standard deviation of the blur that follows, which is how far apart two edges may lie to be found.
-        pixels_per_pixel: How many pixels of this image are one of those that lengths are given in.
+    `blur_px` is the standard deviation of the blur that follows: how far apart two edges may lie to be found, in pixels
+    of which `pixels_per_pixel` of the image make one.
     """
     bad = ~np.isfinite(image)
     filled = np.where(bad, np.float32(np.nanmedian(image) if not bad.all() else 0.0), image).astype(np.float32)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermoxels_ns.capture.rig.coarse_search import CoarseRig, CoarseSearch
+from thermoxels_ns.capture.rig.coarse_search import CoarseSearch
 from thermoxels_ns.capture.rig.explanation import uncertainty_text
-from thermoxels_ns.capture.rig.fit import RigMaximizer
+from thermoxels_ns.capture.rig.fit import RigFit, RigMaximizer
 from thermoxels_ns.capture.rig.images import PreparedFrames, prepare_frames
 from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel, prior_sigmas
 from thermoxels_ns.capture.rig.refinement import refine
@@ -74,7 +74,7 @@ class _RigSearch:
         if len(self.prepared.frames) < _FEWEST_FRAMES:
             reason = f"{len(self.prepared.frames)} frames are too few to tell; at least {_FEWEST_FRAMES} are needed"
             return self._kept(rig, sigmas, before, reason)
-        coarse_rigs: list[CoarseRig] = []
+        coarse_rigs: list[RigFit] = []
         chance, level = 0.0, 0
         for level, size in enumerate(sizes[:_SEARCHED_SIZES]):  # small things show in the second size only
             self.progress(f"Comparing edges, all directions, {size[0]} x {size[1]} pixels", 0.1 * (1 + level))
@@ -126,7 +126,7 @@ class _RigSearch:
         ).rstrip()
         return RigEstimate(camera, transform, True, explanation, PARAMETERS, covariance, before, after, error_px)
 
-    def _best_maximum(self, coarse: RigScore, coarse_rigs: Sequence[CoarseRig], sigmas: FloatArray) -> FloatArray:
+    def _best_maximum(self, coarse: RigScore, coarse_rigs: Sequence[RigFit], sigmas: FloatArray) -> FloatArray:
         """Maximise from every coarse rig worth it; the ten changes of the maximum that agrees best."""
         maxima = []
         for one in coarse_rigs:

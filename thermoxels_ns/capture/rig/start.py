@@ -106,16 +106,12 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
         got = f"no {problem}" if isinstance(problem, KeyError) else str(problem)
         raise SceneError(str(file), expected="'thermal_camera' and 'rig'", got=got, remedy=remedy) from problem
     if not _is_rigid(transform):
-        raise SceneError(
-            f"{file}: rig", expected="4 x 4 numbers, a rotation and a shift", got=transform.tolist(), remedy=remedy
-        )
+        expected, got = "4 x 4 numbers, a rotation and a shift", transform.tolist()
+        raise SceneError(f"{file}: rig", expected=expected, got=got, remedy=remedy)
     if (camera.width, camera.height) != thermal_size:
-        raise SceneError(
-            f"{file.name}: thermal_camera",
-            expected=f"{thermal_size[0]} x {thermal_size[1]} pixels, as the images have",
-            got=f"{camera.width} x {camera.height}",
-            remedy="Pass the rig of the same camera and mode.",
-        )
+        expected = f"{thermal_size[0]} x {thermal_size[1]} pixels, as the images have"
+        got, remedy = f"{camera.width} x {camera.height}", "Pass the rig of the same camera and mode."
+        raise SceneError(f"{file.name}: thermal_camera", expected=expected, got=got, remedy=remedy)
     theirs = content.get("metres_per_unit")
     if metres_per_unit is not None and isinstance(theirs, (int, float)) and 0.0 < theirs < math.inf:
         transform[:3, 3] *= theirs / metres_per_unit

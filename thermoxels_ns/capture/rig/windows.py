@@ -203,16 +203,13 @@ def window_design(
     length = np.sqrt(np.sum(bright * bright, axis=1))
     index, bright, length = (each[length > _SMALLEST_VARIANCE] for each in (index, bright, length))
     used, number = np.unique(index, return_inverse=True)
-    return WindowDesign(
-        rays[used], number.reshape(-1, len(down)), plain, bright / length[:, None], weight, np.ones(len(index))
-    )
+    number, bright = number.reshape(-1, len(down)), bright / length[:, None]
+    return WindowDesign(rays[used], number, plain, bright, weight, np.ones(len(index)))
 
 
 def _contrast(photograph: FloatImage, near: npt.NDArray[np.bool_], plain: FloatArray, weight: FloatArray) -> FloatArray:
-    """Length of what the window around each pixel has beside planes, shape (height, width).
-
-    |w p|^2 less the squares of (w p)'s parts along the planes, all of them correlations with small images.
-    """
+    """Length of what the window around each pixel has beside planes, shape (height, width)."""
+    # |w p|^2 less the squares of (w p)'s parts along the planes, all of them correlations with small images.
 
     def correlated(image: FloatArray, entries: FloatArray) -> FloatArray:
         side = round(np.sqrt(near.size))

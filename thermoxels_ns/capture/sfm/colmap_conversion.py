@@ -67,15 +67,15 @@ def model_of_colmap(
         seen += order
         pixels += [own[point] for point in order]
     return SfmModel(
-        frames=tuple(frame_of_image[image.name] for image in posed.values()),
-        camera=found.resized(*size),
-        camera_to_world=np.stack(poses),
-        points=np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
-        colours=np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
-        point_error_px=np.array([point.error for point in points], dtype=np.float64) * float(factor.mean()),
-        sighting_frame=np.array(frames, dtype=np.int64),
-        sighting_point=np.array(seen, dtype=np.int64),
-        sighting_pixel=np.array(pixels, dtype=np.float64).reshape(-1, 2) * factor,
+        tuple(frame_of_image[image.name] for image in posed.values()),
+        found.resized(*size),
+        np.stack(poses),
+        np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3),
+        np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3),
+        np.array([point.error for point in points], dtype=np.float64) * float(factor.mean()),
+        np.array(frames, dtype=np.int64),
+        np.array(seen, dtype=np.int64),
+        np.array(pixels, dtype=np.float64).reshape(-1, 2) * factor,
     )
 
 

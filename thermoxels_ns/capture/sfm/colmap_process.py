@@ -46,13 +46,8 @@ def run_in_process(
         OSError: It raised one.
     """
     start = f"import sys; sys.path[:] = {sys.path!r}; import {__name__} as there; there.serve()"
-    child = subprocess.Popen(
-        [sys.executable, "-c", start],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        env=os.environ | _ENVIRONMENT,
-    )
+    command, pipe, environment = [sys.executable, "-c", start], subprocess.PIPE, os.environ | _ENVIRONMENT
+    child = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.STDOUT, env=environment)
     assert child.stdin is not None and child.stdout is not None
     words: deque[str] = deque(maxlen=_LINES_KEPT)
     ended: tuple[Any, Exception | None] | None = None  # what it returned, and what it raised
@@ -135,13 +130,8 @@ def colmap_stopped(reason: str, folder: Path) -> ThermoxelsError:
     free = shutil.disk_usage(folder).free
     if free < _FULL_BYTES or "disk is full" in reason:
         return _too_little(folder, "free space for features, matches and poses, to the end", free, "Make space")
-    return ThermoxelsError(
-        "COLMAP",
-        expected="to end",
-        got=reason,
-        remedy="Check free space and memory and run the command again; if that does not help, begin anew with "
-        "--from-stage poses.",
-    )
+    remedy = "Check free space and memory and run the command again; if that does not help, begin anew with "
+    return ThermoxelsError("COLMAP", expected="to end", got=reason, remedy=remedy + "--from-stage poses.")
 
 
 def check_free_space(folder: Path, needed_bytes: float, purpose: str, remedy: str) -> None:
@@ -160,9 +150,5 @@ def disk_of(path: Path) -> Path:
 
 
 def _too_little(folder: Path, expected: str, free: int, remedy: str) -> OutputError:
-    return OutputError(
-        f"disk at {disk_of(folder)}",
-        expected=expected,
-        got=f"{free / 1e6:.0f} MB",
-        remedy=f"{remedy}; finished stages are kept. It was to be written to {folder}.",
-    )
+    remedy += f"; finished stages are kept. It was to be written to {folder}."
+    return OutputError(f"disk at {disk_of(folder)}", expected=expected, got=f"{free / 1e6:.0f} MB", remedy=remedy)

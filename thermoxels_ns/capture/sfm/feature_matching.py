@@ -37,11 +37,9 @@ class PoseOptions:
     image_size: int = 1600
     """Longest side to which photographs are reduced for features, [pixels]."""
     max_features: int = 4000
-    """Features per photograph."""
     matching: Matching = "auto"
     """Which photographs are compared."""
     lens: LensModel = "SIMPLE_RADIAL"
-    """Lens model."""
     seed: int = 0
     """Of all random choices; the same one gives the same bits."""
     threads: int = 2
@@ -132,9 +130,8 @@ def _find_features(photographs: ReducedPhotographs, options: PoseOptions, say: C
     todo = [name for name in names if name not in done]
     for start in range(0, len(todo), _CHUNK):
         some = todo[start : start + _CHUNK]
-        pycolmap.extract_features(
-            database, photographs.images, some, reader_options=reader, extraction_options=extraction
-        )
+        given: dict[str, Any] = {"reader_options": reader, "extraction_options": extraction}
+        pycolmap.extract_features(database, photographs.images, some, **given)
         say(f"features: {len(names) - len(todo) + start + len(some)} of {len(names)} photographs")
 
 
@@ -157,13 +154,14 @@ def _match(
         say(f"matches: {start + len(some)} of {len(pairs)} pairs of photographs")
 
 
-def lens_parameters(camera: Camera, lens: LensModel) -> list[float]:
-    """The numbers of one of COLMAP's lens models."""
-    if lens == "SIMPLE_RADIAL":
-        return [camera.fl_x, camera.cx, camera.cy, camera.k1]
-    if lens == "RADIAL":
-        return [camera.fl_x, camera.cx, camera.cy, camera.k1, camera.k2]
-    return [camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.k1, camera.k2, camera.p1, camera.p2]
+def as_colmap(camera: Camera, lens: LensModel) -> Any:
+    """A camera as COLMAP has it, with one of its lens models and the number 1."""
+    import pycolmap
+
+    numbers = [camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.k1, camera.k2, camera.p1, camera.p2]
+    if lens != "OPENCV":
+        numbers = [numbers[0], *numbers[2 : 5 if lens == "SIMPLE_RADIAL" else 6]]
+    return pycolmap.Camera(camera_id=1, model=lens, width=camera.width, height=camera.height, params=numbers)
 
 
 def _add_images(photographs: ReducedPhotographs, camera: Camera, lens: LensModel, known_focal: bool) -> None:
@@ -178,14 +176,8 @@ def _add_images(photographs: ReducedPhotographs, camera: Camera, lens: LensModel
     for path in database.parent.glob(f"{database.name}*"):  # with its journal
         remove_file(path)
     with pycolmap.Database.open(database) as opened:
-        colmap_camera = pycolmap.Camera(
-            camera_id=1,
-            model=lens,
-            width=camera.width,
-            height=camera.height,
-            params=lens_parameters(camera, lens),
-            has_prior_focal_length=known_focal,
-        )
+        colmap_camera = as_colmap(camera, lens)
+        colmap_camera.has_prior_focal_length = known_focal
         opened.write_camera(colmap_camera, use_camera_id=True)
         rig = pycolmap.Rig(rig_id=1)
         rig.add_ref_sensor(colmap_camera.sensor_id)

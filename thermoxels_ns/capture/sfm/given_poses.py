@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from thermoxels_ns.capture.sfm.colmap_conversion import model_of_colmap, read_colmap
-from thermoxels_ns.capture.sfm.poses import Poses, common_size
+from thermoxels_ns.capture.sfm.poses import Poses, common_size, why_other_size
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json
@@ -32,10 +32,8 @@ def read_given_poses(path: Path, photographs: Mapping[str, str]) -> Poses:
     elif path.is_file():
         model = _read_transforms(path, photographs)
     else:
-        remedy = "Check the path."
-        raise SceneError(
-            "poses", expected="a COLMAP model's folder or a transforms.json", got=f"nothing at {path}", remedy=remedy
-        )
+        expected, got = "a COLMAP model's folder or a transforms.json", f"nothing at {path}"
+        raise SceneError("poses", expected=expected, got=got, remedy="Check the path.")
     order = {name: number for number, name in enumerate(photographs)}
     missing = {name: f"{path.name} has no pose of it" for name in photographs if name not in model.frames}
     return Poses(reordered(model, lambda name: order[name]), missing)
@@ -47,30 +45,18 @@ def fitted_to_photographs(poses: Poses, photographs: Mapping[str, Path]) -> Pose
     Frames whose photographs have another size than most are left out; other proportions are a `SceneError`.
     """
     size, other = common_size({name: photographs[name] for name in poses.model.frames})
-    dropped = dict(poses.dropped) | {
-        name: f"{w} x {h} pixels, the others {size[0]} x {size[1]}: another camera or mode"
-        for name, (w, h) in other.items()
-    }
+    dropped = dict(poses.dropped) | why_other_size(size, other)
     model, camera = poses.model.without(list(other)), poses.model.camera
     if size == (camera.width, camera.height):
         return Poses(model, dropped)
     factors = np.array([size[0] / camera.width, size[1] / camera.height])
     # The sides of a reduced image are rounded to whole pixels.
     if abs(factors[0] / factors[1] - 1.0) > 1.0 / min(*size, camera.width, camera.height):
-        raise SceneError(
-            "given poses",
-            expected=f"photographs with the proportions of {camera.width} x {camera.height} pixels, as their "
-            "camera has",
-            got=f"{size[0]} x {size[1]}",
-            remedy="Use the photographs that the poses were computed from, neither cropped nor turned.",
-        )
-    fitted = replace(
-        model,
-        camera=camera.resized(*size),
-        point_error_px=model.point_error_px * float(factors.mean()),
-        sighting_pixel=model.sighting_pixel * factors,
-    )
-    return Poses(fitted, dropped)
+        expected = f"photographs with the proportions of {camera.width} x {camera.height} pixels, as their camera has"
+        remedy = "Use the photographs that the poses were computed from, neither cropped nor turned."
+        raise SceneError("given poses", expected=expected, got=f"{size[0]} x {size[1]}", remedy=remedy)
+    error_px, pixel = model.point_error_px * float(factors.mean()), model.sighting_pixel * factors
+    return Poses(replace(model, camera=camera.resized(*size), point_error_px=error_px, sighting_pixel=pixel), dropped)
 
 
 def reordered(model: SfmModel, key: Callable[[str], Any]) -> SfmModel:
@@ -109,8 +95,7 @@ def _read_transforms(path: Path, photographs: Mapping[str, str]) -> SfmModel:
         if camera.k3 or camera.k4 or camera.lens != "perspective":
             expected = "a perspective lens with distortion k1, k2, p1, p2"
             got = f"{camera.lens}, k3 {camera.k3}, k4 {camera.k4}"
-            remedy = "Undistort first."
-            raise SceneError(where, expected=expected, got=got, remedy=remedy)
+            raise SceneError(where, expected=expected, got=got, remedy="Undistort first.")
         cameras.add(camera)
         frames.append(frame_of[name])
         poses.append(read_pose(entry.get("transform_matrix"), f"{where}: transform_matrix"))
@@ -118,17 +103,9 @@ def _read_transforms(path: Path, photographs: Mapping[str, str]) -> SfmModel:
         remedy = "Give one set of intrinsics for all frames, or let thermoxels capture find the poses."
         got = f"{len(frames)} photographs of {len(cameras)} cameras"
         raise SceneError(str(path), expected="photographs of one camera", got=got, remedy=remedy)
-    return SfmModel(
-        tuple(frames),
-        cameras.pop(),
-        np.stack(poses),
-        points=np.zeros((0, 3)),
-        colours=np.zeros((0, 3), dtype=np.uint8),
-        point_error_px=np.zeros(0),
-        sighting_frame=np.zeros(0, dtype=np.int64),
-        sighting_point=np.zeros(0, dtype=np.int64),
-        sighting_pixel=np.zeros((0, 2)),
-    )
+    none, sightings = np.zeros((0, 3)), np.zeros(0, dtype=np.int64)
+    points = none, none.astype(np.uint8), none[:, 0]
+    return SfmModel(tuple(frames), cameras.pop(), np.stack(poses), *points, sightings, sightings, none[:, :2])
 
 
 def _frames_of(names: list[str], photographs: Mapping[str, str], path: Path) -> dict[str, str]:

@@ -200,9 +200,8 @@ def _surface_point(model: SfmModel, index: int, pixel: tuple[float, float]) -> t
     camera = model.camera
     if not (0 <= pixel[0] <= camera.width and 0 <= pixel[1] <= camera.height):
         remedy = "Count x to the right and y down from the upper left corner."
-        raise SceneError(
-            "known distance", expected=f"pixels inside {camera.width} x {camera.height}", got=pixel, remedy=remedy
-        )
+        expected = f"pixels inside {camera.width} x {camera.height}"
+        raise SceneError("known distance", expected=expected, got=pixel, remedy=remedy)
     points, pixels = model.seen_by(index)
     apart = np.linalg.norm(pixels - pixel, axis=1)
     near = np.argsort(apart, kind="stable")[:_NEAR_POINTS]
@@ -242,7 +241,6 @@ def _triangulate(model: SfmModel, views: Sequence[tuple[int, npt.NDArray]]) -> t
         normal += across
         right += across @ pose[:3, 3]
     point = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
-    off = [
-        np.linalg.norm(model.camera.project(model.in_camera(index, point[None]))[0] - pixel) for index, pixel in views
-    ]
+    views_px = ((model.camera.project(model.in_camera(index, point[None]))[0], pixel) for index, pixel in views)
+    off = [np.linalg.norm(projected - pixel) for projected, pixel in views_px]
     return point, np.nan_to_num(np.array(off), nan=np.inf)

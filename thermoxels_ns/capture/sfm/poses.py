@@ -16,7 +16,7 @@ from thermoxels_ns.capture.photograph import open_photograph, read_photograph_fa
 from thermoxels_ns.capture.rig_types import OPENGL_FROM_OPENCV
 from thermoxels_ns.capture.sfm.colmap_conversion import model_of_colmap
 from thermoxels_ns.capture.sfm.colmap_process import quiet_colmap, run_in_process
-from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, ReducedPhotographs, fill_database, lens_parameters
+from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, ReducedPhotographs, as_colmap, fill_database
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
@@ -34,14 +34,6 @@ class Poses:
 
     model: SfmModel
     dropped: Mapping[str, str]  # why, by the frame's name
-
-
-@dataclass(frozen=True)
-class _Mapped:
-    """The largest group of photographs that fit together, and those of smaller groups."""
-
-    model: SfmModel
-    elsewhere: Mapping[str, int]  # with how many others a frame of a smaller group fits together
 
 
 def find_poses(
@@ -64,10 +56,7 @@ def find_poses(
     if len(photographs) < MIN_FRAMES:
         raise _too_few(len(photographs), "photographs")
     size, other = common_size(photographs)
-    dropped = {
-        name: f"{w} x {h} pixels, the others {size[0]} x {size[1]}: another camera or mode"
-        for name, (w, h) in other.items()
-    }
+    dropped = why_other_size(size, other)
     names = [name for name in photographs if name not in dropped]
     if len(names) < MIN_FRAMES:
         raise _too_few(len(names), "photographs of one size")
@@ -77,16 +66,15 @@ def find_poses(
     focal = focal_px or _GUESSED_FOCAL * max(size)
     start = Camera(*size, focal, focal, size[0] / 2.0, size[1] / 2.0).resized(*small)
     fill_database(reduced, start, focal_px is not None, options, say)
-    mapped = run_in_process(_map, (reduced, options.seed), folder, say)
-    found = 0 if mapped is None else len(mapped.model.frames)
-    if mapped is None or found < MIN_FRAMES:
-        raise _too_few(found, "photographs that fit together")
+    model, elsewhere = run_in_process(_map, (reduced, options.seed), folder, say)
+    if model is None or len(model.frames) < MIN_FRAMES:
+        raise _too_few(0 if model is None else len(model.frames), "photographs that fit together")
     for name in names:
-        if name in mapped.elsewhere:
-            dropped[name] = f"fits only to {mapped.elsewhere[name]} others, in a part of its own"
-        elif name not in mapped.model.frames:
+        if name in elsewhere:
+            dropped[name] = f"fits only to {elsewhere[name]} others, in a part of its own"
+        elif name not in model.frames:
             dropped[name] = "too few matches with the other photographs"
-    return Poses(mapped.model, dropped)
+    return Poses(model, dropped)
 
 
 def add_points(
@@ -128,6 +116,12 @@ def common_size(photographs: Mapping[str, Path]) -> tuple[tuple[int, int], dict[
     return common, {name: size for name, size in sizes.items() if size != common}
 
 
+def why_other_size(size: tuple[int, int], other: Mapping[str, tuple[int, int]]) -> dict[str, str]:
+    """Why frames of another size than most are left out."""
+    most = f"the others {size[0]} x {size[1]}: another camera or mode"
+    return {name: f"{width} x {height} pixels, {most}" for name, (width, height) in other.items()}
+
+
 def _reduced_size(size: tuple[int, int], longest: int) -> tuple[int, int]:
     factor = min(1.0, longest / max(size))
     return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
@@ -165,17 +159,15 @@ def _reduced(
 
 
 def _too_few(got: int, what: str) -> SceneError:
-    return SceneError(
-        "poses",
-        expected=f"at least {MIN_FRAMES} {what}",
-        got=got,
-        remedy="Take more photographs with more overlap (each part of the scene in three or more), in focus and "
-        "with texture; or give poses with --poses.",
+    remedy = (
+        "Take more photographs with more overlap (each part of the scene in three or more), in focus and "
+        "with texture; or give poses with --poses."
     )
+    return SceneError("poses", expected=f"at least {MIN_FRAMES} {what}", got=got, remedy=remedy)
 
 
-def _map(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> _Mapped | None:
-    """Find camera, poses and points (incremental structure from motion); None where no photographs fit together."""
+def _map(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> tuple[SfmModel | None, dict[str, int]]:
+    """Largest group of photographs that fit together (None: none do), and with how many others those elsewhere do."""
     import pycolmap
 
     found = 2  # the first pair comes without a call
@@ -191,11 +183,10 @@ def _map(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> 
     pycolmap.set_random_seed(seed)
     groups: dict[int, Any] = {}
     with quiet_colmap(folder):
-        groups = pycolmap.incremental_mapping(
-            matched.database, matched.images, folder, _options(seed), next_image_callback=next_image
-        )
+        given = matched.database, matched.images, folder, _options(seed)
+        groups = pycolmap.incremental_mapping(*given, next_image_callback=next_image)
     if not groups:
-        return None
+        return None, {}
     largest, *others = sorted(groups.values(), key=lambda group: (-group.num_reg_images(), -len(group.points3D)))
     elsewhere = {
         matched.frame_of_image[image.name]: group.num_reg_images() - 1
@@ -203,7 +194,7 @@ def _map(matched: ReducedPhotographs, seed: int, say: Callable[[str], None]) -> 
         for image in group.images.values()
         if image.has_pose
     }
-    return _Mapped(model_of_colmap(largest, matched.frame_of_image, matched.size), elsewhere)
+    return model_of_colmap(largest, matched.frame_of_image, matched.size), elsewhere
 
 
 def _triangulate(matched: ReducedPhotographs, posed: SfmModel, seed: int, say: Callable[[str], None]) -> SfmModel:
@@ -217,15 +208,7 @@ def _triangulate(matched: ReducedPhotographs, posed: SfmModel, seed: int, say: C
         stored = opened.read_camera(1)
     camera = posed.camera.resized(stored.width, stored.height)
     start = pycolmap.Reconstruction()
-    start.add_camera_with_trivial_rig(
-        pycolmap.Camera(
-            model="OPENCV",
-            width=camera.width,
-            height=camera.height,
-            params=lens_parameters(camera, "OPENCV"),
-            camera_id=1,
-        )
-    )
+    start.add_camera_with_trivial_rig(as_colmap(camera, "OPENCV"))
     for name, frame in matched.frame_of_image.items():
         inverse = np.linalg.inv(posed.camera_to_world[number[frame]] @ OPENGL_FROM_OPENCV)
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(inverse[:3, :3]), inverse[:3, 3])
@@ -237,9 +220,8 @@ def _triangulate(matched: ReducedPhotographs, posed: SfmModel, seed: int, say: C
     folder = matched.database.parent
     pycolmap.set_random_seed(seed)
     with quiet_colmap(folder):
-        found = pycolmap.triangulate_points(
-            start, matched.database, matched.images, folder, clear_points=True, options=options, refine_intrinsics=False
-        )
+        given = start, matched.database, matched.images, folder
+        found = pycolmap.triangulate_points(*given, clear_points=True, options=options, refine_intrinsics=False)
     model = model_of_colmap(found, matched.frame_of_image, matched.size)
     sighting_frame = np.array([number[frame] for frame in model.frames], dtype=np.int64)[model.sighting_frame]
     order = np.lexsort((model.sighting_point, sighting_frame))

@@ -112,18 +112,16 @@ def _set_names(name: str, names: Sequence[str]) -> list[str]:
     """Names that every reader of .inp files takes."""
     written = [re.sub(r"[^A-Za-z0-9_]+", "_", entry).upper() for entry in names]
     if len(set(written)) != len(written) or max(map(len, written)) > _LONGEST_NAME:
-        raise MeshError(
-            name,
-            expected="names that differ in their letters and digits (capitals or not), of at most "
-            f"{_LONGEST_NAME} characters, as .inp files ask for",
-            got=list(names),
-            remedy="Rename them.",
+        expected = (
+            f"names that differ in their letters and digits (capitals or not), of at most {_LONGEST_NAME} characters"
         )
+        got, remedy = list(names), "Rename them."
+        raise MeshError(name, expected=f"{expected}, as .inp files ask for", got=got, remedy=remedy)
     return written
 
 
 def _sets(index: IntArray, names: Sequence[str]) -> Iterator[tuple[str, IntArray]]:
-    """Name and members, rising, of every patch or region that is not empty."""
+    """Yield name and members, rising, of every patch or region that is not empty."""
     for number, name in enumerate(names):
         members = np.flatnonzero(index == number)
         if len(members):

@@ -52,19 +52,16 @@ def file_content(mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None =
         MeshError: An array has another shape than the mesh asks for, is not finite or points at what is not there,
             or two patches or regions have one name.
     """
-    points = check_shape("points_m", np.asarray(mesh.points_m, dtype=np.float64), (None, 3), _REMEDY, MeshError)
-    check_finite("points_m", points, _REMEDY, MeshError)
+    points = _finite("points_m", mesh.points_m, (None, 3), _REMEDY)
     tets = check_shape("tets", np.asarray(mesh.tets), (None, 4), _REMEDY, MeshError)
     facets = check_shape("facets", np.asarray(mesh.facets), (None, 3), _REMEDY, MeshError)
     check_shape("facet_tags", np.asarray(mesh.facet_tags), (len(facets),), _REMEDY, MeshError)
     remedy = "Pass one finite value per mesh node."
-    temperature = np.asarray(mesh.temperature_c if temperature_c is None else temperature_c, dtype=np.float64)
-    check_shape("temperature_c", temperature, (len(points),), remedy, MeshError)
-    check_finite("temperature_c", temperature, remedy, MeshError)
+    temperature = mesh.temperature_c if temperature_c is None else temperature_c
+    temperature = _finite("temperature_c", temperature, (len(points),), remedy)
     check_shape("observed", np.asarray(mesh.observed), (len(points),), remedy, MeshError)
     if mesh.colour is not None:
-        check_shape("colour", np.asarray(mesh.colour), (len(points), 3), remedy, MeshError)
-        check_finite("colour", np.asarray(mesh.colour), remedy, MeshError)
+        _finite("colour", mesh.colour, (len(points), 3), remedy)
     if not len(tets):
         raise MeshError("tets", expected="at least one tetrahedron", got="none", remedy=_REMEDY)
     _check_indices("tets", tets, len(points))
@@ -78,28 +75,20 @@ def file_content(mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None =
         normal, factor = facet_normals(points, facets), np.ones(len(facets))
     else:
         remedy = "Give every boundary triangle a finite value."
-        normal = np.asarray(mesh.boundary.normal, dtype=np.float64)
-        factor = np.asarray(mesh.boundary.area_factor, dtype=np.float64)
-        check_shape("boundary.normal", normal, (len(facets), 3), remedy, MeshError)
-        check_shape("boundary.area_factor", factor, (len(facets),), remedy, MeshError)
-        check_finite("boundary.normal", normal, remedy, MeshError)
-        check_finite("boundary.area_factor", factor, remedy, MeshError)
+        normal = _finite("boundary.normal", mesh.boundary.normal, (len(facets), 3), remedy)
+        factor = _finite("boundary.area_factor", mesh.boundary.area_factor, (len(facets),), remedy)
         patch, patch_names = np.asarray(mesh.boundary.patch), mesh.boundary.patch_names
         check_shape("boundary.patch", patch, (len(facets),), _REMEDY, MeshError)
         _check_names("boundary.patch_names", patch_names)
         _check_indices("boundary.patch", patch, len(patch_names))
     return FileContent(
-        points_m=points,
-        tets=tets,
-        temperature_c=temperature,
-        region=region,
-        region_names=tuple(mesh.region_names),
-        facets=facets,
-        patch=patch,
-        patch_names=tuple(patch_names),
-        normal=normal,
-        area_factor=factor,
+        points, tets, temperature, region, tuple(mesh.region_names), facets, patch, tuple(patch_names), normal, factor
     )
+
+
+def _finite(name: str, values: npt.ArrayLike, shape: tuple[int | None, ...], remedy: str) -> FloatArray:
+    array = check_shape(name, np.asarray(values, dtype=np.float64), shape, remedy, MeshError)
+    return check_finite(name, array, remedy, MeshError)
 
 
 def node_arrays(mesh: TetMesh, content: FileContent) -> dict[str, npt.NDArray]:
@@ -125,9 +114,8 @@ def check_suffix(path: Path | str, suffix: str) -> Path:
     """Return `path` if its name ends in `suffix`, else raise `OutputError`."""
     path = Path(path)
     if path.suffix != suffix:
-        raise OutputError(
-            "mesh file", expected=f"a name that ends in {suffix}", got=path.name, remedy="Rename the file."
-        )
+        expected = f"a name that ends in {suffix}"
+        raise OutputError("mesh file", expected=expected, got=path.name, remedy="Rename the file.")
     return path
 
 
@@ -142,18 +130,15 @@ def colour_bytes(colour: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
 
 def _check_indices(name: str, values: npt.NDArray, count: int) -> None:
     if not np.issubdtype(values.dtype, np.integer) or (len(values) and (values.min() < 0 or values.max() >= count)):
-        got = f"{values.min()} to {values.max()}" if len(values) else "nothing"
-        raise MeshError(
-            name, expected=f"whole numbers from 0 to {count - 1}", got=f"{got} ({values.dtype})", remedy=_REMEDY
-        )
+        got = f"{values.min()} to {values.max()} ({values.dtype})" if len(values) else f"nothing ({values.dtype})"
+        raise MeshError(name, expected=f"whole numbers from 0 to {count - 1}", got=got, remedy=_REMEDY)
 
 
 def _check_names(name: str, names: Sequence[str]) -> None:
     for entry in names:
         if not (isinstance(entry, str) and entry.strip() and entry.isprintable() and '"' not in entry):
             expected = "names of printable characters without a double quote"
-            remedy = "Rename it."
-            raise MeshError(name, expected=expected, got=repr(entry), remedy=remedy)
+            raise MeshError(name, expected=expected, got=repr(entry), remedy="Rename it.")
     if len(set(names)) != len(names) or not names:
         raise MeshError(name, expected="at least one name, all different", got=list(names), remedy="Rename them.")
 
@@ -206,9 +191,8 @@ def surface_colours(mesh: TetMesh, surface: Surface, temperature_c: FloatArray, 
             raise MeshError("colouring 'photographs'", expected=expected, got="a mesh without", remedy=remedy)
         return np.clip(np.asarray(mesh.colour, dtype=np.float64)[surface.nodes], 0.0, 1.0)
     if colouring != "temperature":
-        raise MeshError(
-            "colouring", expected="'temperature' or 'photographs'", got=repr(colouring), remedy="Choose one."
-        )
+        expected = "'temperature' or 'photographs'"
+        raise MeshError("colouring", expected=expected, got=repr(colouring), remedy="Choose one.")
     import matplotlib
 
     low, high = surface_range_c(surface, temperature_c)

@@ -74,8 +74,7 @@ def mesh_format(path: Path | str) -> MeshFormat:
     path = Path(path)
     if path.suffix not in MESH_FORMATS:
         expected = f"a name that ends in one of {', '.join(MESH_FORMATS)}"
-        remedy = "Rename the file."
-        raise OutputError("mesh file", expected=expected, got=path.name, remedy=remedy)
+        raise OutputError("mesh file", expected=expected, got=path.name, remedy="Rename the file.")
     return MESH_FORMATS[path.suffix]
 
 

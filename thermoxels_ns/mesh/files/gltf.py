@@ -56,9 +56,8 @@ def write_glb(
     content = file_content(mesh, temperature_c)
     surface = surface_of(content.points_m, content.facets)
     if not len(surface.triangles):
-        raise MeshError(
-            "facets", expected="at least one triangle", got="none", remedy="Build the mesh with its boundary."
-        )
+        remedy = "Build the mesh with its boundary."
+        raise MeshError("facets", expected="at least one triangle", got="none", remedy=remedy)
     rotation = _turn_to_y(up)
     light = _linear(surface_colours(mesh, surface, content.temperature_c, colouring))
     colours = np.full((len(light), 4), 65535, dtype="<u2")
@@ -83,26 +82,17 @@ def write_glb(
 
     low, high = surface_range_c(surface, content.temperature_c)
     attributes = {name: number for number, name in enumerate(blocks) if name != "indices"}
+    primitive = {"attributes": attributes, "indices": len(attributes), "material": 0}
+    extras = {"colours": colouring, "lowest_c": low, "highest_c": high}
+    dull = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
     scene: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "thermoxels"},
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"name": "surface", "mesh": 0, "rotation": rotation, **_moved_by(origin, rotation)}],
-        "meshes": [
-            {
-                "name": "surface",
-                "primitives": [{"attributes": attributes, "indices": len(attributes), "material": 0}],
-                "extras": {"colours": colouring, "lowest_c": low, "highest_c": high},
-            }
-        ],
-        "materials": [
-            {
-                "name": colouring,
-                "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
-                "extensions": {"KHR_materials_unlit": {}},
-            }
-        ],
+        "meshes": [{"name": "surface", "primitives": [primitive], "extras": extras}],
+        "materials": [{"name": colouring, "pbrMetallicRoughness": dull, "extensions": {"KHR_materials_unlit": {}}}],
         "buffers": [{"byteLength": len(data)}],
         "bufferViews": views,
         "accessors": accessors,

@@ -45,8 +45,7 @@ def write_msh(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
         if len(name.encode()) > _LONGEST_NAME:
             expected = f"at most {_LONGEST_NAME} bytes, which is what Gmsh reads"
             got = f"{len(name.encode())} bytes: {name!r}"
-            remedy = "Rename it."
-            raise MeshError("name of a region or patch", expected=expected, got=got, remedy=remedy)
+            raise MeshError("name of a region or patch", expected=expected, got=got, remedy="Rename it.")
     # All that can fail on a bad mesh comes before the file is opened.
     owner, _ = facet_owners(content.tets, content.facets)
     blocks = _node_blocks(content)
@@ -109,10 +108,7 @@ def _entities(content: FileContent, owner: IntArray) -> Iterator[bytes]:
 
 
 def _node_blocks(content: FileContent) -> list[tuple[int, int, IntArray]]:
-    """Dimension, number and nodes of every entity that nodes lie on: the first patch that uses them, else the region.
-
-    Together the blocks hold every node once.
-    """
+    """Dimension, number and nodes of every entity that nodes lie on: the first patch with them, else the region."""
     num_patches = len(content.patch_names)
     regions = _used(content.region)
     # A node in no tetrahedron goes with the first region.
@@ -173,10 +169,8 @@ def _node_data(temperature_c: FloatArray) -> Iterator[bytes]:
 
 
 def _triangle_view(name: str, first_tag: int, values: FloatArray) -> Iterator[bytes]:
-    """One view of values per triangle, as values at its three nodes.
-
-    ElementData would be shorter, but meshio then wants a value for every element, in the order of the file.
-    """
+    """One view of values per triangle, as values at its three nodes."""
+    # ElementData would be shorter, but meshio then wants a value for every element, in the order of the file.
     count, components = values.shape
     yield _header("ElementNodeData", name, components, count)
     table = np.empty(count, dtype=[("tag", _INT), ("nodes", _INT), ("value", _DOUBLE, (3, components))])

@@ -97,9 +97,8 @@ def write_ply(
     faces["nodes"] = surface.triangles
 
     low, high = surface_range_c(surface, content.temperature_c)
-    shown = (
-        "photographs" if colouring == "photographs" else f"{COLOUR_MAP} from {low:.6g} to {high:.6g} degrees Celsius"
-    )
+    scale = f"{COLOUR_MAP} from {low:.6g} to {high:.6g} degrees Celsius"
+    shown = colouring if colouring == "photographs" else scale
     header = [
         "ply",
         "format binary_little_endian 1.0",

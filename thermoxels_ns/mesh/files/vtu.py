@@ -33,11 +33,7 @@ def write_vtu(
     if the mesh has colours, `colour` (red, green, blue as bytes). Cell array: `region`; field
     arrays `region:NAME` hold the number of each region.
 
-    Args:
-        path: File to write, ending in .vtu; its folder is made if need be.
-        mesh: The mesh.
-        point_data: More arrays to write, one row per node.
-        temperature_c: Temperatures to write in place of the mesh's own, shape (n,), for a step of a heat simulation.
+    `point_data` holds more arrays to write, one row per node; `temperature_c` takes the place of the mesh's own.
 
     Raises:
         MeshError: An array does not fit the mesh, is not finite, or takes a name that is in use.
@@ -54,9 +50,8 @@ def write_vtu(
     for name, values in (point_data or {}).items():
         values = np.asarray(values)
         if name in _OWN_ARRAYS:
-            raise MeshError(
-                "point_data", expected=f"names other than {_OWN_ARRAYS}", got=repr(name), remedy="Rename it."
-            )
+            expected = f"names other than {_OWN_ARRAYS}"
+            raise MeshError("point_data", expected=expected, got=repr(name), remedy="Rename it.")
         check_shape(f"point_data[{name!r}]", values, (num_nodes, *values.shape[1:]), remedy, MeshError)
         arrays[name] = check_finite(f"point_data[{name!r}]", values, remedy, MeshError)
 

@@ -79,38 +79,32 @@ def write_xdmf(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np
 
 def _index(content: FileContent, arrays: dict[str, npt.NDArray], data_file: str) -> bytes:
     """Text of the .xdmf file."""
+    add = ElementTree.SubElement
     root = ElementTree.Element("Xdmf", Version="3.0")
-    domain = ElementTree.SubElement(root, "Domain")
+    domain = add(root, "Domain")
 
     def add_data(parent: ElementTree.Element, name: str) -> None:
         values = arrays[name]
-        item = ElementTree.SubElement(
-            parent,
-            "DataItem",
-            Format="HDF",
-            Dimensions=" ".join(map(str, values.shape)),
-            NumberType=_NUMBER_TYPES[values.dtype.kind],
-            Precision=str(values.dtype.itemsize),
+        size, kind, width = (
+            " ".join(map(str, values.shape)),
+            _NUMBER_TYPES[values.dtype.kind],
+            str(values.dtype.itemsize),
         )
+        item = add(parent, "DataItem", Format="HDF", Dimensions=size, NumberType=kind, Precision=width)
         item.text = f"{data_file}:/{name}"
 
     def add_grid(name: str, cells: str, kind: str, names_of: str, names: Sequence[str]) -> ElementTree.Element:
-        grid = ElementTree.SubElement(domain, "Grid", Name=name, GridType="Uniform")
+        grid = add(domain, "Grid", Name=name, GridType="Uniform")
         numbered = "; ".join(f"{number} = {entry}" for number, entry in enumerate(names))
-        ElementTree.SubElement(grid, "Information", Name=names_of, Value=numbered)
-        topology = ElementTree.SubElement(
-            grid,
-            "Topology",
-            TopologyType=kind,
-            NumberOfElements=str(len(arrays[cells])),
-            NodesPerElement=str(arrays[cells].shape[1]),
-        )
+        add(grid, "Information", Name=names_of, Value=numbered)
+        count, per_cell = map(str, arrays[cells].shape)
+        topology = add(grid, "Topology", TopologyType=kind, NumberOfElements=count, NodesPerElement=per_cell)
         add_data(topology, cells)
-        add_data(ElementTree.SubElement(grid, "Geometry", GeometryType="XYZ"), "points_m")
+        add_data(add(grid, "Geometry", GeometryType="XYZ"), "points_m")
         return grid
 
     def add_values(grid: ElementTree.Element, name: str, centre: str, kind: str = "Scalar") -> None:
-        add_data(ElementTree.SubElement(grid, "Attribute", Name=name, AttributeType=kind, Center=centre), name)
+        add_data(add(grid, "Attribute", Name=name, AttributeType=kind, Center=centre), name)
 
     body = add_grid(BODY_GRID, "tets", "Tetrahedron", "region_names", content.region_names)
     boundary = add_grid(FACET_GRID, "facets", "Triangle", "patch_names", content.patch_names)

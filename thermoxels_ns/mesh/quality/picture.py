@@ -20,16 +20,13 @@ _MET, _UNMET = "#2a7f3f", "#b3261e"
 
 
 def picture_of_quality(path: Path | str, report: QualityReport, title: str = "") -> None:
-    """Draw the report as a PNG: two histograms above, figures and criteria below.
-
-    Counts are on a logarithmic axis, because a solver stumbles over the few worst tetrahedra. `title` is the boundary
-    mode and the counts if left out.
-    """
+    """Draw the report as a PNG: two histograms above, figures and criteria below; without `title`, counts."""
     from matplotlib.figure import Figure
 
     path = Path(path)
     if path.suffix != ".png":
         raise OutputError("picture", expected="a name that ends in .png", got=path.name, remedy="Rename the file.")
+    # Counts are on a logarithmic axis, because a solver stumbles over the few worst tetrahedra.
     figure = Figure(figsize=(12.5, 9.0), dpi=110, facecolor="white", layout="constrained")
     title = title or f"Mesh quality, {report.boundary_mode} boundary: {report.num_tets:,} tetrahedra"
     figure.suptitle(title, fontsize=14, color=_INK)
@@ -50,19 +47,11 @@ def _draw_angles(axis: Axes, report: QualityReport) -> None:
     low, high = DIHEDRAL_BOUNDS_DEG[report.boundary_mode]
     bins = angle_bins(report.boundary_mode)
     _draw_bars(axis, report.dihedral_counts, bins.first_centre_deg, bins.width_deg)
+    across = axis.get_xaxis_transform()
     for bound, side, shift in ((low, "left", 4), (high, "right", -4)):
         axis.axvline(bound, color=_BOUND, linestyle="--", linewidth=1.3)
-        axis.annotate(
-            f"{bound:g}°",
-            (bound, 0.97),
-            (shift, 0),
-            xycoords=axis.get_xaxis_transform(),
-            textcoords="offset points",
-            ha=side,
-            va="top",
-            color=_BOUND,
-            fontsize=10,
-        )
+        text = axis.annotate(f"{bound:g}°", (bound, 0.97), (shift, 0), xycoords=across, textcoords="offset points")
+        text.set(ha=side, va="top", color=_BOUND, fontsize=10)
     smallest, largest = report.dihedral_range_deg
     axis.set_xlim(0.0, 180.0)
     axis.set_xticks(range(0, 181, 30))

@@ -92,10 +92,8 @@ def convex_hull(cells: BoolArray, of_centres: bool = False) -> BoolArray:
     first = column.argmax(axis=1)
     last = column.shape[1] - column[:, ::-1].argmax(axis=1)
     steps = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
-    corners = np.concatenate(
-        [np.column_stack((columns + step, ends)) for step in steps for ends in (first, last)]
-    ).astype(np.float64)
-    planes = ConvexHull(corners).equations
+    ends_of_columns = [np.column_stack((columns + step, ends)) for step in steps for ends in (first, last)]
+    planes = ConvexHull(np.concatenate(ends_of_columns).astype(np.float64)).equations
     if of_centres:  # the cubes' hull is that of the centres plus half a cube to all sides
         planes[:, 3] += 0.5 * np.abs(planes[:, :3]).sum(axis=1) - 1e-9
 
@@ -109,12 +107,8 @@ def convex_hull(cells: BoolArray, of_centres: bool = False) -> BoolArray:
         upright = np.abs(c) < 1e-9
         with np.errstate(divide="ignore", invalid="ignore"):
             z = -rest / c
-        high = np.minimum(
-            high,
-            np.where(upright, np.where(rest > 1e-9, -np.inf, np.inf), z).min(
-                axis=0, where=(c > 0) | upright, initial=np.inf
-            ),
-        )
+        ceiling = np.where(upright, np.where(rest > 1e-9, -np.inf, np.inf), z)
+        high = np.minimum(high, ceiling.min(axis=0, where=(c > 0) | upright, initial=np.inf))
         low = np.maximum(low, z.max(axis=0, where=(c < 0) & ~upright, initial=-np.inf))
     centre = np.arange(nz) + 0.5
     return (centre >= low[..., None] - 1e-9) & (centre <= high[..., None] + 1e-9)

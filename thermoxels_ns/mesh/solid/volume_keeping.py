@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from thermoxels_ns.core.arrays import BoolArray, Float32Array, IntArray
@@ -24,9 +22,7 @@ _AROUND = np.indices((3, 3, 3)).reshape(3, 27).T - 1
 
 
 def _octant_weights() -> tuple[Float32Array, Float32Array]:
-    """Trilinear value and gradient in the middle of a voxel's octants from its own level and those of the voxels
-    around, shapes (8, 27) and (3, 8, 27).
-    """
+    """Weights of the 27 levels around a voxel in value (8, 27) and gradient (3, 8, 27) in the middle of its octants."""
     side = np.indices((2, 2, 2)).reshape(3, 8).T * 2 - 1
     towards = _AROUND[None] == side[:, None]
     share = np.where(_AROUND[None] == 0, 0.75, np.where(towards, 0.25, 0.0))
@@ -65,16 +61,16 @@ def keep_volume(level: Float32Array, sharp: Float32Array, least: Float32Array, c
 
     padded = np.pad(level, 1, mode="edge")
     levels = padded.reshape(-1)
-    found = _found(levels, index, steps)
+    share, slope = _found(levels, index, steps)
     changed = np.zeros(len(levels), dtype=bool)
     for _ in range(ROUNDS):
-        missing = _windowed(buffer, wanted - found.share, index, steps)
+        missing = _windowed(buffer, wanted - share, index, steps)
         noticed = np.abs(missing) - UNNOTICED * np.where(missing > 0.0, volume, 1.0 - volume)
         moves = np.flatnonzero(noticed > 0.0)
         if len(moves) == 0:
             break
         shift = _RATE * np.sign(missing[moves]) * noticed[moves] / area[moves]
-        moved = levels[index[moves]] + shift * np.maximum(found.slope[moves], np.float32(_LEAST_SLOPE))
+        moved = levels[index[moves]] + shift * np.maximum(slope[moves], np.float32(_LEAST_SLOPE))
         low = lowest[moves]
         moved = np.where(solid[moves], np.maximum(moved, low), np.minimum(moved, -low))
         levels[index[moves]] = np.clip(moved, -1.0, 1.0)
@@ -82,16 +78,13 @@ def keep_volume(level: Float32Array, sharp: Float32Array, least: Float32Array, c
         for step in steps:
             changed[index[moves] + step] = True
         again = np.flatnonzero(changed[index])
-        update = _found(levels, index[again], steps)
-        found.share[again], found.slope[again] = update.share, update.slope
+        share[again], slope[again] = _found(levels, index[again], steps)
     return np.ascontiguousarray(padded[1:-1, 1:-1, 1:-1])
 
 
 def _wanted(sharp: Float32Array, index: IntArray, strides: IntArray) -> tuple[Float32Array, Float32Array]:
-    """Share of some voxels that is solid, and how many of their six neighbours are on the other side of the surface.
-
-    A voxel is as wide along an axis as the surface leaves of it, from its centre at most half a voxel to either side.
-    """
+    """Share of some voxels that is solid, and how many of their six neighbours are on the other side of the surface."""
+    # A voxel is as wide along an axis as the surface leaves of it, from its centre at most half a voxel to either side.
     own = sharp[index]
     share, sides = np.ones(len(index), dtype=np.float32), np.zeros(len(index), dtype=np.float32)
     for stride in strides:
@@ -106,17 +99,9 @@ def _wanted(sharp: Float32Array, index: IntArray, strides: IntArray) -> tuple[Fl
     return np.where(own > 0.0, share, 1.0 - share), sides
 
 
-@dataclass(frozen=True)
-class _Found:
-    """What the trilinear level makes of some voxels, arrays of shape (n,)."""
-
-    share: Float32Array  # solid share, 0 to 1
-    slope: Float32Array  # mean slope, [1 / voxel]
-
-
-def _found(levels: Float32Array, index: IntArray, steps: IntArray) -> _Found:
-    """The level is taken for linear in each octant of a voxel: of a cube of half a voxel, cut by a plane at distance d
-    from its middle, 1/2 + 2 d is inside, whatever way the plane faces (exactly so on average over directions).
+def _found(levels: Float32Array, index: IntArray, steps: IntArray) -> tuple[Float32Array, Float32Array]:
+    """Solid share and mean slope [1 / voxel] of some voxels. The level is taken for linear in each octant of a voxel:
+    of a cube of half a voxel, cut by a plane at distance d from its middle, 1/2 + 2 d is inside (on average).
     """
     share, slope = np.empty(len(index), dtype=np.float32), np.empty(len(index), dtype=np.float32)
     for start in range(0, len(index), _CHUNK):
@@ -126,7 +111,7 @@ def _found(levels: Float32Array, index: IntArray, steps: IntArray) -> _Found:
         distance = (_VALUES @ around) / np.maximum(slopes, np.float32(1e-6))
         share[part] = np.clip(0.5 + 2.0 * distance, 0.0, 1.0).mean(axis=0)
         slope[part] = slopes.mean(axis=0)
-    return _Found(share, slope)
+    return share, slope
 
 
 def _windowed(values: Float32Array, at_index: Float32Array, index: IntArray, steps: IntArray) -> Float32Array:

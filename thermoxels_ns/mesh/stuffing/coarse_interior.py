@@ -96,18 +96,13 @@ def coarse_interior(lattice: BccLattice, largest: int) -> CoarseInterior | None:
     """Build the inside of a solid from cubes of two to `largest` voxels; None if there are no such cubes.
 
     Every cube of the octree has a node at its centre and, as the voxels outside the octree have, nodes at its corners;
-    all of them are points of the body-centred cubic lattice. Between two neighbours
-
-    - of the same size lie four tetrahedra, one for each side of their common face, around the edge that joins the
-      centres. Where smaller cubes touch a side it has a node in the middle, and its tetrahedron is cut in two there;
-    - of different sizes lies the face of the smaller, a quarter of that of the larger. The diagonal through the middle
-      of the larger face cuts it into two triangles, and each of them makes a tetrahedron with either centre.
-
-    The angles are 45, 60, 90 and, in the smaller cube of the second case, 120 degrees. The other diagonal would give
-    35.3 to 125.3 degrees in the larger one. (The inside of Labelle and Shewchuk 2007 is built of the same pieces.)
-
-    The octree begins at the lowest voxel that may be joined with others, so that the place of the solid in the voxel
-    lattice does not matter.
+    all of them are points of the body-centred cubic lattice. Between two neighbours of the same size lie four
+    tetrahedra, one for each side of their common face, around the edge that joins the centres; where smaller cubes
+    touch a side it has a node in the middle, and its tetrahedron is cut in two there. Between two of different sizes
+    lies the face of the smaller: the diagonal through the middle of the larger face cuts it into two triangles, and
+    each of them makes a tetrahedron with either centre. (The same pieces as in Labelle and Shewchuk 2007.)
+    The angles are 45, 60, 90 and, in the smaller cube of the second case, 120 degrees.
+    The octree begins at the lowest voxel that may be joined, so the solid's place in the lattice does not matter.
     """
     if largest == 1:
         return None
@@ -133,12 +128,10 @@ def coarse_interior(lattice: BccLattice, largest: int) -> CoarseInterior | None:
 
 
 def _far_from_surface(lattice: BccLattice) -> BoolArray:
-    """Voxels on whose six faces no bundle has a point that moves or an edge with a cut; shape of the block of centres.
-
-    A point of a cut edge has a neighbour outside. So the voxel's centre and corners and the centres next to it must be
-    inside, and no neighbour of these points outside: no centre next to a centre next to it, no corner of a voxel
-    next to it, and no centre at one of its own corners.
-    """
+    """Voxels on whose six faces no bundle has a point that moves or an edge with a cut; as the block of centres."""
+    # A point of a cut edge has a neighbour outside. So the voxel's centre and corners and the centres next to it must
+    # be inside, and no neighbour of these points outside: no centre next to a centre next to it, no corner of a voxel
+    # next to it, and no centre at one of its own corners.
     centres, corners = lattice.level.reshape(2, *lattice.shape)
     inside = centres > 0.0
     deep = _with_next(_with_next(inside))
@@ -211,10 +204,7 @@ class _Points:
         """Cubes of `size` voxels; the first of them begins at the centre `first` of the lattice."""
         strides = np.array(lattice.strides)
         per_cube = size * strides
-        if size == 1:
-            centre = strides.sum() - lattice.num_centres
-        else:
-            centre = size // 2 * strides.sum()
+        centre = size // 2 * strides.sum() if size > 1 else strides.sum() - lattice.num_centres
         # Centre i lies half a voxel above corner i - 1 of its block.
         origin = lattice.num_centres + (first - 1) @ strides
         corners = _CORNERS @ np.roll(per_cube, -axis)

@@ -38,8 +38,8 @@ class Surface:
 
     points: FloatArray  # all nodes, shape (n, 3)
     facets: IntArray  # triangles, shape (f, 3)
-    areas: FloatArray  # shape (f,)
-    normals: FloatArray  # unit normals, shape (f, 3)
+    areas: FloatArray
+    normals: FloatArray  # areas (f,) and unit normals (f, 3) of the triangles
     node_normals: FloatArray
     """Mean normals of the triangles around each node, weighted by area, not of unit length: shorter where they differ,
     0 where there are none. Shape (n, 3)."""
@@ -55,14 +55,8 @@ class Surface:
         areas = np.linalg.norm(vectors, axis=1)
         around = _sum_at_nodes(facets, areas, len(solid.points))
         total = np.stack([_sum_at_nodes(facets, column, len(solid.points)) for column in vectors.T], axis=1)
-        return cls(
-            solid.points,
-            facets,
-            areas,
-            vectors / areas[:, None],
-            total / np.where(around > 0.0, around, 1.0)[:, None],
-            on_border,
-        )
+        mean = total / np.where(around > 0.0, around, 1.0)[:, None]
+        return cls(solid.points, facets, areas, vectors / areas[:, None], mean, on_border)
 
     def flat_nodes(self) -> BoolArray:
         """True where the triangles around a node lie in one plane, shape (n,)."""

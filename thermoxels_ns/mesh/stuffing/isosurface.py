@@ -106,9 +106,8 @@ def _checked(level: npt.NDArray) -> npt.NDArray[np.floating]:
     check_shape("level", level, (None, None, None), remedy, MeshError)
     check_finite("level", level, remedy, MeshError)
     if not np.any(level > 0.0):
-        raise MeshError(
-            "level", expected="solid voxels, with levels above 0", got="none", remedy="Lower the threshold."
-        )
+        expected = "solid voxels, with levels above 0"
+        raise MeshError("level", expected=expected, got="none", remedy="Lower the threshold.")
     return level
 
 

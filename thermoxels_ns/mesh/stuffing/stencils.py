@@ -110,9 +110,8 @@ def _fill_tet(points: _Tet, signs: tuple[int, ...]) -> list[_Tet]:
         before = {(0, n) if _diagonal_first(a, b, v)[0] == a else (n, 0) for n, v in enumerate(minus, start=1)}
     else:
         top, bottom = tuple(plus), tuple(_cut(v, minus[0]) for v in plus)
-        before = set()
-        for m, n in ((0, 1), (0, 2), (1, 2)):
-            before.add((m, n) if _diagonal_first(plus[m], plus[n], minus[0])[0] == plus[m] else (n, m))
+        pairs = ((0, 1), (0, 2), (1, 2))
+        before = {(m, n) if _diagonal_first(plus[m], plus[n], minus[0])[0] == plus[m] else (n, m) for m, n in pairs}
     return _fill_prism(top, bottom, before)
 
 
