@@ -122,6 +122,16 @@ def test_strays_and_a_street_behind_do_not_count_but_a_chimney_does(tmp_path):
     assert (box[0] < -0.98 * BLOCK).all() and (box[1] > [0.49, 0.34, 0.6]).all() and (np.abs(box) < 0.75).all(), box
 
 
+def test_ground_that_runs_on_is_cut_to_what_photographs_show_of_the_middle(tmp_path):
+    frames = frames_of(tmp_path, [look_at_origin(0.26 * number, radius=2.2, height=1.2) for number in range(24)])
+    draw = np.random.default_rng(4)
+    ground = np.column_stack((draw.uniform(-2.0, 2.0, (4000, 2)), np.full(4000, -0.3)))
+    block = BLOCK * draw.uniform(-1.0, 1.0, (1500, 3))
+    box = box_of_points(np.concatenate((ground, block)), frames, np.eye(3))
+    assert bool((box[0] < -BLOCK).all() and (box[1] > BLOCK).all())
+    assert np.abs(box[:, :2]).max() < 1.5, "half of what an average photograph shows there, 1.3, and rounding"
+
+
 def test_a_plain_wall_without_points_is_held_too(tmp_path):
     frames = frames_of(tmp_path, [outwards(n) for n in range(24)])
     walls = np.random.default_rng(6).uniform(-1.5, 1.5, (3, 600, 3))

@@ -42,6 +42,8 @@ _WORTH_LEAVING_OUT = 1.5
 _NEARLY_BEST = 0.9
 _FEW_IN_VIEW = 0.05
 """Points in view relative to the most that one has, below which a photograph tells nothing."""
+_MOST_WITHIN = 0.1
+"""Share of the cameras that may stand within the box for it to be something looked at from outside."""
 _CONVERGING = 0.5
 """Distance to where cameras look, relative to their spread, below which they look outwards."""
 # The axes that ns-process-data swapped in old versions, before it wrote applied_transform into the json.
@@ -156,7 +158,8 @@ def box_of_points(
         low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
     # Rounded outwards: another processor, on which a few depths differ, shall find the same.
     step = _ROUNDED * 2.0 ** np.floor(np.log2(max((high - low).max(), 1e-300)))
-    low, high = np.floor((low - margin) / step) * step, np.ceil((high + margin) / step) * step
+    low, high = _cut_to_view(np.stack([low - margin, high + margin]), frames, rotation)
+    low, high = np.floor(low / step) * step, np.ceil(high / step) * step
     return _checked(np.stack([low, high]), "box of the points")
 
 
@@ -219,23 +222,54 @@ def box_of_cameras(frames: Sequence[Frame], rotation: FloatArray) -> Box:
     Raises:
         SceneError: All look into one direction, or outwards from one place.
     """
+    looked_at = _looked_at(frames, rotation)
+    if looked_at is None:
+        raise SceneError("scene box", expected="cameras that look at one place", got="parallel views", remedy=_REMEDY)
+    if looked_at[1] > 0.0:
+        return _checked(_cube(*looked_at), "box of the cameras")
+    origins = np.stack([rotation @ frame.pose[:3, 3] for frame in frames])
+    low, high = origins.min(axis=0), origins.max(axis=0)
+    return _checked(_cube(0.5 * (low + high), 2.0 * (high - low).max()), "box of the cameras")
+
+
+def _looked_at(frames: Sequence[Frame], rotation: FloatArray) -> tuple[FloatArray, float] | None:
+    """The point nearest to all optical axes, and half the width of what an average photograph shows at its distance.
+
+    The width is 0 where cameras look outwards; None where all look into one direction.
+    """
     poses = np.stack([rotation @ frame.pose[:3] for frame in frames])
     axes, origins = -poses[:, :, 2], poses[:, :, 3]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     normal = across.mean(axis=0)
     if np.linalg.eigvalsh(normal)[0] < 1e-3:  # mean squared sine of the angle to a common direction
-        raise SceneError("scene box", expected="cameras that look at one place", got="parallel views", remedy=_REMEDY)
+        return None
     centre = np.linalg.solve(normal, np.einsum("nij,nj->i", across, origins) / len(frames))
     depth = ((centre - origins) * axes).sum(axis=1)
-    low, high = origins.min(axis=0), origins.max(axis=0)
     if np.median(depth) <= _CONVERGING * np.sqrt(((origins - origins.mean(axis=0)) ** 2).sum(axis=1).mean()):
-        centre, half = 0.5 * (low + high), 2.0 * (high - low).max()
-    else:
-        half_view = np.array(
-            [max(f.intrinsics.width / f.intrinsics.fl_x, f.intrinsics.height / f.intrinsics.fl_y) / 2 for f in frames]
-        )
-        half = np.median(depth[depth > 0] * half_view[depth > 0])
-    return _checked(np.stack([centre - half, centre + half]), "box of the cameras")
+        return centre, 0.0
+    half_view = np.array(
+        [max(f.intrinsics.width / f.intrinsics.fl_x, f.intrinsics.height / f.intrinsics.fl_y) / 2 for f in frames]
+    )
+    return centre, float(np.median(depth[depth > 0] * half_view[depth > 0]))
+
+
+def _cube(centre: FloatArray, half: float) -> Box:
+    return np.stack([centre - half, centre + half])
+
+
+def _cut_to_view(box: Box, frames: Sequence[Frame], rotation: FloatArray) -> Box:
+    """Leave out what an average photograph does not show, where cameras outside the box look at one place in it.
+
+    A ground or a street that runs on from the body is as close and as dense as the body itself.
+    """
+    looked_at = _looked_at(frames, rotation)
+    origins = np.stack([rotation @ frame.pose[:3, 3] for frame in frames])
+    within = ((origins > box[0]) & (origins < box[1])).all(axis=1).mean()
+    if looked_at is None or looked_at[1] <= 0.0 or within > _MOST_WITHIN:
+        return box
+    cube = _cube(*looked_at)
+    cut = np.stack([np.maximum(box[0], cube[0]), np.minimum(box[1], cube[1])])
+    return cut if bool((cut[1] > cut[0]).all()) else box
 
 
 def _checked(corners: Any, name: str) -> Box:
