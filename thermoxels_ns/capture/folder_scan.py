@@ -31,8 +31,7 @@ _THERMAL_WORDS = frozenset({"thermal", "radiometric", "temperature", "temperatur
 _PHOTOGRAPH_WORDS = frozenset({"visible", "vis", "rgb", "colour", "color", "photo", "photos", "optical"})
 _OTHER_WORDS = frozenset({"image", "images", "raw"})
 ROLE_WORDS = _THERMAL_WORDS | _PHOTOGRAPH_WORDS | _OTHER_WORDS
-_UNPRINTED = ("Cc", "Cs")
-"""Kinds of characters that break a line or a terminal, or are bytes that no encoding explains."""
+_UNPRINTED = ("Cc", "Cs")  # kinds of characters that break a line or a terminal, or are bytes that no encoding explains
 _LAST_LETTERS = {"t": "thermal", "v": "photograph", "w": "photograph", "r": "thermal"}
 """Single letters that stand for a camera at the end of a name, after a separator."""
 

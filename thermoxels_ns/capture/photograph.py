@@ -18,8 +18,7 @@ from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.decoders import errors_name
 from thermoxels_ns.radiometry.exif import ExifFacts, read_exif_facts
 
-LARGEST_SIDE = 30000
-"""Pixels along a side of a photograph that is believed; a header that claims more is damaged."""
+LARGEST_SIDE = 30000  # pixels along a side of a photograph that is believed; a header that claims more is damaged
 _LARGEST_PIXELS = 178_956_970  # in all; Pillow opens no more
 _EXPECTED = "a photograph that can be decoded"
 _REMEDY = "The file is damaged; copy it from the camera again, or go on without it with --skip-bad True."
@@ -50,8 +49,7 @@ class PhotographFacts:
     width: int
     height: int
     exif: ExifFacts
-    taken_at: datetime | None
-    """With fractions of a second where the file has them, as the camera's clock showed it."""
+    taken_at: datetime | None  # with fractions of a second where the file has them, as the camera's clock showed it
     focal_px: float | None
     """Focal length, [pixels], from the lens and the pitch of the sensor, or from its equivalent on 35 mm film."""
     orientation: int

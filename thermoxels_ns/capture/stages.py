@@ -51,8 +51,7 @@ from thermoxels_ns.radiometry.thermogram import RadiometryOptions
 
 PAGE_NAME = "capture.html"  # of the page, in the output folder
 _MOST_NAMED = 10  # files left out that are named while the command runs
-_LEAST_SIGHTINGS = 50
-"""Sightings of scene points below which thermal images and photographs cannot be compared."""
+_LEAST_SIGHTINGS = 50  # sightings of scene points below which thermal images and photographs cannot be compared
 _OVERLAY_FILE = "overlay.npy"
 
 _Options = TypeVar("_Options")

@@ -16,8 +16,7 @@ COLMAP_FOLDERS = ("colmap/sparse/0", "colmap/sparse", "colmap", "sparse/0", "spa
 
 _LEAST_CAMERA_BYTES = 48  # of a camera with three parameters; others have more
 _FRAME_BYTES, _DATUM_BYTES = 64, 16  # of a frame before the number of its images, and of each of them
-_POINT_BYTES, _SIGHTING_BYTES = 43, 8
-"""Of a point before the length of its track, and of each element of the track."""
+_POINT_BYTES, _SIGHTING_BYTES = 43, 8  # of a point before the length of its track, and of each element of the track
 _IMAGE_BYTES, _FEATURE_BYTES = 64, 24  # of an image before its name, and of each of its features
 _LENGTH = struct.Struct("<Q")
 

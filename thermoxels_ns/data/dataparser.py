@@ -27,8 +27,7 @@ from thermoxels_ns.data.splits import Split, split_frames
 from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
 from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, read_thermal_file
 
-SCENE_SIZE = 2.0
-"""Longest side of the scene box in nerfstudio's world; learning rates of the field rely on it."""
+SCENE_SIZE = 2.0  # longest side of the scene box in nerfstudio's world; learning rates of the field rely on it
 _FAR_SIDES = 16.0
 """Farther from the origin than this many times its longest side, as in national coordinates, a box is far: shifts in
 single precision are then off by more than a millionth of it."""
@@ -88,8 +87,7 @@ class ThermalSurvey:
     shapes: dict[Path, tuple[int, int]]  # height and width of every file
     temperature_range: TemperatureRange
     """From temperature_bounds.json and the extremes of the training files' valid pixels."""
-    dead_pixels: dict[tuple[int, int], npt.NDArray[np.bool_]]
-    """Mask of stuck pixels for every resolution that has some."""
+    dead_pixels: dict[tuple[int, int], npt.NDArray[np.bool_]]  # mask of stuck pixels for every resolution that has some
 
 
 @dataclass(frozen=True)

@@ -44,11 +44,9 @@ class SceneFile:
     json_path: Path
     frames: list[Frame]
     unit: ThermalUnit
-    bounds_c: tuple[float, float] | None
-    """Lowest and highest temperature of temperature_bounds.json, [degrees Celsius]."""
+    bounds_c: tuple[float, float] | None  # lowest and highest temperature of temperature_bounds.json, [degrees Celsius]
     meta: dict[str, Any]  # the json as it is (split lists, scene_box, ply_file_path, applied_transform)
-    left_out: list[str] = field(default_factory=list)
-    """Names of frames and files that missing_thermal="skip" left out."""
+    left_out: list[str] = field(default_factory=list)  # names of frames and files that missing_thermal="skip" left out
 
 
 @plain_os_errors("scene folder", "a file or folder that can be read", "Check permissions and names.", SceneError)

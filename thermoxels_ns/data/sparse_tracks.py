@@ -18,8 +18,7 @@ from thermoxels_ns.data.scene_file import Frame
 TRACKS_KEY = "tracks_file_path"  # name in transforms.json under which the file of tracks is given
 FEWEST_VIEWS = 3  # photographs that must see a point: two agree about many wrong ones
 MOST_ERROR_PX = 2.0  # mean reprojection error above which a point is left out
-LEAST_ERROR_PX = 0.3
-"""Error that a point has at least: what three photographs agree on more closely agrees by luck."""
+LEAST_ERROR_PX = 0.3  # error that a point has at least: what three photographs agree on more closely agrees by luck
 LEAST_PARALLAX_DEG = 2.0  # largest angle between the rays of a point below which its distance is not known
 MOST_BEHIND = 0.1  # share of sightings behind their camera above which tracks belong to other poses
 _REMEDY = f"Write the scene again with thermoxels capture, or remove {TRACKS_KEY} from the json to train without it."
@@ -30,8 +29,7 @@ class SparseTracks:
     """Points and the photographs that see them; the content of a file of tracks, arrays by these names."""
 
     points: FloatArray  # shape (n, 3), in the coordinates of the poses
-    point_error_px: FloatArray
-    """Mean reprojection error of each point, shape (n,), [pixels of the photographs]."""
+    point_error_px: FloatArray  # mean reprojection error of each point, shape (n,), [pixels of the photographs]
     frames: tuple[str, ...]  # ``file_path`` of the photographs, as transforms.json has it
     sighting_frame: IntArray
     sighting_point: IntArray  # indices into `frames` and `points`, each shape (s,)

@@ -17,8 +17,7 @@ _NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", 
 _ORIENTATION = 0x0112
 _MOST_DISTORTION = 10.0
 """Most that a term of the distortion may move a corner of the image, in distances from the corner to the middle."""
-MOST_UNITS = 1e8
-"""Farthest that a camera may be from the origin of its coordinates: the earth is 6.4e6 m in radius."""
+MOST_UNITS = 1e8  # farthest that a camera may be from the origin of its coordinates: the earth is 6.4e6 m in radius
 DAMAGED_PHOTOGRAPH = "The file is damaged; copy it again or remove the frame."
 _LENS_OF_MODEL: dict[str, Lens] = {
     "SIMPLE_PINHOLE": "perspective",

@@ -64,8 +64,7 @@ class BuiltMesh:
     mesh: TetMesh
     solid: SolidCells
     unobserved_parts: int  # connected components left out because no thermal ray saw any of their nodes
-    unobserved_voxels: int
-    """Their voxels, which count in `solid.component_sizes`, but are not in `solid.cells`."""
+    unobserved_voxels: int  # their voxels, which count in `solid.component_sizes`, but are not in `solid.cells`
     observed_range_c: tuple[float, float]
     """Lowest and highest temperature of the measured corners, [degrees Celsius]; no node lies outside."""
     idle_rules: tuple[str, ...] = ()

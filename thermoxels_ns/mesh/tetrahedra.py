@@ -34,8 +34,7 @@ class TetMesh:
     temperature_c: FloatArray  # nodal temperature, shape (n,), [degrees Celsius]
     observed: BoolArray
     """True where a thermal ray saw the node; elsewhere the temperature is a harmonic extension. Shape (n,)."""
-    facets: IntArray
-    """Boundary triangles, shape (f, 3), oriented so that the right-hand normal points out of the body."""
+    facets: IntArray  # boundary triangles, shape (f, 3), oriented so that the right-hand normal points out of the body
     facet_tags: IntArray  # one of the `FACET_*` constants per boundary triangle, shape (f,)
     region: IntArray  # region number per tetrahedron, shape (t,); an index into `region_names`
     region_names: tuple[str, ...] = ("solid",)  # names of the regions, all different

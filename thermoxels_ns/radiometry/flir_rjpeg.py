@@ -44,8 +44,7 @@ class FlirImage:
     counts: npt.NDArray[np.uint16]  # what the sensor gave, shape (height, width)
     camera: CameraInfo
     picture_in_picture: PictureInPicture | None
-    visible: bytes | None
-    """The photograph that the camera took with it, a JPEG or PNG file's bytes; None: it took none."""
+    visible: bytes | None  # the photograph that the camera took with it, a JPEG or PNG file's bytes; None: it took none
 
     @property
     def outside_calibration(self) -> npt.NDArray[np.bool_]:

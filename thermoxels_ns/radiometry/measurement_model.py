@@ -16,8 +16,7 @@ from thermoxels_ns.radiometry.conditions import Conditions, check_between
 
 _LARGEST_ATTENUATION, _LARGEST_WEIGHT = 1.0, 10.0
 _LARGEST_EXPONENT = 700.0
-FIRST_RADIATION_W_UM4_M2_SR = 1.191042972e8
-"""2 h c^2 (exact constants of the SI, rounded), [W um^4 / (m2 sr)]."""
+FIRST_RADIATION_W_UM4_M2_SR = 1.191042972e8  # 2 h c^2 (exact constants of the SI, rounded), [W um^4 / (m2 sr)]
 SECOND_RADIATION_UM_K = 14387.76877  # h c / k (exact constants of the SI, rounded), [um K]
 _COLDEST_K, _HOTTEST_K = 50.0, 6000.0
 _STEPS = 8192
@@ -32,8 +31,7 @@ class PlanckConstants:
 
     r1: float  # gain of the calibration
     r2: float  # second gain; only R1 / R2 matters
-    b: float
-    """Second radiation constant over the effective wavelength, [K]; 1300 to 1600 for 7.5 to 14 micrometres."""
+    b: float  # second radiation constant over the effective wavelength, [K]; 1300 to 1600 for 7.5 to 14 micrometres
     f: float  # shape; 1 in Planck's law at one wavelength
     o: float  # offset of the counts (negative in camera files)
 

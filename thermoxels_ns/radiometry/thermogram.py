@@ -56,16 +56,14 @@ class ThermogramMetadata:
     conditions: Conditions | None = None
     """Those that the temperatures were computed with: the camera's, with the user's in their place."""
     picture_in_picture: PictureInPicture | None = None  # factory alignment of photograph and thermal image
-    celsius_per_count: float | None = None
-    """Step of the file's counts, [K], where they are linear in temperature."""
+    celsius_per_count: float | None = None  # step of the file's counts, [K], where they are linear in temperature
 
 
 @dataclass(frozen=True)
 class Thermogram:
     """One thermal image in degrees."""
 
-    temperature_c: npt.NDArray[np.float32]
-    """Shape (height, width), [degrees C], NaN where the camera measured nothing."""
+    temperature_c: npt.NDArray[np.float32]  # shape (height, width), [degrees C], NaN where the camera measured nothing
     metadata: ThermogramMetadata
     report: PixelReport  # how many pixels are NaN and why
 

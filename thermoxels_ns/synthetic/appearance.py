@@ -64,8 +64,7 @@ class Paint:
 
     base: tuple[float, float, float]  # red, green, blue, 0 to 1
     contrast: float = 0.22  # weight of the texture, 0 to about 0.4
-    mirror: float = 0.0
-    """Share of the light that comes off it as off a mirror, 0 to 1; the rest shows the paint."""
+    mirror: float = 0.0  # share of the light that comes off it as off a mirror, 0 to 1; the rest shows the paint
 
 
 @dataclass(frozen=True)

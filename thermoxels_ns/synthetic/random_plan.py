@@ -17,8 +17,7 @@ Shape = Box | Sphere | Cylinder
 Range = tuple[float, float]
 
 SMALLEST = 3.1  # lower bound of every thickness, gap and step of a plan [voxels of the plan]
-WIDEST = 116.0
-"""Upper bound of a plan's extent [voxels of the plan]: with the margins of the scene box it is below 127."""
+WIDEST = 116.0  # upper bound of a plan's extent [voxels of the plan]: with the margins of the scene box it is below 127
 HAIR = 0.002
 """How far a cylinder stays off what carries it [voxels of the plan], since exact solids side by side share no face."""
 

@@ -24,8 +24,7 @@ class RenderedView:
     """What one camera sees."""
 
     rgb: npt.NDArray[np.float32]  # mean colour of each pixel's samples, 0 to 1, shape (height, width, 3)
-    temperature_c: FloatArray
-    """Mean temperature of each pixel's samples [degrees Celsius], shape (height, width)."""
+    temperature_c: FloatArray  # mean temperature of each pixel's samples [degrees Celsius], shape (height, width)
     depth_m: FloatArray
     """Distance along the ray through the pixel's centre [m], infinite where it does not meet the solid first, shape
     (height, width)."""

@@ -34,21 +34,18 @@ class SyntheticScene:
 
     name: str
     solid: Solid  # everything that is not air
-    scene_box: Box
-    """Lower and upper corner of the exact box [m]: the solid lies inside it, the surroundings outside."""
+    scene_box: Box  # lower and upper corner of the exact box [m]: the solid lies inside it, the surroundings outside
     temperature_bounds_c: tuple[float, float]
     """No surface and no background is colder than the first or hotter than the second."""
     colour: RgbFunction  # (points (n, 3), normals (n, 3)) to red, green, blue in [0, 1] (n, 3)
     surface_temperature_c: Callable[[npt.ArrayLike], FloatArray]
     """Points (n, 3) to temperatures (n,); the same from every direction. Off the surface it continues smoothly."""
-    background_rgb: RgbFunction
-    """Unit directions (n, 3), away from the camera, to red, green, blue in [0, 1] (n, 3)."""
+    background_rgb: RgbFunction  # unit directions (n, 3), away from the camera, to red, green, blue in [0, 1] (n, 3)
     background_temperature_c: Callable[[npt.ArrayLike], FloatArray]
     """Unit directions (n, 3), away from the camera, to apparent temperatures (n,)."""
     rings: tuple[CameraRing | CameraWalk, ...]
     focal_share: float  # focal length over the image width, for a 4:3 image
-    around: Surroundings | None = None
-    """What stands between the scene and what lies at infinity (`background_rgb`)."""
+    around: Surroundings | None = None  # what stands between the scene and what lies at infinity (`background_rgb`)
     mirror: Callable[[npt.ArrayLike, npt.ArrayLike], npt.NDArray[np.float32]] | None = None
     """(points (n, 3), normals (n, 3)) to the share of light (n,) that a surface reflects as a mirror does."""
 

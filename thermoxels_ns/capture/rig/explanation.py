@@ -25,8 +25,7 @@ _EXCHANGED = (("rx", "cy"), ("ry", "cx"), ("rx", "ty"), ("ry", "tx"), ("log_foca
 """Numbers that move the image of a narrow lens, or of a scene of one depth, almost alike."""
 _SAME = 0.8
 """Correlation from which on two numbers stand for each other: knowing one would make the other 1.7 times as sure."""
-_NOTHING_LEARNT = 0.8
-"""Share of the first standard deviation that is left where the images say next to nothing."""
+_NOTHING_LEARNT = 0.8  # share of the first standard deviation that is left where the images say next to nothing
 _WORTH_KNOWING = 0.8
 """Share of the turn's standard error that is left with the principal point known, below which that is said."""
 _TURN = [PARAMETERS.index(name) for name in ("rx", "ry", "rz")]

@@ -25,8 +25,7 @@ _STRONGEST_SHARE = 0.35
 _WEAKEST_EDGE = 0.05
 FARTHEST_FROM_POINT = 0.06
 """Distance on the plane at depth 1 to the next scene point, beyond which an edge's depth is not known."""
-SURE_DISTANCE = 0.01
-"""Distance on that plane up to which an edge's depth is that of the scene points around it."""
+SURE_DISTANCE = 0.01  # distance on that plane up to which an edge's depth is that of the scene points around it
 _EDGE_REACH = 2.0  # half the width of an edge, in standard deviations of its blur
 _MARGIN_SHARE = 0.15
 _FINER = 1.23
@@ -46,8 +45,7 @@ class PreparedFrame:
 
     name: str
     grey: FloatImage  # photograph, shape (height, width)
-    contrast: FloatImage
-    """Local contrast of the temperatures, shape (height, width) of the thermal camera [K]."""
+    contrast: FloatImage  # local contrast of the temperatures, shape (height, width) of the thermal camera [K]
     depth: SparseDepth
 
 

@@ -32,8 +32,7 @@ class WindowDesign:
 
     points: FloatArray  # shape (n, 3), the visible camera's OpenCV axes
     index: IntArray  # which points each window has, shape (windows, k)
-    plain: FloatArray
-    """Orthonormal basis of weighted planes a + b x + c y, the same in all windows, shape (k, 3)."""
+    plain: FloatArray  # orthonormal basis of weighted planes a + b x + c y, the same in all windows, shape (k, 3)
     bright: FloatArray
     """The photograph in every window, orthogonal to the planes and of length 1, weighted, shape (windows, k)."""
     weight: FloatArray  # square roots of the weights of a window's points, shape (k,)

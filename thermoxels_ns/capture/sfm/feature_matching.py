@@ -15,8 +15,7 @@ from thermoxels_ns.capture.sfm.colmap_process import check_free_space, quiet_col
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.checks import remove_file
 
-EXHAUSTIVE_UP_TO = 80
-"""Photographs up to which every pair is matched; the time grows with the square of their number."""
+EXHAUSTIVE_UP_TO = 80  # photographs up to which every pair is matched; the time grows with the square of their number
 _NEIGHBOURS = 8
 """Sequential matching: each photograph is matched with so many that follow it, and with those 2, 4, 8, ... times as far
 away."""
@@ -56,8 +55,7 @@ class ReducedPhotographs:
     """Frame by the name of its photograph in that folder, in the order they were taken."""
     size: tuple[int, int]
     """Width and height of the photographs as they are, [pixels]; those in the folder may be smaller."""
-    masks: Path | None = None
-    """Folder of pictures that are black where no feature is looked for; None: everywhere."""
+    masks: Path | None = None  # folder of pictures that are black where no feature is looked for; None: everywhere
 
 
 def image_pairs(count: int, matching: Matching) -> npt.NDArray[np.int64]:

@@ -14,8 +14,7 @@ from thermoxels_ns.capture.rig_types import FloatArray
 _UP_OF_ORIENTATION = {1: (0, 1), 2: (0, 1), 3: (0, -1), 4: (0, -1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
 """Where the upper edge of the upright picture lies in the stored one (x right, y up), by EXIF's orientation."""
 _ROLLED_DEG = 2.0  # how far from level people hold the sides of a picture, standard deviation, [degrees]
-_BELIEVED_DEG = 5.0
-"""Standard error up to which the common normal of the cameras' level axes is believed, [degrees]."""
+_BELIEVED_DEG = 5.0  # standard error up to which the common normal of the cameras' level axes is believed, [degrees]
 
 
 @dataclass(frozen=True)

@@ -22,12 +22,10 @@ class SfmModel:
 
     frames: tuple[str, ...]  # names of the frames that have a pose, in order, all different
     camera: Camera  # the photographs' lens
-    camera_to_world: FloatArray
-    """Shape (f, 4, 4), camera axes x right, y up, z back, as transforms.json has them."""
+    camera_to_world: FloatArray  # shape (f, 4, 4), camera axes x right, y up, z back, as transforms.json has them
     points: FloatArray  # shape (n, 3), in world units; empty where poses were given without points
     colours: npt.NDArray[np.uint8]  # red, green and blue of the points, shape (n, 3)
-    point_error_px: FloatArray
-    """Mean reprojection error of each point, shape (n,), [pixels of the photographs]."""
+    point_error_px: FloatArray  # mean reprojection error of each point, shape (n,), [pixels of the photographs]
     sighting_frame: npt.NDArray[np.int64]
     sighting_point: npt.NDArray[np.int64]  # indices into `frames` and `points`, each shape (s,)
     sighting_pixel: FloatArray  # where the frame shows the point, shape (s, 2), [pixels of the photographs]

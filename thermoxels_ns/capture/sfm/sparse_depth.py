@@ -9,8 +9,7 @@ from thermoxels_ns.capture.rig_types import FloatArray
 
 _NEIGHBOURS = 12
 _NEAR_QUANTILE, _FAR_QUANTILE = 0.9, 0.1
-_ONE_SURFACE = 0.04
-"""Scatter about a plane, as a share of the inverse depth, up to which points belong to one surface."""
+_ONE_SURFACE = 0.04  # scatter about a plane, as a share of the inverse depth, up to which points belong to one surface
 _SLOPE_RIDGE = 0.1  # holds the slope of a plane through points that lie on a line, or far away on one side
 
 

@@ -13,8 +13,7 @@ from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_f
 from thermoxels_ns.mesh.files.content import FileContent, check_suffix, file_content, node_arrays
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-BODY_GRID = "mesh"
-"""Name of the grid of tetrahedra: what `read_mesh` of FEniCSx asks for unless told otherwise."""
+BODY_GRID = "mesh"  # name of the grid of tetrahedra: what `read_mesh` of FEniCSx asks for unless told otherwise
 FACET_GRID = "facets"  # name of the grid of boundary triangles
 
 _NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UChar"}

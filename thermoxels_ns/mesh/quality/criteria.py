@@ -6,8 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-BoundaryMode = Literal["voxel", "conforming"]
-"""How the boundary was made: of voxel faces, or along the level set."""
+BoundaryMode = Literal["voxel", "conforming"]  # how the boundary was made: of voxel faces, or along the level set
 
 DIHEDRAL_BOUNDS_DEG: dict[BoundaryMode, tuple[float, float]] = {"voxel": (45.0, 90.0), "conforming": (10.7, 164.8)}
 """Bounds of the angles between two faces of a tetrahedron, [degrees]: six equal tetrahedra per voxel have angles of 45,
@@ -38,14 +37,12 @@ class Figures:
     """Faces with more than two owners, pairs of boundary triangles upon each other, and nodes at one place."""
     num_open_edges: int  # edges that the boundary's triangles do not pass equally often in both directions
     num_wrong_facets: int  # boundary triangles that are missing, too many or turned over
-    dihedral_range_deg: tuple[float, float]
-    """Smallest and largest angle between two faces of a tetrahedron, [degrees]."""
+    dihedral_range_deg: tuple[float, float]  # smallest and largest angle between two faces of a tetrahedron, [degrees]
     temperature_excess_k: float
     """How far the hottest or coldest node lies outside the observed range, [K]; 0 or less if inside."""
     share_obtuse: float  # share of tetrahedra with an obtuse angle between two faces, 0 to 1
     share_positive_edges: float  # share of edges whose entry of the stiffness matrix is positive, 0 to 1
-    angle_rounding_deg: float = 0.0
-    """How far rounding of nodes far from the origin may have turned angles, [degrees]."""
+    angle_rounding_deg: float = 0.0  # how far rounding of nodes far from the origin may have turned angles, [degrees]
 
 
 @dataclass(frozen=True)

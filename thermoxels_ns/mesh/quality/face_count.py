@@ -21,8 +21,7 @@ TET_EDGES: IntArray = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]],
 class Groups:
     """Rows put together by equality; group g is `order[start[g]:start[g + 1]]`, the last one ends with `order`."""
 
-    order: IntArray
-    """Row numbers, those of a group in a row; within a group in no particular order. Shape (rows,)."""
+    order: IntArray  # row numbers, those of a group in a row; within a group in no particular order. Shape (rows,).
     start: IntArray
     """Where each group starts in `order`, shape (groups,); groups go by their first and then their second number."""
 

@@ -51,8 +51,7 @@ class QualityReport:
     """Area of the surface that the boundary triangles stand for: each times its area factor, [m^2]; None for a mesh
     whose boundary was not tagged."""
     edge_length_m: tuple[float, float, float]  # shortest, mean and longest edge, [m]
-    dihedral_range_deg: tuple[float, float]
-    """Smallest and largest angle between two faces of a tetrahedron, [degrees]."""
+    dihedral_range_deg: tuple[float, float]  # smallest and largest angle between two faces of a tetrahedron, [degrees]
     dihedral_counts: tuple[int, ...]
     """Number of these angles, six per tetrahedron, in the bins of `criteria.angle_bins`."""
     radius_ratio_range: tuple[float, float]
@@ -69,8 +68,7 @@ class QualityReport:
     bodies_by_face: int
     """Parts of the mesh between which no heat is conducted through a face: they share nodes or edges at most."""
     euler_characteristic: int  # vertices - edges + triangles of the boundary
-    genus: int | None
-    """Handles of all boundary components together; None if one of them is not a closed manifold."""
+    genus: int | None  # handles of all boundary components together; None if one of them is not a closed manifold
     components: tuple[SurfaceComponent, ...]
     """Connected components of the boundary (triangles that share edges), largest first."""
     num_non_manifold_edges: int  # boundary edges with more than two boundary triangles

@@ -13,8 +13,7 @@ _CHUNK = 1 << 14  # tetrahedra at a time: what is worked on stays in the process
 _FACE_PAIRS = ((2, 3), (1, 3), (1, 2), (0, 3), (0, 2), (0, 1))
 """Faces (by the node opposite) that meet in edge e of `face_count.TET_EDGES`."""
 _RIGHT_ANGLE = 1e-9  # cosines below this are those of a right angle, up to rounding
-_FAR_SIZES = 16.0
-"""Farther from the origin than this many times its own size, a mesh has nodes whose rounding counts."""
+_FAR_SIZES = 16.0  # farther from the origin than this many times its own size, a mesh has nodes whose rounding counts
 _ANGLE_PER_ROUNDING = 4.0
 """How far rounding turns an angle at most, [rad], over the share of a side that it moves nodes by."""
 

@@ -15,8 +15,7 @@ MOST_CAMERAS = 128  # more cameras than this are thinned out evenly, in their or
 SEEN_SHARE = 0.1
 """A voxel is seen if at least this share of the cameras whose image holds it, and at least one, has a free line to it:
 a reconstruction has pinholes that single cameras look through."""
-CLEAR_OF_CAMERA = 1.5
-"""Solid voxels this close to a camera do not block it, [voxels]: floaters stick to cameras."""
+CLEAR_OF_CAMERA = 1.5  # solid voxels this close to a camera do not block it, [voxels]: floaters stick to cameras
 
 
 @dataclass(frozen=True)
@@ -132,8 +131,7 @@ class _Rays:
     count: int
     eye: float
     voxels: int
-    owns_diagonal: bool
-    """Whether slopes of exactly 1 belong to this pyramid; else they belong to its neighbour."""
+    owns_diagonal: bool  # whether slopes of exactly 1 belong to this pyramid; else they belong to its neighbour
 
     @property
     def slopes(self) -> FloatArray:

@@ -17,8 +17,7 @@ from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.solid.free_space import count_cameras
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected, grow
 
-LARGEST_PASS = 4_000_000
-"""Lattices with more voxels than this are looked at in blocks of 2^3, 4^3, ... voxels."""
+LARGEST_PASS = 4_000_000  # lattices with more voxels than this are looked at in blocks of 2^3, 4^3, ... voxels.
 SHADOW_SURROUNDED = 0.1
 """Space that the shell itself hides is inside only if seen surfaces surround it at least this far, as a winding number:
 behind a surface seen from one side only it is up to one half; in the shadow before a wall it is 0 or less."""

@@ -19,8 +19,7 @@ LEAST_LEVEL = 0.02
 """No voxel is nearer to 0 than this before smoothing: a surface never passes through a voxel's centre."""
 LEAST_SMOOTH_LEVEL = 0.005  # the same where density is a smooth ramp
 LEAST_SHARE = 0.25  # smoothing leaves at least this share of a voxel's level, with its sign
-MARGIN = 4
-"""Voxels farther from the solid than this, along an axis, have level -1 without a look at their density."""
+MARGIN = 4  # voxels farther from the solid than this, along an axis, have level -1 without a look at their density
 LEAST_SHARE_THIN = 0.5  # the same in walls and gaps one voxel thick; they keep their thickness
 
 

@@ -20,8 +20,7 @@ ROUGH_SHARE = (0.5, 0.8)
 """A ramp is believed where fewer of the voxels around than the first share are rough, not at all from the second on.
 At sharp edges some always are."""
 WINDOW = 7  # edge of the cube in which they are counted, [voxels]
-REACH = 1.5
-"""The level reaches 1 no nearer to the surface than this, [voxels]; what ends nearer makes the mesh rough."""
+REACH = 1.5  # the level reaches 1 no nearer to the surface than this, [voxels]; what ends nearer makes the mesh rough
 
 _FULLER = 0.01  # the logarithm is taken unless the density itself bends less by more than this
 
@@ -39,8 +38,7 @@ class SurfaceRamp:
 class _Crossings:
     """How a function of the density runs through the surface: medians over all pairs of a solid and an empty voxel."""
 
-    bend: float
-    """How much steeper it is outside than inside, as a share of its slope between the two, without its sign."""
+    bend: float  # how much steeper it is outside than inside, as a share of its slope between the two, without its sign
     straightness: float  # mean slope on either side, as a share of the slope between the two
 
 

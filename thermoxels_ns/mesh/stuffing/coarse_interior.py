@@ -75,8 +75,7 @@ def _all_of_eight(level: BoolArray) -> BoolArray:
 class CoarseInterior:
     """Tetrahedra that take the place of those of the uniform lattice inside a solid."""
 
-    covered: BoolArray
-    """True for the centres of voxels inside a larger cube, in the order of the lattice's centres."""
+    covered: BoolArray  # True for the centres of voxels inside a larger cube, in the order of the lattice's centres
     tets: IntArray
     """Flat lattice indices, shape (t, 4), positively oriented: everything that the larger cubes share a face with."""
 

@@ -117,8 +117,7 @@ class _Nodes:
 
     points: FloatArray  # positions, shape (n, 3)
     of_point: npt.NDArray[np.integer]  # node number of every lattice point, -1 where it is no node
-    of_cut: npt.NDArray[np.integer]
-    """Node numbers of the cuts on the 14 edges of the first nodes, -1 where no cut is."""
+    of_cut: npt.NDArray[np.integer]  # node numbers of the cuts on the 14 edges of the first nodes, -1 where no cut is
 
 
 def _number_nodes(lattice: BccLattice, warped: WarpedLattice, interior: CoarseInterior | None) -> _Nodes:

@@ -53,8 +53,7 @@ class StencilTable:
 
     tets: IntArray  # bundle numbers, positively oriented, shape (t, 4)
     tet_start: IntArray  # shape (730,)
-    facets: IntArray
-    """Bundle numbers of triangles on the surface, right-hand normal out of the solid, shape (f, 3)."""
+    facets: IntArray  # bundle numbers of triangles on the surface, right-hand normal out of the solid, shape (f, 3)
     facet_start: IntArray  # shape (730,)
     facet_behind: IntArray
     """-1: always on the boundary. 4 * c + s: only if the centre beyond side s, seen from centre c (0 or 1), is not

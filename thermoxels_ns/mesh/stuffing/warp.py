@@ -48,8 +48,7 @@ _CONTRACTIBLE = _contractible_links()
 class WarpedLattice:
     """The lattice with its near points moved onto the surface, and the cuts that are left."""
 
-    sign: npt.NDArray[np.int8]
-    """+1 inside the solid, 0 on its surface, -1 outside, one per point of the lattice."""
+    sign: npt.NDArray[np.int8]  # +1 inside the solid, 0 on its surface, -1 outside, one per point of the lattice
     moved: IntArray  # points that moved, shape (m,)
     moved_to: FloatArray  # where they are now, fractional corner indices, shape (m, 3)
     inner: IntArray  # points with sign +1 that are not buried, ascending; shape (p,)
