@@ -141,15 +141,13 @@ def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
     """The rows of the table, and the name of the baseline among them."""
     for name in ("methods", "recipes"):
         if not getattr(cost, name):
-            raise ThermoxelsError(
-                name, expected="at least one", got="none", remedy=f"Leave out --{name} for the default."
-            )
+            remedy = f"Leave out --{name} for the default."
+            raise ThermoxelsError(name, expected="at least one", got="none", remedy=remedy)
     try:
         further = tuple(shlex.split(cost.train_options))
     except ValueError as problem:
-        raise ThermoxelsError(
-            "train_options", expected="words as in a shell", got=str(problem), remedy="Close the quotes."
-        ) from problem
+        expected, remedy = "words as in a shell", "Close the quotes."
+        raise ThermoxelsError("train_options", expected=expected, got=str(problem), remedy=remedy) from problem
 
     words: dict[str, tuple[str, ...]] = {}
     work: dict[str, float] = {}
@@ -159,14 +157,12 @@ def planned_settings(cost: Cost) -> tuple[list[CostSetting], str]:
         work[text] = float(resolution**2 * steps)
     words |= {quality: ("--quality", quality) for quality in cost.qualities}
     if not words:
-        raise ThermoxelsError(
-            "settings", expected="a setting or a quality", got="none", remedy="Pass --settings 64:800."
-        )
+        remedy = "Pass --settings 64:800."
+        raise ThermoxelsError("settings", expected="a setting or a quality", got="none", remedy=remedy)
     baseline = cost.baseline or ("standard" if "standard" in words else [*words][-1])
     if baseline not in words:
-        raise ThermoxelsError(
-            "baseline", expected=f"one of {', '.join(words)}", got=baseline, remedy="Name one of them."
-        )
+        expected = f"one of {', '.join(words)}"
+        raise ThermoxelsError("baseline", expected=expected, got=baseline, remedy="Name one of them.")
 
     def row(of: str, method: str, recipe: str, kind: str = "") -> CostSetting:
         # The default is the method's own recipe, which needs no option.
@@ -246,9 +242,7 @@ class _Display:
     """Says which run is at work: in the last line of a terminal, in a line a minute elsewhere."""
 
     def __init__(self, console: Console, total: int) -> None:
-        self._console = console
-        self._total = total
-        self._done = 0
+        self._console, self._total, self._done = console, total, 0
 
     def say(self, line: str) -> None:
         self._console.print(line, markup=False, soft_wrap=True)
@@ -353,10 +347,8 @@ class Bench:
         """Remember where things go; refuse a scene folder that is not there."""
         if not scene.is_dir():
             raise SceneError("scene", expected="a scene folder", got=f"none at {scene}", remedy="Correct the path.")
-        self.scene = scene
-        self.fingerprint = scene_fingerprint(scene)
-        self._folder = folder
-        self._keep = keep_models
+        self.scene, self.fingerprint = scene, scene_fingerprint(scene)
+        self._folder, self._keep = folder, keep_models
 
     def planned(self, setting: CostSetting, repeat: int) -> CostRun:
         """The run as it will be remembered, still without figures."""
@@ -393,8 +385,7 @@ class Bench:
         finally:
             if not self._keep:
                 self.discard(name)
-        planned = self.planned(setting, repeat)
-        return CostRun(*planned.key, figures=figures)
+        return CostRun(*self.planned(setting, repeat).key, figures=figures)
 
     def discard(self, name: str) -> None:
         """Remove a run's model."""

@@ -80,9 +80,8 @@ def run_demo(demo: Demo, console: Console) -> None:
     from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
     if demo.iterations is not None and demo.iterations < 1:
-        raise ThermoxelsError(
-            "iterations", expected="1 or more", got=demo.iterations, remedy="Leave it out for the default."
-        )
+        remedy = "Leave it out for the default."
+        raise ThermoxelsError("iterations", expected="1 or more", got=demo.iterations, remedy=remedy)
     folder = prepare_folder(demo.output_dir)
     logs = writable_folder(folder / "logs")
     steps = _Steps(console)
@@ -107,9 +106,8 @@ def run_demo(demo: Demo, console: Console) -> None:
         webbrowser.open(index.resolve().as_uri())
     missed = [f"{t.name} {t.measured_text} (target {t.bound_text})" for t in results.targets if not t.met]
     if missed:
-        raise ThermoxelsError(
-            "demo", expected="every target met", got="; ".join(missed), remedy=f"See {index} for pictures."
-        )
+        remedy = f"See {index} for pictures."
+        raise ThermoxelsError("demo", expected="every target met", got="; ".join(missed), remedy=remedy)
 
 
 def prepare_folder(path: Path) -> Path:
@@ -279,9 +277,8 @@ def _picture(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as problem:
-        expected = "a picture that the demo's commands write"
+        expected, remedy = "a picture that the demo's commands write", "Run the demo again."
         got = problem.strerror or str(problem)
-        remedy = "Run the demo again."
         raise ThermoxelsError(str(path), expected=expected, got=got, remedy=remedy) from problem
 
 

@@ -141,6 +141,5 @@ class _Section:
         return float(value)
 
     def _error(self, expected: str, got: object) -> ThermoxelsError:
-        return ThermoxelsError(
-            f"{self._path}: {self._name}", expected=expected, got=repr(got), remedy="Run the demo again."
-        )
+        what = f"{self._path}: {self._name}"
+        return ThermoxelsError(what, expected=expected, got=repr(got), remedy="Run the demo again.")

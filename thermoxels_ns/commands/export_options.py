@@ -150,17 +150,11 @@ def check_options(options: ExportOptions) -> CheckedOptions:
         raise MeshError("formats", expected="at least one format, each once", got=options.formats, remedy=remedy)
     MeshOptions(options.boundary, options.coarsest_cell)  # refuses what is out of range
     selection = SolidSelection(**{field.name: getattr(options, field.name) for field in fields(SolidSelection)})
-    return CheckedOptions(
-        selection,
-        *_heat_settings(options),
-        PatchRules() if options.patches is None else load_patch_rules(options.patches),
-        distance,
-    )
+    rules = PatchRules() if options.patches is None else load_patch_rules(options.patches)
+    return CheckedOptions(selection, *_heat_settings(options), rules, distance)
 
 
-def scale_of(
-    options: ExportOptions, checked: CheckedOptions, scene_file: Mapping[str, Any] | None
-) -> SceneScale | None:
+def scale_of(options: ExportOptions, checked: CheckedOptions, scene_file: Mapping | None) -> SceneScale | None:
     """The scale of an export: what the user gives, else what the scene's json says; None if nobody does.
 
     Raises `ThermoxelsError` for a scale out of range, or for a format or option that needs one where there is none.

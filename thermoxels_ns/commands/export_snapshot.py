@@ -100,12 +100,8 @@ def export_snapshot(
     up, up_source = up_of(options, scene_file, viewpoint)
     folder = prepare_folder(output_dir, heat=scale is not None)
     to_mesh = np.diag([metres, metres, metres, 1.0]) @ world_to_input
-    built = build_mesh(
-        snapshot,
-        checked.selection,
-        to_mesh,
-        MeshOptions(options.boundary, options.coarsest_cell, up=up, rules=checked.rules),
-    )
+    mesh_options = MeshOptions(options.boundary, options.coarsest_cell, up=up, rules=checked.rules)
+    built = build_mesh(snapshot, checked.selection, to_mesh, mesh_options)
     if photographs is not None:
         built = _with_support(built, photographs, tracks, snapshot.lattice, to_mesh)
     mesh = built.mesh

@@ -78,9 +78,8 @@ def scale_from_known_distance(
     a, b = _point("point_a", point_a), _point("point_b", point_b)
     check_positive("distance_m", distance_m, "Pass the measured distance between the points in metres.")
     if standard_error_m is not None:
-        _check_not_negative(
-            "standard_error_m", standard_error_m, "Pass it in metres, or leave it out.", ThermoxelsError
-        )
+        remedy = "Pass it in metres, or leave it out."
+        _check_not_negative("standard_error_m", standard_error_m, remedy, ThermoxelsError)
     apart = float(np.linalg.norm(b - a))
     if not apart > 1e-12 * max(float(np.abs(a).max()), float(np.abs(b).max())):
         remedy = "Pass two points far from each other, in the coordinates of transforms.json."
@@ -141,9 +140,8 @@ def choose_scale(
     if given is None:
         return in_file
     if in_file is not None:
-        return replace(
-            given, source=f"{given.source} It goes before the {in_file.metres_per_unit:g} m per unit of {_FILE}."
-        )
+        beside = f"It goes before the {in_file.metres_per_unit:g} m per unit of {_FILE}."
+        return replace(given, source=f"{given.source} {beside}")
     return given
 
 

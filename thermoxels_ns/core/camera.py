@@ -47,9 +47,8 @@ class Camera:
         numbers = (self.fl_x, self.fl_y, self.cx, self.cy, *self.distortion)
         good = all(map(math.isfinite, numbers)) and min(self.fl_x, self.fl_y) > 0 and min(self.width, self.height) > 0
         if not good:
-            expected = "at least one pixel, focal lengths above 0 and finite numbers"
+            expected, remedy = "at least one pixel, focal lengths above 0 and finite numbers", "Correct the intrinsics."
             got = f"{self.width} x {self.height} pixels, {numbers}"
-            remedy = "Correct the intrinsics."
             raise SceneError("camera", expected=expected, got=got, remedy=remedy)
 
     @classmethod

@@ -37,9 +37,8 @@ def plain_values(value: Any, name: str = "value", error: type[ThermoxelsError] =
         raise error(name, expected="a finite number", got=value, remedy="Leave it out, or write None for 'unknown'.")
     if value is None or isinstance(value, (str, bool, int, float)):
         return value
-    remedy = "Convert it before writing."
-    got = type(value).__name__
-    raise error(name, expected="text, a number, a list, a mapping, a path or None", got=got, remedy=remedy)
+    expected, got = "text, a number, a list, a mapping, a path or None", type(value).__name__
+    raise error(name, expected=expected, got=got, remedy="Convert it before writing.")
 
 
 def write_json(path: Path, content: Any, error: type[ThermoxelsError] = ThermoxelsError) -> None:

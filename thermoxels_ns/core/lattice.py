@@ -120,12 +120,8 @@ def input_from_world(transform: npt.ArrayLike, scale: float) -> npt.NDArray[np.f
     rotation, shift = matrix[:, :3], matrix[:, 3]
     orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
     if not (orthonormal and np.all(np.isfinite(shift)) and np.isfinite(scale) and scale > 0):
-        raise CheckpointError(
-            "dataparser_transform",
-            expected="a rotation, a finite shift and a scale above 0",
-            got=f"{matrix.tolist()}, scale {scale}",
-            remedy=remedy,
-        )
+        expected, got = "a rotation, a finite shift and a scale above 0", f"{matrix.tolist()}, scale {scale}"
+        raise CheckpointError("dataparser_transform", expected=expected, got=got, remedy=remedy)
     inverse = np.eye(4)
     inverse[:3, :3] = np.linalg.inv(rotation) / scale
     inverse[:3, 3] = -np.linalg.inv(rotation) @ shift

@@ -228,9 +228,8 @@ def with_overrides(config: Config, overrides: Mapping[str, Any], name: str = "pr
     changed = {}
     for key, value in overrides.items():
         if key not in fields:
-            raise ThermoxelsError(
-                f"{name}.{key}", expected=f"one of {', '.join(sorted(fields))}", got=key, remedy="Correct it."
-            )
+            expected = f"one of {', '.join(sorted(fields))}"
+            raise ThermoxelsError(f"{name}.{key}", expected=expected, got=key, remedy="Correct it.")
         old = fields[key]
         if isinstance(value, Mapping) and (dataclasses.is_dataclass(old) or (isinstance(old, Mapping) and old)):
             changed[key] = with_overrides(old, value, f"{name}.{key}")

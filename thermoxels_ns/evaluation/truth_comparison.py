@@ -164,9 +164,8 @@ def load_known_truth(scene_folder: Path | str) -> KnownTruth | None:
             raise
         raise _unusable(path, "intrinsics and frames as a synthetic scene has them", repr(problem)) from problem
     if training_poses.ndim != 3 or training_poses.shape[1:] != (4, 4) or not np.isfinite(training_poses).all():
-        raise _unusable(
-            path, f"finite 4x4 poses of frames named {_TRAINING_PREFIX}*", f"an array of shape {training_poses.shape}"
-        )
+        expected = f"finite 4x4 poses of frames named {_TRAINING_PREFIX}*"
+        raise _unusable(path, expected, f"an array of shape {training_poses.shape}")
     return KnownTruth(scene, training_poses, camera)
 
 

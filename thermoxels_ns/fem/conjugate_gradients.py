@@ -104,13 +104,10 @@ class ConjugateGradients:
         """
         diagonal = matrix.diagonal()
         if not (np.all(np.isfinite(matrix.data)) and np.all(diagonal > 0)):
-            raise HeatError(
-                "matrix of the heat problem",
-                expected="finite entries and a diagonal above 0",
-                got=f"smallest diagonal entry {np.min(diagonal, initial=np.inf):.3g}, "
-                f"{np.count_nonzero(~np.isfinite(matrix.data))} entries not finite",
-                remedy="Check the units of the mesh, the material and the time step.",
-            )
+            expected, bad = "finite entries and a diagonal above 0", np.count_nonzero(~np.isfinite(matrix.data))
+            got = f"smallest diagonal entry {np.min(diagonal, initial=np.inf):.3g}, {bad} entries not finite"
+            remedy = "Check the units of the mesh, the material and the time step."
+            raise HeatError("matrix of the heat problem", expected=expected, got=got, remedy=remedy)
         self._matrix = matrix
         self._size = float(np.max(product_and_bound(matrix, np.ones(len(diagonal)))[1], initial=0.0))
         self._preconditioner = Sweeps(matrix) if preconditioner is None else preconditioner
@@ -365,9 +362,8 @@ def is_solved(error: float, tolerance: float, right_hand_side: float, matrix_tim
     """
     exact_enough = error <= _RECURSION_SLACK * tolerance
     round_off = error <= _ROUND_OFF * (matrix_times_solution + right_hand_side)
-    return math.isfinite(matrix_times_solution) and (
-        exact_enough or (round_off and error < _SOLVES_SOMETHING * right_hand_side)
-    )
+    accepted = exact_enough or (round_off and error < _SOLVES_SOMETHING * right_hand_side)
+    return math.isfinite(matrix_times_solution) and accepted
 
 
 def norm(vector: Vector) -> float:

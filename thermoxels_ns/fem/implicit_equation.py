@@ -99,9 +99,7 @@ class ImplicitEquation:
 
     def __init__(self, system: HeatSystem, time_s: float, step_s: float, *, relative_tolerance: float) -> None:
         """Assemble the matrix at a time, for a step of a length, [s]; infinite for a steady state."""
-        self.system = system
-        self.step_s = step_s
-        self._relative_tolerance = relative_tolerance
+        self.system, self.step_s, self._relative_tolerance = system, step_s, relative_tolerance
         self._free = system.fixed.free if len(system.fixed.nodes) else None
         matrix = system.matrix(time_s, step_s)
         self.matrix: sparse.csr_matrix = self.free_block(matrix)
@@ -353,9 +351,8 @@ def newton(balance: _Balance, num_unknowns: int, *, relative_tolerance: float) -
         direction, linear = balance.correction(u, residual)
         spent += linear.iterations
         if not linear.converged:
-            return _NewtonSolution(
-                u, residual, count, spent, False, f"Newton's method stopped in step {count + 1}: {linear.status}"
-            )
+            status = f"Newton's method stopped in step {count + 1}: {linear.status}"
+            return _NewtonSolution(u, residual, count, spent, False, status)
         settled, lost = balance.is_short(u, direction, _SETTLED), balance.is_lost(u, direction)
         u = u + _length(balance, u, direction) * direction
         before, residual = residual, balance.residual(u)

@@ -106,11 +106,9 @@ def solve_in_range(
         if more is None:
             break
         limited, again = more, solve(more, solution)
-        solution = replace(
-            again,
-            iterations=solution.iterations + again.iterations,
-            newton_iterations=solution.newton_iterations + again.newton_iterations,
-        )
+        iterations = solution.iterations + again.iterations
+        newton_iterations = solution.newton_iterations + again.newton_iterations
+        solution = replace(again, iterations=iterations, newton_iterations=newton_iterations)
     return solution, limited
 
 

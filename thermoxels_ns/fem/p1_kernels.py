@@ -12,6 +12,9 @@ from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.kernel_cache import kernel
 
+Vector = npt.NDArray[np.float64]
+Numbers = npt.NDArray[np.int64]
+
 _REMEDY = "Build the mesh with thermoxels_ns.mesh."
 _FLAT = 6e-12
 """Six volumes over the cube of the size, up to which a tetrahedron is flat: it cannot carry gradients."""
@@ -72,11 +75,7 @@ def mesh_edges(tets: npt.NDArray[np.int64], num_nodes: int) -> MeshEdges:
 
 
 def stiffness_matrix(
-    points_m: npt.NDArray[np.float64],
-    tets: npt.NDArray[np.int64],
-    conductivity_w_mk: float | npt.NDArray[np.float64],
-    *,
-    edges: MeshEdges | None = None,
+    points_m: Vector, tets: Numbers, conductivity_w_mk: float | Vector, *, edges: MeshEdges | None = None
 ) -> sparse.csr_matrix:
     """Assemble K, entries k * integral(grad phi_i . grad phi_j), shape (n, n), [W / K], symmetric bit for bit.
 
@@ -107,11 +106,7 @@ def stiffness_matrix(
     return _symmetric_matrix(edges, coupling, diagonal)
 
 
-def lumped_mass(
-    points_m: npt.NDArray[np.float64],
-    tets: npt.NDArray[np.int64],
-    heat_capacity_j_m3k: float | npt.NDArray[np.float64],
-) -> npt.NDArray[np.float64]:
+def lumped_mass(points_m: Vector, tets: Numbers, heat_capacity_j_m3k: float | Vector) -> Vector:
     """Compute rho c * integral(phi_i) for every node, the row sums of `mass_matrix`, shape (n,), [J / K].
 
     With non-obtuse tetrahedra, such as those of a lattice, backward Euler with this mass keeps every temperature
@@ -121,12 +116,8 @@ def lumped_mass(
 
 
 def mass_matrix(
-    points_m: npt.NDArray[np.float64],
-    tets: npt.NDArray[np.int64],
-    heat_capacity_j_m3k: float | npt.NDArray[np.float64],
-    *,
-    edges: MeshEdges | None = None,
-) -> tuple[sparse.csr_matrix, npt.NDArray[np.float64]]:
+    points_m: Vector, tets: Numbers, heat_capacity_j_m3k: float | Vector, *, edges: MeshEdges | None = None
+) -> tuple[sparse.csr_matrix, Vector]:
     """Assemble the consistent M, entries rho c * integral(phi_i phi_j), and its row sums, the lumped mass, [J / K].
 
     M is symmetric bit for bit. Arguments and errors are those of `stiffness_matrix`, with rho c in [J / (m3 K)].
@@ -143,9 +134,7 @@ def refuse_flat_tets(points_m: npt.NDArray[np.float64], tets: npt.NDArray[np.int
     _refuse_flat(_count_flat(points_m, tets, 1.0 / unit_m), len(tets))
 
 
-def product_and_bound(
-    matrix: sparse.csr_matrix, vector: npt.NDArray[np.float64]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def product_and_bound(matrix: sparse.csr_matrix, vector: Vector) -> tuple[Vector, Vector]:
     """Compute A x and |A| |x|: the round-off in the first is a few eps of the second.
 
     >>> product_and_bound(sparse.csr_matrix([[2.0, -1.0], [-1.0, 2.0]]), np.array([3.0, 3.0]))
@@ -165,9 +154,7 @@ def _capacities(points_m, tets, heat_capacity_j_m3k, edges: MeshEdges) -> tuple[
     return nodal * unit_m**3, along * unit_m**3
 
 
-def _symmetric_matrix(
-    edges: MeshEdges, edge_values: npt.NDArray[np.float64], diagonal: npt.NDArray[np.float64]
-) -> sparse.csr_matrix:
+def _symmetric_matrix(edges: MeshEdges, edge_values: Vector, diagonal: Vector) -> sparse.csr_matrix:
     """Put one value per edge and one per node into a matrix, symmetric bit for bit; zeros at edges are not stored."""
     kept = np.flatnonzero(edge_values)
     rows = np.searchsorted(kept, edges.first).astype(np.int32)
@@ -176,9 +163,7 @@ def _symmetric_matrix(
     return sparse.csr_matrix(upper + upper.T.tocsr() + sparse.diags(diagonal, format="csr"))
 
 
-def _checked(
-    points_m: npt.NDArray[np.float64], tets: npt.NDArray[np.int64]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64], float]:
+def _checked(points_m: Vector, tets: Numbers) -> tuple[Vector, Numbers, float]:
     """Check the arrays; find the power of 2 above all coordinates: in that unit nothing over- or underflows."""
     check_shape("mesh points", points_m, (None, 3), _REMEDY, HeatError)
     points_m = np.ascontiguousarray(points_m, dtype=np.float64)
@@ -216,12 +201,8 @@ def _refuse_flat(num_flat: int, num_tets: int) -> None:
 @kernel
 def _sides(points, tet, scale):
     # Unsigned, here and below: no test for negative numbers.
-    o, a, b, c = (
-        points[np.uint64(tet[0])],
-        points[np.uint64(tet[1])],
-        points[np.uint64(tet[2])],
-        points[np.uint64(tet[3])],
-    )
+    o, a = points[np.uint64(tet[0])], points[np.uint64(tet[1])]
+    b, c = points[np.uint64(tet[2])], points[np.uint64(tet[3])]
     return (
         ((a[0] - o[0]) * scale, (a[1] - o[1]) * scale, (a[2] - o[2]) * scale),
         ((b[0] - o[0]) * scale, (b[1] - o[1]) * scale, (b[2] - o[2]) * scale),

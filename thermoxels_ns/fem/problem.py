@@ -42,12 +42,9 @@ class TimeSteps:
         seconds = check_positive("step_seconds", self.step_seconds, remedy, HeatError)
         object.__setattr__(self, "step_seconds", seconds)
         if self.steps * (seconds / sys.float_info.max) > 1.0:
-            raise HeatError(
-                "steps and step_seconds",
-                expected=f"a last time that is a number, at most {sys.float_info.max:.3g} s",
-                got=f"{self.steps} steps of {seconds:g} s",
-                remedy="Give a shorter one.",
-            )
+            expected = f"a last time that is a number, at most {sys.float_info.max:.3g} s"
+            got, remedy = f"{self.steps} steps of {seconds:g} s", "Give a shorter one."
+            raise HeatError("steps and step_seconds", expected=expected, got=got, remedy=remedy)
 
     @property
     def duration_s(self) -> float:
@@ -220,10 +217,8 @@ class HeatProblem:
         if not isinstance(self.material, Mapping):
             got = repr(self.material)
             raise HeatError("material", expected="a Material or a mapping", got=got, remedy=remedy)
-        shape = (len(self.mesh.tets),)
-        region = check_shape(
-            "mesh region", self.mesh.region, shape, "Build the mesh with thermoxels_ns.mesh.", HeatError
-        )
+        build, shape = "Build the mesh with thermoxels_ns.mesh.", (len(self.mesh.tets),)
+        region = check_shape("mesh region", self.mesh.region, shape, build, HeatError)
         if region.min() < 0 or region.max() >= len(names):
             expected, got = f"numbers from 0 to {len(names) - 1}", f"{region.min()} to {region.max()}"
             raise HeatError("mesh region", expected=expected, got=got, remedy="Name every region of the mesh.")
@@ -231,11 +226,8 @@ class HeatProblem:
         missing, unknown = used - set(self.material), set(self.material) - set(names)
         wrong = [name for name, material in self.material.items() if not isinstance(material, Conductor)]
         if missing or unknown or wrong:
-            got = "; ".join(
-                f"{what}: {', '.join(sorted(names))}"
-                for what, names in (("none for", missing), ("unknown", unknown), ("no Material for", wrong))
-                if names
-            )
+            faults = (("none for", missing), ("unknown", unknown), ("no Material for", wrong))
+            got = "; ".join(f"{what}: {', '.join(sorted(names))}" for what, names in faults if names)
             expected = f"a Material for each of the regions {', '.join(sorted(used))}"
             raise HeatError("material", expected=expected, got=got, remedy=remedy)
 

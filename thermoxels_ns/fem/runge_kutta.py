@@ -44,10 +44,7 @@ class RungeKutta:
     """Takes steps of any length; matrices and preconditioners of the lengths used last are kept."""
 
     def __init__(self, system: HeatSystem, scheme: Scheme, *, relative_tolerance: float) -> None:
-        """Choose a scheme and the tolerance of the linear solver."""
-        self.scheme = scheme
-        self._system = system
-        self._relative_tolerance = relative_tolerance
+        self.scheme, self._system, self._relative_tolerance = scheme, system, relative_tolerance
         self._equations: dict[tuple[float, float], ImplicitEquation] = {}
 
     def step(self, start_k: Vector, time_s: float, step_s: float, *, estimate: bool = False) -> Step:

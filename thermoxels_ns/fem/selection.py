@@ -21,13 +21,8 @@ class Selection:
     """The named parts of a mesh and their geometry."""
 
     def __init__(self, mesh: TetMesh, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> None:
-        """Check the tags of a mesh; `up` is a unit vector, which functions of place are told.
-
-        Raises:
-            HeatError: Facets or tags have the wrong shape, or refer to what is not there.
-        """
-        self.mesh = mesh
-        self.up = up
+        """Check the tags of a mesh (`HeatError`); `up` is a unit vector, which functions of place are told."""
+        self.mesh, self.up = mesh, up
         self._check()
         tags = mesh.boundary
         self.patch_names: tuple[str, ...] = (WHOLE_BOUNDARY,) if tags is None else tags.patch_names
@@ -60,13 +55,11 @@ class Selection:
 
     def facets(self, patterns: tuple[str, ...]) -> npt.NDArray[np.int64]:
         """Number the boundary triangles of the patches that match any pattern; each must match one, or `HeatError`."""
-        chosen = _matching("patches", patterns, self.patch_names)
-        return np.flatnonzero(chosen[self.facet_patch])
+        return np.flatnonzero(_matching("patches", patterns, self.patch_names)[self.facet_patch])
 
     def tets(self, patterns: tuple[str, ...]) -> npt.NDArray[np.int64]:
         """Number the tetrahedra of the regions that match any pattern; each must match one, or `HeatError`."""
-        chosen = _matching("regions", patterns, self.mesh.region_names)
-        return np.flatnonzero(chosen[self.mesh.region])
+        return np.flatnonzero(_matching("regions", patterns, self.mesh.region_names)[self.mesh.region])
 
     def facet_places(self, facets: npt.NDArray[np.int64]) -> Places:
         """Give the centroids of boundary triangles."""
@@ -111,8 +104,7 @@ def _matching(field: str, patterns: tuple[str, ...], names: tuple[str, ...]) -> 
     for pattern in patterns:
         matches = np.array([fnmatchcase(name, pattern) for name in names], dtype=bool)
         if not matches.any():
-            remedy = "Correct the name, or tag the mesh so that it has such a part."
-            got = repr(pattern)
-            raise HeatError(field, expected=f"names or patterns of {', '.join(names)}", got=got, remedy=remedy)
+            expected, remedy = ", ".join(names), "Correct the name, or tag the mesh so that it has such a part."
+            raise HeatError(field, expected=f"names or patterns of {expected}", got=repr(pattern), remedy=remedy)
         chosen |= matches
     return chosen

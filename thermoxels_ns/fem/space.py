@@ -99,9 +99,8 @@ class Space:
         """Give `from_mesh_nodes` as a matrix, shape (n, v)."""
         corners = len(self.selection.mesh.points_m)
         ends = np.stack([self.edges.smaller_nodes(), self.edges.other], axis=1)
-        edges = sparse.csr_matrix(
-            (np.full(ends.size, 0.5), ends.ravel(), 2 * np.arange(len(ends) + 1)), shape=(len(ends), corners)
-        )
+        halves = (np.full(ends.size, 0.5), ends.ravel(), 2 * np.arange(len(ends) + 1))
+        edges = sparse.csr_matrix(halves, shape=(len(ends), corners))
         return sparse.csr_matrix(sparse.vstack([sparse.identity(corners, format="csr"), edges]))
 
     def tet_nodes(self) -> Numbers:

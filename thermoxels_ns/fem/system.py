@@ -76,13 +76,8 @@ class HeatSystem:
     def __init__(
         self, problem: HeatProblem, *, lumped: bool = True, lumped_boundary: bool | None = None, order: int = 1
     ) -> None:
-        """Turn effects into terms and forms, and assemble the stiffness; options are those of `Space`.
-
-        Raises:
-            HeatError: An effect names what the mesh does not have, or quadratic tetrahedra are to be lumped.
-        """
-        self.problem = problem
-        self.assembled = Assembled()
+        """Turn effects into terms and forms, and assemble the stiffness; options and errors are those of `Space`."""
+        self.problem, self.assembled = problem, Assembled()
         start = problem.start_c
         # The middle of the range, not the mean: exact for a uniform temperature.
         self.reference_c: float = 0.5 * (float(start.min()) + float(start.max()))
@@ -196,9 +191,8 @@ class HeatSystem:
             free, num_mesh_nodes = self.fixed.free, len(self.problem.mesh.points_m)
             rows = sparse.csr_matrix(self._space.prolongation()[free])
             self._prolongation = sparse.csr_matrix(rows[:, free[free < num_mesh_nodes]])
-        return ConjugateGradients(
-            matrix, TwoLevel(matrix, self._prolongation), relative_tolerance=relative_tolerance, max_iterations=500
-        )
+        given = TwoLevel(matrix, self._prolongation)
+        return ConjugateGradients(matrix, given, relative_tolerance=relative_tolerance, max_iterations=500)
 
     def held_w_k(self, time_s: float, step_s: float) -> Vector:
         """Row sums of M / step + R, shape (n,), [W / K]: of the matrix too, because those of K are 0, but exact."""

@@ -19,6 +19,7 @@ from thermoxels_ns.fem.steady import check_stored, is_still, too_cold
 from thermoxels_ns.fem.system import HeatSystem
 
 Vector = npt.NDArray[np.float64]
+Steps = TimeSteps | AdaptiveSteps | GivenSteps
 
 MAX_STATE_BYTES = 4 * 2**30
 """Most memory that the temperatures of all times may take, [bytes]; every time is also a file of an export."""
@@ -43,7 +44,7 @@ _SUSPICIOUS = 1e-12
 
 def solve_heat(
     problem: HeatProblem,
-    time: TimeSteps | AdaptiveSteps | GivenSteps,
+    time: Steps,
     *,
     scheme: Scheme | None = None,
     lumped: bool = True,
@@ -123,13 +124,7 @@ class _TimeLoop:
     than effects can be followed by.
     """
 
-    def __init__(
-        self,
-        system: HeatSystem,
-        scheme: Scheme,
-        time: TimeSteps | AdaptiveSteps | GivenSteps,
-        relative_tolerance: float,
-    ) -> None:
+    def __init__(self, system: HeatSystem, scheme: Scheme, time: Steps, relative_tolerance: float) -> None:
         self._system, self._scheme, self._time = system, scheme, time
         self._runge_kutta = RungeKutta(system, scheme, relative_tolerance=relative_tolerance)
         self._limiter = Limiter(system, relative_tolerance=relative_tolerance)
@@ -151,9 +146,8 @@ class _TimeLoop:
         if self._repeated:
             sentence += f" {self._repeated} more were repeated with a shorter length."
         if self._replaced:
-            sentence += (
-                f" {self._replaced} were taken with backward Euler because {self._scheme.name} would have overshot."
-            )
+            why = f"because {self._scheme.name} would have overshot"
+            sentence += f" {self._replaced} were taken with backward Euler {why}."
         return sentence
 
     def _given(self, start_k: Vector, time: TimeSteps | GivenSteps) -> Iterator[_Taken]:
@@ -225,12 +219,9 @@ class _TimeLoop:
             return replace(plain, in_range=False), order
         error_k = float(np.max(np.abs(unlimited_k - plain.relative_k)))
         self._replaced += error_k <= self._allowed_k
-        limited = replace(
-            limited,
-            error_k=error_k,
-            iterations=limited.iterations + plain.iterations,
-            newton_iterations=limited.newton_iterations + plain.newton_iterations,
-        )
+        iterations = limited.iterations + plain.iterations
+        newton = limited.newton_iterations + plain.newton_iterations
+        limited = replace(limited, error_k=error_k, iterations=iterations, newton_iterations=newton)
         return limited, BACKWARD_EULER.order
 
     def _in_range(self, step: Step, start_k: Vector, now_s: float, step_s: float) -> bool:
@@ -390,7 +381,7 @@ def _fitted(wished_s: float, left_s: float) -> float:
     return left_s if wished_s >= left_s else min(wished_s, 0.5 * left_s)
 
 
-def _skips(problem: HeatProblem, time: TimeSteps | AdaptiveSteps | GivenSteps) -> str:
+def _skips(problem: HeatProblem, time: Steps) -> str:
     """Say that steps may be too long to see how an effect changes, or nothing."""
     if not isinstance(time, TimeSteps):
         labelled = zip(effect_labels(problem), problem.effects)

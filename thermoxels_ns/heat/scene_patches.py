@@ -69,13 +69,9 @@ class ScenePatches:
         ]
         if forgotten:
             shares = (f"{patch} ({100.0 * self.area_m2[patch] / whole:.3g} % of the surface)" for patch in forgotten)
-            raise HeatError(
-                "heat scene",
-                expected="something that acts on every patch, or the patch named adiabatic",
-                got=f"nothing on {', '.join(shares)}",
-                remedy=f"{_what_may_act(acting, forgotten)}, or write "
-                f"adiabatic: {_yaml_list((*adiabatic, *forgotten))}.",
-            )
+            expected, got = "something that acts on every patch, or the patch named adiabatic", ", ".join(shares)
+            remedy = f"{_what_may_act(acting, forgotten)}, or write adiabatic: {_yaml_list((*adiabatic, *forgotten))}."
+            raise HeatError("heat scene", expected=expected, got=f"nothing on {got}", remedy=remedy)
 
 
 def check_disjoint(what: str, entries: Sequence[tuple[str, set[str]]], remedy: str) -> None:

@@ -337,10 +337,8 @@ class _Screener:
         if self._stiffness is None:
             return "Every effect can do more than the tolerance."
         if self._obtuse:
-            return (
-                "The mesh has obtuse angles: bounds are those of the heat equation, doubled to allow for the error of "
-                "the mesh."
-            )
+            bounds = "bounds are those of the heat equation, doubled to allow for the error of the mesh"
+            return f"The mesh has obtuse angles: {bounds}."
         return "Bounds hold for the equations on this mesh (discrete maximum principle)."
 
     def _largest(self) -> list[Vector]:

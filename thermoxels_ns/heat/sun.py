@@ -96,9 +96,8 @@ def towards_sun(position: SunPosition, up: Vector, north: Vector) -> Vector:
     upward, northward = _unit(up), _unit(north)
     level = northward - (northward @ upward) * upward
     if float(np.linalg.norm(level)) < 1e-6:
-        raise HeatError(
-            "north", expected="a direction other than up", got=list(north), remedy="Give north along the ground."
-        )
+        remedy = "Give north along the ground."
+        raise HeatError("north", expected="a direction other than up", got=list(north), remedy=remedy)
     level /= np.linalg.norm(level)
     azimuth, elevation = math.radians(position.azimuth_deg), math.radians(position.elevation_deg)
     horizontal = math.cos(azimuth) * level + math.sin(azimuth) * np.cross(level, upward)
@@ -178,13 +177,11 @@ def moving_sun(
 
 
 def _later(start: datetime, time_s: float) -> datetime:
-    """The moment some seconds later."""
     try:
         return start + timedelta(seconds=time_s)
     except OverflowError as problem:
-        expected = "a date of the years 1 to 9999"
+        expected, remedy = "a date of the years 1 to 9999", "Follow the body for a shorter time."
         got = f"{time_s:.3g} s after {start.isoformat()}"
-        remedy = "Follow the body for a shorter time."
         raise HeatError("time of the sun", expected=expected, got=got, remedy=remedy) from problem
 
 

@@ -157,20 +157,15 @@ def _cameras(page: CapturePage) -> Section:
         ("thermal, start value", page.result.start.thermal_camera, {}),
         ("thermal, as written", rig.thermal_camera, errors),
     )
-    cameras = Table(
-        ("", *(name for name, _, _ in columns)),
-        (
-            ("size, pixels", *(f"{camera.width} x {camera.height}" for _, camera, _ in columns)),
-            (
-                "focal length, pixels",
-                *(with_error(camera.fl_x, own.get("focal", math.nan), 1) for _, camera, own in columns),
-            ),
-            ("angle of view, degrees", *(f"{_angle(camera):.1f}" for _, camera, _ in columns)),
-            ("principal point, pixels", *(_principal_point(camera, own) for _, camera, own in columns)),
-            ("distortion k1, k2", *(f"{camera.k1:.4f}, {camera.k2:.4f}" for _, camera, _ in columns)),
-        ),
-        look="cameras",
+    focal = (with_error(camera.fl_x, own.get("focal", math.nan), 1) for _, camera, own in columns)
+    rows = (
+        ("size, pixels", *(f"{camera.width} x {camera.height}" for _, camera, _ in columns)),
+        ("focal length, pixels", *focal),
+        ("angle of view, degrees", *(f"{_angle(camera):.1f}" for _, camera, _ in columns)),
+        ("principal point, pixels", *(_principal_point(camera, own) for _, camera, own in columns)),
+        ("distortion k1, k2", *(f"{camera.k1:.4f}, {camera.k2:.4f}" for _, camera, _ in columns)),
     )
+    cameras = Table(("", *(name for name, _, _ in columns)), rows, look="cameras")
     turn = with_error(turn_deg(rig), turn_error_deg(rig), 2)
     shift = float(np.linalg.norm(rig.visible_to_thermal[:3, 3]))
     metres = f" = {100 * shift * scale.metres_per_unit:.1f} cm" if scale is not None else ""

@@ -199,11 +199,9 @@ def verdict(rows: Sequence[CostRow], targets: Targets, scene: Path | str) -> str
     """Say in a sentence which setting meets the targets for the least time, or how far the best are from it."""
     best = cheapest(rows, targets)
     if best is not None:
-        return (
-            f"Cheapest setting with {targets.words}: {best.setting.name} "
-            f"({', '.join(_figure(best, name) for name in ('seconds', 'thermal_mae_c', 'psnr'))}). "
-            f"Train with: {best.setting.command(scene)}"
-        )
+        figures = ", ".join(_figure(best, name) for name in ("seconds", "thermal_mae_c", "psnr"))
+        found = f"Cheapest setting with {targets.words}: {best.setting.name} ({figures})."
+        return f"{found} Train with: {best.setting.command(scene)}"
     nearest = []
     for name in FRONTS:
         known = [row for row in rows if not math.isnan(row.figures[name])]

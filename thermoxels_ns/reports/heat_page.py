@@ -208,16 +208,10 @@ def _asked(run: HeatRun, mesh_name: str) -> Section:
         rows.append((name, what.name, *(f"{value:g}" for value in figures)))
     columns = ("Region", "material", "W/(m K)", "kg/m³", "J/(kg K)")
     materials = Table(columns, tuple(rows), figures_from=2)
-    selection = Selection(mesh, run.problem.up)
-    effects = Table(
-        ("What the scene names", "with"),
-        tuple(
-            (label, "; ".join(_values(effect, selection)))
-            for label, effect in zip(effect_labels(run.problem), run.problem.effects)
-        ),
-        figures_from=2,
-        note="A range is that over the surface at the start.",
-    )
+    selection, labelled = Selection(mesh, run.problem.up), zip(effect_labels(run.problem), run.problem.effects)
+    shown = tuple((label, "; ".join(_values(effect, selection))) for label, effect in labelled)
+    note = "A range is that over the surface at the start."
+    effects = Table(("What the scene names", "with"), shown, figures_from=2, note=note)
     return Section("What was asked", tables=(general, materials, effects))
 
 
@@ -270,10 +264,8 @@ def _made(run: HeatRun, command: str, files: Sequence[str]) -> Section:
     words.append(f"{newton} Newton steps" if newton else "no Newton steps")
     seconds = Table(("Part", "s"), tuple((name, f"{value:.2f}") for name, value in run.seconds.items()))
     said = ", ".join(words)
-    lines = (command, *files)
-    return Section(
-        "How it was made", words=(solution.status, f"{said[0].upper()}{said[1:]}."), tables=(seconds,), lines=lines
-    )
+    said = f"{said[0].upper()}{said[1:]}."
+    return Section("How it was made", words=(solution.status, said), tables=(seconds,), lines=(command, *files))
 
 
 def _values(effect: Effect, selection: Selection) -> list[str]:
@@ -296,8 +288,7 @@ def _values(effect: Effect, selection: Selection) -> list[str]:
             values = effect.bounded(field.name).at(places, 0.0)
             changes = ", changes with time" if value.in_time else ""
             ends = dict.fromkeys(f"{end:.3g}" for end in (values.min(), values.max())) if len(values) else ("nowhere",)
-            span = " to ".join(ends)
-            shown.append(f"{name} {span}{unit}{changes}")
+            shown.append(f"{name} {' to '.join(ends)}{unit}{changes}")
     return shown
 
 

@@ -103,8 +103,7 @@ def image_address(image: bytes, words: str) -> str:
     """Put a PNG or JPEG file into its own address, or raise a `ThermoxelsError` that names it by `words`."""
     kind = next((kind for signature, kind in _SIGNATURES.items() if image.startswith(signature)), None)
     if kind is None:
-        remedy = "Draw the picture again."
-        got = f"{len(image)} bytes that begin with {image[:8]!r}"
+        got, remedy = f"{len(image)} bytes that begin with {image[:8]!r}", "Draw the picture again."
         raise ThermoxelsError(words, expected="the content of a PNG or JPEG file", got=got, remedy=remedy)
     return f"data:{kind};base64,{base64.b64encode(image).decode()}"
 
