@@ -216,7 +216,7 @@ def test_a_scheme_without_estimate_cannot_adapt() -> None:
     [
         ({"duration_s": 0.0}, "duration_s: expected a finite number above 0"),
         ({"duration_s": 60.0, "tolerance_k": -1.0}, "tolerance_k: expected a finite number above 0"),
-        ({"duration_s": 60.0, "outputs": 0}, "outputs: expected a whole number of at least 1"),
+        ({"duration_s": 60.0, "outputs": 0}, "outputs: expected a whole number from 1"),
         ({"duration_s": 60.0, "outputs": 1.5}, "outputs: expected a whole number"),
     ],
 )

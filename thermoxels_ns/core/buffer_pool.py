@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-SMALLEST = 1 << 15
-"""Bytes below which an array is made as usual."""
-PATIENCE = 2048
-"""Loans after which memory that nobody asked for is given back to the system."""
+SMALLEST = 1 << 15  # Bytes below which an array is made as usual
+PATIENCE = 2048  # Loans after which memory that nobody asked for is given back to the system
 
 
 class BufferPool:
@@ -78,5 +76,4 @@ def rounded_size(size: int) -> int:
     return -(-size // quarter) * quarter
 
 
-BUFFERS = BufferPool()
-"""What the compiled renderer lends from."""
+BUFFERS = BufferPool()  # What the compiled renderer lends from

@@ -33,11 +33,9 @@ class Camera:
     fl_y: float
     cx: float
     cy: float
-    k1: float = 0.0
-    """Radial distortion, second order, as in OpenCV; k2, k3, k4 are the fourth, sixth and eighth order."""
+    k1: float = 0.0  # Radial distortion, second order, as in OpenCV; k2, k3, k4 are the fourth, sixth and eighth order
     k2: float = 0.0
-    p1: float = 0.0
-    """Tangential distortion, as in OpenCV; p2 too."""
+    p1: float = 0.0  # Tangential distortion, as in OpenCV; p2 too
     p2: float = 0.0
     k3: float = 0.0
     k4: float = 0.0

@@ -10,16 +10,11 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
-NEIGHBOURS = 8
-"""Points nearest to a point in a photograph that its distance is compared with."""
-FEWEST_NEIGHBOURS = 4
-"""With fewer in a photograph it says nothing about the point."""
-STEEPEST = 3.0
-"""Slope of a surface against the photograph up to which neighbours on it agree: 72 degrees."""
-LEAST_TOLERANCE = 0.01
-"""Share of the distance by which neighbours may differ at any slope: surfaces are rough."""
-TOLERANCE_ERRORS = 3.0
-"""Standard errors of a ray's length by which they may differ too."""
+NEIGHBOURS = 8  # Points nearest to a point in a photograph that its distance is compared with
+FEWEST_NEIGHBOURS = 4  # With fewer in a photograph it says nothing about the point
+STEEPEST = 3.0  # Slope of a surface against the photograph up to which neighbours on it agree: 72 degrees
+LEAST_TOLERANCE = 0.01  # Share of the distance by which neighbours may differ at any slope: surfaces are rough
+TOLERANCE_ERRORS = 3.0  # Standard errors of a ray's length by which they may differ too
 _RAYS_AT_ONCE = 1 << 18
 
 
@@ -27,14 +22,10 @@ _RAYS_AT_ONCE = 1 << 18
 class FeatureRays:
     """Rays from cameras to points that their photographs agree on: what lies between is air. World units."""
 
-    origins: FloatArray
-    """Where the cameras stood, shape (s, 3)."""
-    point: IntArray
-    """Index into `points`, ascending, shape (s,)."""
-    points: FloatArray
-    """Shape (n, 3)."""
-    uncertainty: FloatArray
-    """Standard error of each ray's length, shape (s,)."""
+    origins: FloatArray  # Where the cameras stood, shape (s, 3)
+    point: IntArray  # Index into `points`, ascending, shape (s,)
+    points: FloatArray  # Shape (n, 3)
+    uncertainty: FloatArray  # Standard error of each ray's length, shape (s,)
 
     def moved(self, rotation: FloatArray, translation: FloatArray, scale: float) -> FeatureRays:
         """The same rays in another world: scale (rotation p + translation)."""

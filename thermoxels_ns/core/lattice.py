@@ -25,12 +25,9 @@ class Lattice:
     index: ``(i * ny + j) * nz + k`` (C order), and the same rule for cells.
     """
 
-    lo: tuple[float, float, float]
-    """World position of corner (0, 0, 0)."""
-    voxel_size: float
-    """Edge length of a voxel, world units."""
-    shape: tuple[int, int, int]
-    """Number of corners along x, y, z; at least 2 each."""
+    lo: tuple[float, float, float]  # World position of corner (0, 0, 0)
+    voxel_size: float  # Edge length of a voxel, world units
+    shape: tuple[int, int, int]  # Number of corners along x, y, z; at least 2 each
 
     def __post_init__(self) -> None:
         assert all(map(math.isfinite, (*self.lo, self.voxel_size))) and self.voxel_size > 0, self

@@ -16,14 +16,10 @@ from thermoxels_ns.core.lattice import Lattice
 class Views:
     """The training cameras (pinholes without distortion), in the coordinates of the lattice."""
 
-    camera_to_world: npt.NDArray[np.float64]
-    """Poses [R | centre], x right, y up, z back (OpenGL), shape (c, 3, 4)."""
-    focal: npt.NDArray[np.float64]
-    """Focal lengths along x and y, shape (c, 2), [pixels]."""
-    centre: npt.NDArray[np.float64]
-    """Principal points x, y from the image's upper left corner, shape (c, 2), [pixels]."""
-    size: npt.NDArray[np.int64]
-    """Image widths and heights, shape (c, 2), [pixels]."""
+    camera_to_world: npt.NDArray[np.float64]  # Poses [R | centre], x right, y up, z back (OpenGL), shape (c, 3, 4)
+    focal: npt.NDArray[np.float64]  # Focal lengths along x and y, shape (c, 2), [pixels]
+    centre: npt.NDArray[np.float64]  # Principal points x, y from the image's upper left corner, shape (c, 2), [pixels]
+    size: npt.NDArray[np.int64]  # Image widths and heights, shape (c, 2), [pixels]
 
     def matrices(self) -> npt.NDArray[np.float64]:
         """World to homogeneous pixels (columns, rows, depth, positive in front), shape (c, 3, 4)."""
@@ -52,8 +48,7 @@ class GridSnapshot:
     """The trained field, detached: arrays of the lattice's shape, all finite (checked)."""
 
     lattice: Lattice
-    density: npt.NDArray[np.float32]
-    """Density after activation at the corners, [1 / world unit], >= 0."""
+    density: npt.NDArray[np.float32]  # Density after activation at the corners, [1 / world unit], >= 0
     temperature_c: npt.NDArray[np.float32]
     """Temperature at the corners, [degrees Celsius]: the mean over thermal training rays, each sample weighted by its
     share of the pixel; where `observed_weight` is 0 it is not a measurement."""
@@ -65,10 +60,8 @@ class GridSnapshot:
     colour: npt.NDArray[np.float32] | None = None
     """Red, green, blue in [0, 1] at the corners, the mean over all directions, shape (*lattice.shape, 3). None: the
     model has no colour."""
-    evidence: RayEvidence | None = None
-    """What training rays spent where. None: not known."""
-    views: Views | None = None
-    """The training cameras of both streams. None: not known."""
+    evidence: RayEvidence | None = None  # What training rays spent where. None: not known
+    views: Views | None = None  # The training cameras of both streams. None: not known
 
     def __post_init__(self) -> None:
         lattice = self.lattice

@@ -12,8 +12,7 @@ from thermoxels_ns.core.errors import ThermoxelsError
 if TYPE_CHECKING:
     import torch
 
-ZERO_CELSIUS_K = 273.15
-"""0 degrees Celsius in kelvin (exact, BIPM)."""
+ZERO_CELSIUS_K = 273.15  # 0 degrees Celsius in kelvin (exact, BIPM)
 
 _SMALLEST_SPAN_K = 1e-3
 _CONSTANT_SCENE_SPAN_K = 1.0

@@ -26,10 +26,8 @@ from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 from thermoxels_ns.synthetic.scene_folder import load_truth, visible_surface_points
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
-TOLERANCE_VOXELS = 1.5
-"""Surfaces closer than this agree, [voxels]."""
-COMMON_RESOLUTION = 128
-"""Voxels along the longest side of the exact box whose size `fscore_128` is measured with."""
+TOLERANCE_VOXELS = 1.5  # Surfaces closer than this agree, [voxels]
+COMMON_RESOLUTION = 128  # Voxels along the longest side of the exact box whose size `fscore_128` is measured with
 
 _SURFACE_POINTS = 20_000
 _TRAINING_PREFIX = "frame_train_"
@@ -40,10 +38,8 @@ _JSON_NAME = "transforms.json"
 class SurfaceDistances:
     """Distances between two surfaces, [truth units]: means both ways, their mean, the largest, the closest ones."""
 
-    mesh_to_truth: float
-    """Mean distance of the mesh's surface, spread evenly by area, to the true surface."""
-    truth_to_mesh: float
-    """Mean distance of the given true points to the mesh's surface."""
+    mesh_to_truth: float  # Mean distance of the mesh's surface, spread evenly by area, to the true surface
+    truth_to_mesh: float  # Mean distance of the given true points to the mesh's surface
     chamfer: float
     hausdorff: float
     closest_temperature_c: FloatArray
@@ -126,8 +122,7 @@ class KnownTruth:
     """A synthetic scene and the cameras that its training photographs were taken with."""
 
     scene: SyntheticScene
-    training_poses: FloatArray
-    """Training cameras, camera to world (OpenGL), shape (c, 4, 4), [m]."""
+    training_poses: FloatArray  # Training cameras, camera to world (OpenGL), shape (c, 4, 4), [m]
     camera: Camera
 
     @property

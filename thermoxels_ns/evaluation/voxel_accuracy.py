@@ -17,8 +17,7 @@ from thermoxels_ns.mesh.build import apply_transform, check_similarity
 from thermoxels_ns.mesh.solid.free_space import count_cameras
 from thermoxels_ns.mesh.solid.morphology import fill_enclosed
 
-MIN_VIEWS = 3
-"""A point of a surface is seen if at least this many training cameras see it."""
+MIN_VIEWS = 3  # A point of a surface is seen if at least this many training cameras see it
 
 _PER_SIDE = 2
 
@@ -37,8 +36,7 @@ class _Score:
     """Share of the reconstructed boundary within the tolerance of the true surface, 0 to 1; 0 if there is none."""
     recall: float
     """Share of the true surface that cameras see within the tolerance of the reconstructed boundary, 0 to 1."""
-    fscore: float
-    """Harmonic mean of precision and recall; 0 if both are."""
+    fscore: float  # Harmonic mean of precision and recall; 0 if both are
 
 
 @dataclass(frozen=True)
@@ -146,12 +144,9 @@ class _Faces:
     """Voxel faces across one axis, between solid and empty."""
 
     axis: int
-    corner: IntArray
-    """Corner index of each face's first corner, shape (n, 3)."""
-    empty: IntArray
-    """The empty voxel beside each face, shape (n, 3); outside the lattice for some faces on its border."""
-    on_border: BoolArray
-    """Faces on the border of the lattice, shape (n,)."""
+    corner: IntArray  # Corner index of each face's first corner, shape (n, 3)
+    empty: IntArray  # The empty voxel beside each face, shape (n, 3); outside the lattice for some faces on its border
+    on_border: BoolArray  # Faces on the border of the lattice, shape (n,)
 
 
 def _boundary_faces(cells: BoolArray) -> tuple[_Faces, ...]:

@@ -22,18 +22,14 @@ PATIENCE = 1000
 
 Measured on lattices of 15,000 to 230,000 nodes: one multigrid iteration costs as much as 26 between sweeps, its set-up
 as much as 300, and it needs about 20 to 24."""
-PATIENCE_WHEN_REPEATED = 600
-"""The same for a matrix that is used again, when its set-up is paid once."""
+PATIENCE_WHEN_REPEATED = 600  # The same for a matrix that is used again, when its set-up is paid once
 _RECURSION_SLACK = 10.0
 _ROUND_OFF = 1e-14
-_SOLVES_SOMETHING = 0.5
-"""No round-off excuses a larger relative residual."""
-_NEARLY = 0.99
-"""How far the loop's residual must fall below where it was expected to suffice, once that was wrong."""
+_SOLVES_SOMETHING = 0.5  # No round-off excuses a larger relative residual
+_NEARLY = 0.99  # How far the loop's residual must fall below where it was expected to suffice, once that was wrong
 _SMALLEST_PIVOT_OF_SWEEPS = 1e-4
 """Share of the diagonal below which a pivot is not used: wrong-signed couplings can make it vanish."""
-_COARSEST = 300
-"""Nodes of the level of multigrid that is solved directly."""
+_COARSEST = 300  # Nodes of the level of multigrid that is solved directly
 _ROUND_OFF_OF_COARSEST = 1e-13
 """Share of its largest eigenvalue below which one of that level is round-off; its mode is left out."""
 
@@ -44,10 +40,8 @@ class LinearSolution:
 
     x: Vector
     iterations: int
-    residual: float
-    """||b - A x|| / ||b|| computed from x itself, not from the recursion; 0 where b is 0."""
-    converged: bool
-    """Whether the residual is within the tolerance, or as small as double precision can make it."""
+    residual: float  # ||b - A x|| / ||b|| computed from x itself, not from the recursion; 0 where b is 0
+    converged: bool  # Whether the residual is within the tolerance, or as small as double precision can make it
     status: str
 
 
@@ -59,8 +53,7 @@ class Preconditioner(Protocol):
     alone (C = 1).
     """
 
-    name: str
-    """What preconditions, for reports."""
+    name: str  # What preconditions, for reports
 
     def residual(self, r: Vector) -> Vector:
         """Residual of the changed system, C^-1 r."""

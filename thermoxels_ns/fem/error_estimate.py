@@ -36,16 +36,14 @@ _LEAST_OF_HALF_THE_SIZE = 0.17
 temperatures are smooth, 0.3 where two airs meet at an edge."""
 _CORNERS = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """Corners of the reference tetrahedron, shape (3, 4)."""
-_EQUAL = 1e-9
-"""Temperatures that differ by less than this share of the absolute temperature are equal."""
+_EQUAL = 1e-9  # Temperatures that differ by less than this share of the absolute temperature are equal
 
 
 @dataclass(frozen=True)
 class ErrorSize:
     """Errors of a solution."""
 
-    temperature_k: float
-    """Largest error of the temperature at the nodes of the given mesh, [K]."""
+    temperature_k: float  # Largest error of the temperature at the nodes of the given mesh, [K]
     heat_flow: float
     """Largest error of the mean heat flow of an effect, as a share of all heat that flows through the body."""
 

@@ -26,10 +26,8 @@ Vector = npt.NDArray[np.float64]
 
 COLDEST_SLOPE_K = 1e-2
 """Below this temperature the slope of radiation is that at it, so that no Newton matrix is singular, [K]."""
-_SAME_TEMPERATURE_K = 1e-9
-"""Two effects may fix the same node if their temperatures differ by no more than this, [K]."""
-_KEPT_TIMES = 4
-"""Times whose values are kept: those of the stages of a step, whose start has ended the one before."""
+_SAME_TEMPERATURE_K = 1e-9  # Two effects may fix the same node if their temperatures differ by no more than this, [K]
+_KEPT_TIMES = 4  # Times whose values are kept: those of the stages of a step, whose start has ended the one before
 
 T = TypeVar("T")
 
@@ -57,10 +55,8 @@ class Form(Protocol):
     also gives its heat flow per patch or region, evaluated as the equations do, so that balances close to round-off.
     """
 
-    effect: str
-    """Label of the effect that it comes from."""
-    groups: tuple[str, ...]
-    """Names of the patches or regions that it acts on."""
+    effect: str  # Label of the effect that it comes from
+    groups: tuple[str, ...]  # Names of the patches or regions that it acts on
 
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat flow into the body through each group, shape (g,), [W]."""

@@ -17,12 +17,10 @@ from thermoxels_ns.fem.system import HeatSystem, SystemSolver
 
 Vector = npt.NDArray[np.float64]
 
-_ESTIMATE_TOLERANCE = 1e-3
-"""Relative tolerance of the linear solver for error estimates."""
+_ESTIMATE_TOLERANCE = 1e-3  # Relative tolerance of the linear solver for error estimates
 _NEWTON_TOLERANCE = 1e-6
 """Relative tolerance of the linear solver in a step of Newton's method: the next step corrects the rest."""
-MAX_ITERATIONS = 60
-"""Newton steps before giving up."""
+MAX_ITERATIONS = 60  # Newton steps before giving up
 
 _SAFE = 0.1
 """Largest change in a Newton step, as a share of the absolute temperature, at which a full step is taken without a line
@@ -34,27 +32,20 @@ left is about the square of it. A small residual alone is no proof: of a body th
 _ENOUGH = 0.5
 """The line search ends where the slope of the energy along the step has fallen to this share of what it was at its
 start, or has changed sign and is no larger than that."""
-_MOST_SEARCHES = 200
-"""Bisections of the line search."""
-_UNEXPLAINED = 1e-11
-"""Largest share of the stored heat that may be unaccounted for where nodes are fixed."""
+_MOST_SEARCHES = 200  # Bisections of the line search
+_UNEXPLAINED = 1e-11  # Largest share of the stored heat that may be unaccounted for where nodes are fixed
 _EPS = float(np.finfo(np.float64).eps)
-ROUND_OFF = 8.0 * _EPS
-"""Round-off of a sum as a share of the sum of sizes."""
+ROUND_OFF = 8.0 * _EPS  # Round-off of a sum as a share of the sum of sizes
 
 
 @dataclass(frozen=True)
 class Residual:
     """Heat that is not balanced yet."""
 
-    heat_w: Vector
-    """At each free node, [W]."""
-    piece_heat_w: Vector
-    """Summed over each connected piece, without the round-off of what flows inside, [W]."""
-    round_off_w: Vector
-    """What round-off may leave at each free node, [W]."""
-    piece_round_off_w: Vector
-    """The same for each piece, [W]."""
+    heat_w: Vector  # At each free node, [W]
+    piece_heat_w: Vector  # Summed over each connected piece, without the round-off of what flows inside, [W]
+    round_off_w: Vector  # What round-off may leave at each free node, [W]
+    piece_round_off_w: Vector  # The same for each piece, [W]
 
     @property
     def is_round_off(self) -> bool:
@@ -73,8 +64,7 @@ class Residual:
 class ImplicitSolution:
     """Temperatures that solve an implicit equation to tolerance, if it converged; the status is a sentence."""
 
-    relative_k: Vector
-    """Relative to the system's reference, shape (n,), [K]."""
+    relative_k: Vector  # Relative to the system's reference, shape (n,), [K]
     change_k: Vector
     """T - T_0 as it was solved for, shape (n,), [K]: the difference of the temperatures has lost its last digits."""
     iterations: int
@@ -326,8 +316,7 @@ class _NewtonSolution:
     residual: Residual
     iterations: int
     linear_iterations: int
-    converged: bool
-    """Whether the residual is within the tolerance or as small as round-off, or the next step would be."""
+    converged: bool  # Whether the residual is within the tolerance or as small as round-off, or the next step would be
     status: str
 
 

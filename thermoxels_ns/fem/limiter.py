@@ -25,12 +25,10 @@ MOST_SLACK = 1e-6
 """The most that a temperature may be out of range besides round-off, as such a share, however loose a tolerance is."""
 LEVEL_ROUND_OFF = 1e-12
 """The same as a share of the absolute temperature: what the linear solver and floating point leave."""
-_POSITIVE = 1e-9
-"""Share of the diagonal above which an entry off it counts as above 0."""
+_POSITIVE = 1e-9  # Share of the diagonal above which an entry off it counts as above 0
 _ROUND_OFF = 16.0 * float(np.finfo(np.float64).eps)
 """An entry above 0 by less than this share of the diagonal is what floating point left of 0."""
-_ATTEMPTS = 8
-"""Attempts after which all positive off-diagonals are left out."""
+_ATTEMPTS = 8  # Attempts after which all positive off-diagonals are left out
 
 
 def holds_maximum_principle(stiffness: sparse.csr_matrix) -> bool:

@@ -8,23 +8,15 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-DEFAULT_MEMORY_BYTES = 4 * 2**30
-"""Most memory that a solution may need, [bytes]."""
+DEFAULT_MEMORY_BYTES = 4 * 2**30  # Most memory that a solution may need, [bytes]
 
-_SAMPLE = 500
-"""Tetrahedra of the sample: more would take as long as a small body's solution."""
-_RUNS = 4
-"""Runs of successive tetrahedra in it."""
-_FACES = np.array([(1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)])
-"""Corners of the face opposite to each corner."""
-_RIGHT = 1e-9
-"""Cosine up to which an angle between faces counts as right."""
-_VECTORS = 15
-"""Vectors of the nodes that are alive at the peak, besides the temperatures that are kept."""
-_FRAGMENTS = 1.15
-"""What the allocator and what lives shortly add, by measurement."""
-_BYTES_PER_FACET = 400.0
-"""What an effect needs per boundary triangle."""
+_SAMPLE = 500  # Tetrahedra of the sample: more would take as long as a small body's solution
+_RUNS = 4  # Runs of successive tetrahedra in it
+_FACES = np.array([(1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)])  # Corners of the face opposite to each corner
+_RIGHT = 1e-9  # Cosine up to which an angle between faces counts as right
+_VECTORS = 15  # Vectors of the nodes that are alive at the peak, besides the temperatures that are kept
+_FRAGMENTS = 1.15  # What the allocator and what lives shortly add, by measurement
+_BYTES_PER_FACET = 400.0  # What an effect needs per boundary triangle
 _BYTES_PER_TET_OF_ORDER_2, _BYTES_PER_UNKNOWN_OF_ORDER_2 = 850.0, 480.0
 """Element matrices that are being added up; matrices and vectors."""
 

@@ -16,24 +16,20 @@ Vector = npt.NDArray[np.float64]
 Numbers = npt.NDArray[np.int64]
 
 _REMEDY = "Build the mesh with thermoxels_ns.mesh."
-_FLAT = 6e-12
-"""Six volumes over the cube of the size, up to which a tetrahedron is flat: it cannot carry gradients."""
+_FLAT = 6e-12  # Six volumes over the cube of the size, up to which a tetrahedron is flat: it cannot carry gradients
 _ANGLE_ROUND_OFF = 16.0 * np.finfo(np.float64).eps
 """Round-off of the cosine of an angle per largest coordinate over the tetrahedron's size; an estimate from above."""
 TET_EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
 """Ends of the edges of a tetrahedron, in scikit-fem's order."""
-FACET_EDGES = np.array([(0, 1), (1, 2), (0, 2)])
-"""Ends of the edges of a triangle, in scikit-fem's order."""
+FACET_EDGES = np.array([(0, 1), (1, 2), (0, 2)])  # Ends of the edges of a triangle, in scikit-fem's order
 
 
 @dataclass(frozen=True)
 class MeshEdges:
     """Every edge of a tetrahedral mesh once, at its smaller node number: a strict upper triangle."""
 
-    first: npt.NDArray[np.int64]
-    """Edges of node i stand at first[i] to first[i + 1]; shape (n + 1,)."""
-    other: npt.NDArray[np.int32]
-    """The larger node number of each edge, ascending for each smaller one, shape (e,)."""
+    first: npt.NDArray[np.int64]  # Edges of node i stand at first[i] to first[i + 1]; shape (n + 1,)
+    other: npt.NDArray[np.int32]  # The larger node number of each edge, ascending for each smaller one, shape (e,)
 
     @property
     def num_nodes(self) -> int:

@@ -21,12 +21,9 @@ _OUTSIDE = 1e-9
 class Probes:
     """Points in a body and how their temperature follows from that of the nodes."""
 
-    points_m: npt.NDArray[np.float64]
-    """Positions, shape (p, 3), [m]."""
-    nodes: npt.NDArray[np.int64]
-    """Nodes of the tetrahedron around each point, shape (p, 4)."""
-    weights: npt.NDArray[np.float64]
-    """Barycentric coordinates in it, shape (p, 4); each row adds up to 1."""
+    points_m: npt.NDArray[np.float64]  # Positions, shape (p, 3), [m]
+    nodes: npt.NDArray[np.int64]  # Nodes of the tetrahedron around each point, shape (p, 4)
+    weights: npt.NDArray[np.float64]  # Barycentric coordinates in it, shape (p, 4); each row adds up to 1
 
     def at(self, nodal: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Interpolate nodal values, shape (..., n), to the points, shape (..., p)."""

@@ -19,8 +19,7 @@ from thermoxels_ns.fem.p1_kernels import refuse_flat_tets
 from thermoxels_ns.fem.terms import Effect
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-_MOST = 10_000_000
-"""Steps or kept times; a minute each for nineteen years."""
+_MOST = 10_000_000  # Steps or kept times; a minute each for nineteen years
 
 
 @dataclass(frozen=True)
@@ -31,10 +30,8 @@ class TimeSteps:
     [0.0, 20.0, 40.0, 60.0]
     """
 
-    steps: int
-    """Number of steps, at least 1."""
-    step_seconds: float
-    """Length of a step, [s], above 0."""
+    steps: int  # Number of steps, at least 1
+    step_seconds: float  # Length of a step, [s], above 0
 
     def __post_init__(self) -> None:
         _check_count("steps", self.steps, "Give 10, for example: steps in a scene, --steps in an export.")
@@ -70,13 +67,11 @@ class AdaptiveSteps:
     [0.0, 1200.0, 2400.0, 3600.0]
     """
 
-    duration_s: float
-    """Time to follow the body for, [s], above 0."""
+    duration_s: float  # Time to follow the body for, [s], above 0
     tolerance_k: float = 0.05
     """Largest error of any temperature that the steps may make, as estimated from their embedded pair, [K]. The
     default is half of what building physics asks of a temperature (ISO 10211: 0.1 K)."""
-    outputs: int = 10
-    """Number of equal intervals at whose ends temperatures are kept."""
+    outputs: int = 10  # Number of equal intervals at whose ends temperatures are kept
 
     def __post_init__(self) -> None:
         for name, remedy in (("duration_s", "Give a time in seconds."), ("tolerance_k", "Give a tolerance in kelvin.")):
@@ -102,8 +97,7 @@ class GivenSteps:
     [0.5, 0.5, 1.0, 1.0]
     """
 
-    duration_s: float
-    """Time to follow the body for, [s]."""
+    duration_s: float  # Time to follow the body for, [s]
     lengths_s: tuple[npt.NDArray[np.float64], ...]
     """Lengths of the steps in each of some equal intervals at whose ends temperatures are kept, [s]."""
     tolerance_k: float
@@ -155,17 +149,14 @@ class HeatProblem:
     k grad T . n = 0.
     """
 
-    mesh: TetMesh
-    """The body."""
+    mesh: TetMesh  # The body
     material: Conductor | Mapping[str, Conductor]
     """What all of it is made of, or one material per name of a region of the mesh."""
     initial_temperature_c: npt.NDArray[np.float64] | None = None
     """Nodal temperature at the start, shape (n,), [degrees Celsius]; None: the mesh's own. A steady solver starts its
     iterations from it."""
-    effects: tuple[Effect, ...] = ()
-    """What acts on the body; several may act on one patch."""
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Direction that points up, for effects that depend on it."""
+    effects: tuple[Effect, ...] = ()  # What acts on the body; several may act on one patch
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Direction that points up, for effects that depend on it
 
     def __post_init__(self) -> None:
         points, tets = self.mesh.points_m, self.mesh.tets

@@ -17,12 +17,9 @@ from thermoxels_ns.core.errors import HeatError
 class Places:
     """Where a quantity is asked for: centroids of boundary triangles or of tetrahedra, or nodes."""
 
-    points_m: npt.NDArray[np.float64]
-    """Positions, shape (k, 3), [m]."""
-    normals: npt.NDArray[np.float64]
-    """Outward unit normals of the true surface, shape (k, 3); 0 inside the body."""
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Unit vector that points up."""
+    points_m: npt.NDArray[np.float64]  # Positions, shape (k, 3), [m]
+    normals: npt.NDArray[np.float64]  # Outward unit normals of the true surface, shape (k, 3); 0 inside the body
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Unit vector that points up
 
     def __len__(self) -> int:
         return len(self.points_m)
@@ -40,8 +37,7 @@ class Varying:
     function: Callable[[Places, float], npt.ArrayLike]
     """Takes the places and the time in seconds since the start; returns one number per place, shape (k,), or one for
     all."""
-    in_time: bool = True
-    """Whether the numbers change with time. False: they are asked for once, at the time 0."""
+    in_time: bool = True  # Whether the numbers change with time. False: they are asked for once, at the time 0
     resolution_s: float = math.inf
     """Numbers this far apart in time say how they change in between, above 0, [s]; steps that are chosen by their error
     are no longer. Infinite: nobody knows, and what happens between two such steps is missed."""
@@ -71,8 +67,7 @@ def tabulated(times_s: npt.ArrayLike, values: npt.ArrayLike) -> Varying:
     )
 
 
-Quantity: TypeAlias = float | Varying
-"""One number for all places and times, or a function."""
+Quantity: TypeAlias = float | Varying  # One number for all places and times, or a function
 
 
 @dataclass(frozen=True)
@@ -83,10 +78,8 @@ class Bounds:
     unit: str
     low: float = -math.inf
     high: float = math.inf
-    above_low: bool = False
-    """Whether `low` itself is refused."""
-    varies: bool = True
-    """Whether it may be a `Varying`."""
+    above_low: bool = False  # Whether `low` itself is refused
+    varies: bool = True  # Whether it may be a `Varying`
 
     def check(self, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Return the values as an array if all are finite and in range, else raise `HeatError`."""

@@ -59,8 +59,7 @@ def refined_values(mesh: TetMesh, nodal: npt.NDArray[np.float64]) -> npt.NDArray
     return np.concatenate([nodal, mesh_edges(mesh.tets, len(mesh.points_m)).midpoints(nodal)])
 
 
-_OPPOSITE = ((4, 9), (6, 8), (7, 5))
-"""Middles of opposite edges: 4 to 9 are those of `TET_EDGES`."""
+_OPPOSITE = ((4, 9), (6, 8), (7, 5))  # Middles of opposite edges: 4 to 9 are those of `TET_EDGES`
 
 
 def _children() -> npt.NDArray[np.int64]:
@@ -82,8 +81,7 @@ def _children() -> npt.NDArray[np.int64]:
 _CHILDREN = _children()
 _FACET_CHILDREN = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 """Local nodes of a triangle's children: 0 to 2 are the corners and 3 to 5 the middles of `FACET_EDGES`."""
-_TIE = 1e-9
-"""Cosines that differ by less are the same."""
+_TIE = 1e-9  # Cosines that differ by less are the same
 
 
 @kernel

@@ -14,30 +14,24 @@ from thermoxels_ns.fem.system import HeatSystem
 
 Vector = npt.NDArray[np.float64]
 
-_KEPT_EQUATIONS = 2
-"""Implicit equations, one for each length of a stage, whose matrices are kept."""
-_SAME_LENGTH = 1e-12
-"""Relative difference up to which two lengths are one."""
+_KEPT_EQUATIONS = 2  # Implicit equations, one for each length of a stage, whose matrices are kept
+_SAME_LENGTH = 1e-12  # Relative difference up to which two lengths are one
 
 
 @dataclass(frozen=True)
 class Step:
     """The outcome of a step; converged: all stages were solved; the status is a sentence."""
 
-    relative_k: Vector
-    """Temperatures at its end, relative to the system's reference, shape (n,), [K]."""
-    group_heat_w: Vector
-    """Mean heat flow into the body of each group of the system, shape (g,), [W]."""
+    relative_k: Vector  # Temperatures at its end, relative to the system's reference, shape (n,), [K]
+    group_heat_w: Vector  # Mean heat flow into the body of each group of the system, shape (g,), [W]
     iterations: int
     newton_iterations: int
     error_k: float
     """Estimated largest error that the step made, [K]; NaN if the scheme has no estimate or none was asked for."""
     converged: bool
     status: str
-    limited: bool = False
-    """Whether the maximum-principle limiter changed the equations."""
-    in_range: bool = True
-    """Whether all temperatures are in the range of the start and of the surroundings."""
+    limited: bool = False  # Whether the maximum-principle limiter changed the equations
+    in_range: bool = True  # Whether all temperatures are in the range of the start and of the surroundings
 
 
 class RungeKutta:

@@ -19,10 +19,8 @@ class Scheme:
     """
 
     name: str
-    order: int
-    """Order of the error at the end as a power of the step length."""
-    nodes: tuple[float, ...]
-    """c: time of each stage as a share of the step."""
+    order: int  # Order of the error at the end as a power of the step length
+    nodes: tuple[float, ...]  # c: time of each stage as a share of the step
     weights: tuple[tuple[float, ...], ...]
     """a: lower triangle, one row per stage; the last row is b. A stage whose row is all 0 is the start."""
     estimate: tuple[float, ...] | None = None

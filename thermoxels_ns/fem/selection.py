@@ -13,8 +13,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-WHOLE_BOUNDARY = "boundary"
-"""What the boundary of a mesh without patches is called in reports."""
+WHOLE_BOUNDARY = "boundary"  # What the boundary of a mesh without patches is called in reports
 
 
 class Selection:

@@ -38,8 +38,7 @@ class Assembled:
 
     counts: dict[str, int] = field(default_factory=dict)
     """How often each kind was assembled: stiffness, mass, convection, flux, radiation, source, fixed."""
-    seconds: dict[str, float] = field(default_factory=dict)
-    """Time each kind took, [s]."""
+    seconds: dict[str, float] = field(default_factory=dict)  # Time each kind took, [s]
 
     @contextmanager
     def form(self, kind: str) -> Iterator[None]:
@@ -54,23 +53,19 @@ class Assembled:
 class EffectHeat:
     """Heat that one effect brings into the body."""
 
-    effect: str
-    """What it is and where it acts."""
+    effect: str  # What it is and where it acts
     heat_w: npt.NDArray[np.float64]
     """Mean heat flow into the body during each interval, as the scheme evaluates it, shape (s,), [W]; negative where
     heat leaves. A steady state has one interval."""
-    group_names: tuple[str, ...]
-    """Names of the patches, or for a source of the regions, that it acts on."""
-    group_heat_w: npt.NDArray[np.float64]
-    """The same for each of them, shape (s, g), [W]."""
+    group_names: tuple[str, ...]  # Names of the patches, or for a source of the regions, that it acts on
+    group_heat_w: npt.NDArray[np.float64]  # The same for each of them, shape (s, g), [W]
 
 
 @dataclass(frozen=True)
 class HeatSolution:
     """Temperatures over time and the account of the heat; converged: every step was solved to tolerance."""
 
-    times_s: npt.NDArray[np.float64]
-    """Time of each state, the start first, shape (s + 1,), [s]."""
+    times_s: npt.NDArray[np.float64]  # Time of each state, the start first, shape (s + 1,), [s]
     temperature_c: npt.NDArray[np.float64]
     """Nodal temperatures, shape (s + 1, n), [degrees Celsius]. Surfaces with a fixed temperature have it from the
     start."""
@@ -87,17 +82,13 @@ class HeatSolution:
     exchanged: the stricter measure. 0 where nothing is unaccounted for."""
     status: str
     converged: bool
-    iterations: npt.NDArray[np.int64]
-    """Iterations of the linear solver in each interval, shape (s,)."""
-    skipped_effects: tuple[str, ...]
-    """What the computation leaves out, one sentence each."""
-    effects: tuple[EffectHeat, ...] = ()
-    """Heat that each effect of the problem brought, in the order of the problem."""
+    iterations: npt.NDArray[np.int64]  # Iterations of the linear solver in each interval, shape (s,)
+    skipped_effects: tuple[str, ...]  # What the computation leaves out, one sentence each
+    effects: tuple[EffectHeat, ...] = ()  # Heat that each effect of the problem brought, in the order of the problem
     newton_iterations: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     """Steps of Newton's method in each interval, shape (s,); all 0 without radiation."""
     steps: int = 0
-    step_lengths_s: tuple[npt.NDArray[np.float64], ...] = ()
-    """Lengths of the steps in each interval, [s]."""
+    step_lengths_s: tuple[npt.NDArray[np.float64], ...] = ()  # Lengths of the steps in each interval, [s]
     time_error_k: float = float("nan")
     """Estimated largest error of the steps at any temperature, their estimates added up, [K]; NaN for fixed steps."""
     assembled: Assembled = field(default_factory=Assembled)
@@ -107,19 +98,15 @@ class HeatSolution:
 class SteadySolution:
     """Temperatures that no longer change, and the account of the heat."""
 
-    temperature_c: npt.NDArray[np.float64]
-    """Temperatures of the mesh's nodes, shape (n,), [degrees Celsius]."""
+    temperature_c: npt.NDArray[np.float64]  # Temperatures of the mesh's nodes, shape (n,), [degrees Celsius]
     effects: tuple[EffectHeat, ...]
     """Heat that each effect of the problem brings, in the order of the problem; they add up to 0."""
-    energy_residual: float
-    """Sum of all heat flows, which should be 0, relative to the sum of their sizes."""
+    energy_residual: float  # Sum of all heat flows, which should be 0, relative to the sum of their sizes
     status: str
     converged: bool
     iterations: int
-    newton_iterations: int
-    """Steps of Newton's method; 0 without radiation."""
-    assembled: Assembled
-    """What was assembled."""
+    newton_iterations: int  # Steps of Newton's method; 0 without radiation
+    assembled: Assembled  # What was assembled
     edge_temperature_c: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     """Temperatures of the middles of the mesh's edges, in the order of `mesh_edges`, shape (e,), [degrees Celsius];
     empty with linear tetrahedra."""
@@ -143,8 +130,7 @@ def left_out(kinds: Sequence[str]) -> tuple[str, ...]:
     return tuple(sentence.format(why) for kind, sentence in LEFT_OUT.items() if kind not in kinds)
 
 
-Solution: TypeAlias = HeatSolution | SteadySolution
-"""What either solver returns."""
+Solution: TypeAlias = HeatSolution | SteadySolution  # What either solver returns
 
 _CHILD_FACETS = 4
 
@@ -156,10 +142,8 @@ class SolutionNodes:
     mesh: TetMesh
     """The mesh that was solved; of quadratic tetrahedra the same with all edges halved, whose new nodes are where their
     further unknowns sit. So pictures, files and extremes show every temperature that was computed."""
-    times_s: Vector
-    """Times, shape (s,), [s]; 0 alone for a steady state."""
-    states_c: Vector
-    """Nodal temperatures, shape (s, n), [degrees Celsius]."""
+    times_s: Vector  # Times, shape (s,), [s]; 0 alone for a steady state
+    states_c: Vector  # Nodal temperatures, shape (s, n), [degrees Celsius]
     quadratic: bool
 
     def of_facets(self, values: npt.NDArray) -> npt.NDArray:

@@ -31,10 +31,8 @@ Numbers = npt.NDArray[np.int64]
 
 _CORNERS = (np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), np.full(3, 1.0 / 6.0))
 """Quadrature at the corners of the reference triangle."""
-_EXACT = 4
-"""Degree up to which integrals over triangles are exact otherwise: products of quadratic functions."""
-_BLOCK = 2_000
-"""Tetrahedra that scikit-fem sees at a time: its arrays, 4 kB each, then fit into a processor's cache."""
+_EXACT = 4  # Degree up to which integrals over triangles are exact otherwise: products of quadratic functions
+_BLOCK = 2_000  # Tetrahedra that scikit-fem sees at a time: its arrays, 4 kB each, then fit into a processor's cache
 
 
 @BilinearForm

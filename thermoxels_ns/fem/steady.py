@@ -15,8 +15,7 @@ from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.solution import SteadySolution, heat_by_effect
 from thermoxels_ns.fem.system import HeatSystem
 
-_SUSPICIOUS = 1e-12
-"""Residual from which on it is worth to look whether it is a share of nothing."""
+_SUSPICIOUS = 1e-12  # Residual from which on it is worth to look whether it is a share of nothing
 _ROUND_OFF = 64.0 * float(np.finfo(np.float64).eps)
 """Share of the absolute temperature below which a difference is round-off."""
 _ERROR_OVER_TOLERANCE = 1e3
@@ -88,13 +87,11 @@ def solve_steady(
 class _LimitedState:
     """A steady state, the equations that it fulfils, positive off-diagonals left out and nodes outside, counted."""
 
-    solution: ImplicitSolution
-    """Temperatures and how they were found; iterations of all repetitions count."""
+    solution: ImplicitSolution  # Temperatures and how they were found; iterations of all repetitions count
     system: HeatSystem
     left_out: int
     outside: int
-    outside_k: float
-    """By how much at most, [K]."""
+    outside_k: float  # By how much at most, [K]
 
     def describe(self) -> str:
         """Say what was done and what was not, or nothing."""

@@ -23,8 +23,7 @@ Vector = npt.NDArray[np.float64]
 SystemSolver: TypeAlias = LinearSolver | ConjugateGradients
 """What solves the equations of a system, by the order of its tetrahedra."""
 
-_KEPT_RANGES = 64
-"""Times at which the range of the surroundings is kept."""
+_KEPT_RANGES = 64  # Times at which the range of the surroundings is kept
 
 
 class Pieces:

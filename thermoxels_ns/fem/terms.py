@@ -16,10 +16,8 @@ from thermoxels_ns.fem.selection import Selection
 
 @dataclass(frozen=True)
 class _OnFacets:
-    effect: str
-    """Label of the effect that it comes from."""
-    facets: npt.NDArray[np.int64]
-    """Numbers of boundary triangles, shape (k,)."""
+    effect: str  # Label of the effect that it comes from
+    facets: npt.NDArray[np.int64]  # Numbers of boundary triangles, shape (k,)
 
 
 @dataclass(frozen=True)
@@ -34,8 +32,7 @@ class ConvectionTerm(_OnFacets):
 class FluxTerm(_OnFacets):
     """A given heat flux through boundary triangles, positive into the body."""
 
-    factors: tuple[Bounded, ...]
-    """The heat flux is the product of these, [W / m2]."""
+    factors: tuple[Bounded, ...]  # The heat flux is the product of these, [W / m2]
 
 
 @dataclass(frozen=True)
@@ -63,8 +60,7 @@ class FixedTerm(_OnFacets):
     temperature_c: Bounded
 
 
-Term: TypeAlias = ConvectionTerm | FluxTerm | RadiationTerm | SourceTerm | FixedTerm
-"""All kinds."""
+Term: TypeAlias = ConvectionTerm | FluxTerm | RadiationTerm | SourceTerm | FixedTerm  # All kinds
 
 
 class Effect(ABC):
@@ -73,10 +69,8 @@ class Effect(ABC):
     A dataclass whose fields are quantities, or names of `patches` or `regions` that it acts on.
     """
 
-    kind: ClassVar[str]
-    """What it is called in reports."""
-    bounds: ClassVar[dict[str, Bounds]]
-    """Which fields are quantities, and their range."""
+    kind: ClassVar[str]  # What it is called in reports
+    bounds: ClassVar[dict[str, Bounds]]  # Which fields are quantities, and their range
 
     def __post_init__(self) -> None:
         for name in ("patches", "regions"):

@@ -28,18 +28,14 @@ STEP_SHARE = 0.1
 to their sum."""
 RANGE_SHARE = 1e-3
 """Share of the tolerance by which a temperature may leave its range before a step is repeated with backward Euler."""
-_SAFETY = 0.9
-"""Share of the longest step that meets the tolerance, by its estimate, that the next one is made."""
+_SAFETY = 0.9  # Share of the longest step that meets the tolerance, by its estimate, that the next one is made
 _SHRINK, _GROW = 0.2, 5.0
 """Least and most that one step changes the length of the next."""
-_KEEP_BELOW = 1.25
-"""Factor below which a step is not lengthened, so that its matrices serve again."""
+_KEEP_BELOW = 1.25  # Factor below which a step is not lengthened, so that its matrices serve again
 _SHORTEST = 1e-60
 """Shortest step as a share of the duration; bodies with next to no heat capacity begin with such short ones."""
-_ROUND_OFF = 64.0 * float(np.finfo(np.float64).eps)
-"""Share of the terms of a sum that round-off leaves of it at most."""
-_SUSPICIOUS = 1e-12
-"""Energy residual above which it is checked whether round-off explains it."""
+_ROUND_OFF = 64.0 * float(np.finfo(np.float64).eps)  # Share of the terms of a sum that round-off leaves of it at most
+_SUSPICIOUS = 1e-12  # Energy residual above which it is checked whether round-off explains it
 
 
 def solve_heat(
@@ -107,12 +103,9 @@ class _Taken:
     """A step that was accepted, or failed."""
 
     step: Step
-    step_s: float
-    """Its length, [s]."""
-    ends_interval: bool
-    """Whether temperatures are kept at its end."""
-    failure: str = ""
-    """Why the computation ends here; empty if the step was accepted."""
+    step_s: float  # Its length, [s]
+    ends_interval: bool  # Whether temperatures are kept at its end
+    failure: str = ""  # Why the computation ends here; empty if the step was accepted
 
 
 class _TimeLoop:

@@ -13,8 +13,7 @@ from torch import Tensor
 from thermoxels_ns.core.errors import MemoryBudgetError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS, Lattice
 
-BLOCK = 8
-"""Voxels along the side of a block."""
+BLOCK = 8  # Voxels along the side of a block
 
 IntArray = npt.NDArray[np.int64]
 
@@ -152,22 +151,17 @@ class KeptVoxels:
 assert CORNER_OFFSETS[1].tolist() == [0, 0, 1], "rows of neighbours along z follow each other"
 
 
-_ROWS_PER_VOXEL = 1.5
-"""Corners per kept voxel of a body a few voxels thick (1 in the bulk, 2 for a single layer)."""
-_BYTES_PER_VOXEL = 4 * 4 + 8 + 2 * 4
-"""Row numbers, index, and the voxel's part of its block (which is about half full)."""
+_ROWS_PER_VOXEL = 1.5  # Corners per kept voxel of a body a few voxels thick (1 in the bulk, 2 for a single layer)
+_BYTES_PER_VOXEL = 4 * 4 + 8 + 2 * 4  # Row numbers, index, and the voxel's part of its block (which is about half full)
 
 
 @dataclass(frozen=True)
 class MemoryNeed:
     """Predicted peak memory of training on a lattice, beside photographs and programs."""
 
-    voxels: int
-    """Kept voxels."""
-    rows: int
-    """Stored corners."""
-    gigabytes: float
-    """Parameters, optimiser state, gradients and tables together, [1e9 bytes]."""
+    voxels: int  # Kept voxels
+    rows: int  # Stored corners
+    gigabytes: float  # Parameters, optimiser state, gradients and tables together, [1e9 bytes]
 
     def __str__(self) -> str:
         return f"{self.gigabytes:.2f} GB for {self.voxels:,} voxels with {self.rows:,} corners"

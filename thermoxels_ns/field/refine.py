@@ -19,8 +19,7 @@ RowChange = Callable[[Tensor], Tensor]
 """Maps values of the old rows, shape (old rows, channels), to values of the new ones."""
 ColumnChange = Callable[[Tensor], Tensor]
 """Maps values with the old columns, shape (rows, old columns), to values with the new ones."""
-ROWS_AT_ONCE = 1 << 17
-"""Rows interpolated at once: corner numbers and weights take more memory than the values."""
+ROWS_AT_ONCE = 1 << 17  # Rows interpolated at once: corner numbers and weights take more memory than the values
 
 
 def split_voxels(voxels: KeptVoxels, factor: int) -> KeptVoxels:

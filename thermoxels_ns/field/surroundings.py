@@ -18,13 +18,10 @@ from thermoxels_ns.field.voxel_grid import DensityActivation, VoxelGrid
 class Segments:
     """Straight pieces of rays in the coordinates of the lattice, in the order in which each ray meets them."""
 
-    ray: Int64[Tensor, " n"]
-    """The ray that each belongs to."""
-    rank: Int64[Tensor, " n"]
-    """0 for the first piece of a ray, 1 for the next."""
+    ray: Int64[Tensor, " n"]  # The ray that each belongs to
+    rank: Int64[Tensor, " n"]  # 0 for the first piece of a ray, 1 for the next
     origins: Float[Tensor, "n 3"]
-    directions: Float[Tensor, "n 3"]
-    """Unit vectors."""
+    directions: Float[Tensor, "n 3"]  # Unit vectors
     lengths: Float[Tensor, " n"]
 
 

@@ -6,8 +6,7 @@ import numpy as np
 
 from thermoxels_ns.core.kernel_cache import kernel
 
-MOST_SEGMENTS = 6
-"""Frusta that a ray can pass through."""
+MOST_SEGMENTS = 6  # Frusta that a ray can pass through
 
 
 @kernel

@@ -21,8 +21,7 @@ DensityActivation = Literal["relu", "softplus", "exp"]
 COLOUR_CHANNELS = tuple(3 * num_coefficients(degree) for degree in range(MAX_DEGREE + 1))
 """Columns of colour by the degree of its harmonics."""
 
-_PALEST = 0.02
-"""Colours nearer to 0 or 1 are stored as this far from them: a sigmoid reaches neither."""
+_PALEST = 0.02  # Colours nearer to 0 or 1 are stored as this far from them: a sigmoid reaches neither
 
 
 def activate_density(raw: Tensor, kind: DensityActivation) -> Tensor:

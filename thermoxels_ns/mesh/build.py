@@ -42,10 +42,8 @@ class MeshOptions:
     min_observed_weight: float = MIN_OBSERVED_WEIGHT
     """Nodes with less thermal ray weight than this are not measurements, [rays], at least 0; 0 keeps every node that
     any ray touched."""
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Direction that points up, in the coordinates of the mesh."""
-    rules: PatchRules = field(default_factory=PatchRules)
-    """Patches and regions of the user."""
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Direction that points up, in the coordinates of the mesh
+    rules: PatchRules = field(default_factory=PatchRules)  # Patches and regions of the user
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.min_observed_weight) and self.min_observed_weight >= 0.0):

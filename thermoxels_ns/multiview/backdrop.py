@@ -10,14 +10,10 @@ from thermoxels_ns.multiview.photographs import Photographs
 
 FloatArray = npt.NDArray[np.float64]
 
-PLAIN = 0.03
-"""Difference of a channel from one pixel to the next, of 1, up to which a photograph is plain."""
-STEEPEST = 0.9
-"""Cosine between the optical axis and the vertical above which a photograph has no top."""
-COLOUR_TOLERANCE = 0.06
-"""Difference from the backdrop's colour up to which a pixel shows it, of 1."""
-THERMAL_TOLERANCE = 0.1
-"""Difference from its temperature, of the scene's range."""
+PLAIN = 0.03  # Difference of a channel from one pixel to the next, of 1, up to which a photograph is plain
+STEEPEST = 0.9  # Cosine between the optical axis and the vertical above which a photograph has no top
+COLOUR_TOLERANCE = 0.06  # Difference from the backdrop's colour up to which a pixel shows it, of 1
+THERMAL_TOLERANCE = 0.1  # Difference from its temperature, of the scene's range
 _WIDEST, _ROUNDS = 0.3, 8
 """Difference up to which colours count in the first of some fits; it shrinks to the tolerance."""
 

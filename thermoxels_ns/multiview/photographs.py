@@ -13,30 +13,23 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 
 from thermoxels_ns.core.camera import Camera
 
-MOST_PHOTOGRAPHS = 64
-"""Photographs compared; of more, that many are taken at equal distances in the list."""
-LONGEST_SIDE = 160
-"""Pixels along the longer side at which photographs are compared; larger ones are averaged down."""
+MOST_PHOTOGRAPHS = 64  # Photographs compared; of more, that many are taken at equal distances in the list
+LONGEST_SIDE = 160  # Pixels along the longer side at which photographs are compared; larger ones are averaged down
 
 
 @dataclass(frozen=True, eq=False)
 class Photographs:
     """Pinhole photographs in one array, for the kernels."""
 
-    matrices: npt.NDArray[np.float64]
-    """World to homogeneous pixels, depth positive in front, shape (photographs, 3, 4)."""
-    centres: npt.NDArray[np.float64]
-    """Camera centres, [world units], shape (photographs, 3)."""
-    sizes: npt.NDArray[np.int64]
-    """Width and height, [pixels], shape (photographs, 2)."""
-    firsts: npt.NDArray[np.int64]
-    """Row of `colours` with each photograph's upper left pixel, shape (photographs,)."""
+    matrices: npt.NDArray[np.float64]  # World to homogeneous pixels, depth positive in front, shape (photographs, 3, 4)
+    centres: npt.NDArray[np.float64]  # Camera centres, [world units], shape (photographs, 3)
+    sizes: npt.NDArray[np.int64]  # Width and height, [pixels], shape (photographs, 2)
+    firsts: npt.NDArray[np.int64]  # Row of `colours` with each photograph's upper left pixel, shape (photographs,)
     colours: npt.NDArray[np.float32]
     """Channels in [0, 1], photograph after photograph, row after row, shape (pixels, 3); NaN where masked."""
     thermal: npt.NDArray[np.float32]
     """Normalised temperature, shape (pixels,); NaN where unknown, or measured by a camera of its own."""
-    near: float = 0.0
-    """Depth up to which a photograph shows nothing, [world units]."""
+    near: float = 0.0  # Depth up to which a photograph shows nothing, [world units]
 
     def __len__(self) -> int:
         return len(self.matrices)

@@ -24,42 +24,29 @@ NEIGHBOURS = 4
 ANGLES_DEG = (4.0, 60.0)
 """Angles between directions to the same point at which two photographs are compared: a smaller one says nothing about
 depth, a larger one shows something else."""
-BEST_ANGLE_DEG = 15.0
-"""Neighbours at about this angle are preferred."""
-RADIUS = 2
-"""Pixels from the middle of the square that is compared to its sides."""
+BEST_ANGLE_DEG = 15.0  # Neighbours at about this angle are preferred
+RADIUS = 2  # Pixels from the middle of the square that is compared to its sides
 LIKENESS = 0.025
 """Difference of a channel, of 1, at which a pixel of the square has 37 % of the weight of the middle one."""
-SPREAD = 1.0
-"""The same, relative to how much the pixels around the middle one differ from it, where that is more."""
-LEAST_WEIGHT = 0.05
-"""Weight below which it has none."""
+SPREAD = 1.0  # The same, relative to how much the pixels around the middle one differ from it, where that is more
+LEAST_WEIGHT = 0.05  # Weight below which it has none
 PLANES = (24, 128)
 """Planes per photograph: such that the picture moves by about a pixel from one to the next, within these limits."""
-SMALLEST_CONTRAST = 1.5 / 255.0
-"""Standard deviation of brightness within a patch that is noise."""
-LEAST_CORRELATION = 0.6
-"""Correlation below which photographs do not agree."""
+SMALLEST_CONTRAST = 1.5 / 255.0  # Standard deviation of brightness within a patch that is noise
+LEAST_CORRELATION = 0.6  # Correlation below which photographs do not agree
 TOLERANCE = 0.3
 """Share of the distance between planes, of both photographs together, by which depths that agree may differ."""
-FEWEST_VIEWS = 3
-"""Photographs whose own depths must lie where a sure one does."""
-VIEWS_PER_CONTRADICTION = 2
-"""As many must do so for each photograph that looks through the point."""
+FEWEST_VIEWS = 3  # Photographs whose own depths must lie where a sure one does
+VIEWS_PER_CONTRADICTION = 2  # As many must do so for each photograph that looks through the point
 FEWEST_AROUND = 6
 """Of the eight pixels around a sure one, those whose depths agree with its own too: outlines and noise have fewer."""
-LEAST_SHARE = 0.01
-"""Share of the pixels whose depth must be sure; less is chance."""
-ERROR_PLANES = 0.25
-"""Standard error of a depth, in planes of the sweep."""
-_NEAREST = 0.1
-"""Distance of the nearest plane in the box relative to the farthest."""
+LEAST_SHARE = 0.01  # Share of the pixels whose depth must be sure; less is chance
+ERROR_PLANES = 0.25  # Standard error of a depth, in planes of the sweep
+_NEAREST = 0.1  # Distance of the nearest plane in the box relative to the farthest
 _OUTSIDE = -100.0
 """Brightness that stands for a pixel that a photograph does not show: where it is mixed in, the rest is negative."""
-_PROBES = (5, 4)
-"""Pixels along each side and depths at which neighbours are looked for."""
-_FEWEST_PROBES = 0.1
-"""Share of these that a neighbour must see."""
+_PROBES = (5, 4)  # Pixels along each side and depths at which neighbours are looked for
+_FEWEST_PROBES = 0.1  # Share of these that a neighbour must see
 _DEPTHS_PER_SPREAD = 2.0 ** np.arange(-6.0, 6.5, 0.5)
 """Depths tried where no box is known, relative to the root of the cameras' mean squared distance from their middle."""
 
@@ -68,12 +55,10 @@ _DEPTHS_PER_SPREAD = 2.0 ** np.arange(-6.0, 6.5, 0.5)
 class Depths:
     """Depths of the pixels of photographs."""
 
-    photographs: Photographs
-    """The photographs."""
+    photographs: Photographs  # The photographs
     depth: npt.NDArray[np.float32]
     """Depth of each pixel, in the order of `photographs.colours`, shape (pixels,), [world units]; NaN: not sure."""
-    error: npt.NDArray[np.float32]
-    """Depth by which its planes are apart there, shape (pixels,), [world units]."""
+    error: npt.NDArray[np.float32]  # Depth by which its planes are apart there, shape (pixels,), [world units]
 
     @property
     def share(self) -> float:
@@ -143,14 +128,10 @@ def depths_of(
 class _View:
     """One photograph."""
 
-    brightness: npt.NDArray[np.float32]
-    """Shape (h, w); `_OUTSIDE` where masked."""
-    colours: npt.NDArray[np.float32]
-    """Shape (h, w, 3)."""
-    matrix: FloatArray
-    """World to homogeneous pixels, (3, 4)."""
-    inverse: FloatArray
-    """Homogeneous pixels to directions of depth 1 in the world, (3, 3)."""
+    brightness: npt.NDArray[np.float32]  # Shape (h, w); `_OUTSIDE` where masked
+    colours: npt.NDArray[np.float32]  # Shape (h, w, 3)
+    matrix: FloatArray  # World to homogeneous pixels, (3, 4)
+    inverse: FloatArray  # Homogeneous pixels to directions of depth 1 in the world, (3, 3)
     centre: FloatArray
 
     @classmethod
@@ -355,10 +336,8 @@ def _rays_through(
 class PhotographEvidence:
     """What training photographs say before there is a model."""
 
-    photographs: Photographs
-    """The photographs, small."""
-    backdrop: npt.NDArray[np.bool_]
-    """Which of their pixels show a plain backdrop, shape (pixels,)."""
+    photographs: Photographs  # The photographs, small
+    backdrop: npt.NDArray[np.bool_]  # Which of their pixels show a plain backdrop, shape (pixels,)
     feature_rays: FeatureRays | None
     """Rays to each depth that several photographs agree about; None where these are too few to tell anything."""
     backdrop_rays: FeatureRays | None

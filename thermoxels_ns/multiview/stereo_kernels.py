@@ -6,8 +6,7 @@ import numpy as np
 
 from thermoxels_ns.core.kernel_cache import kernel
 
-OUTSIDE = -1.0
-"""Correlation that stands for none."""
+OUTSIDE = -1.0  # Correlation that stands for none
 
 
 @kernel

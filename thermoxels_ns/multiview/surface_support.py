@@ -14,24 +14,16 @@ from thermoxels_ns.multiview.photographs import Photographs
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
-MOST_COMPARED = 12
-"""Photographs compared at a place; of more, as many taken evenly from their list."""
-STEEPEST_COSINE = 0.25
-"""A photograph that looks at a surface under a smaller cosine to its normal is not compared."""
-RADIUS = 3
-"""Samples from the middle of a square patch to its sides."""
-SPACING = 0.5
-"""Distance between samples, [voxels]; that of the photographs' pixels where that is more."""
+MOST_COMPARED = 12  # Photographs compared at a place; of more, as many taken evenly from their list
+STEEPEST_COSINE = 0.25  # A photograph that looks at a surface under a smaller cosine to its normal is not compared
+RADIUS = 3  # Samples from the middle of a square patch to its sides
+SPACING = 0.5  # Distance between samples, [voxels]; that of the photographs' pixels where that is more
 NEAR, FAR = (-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5), (-4.0, -3.5, -3.0, 3.0, 3.5, 4.0)
 """How far out of the surface the patch is tried, [voxels]: where it is said to lie, and where it is not."""
-LEAST_CORRELATION = 0.8
-"""Correlation from which two photographs show the same."""
-LEAST_DROP = 0.1
-"""By how much it must fall from the surface to `FAR`: what looks alike at all distances has no place."""
-NOISE = 2.0 / 255.0
-"""Standard deviation of brightness within a patch that is noise."""
-TRACK_REACH = 1.5
-"""Distance from a surface up to which a track's point lies on it, [voxels]."""
+LEAST_CORRELATION = 0.8  # Correlation from which two photographs show the same
+LEAST_DROP = 0.1  # By how much it must fall from the surface to `FAR`: what looks alike at all distances has no place
+NOISE = 2.0 / 255.0  # Standard deviation of brightness within a patch that is noise
+TRACK_REACH = 1.5  # Distance from a surface up to which a track's point lies on it, [voxels]
 
 _SHIFTS, _NUM_NEAR = np.array(NEAR + FAR), len(NEAR)
 _SIDE = 2 * RADIUS + 1

@@ -22,16 +22,11 @@ class Conditions:
     """Emissivity of the objects in the picture, above 0, at most 1. Plaster, brick, wood, paint: 0.90 to 0.96."""
     reflected_c: float | None = None
     """Apparent temperature of what the objects mirror, [degrees C]; needed where the emissivity is below 1."""
-    distance_m: float = 0.0
-    """From the camera to the objects, [m], at least 0."""
-    relative_humidity: float = DEFAULT_RELATIVE_HUMIDITY
-    """Of the air, 0 to 1."""
-    air_c: float | None = None
-    """Air temperature, [degrees C], -100 to 150; needed where the distance is above 0."""
-    window_transmission: float = 1.0
-    """Of a window or filter in front of the lens, above 0, at most 1 (1: none)."""
-    window_c: float | None = None
-    """Temperature of that window, [degrees C]; needed where it does not pass everything."""
+    distance_m: float = 0.0  # From the camera to the objects, [m], at least 0
+    relative_humidity: float = DEFAULT_RELATIVE_HUMIDITY  # Of the air, 0 to 1
+    air_c: float | None = None  # Air temperature, [degrees C], -100 to 150; needed where the distance is above 0
+    window_transmission: float = 1.0  # Of a window or filter in front of the lens, above 0, at most 1 (1: none)
+    window_c: float | None = None  # Temperature of that window, [degrees C]; needed where it does not pass everything
 
     def __post_init__(self) -> None:
         for name in ("emissivity", "window_transmission"):

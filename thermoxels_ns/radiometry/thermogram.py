@@ -76,14 +76,12 @@ class RadiometryOptions(ConditionOverrides):
     """Which camera's counts a TIFF holds (None: by what the file says, which some files leave open)."""
     celsius_per_count: float | None = None
     """Degrees per count of a TIFF, PNG or whole-number NPY, in place of a camera's."""
-    celsius_offset: float | None = None
-    """Temperature of count zero, [degrees C]; goes with --celsius-per-count."""
+    celsius_offset: float | None = None  # Temperature of count zero, [degrees C]; goes with --celsius-per-count
     stored: Conditions = field(default_factory=Conditions)
     """What the temperatures of TIFF, PNG, NPY and CSV files were computed with (default: apparent temperatures)."""
     dji_library: Path | None = None
     """Path of DJI's libdirp.so or libdirp.dll, for DJI R-JPEG (from the DJI Thermal SDK)."""
-    valid_range_c: tuple[float, float] = (-100.0, 2000.0)
-    """Temperatures outside are no measurements, [degrees C]."""
+    valid_range_c: tuple[float, float] = (-100.0, 2000.0)  # Temperatures outside are no measurements, [degrees C]
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -16,8 +16,7 @@ from thermoxels_ns.core.errors import ThermoxelsError
 class RaySteps:
     """Samples along rays, padded to the longest ray."""
 
-    t: Float[Tensor, "rays steps"]
-    """Distance of each sample (the middle of its step) from the ray origin, world units."""
+    t: Float[Tensor, "rays steps"]  # Distance of each sample (the middle of its step) from the ray origin, world units
     deltas: Float[Tensor, "rays steps"]
     """Length of each step; 0 for padding. Sums to the length of the ray inside the box."""
 
@@ -79,26 +78,19 @@ RowsFn = Callable[[Tensor], Tensor]
 class RayWeights:
     """What density makes of a ray's steps."""
 
-    weights: Float[Tensor, "rays steps"]
-    """Share of the pixel that each step fills."""
-    transmittance: Float[Tensor, " rays"]
-    """Share of the background that is left behind the last step."""
-    accumulation: Float[Tensor, " rays"]
-    """1 - transmittance, with all digits when it is small."""
+    weights: Float[Tensor, "rays steps"]  # Share of the pixel that each step fills
+    transmittance: Float[Tensor, " rays"]  # Share of the background that is left behind the last step
+    accumulation: Float[Tensor, " rays"]  # 1 - transmittance, with all digits when it is small
 
 
 @dataclass(frozen=True)
 class Composite:
     """What a bundle of rays sees."""
 
-    rgb: Float[Tensor, "rays 3"] | None
-    """Colour in [0, 1]; None if no colour was asked for."""
-    thermal: Float[Tensor, "rays 1"] | None
-    """Normalised temperature; None if none was asked for."""
-    accumulation: Float[Tensor, " rays"]
-    """Opacity of the whole ray, in [0, 1]."""
-    depth: Float[Tensor, " rays"]
-    """Expected distance of what was hit, world units; infinite where nothing was."""
+    rgb: Float[Tensor, "rays 3"] | None  # Colour in [0, 1]; None if no colour was asked for
+    thermal: Float[Tensor, "rays 1"] | None  # Normalised temperature; None if none was asked for
+    accumulation: Float[Tensor, " rays"]  # Opacity of the whole ray, in [0, 1]
+    depth: Float[Tensor, " rays"]  # Expected distance of what was hit, world units; infinite where nothing was
 
 
 def ray_weights(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> RayWeights:

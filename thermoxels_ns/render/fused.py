@@ -23,20 +23,15 @@ from thermoxels_ns.render.kernels_rows import Blocks, Order, RowGradients
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions, near_and_far
 
 ACTIVATIONS = {"relu": kernels.RELU, "softplus": kernels.SOFTPLUS, "exp": kernels.EXP}
-SMALLEST_VARIATION = 1e-10
-"""Added under the root of the total variation; the reference's value."""
+SMALLEST_VARIATION = 1e-10  # Added under the root of the total variation; the reference's value
 MOST_HARMONICS = 9
-VOXELS_AT_ONCE = 1 << 14
-"""Voxels whose total variation is one task."""
-FEWEST_SAMPLES = 24
-"""Samples per ray, averaged over a range of rays, that the first batch on a lattice has memory for."""
+VOXELS_AT_ONCE = 1 << 14  # Voxels whose total variation is one task
+FEWEST_SAMPLES = 24  # Samples per ray, averaged over a range of rays, that the first batch on a lattice has memory for
 SPARE = 1.25
 """A batch with too little memory is marched again with this many times the samples per ray counted until it ran out."""
-MOST_GROUPS = 1 << 12
-"""Groups of voxels that samples are put in order by."""
+MOST_GROUPS = 1 << 12  # Groups of voxels that samples are put in order by
 RANGES_PER_THREAD = 4
-VARIATION_SHARE = 0.02
-"""Work of one channel's variation in a voxel, in samples."""
+VARIATION_SHARE = 0.02  # Work of one channel's variation in a voxel, in samples
 _room: dict[int, int] = {}
 """Samples per ray that batches on the last lattice had memory for; the key is the number of rows."""
 NAMES = ("density", "sh", "temperature")

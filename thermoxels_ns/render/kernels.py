@@ -53,14 +53,10 @@ prefetch: Any = intrinsic(_prefetch)
 Floats = npt.NDArray[np.floating]
 Ints = Any  # arrays of integers; numba knows which
 
-BLOCK = 8
-"""Voxels along the side of a block; the rule is that of `KeptVoxels`."""
-OPAQUE = 100.0
-"""Optical depth of a step from which it counts as opaque."""
-EXP_LIMIT = 15.0
-"""Raw density from which `exp` stays constant."""
-AHEAD = 8
-"""Samples of a ray that are read before they are weighed."""
+BLOCK = 8  # Voxels along the side of a block; the rule is that of `KeptVoxels`
+OPAQUE = 100.0  # Optical depth of a step from which it counts as opaque
+EXP_LIMIT = 15.0  # Raw density from which `exp` stays constant
+AHEAD = 8  # Samples of a ray that are read before they are weighed
 RELU, SOFTPLUS, EXP = 0, 1, 2
 DENSITY, COLOUR, TEMPERATURE = 1, 2, 4
 """Bits: which parameters a sample has a gradient for."""
@@ -69,23 +65,16 @@ DENSITY, COLOUR, TEMPERATURE = 1, 2, 4
 class Volume(NamedTuple):
     """The kept voxels and their parameters as plain arrays."""
 
-    lo: Floats
-    """Lower corner, (3,) float64."""
-    hi: Floats
-    """Upper corner, (3,) float64."""
-    size: float
-    """Edge of a voxel."""
-    cells: Ints
-    """Voxels along x, y, z, (3,) int64."""
+    lo: Floats  # Lower corner, (3,) float64
+    hi: Floats  # Upper corner, (3,) float64
+    size: float  # Edge of a voxel
+    cells: Ints  # Voxels along x, y, z, (3,) int64
     block_slot: Ints
     voxel_number: Ints
     voxel_rows: Ints
-    density: Floats
-    """(rows, 1), raw."""
-    sh: Floats
-    """(rows, 3 k), or (0, 0)."""
-    temperature: Floats
-    """(rows, k)."""
+    density: Floats  # (rows, 1), raw
+    sh: Floats  # (rows, 3 k), or (0, 0)
+    temperature: Floats  # (rows, k)
     activation: int
 
 
@@ -96,8 +85,7 @@ class Rays(NamedTuple):
     directions: Floats
     near: Floats
     far: Floats
-    wants: Ints
-    """Bits per ray, (rays,) uint8: 1 colour, 2 temperature."""
+    wants: Ints  # Bits per ray, (rays,) uint8: 1 colour, 2 temperature
 
 
 class Settings(NamedTuple):
@@ -106,13 +94,10 @@ class Settings(NamedTuple):
     step: float
     smallest_weight: float
     early_stop: float
-    distortion_scale: float
-    """Length that counts as 1 in the distortion; 0: not computed."""
-    sparsity: int
-    """1: sum the sparsity term."""
+    distortion_scale: float  # Length that counts as 1 in the distortion; 0: not computed
+    sparsity: int  # 1: sum the sparsity term
     thermal_moves_density: int
-    sh_active: int
-    """Colour harmonics per channel that take part; those behind them count as 0."""
+    sh_active: int  # Colour harmonics per channel that take part; those behind them count as 0
 
 
 class Records(NamedTuple):
@@ -121,42 +106,29 @@ class Records(NamedTuple):
     Each range of rays writes from a place of its own on, so that unused records may lie between ranges.
     """
 
-    offset: Ints
-    """First record of each ray, (rays,) int64."""
-    used: Ints
-    """Records of each ray, (rays,) int64."""
-    number: Ints
-    """Number of the voxel, int32."""
-    step: Ints
-    """Number of the step, int32."""
-    fraction: Floats
-    """Place in the voxel, (records, 3)."""
+    offset: Ints  # First record of each ray, (rays,) int64
+    used: Ints  # Records of each ray, (rays,) int64
+    number: Ints  # Number of the voxel, int32
+    step: Ints  # Number of the step, int32
+    fraction: Floats  # Place in the voxel, (records, 3)
     density: Floats
-    transmittance: Floats
-    """Share of the ray's light that is left behind the step."""
+    transmittance: Floats  # Share of the ray's light that is left behind the step
     weight: Floats
-    rgb: Floats
-    """Colour, (records, 3)."""
-    thermal: Floats
-    """Temperature."""
+    rgb: Floats  # Colour, (records, 3)
+    thermal: Floats  # Temperature
 
 
 class SampleGradients(NamedTuple):
     """Gradients of recorded samples. Three take the memory of the `Records` that the backward pass has read by then."""
 
-    offset: Ints
-    """That of the records, as the next three."""
+    offset: Ints  # That of the records, as the next three
     used: Ints
     number: Ints
     fraction: Floats
-    raw_density: Floats
-    """Written over `Records.density`."""
-    temperature: Floats
-    """Written over `Records.transmittance`."""
-    logits: Floats
-    """Those of the colour, (records, 3), written over `Records.rgb`."""
-    uses: Ints
-    """Which of the three a sample has (bits), uint8."""
+    raw_density: Floats  # Written over `Records.density`
+    temperature: Floats  # Written over `Records.transmittance`
+    logits: Floats  # Those of the colour, (records, 3), written over `Records.rgb`
+    uses: Ints  # Which of the three a sample has (bits), uint8
 
 
 class Sums(NamedTuple):

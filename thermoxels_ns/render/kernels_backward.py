@@ -32,8 +32,7 @@ class RayGradients(NamedTuple):
 
     rgb: Floats
     thermal: Floats
-    transmittance: Floats
-    """That of the accumulation is subtracted already, the sum of both being 1."""
+    transmittance: Floats  # That of the accumulation is subtracted already, the sum of both being 1
     distortion: Floats
     sparsity: Floats
 

@@ -28,38 +28,27 @@ NEAR, FAR = 8, 16
 class Order(NamedTuple):
     """Samples with a gradient in the order of their voxels; of those in one group of voxels, in the order of rays."""
 
-    shift: int
-    """A group is 2^shift voxels."""
-    group: Ints
-    """First of each group in the lists below and one behind the last, (groups + 1,) int64."""
-    record: Ints
-    """Record, int32."""
-    ray: Ints
-    """Its ray, int32."""
+    shift: int  # A group is 2^shift voxels
+    group: Ints  # First of each group in the lists below and one behind the last, (groups + 1,) int64
+    record: Ints  # Record, int32
+    ray: Ints  # Its ray, int32
 
 
 class Blocks(NamedTuple):
     """Total variation to add: one entry per parameter, in the order density, colour, temperature."""
 
-    first: Ints
-    """First voxel, (3,) int64."""
-    last: Ints
-    """One behind the last voxel; the first where there is no block."""
-    push: Floats
-    """Gradient of the block's total variation, (3,) float64."""
-    channels: Ints
-    """Channels of which it is the mean, (3,) int64: those without a column are 0."""
-    smallest: float
-    """Added under the root."""
+    first: Ints  # First voxel, (3,) int64
+    last: Ints  # One behind the last voxel; the first where there is no block
+    push: Floats  # Gradient of the block's total variation, (3,) float64
+    channels: Ints  # Channels of which it is the mean, (3,) int64: those without a column are 0
+    smallest: float  # Added under the root
 
 
 class RowGradients(NamedTuple):
     """Gradients of the rows that have one."""
 
-    uses: Ints
-    """Which parameters each row has a gradient for (bits), (rows,) uint8."""
-    place: Ints
-    """Where, in the arrays below, (rows, 3) int32; for density, colour, temperature."""
+    uses: Ints  # Which parameters each row has a gradient for (bits), (rows,) uint8
+    place: Ints  # Where, in the arrays below, (rows, 3) int32; for density, colour, temperature
     density_rows: Ints
     density: Floats
     sh_rows: Ints

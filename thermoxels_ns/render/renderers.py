@@ -54,13 +54,11 @@ class ReferenceSamples:
     """Samples of rays through the box, and what density makes of them."""
 
     steps: RaySteps
-    density: Float[Tensor, "rays steps"]
-    """Density at the samples, 0 where nothing was asked, [1 / world unit]."""
+    density: Float[Tensor, "rays steps"]  # Density at the samples, 0 where nothing was asked, [1 / world unit]
     along: RayWeights
     active: Int64[Tensor, " n"]
     """Flat indices (into rays x steps) of the samples whose density was asked for, ascending."""
-    positions: Float[Tensor, "n 3"]
-    """World positions of the active samples."""
+    positions: Float[Tensor, "n 3"]  # World positions of the active samples
 
     def active_index(self, flat: Int64[Tensor, " m"]) -> Int64[Tensor, " m"]:
         """Where the samples `flat` (all active) stand in `active`."""
@@ -173,16 +171,11 @@ def fused_render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -
 class GridSamples:
     """Samples of rays in kept voxels, ray after ray, for statistics. No gradients."""
 
-    ray: Int64[Tensor, " n"]
-    """Ray of each sample, ascending."""
-    at: TrilinearPoints
-    """Where the samples lie."""
-    weight: Float[Tensor, " n"]
-    """Share of the pixel."""
-    before: Float[Tensor, " n"]
-    """Share of the pixel that is spent before the sample."""
-    transmittance: Float[Tensor, " rays"]
-    """Share of the pixel that is left for the background."""
+    ray: Int64[Tensor, " n"]  # Ray of each sample, ascending
+    at: TrilinearPoints  # Where the samples lie
+    weight: Float[Tensor, " n"]  # Share of the pixel
+    before: Float[Tensor, " n"]  # Share of the pixel that is spent before the sample
+    transmittance: Float[Tensor, " rays"]  # Share of the pixel that is left for the background
 
 
 @torch.no_grad()

@@ -17,14 +17,10 @@ from thermoxels_ns.render.renderers import Backend, render_rays
 class SurroundingsRender:
     """What rays see of the surroundings."""
 
-    rgb: Float[Tensor, "rays 3"] | None
-    """Sum of weight times colour; None where there is no colour."""
-    thermal: Float[Tensor, "rays 1"]
-    """Sum of weight times normalised temperature."""
-    transmittance: Float[Tensor, " rays"]
-    """Share of the light that reaches them from infinity."""
-    variation: dict[str, Float[Tensor, ""]]
-    """Total variation of the blocks asked for."""
+    rgb: Float[Tensor, "rays 3"] | None  # Sum of weight times colour; None where there is no colour
+    thermal: Float[Tensor, "rays 1"]  # Sum of weight times normalised temperature
+    transmittance: Float[Tensor, " rays"]  # Share of the light that reaches them from infinity
+    variation: dict[str, Float[Tensor, ""]]  # Total variation of the blocks asked for
 
 
 def render_surroundings(

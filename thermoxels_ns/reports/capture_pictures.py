@@ -21,15 +21,11 @@ from thermoxels_ns.reports.capture_page import CapturePage, Overlay, build_page
 from thermoxels_ns.reports.page import write_page
 
 _WIDTH = 640
-_DEPTH_STEP = 4
-"""Depth is looked up at every so many pixels of the reduced photograph, and linear between."""
-_COLOUR_SHARE = 0.55
-"""How much of the thermal colours covers the photograph."""
-_PERCENTILES = (2.0, 98.0)
-"""Of a thermal image's temperatures, for its darkest and brightest colours."""
+_DEPTH_STEP = 4  # Depth is looked up at every so many pixels of the reduced photograph, and linear between
+_COLOUR_SHARE = 0.55  # How much of the thermal colours covers the photograph
+_PERCENTILES = (2.0, 98.0)  # Of a thermal image's temperatures, for its darkest and brightest colours
 _SHOWN = 6
-_SAMPLED_PIXELS = 4000
-"""Of every thermal image, for the histogram."""
+_SAMPLED_PIXELS = 4000  # Of every thermal image, for the histogram
 
 
 def write_capture_page(result: CaptureResult) -> None:

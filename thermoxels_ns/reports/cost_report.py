@@ -33,8 +33,7 @@ FIGURES: Mapping[str, str] = {
     "surface_distance_m": "the same in metres",
 }
 """What is measured, by the name of its column."""
-FRONTS = ("thermal_mae_c", "psnr")
-"""Figures whose Pareto front against seconds is marked."""
+FRONTS = ("thermal_mae_c", "psnr")  # Figures whose Pareto front against seconds is marked
 
 _HIGHER_IS_BETTER = frozenset({"psnr", "fscore", "fscore_128"})
 _SHORT = {"thermal_mae_c": "MAE", "psnr": "PSNR"}
@@ -58,22 +57,19 @@ _PANELS = (
 )
 _MAIN, _OTHER, _FRONT_LINE = "#1f5fa8", "#b8571b", "#8fb3d9"
 
-NamedPoint = tuple[str, float, float]
-"""A name, seconds and a figure."""
+NamedPoint = tuple[str, float, float]  # A name, seconds and a figure
 
 
 @dataclass(frozen=True)
 class CostSetting:
     """One way to train."""
 
-    name: str
-    """What the user calls it, for instance ``64:800``, ``standard`` or ``standard, recipe paper``."""
+    name: str  # What the user calls it, for instance ``64:800``, ``standard`` or ``standard, recipe paper``
     method: str
     options: tuple[str, ...]
     work: float = math.inf
     """Roughly how much there is to do, to find the cheapest before anything ran; infinite if not known."""
-    beside: bool = False
-    """Another method or recipe at the baseline, for comparison."""
+    beside: bool = False  # Another method or recipe at the baseline, for comparison
 
     @property
     def training(self) -> str:
@@ -99,8 +95,7 @@ class CostRun:
     scene: str
     version: str
     training: str
-    figures: Mapping[str, float]
-    """What was measured, by the names in `FIGURES`; NaN where there is nothing to measure."""
+    figures: Mapping[str, float]  # What was measured, by the names in `FIGURES`; NaN where there is nothing to measure
 
     @property
     def key(self) -> tuple[str, int, str, str, str]:
@@ -114,22 +109,17 @@ class CostRow:
 
     setting: CostSetting
     repeats: int
-    figures: Mapping[str, float]
-    """Medians by the names in `FIGURES`; NaN where there is nothing to measure."""
-    time_ratio: float
-    """Median wall time over that of the baseline; NaN if the baseline has none."""
-    fronts: frozenset[str]
-    """Those of `FRONTS` in which no other setting is better without being slower."""
+    figures: Mapping[str, float]  # Medians by the names in `FIGURES`; NaN where there is nothing to measure
+    time_ratio: float  # Median wall time over that of the baseline; NaN if the baseline has none
+    fronts: frozenset[str]  # Those of `FRONTS` in which no other setting is better without being slower
 
 
 @dataclass(frozen=True)
 class Targets:
     """Bounds that a setting should keep; None: any value will do."""
 
-    thermal_mae_c: float | None = None
-    """Largest thermal MAE, [degrees Celsius]."""
-    psnr: float | None = None
-    """Smallest RGB PSNR, [dB]."""
+    thermal_mae_c: float | None = None  # Largest thermal MAE, [degrees Celsius]
+    psnr: float | None = None  # Smallest RGB PSNR, [dB]
 
     def met(self, figures: Mapping[str, float]) -> bool:
         """Whether the figures keep all bounds; NaN keeps none."""

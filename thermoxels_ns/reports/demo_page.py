@@ -17,8 +17,7 @@ class Check:
     measured: str
     target: str
     met: bool
-    meaning: str = ""
-    """What the figure says, for somebody who meets it for the first time."""
+    meaning: str = ""  # What the figure says, for somebody who meets it for the first time
 
 
 @dataclass(frozen=True)
@@ -50,12 +49,9 @@ class ColourBar:
     ('10.0', '15.0', '20.0', '25.0', '30.0\\xa0°C')
     """
 
-    colours: tuple[str, ...]
-    """Html colours at even steps from the coldest to the hottest; at least two."""
-    min_c: float
-    """Temperature of the first colour, [degrees Celsius]."""
-    max_c: float
-    """Temperature of the last colour, [degrees Celsius]."""
+    colours: tuple[str, ...]  # Html colours at even steps from the coldest to the hottest; at least two
+    min_c: float  # Temperature of the first colour, [degrees Celsius]
+    max_c: float  # Temperature of the last colour, [degrees Celsius]
 
     def __post_init__(self) -> None:
         if len(self.colours) < 2:
@@ -74,25 +70,19 @@ class DemoPage:
     """Everything the page says; steps in order with the time each took, [s]."""
 
     title: str
-    summary: str
-    """One or two sentences on what the page shows."""
-    at_a_glance: tuple[Picture, ...]
-    """What went in and what came out, side by side."""
+    summary: str  # One or two sentences on what the page shows
+    at_a_glance: tuple[Picture, ...]  # What went in and what came out, side by side
     checks: tuple[Check, ...]
     more_figures: Table
-    training_pairs: tuple[tuple[bytes, bytes], ...]
-    """Some of the photographs that went in, each with its thermal image."""
+    training_pairs: tuple[tuple[bytes, bytes], ...]  # Some of the photographs that went in, each with its thermal image
     views: tuple[HeldOutView, ...]
     colour_bar: ColourBar
     """Colours of all thermal images of the page, but not of the mesh pictures, which have their own."""
-    mesh_pictures: tuple[Picture, ...]
-    """The mesh, before and after heat."""
-    next_steps: tuple[tuple[str, str], ...]
-    """Commands to try next, and what each does."""
+    mesh_pictures: tuple[Picture, ...]  # The mesh, before and after heat
+    next_steps: tuple[tuple[str, str], ...]  # Commands to try next, and what each does
     seconds: tuple[tuple[str, float], ...]
     commands: tuple[str, ...]
-    files: tuple[tuple[str, str], ...]
-    """Files and folders relative to the page, and what they hold."""
+    files: tuple[tuple[str, str], ...]  # Files and folders relative to the page, and what they hold
 
 
 def build_page(page: DemoPage) -> str:

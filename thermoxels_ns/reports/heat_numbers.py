@@ -57,8 +57,7 @@ def unit_signs(unit: str) -> str:
 class RoundOff:
     """Heat flows so small that they are rounding: of a steady body, what flows in and out of it again."""
 
-    below_w: float
-    """Flows smaller than this are round-off, [W]."""
+    below_w: float  # Flows smaller than this are round-off, [W]
 
     def flow(self, heat_w: float) -> str:
         """Write a heat flow; round-off is 0.

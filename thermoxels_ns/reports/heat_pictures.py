@@ -18,8 +18,7 @@ Vector = npt.NDArray[np.float64]
 PICTURES = ("surface-start.png", "surface-end.png", "surface-change.png", "cut.png")
 """Names of the pictures; of a steady state there are the second and the last only."""
 
-_MOST_LINES = 8
-"""Curves in one plot; more cannot be told apart."""
+_MOST_LINES = 8  # Curves in one plot; more cannot be told apart
 
 
 def draw_surface(

@@ -31,13 +31,10 @@ if TYPE_CHECKING:
 _MESH_AREA = (0.04, 0.16, 0.80, 0.90)
 _INK = "#202020"
 _SUPPORT_COLOURS: tuple[str, ...] = ("green", "gold", "red", "grey")
-BAR_TITLE = "temperature [°C]"
-"""What a colour bar says unless told otherwise."""
-_LEAST_CHANGE_K = 1e-3
-"""Half the span of the smallest scale of changes, [K]."""
+BAR_TITLE = "temperature [°C]"  # What a colour bar says unless told otherwise
+_LEAST_CHANGE_K = 1e-3  # Half the span of the smallest scale of changes, [K]
 _SHARE_OF_CHANGES = 0.95
-_DARKEST = 0.1
-"""Share of inferno left out at its dark end, where shading could not be told from cold."""
+_DARKEST = 0.1  # Share of inferno left out at its dark end, where shading could not be told from cold
 
 
 def picture_of_mesh(

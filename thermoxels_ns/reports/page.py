@@ -21,26 +21,20 @@ _SIGNATURES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 class Table:
     """Rows of text; figures are aligned to the right."""
 
-    columns: tuple[str, ...]
-    """Headings of the columns; all empty: the table has no head."""
+    columns: tuple[str, ...]  # Headings of the columns; all empty: the table has no head
     rows: tuple[tuple[str, ...], ...]
     """As many entries each as there are columns; further lines of an entry are written small below its first."""
-    figures_from: int = 1
-    """First column of figures."""
-    note: str = ""
-    """A sentence below."""
-    summary: str = ""
-    """Words to click on where the table is folded away at first; empty: it is shown."""
-    look: str = ""
-    """Class of the style sheet: ``rows`` for names with their values, ``cameras`` for few wide columns."""
+    figures_from: int = 1  # First column of figures
+    note: str = ""  # A sentence below
+    summary: str = ""  # Words to click on where the table is folded away at first; empty: it is shown
+    look: str = ""  # Class of the style sheet: ``rows`` for names with their values, ``cameras`` for few wide columns
 
 
 @dataclass(frozen=True)
 class Picture:
     """One picture with its caption."""
 
-    image: bytes
-    """Content of a PNG or JPEG file."""
+    image: bytes  # Content of a PNG or JPEG file
     caption: str
 
 
@@ -48,12 +42,9 @@ class Picture:
 class Gallery:
     """Pictures side by side."""
 
-    pictures: tuple[Picture, ...]
-    """From left to right."""
-    columns: int = 2
-    """How many stand in a row on a wide screen, 2 to 4."""
-    heading: str = ""
-    """Words above."""
+    pictures: tuple[Picture, ...]  # From left to right
+    columns: int = 2  # How many stand in a row on a wide screen, 2 to 4
+    heading: str = ""  # Words above
 
 
 @dataclass(frozen=True)
@@ -63,12 +54,9 @@ class Section:
     heading: str
     words: tuple[str, ...] = ()
     galleries: tuple[Gallery, ...] = ()
-    svg: str = ""
-    """A chart as an svg element."""
-    tables: tuple[Table, ...] = ()
-    """Tables; one without rows is left out."""
-    lines: tuple[str, ...] = ()
-    """Lines as they are typed or written, in a box."""
+    svg: str = ""  # A chart as an svg element
+    tables: tuple[Table, ...] = ()  # Tables; one without rows is left out
+    lines: tuple[str, ...] = ()  # Lines as they are typed or written, in a box
 
 
 @dataclass(frozen=True)
@@ -76,13 +64,10 @@ class Page:
     """Everything a page says."""
 
     title: str
-    summary: str
-    """One or two sentences below it."""
+    summary: str  # One or two sentences below it
     sections: tuple[Section, ...]
-    figures: tuple[tuple[str, str], ...] = ()
-    """The figures that matter most: value with unit, and what it is."""
-    warnings: tuple[str, ...] = ()
-    """What to know before any figure is believed; stands above the figures."""
+    figures: tuple[tuple[str, str], ...] = ()  # The figures that matter most: value with unit, and what it is
+    warnings: tuple[str, ...] = ()  # What to know before any figure is believed; stands above the figures
 
 
 def build_page(page: Any, template: str = "page.html.j2") -> str:

@@ -24,18 +24,13 @@ from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler
 from thermoxels_ns.training.model import SurroundingsSampler, ThermoxelsModel
 from thermoxels_ns.training.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
 
-FEWEST_OPEN_RAYS = 0.002
-"""Share of rays that must leave the box unsaturated for a background to be worth its cost."""
+FEWEST_OPEN_RAYS = 0.002  # Share of rays that must leave the box unsaturated for a background to be worth its cost
 FEWEST_SKY_DIFFERENCE = 0.01
 """Share of the temperature range by which the learned sky must differ from the scene's minimum to be kept."""
-MOST_OPENED_RAYS = 0.01
-"""Share of the rays that end on something which pruning may open."""
-OPAQUE_DEPTH = 0.7
-"""Optical depth across a voxel from which it is opaque: half of the light is lost."""
-PRUNING_ATTEMPTS = 4
-"""Thresholds tried before pruning fails."""
-RAYS_PER_IMAGE = 4096
-"""Training rays per image that statistics look at."""
+MOST_OPENED_RAYS = 0.01  # Share of the rays that end on something which pruning may open
+OPAQUE_DEPTH = 0.7  # Optical depth across a voxel from which it is opaque: half of the light is lost
+PRUNING_ATTEMPTS = 4  # Thresholds tried before pruning fails
+RAYS_PER_IMAGE = 4096  # Training rays per image that statistics look at
 SHORTEST_RUN_WITH_DEPTHS = 400
 """Steps that a run must have for photo_depth auto: a shorter one would spend most of its time on depths."""
 
@@ -174,10 +169,8 @@ class PruningReport:
 
     kept_voxels: int
     total_voxels: int
-    threshold: float
-    """Smallest largest weight of a voxel that was kept for its own sake."""
-    opened: float
-    """Share of the rays with an end of whose weight more than half lay in the voxels removed."""
+    threshold: float  # Smallest largest weight of a voxel that was kept for its own sake
+    opened: float  # Share of the rays with an end of whose weight more than half lay in the voxels removed
 
     def __str__(self) -> str:
         return (

@@ -13,12 +13,9 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.refine import RowChange, prune
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 
-FEWEST_POINTS = 2
-"""Different points whose rays must cross a voxel: a single one may be wrong."""
-MARGIN_VOXELS = 1.5
-"""Voxels before a point that are not judged by the rays to it."""
-MARGIN_ERRORS = 3.0
-"""Standard errors of a ray's length that are not judged either."""
+FEWEST_POINTS = 2  # Different points whose rays must cross a voxel: a single one may be wrong
+MARGIN_VOXELS = 1.5  # Voxels before a point that are not judged by the rays to it
+MARGIN_ERRORS = 3.0  # Standard errors of a ray's length that are not judged either
 MOST_RAYS = 500_000
 """Rays that are looked at; of more, those to every second, third, ... point. They say the same many times over."""
 _STEPS_PER_VOXEL = 2.0

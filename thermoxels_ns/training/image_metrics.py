@@ -15,8 +15,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 _SMALLEST_MSE = 1e-10
 _HSSIM_WINDOW = 4
 _HSSIM_C2 = 9e-4  # (0.03 x data range 1)^2
-HALF_TRANSPARENT = (0.1, 0.9)
-"""A ray whose accumulation lies strictly between these is neither through nor stopped."""
+HALF_TRANSPARENT = (0.1, 0.9)  # A ray whose accumulation lies strictly between these is neither through nor stopped
 
 
 def psnr(predicted: Tensor, target: Tensor, valid: Tensor | None = None) -> float:

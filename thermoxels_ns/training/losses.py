@@ -13,12 +13,9 @@ from torch import Tensor
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.render.ray_render import RayRequest
 
-MARGIN_VOXELS = 1.5
-"""Voxels before and behind a point between which the surface may lie."""
-LARGEST_ERROR = 0.25
-"""Share of a ray's length that the margin may be for it to end in the surroundings."""
-MARGIN_ERRORS = 2.0
-"""Standard errors of a ray's length by which that is widened."""
+MARGIN_VOXELS = 1.5  # Voxels before and behind a point between which the surface may lie
+LARGEST_ERROR = 0.25  # Share of a ray's length that the margin may be for it to end in the surroundings
+MARGIN_ERRORS = 2.0  # Standard errors of a ray's length by which that is widened
 
 COARSE_LIGHT = 0.5
 """Share of the light that may pass a depth of photographs while the lattice is coarse: a coarse voxel that is opaque

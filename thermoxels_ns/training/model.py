@@ -38,13 +38,11 @@ from thermoxels_ns.training.ray_statistics import FieldEvidence, field_evidence
 SURROUNDINGS = (48, 12)
 """Voxels of the surroundings across a face of the box and from there to infinity, at the start; they are split
 whenever those of the box are."""
-SURROUNDINGS_DENSITY = 0.005
-"""Their density at the start, [1 / voxel]: a tenth of the light is lost."""
+SURROUNDINGS_DENSITY = 0.005  # Their density at the start, [1 / voxel]: a tenth of the light is lost
 SURROUNDINGS_VARIATION = 100.0
 """Their total variation counts this many times as much as that of the box: few photographs show the same part of them.
 Chosen on one real scene (1: 16.6 dB over whole held-out photographs, 100: 17.7, 1000: 17.4)."""
-LEAST_LIGHT = 0.003
-"""Share of a ray's light that leaves the box from which its surroundings are asked for."""
+LEAST_LIGHT = 0.003  # Share of a ray's light that leaves the box from which its surroundings are asked for
 
 
 class ThermoxelsModel(Model):

@@ -34,8 +34,7 @@ class RaySampler(Protocol):
 class VoxelWeights:
     """Weights of rays per kept voxel."""
 
-    largest: Float[Tensor, " voxels"]
-    """Largest weight a sample in the voxel had on any ray."""
+    largest: Float[Tensor, " voxels"]  # Largest weight a sample in the voxel had on any ray
     ends: Bool[Tensor, " voxels"]
     """Voxels in which some ray that ends on something (opacity above one half) has spent half of its weight."""
 
@@ -104,12 +103,9 @@ class CornerTemperature:
 class FieldEvidence:
     """What training rays say about the trained field."""
 
-    rays: int
-    """Rays looked at."""
-    temperature: CornerTemperature
-    """What the thermal ones among them measured."""
-    voxel_weight: Float[Tensor, " voxels"]
-    """Sum of the weights that rays spent in each kept voxel, [rays]."""
+    rays: int  # Rays looked at
+    temperature: CornerTemperature  # What the thermal ones among them measured
+    voxel_weight: Float[Tensor, " voxels"]  # Sum of the weights that rays spent in each kept voxel, [rays]
     voxel_ends: Float[Tensor, " voxels"]
     """Number of rays that end on something (opacity above one half) and have spent half of their weight in each kept
     voxel, [rays]."""

@@ -8,8 +8,7 @@ from typing import Literal
 
 from thermoxels_ns.core.errors import ThermoxelsError
 
-COARSEST = 32
-"""Voxels along the longest side that a training starts with, or a few more."""
+COARSEST = 32  # Voxels along the longest side that a training starts with, or a few more
 # The shares of the run below were set by hand while the losses were tuned; only the whole was measured.
 _REFINE: Mapping[int, tuple[float, ...]] = {
     0: (),
@@ -18,8 +17,7 @@ _REFINE: Mapping[int, tuple[float, ...]] = {
     3: (0.15, 0.35, 0.6),
     4: (0.12, 0.27, 0.44, 0.62),
 }
-_PRUNE_AFTER = 0.13
-"""Share of the run after each refinement at which what turned out empty is dropped."""
+_PRUNE_AFTER = 0.13  # Share of the run after each refinement at which what turned out empty is dropped
 _THIN = 0.8
 _VIEW_DEPENDENCE = 0.8
 _RAMP = (0.1, 0.4)
@@ -33,20 +31,13 @@ QUALITIES: Mapping[Quality, tuple[int, int]] = {"draft": (64, 800), "standard": 
 class Schedule:
     """The course of a training."""
 
-    resolutions: tuple[int, ...]
-    """Voxels along the longest side, coarse to fine."""
-    refine_at: tuple[int, ...]
-    """Steps at which the next resolution begins."""
-    prune_at: tuple[int, ...]
-    """Steps at which voxels without weight are dropped, beside those of refinement."""
-    thin_at: tuple[int, ...]
-    """Steps at which surfaces are thinned."""
-    distortion_ramp: tuple[int, int]
-    """Steps over which the distortion term grows."""
-    view_dependence_from: int
-    """Step from which colour depends on the direction."""
-    steps: int
-    """Number of steps."""
+    resolutions: tuple[int, ...]  # Voxels along the longest side, coarse to fine
+    refine_at: tuple[int, ...]  # Steps at which the next resolution begins
+    prune_at: tuple[int, ...]  # Steps at which voxels without weight are dropped, beside those of refinement
+    thin_at: tuple[int, ...]  # Steps at which surfaces are thinned
+    distortion_ramp: tuple[int, int]  # Steps over which the distortion term grows
+    view_dependence_from: int  # Step from which colour depends on the direction
+    steps: int  # Number of steps
 
 
 def schedule_for(resolution: int, steps: int) -> Schedule:

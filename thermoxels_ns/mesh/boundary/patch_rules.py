@@ -12,12 +12,10 @@ from typing import Literal
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.yaml_records import as_record, raising, read_yaml, wrong
 
-FACINGS = ("up", "side", "down")
-"""Where a surface may face."""
+FACINGS = ("up", "side", "down")  # Where a surface may face
 DEFAULT_PATCHES = (*(f"{where}-{facing}" for where in ("exterior", "interior") for facing in FACINGS), "cut")
 """Names of the patches that every mesh has, in this order."""
-DEFAULT_REGION = "solid"
-"""Name of region 0."""
+DEFAULT_REGION = "solid"  # Name of region 0
 
 Vector = tuple[float, float, float]
 
@@ -28,30 +26,24 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,39}")
 class Rule:
     """What belongs to a patch or to a region: everything that meets all conditions that are given."""
 
-    name: str
-    """Name of the patch or region; rules of the same name add up."""
-    box: tuple[Vector, Vector] | None = None
-    """Lower and upper corner of an axis-aligned box around the centroid, [m]."""
+    name: str  # Name of the patch or region; rules of the same name add up
+    box: tuple[Vector, Vector] | None = None  # Lower and upper corner of an axis-aligned box around the centroid, [m]
     plane: tuple[Vector, Vector] | None = None
     """Point [m] and unit normal of a plane; the centroid is on the side that the normal points to."""
     colour: Vector | None = None
     """Red, green, blue in [0, 1]; of all rules that have one and whose other conditions hold, the closest wins."""
     max_colour_distance: float = math.inf
     """Longest distance to `colour`, root of the sum of the squared differences of red, green and blue in [0, 1]."""
-    only: str = "all"
-    """Part of the boundary: exterior, interior, cut or all."""
-    facing: str = "any"
-    """Where the normal points: up, side, down or any."""
+    only: str = "all"  # Part of the boundary: exterior, interior, cut or all
+    facing: str = "any"  # Where the normal points: up, side, down or any
 
 
 @dataclass(frozen=True)
 class PatchRules:
     """A user's patches and regions, in the order of the file: later rules win."""
 
-    patches: tuple[Rule, ...] = ()
-    """Rules for boundary triangles."""
-    regions: tuple[Rule, ...] = ()
-    """Rules for tetrahedra."""
+    patches: tuple[Rule, ...] = ()  # Rules for boundary triangles
+    regions: tuple[Rule, ...] = ()  # Rules for tetrahedra
 
 
 @dataclass(frozen=True)

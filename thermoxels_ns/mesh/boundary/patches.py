@@ -21,10 +21,8 @@ _COS_45 = math.sqrt(0.5) + 1e-9
 class Applied(NamedTuple):
     """What rules make of some elements."""
 
-    number: IntArray
-    """Index of each element's patch or region, shape (n,)."""
-    names: tuple[str, ...]
-    """Names of all patches or regions."""
+    number: IntArray  # Index of each element's patch or region, shape (n,)
+    names: tuple[str, ...]  # Names of all patches or regions
     idle: tuple[str, ...]
     """Rules that no element follows, such as "patch roof (entry 2)": none meets their conditions, or later rules take
     all that do."""

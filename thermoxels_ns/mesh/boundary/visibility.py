@@ -19,10 +19,8 @@ START_ABOVE_SURFACE = (1.0, 0.5)
 """A line of sight starts this far out along the normal, [voxels]: past the steps of a staircase, or, if something solid
 is there, half as far, as in a gap of one voxel."""
 
-_LARGEST_BLOCK = 5
-"""Empty blocks of up to 2^5 voxels along an edge are crossed in one step."""
-_NUDGE = 1e-4
-"""How far a line steps into the next block, [voxels]."""
+_LARGEST_BLOCK = 5  # Empty blocks of up to 2^5 voxels along an edge are crossed in one step
+_NUDGE = 1e-4  # How far a line steps into the next block, [voxels]
 
 
 def seen_facets(
@@ -40,14 +38,10 @@ def seen_facets(
 class FacetViews:
     """Which cameras see boundary triangles, for groups of triangles that share one answer."""
 
-    group: IntArray
-    """Group of each triangle, shape (f,)."""
-    middle: FloatArray
-    """Mean centroid of each group, shape (g, 3), [world units]."""
-    normal: FloatArray
-    """Unit mean normal of each group, shape (g, 3)."""
-    seen: BoolArray
-    """Whether each camera sees it, shape (g, cameras)."""
+    group: IntArray  # Group of each triangle, shape (f,)
+    middle: FloatArray  # Mean centroid of each group, shape (g, 3), [world units]
+    normal: FloatArray  # Unit mean normal of each group, shape (g, 3)
+    seen: BoolArray  # Whether each camera sees it, shape (g, cameras)
 
 
 def facet_views(

@@ -38,16 +38,11 @@ _REAL = "%.12E"
 class HeatStep:
     """Conduction in a body of one material, insulated all round, in equal steps of time."""
 
-    conductivity_w_mk: float
-    """Thermal conductivity, [W / (m K)], above 0."""
-    density_kg_m3: float
-    """Mass density, [kg / m3], above 0."""
-    specific_heat_j_kgk: float
-    """Specific heat capacity, [J / (kg K)], above 0."""
-    steps: int
-    """Number of steps, at least 1."""
-    step_seconds: float
-    """Length of a step, [s], above 0."""
+    conductivity_w_mk: float  # Thermal conductivity, [W / (m K)], above 0
+    density_kg_m3: float  # Mass density, [kg / m3], above 0
+    specific_heat_j_kgk: float  # Specific heat capacity, [J / (kg K)], above 0
+    steps: int  # Number of steps, at least 1
+    step_seconds: float  # Length of a step, [s], above 0
 
     def __post_init__(self) -> None:
         for field in ("conductivity_w_mk", "density_kg_m3", "specific_heat_j_kgk", "step_seconds"):

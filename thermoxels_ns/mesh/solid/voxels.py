@@ -47,8 +47,7 @@ class SolidSelection:
     continuous without it. 0: none."""
     smallest_body: float = 0.01
     """Drop bodies (voxels that touch, if only by corners) of less than this share of the largest; mostly floaters."""
-    largest_component: bool = False
-    """Keep only the largest body of voxels that touch by faces."""
+    largest_component: bool = False  # Keep only the largest body of voxels that touch by faces
     interior: InteriorKind = "solid"
     """What becomes of the inside of a body of which photographs only show the shell. solid: it is filled, namely
     cavities that the shell encloses, and space within the body's convex hull that the training cameras would see if
