@@ -374,7 +374,9 @@ def stand_in_run(monkeypatch, ball: GridSnapshot, fail: Exception | None = None)
         dataparser_transform=torch.eye(4)[:3], dataparser_scale=0.5, cameras=cameras, metadata={"feature_rays": None}
     )
     grey = torch.full((40, 40, 3), 128, dtype=torch.uint8)
-    dataset = SimpleNamespace(cameras=cameras, get_image_uint8=lambda _: grey, get_mask=lambda _: None)
+    dataset = SimpleNamespace(
+        cameras=cameras, thermal_cameras=cameras, get_image_uint8=lambda _: grey, get_mask=lambda _: None
+    )
     datamanager = SimpleNamespace(
         train_dataparser_outputs=outputs, get_datapath=lambda: Path("no-scene"), train_dataset=dataset
     )
@@ -573,7 +575,8 @@ def test_surfaces_that_photographs_do_not_support_say_so(ball, tmp_path) -> None
     views = looking_at((0, 0, 0), [(2.0, y, 0.2) for y in (-0.6, 0.0, 0.6)], focal=60.0, size=40)
     grey = np.full((3 * 40 * 40, 3), 0.5, dtype=np.float32)
     centres = views.camera_to_world[:, :, 3]
-    photographs = Photographs(views.matrices(), centres, views.size, np.arange(3) * 1600, grey)
+    thermal = np.full(len(grey), np.nan, np.float32)
+    photographs = Photographs(views.matrices(), centres, views.size, np.arange(3) * 1600, grey, thermal)
     lines: list[str] = []
     summary = export_snapshot(ball, np.eye(4), ExportOptions(), tmp_path, lines.append, photographs=photographs)
     shares = summary["mesh"]["share_of_area_by_support"]

@@ -51,7 +51,8 @@ def photographs() -> Photographs:
         picture[met] = colours(centre + hits.distance[met, None] * rays[met], hits.normal[met])
         pictures.append(picture + rng.normal(0.0, 0.006, picture.shape))
     firsts = np.arange(len(EYES)) * WIDTH * WIDTH
-    return Photographs(matrices, centres, views.size, firsts, np.concatenate(pictures).astype(np.float32))
+    shown = np.concatenate(pictures).astype(np.float32)
+    return Photographs(matrices, centres, views.size, firsts, shown, np.full(len(shown), np.nan, np.float32))
 
 
 def support(cells: np.ndarray, tracks: FeatureRays | None = None) -> tuple[FacetViews, np.ndarray]:
