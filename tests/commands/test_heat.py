@@ -262,7 +262,8 @@ def test_a_tolerance_in_time_keeps_the_scenes_times(folder, tmp_path) -> None:
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ({"tolerance": -1.0}, "tolerance: expected a finite number above 0"),
+        ({"tolerance": 0.0}, "tolerance: expected a finite number above 0 .* Pass --tolerance 0.05"),
+        ({"flow_tolerance": 2.0}, "flow-tolerance: .* at most 1 .* Pass --flow-tolerance 0.01"),
         ({"flow_tolerance": 0.1}, "flow-tolerance: expected --tolerance beside it"),
         ({"tolerance": 0.1, "leave_out_below_k": 0.1}, "leave-out-below-k: expected less than the tolerance of 0.1 K"),
         ({"memory_gb": 1e-7}, "memory of the heat problem: expected at most .*fewer steps or outputs"),

@@ -177,7 +177,7 @@ def test_too_little_memory_is_a_status() -> None:
     found = solve_to_tolerance(problem, Tolerance(1e-5), memory_bytes=room, allow_unmet=True, log=silent)
     assert not found.met and found.settings.order == 2 and "a larger error" in found.status
     assert np.isfinite(found.solution.temperature_c).all()
-    with pytest.raises(HeatError, match="memory_bytes: expected room for a first estimate, got P2 on the given mesh"):
+    with pytest.raises(HeatError, match="memory_bytes: expected room for a first estimate, got P1 on the given mesh"):
         solve_to_tolerance(problem, Tolerance(1.0), memory_bytes=1e4, log=silent)
     transient = solve_to_tolerance(
         nafems_t3(), Tolerance(0.01), duration_s=32.0, memory_bytes=1e6, allow_unmet=True, log=silent
@@ -213,12 +213,13 @@ def test_heat_that_rushes_in_at_the_start_is_not_missed(outputs: int) -> None:
     mesh = box_mesh(np.linspace(0.0, 1.2, 13), [0.0, 0.2], [0.0, 0.2], temperature_c=4.0)
     problem = HeatProblem(mesh, CONCRETE, effects=(FixedTemperature(("x0",), 100.0),))
     found = solve_to_tolerance(
-        problem, Tolerance(2.0, 0.02), duration_s=36_000.0, outputs=outputs, allow_unmet=True, log=silent
+        problem, Tolerance(20.0, 0.3), duration_s=36_000.0, outputs=outputs, allow_unmet=True, log=silent
     )
     exact_w = 0.04 * 2.0 * 1.7 * 96.0 / np.sqrt(np.pi * CONCRETE.diffusivity_m2_s * 36_000.0)
     (flow_w,) = mean_flows_w(found.solution).values()
     assert found.settings.refinements >= 1
-    assert not found.met or abs(flow_w / exact_w - 1.0) < WITHIN * 0.02
+    true = abs(exact_w - flow_w) / (0.5 * abs(flow_w))
+    assert 0.6 < found.settings.error.heat_flow / true < 1.5, (found.settings, true)
 
 
 def test_where_nothing_flows_any_share_of_it_is_met() -> None:

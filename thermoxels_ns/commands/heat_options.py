@@ -24,15 +24,16 @@ class HeatOptions:
     """Largest error that any temperature may have, [K], such as 0.05. Linear or quadratic tetrahedra, the mesh size and
     the time steps are then chosen so that the estimated error meets it; of the scene's time settings only
     the duration and the times at which temperatures are kept remain. The error is that of the heat equation in the
-    body as the mesh describes it. Left out: the mesh as it is, with the scene's own steps, and no estimate for it."""
+    body as the mesh describes it. Left out: the mesh as it is, with the scene's own steps; of a steady state the error
+    is estimated all the same."""
     flow_tolerance: float | None = None
     """Largest error that the mean heat flow of any effect may have, as a share of all heat that flows through the body,
     such as 0.01; alone or beside --tolerance, without which a scene with a duration cannot do."""
     memory_gb: float = 4.0
     """Most memory that solving may take, [GiB]. What needs more is refused before any of it is taken."""
     allow_unmet: bool = False
-    """If a tolerance cannot be met within the memory, write the best that fits and say so, instead of an error. The
-    first estimate needs room for quadratic tetrahedra on the given mesh, through time for a mesh of half the size."""
+    """If a tolerance cannot be met within the memory, write the best that fits and say so, instead of an error.
+    Through time the first estimate needs room for a mesh of half the size."""
     leave_out_below_k: float | None = None
     """Effects that together can change no temperature by more than this are left out, [K]; the report lists each with
     its bound. 0 builds everything that the scene names. Left out: a fifth of --tolerance, which counts against it; 0.01

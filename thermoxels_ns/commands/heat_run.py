@@ -22,7 +22,7 @@ from thermoxels_ns.core.checks import (
 )
 from thermoxels_ns.core.errors import HeatError, MeshError
 from thermoxels_ns.core.json_values import read_json_object
-from thermoxels_ns.fem.solution import Solution, SteadySolution
+from thermoxels_ns.fem.solution import HeatSolution, Solution, SteadySolution
 from thermoxels_ns.heat.run import HeatRun, run_scene
 from thermoxels_ns.heat.scene_file import load_heat_scene
 from thermoxels_ns.heat.solving import Goals, Say
@@ -99,6 +99,9 @@ def answers_of(options: HeatOptions, run: HeatRun) -> dict[str, Any]:
         "warnings": list(run.warnings),
         "leave_out_below_k": screening.tolerance_k,
         "accuracy": None if run.accuracy is None else asdict(run.accuracy),
+        "mesh_error": None
+        if isinstance(run.solution, HeatSolution) or run.solution.error is None
+        else asdict(run.solution.error),
         "solved": {
             "tets": len(run.solved.mesh.tets),
             "nodes": len(run.solved.mesh.points_m),

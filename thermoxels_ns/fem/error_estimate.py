@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
-from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
+from thermoxels_ns.fem.solution import ErrorSize, Solution, SteadySolution, mean_flows_w, share_of_heat
 from thermoxels_ns.fem.space import Space
 
 Vector = npt.NDArray[np.float64]
@@ -36,20 +32,6 @@ _LEAST_OF_HALF_THE_SIZE = 0.17
 temperatures are smooth, 0.3 where two airs meet at an edge."""
 _CORNERS = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """Corners of the reference tetrahedron, shape (3, 4)."""
-_EQUAL = 1e-9  # Temperatures that differ by less than this share of the absolute temperature are equal
-
-
-@dataclass(frozen=True)
-class ErrorSize:
-    """Errors of a solution."""
-
-    temperature_k: float  # Largest error of the temperature at the nodes of the given mesh, [K]
-    heat_flow: float
-    """Largest error of the mean heat flow of an effect, as a share of all heat that flows through the body."""
-
-    def describe(self) -> str:
-        """Say it in words."""
-        return f"{self.temperature_k:.2g} K and {100.0 * self.heat_flow:.2g} % of the heat flow"
 
 
 def richardson(difference: float, ratio: float) -> float:
@@ -70,34 +52,20 @@ def richardson(difference: float, ratio: float) -> float:
     return abs(difference) * ratio / (1.0 - ratio)
 
 
-def mean_flows_w(solution: SteadySolution | HeatSolution) -> dict[str, float]:
-    """Give the mean heat flow into the body of each effect over all times, [W]."""
-    lengths = np.diff(solution.times_s) if isinstance(solution, HeatSolution) else np.ones(1)
-    return {heat.effect: float(lengths @ heat.heat_w / lengths.sum()) for heat in solution.effects}
-
-
-def compared_values(solution: SteadySolution | HeatSolution, num_nodes: int) -> Vector:
+def compared_values(solution: Solution, num_nodes: int) -> Vector:
     """List temperatures of the first `num_nodes` nodes, which solutions share, at all times, then `mean_flows_w`."""
     flows_w = np.array(list(mean_flows_w(solution).values()))
     return np.concatenate([solution.temperature_c[..., :num_nodes].ravel(), flows_w])
 
 
-def error_size(error: Vector, solution: SteadySolution | HeatSolution) -> ErrorSize:
+def error_size(error: Vector, solution: Solution) -> ErrorSize:
     """Give the largest errors of a solution from those of its `compared_values`; shares are of its heat flows."""
-    flows_w = np.abs(list(mean_flows_w(solution).values()))
-    errors = np.abs(error)
-    temperature_k = float(np.max(errors[: len(errors) - len(flows_w)]))
-    largest_w = float(np.max(errors[len(errors) - len(flows_w) :], initial=0.0))
-    level_k = float(np.abs(solution.temperature_c).max()) + ZERO_CELSIUS_K
-    if largest_w == 0.0 or float(np.ptp(solution.temperature_c)) <= _EQUAL * level_k:
-        return ErrorSize(temperature_k, 0.0)
-    through_w = 0.5 * float(flows_w.sum())
-    return ErrorSize(temperature_k, largest_w / through_w if through_w > 0.0 else math.inf)
+    errors, first_flow = np.abs(error), len(error) - len(solution.effects)
+    largest_w = float(np.max(errors[first_flow:], initial=0.0))
+    return ErrorSize(float(np.max(errors[:first_flow])), share_of_heat(largest_w, solution))
 
 
-def difference_between(
-    coarse: SteadySolution | HeatSolution, fine: SteadySolution | HeatSolution, num_nodes: int
-) -> ErrorSize:
+def difference_between(coarse: Solution, fine: Solution, num_nodes: int) -> ErrorSize:
     """Compare two solutions of one problem at the same times; `num_nodes` as in `compared_values`."""
     return error_size(compared_values(fine, num_nodes) - compared_values(coarse, num_nodes), fine)
 

@@ -139,6 +139,10 @@ class ConvectionForm(_Boundary):
         """Nodes whose temperature its surroundings pull on: the coefficient is above 0 there."""
         return np.unique(self.nodes[self.at(self.term.coefficient_w_m2k, time_s)[:, 0] > 0.0])
 
+    def slope_w_m2k(self, relative_k: Vector, time_s: float) -> Vector:
+        """h of each triangle, shape (k, 1), [W / (m2 K)]."""
+        return self.at(self.term.coefficient_w_m2k, time_s)
+
     def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat flow into the body through each patch, [W]."""
         difference_k = self.ambient_k(time_s) - self.surface_k(relative_k)
@@ -225,8 +229,12 @@ class RadiationForm(_Boundary):
 
     def slope(self, relative_k: Vector, time_s: float) -> sparse.csr_matrix:
         """Minus the derivative of the load, entries integral(4 sigma eps T^3 phi_i phi_j), [W / K]."""
+        return self.matrix(self.slope_w_m2k(relative_k, time_s))
+
+    def slope_w_m2k(self, relative_k: Vector, time_s: float) -> Vector:
+        """4 sigma eps T^3 at the points of integration, shape (k, q), [W / (m2 K)]."""
         kelvin = np.maximum(np.abs(self.surface_k(relative_k) + self._reference_k), COLDEST_SLOPE_K)
-        return self.matrix(4.0 * self._strength(time_s) * (kelvin * kelvin * kelvin))
+        return 4.0 * self._strength(time_s) * (kelvin * kelvin * kelvin)
 
     def magnitude(self, relative_k: Vector, time_s: float) -> Vector:
         """Sum of the absolute values of the load's terms, [W]: the load's round-off is a few eps of this."""

@@ -17,9 +17,12 @@ from thermoxels_ns.core.errors import HeatError
 class Places:
     """Where a quantity is asked for: centroids of boundary triangles or of tetrahedra, or nodes."""
 
-    points_m: npt.NDArray[np.float64]  # Positions, shape (k, 3), [m]
-    normals: npt.NDArray[np.float64]  # Outward unit normals of the true surface, shape (k, 3); 0 inside the body
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Unit vector that points up
+    points_m: npt.NDArray[np.float64]
+    """Positions, shape (k, 3), [m]."""
+    normals: npt.NDArray[np.float64]
+    """Outward unit normals of the true surface, shape (k, 3); 0 inside the body."""
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Unit vector that points up."""
 
     def __len__(self) -> int:
         return len(self.points_m)
@@ -37,7 +40,8 @@ class Varying:
     function: Callable[[Places, float], npt.ArrayLike]
     """Takes the places and the time in seconds since the start; returns one number per place, shape (k,), or one for
     all."""
-    in_time: bool = True  # Whether the numbers change with time. False: they are asked for once, at the time 0
+    in_time: bool = True
+    """Whether the numbers change with time. False: they are asked for once, at the time 0."""
     resolution_s: float = math.inf
     """Numbers this far apart in time say how they change in between, above 0, [s]; steps that are chosen by their error
     are no longer. Infinite: nobody knows, and what happens between two such steps is missed."""
@@ -47,8 +51,14 @@ def tabulated(times_s: npt.ArrayLike, values: npt.ArrayLike) -> Varying:
     """Make a quantity that changes with time as a table says, in straight lines from entry to entry.
 
     It is held at the first and the last entry before and after them. Adaptive steps are no longer than the shortest
-    time between two entries, so that none is stepped over. Times, [s], ascend, at least two, shape (k,), as the values;
-    raises `HeatError` otherwise.
+    time between two entries, so that none is stepped over.
+
+    Args:
+        times_s: Times, ascending, at least two, shape (k,), [s].
+        values: What it is at these times, shape (k,).
+
+    Raises:
+        HeatError: The table is none.
 
     >>> tabulated([0.0, 3600.0, 7200.0], [10.0, 20.0, 10.0]).resolution_s
     3600.0
@@ -67,19 +77,28 @@ def tabulated(times_s: npt.ArrayLike, values: npt.ArrayLike) -> Varying:
     )
 
 
-Quantity: TypeAlias = float | Varying  # One number for all places and times, or a function
+Quantity: TypeAlias = float | Varying
+"""One number for all places and times, or a function."""
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """The values that a quantity may have, from the smallest to the largest; name and unit are for messages."""
+    """The values that a quantity may have, by its name and unit."""
 
     name: str
+    """Name of the field, for messages."""
     unit: str
+    """Its unit, for messages."""
     low: float = -math.inf
+    """Smallest value."""
     high: float = math.inf
-    above_low: bool = False  # Whether `low` itself is refused
-    varies: bool = True  # Whether it may be a `Varying`
+    """Largest value."""
+    above_low: bool = False
+    """Whether `low` itself is refused."""
+    varies: bool = True
+    """Whether it may be a `Varying`."""
+    remedy: str = ""
+    """What to do instead of a value that is refused; empty: an example in the unit."""
 
     def check(self, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Return the values as an array if all are finite and in range, else raise `HeatError`."""
@@ -107,7 +126,10 @@ class Bounds:
         return float(self.check(quantity))
 
     def _remedy(self) -> str:
-        return f"Correct {self.name}." if self.unit == "1" else f"Give {self.name} in {self.unit}."
+        if self.remedy:
+            return self.remedy
+        example = 20.0 if self.low < 20.0 <= self.high else 0.5 * (self.low + self.high)
+        return f"Give {self.name}{'' if self.unit == '1' else f' in {self.unit}'}, such as {example:g}."
 
     def _expected(self) -> str:
         parts = ["a finite number"]
@@ -123,7 +145,9 @@ class Bounded:
     """A quantity with its range, ready to be asked."""
 
     quantity: Quantity
+    """A number or a function."""
     bounds: Bounds
+    """What it may be."""
 
     @property
     def in_time(self) -> bool:
@@ -141,7 +165,11 @@ class Bounded:
         return self.quantity.resolution_s if isinstance(self.quantity, Varying) and self.in_time else math.inf
 
     def at(self, places: Places, time_s: float) -> npt.NDArray[np.float64]:
-        """Compute the quantity at places, shape (k,); raises `HeatError` for a wrong shape or values out of range."""
+        """Compute the quantity at places, shape (k,).
+
+        Raises:
+            HeatError: A function returned the wrong shape, or values out of range.
+        """
         if not isinstance(self.quantity, Varying):
             return np.full(len(places), self.quantity, dtype=np.float64)
         value = self.quantity.function(places, time_s if self.in_time else 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,6 +12,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -62,6 +64,20 @@ class EffectHeat:
 
 
 @dataclass(frozen=True)
+class ErrorSize:
+    """Errors of a solution."""
+
+    temperature_k: float
+    """Largest error of the temperature at the nodes of the given mesh, [K]."""
+    heat_flow: float
+    """Largest error of the mean heat flow of an effect, as a share of all heat that flows through the body."""
+
+    def describe(self) -> str:
+        """Say it in words."""
+        return f"{self.temperature_k:.2g} K and {100.0 * self.heat_flow:.2g} % of the heat flow"
+
+
+@dataclass(frozen=True)
 class HeatSolution:
     """Temperatures over time and the account of the heat; converged: every step was solved to tolerance."""
 
@@ -110,6 +126,8 @@ class SteadySolution:
     edge_temperature_c: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     """Temperatures of the middles of the mesh's edges, in the order of `mesh_edges`, shape (e,), [degrees Celsius];
     empty with linear tetrahedra."""
+    error: ErrorSize | None = None
+    """Estimated errors of linear tetrahedra on this mesh, see `p1_error`; None if there is no estimate."""
 
 
 def heat_by_effect(
@@ -133,6 +151,23 @@ def left_out(kinds: Sequence[str]) -> tuple[str, ...]:
 Solution: TypeAlias = HeatSolution | SteadySolution  # What either solver returns
 
 _CHILD_FACETS = 4
+_EQUAL = 1e-9
+"""Temperatures that differ by less than this share of the absolute temperature are equal."""
+
+
+def mean_flows_w(solution: Solution) -> dict[str, float]:
+    """Give the mean heat flow into the body of each effect over all times, [W]."""
+    lengths = np.diff(solution.times_s) if isinstance(solution, HeatSolution) else np.ones(1)
+    return {heat.effect: float(lengths @ heat.heat_w / lengths.sum()) for heat in solution.effects}
+
+
+def share_of_heat(heat_w: float, solution: Solution) -> float:
+    """Give a heat flow as a share of all heat that flows through the body on average; 0 where nothing flows."""
+    level_k = float(np.abs(solution.temperature_c).max()) + ZERO_CELSIUS_K
+    if heat_w == 0.0 or float(np.ptp(solution.temperature_c)) <= _EQUAL * level_k:
+        return 0.0
+    through_w = 0.5 * sum(map(abs, mean_flows_w(solution).values()))
+    return heat_w / through_w if through_w > 0.0 else math.inf
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +11,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.implicit_equation import ImplicitEquation, ImplicitSolution
 from thermoxels_ns.fem.limiter import LEVEL_ROUND_OFF, MOST_SLACK, RANGE_ROUND_OFF, PositiveOffDiagonals, solve_in_range
+from thermoxels_ns.fem.p1_error import p1_error
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.solution import SteadySolution, heat_by_effect
 from thermoxels_ns.fem.system import HeatSystem
@@ -61,7 +62,7 @@ def solve_steady(
     system = HeatSystem(problem, lumped=order == 1, lumped_boundary=lumped_boundary, order=order)
     check_held(system, time_s)
     state = _limited_state(system, time_s, relative_tolerance)
-    solution, system = state.solution, state.system
+    solution, given, system = state.solution, system, state.system
     failure = too_cold(system, solution.relative_k)
     if not solution.converged:
         failure = f"No steady state was found. {solution.status} Check the mesh's quality and the effects."
@@ -70,7 +71,7 @@ def solve_steady(
     relative_k = solution.relative_k
     group_heat = heat_of_groups_w(system, relative_k, time_s)
     num_mesh_nodes = len(problem.mesh.points_m)
-    return SteadySolution(
+    found = SteadySolution(
         temperature_c=relative_k[:num_mesh_nodes] + system.reference_c,
         effects=heat_by_effect(effect_labels(problem), system.groups, group_heat[None]),
         energy_residual=_residual(system, relative_k, time_s, group_heat, relative_tolerance),
@@ -81,6 +82,8 @@ def solve_steady(
         assembled=system.assembled,
         edge_temperature_c=relative_k[num_mesh_nodes:] + system.reference_c,
     )
+    estimated = order == 1 and given.lumped and not failure
+    return replace(found, error=p1_error(given, found, time_s)) if estimated else found
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients, LinearSolver, TwoLevel
-from thermoxels_ns.fem.forms import FixedNodes, at_time, effect_forms
+from thermoxels_ns.fem.forms import ConvectionForm, FixedNodes, RadiationForm, at_time, effect_forms
 from thermoxels_ns.fem.p1_kernels import product_and_bound
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
@@ -85,6 +85,8 @@ class HeatSystem:
         self._space = Space(selection, order=order, lumped=lumped, lumped_boundary=lumped_boundary)
         forms = effect_forms(problem, self._space, self.reference_c, self.assembled)
         self._convection, self._loads, self._radiation = forms.convection, forms.loads, forms.radiation
+        self.surface_forms: tuple[ConvectionForm | RadiationForm, ...] = (*forms.convection, *forms.radiation)
+        """Heat flows through the surface that depend on its temperature."""
         self.fixed: FixedNodes = FixedNodes(forms.fixed, self.num_nodes)
         """Nodes whose temperature is given."""
         with self.assembled.form("stiffness"):
@@ -284,7 +286,7 @@ class HeatSystem:
     def exchanging_pieces(self, time_s: float) -> npt.NDArray[np.bool_]:
         """Mark the pieces whose temperature convection, radiation or fixed nodes hold, shape (p,)."""
         marks = self.pieces.touched(self.fixed.nodes)
-        for form in (*self._convection, *self._radiation):
+        for form in self.surface_forms:
             marks |= self.pieces.touched(form.exchanging_nodes(time_s))
         return marks
 

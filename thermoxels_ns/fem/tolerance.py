@@ -33,8 +33,12 @@ _STEADY_TOLERANCE, _STEP_TOLERANCE = 1e-8, 1e-10
 _STEPS_OVER_ERROR = 6.0
 """Tolerance of the first, adaptive steps over the allowed error: steps that are controlled to 1 K make an error of 0.03
 to 0.07 K in all, because conduction forgets."""
-_AIM = 0.95  # Share of the allowed error that a solution is chosen to make
-_MOST_HALVINGS = 8  # Halvings of the mesh size or of the steps beyond which nothing is tried
+_AIM = 0.95
+"""Share of the allowed error that a solution is chosen to make."""
+_MOST_HALVINGS = 8
+"""Halvings of the mesh size or of the steps beyond which nothing is tried."""
+_SUDDENLY_HELD = 0.5
+"""Share of a flow's error that is left after the mesh size is halved where a surface is suddenly held."""
 _MESH_COST, _STEP_COST = 10.0, 2.0
 """How much more half the mesh size and half the steps cost."""
 
@@ -79,12 +83,18 @@ class Tolerance:
 class Level:
     """A solution on the way."""
 
-    order: int  # 1 for linear tetrahedra, 2 for quadratic ones
-    refinements: int  # How often the size of the given mesh was halved
-    step_tolerance_k: float | None  # Error that the time steps are estimated to make, [K]; None for a steady state
-    num_nodes: int  # Number of unknowns
-    error: ErrorSize  # Estimated errors
-    seconds: float  # Time to solve it, [s]
+    order: int
+    """1 for linear tetrahedra, 2 for quadratic ones."""
+    refinements: int
+    """How often the size of the given mesh was halved."""
+    step_tolerance_k: float | None
+    """Error that the time steps are estimated to make, [K]; None for a steady state."""
+    num_nodes: int
+    """Number of unknowns."""
+    error: ErrorSize
+    """Estimated errors."""
+    seconds: float
+    """Time to solve it, [s]."""
 
     def describe(self) -> str:
         """Say it in a line."""
@@ -100,13 +110,20 @@ class Level:
 class ToleratedSolution:
     """A solution with what is known of its error."""
 
-    solution: SteadySolution | HeatSolution  # Temperatures and heat flows. Nodes of the given mesh come first
-    problem: HeatProblem  # What was solved: the given problem, or the same on a finer mesh
-    settings: Level  # Order, refinements and steps that were chosen, and the estimated errors
-    met: bool  # Whether the estimated errors are within the tolerance
-    status: str  # The outcome as a sentence, with the estimate and the seconds
-    seconds: float  # Time for all, [s]
-    levels: tuple[Level, ...]  # All solutions on the way, the last one is `settings`
+    solution: SteadySolution | HeatSolution
+    """Temperatures and heat flows. Nodes of the given mesh come first."""
+    problem: HeatProblem
+    """What was solved: the given problem, or the same on a finer mesh."""
+    settings: Level
+    """Order, refinements and steps that were chosen, and the estimated errors."""
+    met: bool
+    """Whether the estimated errors are within the tolerance."""
+    status: str
+    """The outcome as a sentence, with the estimate and the seconds."""
+    seconds: float
+    """Time for all, [s]."""
+    levels: tuple[Level, ...]
+    """All solutions on the way, the last one is `settings`."""
 
 
 def solve_to_tolerance(
@@ -123,9 +140,10 @@ def solve_to_tolerance(
 ) -> ToleratedSolution:
     """Solve a problem with order, mesh size and time steps whose estimated error is allowed.
 
-    A steady state is solved with linear and with quadratic tetrahedra on the given mesh. Their difference, and the
-    ratio between the recovered errors of their fluxes, tell the errors of both. If they are too large, quadratic
-    tetrahedra on meshes of half the size follow, again and again.
+    A steady state is solved with linear tetrahedra on the given mesh first, whose errors `p1_error` estimates from that
+    solution alone. If they are too large, quadratic ones follow: the difference of both, and the ratio between the
+    recovered errors of their fluxes, tell the errors of both. If these are too large still, quadratic tetrahedra on
+    meshes of half the size follow, again and again. What does not fit into the memory ends this with the best so far.
 
     In time tetrahedra stay linear, since the mass of quadratic ones cannot be lumped. Three solutions tell the errors
     of the mesh and of the steps: one on the given mesh, one with all steps halved, one on a mesh of half the size. From
@@ -192,6 +210,10 @@ class _Run:
         self._solved.append((level, problem, solution))
         self._log(level.describe())
 
+    def forget(self) -> None:
+        """Take back what is estimated better by now."""
+        self._solved.clear()
+
     def lacks_memory(self, order: int, refinements: int, times: int = 1) -> str:
         """Say what a solution on the given mesh with its size halved so often takes; return that it does not fit."""
         needed = peak_bytes(self.given, order=order, refinements=refinements, times=times, adaptive=times > 1)
@@ -243,10 +265,15 @@ def _solve_steady(run: _Run, time_s: float) -> str:
         return solution, time.perf_counter() - begin_s
 
     problem, refinements, apart_k = run.given, 0, 0.0
-    failure = run.lacks_memory(2, 0)
+    failure = run.lacks_memory(1, 0)
     if failure:
         return failure
     before, first_seconds = solve(problem, 1)
+    if before.error is not None:
+        run.add(problem, before, first_seconds, before.error, 0)
+    failure = "" if run.excess <= 1.0 else run.lacks_memory(2, 0)
+    if run.excess <= 1.0 or failure:
+        return failure
     before_w_k = recovered_error_w_k(problem, before)
     problem = replace(problem, initial_temperature_c=before.temperature_c)
     while True:
@@ -260,6 +287,7 @@ def _solve_steady(run: _Run, time_s: float) -> str:
         )
         if refinements == 0:
             both = ErrorSize(error.temperature_k + apart.temperature_k, error.heat_flow + apart.heat_flow)
+            run.forget()
             run.add(run.given, before, first_seconds, both, 0)
         run.add(problem, solution, seconds, error, refinements)
         if run.excess <= 1.0:
@@ -303,7 +331,9 @@ class _Refinable:
 def _solve_in_time(run: _Run, steps: AdaptiveSteps, progress: Callable[[float, int], None] | None) -> str:
     """Follow a body through time well enough; returns why that was not possible, or nothing.
 
-    The error of m halvings of the mesh and j of the steps is of_mesh * HALVED^m + of_steps * HALVED^j.
+    The error of m halvings of the mesh and j of the steps is of_mesh * left^m + of_steps * HALVED^j. There left is
+    HALVED, except for heat flows if a surface is suddenly held at a temperature: half an element around it has it at
+    once, heat that no flow accounts for and that halves with the size.
     """
     failure = run.lacks_memory(1, 1, steps.num_times)
     if failure:
@@ -313,10 +343,13 @@ def _solve_in_time(run: _Run, steps: AdaptiveSteps, progress: Callable[[float, i
     solved = {choice: body.solve(*choice) for choice in ((0, 0), (0, 1), (1, 0))}
     values = {choice: compared_values(solution, num_nodes) for choice, (solution, _) in solved.items()}
     first = values[0, 0]
-    of_steps, of_mesh = ((first - values[choice]) / (1.0 - HALVED) for choice in ((0, 1), (1, 0)))
+    left = np.full(len(first), HALVED)
+    if np.any(solved[0, 0][0].temperature_c[0] != run.given.start_c):
+        left[num_values:] = _SUDDENLY_HELD
+    of_steps, of_mesh = (first - values[0, 1]) / (1.0 - HALVED), (first - values[1, 0]) / (1.0 - left)
 
     def error(choice: tuple[int, int]) -> ErrorSize:
-        total = of_mesh * HALVED ** choice[0] + of_steps * HALVED ** choice[1]
+        total = of_mesh * left ** choice[0] + of_steps * HALVED ** choice[1]
         return error_size(total, solved[1, 0][0])
 
     def keep(choice: tuple[int, int]) -> None:
@@ -338,7 +371,7 @@ def _solve_in_time(run: _Run, steps: AdaptiveSteps, progress: Callable[[float, i
             return failure
         solved[choice] = body.solve(*choice)
         change = first - compared_values(solved[choice][0], num_nodes)
-        mesh_gain, steps_gain = 1.0 - HALVED ** choice[0], 1.0 - HALVED ** choice[1]
+        mesh_gain, steps_gain = 1.0 - left ** choice[0], 1.0 - HALVED ** choice[1]
         if choice[0] > 0:
             of_mesh = (change - of_steps * steps_gain) / mesh_gain
         else:

@@ -94,7 +94,9 @@ class Radiation(SurfaceEffect):
     bounds = {
         "emissivity": Bounds("emissivity", "1", 0.0, 1.0),
         "surroundings_c": Bounds("surroundings_c", "degrees Celsius", _ABSOLUTE_ZERO_C),
-        "stefan_boltzmann_w_m2k4": Bounds("stefan_boltzmann_w_m2k4", "W/(m2 K4)", 0.0, above_low=True, varies=False),
+        "stefan_boltzmann_w_m2k4": Bounds(
+            "stefan_boltzmann_w_m2k4", "W/(m2 K4)", 0.0, above_low=True, varies=False, remedy="Give 5.670374419e-8."
+        ),
     }
 
     def terms(self, selection: Selection) -> tuple[Term, ...]:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from thermoxels_ns.fem.probes import Probes, place_probes
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
-from thermoxels_ns.fem.solution import Solution, SolutionNodes, solution_nodes
+from thermoxels_ns.fem.solution import Solution, SolutionNodes, SteadySolution, solution_nodes
 from thermoxels_ns.heat.results import HeatResults, WallResult, heat_results, volume_shares, wall_of_scene
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import INSIDE, OUTSIDE
@@ -85,7 +85,9 @@ def run_scene(
     seconds = {"screen": found.screening.seconds, "solve": done - start - found.screening.seconds}
     say(f"Heat: {solution.status} ({seconds['solve']:.1f} s)")
     say(f"Energy balance closed to {solution.energy_residual:.1e}.")
-    if found.accuracy is not None and not found.accuracy.met:
+    if found.accuracy is None:
+        say(f"Error of the mesh: {mesh_error_in_words(solution)}.")
+    elif not found.accuracy.met:
         say("Warning: the tolerance was not met.")
 
     nodes = solution_nodes(solved, solution)
@@ -109,6 +111,14 @@ def run_scene(
         probes_c=probes.at_quadratic(solved.mesh, nodes.states_c) if nodes.quadratic else probes.at(nodes.states_c),
         seconds={**seconds, "answers": clock.perf_counter() - done},
     )
+
+
+def mesh_error_in_words(solution: Solution) -> str:
+    """Say what the mesh's error is without a tolerance, as far as the solution itself tells."""
+    error = solution.error if isinstance(solution, SteadySolution) else None
+    if error is None:
+        return "not estimated; --tolerance estimates it"
+    return f"estimated {error.describe()}, usually right to a factor of three"
 
 
 _COS_45 = float(np.sqrt(0.5))

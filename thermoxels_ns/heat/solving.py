@@ -33,10 +33,12 @@ SAY_FIRST_S = 1.0
 """Time of a first step from which on it is said, [s]: then the next ones will take some, too."""
 
 _BOUNDS = {
-    "tolerance_k": Bounds("tolerance", "K", 0.0, above_low=True),
-    "flow_tolerance": Bounds("flow-tolerance", "share of the heat flow", 0.0, np.nextafter(1.0, 0.0), above_low=True),
-    "leave_out_below_k": Bounds("leave-out-below-k", "K", 0.0),
-    "memory_gb": Bounds("memory-gb", "GiB", 0.0, above_low=True),
+    "tolerance_k": Bounds("tolerance", "K", 0.0, above_low=True, remedy="Pass --tolerance 0.05."),
+    "flow_tolerance": Bounds(
+        "flow-tolerance", "share of the heat flow", 0.0, 1.0, above_low=True, remedy="Pass --flow-tolerance 0.01."
+    ),
+    "leave_out_below_k": Bounds("leave-out-below-k", "K", 0.0, remedy="Pass --leave-out-below-k 0.01."),
+    "memory_gb": Bounds("memory-gb", "GiB", 0.0, above_low=True, remedy="Pass --memory-gb 4."),
 }
 
 

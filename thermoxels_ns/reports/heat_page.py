@@ -15,7 +15,7 @@ from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.heat.effects import Effect, FixedTemperature, InternalHeat
 from thermoxels_ns.heat.materials import materials_by_region
 from thermoxels_ns.heat.results import Spot
-from thermoxels_ns.heat.run import HeatRun
+from thermoxels_ns.heat.run import HeatRun, mesh_error_in_words
 from thermoxels_ns.heat.solving import Accuracy
 from thermoxels_ns.reports.heat_numbers import RoundOff, coordinate, degrees, figure, round_off_of, unit_signs
 from thermoxels_ns.reports.heat_pictures import in_words, plot_over_time
@@ -59,8 +59,10 @@ def _summary(run: HeatRun) -> str:
     kind = "quadratic tetrahedra" if run.nodes.quadratic else "tetrahedra"
     what = f"A body of {len(mesh.tets):,} {kind}"
     if run.scene.time is None:
-        return f"{what} in its steady state."
-    return f"{what}, followed for {in_words(float(run.scene.time.times_s[-1]))}."
+        what += " in its steady state."
+    else:
+        what += f", followed for {in_words(float(run.scene.time.times_s[-1]))}."
+    return what if run.accuracy else f"{what} Error of the mesh: {mesh_error_in_words(run.solution)}."
 
 
 def _figures(run: HeatRun) -> tuple[tuple[str, str], ...]:

@@ -1,0 +1,97 @@
+"""Errors of linear tetrahedra estimated from one solution, on bodies that no constant was chosen on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.support.heat_meshes import box_mesh
+from tests.support.shell_mesh import shell_mesh
+from thermoxels_ns.fem.error_estimate import difference_between
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.refine_mesh import refine_mesh
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.fem.tolerance import Tolerance, solve_to_tolerance
+from thermoxels_ns.heat.effects import Convection, FixedTemperature, InternalHeat, Radiation
+from thermoxels_ns.heat.materials import Material
+
+CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
+STEEL = Material("steel", 50.0, 7800.0, 450.0)
+INSIDE, OUTSIDE = Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, -10.0)
+
+
+def axis(end: float, parts: int) -> np.ndarray:
+    return np.linspace(0.0, end, parts + 1)
+
+
+def notched(*effects) -> HeatProblem:
+    keep = lambda p: (p[..., 0] > 0.5) | (p[..., 1] > 0.5)  # noqa: E731
+    return HeatProblem(box_mesh(axis(1.0, 8), axis(1.0, 8), axis(0.25, 2), keep=keep), CONCRETE, effects=effects)
+
+
+def bridge() -> HeatProblem:
+    """A steel plate through wool, 1000 times as conductive."""
+    regions = {"wool": lambda p: p[..., 0] > -1.0, "steel": lambda p: (p[..., 1] > 0.15) & (p[..., 1] < 0.25)}
+    mesh = box_mesh(axis(0.4, 16), axis(0.4, 16), axis(0.05, 2), regions=regions)
+    wool = Material("wool", 0.05, 30.0, 1000.0)
+    return HeatProblem(mesh, {"wool": wool, "steel": STEEL}, effects=(INSIDE, OUTSIDE))
+
+
+def plate() -> HeatProblem:
+    effects = FixedTemperature(("x0",), 50.0), Convection(("z0", "z1"), 8.0, 5.0), InternalHeat(("*",), 2e4)
+    return HeatProblem(box_mesh(axis(1.0, 16), axis(1.0, 16), [0.0, 0.01]), STEEL, effects=effects)
+
+
+def graded() -> HeatProblem:
+    steps = np.concatenate([[0.0], np.geomspace(0.01, 1.0, 10)])
+    effects = Convection(("x0",), 100.0, 100.0), Convection(("y0",), 25.0, 0.0)
+    return HeatProblem(box_mesh(steps, steps, [0.0, 0.05, 0.1]), CONCRETE, effects=effects)
+
+
+def fin() -> HeatProblem:
+    effects = FixedTemperature(("x0",), 80.0), Convection(("y0", "y1"), 60.0, 20.0)
+    mesh = box_mesh(axis(0.2, 10), axis(0.01, 2), [0.0, 0.01])
+    return HeatProblem(mesh, Material("aluminium", 200.0, 2700.0, 900.0), effects=effects)
+
+
+def stove() -> HeatProblem:
+    effects = (
+        FixedTemperature(("inside",), 300.0),
+        Radiation(("outside",), 0.9, 20.0),
+        Convection(("outside",), 5.0, 20.0),
+    )
+    return HeatProblem(shell_mesh(0.1, 0.3, 4, 3, eighth=True), CONCRETE, effects=effects)
+
+
+BODIES = {
+    "notch, given temperatures": lambda: notched(FixedTemperature(("x0",), 20.0), FixedTemperature(("y0",), 0.0)),
+    "notch, two airs": lambda: notched(Convection(("x1", "y1"), 25.0, -10.0), Convection(("other",), 8.0, 20.0)),
+    "conductivities 1000 apart": bridge,
+    "thin heated plate": plate,
+    "graded": graded,
+    "fin": fin,
+    "radiating sphere": stove,
+}
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_the_estimate_is_within_a_factor_of_three(name) -> None:
+    problem = BODIES[name]()
+    found, fine = solve_steady(problem), problem
+    for _ in range(1 if len(problem.mesh.tets) > 1500 else 2):
+        fine = replace(fine, mesh=refine_mesh(fine.mesh), initial_temperature_c=None)
+    exact = solve_steady(fine, order=2, relative_tolerance=1e-9)
+    true = difference_between(found, exact, len(problem.mesh.points_m))
+    assert found.error is not None
+    ratios = true.temperature_k / found.error.temperature_k, true.heat_flow / found.error.heat_flow
+    assert all(1 / 3 < ratio < 3 for ratio in ratios), ratios
+
+
+def test_linear_tetrahedra_that_will_do_need_no_room_for_quadratic_ones() -> None:
+    problem = fin()
+    found = solve_to_tolerance(problem, Tolerance(1.0), memory_bytes=2e5, log=lambda _: None)
+    assert found.met and [level.order for level in found.levels] == [1]
+    unmet = solve_to_tolerance(problem, Tolerance(1e-6), memory_bytes=2e5, allow_unmet=True, log=lambda _: None)
+    assert not unmet.met and unmet.settings.order == 1 and "P2 on the given mesh needs about" in unmet.status
