@@ -14,10 +14,8 @@ from thermoxels_ns.fem.system import HeatSystem
 
 Vector = npt.NDArray[np.float64]
 
-_SHARPENINGS = 3
-"""Corrections of the recovered gradient, which without them lags by half an element at surfaces."""
-_TOLERANCE = 1e-2
-"""Relative tolerance of the linear solver: a percent of an estimate."""
+_SHARPENINGS = 3  # Corrections of the recovered gradient, which without them lags by half an element at surfaces
+_TOLERANCE = 1e-2  # Relative tolerance of the linear solver: a percent of an estimate
 _EQUAL = 1e-9
 """Given temperatures that differ by less than this share of all differences are even: T does not curve between them."""
 _LEFT = 0.3

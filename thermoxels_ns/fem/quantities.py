@@ -17,12 +17,9 @@ from thermoxels_ns.core.errors import HeatError
 class Places:
     """Where a quantity is asked for: centroids of boundary triangles or of tetrahedra, or nodes."""
 
-    points_m: npt.NDArray[np.float64]
-    """Positions, shape (k, 3), [m]."""
-    normals: npt.NDArray[np.float64]
-    """Outward unit normals of the true surface, shape (k, 3); 0 inside the body."""
-    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Unit vector that points up."""
+    points_m: npt.NDArray[np.float64]  # Positions, shape (k, 3), [m]
+    normals: npt.NDArray[np.float64]  # Outward unit normals of the true surface, shape (k, 3); 0 inside the body
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Unit vector that points up
 
     def __len__(self) -> int:
         return len(self.points_m)
@@ -40,8 +37,7 @@ class Varying:
     function: Callable[[Places, float], npt.ArrayLike]
     """Takes the places and the time in seconds since the start; returns one number per place, shape (k,), or one for
     all."""
-    in_time: bool = True
-    """Whether the numbers change with time. False: they are asked for once, at the time 0."""
+    in_time: bool = True  # Whether the numbers change with time. False: they are asked for once, at the time 0
     resolution_s: float = math.inf
     """Numbers this far apart in time say how they change in between, above 0, [s]; steps that are chosen by their error
     are no longer. Infinite: nobody knows, and what happens between two such steps is missed."""
@@ -77,28 +73,20 @@ def tabulated(times_s: npt.ArrayLike, values: npt.ArrayLike) -> Varying:
     )
 
 
-Quantity: TypeAlias = float | Varying
-"""One number for all places and times, or a function."""
+Quantity: TypeAlias = float | Varying  # One number for all places and times, or a function
 
 
 @dataclass(frozen=True)
 class Bounds:
     """The values that a quantity may have, by its name and unit."""
 
-    name: str
-    """Name of the field, for messages."""
-    unit: str
-    """Its unit, for messages."""
-    low: float = -math.inf
-    """Smallest value."""
-    high: float = math.inf
-    """Largest value."""
-    above_low: bool = False
-    """Whether `low` itself is refused."""
-    varies: bool = True
-    """Whether it may be a `Varying`."""
-    remedy: str = ""
-    """What to do instead of a value that is refused; empty: an example in the unit."""
+    name: str  # Name of the field, for messages
+    unit: str  # Its unit, for messages
+    low: float = -math.inf  # Smallest value
+    high: float = math.inf  # Largest value
+    above_low: bool = False  # Whether `low` itself is refused
+    varies: bool = True  # Whether it may be a `Varying`
+    remedy: str = ""  # What to do instead of a value that is refused; empty: an example in the unit
 
     def check(self, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Return the values as an array if all are finite and in range, else raise `HeatError`."""
@@ -144,10 +132,8 @@ class Bounds:
 class Bounded:
     """A quantity with its range, ready to be asked."""
 
-    quantity: Quantity
-    """A number or a function."""
-    bounds: Bounds
-    """What it may be."""
+    quantity: Quantity  # A number or a function
+    bounds: Bounds  # What it may be
 
     @property
     def in_time(self) -> bool:

@@ -67,8 +67,7 @@ class EffectHeat:
 class ErrorSize:
     """Errors of a solution."""
 
-    temperature_k: float
-    """Largest error of the temperature at the nodes of the given mesh, [K]."""
+    temperature_k: float  # Largest error of the temperature at the nodes of the given mesh, [K]
     heat_flow: float
     """Largest error of the mean heat flow of an effect, as a share of all heat that flows through the body."""
 
@@ -151,8 +150,7 @@ def left_out(kinds: Sequence[str]) -> tuple[str, ...]:
 Solution: TypeAlias = HeatSolution | SteadySolution  # What either solver returns
 
 _CHILD_FACETS = 4
-_EQUAL = 1e-9
-"""Temperatures that differ by less than this share of the absolute temperature are equal."""
+_EQUAL = 1e-9  # Temperatures that differ by less than this share of the absolute temperature are equal
 
 
 def mean_flows_w(solution: Solution) -> dict[str, float]:

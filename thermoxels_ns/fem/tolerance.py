@@ -33,10 +33,8 @@ _STEADY_TOLERANCE, _STEP_TOLERANCE = 1e-8, 1e-10
 _STEPS_OVER_ERROR = 6.0
 """Tolerance of the first, adaptive steps over the allowed error: steps that are controlled to 1 K make an error of 0.03
 to 0.07 K in all, because conduction forgets."""
-_AIM = 0.95
-"""Share of the allowed error that a solution is chosen to make."""
-_MOST_HALVINGS = 8
-"""Halvings of the mesh size or of the steps beyond which nothing is tried."""
+_AIM = 0.95  # Share of the allowed error that a solution is chosen to make
+_MOST_HALVINGS = 8  # Halvings of the mesh size or of the steps beyond which nothing is tried
 _SUDDENLY_HELD = 0.5
 """Share of a flow's error that is left after the mesh size is halved where a surface is suddenly held."""
 _MESH_COST, _STEP_COST = 10.0, 2.0
@@ -83,18 +81,12 @@ class Tolerance:
 class Level:
     """A solution on the way."""
 
-    order: int
-    """1 for linear tetrahedra, 2 for quadratic ones."""
-    refinements: int
-    """How often the size of the given mesh was halved."""
-    step_tolerance_k: float | None
-    """Error that the time steps are estimated to make, [K]; None for a steady state."""
-    num_nodes: int
-    """Number of unknowns."""
-    error: ErrorSize
-    """Estimated errors."""
-    seconds: float
-    """Time to solve it, [s]."""
+    order: int  # 1 for linear tetrahedra, 2 for quadratic ones
+    refinements: int  # How often the size of the given mesh was halved
+    step_tolerance_k: float | None  # Error that the time steps are estimated to make, [K]; None for a steady state
+    num_nodes: int  # Number of unknowns
+    error: ErrorSize  # Estimated errors
+    seconds: float  # Time to solve it, [s]
 
     def describe(self) -> str:
         """Say it in a line."""
@@ -110,20 +102,13 @@ class Level:
 class ToleratedSolution:
     """A solution with what is known of its error."""
 
-    solution: SteadySolution | HeatSolution
-    """Temperatures and heat flows. Nodes of the given mesh come first."""
-    problem: HeatProblem
-    """What was solved: the given problem, or the same on a finer mesh."""
-    settings: Level
-    """Order, refinements and steps that were chosen, and the estimated errors."""
-    met: bool
-    """Whether the estimated errors are within the tolerance."""
-    status: str
-    """The outcome as a sentence, with the estimate and the seconds."""
-    seconds: float
-    """Time for all, [s]."""
-    levels: tuple[Level, ...]
-    """All solutions on the way, the last one is `settings`."""
+    solution: SteadySolution | HeatSolution  # Temperatures and heat flows. Nodes of the given mesh come first
+    problem: HeatProblem  # What was solved: the given problem, or the same on a finer mesh
+    settings: Level  # Order, refinements and steps that were chosen, and the estimated errors
+    met: bool  # Whether the estimated errors are within the tolerance
+    status: str  # The outcome as a sentence, with the estimate and the seconds
+    seconds: float  # Time for all, [s]
+    levels: tuple[Level, ...]  # All solutions on the way, the last one is `settings`
 
 
 def solve_to_tolerance(
