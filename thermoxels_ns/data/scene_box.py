@@ -18,8 +18,7 @@ from thermoxels_ns.data.transforms_json import DAMAGED_PHOTOGRAPH, read_pose
 from thermoxels_ns.radiometry.decoders import errors_name
 
 FloatArray = npt.NDArray[np.float64]
-Box = FloatArray
-"""Lowest and highest corner, shape (2, 3)."""
+Box = FloatArray  # Lowest and highest corner, shape (2, 3)
 
 _REMEDY = "Pass --scene-box with two corners in the coordinates of the input poses: xmin ymin zmin xmax ymax zmax."
 _TAIL_OF_POINTS, _TAIL_OF_DEPTHS = 0.5, 0.1
@@ -27,25 +26,19 @@ _TAIL_OF_POINTS, _TAIL_OF_DEPTHS = 0.5, 0.1
 _MARGIN = 0.08
 _ROUNDED = 2.0**-8
 _MOST_POINTS = 20_000
-_MOST_PHOTOGRAPHS = 64
-"""Photographs in which points are looked at."""
+_MOST_PHOTOGRAPHS = 64  # Photographs in which points are looked at
 _STEREO_PHOTOGRAPHS, _STEREO_SIDE = 32, 96
 """Photographs whose depths are compared, and pixels along their longer side: some seconds."""
-_FEWEST_VIEWS = 2
-"""Other photographs that a depth must agree with: within a room hardly a place is in view of more."""
+_FEWEST_VIEWS = 2  # Other photographs that a depth must agree with: within a room hardly a place is in view of more
 _FEWEST_POINTS = 10
 _FEWEST_DEPTHS = 200
 _LEAST_SHOWN, _MOST_WITHOUT = 0.15, 0.1
 """What is close up fills this share of a photograph's points, except in this share of the photographs."""
-_WORTH_LEAVING_OUT = 1.5
-"""Points per length that a box without the distant points must gain."""
+_WORTH_LEAVING_OUT = 1.5  # Points per length that a box without the distant points must gain
 _NEARLY_BEST = 0.9
-_FEW_IN_VIEW = 0.05
-"""Points in view relative to the most that one has, below which a photograph tells nothing."""
-_MOST_WITHIN = 0.1
-"""Share of the cameras that may stand within the box for it to be something looked at from outside."""
-_CONVERGING = 0.5
-"""Distance to where cameras look, relative to their spread, below which they look outwards."""
+_FEW_IN_VIEW = 0.05  # Points in view relative to the most that one has, below which a photograph tells nothing
+_MOST_WITHIN = 0.1  # Share of the cameras that may stand within the box for it to be something looked at from outside
+_CONVERGING = 0.5  # Distance to where cameras look, relative to their spread, below which they look outwards
 # The axes that ns-process-data swapped in old versions, before it wrote applied_transform into the json.
 _LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
 
@@ -54,8 +47,7 @@ _LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 
 class BoxEvidence:
     """What says where the scene's box is, in input coordinates: the box itself, else points, else the cameras."""
 
-    source: str
-    """Where it comes from, in words."""
+    source: str  # Where it comes from, in words
     frames: Sequence[Frame]
     corners: Box | None = None
     points: FloatArray | None = None

@@ -9,8 +9,7 @@ from thermoxels_ns.fem.quantities import Bounded, Bounds, Quantity
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.terms import ConvectionTerm, Effect, FixedTerm, FluxTerm, RadiationTerm, SourceTerm, Term
 
-STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8
-"""Stefan-Boltzmann constant (CODATA 2018), [W / (m2 K4)]."""
+STEFAN_BOLTZMANN_W_M2K4 = 5.670374419e-8  # Stefan-Boltzmann constant (CODATA 2018), [W / (m2 K4)]
 
 _ABSOLUTE_ZERO_C = -ZERO_CELSIUS_K
 
@@ -24,16 +23,14 @@ class SurfaceEffect(Effect):
     temperatures: at nodes).
     """
 
-    patches: tuple[str, ...]
-    """Names of boundary patches, or patterns such as exterior-*; * is the whole boundary."""
+    patches: tuple[str, ...]  # Names of boundary patches, or patterns such as exterior-*; * is the whole boundary
 
 
 @dataclass(frozen=True)
 class FixedTemperature(SurfaceEffect):
     """A surface kept at a temperature."""
 
-    temperature_c: Quantity
-    """Temperature of the surface, [degrees Celsius], at least -273.15. Asked at the nodes."""
+    temperature_c: Quantity  # Temperature of the surface, [degrees Celsius], at least -273.15. Asked at the nodes
 
     kind = "fixed temperature"
     bounds = {"temperature_c": Bounds("temperature_c", "degrees Celsius", _ABSOLUTE_ZERO_C)}
@@ -47,8 +44,7 @@ class FixedTemperature(SurfaceEffect):
 class HeatFlux(SurfaceEffect):
     """A given heat flux through a surface."""
 
-    flux_w_m2: Quantity
-    """Heat flux, [W / m2], positive into the body."""
+    flux_w_m2: Quantity  # Heat flux, [W / m2], positive into the body
 
     kind = "heat flux"
     bounds = {"flux_w_m2": Bounds("flux_w_m2", "W/m2")}
@@ -62,10 +58,8 @@ class HeatFlux(SurfaceEffect):
 class Convection(SurfaceEffect):
     """Heat exchange with air (Newton's law of cooling)."""
 
-    coefficient_w_m2k: Quantity
-    """Surface heat transfer coefficient h, [W / (m2 K)], at least 0."""
-    air_c: Quantity
-    """Temperature of the air, [degrees Celsius], at least -273.15."""
+    coefficient_w_m2k: Quantity  # Surface heat transfer coefficient h, [W / (m2 K)], at least 0
+    air_c: Quantity  # Temperature of the air, [degrees Celsius], at least -273.15
 
     kind = "convection"
     bounds = {
@@ -85,8 +79,7 @@ class Radiation(SurfaceEffect):
 
     emissivity: Quantity
     """Emissivity of the surface, times the view factor of the surroundings if they do not fill its view; 0 to 1."""
-    surroundings_c: Quantity
-    """Radiant temperature of the surroundings, [degrees Celsius], at least -273.15."""
+    surroundings_c: Quantity  # Radiant temperature of the surroundings, [degrees Celsius], at least -273.15
     stefan_boltzmann_w_m2k4: float = STEFAN_BOLTZMANN_W_M2K4
     """Stefan-Boltzmann constant, [W / (m2 K4)]; the default is CODATA 2018's. Published benchmarks use 5.67e-8."""
 
@@ -109,10 +102,8 @@ class Radiation(SurfaceEffect):
 class AbsorbedSolar(SurfaceEffect):
     """Sunlight that a surface takes up."""
 
-    absorptivity: Quantity
-    """Share of the sunlight that the surface absorbs, 0 to 1."""
-    irradiance_w_m2: Quantity
-    """Sunlight that falls on the surface, [W / m2] of the surface itself, at least 0."""
+    absorptivity: Quantity  # Share of the sunlight that the surface absorbs, 0 to 1
+    irradiance_w_m2: Quantity  # Sunlight that falls on the surface, [W / m2] of the surface itself, at least 0
 
     kind = "absorbed solar"
     bounds = {
@@ -130,10 +121,8 @@ class AbsorbedSolar(SurfaceEffect):
 class GroundContact(SurfaceEffect):
     """Heat exchange with the ground through a thermal resistance."""
 
-    resistance_m2k_w: float
-    """Thermal resistance between the surface and the undisturbed ground, [m2 K / W], above 0."""
-    ground_c: Quantity
-    """Temperature of the undisturbed ground, [degrees Celsius], at least -273.15."""
+    resistance_m2k_w: float  # Thermal resistance between the surface and the undisturbed ground, [m2 K / W], above 0
+    ground_c: Quantity  # Temperature of the undisturbed ground, [degrees Celsius], at least -273.15
 
     kind = "ground contact"
     bounds = {
@@ -153,10 +142,8 @@ class GroundContact(SurfaceEffect):
 class InternalHeat(Effect):
     """Heat set free inside the body."""
 
-    regions: tuple[str, ...]
-    """Names of regions, or patterns; * is the whole body."""
-    source_w_m3: Quantity
-    """Heat source, [W / m3]; negative takes heat out."""
+    regions: tuple[str, ...]  # Names of regions, or patterns; * is the whole body
+    source_w_m3: Quantity  # Heat source, [W / m3]; negative takes heat out
 
     kind = "internal heat"
     bounds = {"source_w_m3": Bounds("source_w_m3", "W/m3")}

@@ -26,12 +26,9 @@ class Material:
     """
 
     name: str
-    conductivity_w_mk: float
-    """Thermal conductivity, [W / (m K)], above 0."""
-    density_kg_m3: float
-    """Mass density, [kg / m3], above 0."""
-    specific_heat_j_kgk: float
-    """Specific heat capacity, [J / (kg K)], above 0."""
+    conductivity_w_mk: float  # Thermal conductivity, [W / (m K)], above 0
+    density_kg_m3: float  # Mass density, [kg / m3], above 0
+    specific_heat_j_kgk: float  # Specific heat capacity, [J / (kg K)], above 0
 
     def __post_init__(self) -> None:
         if not (isinstance(self.name, str) and self.name.strip()):

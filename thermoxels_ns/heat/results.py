@@ -40,10 +40,8 @@ class Spot:
 
     temperature_c: float
     point_m: tuple[float, float, float]
-    time_s: float
-    """When, [s]; 0 in a steady state."""
-    node: int
-    """Its number in the mesh, from 0."""
+    time_s: float  # When, [s]; 0 in a steady state
+    node: int  # Its number in the mesh, from 0
     patches: tuple[str, ...]
 
 
@@ -55,8 +53,7 @@ class PatchResult:
     area_m2: float
     heat_w: float
     heat_w_m2: float
-    last_heat_w: float
-    """Mean heat flow into the body during the last interval, [W]."""
+    last_heat_w: float  # Mean heat flow into the body during the last interval, [W]
     mean_c: float
     coldest: Spot
     hottest: Spot
@@ -70,10 +67,8 @@ class EffectResult:
     heat_w: float
     area_m2: float | None
     heat_w_m2: float | None
-    last_heat_w: float
-    """Mean heat flow into the body during the last interval, [W]."""
-    groups: dict[str, float]
-    """Mean heat flow over all times by patch, of a source by region, [W]."""
+    last_heat_w: float  # Mean heat flow into the body during the last interval, [W]
+    groups: dict[str, float]  # Mean heat flow over all times by patch, of a source by region, [W]
 
 
 @dataclass(frozen=True)
@@ -83,10 +78,8 @@ class RegionResult:
     region: str
     material: str
     volume_m3: float
-    area_m2: float
-    """True area of its own surface, [m2]; where it touches other regions does not count."""
-    heat_w: float
-    """Heat flow into the body through its own surface at the end, [W]; negative where heat is lost."""
+    area_m2: float  # True area of its own surface, [m2]; where it touches other regions does not count
+    heat_w: float  # Heat flow into the body through its own surface at the end, [W]; negative where heat is lost
     heat_w_m2: float
     mean_c: float
     min_c: float
@@ -97,14 +90,11 @@ class RegionResult:
 class EnergyBalance:
     """Stored = in - out."""
 
-    unit: str
-    """J through time, W in a steady state."""
+    unit: str  # J through time, W in a steady state
     into_body: float
     out_of_body: float
-    stored: float
-    """Change of the body's heat content; 0 in a steady state."""
-    residual: float
-    """Stored - in + out: what nothing accounts for."""
+    stored: float  # Change of the body's heat content; 0 in a steady state
+    residual: float  # Stored - in + out: what nothing accounts for
     relative_residual: float
     """The solver's own measure of it: its largest size relative to the heat content or to all heat exchanged."""
 
@@ -114,8 +104,7 @@ class HeatResults:
     """What people ask of a solution. Heat flows are positive into the body; spots are those of all nodes and times."""
 
     status: str
-    times_s: tuple[float, ...]
-    """Times of the kept temperatures, [s]; 0 alone for a steady state."""
+    times_s: tuple[float, ...]  # Times of the kept temperatures, [s]; 0 alone for a steady state
     patches: tuple[PatchResult, ...]
     effects: tuple[EffectResult, ...]
     regions: tuple[RegionResult, ...]
@@ -287,10 +276,8 @@ class WallPart:
 
     name: str
     area_m2: float
-    heat_w: float
-    """Heat flow into it from the inside, [W]."""
-    u_value_w_m2k: float
-    """Heat flow per area and difference of the airs, [W / (m2 K)]."""
+    heat_w: float  # Heat flow into it from the inside, [W]
+    u_value_w_m2k: float  # Heat flow per area and difference of the airs, [W / (m2 K)]
 
 
 @dataclass(frozen=True)
@@ -301,8 +288,7 @@ class WallResult:
     outside_c: float
     area_m2: float
     heat_w: float
-    coupling_w_k: float
-    """Thermal coupling coefficient, heat flow per difference of the airs (ISO 10211: L_3D), [W / K]."""
+    coupling_w_k: float  # Thermal coupling coefficient, heat flow per difference of the airs (ISO 10211: L_3D), [W / K]
     u_value_w_m2k: float
     """The same per area of the inner surface, [W / (m2 K)]. For a plane wall this is its U-value (ISO 6946); at corners
     and thermal bridges it is a mean that depends on which surface is measured."""

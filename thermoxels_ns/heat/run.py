@@ -31,29 +31,21 @@ class HeatRun:
     """All that a run found out; warnings are what looks wrong about the scene on this mesh, a sentence or two each."""
 
     scene: HeatScene
-    problem: HeatProblem
-    """The problem with all that the scene names, on the given mesh."""
-    solved: HeatProblem
-    """What was solved: without what is left out, and, if a tolerance asked for it, on a finer mesh."""
-    nodes: SolutionNodes
-    """All temperatures of the solution on a mesh that has a node for each."""
+    problem: HeatProblem  # The problem with all that the scene names, on the given mesh
+    solved: HeatProblem  # What was solved: without what is left out, and, if a tolerance asked for it, on a finer mesh
+    nodes: SolutionNodes  # All temperatures of the solution on a mesh that has a node for each
     screening: Screening
-    accuracy: Accuracy | None
-    """What is known of the error; None if no tolerance was given."""
+    accuracy: Accuracy | None  # What is known of the error; None if no tolerance was given
     warnings: tuple[str, ...]
     solution: Solution
     results: HeatResults
     wall: WallResult | None
     """The body as a wall, if its steady state between two airs was asked for and nothing else acts."""
-    no_wall: str
-    """Why there is no wall although there are two airs, a sentence; else empty."""
-    mean_c: Vector
-    """Mean temperature of the volume at each time, shape (s,), [degrees Celsius]."""
+    no_wall: str  # Why there is no wall although there are two airs, a sentence; else empty
+    mean_c: Vector  # Mean temperature of the volume at each time, shape (s,), [degrees Celsius]
     probes: Probes
-    probes_c: Vector
-    """Temperatures there, shape (s, p), [degrees Celsius]."""
-    seconds: Mapping[str, float]
-    """Time that each part took, [s]."""
+    probes_c: Vector  # Temperatures there, shape (s, p), [degrees Celsius]
+    seconds: Mapping[str, float]  # Time that each part took, [s]
 
 
 def run_scene(

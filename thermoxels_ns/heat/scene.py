@@ -55,38 +55,23 @@ class HeatScene:
     """How the body is followed through time; None: its steady state is asked for."""
     initial_c: float | None = None
     """Temperature of the whole body at the start, [degrees Celsius]; None: that of the photographs."""
-    up: Vector | None = None
-    """Direction that points up in the coordinates of the mesh; None: as the mesh says."""
-    inside_air: InsideAir | None = None
-    """The air of a room."""
-    outside_air: OutsideAir | None = None
-    """The open air and its wind."""
-    surfaces: tuple[Surface, ...] = ()
-    """How surfaces radiate to sky and ground and absorb sunlight; later entries hold."""
-    sky: Sky | None = None
-    """The sky that surfaces radiate to."""
-    ground: Ground | None = None
-    """The ground that surfaces see."""
-    sun: Sun | None = None
-    """The sun."""
-    fixed_temperature: tuple[FixedTemperature, ...] = ()
-    """Surfaces kept at a temperature."""
-    heat_flux: tuple[HeatFlux, ...] = ()
-    """Given heat fluxes, positive into the body."""
-    convection: tuple[Convection, ...] = ()
-    """Further air, such as a second room, with given coefficients."""
-    radiation: tuple[Radiation, ...] = ()
-    """Long-wave exchange with surroundings of one temperature."""
-    absorbed_solar: tuple[AbsorbedSolar, ...] = ()
-    """Sunlight that falls on surfaces alike, wherever they face."""
-    ground_contact: tuple[GroundContact, ...] = ()
-    """Surfaces that touch the ground."""
-    internal_heat: tuple[InternalHeat, ...] = ()
-    """Heat set free inside."""
+    up: Vector | None = None  # Direction that points up in the coordinates of the mesh; None: as the mesh says
+    inside_air: InsideAir | None = None  # The air of a room
+    outside_air: OutsideAir | None = None  # The open air and its wind
+    surfaces: tuple[Surface, ...] = ()  # How surfaces radiate to sky and ground and absorb sunlight; later entries hold
+    sky: Sky | None = None  # The sky that surfaces radiate to
+    ground: Ground | None = None  # The ground that surfaces see
+    sun: Sun | None = None  # The sun
+    fixed_temperature: tuple[FixedTemperature, ...] = ()  # Surfaces kept at a temperature
+    heat_flux: tuple[HeatFlux, ...] = ()  # Given heat fluxes, positive into the body
+    convection: tuple[Convection, ...] = ()  # Further air, such as a second room, with given coefficients
+    radiation: tuple[Radiation, ...] = ()  # Long-wave exchange with surroundings of one temperature
+    absorbed_solar: tuple[AbsorbedSolar, ...] = ()  # Sunlight that falls on surfaces alike, wherever they face
+    ground_contact: tuple[GroundContact, ...] = ()  # Surfaces that touch the ground
+    internal_heat: tuple[InternalHeat, ...] = ()  # Heat set free inside
     adiabatic: tuple[str, ...] = ("cut",)
     """Patches that no heat crosses, by name or pattern. Every patch is named here or has something act on it."""
-    description: str = ""
-    """What the scene is, for reports."""
+    description: str = ""  # What the scene is, for reports
 
     def __post_init__(self) -> None:
         if not self.materials:

@@ -18,8 +18,7 @@ from thermoxels_ns.fem.quantities import Bounds, Places, Quantity, Varying
 from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4, Convection
 from thermoxels_ns.heat.sky import Vector
 
-HeatDirection: TypeAlias = Literal["up", "horizontal", "down"]
-"""Where heat flows to."""
+HeatDirection: TypeAlias = Literal["up", "horizontal", "down"]  # Where heat flows to
 HeatFlow: TypeAlias = Literal["into-body", "out-of-body"]
 """Into the body: the air is warmer than the surface, as in a heated room; out of it: the air is colder."""
 InsideCoefficient = Literal["iso-6946-combined", "iso-6946-separate", "iso-6946-convection"]
@@ -91,13 +90,10 @@ def radiative_coefficient(mean_c: float, emissivity: float) -> float:
     return 4.0 * emissivity * STEFAN_BOLTZMANN_W_M2K4 * celsius_to_kelvin(mean_c) ** 3
 
 
-OUTSIDE = ("exterior-*",)
-"""Patches that what is outside acts on, unless others are named."""
-INSIDE = ("interior-*",)
-"""Patches that the air inside acts on, unless others are named."""
+OUTSIDE = ("exterior-*",)  # Patches that what is outside acts on, unless others are named
+INSIDE = ("interior-*",)  # Patches that the air inside acts on, unless others are named
 
-WITH_RADIATION = ("iso-6946-combined", "iso-6946-separate")
-"""Coefficients that hold radiation as well."""
+WITH_RADIATION = ("iso-6946-combined", "iso-6946-separate")  # Coefficients that hold radiation as well
 
 _RANGES: dict[str, Bounds] = {
     "emissivity": Bounds("emissivity", "1", 0.0, 1.0),
@@ -156,21 +152,17 @@ class Section:
 class InsideAir(Section):
     """The air of a room."""
 
-    air_c: float
-    """Temperature of the air, [degrees Celsius], at least -273.15."""
+    air_c: float  # Temperature of the air, [degrees Celsius], at least -273.15
     coefficient: InsideCoefficient | None = None
     """Heat transfer coefficient by the orientation of each surface, after ISO 6946: iso-6946-combined (1 / Rsi,
     convection and radiation together), iso-6946-separate (hci + 4 eps sigma T^3 at the temperature of the air), or
     iso-6946-convection (hci alone, for scenes that name radiation themselves)."""
-    coefficient_w_m2k: float | None = None
-    """The coefficient itself, [W / (m2 K)], instead of a named one."""
-    emissivity: float | None = None
-    """Emissivity of the surfaces, 0 to 1, for iso-6946-separate and for nothing else."""
+    coefficient_w_m2k: float | None = None  # The coefficient itself, [W / (m2 K)], instead of a named one
+    emissivity: float | None = None  # Emissivity of the surfaces, 0 to 1, for iso-6946-separate and for nothing else
     heat_flow: HeatFlow = "into-body"
     """into-body: the air is warmer than the surfaces, as in a heated room, and loses most to the ceiling; out-of-body:
     it is colder. Named coefficients depend on it."""
-    patches: tuple[str, ...] = INSIDE
-    """Patches that it acts on, by name or pattern."""
+    patches: tuple[str, ...] = INSIDE  # Patches that it acts on, by name or pattern
 
     def _check(self) -> None:
         _check_coefficient(self.coefficient, self.coefficient_w_m2k, self.emissivity)
@@ -188,20 +180,16 @@ class InsideAir(Section):
 class OutsideAir(Section):
     """The open air."""
 
-    air_c: float
-    """Temperature of the air, [degrees Celsius], at least -273.15."""
+    air_c: float  # Temperature of the air, [degrees Celsius], at least -273.15
     coefficient: OutsideCoefficient | None = None
     """Heat transfer coefficient: iso-6946-combined (1 / Rse = 25, convection and radiation together), iso-6946-separate
     (4 + 4 v, and 4 eps sigma T^3 at the temperature of the air), iso-6946-convection (4 + 4 v alone, for scenes that
     name radiation themselves), or thermoxels-original (18.6 v^0.605, convection alone)."""
-    coefficient_w_m2k: float | None = None
-    """The coefficient itself, [W / (m2 K)], instead of a named one."""
+    coefficient_w_m2k: float | None = None  # The coefficient itself, [W / (m2 K)], instead of a named one
     wind_m_s: float | None = None
     """Wind speed beside the surfaces, [m / s], for the coefficients that depend on it and for no other."""
-    emissivity: float | None = None
-    """Emissivity of the surfaces, 0 to 1, for iso-6946-separate and for nothing else."""
-    patches: tuple[str, ...] = OUTSIDE
-    """Patches that it acts on, by name or pattern."""
+    emissivity: float | None = None  # Emissivity of the surfaces, 0 to 1, for iso-6946-separate and for nothing else
+    patches: tuple[str, ...] = OUTSIDE  # Patches that it acts on, by name or pattern
 
     def _check(self) -> None:
         _check_coefficient(self.coefficient, self.coefficient_w_m2k, self.emissivity)
@@ -224,8 +212,7 @@ class Surface(Section):
 
     emissivity: float | None = None
     """Emissivity for long-wave radiation, 0 to 1; without it they do not radiate to sky and ground."""
-    absorptivity: float | None = None
-    """Share of the sunlight that they absorb, 0 to 1; without it they take up none."""
+    absorptivity: float | None = None  # Share of the sunlight that they absorb, 0 to 1; without it they take up none
     patches: tuple[str, ...] = OUTSIDE
     """Patches, by name or pattern; of several entries for one patch, the later one holds."""
 
@@ -238,10 +225,8 @@ class Surface(Section):
 class Sky(Section):
     """The sky that surfaces radiate to. One of the three ways to give its temperature is needed."""
 
-    temperature_c: float | None = None
-    """Its effective temperature, [degrees Celsius], at least -273.15."""
-    model: Literal["swinbank"] | None = None
-    """swinbank: a clear sky, 0.0552 T^1.5 of the outside air in kelvin."""
+    temperature_c: float | None = None  # Its effective temperature, [degrees Celsius], at least -273.15
+    model: Literal["swinbank"] | None = None  # swinbank: a clear sky, 0.0552 T^1.5 of the outside air in kelvin
     below_air_k: float | None = None
     """How much colder it is than the outside air, [K]; 6 is common for skies with some clouds (Whillier 1967)."""
 
@@ -277,12 +262,10 @@ class Sun(Section):
 
     start: datetime | None = None
     """Date and time of the scene's start, with a time zone, such as 2025-06-21T12:00:00+02:00; the sun moves on."""
-    latitude_deg: float | None = None
-    """Latitude of the place, north positive, [degrees], -90 to 90; goes with `start`."""
+    latitude_deg: float | None = None  # Latitude of the place, north positive, [degrees], -90 to 90; goes with `start`
     longitude_deg: float | None = None
     """Longitude of the place, east positive, [degrees], -180 to 180; goes with `start`."""
-    north: Vector | None = None
-    """Direction that points north in the coordinates of the mesh; goes with `start`."""
+    north: Vector | None = None  # Direction that points north in the coordinates of the mesh; goes with `start`
     towards: Vector | None = None
     """Direction from the mesh to the sun in the coordinates of the mesh, instead of date and place."""
     clear_sky: Literal["meinel"] | None = None
@@ -291,8 +274,7 @@ class Sun(Section):
     """Direct light on a surface that faces the sun, [W / m2], at least 0, as long as the sun is up."""
     diffuse_w_m2: float = 0.0
     """Light from the sky on a surface that faces up, [W / m2], at least 0, as long as the sun is up."""
-    patches: tuple[str, ...] = OUTSIDE
-    """Patches that it may reach, by name or pattern."""
+    patches: tuple[str, ...] = OUTSIDE  # Patches that it may reach, by name or pattern
 
     def _check(self) -> None:
         _check_one(start=self.start, towards=self.towards)

@@ -24,8 +24,7 @@ from thermoxels_ns.fem.terms import ConvectionTerm, FixedTerm, FluxTerm, SourceT
 
 Vector = npt.NDArray[np.float64]
 
-MOST_TIMES = 241
-"""Most times at which quantities that change are asked for."""
+MOST_TIMES = 241  # Most times at which quantities that change are asked for
 
 
 @dataclass(frozen=True)
@@ -49,8 +48,7 @@ class _SurfaceExchange:
     """Strength times a difference of temperatures (`power` 1, convection) or their fourth powers; nodes (k, 3)."""
 
     nodes: npt.NDArray[np.int64]
-    strength: Span
-    """Coefficient times area, [W / K]; of radiation sigma eps times area, [W / K^4]."""
+    strength: Span  # Coefficient times area, [W / K]; of radiation sigma eps times area, [W / K^4]
     surroundings_c: Span
     power: int
 
@@ -193,8 +191,7 @@ class LeftOut:
     """An effect that is not built, and which bound says so."""
 
     effect: str
-    bound_k: float
-    """Largest difference that it could make to any temperature at any time, [K]."""
+    bound_k: float  # Largest difference that it could make to any temperature at any time, [K]
     bound_w: float
     """Largest heat flow that it could bring, [W]. Averaged since the start, no other effect's changes by more."""
     reason: str
@@ -217,8 +214,7 @@ class Screening:
     problem: HeatProblem
     kept: tuple[Kept, ...]
     left_out: tuple[LeftOut, ...]
-    tolerance_k: float
-    """Their bounds add up to no more than this, [K]."""
+    tolerance_k: float  # Their bounds add up to no more than this, [K]
     note: str
     seconds: float
 

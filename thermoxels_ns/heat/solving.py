@@ -20,17 +20,13 @@ from thermoxels_ns.fem.tolerance import Tolerance, ToleratedSolution, solve_to_t
 from thermoxels_ns.heat.screening import Screening, screen
 
 Say = Callable[[str], None]
-Time = TimeSteps | AdaptiveSteps | None
-"""How a body is followed; None: its steady state."""
+Time = TimeSteps | AdaptiveSteps | None  # How a body is followed; None: its steady state
 
 LEFT_OUT_SHARE = 0.2
 """Share of the tolerance that effects which are left out may use together; the solver gets what they do not use."""
-LEAVE_OUT_BELOW_K = 0.01
-"""The same without a tolerance, [K]: a fifth of the default tolerance of the time steps."""
-SAY_EVERY_S = 10.0
-"""Time between two lines of progress, [s]."""
-SAY_FIRST_S = 1.0
-"""Time of a first step from which on it is said, [s]: then the next ones will take some, too."""
+LEAVE_OUT_BELOW_K = 0.01  # The same without a tolerance, [K]: a fifth of the default tolerance of the time steps
+SAY_EVERY_S = 10.0  # Time between two lines of progress, [s]
+SAY_FIRST_S = 1.0  # Time of a first step from which on it is said, [s]: then the next ones will take some, too
 
 _BOUNDS = {
     "tolerance_k": Bounds("tolerance", "K", 0.0, above_low=True, remedy="Pass --tolerance 0.05."),
@@ -46,16 +42,13 @@ _BOUNDS = {
 class Goals:
     """How exact a solution must be, and what it may take; raises `HeatError` if a number is out of range."""
 
-    tolerance_k: float | None = None
-    """Largest error of any temperature, [K]; None: any."""
+    tolerance_k: float | None = None  # Largest error of any temperature, [K]; None: any
     flow_tolerance: float | None = None
     """Largest error of the mean heat flow of any effect, as a share of all heat; None: any."""
     leave_out_below_k: float | None = None
     """Effects that together can change no temperature by more than this are left out, [K]; None: `left_out_k`."""
-    memory_gb: float | None = 4.0
-    """Most memory that solving may take, [GiB]; None: any."""
-    allow_unmet: bool = False
-    """Whether the best that fits into the memory will do if a tolerance cannot be met."""
+    memory_gb: float | None = 4.0  # Most memory that solving may take, [GiB]; None: any
+    allow_unmet: bool = False  # Whether the best that fits into the memory will do if a tolerance cannot be met
 
     def __post_init__(self) -> None:
         for name, bounds in _BOUNDS.items():
@@ -92,23 +85,16 @@ class Goals:
 class Accuracy:
     """What is known of the error, and how the tolerance was met."""
 
-    tolerance_k: float | None
-    """Error of any temperature that was allowed, [K]; None: any."""
+    tolerance_k: float | None  # Error of any temperature that was allowed, [K]; None: any
     flow_tolerance: float | None
     """Error of the mean heat flow of any effect that was allowed, as a share of all heat; None: any."""
     met: bool
-    estimated_k: float
-    """Estimated largest error of a temperature, what is left out included, [K]."""
-    estimated_flow: float
-    """Estimated largest error of a heat flow as a share of all heat."""
-    left_out_k: float
-    """What of `estimated_k` is the bound of the effects that are left out, [K]."""
-    order: int
-    """1 for linear tetrahedra, 2 for quadratic ones."""
-    refinements: int
-    """How often the size of the given mesh was halved."""
-    step_tolerance_k: float | None
-    """Tolerance of the time steps, [K]; None without steps."""
+    estimated_k: float  # Estimated largest error of a temperature, what is left out included, [K]
+    estimated_flow: float  # Estimated largest error of a heat flow as a share of all heat
+    left_out_k: float  # What of `estimated_k` is the bound of the effects that are left out, [K]
+    order: int  # 1 for linear tetrahedra, 2 for quadratic ones
+    refinements: int  # How often the size of the given mesh was halved
+    step_tolerance_k: float | None  # Tolerance of the time steps, [K]; None without steps
     seconds: float
     status: str
     levels: tuple[dict[str, Any], ...]

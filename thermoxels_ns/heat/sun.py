@@ -17,8 +17,7 @@ SOLAR_CONSTANT_W_M2 = 1353.0
 """Sunlight above the air at the mean distance of the sun, [W / m2]: the value that Meinel's fit was made with. (Today's
 is 1361.)"""
 
-_RESOLUTION_S = 3600.0
-"""The sun moves by 15 degrees in this time."""
+_RESOLUTION_S = 3600.0  # The sun moves by 15 degrees in this time
 _EPOCH = datetime(2000, 1, 1, 12, tzinfo=timezone.utc)
 
 
@@ -35,8 +34,7 @@ class SunCoordinates:
 class SunPosition:
     """The sun as seen from a place; its distance in astronomical units."""
 
-    azimuth_deg: float
-    """Direction along the horizon, clockwise from north, [degrees], 0 to 360."""
+    azimuth_deg: float  # Direction along the horizon, clockwise from north, [degrees], 0 to 360
     elevation_deg: float
     """Height over the horizon, [degrees]; refraction, which lifts it by 0.5 degrees at the horizon and by 0.1 at 10
     degrees, is left out."""
@@ -47,10 +45,8 @@ class SunPosition:
 class Sunlight:
     """Strength of the sunlight."""
 
-    direct_w_m2: float
-    """On a surface that faces the sun, [W / m2], at least 0."""
-    diffuse_w_m2: float
-    """From the sky on a surface that faces up, [W / m2], at least 0."""
+    direct_w_m2: float  # On a surface that faces the sun, [W / m2], at least 0
+    diffuse_w_m2: float  # From the sky on a surface that faces up, [W / m2], at least 0
 
 
 def sun_coordinates(moment: datetime) -> SunCoordinates:

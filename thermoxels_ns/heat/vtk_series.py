@@ -11,8 +11,7 @@ from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.mesh.files.vtu import write_vtu
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-STEP_PATTERN = "step-*.vtu"
-"""Names of the files of a series."""
+STEP_PATTERN = "step-*.vtu"  # Names of the files of a series
 
 
 def write_heat_series(pvd: Path | str, mesh: TetMesh, solution: HeatSolution) -> list[Path]:
