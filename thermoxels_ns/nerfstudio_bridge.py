@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 _EXPORTER, _TRAIN = "nerfstudio.scripts.exporter", "nerfstudio.scripts.train"
 _EVALUATIONS = ("nerfstudio.scripts.eval", "nerfstudio.scripts.render")
 _SUBCOMMAND, _DATAPARSER = "thermoxels-mesh", "thermal-data"
-METHODS = ("thermoxels", "thermoxels-paper", "thermoxels-arco", "plenoxels-t")
-"""Names of our methods."""
+METHODS = ("thermoxels", "thermoxels-paper", "thermoxels-arco", "plenoxels-t")  # Names of our methods
 
 
 def install() -> None:

@@ -10,8 +10,7 @@ from typing import Any
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.json_values import read_json_object
 
-_ENERGY_UNITS = ("J", "kJ", "MJ", "GJ", "TJ", "PJ")
-"""Each a thousand of the one before."""
+_ENERGY_UNITS = ("J", "kJ", "MJ", "GJ", "TJ", "PJ")  # Each a thousand of the one before
 
 
 @dataclass(frozen=True)
@@ -19,15 +18,11 @@ class Target:
     """A measured figure and the bound it should keep."""
 
     name: str
-    measured: float
-    """The figure; NaN if it could not be measured."""
+    measured: float  # The figure; NaN if it could not be measured
     bound: float
-    at_least: bool
-    """True: the figure should be at least the bound. False: at most."""
-    form: str
-    """How to write the figure and the bound, for instance ``{:.1f} dB``."""
-    meaning: str
-    """What the figure says, for somebody who meets it for the first time."""
+    at_least: bool  # True: the figure should be at least the bound. False: at most
+    form: str  # How to write the figure and the bound, for instance ``{:.1f} dB``
+    meaning: str  # What the figure says, for somebody who meets it for the first time
 
     @property
     def met(self) -> bool:
@@ -50,8 +45,7 @@ class DemoResults:
     """What a demo run achieved: the figures with a target, and others."""
 
     targets: tuple[Target, ...]
-    others: tuple[tuple[str, str], ...]
-    """Further figures: name and value with unit."""
+    others: tuple[tuple[str, str], ...]  # Further figures: name and value with unit
 
 
 def read_results(eval_json: Path, summary_json: Path) -> DemoResults:

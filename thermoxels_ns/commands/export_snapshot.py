@@ -32,8 +32,7 @@ if TYPE_CHECKING:
 
 Say = Callable[[str], None]
 
-OBLIQUE = Viewpoint()
-"""Obliquely from above, z up."""
+OBLIQUE = Viewpoint()  # Obliquely from above, z up
 
 _SUMMARY, _HEAT, _QUALITY = "summary.json", "heat.pvd", "quality.json"
 _MESH_STEM = "mesh"

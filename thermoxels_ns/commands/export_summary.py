@@ -30,8 +30,7 @@ NO_SCALE = (
 )
 """What an export without a scale says."""
 
-HEAT_SKIPPED = f"Heat step skipped: {NO_SCALE[0].lower()}{NO_SCALE[1:]}"
-"""The same, where the heat balance would be."""
+HEAT_SKIPPED = f"Heat step skipped: {NO_SCALE[0].lower()}{NO_SCALE[1:]}"  # The same, where the heat balance would be
 
 ONLY_THE_SHELL = (
     "Space that no camera saw and that the mesh leaves empty, such as the inside of a building seen from outside with "

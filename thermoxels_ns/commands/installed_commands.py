@@ -45,8 +45,7 @@ Watch = Callable[[float | None], None]
 class ProcessCost:
     """What a finished process took."""
 
-    seconds: float
-    """Wall time, [s]."""
+    seconds: float  # Wall time, [s]
     peak_memory_gb: float
     """Largest resident memory of the process, [1e9 bytes]; NaN where it cannot be told: the system has no `wait4`, or
     the command stayed smaller than the process that started it."""

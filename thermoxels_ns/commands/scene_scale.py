@@ -23,12 +23,9 @@ _KEY, _ERROR_KEY, _UP_KEY = "metres_per_unit", "metres_per_unit_standard_error",
 class SceneScale:
     """Metres per unit of the scene's coordinates, with its standard error."""
 
-    metres_per_unit: float
-    """Length of one input unit, above 0, [m]."""
-    standard_error: float | None
-    """Standard error of `metres_per_unit`, at least 0, [m]; None where nobody knows it."""
-    source: str
-    """Where the scale comes from: a sentence."""
+    metres_per_unit: float  # Length of one input unit, above 0, [m]
+    standard_error: float | None  # Standard error of `metres_per_unit`, at least 0, [m]; None where nobody knows it
+    source: str  # Where the scale comes from: a sentence
 
     @property
     def relative_standard_error(self) -> float | None:

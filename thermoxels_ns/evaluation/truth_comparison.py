@@ -180,15 +180,9 @@ def compare_with_truth(
     boundary is not counted for precision where the scene box cuts it. Beside them stand the same figures for the part
     of the boundary that at least `MIN_VIEWS` training cameras see: no photograph shows the rest, which is a guess.
 
-    Args:
-        cells: Solid voxels, shape `lattice.cell_shape`.
-        lattice: Where they are, [world units].
-        world_to_truth: Similarity, shape (4, 4), from the lattice's world to the coordinates of the input poses, in
-            which a synthetic scene is written in metres.
-        truth: The scene folder (or its ``transforms.json``), or its truth if it is at hand.
-        mesh: The mesh of these voxels, for its temperatures. None: they are not compared.
-        metres_per_unit: The scale that was applied to the mesh's nodes after `world_to_truth`, above 0. All lengths,
-            areas and volumes of the result, those of the exact scene too, are in the units of the mesh.
+    `cells` has the shape `lattice.cell_shape`; `world_to_truth` (4, 4) is the similarity from the lattice's world to
+    the input poses' coordinates, in which a synthetic scene is written in metres; without `mesh` no temperatures are
+    compared; lengths of the result are those times `metres_per_unit`, the scale of the mesh's nodes.
 
     Returns:
         A mapping that json can write, or None if the truth is not known. Scores are 0 to 1; mean distances are of the

@@ -35,13 +35,7 @@ def p1_error(system: HeatSystem, solution: SteadySolution, time_s: float) -> Err
     with radiation's slope in h. The flows of T + b + c less those of T are the errors of flows. Where temperatures are
     singular b is not all that is missed, only what half the mesh size would find, 1 - 0.3 of it (Richardson).
 
-    Args:
-        system: The equations, without what a limiter left out.
-        solution: Temperatures and heat flows.
-        time_s: Time at which effects that change are taken, [s].
-
-    Returns:
-        The estimates; None where they are no numbers.
+    Effects that change are taken at `time_s`. None where the estimates are no numbers.
     """
     problem, fixed, num_nodes = system.problem, system.fixed, system.num_nodes
     points, tets = np.ascontiguousarray(problem.mesh.points_m), problem.mesh.tets

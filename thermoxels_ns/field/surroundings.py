@@ -33,12 +33,8 @@ class Surroundings(nn.Module):
     ends at infinity, where 1/q = 0, and in which straight lines are straight. So the renderer of the box serves here
     too: the six boxes stand one behind the other in one lattice, with an empty layer of voxels between.
 
-    Args:
-        box: Lower and upper corner, (2, 3), world units.
-        across: Voxels along the edges of a face.
-        deep: Voxels from a face to infinity.
-        start_density: Density everywhere at the start, [1 / voxel].
-        activation: Density activation.
+    The box, (2, 3), is in world units; a face is `across` voxels wide, infinity `deep` voxels away; density is
+    [1 / voxel].
     """
 
     centre: Tensor

@@ -25,10 +25,7 @@ def plain_backdrop(photographs: Photographs, depth: npt.NDArray[np.float32]) -> 
     edge of the photograph (a wall ends at a roof, at windows, at the ground), and if its colour and temperature are
     those that most such pixels have, as a function of direction (harmonics of degree 2, fitted to the pixels that agree
     with it); and so are plain pixels that look the same and touch it, those below an object among them.
-
-    Args:
-        photographs: Pinhole photographs.
-        depth: Depths of their pixels, NaN where unknown, shape (pixels,).
+    `depth`, (pixels,), is NaN where unknown.
     """
     open_above, plain = (np.zeros(len(photographs.colours), dtype=bool) for _ in range(2))
     directions = np.empty((len(open_above), 3))

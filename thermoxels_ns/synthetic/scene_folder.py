@@ -70,23 +70,11 @@ def write_scene(
     with ``frame_train_`` and ``frame_eval_`` names. Scale (metres) and up (z) are added to the json, as a capture finds
     them. The scene's name, its exact box and the errors of each image go to ``truth.json``, which training never reads.
 
-    Args:
-        scene: What to photograph.
-        folder: Where to write; made if absent. An earlier synthetic scene in it is removed; a folder that holds a
-            scene which is not synthetic is refused.
-        num_train: Number of training views.
-        num_eval: Number of held-out views, half-way between training views.
-        width, height: Size of the photographs [pixels].
-        thermal_width: Width of the thermal images [pixels]. None: that of the photographs, or half of it for a
-            camera of their own. The height follows: the photographs' aspect, or 5:4 for a camera of their own.
-        thermal_format: How temperatures are stored; the unit of TIFF counts is written under ``thermal_unit``.
-        noise_k: Standard deviation of independent Gaussian noise in every thermal pixel [K].
-        drift_k: Standard deviation of one temperature offset per thermal image [K].
-        seed: Seed of noise and drift. The same seed writes the same bytes.
-        own_thermal_camera: Take the thermal images with a second camera beside the first, with its own lens. Its
-            intrinsics and poses are written under ``thermal_camera`` and ``thermal_transform_matrix``.
-        photo_format: How photographs are stored.
-        progress: Show a progress bar.
+    The folder is made if absent; an earlier synthetic scene in it is removed, any other refused. Held-out views lie
+    half-way between training views. `thermal_width` [pixels] is by default that of the photographs, half of it for a
+    camera of their own, whose lens and poses are written under ``thermal_camera`` and ``thermal_transform_matrix``.
+    `noise_k` and `drift_k` are standard deviations, of every thermal pixel and of one offset per image [K]; the same
+    `seed` writes the same bytes. The unit of TIFF counts is written under ``thermal_unit``.
 
     Raises:
         SceneError: An option is out of range, or the folder holds somebody else's scene.

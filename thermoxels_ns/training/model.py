@@ -25,7 +25,7 @@ from thermoxels_ns.field.harmonics import harmonics, num_coefficients
 from thermoxels_ns.field.kept_voxels import check_memory
 from thermoxels_ns.field.refine import ColumnChange, RowChange, refine, widen_colour
 from thermoxels_ns.field.surroundings import Surroundings
-from thermoxels_ns.field.voxel_grid import VoxelField, VoxelGrid
+from thermoxels_ns.field.voxel_grid import VoxelField
 from thermoxels_ns.render.compositing import intersect_box
 from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
 from thermoxels_ns.render.renderers import GridSamples, render_rays, sample_rays
@@ -40,8 +40,7 @@ SURROUNDINGS = (48, 12)
 whenever those of the box are."""
 SURROUNDINGS_DENSITY = 0.005  # Their density at the start, [1 / voxel]: a tenth of the light is lost
 SURROUNDINGS_VARIATION = 100.0
-"""Their total variation counts this many times as much as that of the box: few photographs show the same part of them.
-Chosen on one real scene (1: 16.6 dB over whole held-out photographs, 100: 17.7, 1000: 17.4)."""
+"""Their total variation counts this many times that of the box; chosen on one real scene (1: 16.6, 100: 17.7 dB)."""
 LEAST_LIGHT = 0.003  # Share of a ray's light that leaves the box from which its surroundings are asked for
 
 
@@ -453,22 +452,17 @@ class ThermoxelsModel(Model):
 
 
 class SurroundingsSampler:
-    """Samples of rays in the surroundings, for statistics; the box is not in their way."""
+    """Samples of rays in the surroundings, each piece a ray of its own, for statistics; the box is not in their way."""
 
     def __init__(self, model: ThermoxelsModel) -> None:
         assert model.surroundings is not None
-        self._model, self._surroundings = model, model.surroundings
-
-    @property
-    def grid(self) -> VoxelGrid:
-        """The lattices of the surroundings."""
-        return self._surroundings.grid
+        self.grid, self._surroundings, self._config = model.surroundings.grid, model.surroundings, model.config
 
     def sample_rays(self, origins: Tensor, directions: Tensor) -> GridSamples:
-        """List the samples of the pieces of rays, each a ray of its own."""
+        """List the samples of rays."""
         cut = self._surroundings.segments(origins, directions)
         request = RayRequest(cut.origins, cut.directions, 0.0, cut.lengths)
-        return sample_rays(self.grid, request, RenderOptions(), self._model.config.backend)
+        return sample_rays(self.grid, request, RenderOptions(), self._config.backend)
 
 
 ThermoxelsModelConfig.model_class = ThermoxelsModel

@@ -23,28 +23,18 @@ _STANDARD = schedule_for(*QUALITIES["standard"])
 class LossWeights:
     """Weight of each loss term; a term of weight 0 is not computed."""
 
-    rgb: float = 1.0
-    """Mean squared error of colour (paper, eq. 3)."""
-    thermal: float = 1.0
-    """lambda L2 + (1 - lambda) L1 of temperature (paper, eq. 4)."""
-    tv_density: float = 1e-5
-    """Total variation of the stored density."""
-    tv_sh: float = 1e-5
-    """Total variation of the colour harmonics."""
-    tv_temperature: float = 1e-3
-    """Total variation of temperature."""
-    sparsity: float = 0.0
-    """Cauchy sparsity of density along rays."""
-    beta: float = 0.0
-    """Push rays to be opaque or empty."""
-    distortion: float = 0.1
-    """Gather each ray's weight in one short interval."""
+    rgb: float = 1.0  # Mean squared error of colour (paper, eq. 3)
+    thermal: float = 1.0  # lambda L2 + (1 - lambda) L1 of temperature (paper, eq. 4)
+    tv_density: float = 1e-5  # Total variation of the stored density
+    tv_sh: float = 1e-5  # Total variation of the colour harmonics
+    tv_temperature: float = 1e-3  # Total variation of temperature
+    sparsity: float = 0.0  # Cauchy sparsity of density along rays
+    beta: float = 0.0  # Push rays to be opaque or empty
+    distortion: float = 0.1  # Gather each ray's weight in one short interval
     tracks: float = 0.05
     """Feature rays end at their points: tracks of structure from motion, depths on which photographs agree."""
-    backdrop: float = 0.02
-    """Rays through a plain backdrop (sky, a wall far behind) meet nothing in the box."""
-    surroundings: float = 1e-3
-    """What infinity explains is not in the surroundings before it."""
+    backdrop: float = 0.02  # Rays through a plain backdrop (sky, a wall far behind) meet nothing in the box
+    surroundings: float = 1e-3  # What infinity explains is not in the surroundings before it
 
 
 LOSS_RECIPES: Mapping[str, LossWeights] = {

@@ -33,16 +33,12 @@ _PAIR_CHUNK = 200
 class PoseOptions:
     """How poses are found."""
 
-    image_size: int = 1600
-    """Longest side to which photographs are reduced for features, [pixels]."""
+    image_size: int = 1600  # Longest side to which photographs are reduced for features, [pixels]
     max_features: int = 4000
-    matching: Matching = "auto"
-    """Which photographs are compared."""
+    matching: Matching = "auto"  # Which photographs are compared
     lens: LensModel = "SIMPLE_RADIAL"
-    seed: int = 0
-    """Of all random choices; the same one gives the same bits."""
-    threads: int = 2
-    """Of features and matching."""
+    seed: int = 0  # Of all random choices; the same one gives the same bits
+    threads: int = 2  # Of features and matching
 
 
 @dataclass(frozen=True)

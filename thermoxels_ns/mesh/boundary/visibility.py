@@ -59,15 +59,9 @@ def facet_views(
     A camera sees a triangle that faces it, lies in its image and has no solid voxel on the straight line between
     them. Triangles that lie in the same voxel and face the same of the six sides share one answer, taken at their mean.
 
-    Args:
-        cells: True where a voxel is solid, shape `lattice.cell_shape`.
-        lattice: Where the voxels are.
-        matrices: World to homogeneous pixels of each camera, depth positive in front, shape (cameras, 3, 4).
-        centres: Where the cameras stand, shape (cameras, 3), [world units].
-        sizes: Widths and heights of their images, shape (cameras, 2), [pixels].
-        centroids_world: Middle of each triangle, shape (f, 3), [world units].
-        normals_world: Outward unit normals of the true surface, shape (f, 3), in world axes.
-        enough: Cameras that see a triangle after which no others are tried. None: all are.
+    `cells` (`lattice.cell_shape`) are the solid voxels; `matrices` (cameras, 3, 4) lead from the world to homogeneous
+    pixels, depth positive in front; `centres` (cameras, 3) and `centroids_world` (f, 3) are in [world units], `sizes`
+    (cameras, 2) in [pixels], `normals_world` (f, 3) unit vectors. After `enough` cameras no others are tried.
     """
     group, middle, normal = _grouped(lattice.world_to_index(centroids_world), normals_world, lattice.cell_shape)
     space = _EmptySpace(cells)
