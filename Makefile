@@ -13,7 +13,7 @@ export PYTHON
 activate = PATH="$(abspath $(1))/bin:$$PATH" VIRTUAL_ENV="$(abspath $(1))"
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-newest lint format clean
+.PHONY: help setup demo test test-newest nightly lint format clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -30,6 +30,9 @@ test: setup ## Run the tests
 test-newest: ## Run the tests with the newest versions that pyproject.toml allows
 	@VENV="$(NEWEST_VENV)" CONSTRAINTS= tools/setup.sh
 	$(call activate,$(NEWEST_VENV)) OMP_NUM_THREADS=1 pytest --numprocesses logical --dist loadfile $(ARGS)
+
+nightly: setup ## Files changed at random, 2,000 of each kind
+	$(call activate,$(VENV)) NIGHTLY=1 OMP_NUM_THREADS=1 pytest --numprocesses logical tests/stability/test_files_changed_at_random.py $(ARGS)
 
 lint: setup ## Check format, style and types
 	$(call activate,$(VENV)) ruff format --check .

@@ -1,7 +1,3 @@
-"""Fixtures for all tests."""
-
-from __future__ import annotations
-
 import os
 from collections import Counter
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The rooms of the house: every file lies in one, data flows one way, nothing imports in a circle."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess

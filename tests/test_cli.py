@@ -1,7 +1,3 @@
-"""The command `thermoxels`: its help, its exit statuses, and the scene it writes."""
-
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

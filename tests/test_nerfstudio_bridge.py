@@ -1,7 +1,3 @@
-"""The exporter hook and the checkpoint bridge, in processes of their own where what is loaded matters."""
-
-from __future__ import annotations
-
 import dataclasses
 import json
 import os
@@ -91,18 +87,12 @@ def ns_export(tmp_path_factory) -> dict[str, list[str]]:
     return json.loads((folder / "results.json").read_text())
 
 
-def test_help_lists_ours_beside_all_stock_subcommands(ns_export) -> None:
-    outcome, printed = ns_export["help"]
-    assert outcome == "SystemExit: 0"
-    for name in (*STOCK, "thermoxels-mesh"):
-        assert name in printed
-
-
-def test_help_of_ours_shows_every_option(ns_export) -> None:
-    outcome, printed = ns_export["our help"]
-    assert outcome == "SystemExit: 0"
-    for option in dataclasses.fields(ExportThermoxelsMesh):
-        assert "--" + option.name.replace("_", "-") in printed
+def test_help_lists_ours_beside_all_stock_subcommands_and_shows_every_option(ns_export) -> None:
+    options = ["--" + option.name.replace("_", "-") for option in dataclasses.fields(ExportThermoxelsMesh)]
+    for key, words in (("help", [*STOCK, "thermoxels-mesh"]), ("our help", options)):
+        outcome, printed = ns_export[key]
+        assert outcome == "SystemExit: 0"
+        assert [word for word in words if word not in printed] == []
 
 
 @pytest.mark.parametrize("name", STOCK)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -52,7 +53,7 @@ def print_our_errors_plainly() -> None:
 
     def hook(kind: type[BaseException], problem: BaseException, traceback: TracebackType | None) -> None:
         if isinstance(problem, ThermoxelsError):
-            print(f"Error: {problem}", file=sys.stderr)
+            print(f"Error: {problem}{_where_to_say_it(str(problem))}", file=sys.stderr)
         else:
             previous(kind, problem, traceback)
 
@@ -121,9 +122,7 @@ def _with_dataparser_last(words: list[str]) -> list[str]:
     """
     from nerfstudio.configs.dataparser_configs import all_dataparsers
 
-    from thermoxels_ns.data.dataparser import ThermalDataParserConfig
-
-    ours = {f"--{field.name.replace('_', '-')}" for field in dataclasses.fields(ThermalDataParserConfig)} - {"--data"}
+    ours = _dataparser_options()
     if not words or words[0] not in METHODS or (all_dataparsers.keys() - {_DATAPARSER}) & set(words):
         return words
     kept, moved, behind = list[str](), list[str](), False
@@ -134,6 +133,23 @@ def _with_dataparser_last(words: list[str]) -> list[str]:
             behind = False
         (moved if behind else kept).append(word)
     return [*kept, *([_DATAPARSER] if moved and _DATAPARSER not in kept else []), *moved]
+
+
+def _dataparser_options() -> dict[str, str]:
+    """Name the fields of our dataparser's config by the options of ns-train."""
+    from thermoxels_ns.data.dataparser import ThermalDataParserConfig
+
+    names = (field.name for field in dataclasses.fields(ThermalDataParserConfig))
+    return {f"--{name.replace('_', '-')}": name for name in names if name != "data"}
+
+
+def _where_to_say_it(problem: str) -> str:
+    """Say where options of ns-train that a remedy names stand for a command that has a config.yml in their place."""
+    command, words = Path(sys.argv[0]).name, re.findall(r"--[a-z-]*[a-z]", problem)
+    named = [field for option, field in _dataparser_options().items() if option in words]
+    if not named or command not in ("ns-eval", "ns-export", "ns-render", "ns-viewer"):
+        return ""
+    return f" {command} has them in config.yml: change {', '.join(named)} there, below dataparser."
 
 
 def _with_mesh_export(commands: Any) -> Any:

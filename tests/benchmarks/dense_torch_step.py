@@ -6,8 +6,6 @@ same colours, temperatures and gradients (tests/reference/test_dense_step.py); w
 variation) makes it look quicker, not slower.
 """
 
-from __future__ import annotations
-
 import time
 
 import torch

@@ -12,8 +12,6 @@ it stands what plain conjugate gradients cost on the same matrices, without what
 how much of a heat flow is round-off.
 """
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,6 +22,7 @@ import tyro
 from measuring import take_turns
 from scipy import sparse
 
+from tests.support.scene_bodies import tagged_body
 from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients, LinearSolver
 from thermoxels_ns.fem.forms import FixedNodes
 from thermoxels_ns.fem.p1_kernels import lumped_mass, product_and_bound, stiffness_matrix
@@ -34,20 +33,14 @@ from thermoxels_ns.fem.system import HeatSystem, Pieces
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.scene_file import load_heat_scene
 from thermoxels_ns.heat.screening import screen
-from thermoxels_ns.mesh.boundary.patches import default_patches
-from thermoxels_ns.mesh.quality.face_count import boundary_facets
-from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
-from thermoxels_ns.mesh.voxel_tets import kuhn_tets
+from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 TOLERANCE = 1e-12
-Z_UP = (0.0, 0.0, 1.0)
 KINDS = ("stiffness", "mass", "convection", "flux", "radiation", "source", "fixed")
 
 
 @dataclass
 class EffectsCost:
-    """Print the tables."""
-
     voxels: int = 28
     """Voxels along a side of the room; its walls are an eighth as thick."""
     steps: int = 24
@@ -58,7 +51,6 @@ class EffectsCost:
     """Runs per median."""
 
     def main(self) -> None:
-        """Measure and print."""
         mesh, steps = room(self.voxels), TimeSteps(self.steps, self.step_seconds)
         scene = load_heat_scene("all-effects")
         whole = scene.problem(mesh)
@@ -84,7 +76,6 @@ class EffectsCost:
         self.conduction_only(problems["conduction only"], steps)
 
     def screening(self, whole: HeatProblem, steps: TimeSteps) -> None:
-        """What screening costs, beside the computation that it may shorten."""
         taken, _ = take_turns({"screen": lambda: screen(whole, steps, 0.01)}, self.repeats)
         print(f"\nScreening all effects at 0.01 K: {statistics.median(taken['screen']):.3f} s")
 
@@ -117,17 +108,14 @@ class Conduction:
     groups = ()
 
     def __init__(self, problem: HeatProblem) -> None:
-        """Assemble stiffness and lumped mass."""
         self._stiffness, self._mass = stiffness_and_mass(problem)
         self.num_nodes = len(self._mass)
         self.pieces, self.fixed = Pieces(self._stiffness), FixedNodes((), self.num_nodes)
 
     def matrix(self, _: float, step_s: float) -> sparse.csr_matrix:
-        """M / step + K."""
         return sparse.csr_matrix(self._stiffness + sparse.diags(self._mass / step_s, format="csr"))
 
     def held_w_k(self, _: float, step_s: float) -> np.ndarray:
-        """Its row sums."""
         return self._mass / step_s
 
     def conducted_heat(self, relative_k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -135,12 +123,10 @@ class Conduction:
         return product_and_bound(self._stiffness, relative_k)
 
     def linear_solver(self, matrix: sparse.csr_matrix, relative_tolerance: float) -> LinearSolver:
-        """The solver of linear tetrahedra."""
         return LinearSolver(matrix, relative_tolerance=relative_tolerance)
 
 
 def stiffness_and_mass(problem: HeatProblem) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """K and the lumped M."""
     points, tets = problem.mesh.points_m, problem.mesh.tets
     stiffness = stiffness_matrix(points, tets, problem.conductivity_w_mk)
     return stiffness, lumped_mass(points, tets, problem.heat_capacity_j_m3k)
@@ -175,27 +161,12 @@ def plainly(problem: HeatProblem, steps: TimeSteps) -> np.ndarray:
 def room(voxels: int) -> TetMesh:
     """A closed room of 4 m whose side at x = 0 is cut by the box around the scene."""
     thick = max(voxels // 8, 1)
+    hollow = slice(thick, -thick)
     cells = np.ones((voxels,) * 3, dtype=bool)
-    cells[thick:-thick, thick:-thick, thick:-thick] = False
-    corners, tets = kuhn_tets(cells)
-    facets = boundary_facets(tets)
-    corner = corners[facets]
-    normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).astype(float)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    middle = corner.mean(axis=1)
-    outside = np.any((middle + 0.5 * normals < 0) | (middle + 0.5 * normals > voxels), axis=1)
-    patch, names = default_patches(normals, Z_UP, outside, middle[:, 0] < 1e-6)
-    points = corners * (4.0 / voxels)
-    return TetMesh(
-        points_m=points,
-        tets=tets,
-        temperature_c=15.0 + 2.0 * points[:, 2] + np.sin(3.0 * points[:, 0]),
-        observed=np.ones(len(points), bool),
-        facets=facets,
-        facet_tags=np.zeros(len(facets), np.int64),
-        region=np.zeros(len(tets), np.int64),
-        boundary=Boundary(normals, np.ones(len(facets)), outside, patch, names),
-    )
+    cells[hollow, hollow, hollow] = False
+    mesh = tagged_body(cells, 4.0 / voxels, np.pad(cells, 1, constant_values=True), cut_below_x=1e-6)
+    points = mesh.points_m
+    return replace(mesh, temperature_c=15.0 + 2.0 * points[:, 2] + np.sin(3.0 * points[:, 0]))
 
 
 if __name__ == "__main__":

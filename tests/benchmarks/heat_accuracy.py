@@ -20,13 +20,9 @@ which both ran, and the best setting is the one with the largest such ratio: no 
 Prints all rows, and writes them to a csv file and the errors against the seconds to a picture.
 """
 
-from __future__ import annotations
-
 import gc
 import statistics
-import sys
 import time
-import types
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -37,24 +33,19 @@ import numpy as np
 import tyro
 from measuring import logarithmic_panels, save, write_rows
 
-if "tests" not in sys.modules:  # Another distribution may have installed a package of this name.
-    sys.modules["tests"] = types.ModuleType("tests")
-    sys.modules["tests"].__path__ = [str(Path(__file__).parents[1])]
-
 from tests.support.building_corner import building_corner
-from tests.support.heat_meshes import box_mesh, planes
+from tests.support.heat_bodies import CONCRETE
+from tests.support.heat_meshes import planes
+from tests.support.heat_problems import finer, nafems_t3
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.fem.error_estimate import ErrorSize, difference_between
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.fem.tolerance import Tolerance, solve_to_tolerance
-from thermoxels_ns.heat.effects import Convection, FixedTemperature
-from thermoxels_ns.heat.materials import Material
+from thermoxels_ns.heat.effects import Convection
 
 DURATION_S = 32.0
 OUTPUTS = 10
@@ -65,8 +56,6 @@ LONG_S = 1.0
 
 @dataclass(frozen=True)
 class Row:
-    """One solution."""
-
     problem: str
     method: str
     setting: str
@@ -98,18 +87,15 @@ class Contest:
 
     @property
     def median_s(self) -> float:
-        """The median, [s]."""
         return statistics.median(self.seconds)
 
-    def over(self, other: Contest) -> float:
+    def over(self, other: "Contest") -> float:
         """Median of the time over that of another setting in the same round."""
         return statistics.median(mine / its for mine, its in zip(self.seconds, other.seconds))
 
 
 @dataclass
 class HeatAccuracy:
-    """Error against seconds."""
-
     output: Path = Path("outputs/heat-accuracy.csv")
     """Where the rows go."""
     picture: Path = Path("docs/heat-accuracy.png")
@@ -118,7 +104,6 @@ class HeatAccuracy:
     """Rounds of which the median counts; fewer than 7 are not taken."""
 
     def main(self) -> None:
-        """Measure, print and write."""
         rows: list[Row] = []
         for name, problem, finest, tolerances in (
             ("ISO 10211 case 3", building_corner(lambda *k: planes(*k, step=0.1)), 2, (0.5, 0.25, 0.15, 0.05)),
@@ -131,14 +116,13 @@ class HeatAccuracy:
         self.draw(rows)
 
     def steady(self, name: str, given: HeatProblem, finest: int, tolerances: tuple[float, ...]) -> list[Row]:
-        """Rows of a steady problem; `finest` is how often the mesh is refined for the reference."""
-        exact = solve_steady(_refined(given, finest), order=2, relative_tolerance=1e-9)
+        exact = solve_steady(finer(given, finest), order=2, relative_tolerance=1e-9)
         settings = [(1, 0), (1, 1), (1, 2), (2, 0), (2, 1)] + ([(2, 2)] if finest > 2 else [])
         by_hand = [
             Contest(
                 f"P{order}",
                 f"mesh size / {2**refinements}",
-                lambda o=order, r=refinements: solve_steady(_refined(given, r), order=o, relative_tolerance=1e-8),
+                lambda o=order, r=refinements: solve_steady(finer(given, r), order=o, relative_tolerance=1e-8),
             )
             for order, refinements in settings
         ]
@@ -146,10 +130,9 @@ class HeatAccuracy:
         return self.contest(name, given, by_hand, tolerances, None, lambda s: difference_between(s, exact, nodes))
 
     def in_time(self) -> list[Row]:
-        """Rows of NAFEMS T3."""
-        name, given = "NAFEMS T3", rod(10)
-        fine = solve_heat(rod(320), AdaptiveSteps(DURATION_S, 1e-3, outputs=OUTPUTS))
-        fine_x = rod(320).mesh.points_m[:, 0]
+        name, given = "NAFEMS T3", nafems_t3(10)
+        fine = solve_heat(nafems_t3(320), AdaptiveSteps(DURATION_S, 1e-3, outputs=OUTPUTS))
+        fine_x = nafems_t3(320).mesh.points_m[:, 0]
         ascending = np.argsort(fine_x)
         x = given.mesh.points_m[:, 0]
         line = np.array([np.interp(x, fine_x[ascending], state[ascending]) for state in fine.temperature_c])
@@ -163,7 +146,7 @@ class HeatAccuracy:
 
         def march(refinements: int, scheme: Any, steps: int) -> HeatSolution:
             times = TimeSteps(steps, DURATION_S / steps)
-            solution = solve_heat(_refined(given, refinements), times, scheme=scheme)
+            solution = solve_heat(finer(given, refinements), times, scheme=scheme)
             return replace(solution, temperature_c=solution.temperature_c[:: steps // OUTPUTS])
 
         by_hand = [
@@ -231,7 +214,6 @@ class HeatAccuracy:
                     one.seconds.append(time.process_time() - begin)
 
     def draw(self, rows: list[Row]) -> None:
-        """Draw errors against seconds, one panel per problem."""
         problems = list(dict.fromkeys(row.problem for row in rows))
         figure, panels = logarithmic_panels(1, len(problems), figsize=(4.6 * len(problems), 4.2))
         for panel, problem in zip(panels[0], problems):
@@ -250,22 +232,7 @@ def shell() -> HeatProblem:
     """An eighth of the shell of tests/verification/test_walls.py; the body is what lies between the facets."""
     effects = (Convection(("inside",), 7.69, 20.0), Convection(("outside",), 25.0, -10.0))
     mesh = shell_mesh(0.5, 0.6, 12, 2, eighth=True)
-    return HeatProblem(mesh, Material("concrete", 1.7, 2200.0, 880.0), effects=effects)
-
-
-def rod(parts: int) -> HeatProblem:
-    """The rod of NAFEMS T3."""
-    mesh = box_mesh(np.linspace(0, 0.1, parts + 1), [0, 0.01], [0, 0.01], temperature_c=0.0)
-    swing = Varying(lambda places, time_s: 100.0 * np.sin(np.pi * time_s / 40.0))
-    effects = (FixedTemperature(("x0",), 0.0), FixedTemperature(("x1",), swing))
-    return HeatProblem(mesh, Material("steel", 35.0, 7200.0, 440.5), effects=effects)
-
-
-def _refined(given: HeatProblem, refinements: int) -> HeatProblem:
-    problem = replace(given)
-    for _ in range(refinements):
-        problem = replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=None)
-    return problem
+    return HeatProblem(mesh, CONCRETE, effects=effects)
 
 
 if __name__ == "__main__":

@@ -8,43 +8,34 @@ signed distance on a lattice `--finer` times as fine. Reconstructions are meshed
 with the plain area of their faces, voxels with the area factor, and conforming. Scenes with a known truth only.
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 from pathlib import Path
 
+import measuring  # noqa: F401 - makes tests.support importable
 import numpy as np
 
+from tests.support.demo_mesh import exact_snapshot
+from tests.support.heat_bodies import CONCRETE
 from thermoxels_ns.commands.export import load_trained_scene
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.evaluation.truth_comparison import load_known_truth
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection
-from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh
 from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
-
 
 def exact_mesh(scene, voxels: int) -> TetMesh:
-    """The scene's exact solid."""
-    lattice = Lattice.covering(*scene.scene_box, voxels)
-    centres = lattice.cell_centres().reshape(-1, 3)
-    depth = np.clip(-scene.signed_distance(centres) / lattice.voxel_size, -8.0, 8.0).reshape(lattice.cell_shape)
-    ones = np.ones(lattice.shape, np.float32)
-    snapshot = GridSnapshot(lattice, ones, 20.0 * ones, ones, np.exp(depth).astype(np.float32))
+    snapshot = exact_snapshot(scene.signed_distance, Lattice.covering(*scene.scene_box, voxels))
     return build_mesh(snapshot, SolidSelection(density_threshold=1.0, close_gaps=0), np.eye(4)).mesh
 
 
 def heat_lost_j(mesh: TetMesh, hours: float) -> float:
-    """Heat that the body gives to the air."""
     start = np.full(len(mesh.points_m), 20.0)
     problem = HeatProblem(mesh, CONCRETE, start, effects=(Convection(("*",), 25.0, 0.0),))
     solution = solve_heat(problem, TimeSteps(10, 360.0 * hours))
@@ -52,14 +43,12 @@ def heat_lost_j(mesh: TetMesh, hours: float) -> float:
 
 
 def size(mesh: TetMesh) -> tuple[float, float]:
-    """True area and volume."""
     assert mesh.boundary is not None
     area = facet_areas(mesh.points_m, mesh.facets) * mesh.boundary.area_factor
     return float(area.sum()), float(signed_volumes(mesh.points_m, mesh.tets).sum())
 
 
 def main() -> None:
-    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("configs", type=Path, nargs="+")
     parser.add_argument("--hours", type=float, default=1.0)

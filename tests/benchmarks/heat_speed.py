@@ -14,8 +14,6 @@ Times are medians, the two sides taking turns in one process; compiled kernels a
 that of a process for each side alone: its peak less what it needs after its imports.
 """
 
-from __future__ import annotations
-
 import json
 import statistics
 import subprocess
@@ -38,8 +36,6 @@ SIDE_M = 1.0
 
 @dataclass
 class HeatSpeed:
-    """Compare with scikit-fem."""
-
     voxels: tuple[int, ...] = (20, 40, 64)
     """Voxels along a side, N; the mesh has 6 N^3 tetrahedra."""
     ours_alone: tuple[int, ...] = (88,)
@@ -60,7 +56,6 @@ class HeatSpeed:
     """Internal: for `side`."""
 
     def main(self) -> None:
-        """Print the tables."""
         if self.side:
             print(json.dumps(self.peak_memory_mb()))
             return
@@ -80,7 +75,6 @@ class HeatSpeed:
                 print(self.row(voxels, lumped, alone=True), flush=True)
 
     def row(self, voxels: int, lumped: bool, *, alone: bool) -> str:
-        """One row of a table."""
         points, tets = cube(voxels)
         start = temperatures(points)
         sides = {"ours": lambda: self.ours(points, tets, start, lumped)}
@@ -121,7 +115,6 @@ class HeatSpeed:
         return (most_memory_kb() - before) / 1024.0
 
     def ours(self, points: np.ndarray, tets: np.ndarray, start: np.ndarray, lumped: bool) -> np.ndarray:
-        """Temperatures of all times by this package."""
         from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
         from thermoxels_ns.fem.time_loop import solve_heat
         from thermoxels_ns.heat.materials import Material
@@ -134,7 +127,6 @@ class HeatSpeed:
         return solve_heat(problem, time_steps, lumped=lumped, relative_tolerance=TOLERANCE).temperature_c
 
     def scikit_fem(self, points: np.ndarray, tets: np.ndarray, start: np.ndarray, lumped: bool) -> np.ndarray:
-        """Temperatures of all times by a script as its documentation suggests."""
         from skfem import Basis, BilinearForm, ElementTetP1, MeshTet
         from skfem.helpers import dot
 
@@ -170,7 +162,6 @@ def most_memory_kb() -> int:
 
 
 def cube(voxels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes, [m], and tetrahedra of the cube."""
     from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
     corners, tets = kuhn_tets(np.ones((voxels, voxels, voxels), bool))

@@ -1,14 +1,18 @@
-"""Runs in turns, csv files and logarithmic panels for the other benchmarks."""
-
-from __future__ import annotations
+"""Runs in turns, csv files and logarithmic panels for the other benchmarks, which may then import tests.support."""
 
 import csv
+import sys
 import time
+import types
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from thermoxels_ns.core.checks import replace_when_done
+
+if "tests" not in sys.modules:  # Another distribution may have installed a package of this name.
+    sys.modules["tests"] = types.ModuleType("tests")
+    sys.modules["tests"].__path__ = [str(Path(__file__).parents[1])]
 
 
 def take_turns(
@@ -27,7 +31,6 @@ def take_turns(
 
 
 def write_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Write a csv file, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with replace_when_done(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]))
@@ -55,7 +58,6 @@ def logarithmic_panels(lines: int, columns: int, **options: Any) -> tuple[Any, A
 
 
 def save(figure: Any, path: Path, dpi: int = 110) -> None:
-    """Write a picture, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with replace_when_done(path) as temporary:
         figure.savefig(temporary, dpi=dpi)

@@ -15,8 +15,6 @@ and boundary, and the plot shows all that the file holds: parts can be measured 
 `--speed` times a lattice of 128^3 voxels, 5 % of them solid, beside a plain Python loop over the same voxels.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import multiprocessing
@@ -34,6 +32,7 @@ import numpy.typing as npt
 import tyro
 from measuring import logarithmic_panels, save, write_rows
 
+from tests.support.demo_mesh import exact_snapshot
 from thermoxels_ns.core.lattice import CORNER_OFFSETS, Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, Views
 from thermoxels_ns.evaluation.truth_comparison import sample_facets
@@ -87,24 +86,11 @@ def body_named(name: str) -> Body:
     return Body(scene.signed_distance, scene.area_m2, scene.volume_m3, scene.scene_box)
 
 
-def exact_snapshot(body: Body, voxels: int) -> GridSnapshot:
-    """A field whose density is 1 on the surface and grows e-fold per voxel inwards, seen from all sides."""
-    lattice = Lattice.covering(*body.box, voxels)
-    h = lattice.voxel_size
-
-    def density(points: Vector) -> npt.NDArray[np.float32]:
-        return np.exp(np.clip(-body.signed_distance(points.reshape(-1, 3)) / h, -8.0, 8.0)).astype(np.float32)
-
-    at_corners = density(lattice.corner_positions()).reshape(lattice.shape)
+def snapshot_of(body: Body, voxels: int) -> GridSnapshot:
+    """A field of the exact body, seen from all sides."""
     low, high = np.array(body.box)
-    return GridSnapshot(
-        lattice,
-        at_corners,
-        np.full(lattice.shape, 20.0, np.float32),
-        (np.abs(np.log(at_corners)) < 1.5).astype(np.float32),
-        density(lattice.cell_centres()).reshape(lattice.cell_shape),
-        views=cameras_around(0.5 * (low + high), 1.5 * float(np.linalg.norm(high - low)), 40),
-    )
+    views = cameras_around(0.5 * (low + high), 1.5 * float(np.linalg.norm(high - low)), 40)
+    return exact_snapshot(body.signed_distance, Lattice.covering(*body.box, voxels), views=views)
 
 
 def cameras_around(centre: Vector, reach: float, count: int) -> Views:
@@ -118,7 +104,6 @@ def cameras_around(centre: Vector, reach: float, count: int) -> Views:
 
 
 def timed_build(snapshot: GridSnapshot, selection: SolidSelection, mode: Mode, repeats: int) -> tuple[BuiltMesh, float]:
-    """The mesh and the median of the seconds."""
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
@@ -130,7 +115,7 @@ def timed_build(snapshot: GridSnapshot, selection: SolidSelection, mode: Mode, r
 def measure(name: str, voxels: int, mode: Mode, repeats: int) -> dict[str, Any]:
     """One case; runs in a process of its own."""
     body = body_named(name)
-    snapshot = exact_snapshot(body, voxels)
+    snapshot = snapshot_of(body, voxels)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     built, seconds = timed_build(snapshot, SolidSelection(density_threshold=1.0, close_gaps=0), mode, repeats)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
@@ -191,7 +176,7 @@ def speed(repeats: int) -> None:
             0.0,
             ((0.0, 0.0, 0.0), (float(voxels),) * 3),
         )
-        snapshot = exact_snapshot(shell, voxels)
+        snapshot = snapshot_of(shell, voxels)
         cells = select_solid(snapshot, selection).cells
         start = time.perf_counter()
         tets = plain_loop(cells)
@@ -203,7 +188,6 @@ def speed(repeats: int) -> None:
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
-    """Errors against seconds, one column per body."""
     names = list(dict.fromkeys(row["body"] for row in rows))
     figure, panels = logarithmic_panels(2, len(names), figsize=(3.1 * len(names), 5.6), sharex=True, sharey="row")
     for (line, key), (column, name) in product(enumerate(("area_error", "volume_error")), enumerate(names)):
@@ -236,8 +220,6 @@ def read_rows(path: Path | None) -> list[dict[str, Any]]:
 
 @dataclass
 class MeshCost:
-    """Measure, print and plot."""
-
     resolutions: tuple[int, ...] = (16, 32, 64, 128)
     """Voxels along the longest side."""
     bodies: tuple[BodyName, ...] = BODIES
@@ -254,7 +236,6 @@ class MeshCost:
     """Only time 128^3 and 256^3 voxels beside a plain loop."""
 
     def main(self) -> None:
-        """Run what was asked for."""
         if self.speed:
             speed(self.repeats)
             return

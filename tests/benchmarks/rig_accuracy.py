@@ -6,19 +6,14 @@ Turn, direction between the lenses, angle of view, principal point, noise, drift
 Prints the errors of turn [degrees], focal length [%], where scene points fall [thermal pixels] and offsets [K].
 """
 
-from __future__ import annotations
-
-import sys
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import tyro
+from measuring import take_turns  # noqa: F401 (finds tests.support)
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
-from known_rig import drawn_capture
-
+from tests.support.known_rig import drawn_capture
 from thermoxels_ns.capture.rig.drift import estimate_drift
 from thermoxels_ns.capture.rig.search import estimate_rig
 
@@ -33,8 +28,6 @@ CAPTURES = (
 
 @dataclass
 class RigAccuracy:
-    """Draw captures and find their rigs."""
-
     captures: tuple[str, ...] = CAPTURES
     """scene:ratio:thermal width:baseline in metres:seed. Ratio is photograph's pixels per thermal pixel along one side;
     drawing 3200 pixels wide photographs takes minutes."""
@@ -42,7 +35,6 @@ class RigAccuracy:
     """Frames of each capture."""
 
     def main(self) -> None:
-        """Print a line per capture."""
         for text in self.captures:
             scene, ratio, width, baseline_m, seed = text.split(":")
             capture, start = drawn_capture(scene, int(ratio), int(width), float(baseline_m), int(seed), self.frames)

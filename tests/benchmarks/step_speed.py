@@ -14,8 +14,6 @@ torch on the same sparse lattice, skipping what is empty), and once a dense step
 every sample reading all values of its corners), as in `dense_torch_step.py`.
 """
 
-from __future__ import annotations
-
 import statistics
 import tempfile
 import time
@@ -28,9 +26,11 @@ from typing import Any, Literal
 import torch
 import tyro
 from dense_torch_step import dense_step_seconds
+from measuring import take_turns  # noqa: F401 (finds tests.support)
 from nerfstudio.utils.rich_utils import CONSOLE
-from training_run import TrainingRun
 
+from tests.support.short_training import Training
+from thermoxels_ns.config import thermoxels
 from thermoxels_ns.core.threads import num_threads
 from thermoxels_ns.field.refine import widen_colour
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
@@ -39,8 +39,6 @@ from thermoxels_ns.training.schedule import schedule_for
 
 @dataclass
 class StepSpeed:
-    """Time training steps."""
-
     resolutions: tuple[int, ...] = (64, 128, 256)
     """Voxels along the longest side."""
     scene: str = "house-corner"
@@ -61,7 +59,6 @@ class StepSpeed:
     """The lattice on which a dense step in plain torch is timed too, once; 0: none."""
 
     def main(self) -> None:
-        """Print the table."""
         rows = []
         with tempfile.TemporaryDirectory() as folder:
             scene = write_scene(
@@ -93,15 +90,16 @@ class StepSpeed:
             before = fused
 
     def measure(self, scene: Path, resolution: int) -> dict:
-        """Train to the middle of the last stage and time."""
         schedule = schedule_for(resolution, self.steps)
         rays: Any = {"train_num_rays_per_batch": self.rays, "thermal_num_rays_per_batch": self.rays}
         pipeline = {
-            "datamanager": rays,
+            "datamanager": {"data": scene, **rays},
             "model": {"photo_depth": "off"},  # rays of photographs and thermal images alone
             "cpu_threads": self.threads,
         }
-        run = TrainingRun(scene, schedule, {"pipeline": pipeline})
+        config: Any = deepcopy(thermoxels.config)
+        config.follow_schedule(schedule)
+        run = Training(pipeline, schedule.steps, config)
         if self.threads is not None:
             torch.set_num_threads(max(1, self.threads // 2))
         datamanager: Any = run.pipeline.datamanager
@@ -154,7 +152,7 @@ class StepSpeed:
             times.append(self.now() - start)
         return statistics.median(times)
 
-    def median_of_kernels(self, run: TrainingRun) -> float:
+    def median_of_kernels(self, run: Training) -> float:
         """Time per step that is spent in compiled kernels: renderer forward and backward, and row optimisers."""
         from thermoxels_ns.render import fused
         from thermoxels_ns.training.optimizers import RowOptimizer

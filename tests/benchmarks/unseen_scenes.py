@@ -10,8 +10,6 @@ results stay in the output folder. Seconds are those of the whole `ns-train`, wh
 mean anything. F-scores are those at 1.5 voxels of 128 along the exact box.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import sys
@@ -37,8 +35,6 @@ _VIEWS = (42, 6)
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one scene."""
-
     scene: SyntheticScene
     """The exact scene."""
     family: str
@@ -49,13 +45,11 @@ class Outcome:
     """What `ns-eval` reports; of the whole image where it does not say what the box covers."""
 
     def met(self, name: str) -> bool:
-        """Whether a figure is there and meets its target."""
         value, (relation, bound) = self.figures.get(name, math.nan), _TARGETS[name]
         return value >= bound if relation == ">=" else value <= bound
 
     @property
     def row(self) -> str:
-        """The line of the table."""
         coldest, hottest = self.scene.temperature_bounds_c
         shown = {name: f"{value:.2f}" for name, value in self.figures.items()}
         bold = {name: f"**{shown[name]}**" for name in _TARGETS if name in shown and not self.met(name)}
@@ -92,7 +86,6 @@ class UnseenScenes:
         print(f"all three: {sum(all(map(one.met, _TARGETS)) for one in outcomes)} of {len(outcomes)}")
 
     def measure(self, seed: int, options: Sequence[str]) -> Outcome:
-        """Write, train and evaluate one scene."""
         scene, folder = make_scene(f"{self.family}-{seed}"), self.output / f"{self.family}-{seed}"
         if not _is_written(scene, folder / "scene"):
             write_scene(scene, folder / "scene", *_VIEWS, progress=False)

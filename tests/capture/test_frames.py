@@ -1,7 +1,3 @@
-"""Reading pairs: degrees, photographs out of thermal files, and files that cannot be read."""
-
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

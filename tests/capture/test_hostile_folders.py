@@ -1,14 +1,12 @@
 """Folders as they are not meant to be: strange names, links, shut folders, pipes, and none that belongs together."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path
 
 import pytest
 
-from tests.support.camera_card import counts, photograph
+from tests.support.camera_card import counts, photograph, write_pairs
 from tests.support.flir_file import picture_bytes, segment
 from thermoxels_ns.capture.folder_scan import scan_folder, shown_name
 from thermoxels_ns.capture.pairs import find_pairs
@@ -23,13 +21,6 @@ def dji_thermal(path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(plain[:2] + segment(0xE1, b"DJI") + segment(0xE3, bytes(24)) + plain[2:])
     return path
-
-
-def three_pairs(card: Path) -> Path:
-    for name in "abc":
-        photograph(card / f"{name}-visible.jpg")
-        counts(card / f"{name}-radiometric.tiff")
-    return card
 
 
 def capture(card: Path, **more: object) -> None:
@@ -117,7 +108,7 @@ def test_an_input_inside_the_output_is_not_touched(tmp_path):
 
 
 def test_too_little_space_for_features_is_said_before_colmap_starts(tmp_path, monkeypatch):
-    three_pairs(tmp_path / "card")
+    write_pairs(tmp_path / "card")
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1_000_000))
     with pytest.raises(OutputError, match=r"up to 4 MB free for features and matches, got 1 MB.*--max-features"):
@@ -125,7 +116,7 @@ def test_too_little_space_for_features_is_said_before_colmap_starts(tmp_path, mo
 
 
 def test_what_colmap_cannot_open_says_how_to_begin_anew(tmp_path):
-    three_pairs(tmp_path / "card")
+    write_pairs(tmp_path / "card")
     with pytest.raises(SceneError):  # grey photographs have no features; what is left is that of an interrupted stage
         capture(tmp_path / "card")
     (tmp_path / "scene" / ".capture" / "poses" / "features.db").write_bytes(b"no database" * 500)

@@ -1,7 +1,3 @@
-"""What the camera draws over its photographs is found; what the scene shows is not taken for it."""
-
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

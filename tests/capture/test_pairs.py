@@ -1,7 +1,3 @@
-"""Which thermal image belongs to which photograph: by file, by names, by time; nothing is paired by chance."""
-
-from __future__ import annotations
-
 from datetime import datetime, timedelta
 from pathlib import Path
 

@@ -1,7 +1,3 @@
-"""What photographs say of themselves: time, place, lens and level; and damaged ones."""
-
-from __future__ import annotations
-
 import struct
 
 import pytest

@@ -1,7 +1,3 @@
-"""The folder that is written is a scene that the dataparser reads, with the numbers that went in."""
-
-from __future__ import annotations
-
 import json
 
 import numpy as np

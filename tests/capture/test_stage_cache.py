@@ -1,15 +1,12 @@
-"""Stages run once for the same input, again when something changed, and survive an interruption."""
-
-from __future__ import annotations
-
 import gc
 import shutil
 import sqlite3
 import sys
 
 import pytest
+from PIL import Image
 
-from tests.support.camera_card import counts, photograph
+from tests.support.camera_card import photograph, write_pairs
 from tests.support.posed_model import ring_model
 from tests.support.textured_room import VISIBLE
 from thermoxels_ns.capture.settings import CaptureSettings
@@ -105,8 +102,6 @@ def test_a_scene_that_someone_changed_is_written_again(tmp_path, damage):
 
 def test_a_database_without_its_last_frame_is_begun_again(tmp_path):
     """COLMAP's images and frames are written one after the other: a kill between them leaves one too few."""
-    from PIL import Image
-
     (tmp_path / "images").mkdir()
     names = ["0000.jpg", "0001.jpg"]
     for name in names:
@@ -154,10 +149,7 @@ def stages_that_ran(card, scene, **more):
 
 @pytest.fixture
 def card(tmp_path):
-    for name in "abcd":
-        photograph(tmp_path / "card" / f"{name}-visible.jpg")
-        counts(tmp_path / "card" / f"{name}-radiometric.tiff")
-    return tmp_path / "card"
+    return write_pairs(tmp_path / "card", "abcd")
 
 
 def test_every_change_of_the_input_is_noticed(card, tmp_path):

@@ -1,7 +1,3 @@
-"""A whole capture, from camera files to a scene that trains, and again with what is kept from the first time."""
-
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -49,6 +45,14 @@ def content(scene):
     return json.loads((scene / "transforms.json").read_text())
 
 
+def entries(scene):
+    return sorted(content(scene)["frames"], key=lambda entry: entry["source"])
+
+
+def found_poses(scene):
+    return np.array([entry["transform_matrix"] for entry in entries(scene)])
+
+
 def test_nothing_is_written_outside_the_output_folder(capture):
     before, after = capture[3]
     assert len(before) > 2 * COUNT
@@ -63,11 +67,10 @@ def test_what_is_left_out_is_named_with_its_reason(capture):
 
 
 def test_the_scene_has_the_cameras_of_the_truth(capture):
-    entries = sorted(content(capture[1])["frames"], key=lambda entry: entry["source"])
-    found = np.array([entry["transform_matrix"] for entry in entries])
+    found = found_poses(capture[1])
     scale, off_m, off_deg = alignment(found, poses(COUNT))
     assert off_m < 0.01 and off_deg < 0.3
-    thermal = np.array([entry["thermal_transform_matrix"] for entry in entries])
+    thermal = np.array([entry["thermal_transform_matrix"] for entry in entries(capture[1])])
     apart = np.linalg.norm(thermal[:, :3, 3] - found[:, :3, 3], axis=1) * scale
     assert apart.std() < 1e-6
     assert apart[0] == pytest.approx(np.linalg.norm(RIG[:3, 3]), abs=0.04)
@@ -76,10 +79,7 @@ def test_the_scene_has_the_cameras_of_the_truth(capture):
 def test_the_rig_that_was_found_projects_as_the_true_one(capture):
     rig = capture[2].scene.rig
     assert rig.determined, rig.explanation
-    scale = alignment(
-        np.array([e["transform_matrix"] for e in sorted(content(capture[1])["frames"], key=lambda e: e["source"])]),
-        poses(COUNT),
-    )[0]
+    scale = alignment(found_poses(capture[1]), poses(COUNT))[0]
     grid = np.stack(np.meshgrid(np.linspace(60, 420, 7), np.linspace(60, 300, 5)), -1).reshape(-1, 2)
     points_m = VISIBLE.rays(grid) * 2.5
     true = THERMAL.project(points_m @ RIG[:3, :3].T + RIG[:3, 3])
@@ -97,10 +97,8 @@ def test_drift_is_found(capture):
 
 
 def test_z_is_up(capture):
-    meta = content(capture[1])
-    assert meta["up"] == pytest.approx([0, 0, 1], abs=1e-9)
-    entries = sorted(meta["frames"], key=lambda entry: entry["source"])
-    found = np.array([entry["transform_matrix"] for entry in entries])[:, :3, :3]
+    assert content(capture[1])["up"] == pytest.approx([0, 0, 1], abs=1e-9)
+    found = found_poses(capture[1])[:, :3, :3]
     # Up in each camera's axes, by the scene and by the truth.
     assert np.degrees(np.arccos(np.einsum("ni,ni->n", found[:, 2], poses(COUNT)[:, 2, :3]))).max() < 2.0
 

@@ -1,7 +1,3 @@
-"""Commands that stand in for those of the installation."""
-
-from __future__ import annotations
-
 import stat
 import sys
 from collections.abc import Callable

@@ -1,7 +1,3 @@
-"""The command `thermoxels cost` around its runs: what is planned, run, kept, repeated and reported."""
-
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,3 @@
-"""The demo around its commands: its folder, running and failing commands, figures against targets, the whole run."""
-
-from __future__ import annotations
-
 import json
 import math
 import shlex

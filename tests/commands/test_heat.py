@@ -1,7 +1,3 @@
-"""The command `thermoxels heat`: from the files of an export to answers, a series, pictures and a report."""
-
-from __future__ import annotations
-
 import csv
 import json
 import re
@@ -159,7 +155,6 @@ def test_a_failing_run_leaves_the_old_results(folder, tmp_path) -> None:
 
 @pytest.mark.parametrize("name", ["quality.json", "heat.pvd", "heat/step-0001.vtu", "report.html"])
 def test_files_of_others_are_not_removed(folder, tmp_path, name) -> None:
-    """Those of an export, or of the user."""
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_text("mine")
     options = Heat(folder / "room" / "mesh.vtu", str(folder / "steady.yaml"), tmp_path, pictures=False)

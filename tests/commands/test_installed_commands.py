@@ -1,7 +1,3 @@
-"""Running a command and measuring it."""
-
-from __future__ import annotations
-
 import io
 import math
 import os

@@ -1,7 +1,3 @@
-"""Scale and up: where they come from, what they err, and what is refused."""
-
-from __future__ import annotations
-
 import json
 import math
 
@@ -38,16 +34,13 @@ def test_scale_and_distance_must_be_above_zero(value):
         scale_from_known_distance((0, 0, 0), (1, 0, 0), value)
 
 
-@pytest.mark.parametrize("bad", [(1.0, 2.0), (1.0, math.nan, 3.0), "door", (1.0, "x", 2.0), None])
-def test_points_that_are_no_points(bad):
+@pytest.mark.parametrize("point", [(1.0, 2.0), (1.0, math.nan, 3.0), "door", (1.0, "x", 2.0), None])
+@pytest.mark.parametrize("error", [-0.1, math.nan, "small"])
+def test_points_and_standard_errors_that_are_none(point, error):
     with pytest.raises(ThermoxelsError, match="point_b: expected"):
-        scale_from_known_distance((0, 0, 0), bad, 1.0)
-
-
-@pytest.mark.parametrize("bad", [-0.1, math.nan, "small"])
-def test_standard_errors_that_are_none(bad):
+        scale_from_known_distance((0, 0, 0), point, 1.0)
     with pytest.raises(ThermoxelsError, match="standard_error_m: expected a finite number of at least 0"):
-        scale_from_known_distance((0, 0, 0), (1, 0, 0), 1.0, bad)
+        scale_from_known_distance((0, 0, 0), (1, 0, 0), 1.0, error)
 
 
 def test_scene_file():

@@ -1,26 +1,9 @@
-"""Measured orders of the heat solver: 2 in the voxel size, 1 in the time step."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
+from tests.support.heat_bodies import CONCRETE, make_body
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.time_loop import solve_heat
-from thermoxels_ns.heat.materials import Material
-from thermoxels_ns.mesh.quality.face_count import boundary_facets
-from thermoxels_ns.mesh.tetrahedra import TetMesh
-from thermoxels_ns.mesh.voxel_tets import kuhn_tets
-
-CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
-
-
-def body(cells: np.ndarray, voxel_m: float, temperature_c=lambda points: np.full(len(points), 20.0)) -> TetMesh:
-    corners, tets = kuhn_tets(cells)
-    points, facets = corners * voxel_m, boundary_facets(tets)
-    seen, tags, region = np.ones(len(points), bool), np.zeros(len(facets), np.int64), np.zeros(len(tets), np.int64)
-    return TetMesh(points, tets, temperature_c(points), seen, facets, tags, region)
-
 
 LENGTH = 0.8
 RATE = 3.0 * CONCRETE.diffusivity_m2_s * (np.pi / LENGTH) ** 2
@@ -40,7 +23,7 @@ def test_second_order_in_space(lumped: bool) -> None:
     """Against backward Euler's own decay of the continuous mode, so that only the space error is left."""
     dt, steps, errors = 0.2 / RATE, 5, []
     for n in (4, 8, 16):
-        mesh = body(np.ones((n, n, n), bool), LENGTH / n, cosines)
+        mesh = make_body(np.ones((n, n, n), bool), LENGTH / n, cosines)
         end = solve_heat(HeatProblem(mesh, CONCRETE), TimeSteps(steps, dt), lumped=lumped).temperature_c[-1]
         exact = 20.0 + (mesh.temperature_c - 20.0) / (1.0 + dt * RATE) ** steps
         errors.append(float(np.sqrt(np.mean((end - exact) ** 2))))
@@ -50,7 +33,7 @@ def test_second_order_in_space(lumped: bool) -> None:
 
 def test_first_order_in_time() -> None:
     """Against very short steps on the same mesh, so that only the time error is left."""
-    mesh = body(np.ones((6, 6, 6), bool), LENGTH / 6, cosines)
+    mesh = make_body(np.ones((6, 6, 6), bool), LENGTH / 6, cosines)
     until = 1.0 / RATE
 
     def end(steps: int) -> np.ndarray:

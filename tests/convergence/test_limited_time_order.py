@@ -1,7 +1,3 @@
-"""Measured order in time while the maximum-principle limiter acts."""
-
-from __future__ import annotations
-
 import re
 
 import numpy as np

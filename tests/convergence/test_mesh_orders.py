@@ -1,7 +1,3 @@
-"""From a field to a mesh: area and volume of known bodies, and how their errors fall with the voxel size."""
-
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Measured orders in space of linear and quadratic tetrahedra, on u = cos(pi x) sin(pi y) e^z in the unit cube."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from skfem import Basis, ElementTetP1, ElementTetP2, MeshTet
@@ -22,11 +20,7 @@ def exact_gradient(p: np.ndarray) -> np.ndarray:
     wave = np.exp(p[..., 2])
     x, y = np.pi * p[..., 0], np.pi * p[..., 1]
     return np.stack(
-        [
-            -np.pi * np.sin(x) * np.sin(y) * wave,
-            np.pi * np.cos(x) * np.cos(y) * wave,
-            np.cos(x) * np.sin(y) * wave,
-        ]
+        [-np.pi * np.sin(x) * np.sin(y) * wave, np.pi * np.cos(x) * np.cos(y) * wave, np.cos(x) * np.sin(y) * wave]
     )
 
 

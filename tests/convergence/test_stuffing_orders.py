@@ -1,7 +1,3 @@
-"""Measured orders of isosurface stuffing: 2 in the voxel size where all is smooth; what edges and larger cells cost."""
-
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

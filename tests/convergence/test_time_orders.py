@@ -1,21 +1,16 @@
-"""Measured orders of the schemes in time, with everything that can flow."""
-
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np
 import pytest
 
+from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Scheme, theta_scheme
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, HeatFlux, InternalHeat, Radiation
-from thermoxels_ns.heat.materials import Material
 
-CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
 DURATION_S = 4 * 3600.0
 
 

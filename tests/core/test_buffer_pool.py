@@ -1,7 +1,3 @@
-"""Memory that is lent again: when it comes back, to whom it goes, and that nobody shares it."""
-
-from __future__ import annotations
-
 import numpy as np
 import torch
 
@@ -19,7 +15,6 @@ def address(array: np.ndarray) -> int:
 
 
 def held_bytes(pool: BufferPool) -> int:
-    """Memory that waits to be lent again, [bytes]."""
     return sum(length * len(blocks) for length, blocks in pool._free.items())
 
 

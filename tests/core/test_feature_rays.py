@@ -1,7 +1,5 @@
 """Points that lie where their neighbours in the photographs do not: found, however dense or far they are."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -12,13 +10,11 @@ CAMERAS = np.random.default_rng(9).uniform(-0.6, 0.6, (6, 3)) + np.array([0.0, 0
 
 
 def seen_by_all(points: np.ndarray, uncertainty: float = 0.0) -> FeatureRays:
-    """Every camera sees every point."""
     number = np.repeat(np.arange(len(points)), len(CAMERAS))
     return FeatureRays(np.tile(CAMERAS, (len(points), 1)), number, points, np.full(len(number), uncertainty))
 
 
 def floor(count: int = 600, seed: int = 0, slope: float = 0.0) -> np.ndarray:
-    """Points on a plane below the cameras."""
     x, y = np.random.default_rng(seed).uniform(-1.0, 1.0, (2, count))
     return np.column_stack((x, y, slope * x))
 

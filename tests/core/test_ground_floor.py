@@ -1,7 +1,5 @@
 """Units, checks and the rename-when-done rule."""
 
-from __future__ import annotations
-
 import os
 
 import numpy as np

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -22,6 +20,8 @@ def test_corners_and_centres_sit_where_the_house_says():
     np.testing.assert_array_equal(corners[-1, -1, -1], LATTICE.hi)
     np.testing.assert_array_equal(LATTICE.cell_centres()[0, 0, 0], [-0.75, 0.5, 3.25])
     assert LATTICE.num_corners == 60 and LATTICE.cell_shape == (3, 2, 4)
+    slope = np.array([1.0, -2.0, 0.5])  # the mean of a linear field is its value at the centre
+    np.testing.assert_allclose(LATTICE.corner_to_cell_mean(corners @ slope), LATTICE.cell_centres() @ slope)
 
 
 def test_refinement_keeps_every_old_corner():
@@ -52,8 +52,3 @@ def test_covering_covers_and_wastes_less_than_a_voxel(lo, size, resolution):
 def test_boxes_of_no_size_are_refused(lo, hi, resolution):
     with pytest.raises(ThermoxelsError, match="scene box: expected three finite sides"):
         Lattice.covering(lo, hi, resolution)
-
-
-def test_cell_mean_of_a_linear_field_is_its_value_at_the_centre():
-    values = LATTICE.corner_positions() @ np.array([1.0, -2.0, 0.5])
-    np.testing.assert_allclose(LATTICE.corner_to_cell_mean(values), LATTICE.cell_centres() @ np.array([1.0, -2.0, 0.5]))

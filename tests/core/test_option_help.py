@@ -1,7 +1,3 @@
-"""Texts of options break at the width of the terminal, not where the source does."""
-
-from __future__ import annotations
-
 import dataclasses
 import re
 import subprocess
@@ -20,8 +16,6 @@ LONG = "Every option's text is one paragraph here, however many lines it takes i
 
 @dataclass
 class Below:
-    """What is inherited."""
-
     low: int = 1
     """Every option's text is one paragraph here,
     however many lines it takes in the source:
@@ -30,8 +24,6 @@ class Below:
 
 @dataclass
 class Options(Below):
-    """What is asked for."""
-
     high: int = 2
     """Every option's text is one paragraph here, however many lines
     it takes in the source: 12 of them,

@@ -1,7 +1,3 @@
-"""Each file in configs/ says what the command that reads it does, and each entry point leads to it."""
-
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import sys
@@ -17,6 +13,7 @@ from nerfstudio.plugins.registry_dataparser import discover_dataparsers
 from nerfstudio.plugins.types import MethodSpecification
 
 from thermoxels_ns import config
+from thermoxels_ns.core import yaml_records
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.yaml_records import read_preset, read_yaml, with_overrides
 
@@ -36,13 +33,11 @@ METHOD_FILES = [name for name in FILES if not name.startswith(OTHERS)]
 
 
 def _object(reference: str) -> Any:
-    """What an entry point names."""
     module, _, name = reference.partition(":")
     return getattr(importlib.import_module(module), name)
 
 
 def _leaves(content: Mapping[str, Any], above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Paths and values of a nested mapping."""
     for key, value in content.items():
         if isinstance(value, Mapping):
             yield from _leaves(value, (*above, key))
@@ -51,14 +46,12 @@ def _leaves(content: Mapping[str, Any], above: tuple[str, ...] = ()) -> Iterator
 
 
 def _at(tree: Any, path: tuple[str, ...]) -> Any:
-    """The value that a nested configuration has at a path."""
     for key in path:
         tree = tree[key] if isinstance(tree, Mapping) else getattr(tree, key)
     return list(tree) if isinstance(tree, tuple) else tree
 
 
 def _settings(name: str) -> dict[str, Any]:
-    """What a preset of a method changes."""
     content = yaml.safe_load((ROOT / "configs" / f"{name}.yaml").read_text(encoding="utf-8"))
     content.pop("description")
     return content
@@ -70,15 +63,11 @@ def test_every_file_belongs_to_a_command() -> None:
 
 
 @pytest.mark.parametrize("name", METHOD_FILES)
-def test_a_method_has_the_values_of_its_file(name: str) -> None:
+def test_a_method_has_the_values_of_its_file_and_else_those_of_the_base(name: str) -> None:
     specification = _object(METHODS[name])
     for path, value in _leaves(_settings(name)):
         assert _at(specification.config, path) == value, ".".join(path)
     assert specification.description == read_preset(name)["description"]
-
-
-@pytest.mark.parametrize("name", METHOD_FILES)
-def test_a_method_differs_from_the_base_only_where_its_file_says(name: str) -> None:
     base = dict(_leaves(dataclasses.asdict(config.thermoxels.config)))
     ours = dict(_leaves(dataclasses.asdict(_object(METHODS[name]).config)))
     # Another class of optimizer has fields of its own, so the two trees are compared without their optimizers.
@@ -110,7 +99,6 @@ def test_an_entry_point_of_a_method_leads_to_it(name: str) -> None:
 
 
 def test_methods_share_no_configuration() -> None:
-    """An option that ns-train changes in one method does not appear in another."""
     seen: set[int] = set()
     for reference in METHODS.values():
         pipeline = _object(reference).config.pipeline
@@ -168,3 +156,24 @@ def test_yaml_that_cannot_be_used_is_refused(tmp_path, text):
     (tmp_path / "a.yaml").write_text(text)
     with pytest.raises(ThermoxelsError, match=r"a\.yaml: expected"):
         read_yaml(tmp_path / "a.yaml")
+
+
+def test_a_key_given_twice_is_found_among_many(tmp_path):
+    """Each key is looked up once."""
+    lines = [f"k{number}: 1" for number in range(3000)]
+    (tmp_path / "a.yaml").write_text("\n".join([*lines, "k7: 2"]))
+    with pytest.raises(ThermoxelsError, match=r"a\.yaml: expected a yaml file, got the key k7 twice.*line 3001"):
+        read_yaml(tmp_path / "a.yaml")
+    looked_up = []
+
+    class Names(set):
+        def __contains__(self, name):
+            looked_up.append(name)
+            return super().__contains__(name)
+
+    node = yaml.compose("\n".join(lines[:2000]))
+    loader = yaml_records._UniqueKeyLoader("")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(yaml_records, "set", {str: Names}, raising=False)
+        loader.construct_mapping(node)
+    assert looked_up == [f"k{number}" for number in range(2000)]

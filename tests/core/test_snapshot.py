@@ -1,7 +1,3 @@
-"""What crosses the wall to the mesher is checked there, and a pipeline fills all of it."""
-
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

@@ -1,7 +1,3 @@
-"""Ranges of work shared among threads."""
-
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Iterator

@@ -1,7 +1,3 @@
-"""Views look where the cameras look: exactly for pinholes, over the same angles for other lenses."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

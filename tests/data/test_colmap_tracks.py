@@ -1,7 +1,3 @@
-"""Tracks of a COLMAP model beside given poses: found, matched by name, moved to the json's world, or refused."""
-
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +12,7 @@ from thermoxels_ns.data.colmap_tracks import _matched, _points, read_colmap_trac
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_box import find_scene_box
 from thermoxels_ns.data.scene_file import read_scene_file
-from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, write_tracks
+from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, SparseTracks, write_tracks
 
 TAGS = ["train", "train", "eval", "train", "train", "train"]
 NAMES = [f"frame_{tag}_{number:05d}" for number, tag in enumerate(TAGS)]
@@ -78,6 +74,12 @@ def add_model(folder, where="colmap/sparse/0", frames=None, names=None, **option
     write_model(frames, names or [one.image.name for one in frames], folder.path / where, **options)
 
 
+def tracks_of(folder) -> SparseTracks:
+    tracks = read_colmap_tracks(read_scene_file(folder.path))
+    assert tracks is not None
+    return tracks
+
+
 def lines_of(folder, split="train", **options):
     return ThermalDataParserConfig(data=folder.path, **options).setup().get_dataparser_outputs(split)
 
@@ -86,8 +88,7 @@ def lines_of(folder, split="train", **options):
 @pytest.mark.parametrize("text", [False, True])
 def test_points_come_in_the_worlds_of_the_json_and_of_training(scene, where, text):
     add_model(scene, where, text=text)
-    tracks = read_colmap_tracks(read_scene_file(scene.path))
-    assert tracks is not None
+    tracks = tracks_of(scene)
     assert np.sort(tracks.points, axis=0) == pytest.approx(np.sort(POINTS, axis=0), abs=1e-6)
     assert len(tracks.sighting_frame) == 6 * 30
     outputs = lines_of(scene)
@@ -101,9 +102,7 @@ def test_points_come_in_the_worlds_of_the_json_and_of_training(scene, where, tex
 
 @pytest.mark.parametrize("where", COLMAP_FOLDERS)
 def test_the_box_too_is_found_wherever_a_model_may_lie(scene_folder, where):
-    scene = scene_folder(frames=len(NAMES), names=NAMES)
-    del scene.meta["scene_box"]
-    scene.rewrite()
+    scene = scene_folder(frames=len(NAMES), names=NAMES, scene_box=None)
     add_model(scene, where, moved=False)
     file = read_scene_file(scene.path)
     evidence = find_scene_box(file, None, range(len(NAMES)))
@@ -122,8 +121,7 @@ def test_without_a_model_and_switched_off_there_are_no_lines(scene):
 
 def test_the_file_that_the_json_names_comes_first(scene):
     add_model(scene)
-    tracks = read_colmap_tracks(read_scene_file(scene.path))
-    assert tracks is not None
+    tracks = tracks_of(scene)
     few = tracks.sighting_point < 7
     some = type(tracks)(
         tracks.points, tracks.point_error_px, tracks.frames, tracks.sighting_frame[few], tracks.sighting_point[few]
@@ -141,8 +139,7 @@ def test_some_wrong_poses_are_left_out_and_named_and_move_nothing(scene, capsys)
     entry = next(one for one in scene.meta["frames"] if frames[4].image.name in one["file_path"])
     entry["transform_matrix"][0][3] += 2.0
     scene.rewrite()
-    tracks = read_colmap_tracks(read_scene_file(scene.path))
-    assert tracks is not None
+    tracks = tracks_of(scene)
     assert np.sort(tracks.points, axis=0) == pytest.approx(np.sort(POINTS, axis=0), abs=1e-6)
     assert set(tracks.sighting_frame.tolist()) == {0, 1, 2, 3, 5}
     assert frames[4].name in capsys.readouterr().out.replace("\n", "")
@@ -178,18 +175,11 @@ def test_models_that_cannot_be_used_are_left_out_with_a_warning(scene, capsys, s
     assert said in " ".join(capsys.readouterr().out.split())
 
 
-def test_errors_are_pixels_of_the_photographs(scene):
+def test_errors_are_pixels_of_the_photographs_and_are_computed_where_colmap_did_not(scene):
     add_model(scene, focal_factor=0.5, error=0.4)
-    tracks = read_colmap_tracks(read_scene_file(scene.path))
-    assert tracks is not None
-    assert tracks.point_error_px == pytest.approx(0.8)
-
-
-def test_errors_that_colmap_did_not_compute_are_computed(scene):
+    assert tracks_of(scene).point_error_px == pytest.approx(0.8)
     add_model(scene, error=-1.0)
-    tracks = read_colmap_tracks(read_scene_file(scene.path))
-    assert tracks is not None
-    assert (tracks.point_error_px >= 0.0).all()
+    assert (tracks_of(scene).point_error_px >= 0.0).all()
 
 
 def test_photographs_of_one_name_are_told_apart_by_their_folders():

@@ -1,7 +1,3 @@
-"""Batches: the right rays, the right targets, the same again for the same step."""
-
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +23,7 @@ def manager(data: Path, mode: str = "val", parser: dict | None = None, **options
 
 def all_rays(cameras) -> dict[str, torch.Tensor]:
     """nerfstudio's rays of every pixel of every camera, flat."""
-    bundles = [cameras.generate_rays(index, keep_shape=True).flatten() for index in range(len(cameras))]
+    bundles = [cameras[n : n + 1].generate_rays(0, keep_shape=True).flatten() for n in range(len(cameras))]
     return {
         name: torch.cat([getattr(b, name) for b in bundles]) for name in ("origins", "directions", "pixel_area")
     } | {"camera_indices": torch.cat([torch.full((len(b), 1), i) for i, b in enumerate(bundles)])}
@@ -188,16 +184,9 @@ def test_frames_of_different_resolutions(scene_folder):
     scene.rewrite()
     served = manager(scene.path)
     bundle, batch = served.next_train(0)
-    pixels = check_rays(bundle, all_rays_mixed(served.train_dataset.cameras))
+    pixels = check_rays(bundle, all_rays(served.train_dataset.cameras))
     colours = torch.cat([served.train_dataset[i]["image"].reshape(-1, 3) for i in range(4)])
     torch.testing.assert_close(batch["image"], colours[pixels])
-
-
-def all_rays_mixed(cameras) -> dict[str, torch.Tensor]:
-    parts = [all_rays(cameras[index : index + 1]) for index in range(len(cameras))]
-    for index, part in enumerate(parts):
-        part["camera_indices"] += index
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
 def test_training_rays_are_a_regular_subset(scene_folder):

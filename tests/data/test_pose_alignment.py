@@ -1,7 +1,3 @@
-"""The similarity between two worlds of the same cameras: exact, also on a line and with wrong poses among them."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -13,7 +9,6 @@ SCALE, SHIFT = 0.37, np.array([5.0, -2.0, 0.3])
 
 
 def worlds(count: int, on_a_line: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Cameras in two worlds."""
     random = np.random.default_rng(count)
     source = np.tile(np.eye(4), (count, 1, 1))
     source[:, :3, :3] = Rotation.from_rotvec(2.0 * random.normal(size=(count, 3))).as_matrix()

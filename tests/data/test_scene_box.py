@@ -1,7 +1,3 @@
-"""The box that is found without being given: from outside and from within, with strays and with far surroundings."""
-
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -77,7 +73,6 @@ def found(folder: Path) -> tuple[np.ndarray, str]:
 
 @pytest.mark.parametrize("across", [False, True])
 def test_a_room_from_within(tmp_path, across):
-    """Cameras on a circle that look outwards, or across the room."""
     half = np.array([2.0, 1.5, 1.2])
     poses = [look_at_origin(np.pi * n / 12, radius=0.6, height=0.0) if across else outwards(n) for n in range(24)]
     write(tmp_path / "scene", poses, half.tolist(), block=False)
@@ -122,14 +117,15 @@ def test_strays_and_a_street_behind_do_not_count_but_a_chimney_does(tmp_path):
     assert (box[0] < -0.98 * BLOCK).all() and (box[1] > [0.49, 0.34, 0.6]).all() and (np.abs(box) < 0.75).all(), box
 
 
-def test_ground_that_runs_on_is_cut_to_what_photographs_show_of_the_middle(tmp_path):
+@pytest.mark.parametrize("reach, below", [(2.0, 0.64), (0.6, 0.75)])
+def test_a_ground_that_runs_on_is_left_out_but_a_slab_stays(tmp_path, reach, below):
     frames = frames_of(tmp_path, [look_at_origin(0.26 * number, radius=2.2, height=1.2) for number in range(24)])
     draw = np.random.default_rng(4)
-    ground = np.column_stack((draw.uniform(-2.0, 2.0, (4000, 2)), np.full(4000, -0.3)))
-    block = BLOCK * draw.uniform(-1.0, 1.0, (1500, 3))
-    box = box_of_points(np.concatenate((ground, block)), frames, np.eye(3))
-    assert bool((box[0] < -BLOCK).all() and (box[1] > BLOCK).all())
-    assert np.abs(box[:, :2]).max() < 1.5, "half of what an average photograph shows there, 1.3, and rounding"
+    ground = np.column_stack((draw.uniform(-reach, reach, (4000, 2)), np.full(4000, -0.3)))
+    block, house = BLOCK * draw.uniform(-1.0, 1.0, (1500, 3)), draw.uniform((-2, 1.6, -0.3), (2, 2, 0.5), (150, 3))
+    box = box_of_points(np.concatenate((ground, block, house) if reach > 1.0 else (ground, block)), frames, np.eye(3))
+    assert (box[0] < (*-BLOCK[:2], -0.3)).all() and (box[1] > BLOCK).all(), box
+    assert min(reach, 0.5) < np.abs(box[:, :2]).max() < below, box
 
 
 def test_a_plain_wall_without_points_is_held_too(tmp_path):

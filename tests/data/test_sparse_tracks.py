@@ -1,7 +1,3 @@
-"""Tracks beside a scene: what is written is read, evaluation photographs stay out, wrong files are refused."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,13 +7,7 @@ import pytest
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_file import read_scene_file
-from thermoxels_ns.data.sparse_tracks import (
-    TRACKS_KEY,
-    SparseTracks,
-    feature_rays,
-    read_tracks,
-    write_tracks,
-)
+from thermoxels_ns.data.sparse_tracks import TRACKS_KEY, SparseTracks, feature_rays, read_tracks, write_tracks
 
 TAGS = ["train", "train", "eval", "train", "train", "train"]
 NAMES = [f"frame_{tag}_{number:05d}" for number, tag in enumerate(TAGS)]
@@ -110,9 +100,7 @@ def test_sightings_given_twice_count_once(scene):
     folder, tracks = scene
     frames = [frame for frame in read_scene_file(folder.path).frames if "train" in frame.name]
     twice = replace(
-        tracks,
-        sighting_frame=np.tile(tracks.sighting_frame, 3),
-        sighting_point=np.tile(tracks.sighting_point, 3),
+        tracks, sighting_frame=np.tile(tracks.sighting_frame, 3), sighting_point=np.tile(tracks.sighting_point, 3)
     )
     assert len(feature_rays(twice, frames).origins) == len(feature_rays(tracks, frames).origins) == 5 * 30
     assert len(feature_rays(twice, frames[:2]).points) == 0  # two photographs are not six

@@ -1,7 +1,3 @@
-"""Which frames train and which evaluate: by names, by lists, by number; none does both."""
-
-from __future__ import annotations
-
 import pytest
 
 from thermoxels_ns.core.errors import SceneError

@@ -1,7 +1,3 @@
-"""Figures of geometry: the exact scene scores as it must, and ns-eval gets them from the right surface."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,6 +1,4 @@
-"""Distances between a mesh's surface and the true one."""
-
-from __future__ import annotations
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +8,6 @@ from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 
 
 class Plane:
-    """Solid below z = height."""
-
     def __init__(self, height: float):
         self.height = height
 
@@ -28,9 +24,7 @@ def slab(mesh_of_cells, height_tag: bool = True) -> TetMesh:
     mesh = mesh_of_cells(np.ones((4, 4, 1), dtype=bool), 0.25)
     top = np.all(mesh.points_m[mesh.facets][:, :, 2] == 0.25, axis=1)
     tags = np.where(top, mesh.facet_tags * 0, FACET_BOX) if height_tag else mesh.facet_tags
-    return TetMesh(
-        mesh.points_m, mesh.tets, 10.0 + 4.0 * mesh.points_m[:, 0], mesh.observed, mesh.facets, tags, mesh.region
-    )
+    return replace(mesh, temperature_c=10.0 + 4.0 * mesh.points_m[:, 0], facet_tags=tags)
 
 
 def test_parallel_planes_are_their_distance_apart(mesh_of_cells):

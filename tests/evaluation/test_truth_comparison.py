@@ -1,7 +1,3 @@
-"""Solid voxels made from the exact scene score as they must, and every shift, scale and error is noticed."""
-
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -21,16 +17,19 @@ from thermoxels_ns.synthetic.scene_folder import make_scene, visible_surface_poi
 IDENTITY = np.eye(4)
 
 
+def known(name: str, cameras: int = 12, width: int = 64) -> KnownTruth:
+    scene = make_scene(name)
+    return KnownTruth(scene, scene.poses(cameras, 0)[0], scene.camera(width, 3 * width // 4))
+
+
 @pytest.fixture(scope="module")
 def hot_object() -> KnownTruth:
-    scene = make_scene("hot-object")
-    return KnownTruth(scene, scene.poses(12, 0)[0], scene.camera(64, 48))
+    return known("hot-object")
 
 
 @pytest.fixture(scope="module")
 def sphere() -> KnownTruth:
-    scene = make_scene("sphere")
-    return KnownTruth(scene, scene.poses(12, 0)[0], scene.camera(64, 48))
+    return known("sphere")
 
 
 def exact_cells(truth: KnownTruth, resolution: int = 24) -> tuple[np.ndarray, Lattice]:
@@ -264,8 +263,7 @@ def shell_that_cameras_see(truth: KnownTruth, resolution: int) -> GridSnapshot:
 )
 def test_the_solid_of_a_perfectly_trained_scene_is_the_scene(name, resolution, least_fscore):
     """Filling adds the inside of every body, and nothing between pipes and the wall that they stand before."""
-    scene = make_scene(name)
-    truth = KnownTruth(scene, scene.poses(24, 0)[0], scene.camera(160, 120))
+    truth = known(name, 24, 160)
     snapshot = shell_that_cameras_see(truth, resolution)
     shell = select_solid(snapshot, SolidSelection(density_threshold=0.5, interior="hollow")).cells
     cells = select_solid(snapshot, SolidSelection(density_threshold=0.5)).cells

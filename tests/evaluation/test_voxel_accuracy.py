@@ -1,7 +1,3 @@
-"""F-score of the surface against a body that is known exactly."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -10,27 +6,12 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.evaluation.voxel_accuracy import SeenScore, surface_fscore
-
-
-class Sphere:
-    """A sphere with exact signed distance."""
-
-    def __init__(self, centre=(0.0, 0.0, 0.0), radius: float = 0.6) -> None:
-        self.centre, self.radius = np.asarray(centre, dtype=float), radius
-
-    def signed_distance(self, points):
-        return np.linalg.norm(points - self.centre, axis=-1) - self.radius
-
-    def surface_points(self, n, seed):
-        normals = np.random.default_rng(seed).normal(size=(n, 3))
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        return self.centre + self.radius * normals, normals
-
+from thermoxels_ns.synthetic.solids import Sphere
 
 LATTICE = Lattice.covering((-1, -1, -1), (1, 1, 1), 24)
 H = LATTICE.voxel_size
 TOLERANCE = 1.5 * H
-SPHERE = Sphere()
+SPHERE = Sphere((0.0, 0.0, 0.0), 0.6)
 SEEN = SPHERE.surface_points(2000, 0)[0]
 
 
@@ -40,16 +21,15 @@ def voxels(shape: Sphere) -> np.ndarray:
 
 def test_voxelised_sphere_scores_high():
     score = surface_fscore(voxels(SPHERE), LATTICE, SPHERE, SEEN, TOLERANCE)
-    assert score.precision == 1.0
-    assert score.recall == 1.0
-    assert score.fscore == 1.0
+    assert (score.precision, score.recall, score.fscore) == (1.0, 1.0, 1.0)
     assert score.mean_distance is not None
     assert 0.0 < score.mean_distance < 0.5 * H
 
 
 def test_score_falls_as_the_body_is_shifted_away():
     scores = [
-        surface_fscore(voxels(Sphere((shift * H, 0, 0))), LATTICE, SPHERE, SEEN, TOLERANCE) for shift in (0, 2, 4, 6)
+        surface_fscore(voxels(Sphere((shift * H, 0, 0), 0.6)), LATTICE, SPHERE, SEEN, TOLERANCE)
+        for shift in (0, 2, 4, 6)
     ]
     fscores = [s.fscore for s in scores]
     distances = [s.mean_distance for s in scores]
@@ -59,7 +39,7 @@ def test_score_falls_as_the_body_is_shifted_away():
 
 
 def test_grown_sphere_has_neither_precision_nor_recall():
-    score = surface_fscore(voxels(Sphere(radius=0.6 + 3.5 * H)), LATTICE, SPHERE, SEEN, TOLERANCE)
+    score = surface_fscore(voxels(Sphere((0, 0, 0), 0.6 + 3.5 * H)), LATTICE, SPHERE, SEEN, TOLERANCE)
     assert (score.precision, score.recall, score.fscore) == (0.0, 0.0, 0.0)
     assert score.mean_distance == pytest.approx(3.5 * H, rel=0.1)
 
@@ -74,7 +54,7 @@ def test_half_a_sphere_has_half_the_recall():
 
 
 def test_enclosed_cavities_do_not_count():
-    hollow = voxels(SPHERE) & ~voxels(Sphere(radius=0.25))
+    hollow = voxels(SPHERE) & ~voxels(Sphere((0, 0, 0), 0.25))
     assert surface_fscore(hollow, LATTICE, SPHERE, SEEN, TOLERANCE).precision == 1.0
     opened = hollow.copy()
     opened[12, 12, :12] = False
@@ -82,7 +62,7 @@ def test_enclosed_cavities_do_not_count():
 
 
 def test_faces_where_the_box_cuts_do_not_count_for_precision():
-    shape = Sphere((-1.0, 0.0, 0.0))
+    shape = Sphere((-1.0, 0.0, 0.0), 0.6)
     score = surface_fscore(voxels(shape), LATTICE, shape, shape.surface_points(500, 0)[0], TOLERANCE)
     assert score.precision == 1.0
 

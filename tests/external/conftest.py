@@ -1,7 +1,5 @@
 """A body that programs outside of the project read, and our own answer to compare theirs with."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
@@ -11,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from tests.support.demo_mesh import demo_mesh
+from tests.support.heat_bodies import CONCRETE
 from tests.support.house_mesh import house_mesh
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
-from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 _LONGEST_RUN_S = 300
@@ -28,7 +26,7 @@ def solid_mesh(request: pytest.FixtureRequest) -> TetMesh:
 @pytest.fixture(scope="session")
 def heat_problem(solid_mesh) -> HeatProblem:
     """Conduction in it, as concrete."""
-    return HeatProblem(solid_mesh, Material("concrete", 1.7, 2200.0, 880.0))
+    return HeatProblem(solid_mesh, CONCRETE)
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,3 @@
-"""CalculiX runs the input file as it is."""
-
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -9,10 +5,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_matrices import HeatMatrices, assemble
 from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
-from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.files.abaqus import HeatStep, write_inp
 from thermoxels_ns.mesh.quality.checks import facet_areas
 
@@ -99,7 +95,7 @@ def test_surfaces_and_sets_are_the_patches(tmp_path, heat_problem, program, run_
     surfaces = re.findall(r"\*SURFACE, NAME=([^,]+),", plain)
     used = np.unique(mesh.boundary.patch)
     assert len(surfaces) == len(used) > 1
-    nodal_mass = assemble(mesh, Material("concrete", 1.7, 2200.0, 880.0)).nodal_mass_j_k
+    nodal_mass = assemble(mesh, CONCRETE).nodal_mass_j_k
     areas = facet_areas(mesh.points_m, mesh.facets)
     for name, patch in zip(surfaces, used):
         facets = mesh.boundary.patch == patch

@@ -1,7 +1,3 @@
-"""FEniCSx reads the mesh with its tags and solves the same problem."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

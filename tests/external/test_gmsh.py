@@ -1,7 +1,3 @@
-"""Gmsh reads the mesh with its physical groups."""
-
-from __future__ import annotations
-
 from pathlib import Path
 
 import meshio

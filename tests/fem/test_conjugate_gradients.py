@@ -1,31 +1,20 @@
-"""Conjugate gradients: right, in few iterations, whatever the threads, and nothing unsolved passes for solved."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import sparse
 from scipy.sparse.linalg import cg, spsolve
 from threadpoolctl import threadpool_limits
 
+from tests.support.heat_bodies import CONCRETE, STEEL
 from tests.support.heat_meshes import box_mesh, planes
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.conjugate_gradients import (
-    ConjugateGradients,
-    LinearSolution,
-    LinearSolver,
-    Multigrid,
-    TwoLevel,
-)
+from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients, LinearSolution, LinearSolver, Multigrid, TwoLevel
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import HeatSystem
-from thermoxels_ns.heat.effects import Convection, FixedTemperature, InternalHeat, Radiation
-from thermoxels_ns.heat.materials import Material
+from thermoxels_ns.heat.effects import Convection, FixedTemperature, InternalHeat
 
-STEEL = Material("steel", 50.0, 7800.0, 450.0)
 KERSHAW = np.array([[3.0, -2.0, 0.0, 2.0], [-2.0, 3.0, -2.0, 0.0], [0.0, -2.0, 3.0, -2.0], [2.0, 0.0, -2.0, 3.0]])
 """Positive definite (Kershaw, Journal of Computational Physics 26, 1978), but its last pivot is not."""
 
@@ -223,7 +212,7 @@ def cube() -> tuple[sparse.csr_matrix, np.ndarray]:
     """A cube of 21^3 nodes, above the size from which BLAS shares a sum among threads."""
     x = planes(0.0, 1.0, step=0.05)
     air = Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, -5.0)
-    system = HeatSystem(HeatProblem(box_mesh(x, x, x), Material("concrete", 1.7, 2200.0, 880.0), effects=air))
+    system = HeatSystem(HeatProblem(box_mesh(x, x, x), CONCRETE, effects=air))
     return system.matrix(0.0, np.inf), system.load(0.0)
 
 
@@ -231,19 +220,14 @@ def by_multigrid(matrix: sparse.csr_matrix, b: np.ndarray) -> LinearSolution:
     return ConjugateGradients(matrix, Multigrid(matrix), max_iterations=500).solve(b)
 
 
-def test_the_number_of_threads_changes_no_bit(cube) -> None:
+def test_few_iterations_to_the_solution_of_the_diagonal_alone_with_any_number_of_threads(cube) -> None:
     found = []
     for threads in (1, 2):
         with threadpool_limits(threads, "blas"):
             found.append(by_multigrid(cube[0], cube[1]))
-    assert found[0].converged and found[0].iterations == found[1].iterations
+    assert found[0].converged and found[0].iterations == found[1].iterations <= 20
     np.testing.assert_array_equal(found[0].x, found[1].x)
-
-
-def test_few_iterations_to_the_solution_of_the_diagonal_alone(cube) -> None:
-    solution = by_multigrid(cube[0], cube[1])
-    assert solution.converged and solution.iterations <= 20
-    np.testing.assert_allclose(solution.x, ConjugateGradients(cube[0]).solve(cube[1]).x, rtol=1e-9)
+    np.testing.assert_allclose(found[0].x, ConjugateGradients(cube[0]).solve(cube[1]).x, rtol=1e-9)
 
 
 def _line(count: int) -> sparse.lil_matrix:
@@ -300,17 +284,6 @@ def test_iterations_do_not_grow_with_the_mesh() -> None:
         system, matrix, b = matrix_and_load(shell(refinements))
         counts.append(system.linear_solver(matrix, 1e-8).solve(b).iterations)
     assert max(counts) < 40 and counts[2] < 1.3 * counts[1], counts
-
-
-@pytest.mark.parametrize("contrast", [1e-6, 1e6])
-def test_conductivity_contrast_radiation_and_fixed_sides(contrast) -> None:
-    axis = np.linspace(0, 1, 7)
-    rod = {"block": lambda p: p[..., 0] > -1, "rod": lambda p: np.hypot(p[..., 1] - 0.5, p[..., 2] - 0.5) < 0.2}
-    mesh = box_mesh(axis, axis, axis, regions=rod)
-    materials = {"block": Material("a", 1.0, 1000.0, 1000.0), "rod": Material("b", contrast, 1000.0, 1000.0)}
-    effects = (Convection(("x0",), 10.0, 20.0), FixedTemperature(("x1",), 0.0), Radiation(("z1",), 0.9, 10.0))
-    solution = solve_steady(HeatProblem(mesh, materials, effects=effects), order=2)
-    assert solution.converged and solution.energy_residual < 1e-9
 
 
 def test_a_mesh_whose_corners_are_all_fixed() -> None:

@@ -1,7 +1,3 @@
-"""An energy balance that does not close is said not to, however small the heat that flows is beside its terms."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,21 +1,19 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.support.heat_bodies import STEEL
 from tests.support.heat_meshes import box_mesh, planes
+from tests.support.heat_problems import finer
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.error_estimate import recovered_error_w_k
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.heat.effects import Convection, FixedTemperature, InternalHeat
 from thermoxels_ns.heat.materials import Material
 
-STEEL = Material("steel", 50.0, 7800.0, 450.0)
 WOOL = Material("wool", 0.04, 30.0, 1000.0)
 
 
@@ -76,7 +74,7 @@ def test_the_recovered_error_is_close_to_the_true_one(order, parts) -> None:
 
 def test_the_recovered_error_is_that_of_the_heat_flow() -> None:
     """Between two airs, flow times their difference exceeds the exact one by the error: here within a factor of 2."""
-    exact_w = solve_steady(replace_mesh(corner(16), 1), order=2).effects[0].heat_w[0]
+    exact_w = solve_steady(finer(corner(16)), order=2).effects[0].heat_w[0]
     for parts in (8, 16):
         problem = corner(parts)
         depth = (1 / parts) / (1 / 16)
@@ -94,9 +92,3 @@ def test_a_solution_of_another_mesh_is_refused() -> None:
     quadratic = solve_steady(problem, order=2)
     with pytest.raises(HeatError, match="solution: expected 125 temperatures, got 124"):
         recovered_error_w_k(problem, replace(quadratic, edge_temperature_c=quadratic.edge_temperature_c[1:]))
-
-
-def replace_mesh(problem: HeatProblem, times: int) -> HeatProblem:
-    for _ in range(times):
-        problem = replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=None)
-    return problem

@@ -1,8 +1,7 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
+from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
@@ -12,7 +11,6 @@ from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 EMPTY = Material("next to nothing", 1.7, 1.0, 1e-12)
-CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
 AIR = Convection(("x0",), 10.0, 5.0)
 SKY = Radiation(("x0",), 0.9, -20.0)
 SUN = HeatFlux(("x1",), 100.0)

@@ -1,7 +1,3 @@
-"""The memory that a computation takes is what was said before."""
-
-from __future__ import annotations
-
 import tracemalloc
 from dataclasses import replace
 
@@ -42,25 +38,21 @@ def peak(run) -> int:
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("effects", [(), MIXED], ids=["conduction", "radiation"])
-@pytest.mark.parametrize("kept", [2, 60])
-def test_steps_take_what_was_said(mesh, concrete, effects, kept) -> None:
+@pytest.mark.parametrize(
+    ("effects", "solve", "said"),
+    [
+        ((), lambda p: solve_heat(p, TimeSteps(1, 5.0)), {"times": 2}),
+        ((), lambda p: solve_heat(p, TimeSteps(59, 5.0)), {"times": 60}),
+        (MIXED, lambda p: solve_heat(p, TimeSteps(1, 5.0)), {"times": 2}),
+        (MIXED, lambda p: solve_heat(p, TimeSteps(59, 5.0)), {"times": 60}),
+        (MIXED[:1], lambda p: solve_heat(p, AdaptiveSteps(600.0, 0.5, outputs=9)), dict(times=10, adaptive=True)),
+        (MIXED[:1], lambda p: solve_steady(p, order=1), {"order": 1}),
+        (MIXED[:1], lambda p: solve_steady(p, order=2), {"order": 2}),
+    ],
+)
+def test_it_takes_what_was_said(mesh, concrete, effects, solve, said) -> None:
     problem = HeatProblem(mesh, concrete, effects=effects)
-    taken = peak(lambda: solve_heat(problem, TimeSteps(kept - 1, 5.0)))
-    assert 1 / 1.5 < peak_bytes(problem, times=kept) / taken < 1.5
-
-
-def test_adaptive_steps_take_what_was_said(mesh, concrete) -> None:
-    problem = HeatProblem(mesh, concrete, effects=MIXED[:1])
-    taken = peak(lambda: solve_heat(problem, AdaptiveSteps(600.0, 0.5, outputs=9)))
-    assert 1 / 1.5 < peak_bytes(problem, times=10, adaptive=True) / taken < 1.5
-
-
-@pytest.mark.parametrize("order", [1, 2])
-def test_steady_states_take_what_was_said(mesh, concrete, order) -> None:
-    problem = HeatProblem(mesh, concrete, effects=MIXED[:1])
-    taken = peak(lambda: solve_steady(problem, order=order))
-    assert 1 / 1.5 < peak_bytes(problem, order=order) / taken < 1.5
+    assert 1 / 1.5 < peak_bytes(problem, **said) / peak(lambda: solve(problem)) < 1.5
 
 
 def test_what_does_not_fit_is_refused() -> None:

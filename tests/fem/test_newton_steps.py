@@ -1,7 +1,3 @@
-"""Steps with radiation that are very short, change next to nothing, or begin where nothing is left to change."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,24 +1,19 @@
 """Errors of linear tetrahedra estimated from one solution, on bodies that no constant was chosen on."""
 
-from __future__ import annotations
-
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
+from tests.support.heat_bodies import CONCRETE, STEEL
 from tests.support.heat_meshes import box_mesh
+from tests.support.heat_problems import finer
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.fem.error_estimate import difference_between
 from thermoxels_ns.fem.problem import HeatProblem
-from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.tolerance import Tolerance, solve_to_tolerance
 from thermoxels_ns.heat.effects import Convection, FixedTemperature, InternalHeat, Radiation
 from thermoxels_ns.heat.materials import Material
 
-CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
-STEEL = Material("steel", 50.0, 7800.0, 450.0)
 INSIDE, OUTSIDE = Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, -10.0)
 
 
@@ -79,9 +74,7 @@ BODIES = {
 @pytest.mark.parametrize("name", BODIES)
 def test_the_estimate_is_within_a_factor_of_three(name) -> None:
     problem = BODIES[name]()
-    found, fine = solve_steady(problem), problem
-    for _ in range(1 if len(problem.mesh.tets) > 1500 else 2):
-        fine = replace(fine, mesh=refine_mesh(fine.mesh), initial_temperature_c=None)
+    found, fine = solve_steady(problem), finer(problem, 1 if len(problem.mesh.tets) > 1500 else 2)
     exact = solve_steady(fine, order=2, relative_tolerance=1e-9)
     true = difference_between(found, exact, len(problem.mesh.points_m))
     assert found.error is not None

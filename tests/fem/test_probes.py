@@ -1,12 +1,9 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from tests.support.heat_meshes import box_mesh, planes
+from tests.support.heat_meshes import box_mesh, mesh_from, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.probes import place_probes
-from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 
 def linear(points: np.ndarray) -> np.ndarray:
@@ -44,9 +41,8 @@ def test_probes_are_rows_of_three_finite_numbers(box, points) -> None:
 
 def test_a_point_just_beyond_a_slanted_face_is_outside() -> None:
     """It lies within the box around the tetrahedron."""
-    none = np.zeros((0, 3), np.int64)
     corner = np.vstack([np.zeros(3), np.eye(3)])
-    tet = TetMesh(corner, np.array([[0, 1, 2, 3]]), np.arange(4.0), np.ones(4, bool), none, none[:, 0], np.array([0]))
+    tet = mesh_from(corner, np.array([[0, 1, 2, 3]]), lambda p: np.arange(4.0))
     on_it = np.full(3, 1.0 / 3.0)
     assert place_probes(tet, [on_it]).at(tet.temperature_c)[0] == pytest.approx(2.0)
     with pytest.raises(HeatError, match="probe 1: expected a point inside"):

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -16,16 +14,16 @@ def test_material_refuses_impossible_values(concrete, field, bad) -> None:
         replace(concrete, **{field: bad})
 
 
-@pytest.mark.parametrize("steps", [0, -1, 2.5, True, "10"])
-def test_steps_must_be_whole_and_positive(steps) -> None:
-    with pytest.raises(HeatError, match="steps: expected a whole number"):
-        TimeSteps(steps, 60.0)
-
-
-@pytest.mark.parametrize("seconds", [0.0, -60.0, float("nan"), float("inf")])
-def test_step_length_must_be_positive(seconds) -> None:
-    with pytest.raises(HeatError, match="step_seconds"):
-        TimeSteps(10, seconds)
+@pytest.mark.parametrize(
+    ("steps", "seconds", "message"),
+    [
+        *((steps, 60.0, "steps: expected a whole number") for steps in (0, -1, 2.5, True, "10")),
+        *((10, seconds, "step_seconds") for seconds in (0.0, -60.0, float("nan"), float("inf"))),
+    ],
+)
+def test_steps_must_be_whole_and_positive(steps, seconds, message) -> None:
+    with pytest.raises(HeatError, match=message):
+        TimeSteps(steps, seconds)
 
 
 def broken(mesh, what: str):

@@ -1,17 +1,14 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
+from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Places, Quantity, Varying, tabulated
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import HeatFlux
-from thermoxels_ns.heat.materials import Material
 
-CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
 HOUR_S = 3600.0
 TIMES_S = [0.0, 100.0 * HOUR_S, 101.0 * HOUR_S, 102.0 * HOUR_S, 200.0 * HOUR_S]
 FLASH = [0.0, 0.0, 500.0, 0.0, 0.0]
@@ -30,12 +27,7 @@ def test_a_table_is_straight_from_entry_to_entry_and_held_outside() -> None:
 
 @pytest.mark.parametrize(
     ("times_s", "values"),
-    [
-        ([0.0, 1.0], [1.0]),
-        ([1.0, 0.0], [1.0, 2.0]),
-        ([0.0, np.nan], [1, 2]),
-        (["a", "b"], [1.0, 2.0]),
-    ],
+    [([0.0, 1.0], [1.0]), ([1.0, 0.0], [1.0, 2.0]), ([0.0, np.nan], [1, 2]), (["a", "b"], [1.0, 2.0])],
 )
 def test_a_table_that_is_none_is_refused(times_s, values) -> None:
     with pytest.raises(HeatError, match="table: expected at least two times, ascending"):

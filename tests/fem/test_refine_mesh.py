@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -9,18 +7,10 @@ from tests.support.heat_meshes import box_mesh
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.fem.p1_kernels import TET_EDGES, stiffness_matrix
 from thermoxels_ns.fem.refine_mesh import refine_mesh, refined_values
+from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.quality.face_count import boundary_facets
+from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-
-
-def volumes(mesh: TetMesh) -> np.ndarray:
-    corner = mesh.points_m[mesh.tets]
-    return np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6.0
-
-
-def areas(mesh: TetMesh) -> np.ndarray:
-    corner = mesh.points_m[mesh.facets]
-    return 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
 
 
 def turned(facets: np.ndarray) -> set[tuple[int, ...]]:
@@ -52,13 +42,15 @@ def test_the_body_and_its_boundary_stay_the_same(make) -> None:
     mesh = make()
     fine = refine_mesh(mesh)
     assert len(fine.tets) == 8 * len(mesh.tets) and len(fine.facets) == 4 * len(mesh.facets)
-    parts = volumes(fine).reshape(-1, 8)
+    parts = signed_volumes(fine.points_m, fine.tets).reshape(-1, 8)
     assert parts.min() > 0.0
     # Each child is an eighth of its parent, and stands where its parent stood.
-    np.testing.assert_allclose(parts, np.repeat(volumes(mesh)[:, None] / 8.0, 8, axis=1), rtol=1e-9)
+    before = signed_volumes(mesh.points_m, mesh.tets)
+    np.testing.assert_allclose(parts, np.repeat(before[:, None] / 8.0, 8, axis=1), rtol=1e-9)
     # Conforming: what faces no other tetrahedron is exactly the children of the boundary, with their orientation.
     assert turned(boundary_facets(fine.tets)) == turned(fine.facets)
-    np.testing.assert_allclose(areas(fine).reshape(-1, 4), np.repeat(areas(mesh)[:, None] / 4.0, 4, axis=1))
+    areas, finer = (facet_areas(one.points_m, one.facets) for one in (mesh, fine))
+    np.testing.assert_allclose(finer.reshape(-1, 4), np.repeat(areas[:, None] / 4.0, 4, axis=1))
     assert len(np.unique(fine.tets)) == len(fine.points_m)
 
 
@@ -109,5 +101,5 @@ def test_shapes_do_not_degenerate() -> None:
         mesh = refine_mesh(mesh)
         corner = mesh.points_m[mesh.tets]
         longest = np.linalg.norm(corner[:, TET_EDGES[:, 0]] - corner[:, TET_EDGES[:, 1]], axis=2).max(axis=1)
-        worst.append(float((volumes(mesh) / longest**3).min()))
+        worst.append(float((signed_volumes(mesh.points_m, mesh.tets) / longest**3).min()))
     assert worst[-1] == pytest.approx(worst[0], rel=0.3), worst

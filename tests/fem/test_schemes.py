@@ -1,9 +1,8 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.sparse.linalg import spsolve
 
+from tests.support.heat_bodies import CONCRETE, STEEL
 from tests.support.heat_matrices import assemble
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
@@ -11,18 +10,9 @@ from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2, Scheme, theta_scheme
 from thermoxels_ns.fem.time_loop import solve_heat
-from thermoxels_ns.heat.effects import (
-    AbsorbedSolar,
-    Convection,
-    FixedTemperature,
-    HeatFlux,
-    InternalHeat,
-    Radiation,
-)
-from thermoxels_ns.heat.materials import Material
+from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
 SCHEMES = (BACKWARD_EULER, theta_scheme(0.7), CRANK_NICOLSON, SDIRK2)
 H = 0.05
 STEP_S = H**2 / CONCRETE.diffusivity_m2_s
@@ -135,7 +125,6 @@ def test_what_overshoots_instead() -> None:
 @pytest.mark.parametrize("strength", [1e-6, 5.0, 1e6])
 @pytest.mark.parametrize("fourier", [1e-3, 1.0, 1e6])
 def test_surroundings_bound_the_temperature(strength, fourier) -> None:
-    """From next to insulated to strongly cooled, with radiation: nothing leaves the range of start and surroundings."""
     mesh = bar(6, lambda p: np.random.default_rng(1).choice([-30.0, 20.0, 90.0], len(p)))
     effects = (Convection(("x0", "y0"), strength, 120.0), Radiation(("x1", "y1"), 0.9, -60.0))
     states = solve_heat(HeatProblem(mesh, CONCRETE, effects=effects), TimeSteps(5, fourier * STEP_S)).temperature_c
@@ -147,7 +136,7 @@ def test_a_body_radiates_from_1000_k_to_3_k() -> None:
     """A thin plate in the dark: rho c d dT/dt = -2 sigma T^4, so T = (T0^-3 + 6 sigma t / (rho c d))^(-1/3)."""
     thickness = 1e-3
     mesh = box_mesh([0, 0.01, 0.02], [0, 0.01, 0.02], [0, thickness], temperature_c=1000.0 - 273.15)
-    steel = Material("steel", 50.0, 7800.0, 450.0)
+    steel = STEEL
     problem = HeatProblem(mesh, steel, effects=(Radiation(("z0", "z1"), 1.0, -273.15),))
     rate = 6.0 * 5.670374419e-8 / (7800.0 * 450.0 * thickness)
     for duration, tolerance in ((600.0, 0.05), (1e9, 0.01)):
@@ -184,7 +173,6 @@ def test_adaptive_steps_keep_their_tolerance(name, tolerance_k) -> None:
 
 
 def test_adaptive_steps_grow_and_shrink_with_what_happens() -> None:
-    """A body at rest takes one step per output; a jump of the air in the middle is found and does not overshoot."""
     problem = HeatProblem(bar(12), CONCRETE, effects=(Convection(("x0",), 25.0, 20.0),))
     assert solve_heat(problem, AdaptiveSteps(1e6, 0.1, outputs=3)).steps == 3
     jump = Convection(("*",), 1e5, Varying(lambda places, time_s: 20.0 if time_s < 5e5 else -20.0))

@@ -1,9 +1,8 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from skfem import FacetBasis, LinearForm, MeshTet
 
+from tests.support.heat_bodies import STEEL
 from tests.support.heat_meshes import box_mesh, planes
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.core.errors import HeatError
@@ -18,7 +17,6 @@ from thermoxels_ns.fem.terms import FluxTerm
 from thermoxels_ns.heat.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.heat.materials import Material
 
-STEEL = Material("steel", 50.0, 7800.0, 450.0)
 HESSIAN = np.array([[2.0, 0.5, -1.0], [0.5, -3.0, 0.25], [-1.0, 0.25, 1.5]])
 SLOPE = np.array([1.0, -2.0, 0.5])
 

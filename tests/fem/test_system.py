@@ -1,25 +1,16 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_matrices import assemble
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.system import HeatSystem
-from thermoxels_ns.heat.effects import (
-    AbsorbedSolar,
-    Convection,
-    GroundContact,
-    HeatFlux,
-    InternalHeat,
-    Radiation,
-)
-from thermoxels_ns.heat.materials import Material
+from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, GroundContact, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 ALL = (
@@ -147,7 +138,6 @@ def test_wrong_tags_are_refused(box, concrete, field, value, message) -> None:
 
 
 def test_what_changes_in_time_is_assembled_again(box, concrete) -> None:
-    """Only the parts that change: the air of one convection, the coefficient of another."""
     air = Convection(("x0",), 5.0, Varying(lambda places, time_s: 20.0 + time_s))
     wind = Convection(("x1",), Varying(lambda places, time_s: 5.0 + time_s), 20.0)
     still = Convection(("y0",), 5.0, 20.0)
@@ -167,13 +157,9 @@ def test_what_changes_in_time_is_assembled_again(box, concrete) -> None:
 
 def test_labels_differ_even_where_a_patch_is_named_like_a_number() -> None:
     """Two equal labels would count the heat of both effects twice."""
-    from tests.support.heat_meshes import box_mesh
-    from thermoxels_ns.fem.problem import HeatProblem
-    from thermoxels_ns.heat.effects import Convection
-
     side = [0.0, 0.1]
     airs = tuple(Convection((name,), 8.0, 0.0) for name in ("wall (2)", "wall", "wall", "wall (2)"))
-    problem = HeatProblem(box_mesh(side, side, side), Material("concrete", 1.7, 2200.0, 880.0), effects=airs)
+    problem = HeatProblem(box_mesh(side, side, side), CONCRETE, effects=airs)
     labels = effect_labels(problem)
     assert len(set(labels)) == 4, labels
     assert labels[:3] == tuple(f"convection on {name}" for name in ("wall (2)", "wall", "wall (3)"))

@@ -1,18 +1,17 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.support.building_corner import building_corner
+from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh, graded
+from tests.support.heat_problems import finer, nafems_t3
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.error_estimate import ErrorSize, difference_between, mean_flows_w
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem
 from thermoxels_ns.fem.quantities import Varying
-from thermoxels_ns.fem.refine_mesh import refine_mesh
 from thermoxels_ns.fem.solution import HeatSolution, SteadySolution
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
@@ -20,15 +19,8 @@ from thermoxels_ns.fem.tolerance import Tolerance, ToleratedSolution, solve_to_t
 from thermoxels_ns.heat.effects import Convection, FixedTemperature, Radiation
 from thermoxels_ns.heat.materials import Material
 
-CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
 WITHIN = 3.0
 """Factor that an estimate may be off by."""
-
-
-def finer(problem: HeatProblem, times: int = 1) -> HeatProblem:
-    for _ in range(times):
-        problem = replace(problem, mesh=refine_mesh(problem.mesh), initial_temperature_c=None)
-    return problem
 
 
 def true_error(found: ToleratedSolution, given: HeatProblem, exact: SteadySolution | HeatSolution) -> ErrorSize:
@@ -43,13 +35,6 @@ def shell() -> HeatProblem:
     mesh = shell_mesh(0.5, 0.6, 4, 1, eighth=True)
     effects = (Convection(("inside",), 7.69, 20.0), Convection(("outside",), 25.0, -10.0))
     return HeatProblem(mesh, CONCRETE, effects=effects)
-
-
-def nafems_t3(parts: int = 10) -> HeatProblem:
-    mesh = box_mesh(np.linspace(0, 0.1, parts + 1), [0, 0.01], [0, 0.01], temperature_c=0.0)
-    swing = Varying(lambda places, time_s: 100.0 * np.sin(np.pi * time_s / 40.0))
-    effects = (FixedTemperature(("x0",), 0.0), FixedTemperature(("x1",), swing))
-    return HeatProblem(mesh, Material("steel", 35.0, 7200.0, 440.5), effects=effects)
 
 
 @pytest.fixture(scope="module")

@@ -1,19 +1,15 @@
-"""What a solution to a tolerance says and refuses is what one with given steps does."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.tolerance import Tolerance, ToleratedSolution, solve_to_tolerance
 from thermoxels_ns.heat.effects import Convection, Effect
 from thermoxels_ns.heat.materials import Material
 
-CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
 EMPTY = Material("next to nothing", 1.0, 1e-3, 1e-3)
 HOUR_S = 3600.0
 

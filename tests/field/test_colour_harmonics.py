@@ -1,7 +1,5 @@
 """Colour gets columns for further harmonics: colours, gradients and optimisers go on as if they had been there."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 

@@ -1,7 +1,3 @@
-"""Which voxels are kept, in which rows their corners stand, and how both are found again."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

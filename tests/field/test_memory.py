@@ -1,7 +1,3 @@
-"""What a lattice will take in memory is said, and refused, before it is taken."""
-
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,26 +1,17 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 
+from tests.reference import two_renderers
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.field.kept_voxels import KeptVoxels
 from thermoxels_ns.field.refine import prune, refine, split_voxels
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 
 
 def random_grid(activation="exp", kept: float = 1.0, temperature_degree: int = 0) -> VoxelGrid:
-    torch.manual_seed(0)
-    lattice = Lattice((-1.0, -1.0, -0.5), 0.25, (9, 9, 5))
-    grid = VoxelGrid(lattice, sh_degree=1, temperature_degree=temperature_degree, activation=activation)
-    if kept < 1:
-        voxels = KeptVoxels(lattice, np.flatnonzero(np.random.default_rng(0).random(256) < kept))
-        rows = {k: torch.zeros(voxels.num_rows, p.shape[1]) for k, p in grid.row_parameters().items()}
-        grid.replace_voxels(voxels, rows)
-    for parameter in grid.row_parameters().values():
-        parameter.data = torch.randn_like(parameter)
-    return grid
+    return two_renderers.random_grid(
+        1, temperature_degree, activation, kept, Lattice((-1.0, -1.0, -0.5), 0.25, (9, 9, 5))
+    )
 
 
 def points_inside(grid: VoxelGrid, n: int = 300) -> torch.Tensor:

@@ -1,7 +1,3 @@
-"""The surroundings: rays outside the box become straight pieces in lattices that end at infinity."""
-
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +8,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.solution import HeatSolution
+from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import (
     STEFAN_BOLTZMANN_W_M2K4,
@@ -29,7 +28,6 @@ AREA_X, VOLUME = 0.3 * 0.2, 0.4 * 0.3 * 0.2
 
 @pytest.fixture
 def box() -> TetMesh:
-    """0.4 x 0.3 x 0.2 m at 20 degrees."""
     return box_mesh(np.linspace(0, 0.4, 5), np.linspace(0, 0.3, 4), np.linspace(0, 0.2, 3))
 
 
@@ -77,7 +75,6 @@ def test_impossible_values_are_refused(make, message) -> None:
 )
 @pytest.mark.parametrize("lumped_boundary", [True, False])
 def test_positive_is_into_the_body(box, concrete, effect, watts, lumped_boundary) -> None:
-    """The sign and the size of each effect, at the temperatures of the start."""
     problem = HeatProblem(box, concrete, effects=(effect,))
     solution = solve_heat(problem, TimeSteps(1, 1e-6), lumped_boundary=lumped_boundary)
     assert solution.effects[0].heat_w[0] == pytest.approx(watts, rel=1e-6)
@@ -100,8 +97,6 @@ def test_a_fixed_temperature_draws_the_body_to_it(box, concrete) -> None:
 
 def test_a_given_flux_makes_its_own_gradient(box, concrete) -> None:
     """k dT/dx = q across the box once it is steady: 100 W/m2 in at x0, out at x1."""
-    from thermoxels_ns.fem.steady import solve_steady
-
     effects = (HeatFlux(("x0",), 100.0), FixedTemperature(("x1",), 0.0))
     solution = solve_steady(HeatProblem(box, concrete, effects=effects))
     np.testing.assert_allclose(solution.temperature_c, 100.0 / 1.7 * (0.4 - box.points_m[:, 0]), atol=1e-9)
@@ -116,7 +111,6 @@ def test_effects_on_one_patch_add_up(box, concrete) -> None:
 
 
 def test_heat_per_patch(box, concrete) -> None:
-    """A pattern takes several patches, each with its own sum; the true area of a triangle counts."""
     heat = at_once(box, concrete, HeatFlux(("x?", "z1"), 100.0)).effects[0]
     assert heat.group_names == ("x0", "x1", "z1")
     np.testing.assert_allclose(heat.group_heat_w[0], 100.0 * np.array([AREA_X, AREA_X, 0.12]), rtol=1e-12)
@@ -143,21 +137,27 @@ def test_a_star_is_the_whole_boundary_also_without_tags(box, concrete) -> None:
         assert at_once(mesh, concrete, HeatFlux(("*",), 10.0)).heat_w[0] == pytest.approx(10.0 * area, rel=1e-9)
 
 
+def with_coefficient(function) -> Convection:
+    return Convection(("x0",), Varying(function), 20.0)
+
+
 @pytest.mark.parametrize(
     ("effect", "message"),
     [
         (HeatFlux(("roof",), 1.0), r"patches: expected names or patterns of x0, x1, y0, y1, z0, z1, other, got 'roof'"),
         (HeatFlux(("x0", "X?"), 1.0), "got 'X\\?'"),
         (InternalHeat(("oven",), 1.0), "regions: expected names or patterns of solid, got 'oven'"),
+        (with_coefficient(lambda places, _: np.ones(3)), "function of coefficient_w_m2k: expected one number, or one"),
+        (with_coefficient(lambda places, _: -1.0), "coefficient_w_m2k: expected a finite number of at least 0"),
+        (with_coefficient(lambda places, _: np.full(len(places), np.nan)), "coefficient_w_m2k: .*got .* that are not"),
     ],
 )
-def test_unknown_names_are_refused(box, concrete, effect, message) -> None:
+def test_unknown_names_and_functions_without_usable_numbers_are_refused(box, concrete, effect, message) -> None:
     with pytest.raises(HeatError, match=message):
         at_once(box, concrete, effect)
 
 
 def test_functions_are_told_where_they_are(box, concrete) -> None:
-    """Centroids and normals of triangles, the direction up, and the time at both ends of a step."""
     seen = {}
 
     def flux(places, time_s):
@@ -170,19 +170,6 @@ def test_functions_are_told_where_they_are(box, concrete) -> None:
     assert set(seen) == {0.0, 30.0, 60.0}  # at the start, what pushes temperatures out of their range counts too
     places = seen[30.0]
     assert np.isin(np.round(places.points_m[:, 2], 12), [0.0, 0.2]).all() and len(places) == len(places.normals) == 48
-
-
-@pytest.mark.parametrize(
-    ("function", "message"),
-    [
-        (lambda places, time_s: np.ones(3), r"function of coefficient_w_m2k: expected one number, or one per place"),
-        (lambda places, time_s: -1.0, "coefficient_w_m2k: expected a finite number of at least 0"),
-        (lambda places, time_s: np.full(len(places), np.nan), "coefficient_w_m2k: .*got .* that are not"),
-    ],
-)
-def test_functions_must_return_usable_numbers(box, concrete, function, message) -> None:
-    with pytest.raises(HeatError, match=message):
-        at_once(box, concrete, Convection(("x0",), Varying(function), 20.0))
 
 
 def test_two_temperatures_at_one_node_are_refused(box, concrete) -> None:
@@ -213,10 +200,6 @@ EVERY = {
 """One effect for each kind of term."""
 
 
-def test_conduction_alone_assembles_nothing_else(box, concrete) -> None:
-    assert at_once(box, concrete).assembled.counts == {"stiffness": 1, "mass": 1}
-
-
 @pytest.mark.parametrize("absent", EVERY)
 def test_an_absent_effect_assembles_nothing(box, concrete, absent) -> None:
     effects = tuple(effect for kind, effect in EVERY.items() if kind != absent)
@@ -225,7 +208,8 @@ def test_an_absent_effect_assembles_nothing(box, concrete, absent) -> None:
     assert set(bill.seconds) == set(bill.counts)
 
 
-def test_an_effect_on_a_patch_without_triangles_assembles_nothing(box, concrete) -> None:
+def test_neither_conduction_alone_nor_an_effect_on_a_patch_without_triangles_assembles_more(box, concrete) -> None:
+    assert at_once(box, concrete).assembled.counts == {"stiffness": 1, "mass": 1}
     solution = at_once(box, concrete, Convection(("other",), 8.0, 5.0), Radiation(("other",), 0.9, 5.0))
     assert solution.assembled.counts == {"stiffness": 1, "mass": 1}
     assert [heat.heat_w.tolist() for heat in solution.effects] == [[0.0], [0.0]]

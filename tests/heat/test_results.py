@@ -1,13 +1,10 @@
-"""Results against walls whose figures are known, and against each other."""
-
-from __future__ import annotations
-
 import dataclasses
 import json
 
 import numpy as np
 import pytest
 
+from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
@@ -18,7 +15,6 @@ from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.results import heat_by_part, heat_results, wall_result
 
 BRICK, WOOL = Material("brick", 0.7, 1600.0, 940.0), Material("wool", 0.04, 30.0, 1030.0)
-CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
 
 
 def two_walls() -> HeatProblem:
@@ -87,7 +83,6 @@ def test_heat_by_patch_effect_and_region_of_a_steady_state() -> None:
 
 @pytest.mark.parametrize("time", [TimeSteps(6, 600.0), AdaptiveSteps(3600.0, 0.1, outputs=6)])
 def test_energy_balance_through_time(time) -> None:
-    """Every kind of effect at once: stored = in - out, and parts add up to wholes."""
     mesh = box_mesh(
         planes(0.0, 0.3, step=0.1), [0.0, 0.2, 0.4], [0.0, 0.3], temperature_c=lambda p: 10.0 + 30.0 * p[:, 0]
     )

@@ -1,19 +1,17 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.support.heat_bodies import CONCRETE
 from tests.support.scene_bodies import Z_UP, room, tagged_body, wall
 from thermoxels_ns.fem.problem import TimeSteps
-from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.run import patch_warnings, unused_settings
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import InsideAir, OutsideAir
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-CONCRETE = {"*": Material("concrete", 1.7, 2200.0, 880.0)}
+CONCRETE = {"*": CONCRETE}
 AIRS = {"inside_air": InsideAir(20.0, "iso-6946-combined"), "outside_air": OutsideAir(0.0, "iso-6946-combined")}
 
 
@@ -22,15 +20,6 @@ def filled() -> TetMesh:
     outside = np.ones((5, 5, 5), dtype=bool)
     outside[:, :, 0] = False
     return tagged_body(np.ones((3, 3, 3), dtype=bool), 1.0, outside)
-
-
-def photographed_from_within() -> TetMesh:
-    """A room whose inner surface is what was seen."""
-    cells = np.ones((4, 4, 4), dtype=bool)
-    cells[1:3, 1:3, 1:3] = False
-    inside = np.zeros((6, 6, 6), dtype=bool)
-    inside[2:4, 2:4, 2:4] = True
-    return tagged_body(cells, 1.0, inside)
 
 
 def test_rooms_and_walls_are_trusted() -> None:
@@ -45,10 +34,10 @@ def test_a_filled_body_has_no_rooms() -> None:
 
 def test_a_room_seen_from_within_is_inside_out() -> None:
     scene = HeatScene(CONCRETE, **AIRS)
-    (warning,) = patch_warnings(scene, photographed_from_within(), Z_UP)
+    (warning,) = patch_warnings(scene, room(from_within=True), Z_UP)
     assert "faces inwards" in warning and 'patches: ["exterior-*"] to the inside air' in warning
     turned = {name: replace(air, patches=(where,)) for (name, air), where in zip(AIRS.items(), ("ext*", "int*"))}
-    assert patch_warnings(HeatScene(CONCRETE, **turned), photographed_from_within(), Z_UP) == ()
+    assert patch_warnings(HeatScene(CONCRETE, **turned), room(from_within=True), Z_UP) == ()
 
 
 @pytest.mark.parametrize("up", [(1.0, 0.0, 0.0), (0.0, -3.0, 0.0)])

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +7,8 @@ import yaml
 from tests.support.scene_bodies import room, wall
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.selection import Selection
-from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.heat.effects import AbsorbedSolar, Convection, Effect, GroundContact, Radiation
-from thermoxels_ns.heat.materials import Material, material
+from thermoxels_ns.heat.materials import material
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import Ground, InsideAir, OutsideAir, Sky, Sun, Surface
 from thermoxels_ns.heat.sky import swinbank_sky_c
@@ -247,18 +244,3 @@ def test_start_and_up() -> None:
     assert scene.problem(mesh).up == (0.0, 0.0, 1.0)
     assert scene.problem(mesh, up=(0.0, 2.0, 0.0)).up == (0.0, 1.0, 0.0)
     assert replace(scene, up=(3.0, 0.0, 0.0)).problem(mesh, up=(0.0, 1.0, 0.0)).up == (1.0, 0.0, 0.0)
-
-
-def test_heat_loss_of_a_wall_is_that_of_the_standard() -> None:
-    """q = 20 / (Rsi + d / k + Rse) through 0.2 m, exactly, because the temperature is linear in between."""
-    made_of = Material("block", 0.5, 1200.0, 1000.0)
-    scene = HeatScene({"*": made_of}, inside_air=INSIDE, outside_air=OUTSIDE)
-    assert scene.steady
-    mesh = wall()
-    solution = solve_steady(scene.problem(mesh))
-    u_value = 1.0 / (0.13 + 0.2 / 0.5 + 0.04)
-    room_side = mesh.points_m[:, 1] < 1e-9
-    np.testing.assert_allclose(solution.temperature_c[room_side], 20.0 - 20.0 * u_value * 0.13, rtol=1e-9)
-    np.testing.assert_allclose(
-        solution.temperature_c[mesh.points_m[:, 1] > 0.2 - 1e-9], 20.0 * u_value * 0.04, rtol=1e-9
-    )

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 
@@ -36,11 +34,7 @@ def scene(tmp_path: Path, text: str) -> HeatScene:
     return load_heat_scene(path)
 
 
-def test_scenes_of_the_package() -> None:
-    assert heat_scene_names() == ["all-effects", "concrete", "original", "winter-night"]
-
-
-@pytest.mark.parametrize("name", ["all-effects", "concrete", "original", "winter-night"])
+@pytest.mark.parametrize("name", heat_scene_names())
 def test_each_builds_a_problem_by_name_and_by_path(name: str) -> None:
     mesh, found = room(), load_heat_scene(name)
     problem = found.problem(mesh)

@@ -1,13 +1,10 @@
-"""What is left out does not matter: bounds hold on random problems, and are sharp where the answer is known."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 from datetime import datetime, timezone
 
 import numpy as np
 import pytest
 
+from tests.support.heat_bodies import CONCRETE, STEEL
 from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.quantities import Varying
@@ -24,13 +21,10 @@ from thermoxels_ns.heat.effects import (
     InternalHeat,
     Radiation,
 )
-from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.heat.screening import nodal_heats, screen
 from thermoxels_ns.heat.sun import moving_sun
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
-STEEL = Material("steel", 50.0, 7800.0, 450.0)
 EVERYTHING = 1e9
 """A tolerance that leaves out whatever can be bounded."""
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -24,7 +22,6 @@ def test_view_factors_by_tilt() -> None:
 
 
 def loss_w_m2(surface_k: float, places: Places, **temperatures: float) -> np.ndarray:
-    """What surfaces radiate away."""
     effect = Radiation(("*",), *outdoor_radiation(0.8, **temperatures))
     emissivity = effect.bounded("emissivity").at(places, 0.0)
     around_k = effect.bounded("surroundings_c").at(places, 0.0) + 273.15

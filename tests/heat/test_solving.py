@@ -1,17 +1,13 @@
-"""What the solver is given of a tolerance, and what is said while it works."""
-
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.heat import solving as heat_solving
 from thermoxels_ns.heat.effects import Convection, HeatFlux
-from thermoxels_ns.heat.materials import Material
 
 
 class Clock:
@@ -64,7 +60,7 @@ def feebly_warmed(depth_m: float = 0.3) -> HeatProblem:
     """A wall between two airs, warmed by 0.05 W/m2, which 25 W/(m2 K) turn into at most 2 mK."""
     mesh = box_mesh(planes(0.0, depth_m, step=depth_m / 6), [0.0, 0.1], [0.0, 0.1], temperature_c=20.0)
     effects = Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, 0.0), HeatFlux(("x1",), 0.05)
-    return HeatProblem(mesh, Material("concrete", 1.7, 2200.0, 880.0), effects=effects)
+    return HeatProblem(mesh, CONCRETE, effects=effects)
 
 
 def solved(problem: HeatProblem, **goals: Any) -> heat_solving.SolvedProblem:

@@ -1,7 +1,5 @@
 """Running the real console scripts, and the short training that integration tests share."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -15,9 +13,12 @@ SHORT_TRAINING = [
     *("--pipeline.model.view-dependence-from", "25", "--pipeline.datamanager.train-num-rays-per-batch", "512"),
     *("--logging.local-writer.enable", "False", "--save-only-latest-checkpoint", "False"),
 ]
+SCREEN = {"COLUMNS": "200", "TERM": "dumb"}
 
 
-def run(*command: str, timeout_s: float = 300.0, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+def run(
+    *command: str, timeout_s: float = 300.0, cwd: Path | None = None, threads: int = 1
+) -> subprocess.CompletedProcess[str]:
     """Run a console script of this environment as a user would, with its output captured as one text."""
     script = Path(sys.executable).with_name(command[0])
     return subprocess.run(
@@ -28,7 +29,7 @@ def run(*command: str, timeout_s: float = 300.0, cwd: Path | None = None) -> sub
         timeout=timeout_s,
         check=False,
         cwd=cwd,
-        env={**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "200", "TERM": "dumb"},
+        env={**os.environ, **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), str(threads)), **SCREEN},
     )
 
 

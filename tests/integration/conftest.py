@@ -1,7 +1,5 @@
 """A tiny scene, trained once for all integration tests by the real commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

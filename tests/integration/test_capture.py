@@ -1,7 +1,3 @@
-"""Real camera files through the real command, held against poses and a rig that were found in another way."""
-
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,3 @@
-"""A capture that is killed without warning goes on to the same scene as one that was left alone."""
-
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,16 +1,10 @@
-"""A capture gives the same bytes for any number of threads of COLMAP, of its BLAS and of numpy's."""
-
-from __future__ import annotations
-
-import os
 import sqlite3
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.integration.commands import run
 from tests.support.textured_room import write_card
 
 COUNT = 5
@@ -21,15 +15,8 @@ OF_THE_RUN = {"capture.html", "lock", "done.json", "key.txt", "features.db"}
 
 def captured(card: Path, scene: Path, threads: int) -> Path:
     """The scene that the command writes where everything may use so many threads."""
-    script = str(Path(sys.executable).with_name("thermoxels"))
-    result = subprocess.run(
-        [script, "capture", str(card), "--output", str(scene), *OPTIONS.split(), "--threads", str(threads)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        check=False,
-        env={**os.environ, "OMP_NUM_THREADS": str(threads), "OPENBLAS_NUM_THREADS": str(threads), "TERM": "dumb"},
-    )
+    command = ("thermoxels", "capture", str(card), "--output", str(scene), *OPTIONS.split())
+    result = run(*command, "--threads", str(threads), timeout_s=1200.0, threads=threads)
     assert result.returncode == 0, result.stdout
     return scene
 
@@ -42,7 +29,6 @@ def scenes(tmp_path_factory) -> tuple[Path, Path]:
 
 
 def files_of(scene: Path) -> dict[str, bytes]:
-    """The scene and what every stage found."""
     paths = [path for path in scene.rglob("*") if path.is_file() and path.name not in OF_THE_RUN]
     return {path.relative_to(scene).as_posix(): path.read_bytes() for path in paths}
 

@@ -1,7 +1,3 @@
-"""nerfstudio's own commands on our method, in subprocesses."""
-
-from __future__ import annotations
-
 import json
 import shutil
 
@@ -15,7 +11,6 @@ from tests.integration.commands import SHORT_TRAINING, Trained, run
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 
-STOCK_EXPORTS = ("pointcloud", "tsdf", "poisson", "marching-cubes", "cameras", "gaussian-splat")
 METRICS = (
     *("psnr", "ssim", "thermal_psnr", "thermal_ssim", "thermal_hssim"),
     *("thermal_mae_c", "thermal_mae_hit_c", "thermal_mae_roi_c", "thermal_mae_debiased_c"),
@@ -70,13 +65,6 @@ def test_render_dataset_writes_thermal_pictures(trained: Trained, tmp_path):
         assert len(files) == 2, name
         assert np.asarray(Image.open(files[0])).std() > 1, name  # not one flat colour
     assert len(list((tmp_path / "test" / "raw-temperature_c").rglob("*.npy.gz"))) == 2
-
-
-def test_export_lists_ours_among_all_stock_subcommands():
-    result = run("ns-export", "--help")
-    assert result.returncode == 0, result.stdout
-    for name in (*STOCK_EXPORTS, "thermoxels-mesh"):
-        assert name in result.stdout
 
 
 def test_a_stock_export_still_works(trained: Trained, tmp_path):

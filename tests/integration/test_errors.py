@@ -1,7 +1,5 @@
 """Bad input through the real commands: one clear sentence and a non-zero exit, no traceback of ours."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 
@@ -73,11 +71,6 @@ def test_checkpoint_of_another_method(trained: Trained, tmp_path):
     assert "checkpoint: expected a voxel grid with" in " ".join(result.stdout.split())
     result = run("ns-eval", "--load-config", str(folder / "config.yml"), "--output-path", str(tmp_path / "e.json"))
     assert result.returncode == 1 and "Error: checkpoint:" in result.stdout and "Traceback" not in result.stdout
-
-
-def test_config_that_is_not_there(tmp_path):
-    result = export(tmp_path / "absent.yml", tmp_path / "export")
-    assert result.returncode == 1 and "load_config: expected the config.yml" in " ".join(result.stdout.split())
 
 
 def test_config_of_a_stock_method(tmp_path):

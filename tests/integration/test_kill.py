@@ -1,7 +1,3 @@
-"""What is left when a training is killed without warning."""
-
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,3 @@
-"""The viewer shows every output to a client that chooses it, as a browser does."""
-
-from __future__ import annotations
-
 import asyncio
 import io
 import os

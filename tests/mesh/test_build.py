@@ -1,7 +1,3 @@
-"""From a snapshot to a mesh in metres."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,3 @@
-"""Harmonic extension of measured temperatures."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits

@@ -1,7 +1,3 @@
-"""Six conforming tetrahedra per voxel."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

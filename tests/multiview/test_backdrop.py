@@ -1,7 +1,3 @@
-"""Which pixels show a plain backdrop, on drawn photographs of a house under a sky."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

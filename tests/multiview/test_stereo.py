@@ -1,7 +1,3 @@
-"""Depths of photographs of a plane whose place is known, and where photographs say nothing of depth."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -13,12 +9,7 @@ from tests.support.plane_photographs import EYES, FOCAL, PLANE, SIZE, photograph
 from thermoxels_ns.core.threads import set_num_threads
 from thermoxels_ns.multiview import stereo
 from thermoxels_ns.multiview.photographs import Photographs, read_photographs
-from thermoxels_ns.multiview.stereo import (
-    FEWEST_VIEWS,
-    Depths,
-    depths_of,
-    feature_rays_to_depths,
-)
+from thermoxels_ns.multiview.stereo import FEWEST_VIEWS, Depths, depths_of, feature_rays_to_depths
 
 LO, HI = (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)
 TRUE_DEPTH = 1.6 - PLANE

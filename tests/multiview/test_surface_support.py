@@ -1,7 +1,5 @@
 """Which photographs support a surface: a drawn box with one plain side on textured ground, whose truth is exact."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

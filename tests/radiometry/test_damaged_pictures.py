@@ -1,7 +1,3 @@
-"""Pictures that are damaged or made to do harm: an error that names the file, in little memory, and nothing else."""
-
-from __future__ import annotations
-
 import io
 import struct
 import tracemalloc

@@ -1,7 +1,3 @@
-"""DJI R-JPEG: a clear message without DJI's library, and the library's own numbers with it."""
-
-from __future__ import annotations
-
 import shutil
 import subprocess
 from collections.abc import Callable

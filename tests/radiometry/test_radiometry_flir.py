@@ -1,7 +1,5 @@
 """FLIR R-JPEG: what is read is what is in the file, checked by an independent computation."""
 
-from __future__ import annotations
-
 import math
 import re
 import struct

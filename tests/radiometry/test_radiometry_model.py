@@ -1,7 +1,3 @@
-"""The radiometric model: exact limits, round trips, and the laws that any such model obeys."""
-
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,3 @@
-"""Camera files to degrees: formats by content, presets, corrections, and files that are none."""
-
-from __future__ import annotations
-
 import struct
 import warnings
 import zlib

@@ -1,7 +1,5 @@
 """The dense step in plain torch that `step_speed` compares with computes what the fused kernels do."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Cases that break naive volume rendering, for both renderers: what must hold exactly, and their agreement."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The compiled renderer against its plain torch twin, over random grids: values, gradients, samples."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 

@@ -1,7 +1,3 @@
-"""The same bits for any number of threads: gradients, updates and a whole training."""
-
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

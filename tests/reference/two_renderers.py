@@ -1,7 +1,5 @@
 """Random grids and rays, and what both renderers make of them: values and gradients of everything they give."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -56,7 +54,6 @@ def random_grid(
 
 
 def as_double(grid: VoxelGrid) -> VoxelGrid:
-    """The same grid with its parameters in double precision."""
     twin = VoxelGrid(grid.lattice, grid.sh_degree, grid.temperature_degree, 1.0, grid.activation)
     twin.replace_voxels(grid.voxels, {k: p.detach() for k, p in grid.row_parameters().items()})
     return twin.double()
@@ -78,7 +75,6 @@ def random_request(grid: VoxelGrid, rays: int = 150, seed: int = 0, mixed: bool 
 
 
 def in_double(request: RayRequest) -> RayRequest:
-    """The same rays in double precision."""
     near = request.near.double() if isinstance(request.near, Tensor) else request.near
     far = None if request.far is None else request.far.double()
     return RayRequest(
@@ -95,11 +91,7 @@ class Seen:
 
 
 def see(
-    renderer: str,
-    grid: VoxelGrid,
-    request: RayRequest,
-    options: RenderOptions = EVERYTHING,
-    background: bool = False,
+    renderer: str, grid: VoxelGrid, request: RayRequest, options: RenderOptions = EVERYTHING, background: bool = False
 ) -> Seen:
     """Render, and differentiate a random combination of everything that has a gradient."""
     generator = torch.Generator().manual_seed(7)

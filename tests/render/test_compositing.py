@@ -1,7 +1,3 @@
-"""The rendering sum against a float64 double loop, its gradients, and its laws."""
-
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -43,20 +39,20 @@ def test_matches_the_double_loop(dtype, tolerance):
         *(x.tolist() for x in (density, deltas, rgb, thermal, t)), background_rgb, background_thermal
     )
 
+    along = ray_weights(density.to(dtype), deltas.to(dtype))
     seen = composite(
         RaySteps(t.to(dtype), deltas.to(dtype)),
-        ray_weights(density.to(dtype), deltas.to(dtype)),
+        along,
         lambda flat: rgb.reshape(-1, 3)[flat].to(dtype),
         lambda flat: thermal.reshape(-1, 1)[flat].to(dtype),
-        background_rgb=torch.tensor(background_rgb, dtype=dtype),
-        background_thermal=torch.tensor([background_thermal], dtype=dtype),
     )
     assert seen.rgb is not None and seen.thermal is not None
+    left = along.transmittance[:, None]
+    shown = seen.rgb + left * torch.tensor(background_rgb, dtype=dtype)
+    warm = seen.thermal + left * background_thermal
     for r, (colour, temperature, opacity, distance) in enumerate(expected):
-        torch.testing.assert_close(
-            seen.rgb[r].double(), torch.tensor(colour, dtype=torch.float64), atol=tolerance, rtol=0
-        )
-        assert abs(float(seen.thermal[r]) - temperature) < tolerance
+        torch.testing.assert_close(shown[r].double(), torch.tensor(colour, dtype=torch.float64), atol=tolerance, rtol=0)
+        assert abs(float(warm[r]) - temperature) < tolerance
         assert abs(float(seen.accumulation[r]) - opacity) < tolerance
         assert abs(float(seen.depth[r]) - distance) < 20 * tolerance
 
@@ -72,23 +68,20 @@ def test_gradcheck_of_the_sum():
     density = (torch.rand(3, 6, dtype=torch.float64) * 5 + 0.1).requires_grad_()
     rgb = torch.rand(18, 3, dtype=torch.float64, requires_grad=True)
     thermal = torch.rand(18, 1, dtype=torch.float64, requires_grad=True)
-    background = torch.rand(3, 3, dtype=torch.float64, requires_grad=True)
     deltas = torch.full((3, 6), 0.1, dtype=torch.float64)
     steps = RaySteps(torch.arange(6, dtype=torch.float64).expand(3, 6) * 0.1 + 0.05, deltas)
 
-    def outputs(density, rgb, thermal, background):
+    def outputs(density, rgb, thermal):
         seen = composite(
             steps,
             ray_weights(density, deltas),
             lambda flat: rgb[flat],
             lambda flat: thermal[flat],
-            background_rgb=background,
-            background_thermal=torch.tensor([0.2], dtype=torch.float64),
             thermal_moves_density=True,
         )
         return seen.rgb, seen.thermal, seen.accumulation, seen.depth
 
-    assert torch.autograd.gradcheck(outputs, (density, rgb, thermal, background))
+    assert torch.autograd.gradcheck(outputs, (density, rgb, thermal))
 
 
 def test_temperature_does_not_move_density_unless_asked():

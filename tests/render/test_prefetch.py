@@ -1,7 +1,3 @@
-"""Asking for memory ahead is a hint: it changes no value and needs no valid index."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numba import njit

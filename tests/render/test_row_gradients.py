@@ -1,7 +1,5 @@
 """Sums over rows: the order of samples, and that no split of the rows changes a sum."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

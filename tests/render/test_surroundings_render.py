@@ -1,7 +1,3 @@
-"""Rays behind the box: parallax, order, and the two renderers."""
-
-from __future__ import annotations
-
 import torch
 
 from thermoxels_ns.field.surroundings import Surroundings
@@ -13,7 +9,6 @@ BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 
 
 def scene() -> Surroundings:
-    """Random density and colours."""
     made = Surroundings(BOX, 8, 4, 0.05, "exp", True)
     generator = torch.Generator().manual_seed(1)
     for values, scale in ((made.grid.density, 1.0), (made.grid.sh, 3.0), (made.grid.temperature, 1.0)):

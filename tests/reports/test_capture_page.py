@@ -1,7 +1,3 @@
-"""The page of a capture: pictures, how sure the rig is, how degrees were measured, what is missing."""
-
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -88,7 +84,7 @@ def page() -> CapturePage:
         poses_source="Given.",
         seconds=[("pairs", 1.0)],
     )
-    overlays = [Overlay("a", JPEG, JPEG, JPEG, (12.34, 20.06))]
+    overlays = [Overlay("a", JPEG, JPEG, JPEG)]
     return CapturePage(result, overlays, np.linspace(10, 20, 100, dtype=np.float32), 0.0)
 
 

@@ -1,7 +1,3 @@
-"""Medians, ratios, the Pareto front, the cheapest setting, and the files of a report."""
-
-from __future__ import annotations
-
 import csv
 import math
 

@@ -1,7 +1,3 @@
-"""The demo's page: results, pictures in their places, and nothing in it can break out of its place."""
-
-from __future__ import annotations
-
 import base64
 import re
 from dataclasses import replace

@@ -1,7 +1,3 @@
-"""Numbers of the heat report: no sign on what rounds to zero, and no rounding errors among the heat flows."""
-
-from __future__ import annotations
-
 import pytest
 
 from thermoxels_ns.reports.heat_numbers import RoundOff, degrees, figure, round_off_of, unit_signs

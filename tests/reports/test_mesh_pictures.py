@@ -1,7 +1,3 @@
-"""Pictures: what is drawn, where and in which colours."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,3 @@
-"""Pages: complete in one file, closed, words stay words, fit for narrow screens and paper."""
-
-from __future__ import annotations
-
 import base64
 import re
 from html.parser import HTMLParser

@@ -1,7 +1,3 @@
-"""Broken sensors, constant scenes and wide gaps in resolution must not reach the loss."""
-
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -1,7 +1,3 @@
-"""Heat problems drawn at random: each is solved within all bounds, or refused with a reason."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

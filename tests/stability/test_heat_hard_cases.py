@@ -1,26 +1,11 @@
-"""Hard cases of the heat solver: extreme steps, materials, shapes and sizes."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
+from tests.support.heat_bodies import CONCRETE, make_body
 from tests.support.heat_matrices import assemble
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.materials import Material
-from thermoxels_ns.mesh.quality.face_count import boundary_facets
-from thermoxels_ns.mesh.tetrahedra import TetMesh
-from thermoxels_ns.mesh.voxel_tets import kuhn_tets
-
-CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
-
-
-def body(cells: np.ndarray, voxel_m: float, temperature_c=lambda points: np.full(len(points), 20.0)) -> TetMesh:
-    corners, tets = kuhn_tets(cells)
-    points, facets = corners * voxel_m, boundary_facets(tets)
-    seen, tags, region = np.ones(len(points), bool), np.zeros(len(facets), np.int64), np.zeros(len(tets), np.int64)
-    return TetMesh(points, tets, temperature_c(points), seen, facets, tags, region)
 
 
 def carved(seed: int = 0, size: int = 8) -> np.ndarray:
@@ -36,7 +21,7 @@ def spots(points: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("fourier", [1e-3, 1e-2, 1 / 6, 1.0, 1e2, 1e4, 1e6])
 def test_maximum_principle_at_any_step_length(fourier: float) -> None:
     """Lumped mass and non-obtuse tetrahedra: no temperature leaves its range; dt = fourier h^2 / diffusivity."""
-    mesh = body(carved(), 0.05, spots)
+    mesh = make_body(carved(), 0.05, spots)
     dt = fourier * 0.05**2 / CONCRETE.diffusivity_m2_s
     states = solve_heat(HeatProblem(mesh, CONCRETE), TimeSteps(5, dt)).temperature_c
     assert states.min() >= -30.0 - 1e-9
@@ -47,7 +32,7 @@ def test_maximum_principle_at_any_step_length(fourier: float) -> None:
 
 def test_consistent_mass_breaks_it_for_short_steps() -> None:
     """The reason why lumping is the default: beside a jump from 20 to 90 degrees the consistent mass undershoots."""
-    mesh = body(np.ones((8, 4, 4), bool), 0.05, lambda points: np.where(points[:, 0] < 0.22, 20.0, 90.0))
+    mesh = make_body(np.ones((8, 4, 4), bool), 0.05, lambda points: np.where(points[:, 0] < 0.22, 20.0, 90.0))
     problem, time = HeatProblem(mesh, CONCRETE), TimeSteps(1, 1e-2 * 0.05**2 / CONCRETE.diffusivity_m2_s)
     assert solve_heat(problem, time).temperature_c.min() >= 20.0 - 1e-9
     assert solve_heat(problem, time, lumped=False).temperature_c.min() < 19.5
@@ -56,7 +41,7 @@ def test_consistent_mass_breaks_it_for_short_steps() -> None:
 @pytest.mark.parametrize("conductivity", [1e-9, 0.024, 400.0, 1e9])
 def test_conductivity_extremes(conductivity: float) -> None:
     material = Material("extreme", conductivity, 2200.0, 880.0)
-    mesh = body(np.ones((6, 6, 6), bool), 0.05, spots)
+    mesh = make_body(np.ones((6, 6, 6), bool), 0.05, spots)
     solution = solve_heat(HeatProblem(mesh, material), TimeSteps(10, 60.0))
     assert solution.converged and solution.energy_residual < 1e-12
     left = np.ptp(solution.temperature_c[-1])
@@ -68,20 +53,18 @@ def test_conductivity_extremes(conductivity: float) -> None:
 
 @pytest.mark.parametrize("voxel_m", [1e-6, 1e-3, 1e3])
 def test_similar_bodies_have_the_same_solution(voxel_m: float) -> None:
-    """Only the Fourier number counts: micrometres and kilometres give the same temperatures."""
     states = []
     for h in (0.1, voxel_m):
-        mesh = body(carved(2, 5), h, spots)
+        mesh = make_body(carved(2, 5), h, spots)
         dt = 0.3 * h**2 / CONCRETE.diffusivity_m2_s
         states.append(solve_heat(HeatProblem(mesh, CONCRETE), TimeSteps(4, dt)).temperature_c)
     np.testing.assert_allclose(states[0], states[1], atol=1e-8)
 
 
 def test_separate_pieces_keep_their_own_heat() -> None:
-    """Two bodies that do not touch: each conserves its heat and goes to its own mean."""
     cells = np.zeros((9, 3, 3), bool)
     cells[:4] = cells[6:] = True
-    mesh = body(cells, 0.05, lambda points: np.where(points[:, 0] < 0.25, 10.0, 1000.0) + spots(points))
+    mesh = make_body(cells, 0.05, lambda points: np.where(points[:, 0] < 0.25, 10.0, 1000.0) + spots(points))
     left = mesh.points_m[:, 0] < 0.25
     mass = assemble(mesh, CONCRETE).nodal_mass_j_k
     states = solve_heat(HeatProblem(mesh, CONCRETE), TimeSteps(3, 1e9)).temperature_c
@@ -93,11 +76,10 @@ def test_separate_pieces_keep_their_own_heat() -> None:
 
 @pytest.mark.parametrize("touching", ["edge", "corner"])
 def test_voxels_that_touch_by_an_edge_or_a_corner(touching: str) -> None:
-    """The shared nodes carry heat from one voxel to the other, and the total is conserved."""
     cells = np.zeros((2, 2, 2), bool)
     cells[0, 0, 0] = True
     cells[(1, 1, 0) if touching == "edge" else (1, 1, 1)] = True
-    mesh = body(cells, 0.05, lambda points: np.where(points.sum(axis=1) > 0.11, 60.0, 20.0))
+    mesh = make_body(cells, 0.05, lambda points: np.where(points.sum(axis=1) > 0.11, 60.0, 20.0))
     solution = solve_heat(HeatProblem(mesh, CONCRETE), TimeSteps(2, 1e9))
     assert solution.energy_residual < 1e-14
     assert np.ptp(solution.temperature_c[-1]) < 1e-4
@@ -105,19 +87,19 @@ def test_voxels_that_touch_by_an_edge_or_a_corner(touching: str) -> None:
 
 def test_wall_of_one_voxel() -> None:
     cells = np.ones((12, 12, 1), bool)
-    solution = solve_heat(HeatProblem(body(cells, 0.02, spots), CONCRETE), TimeSteps(10, 60.0))
+    solution = solve_heat(HeatProblem(make_body(cells, 0.02, spots), CONCRETE), TimeSteps(10, 60.0))
     assert solution.energy_residual < 1e-14
     assert solution.temperature_c.min() >= -30.0 and solution.temperature_c.max() <= 90.0
 
 
 def test_single_voxel() -> None:
-    solution = solve_heat(HeatProblem(body(np.ones((1, 1, 1), bool), 0.02, spots), CONCRETE), TimeSteps(1, 60.0))
+    solution = solve_heat(HeatProblem(make_body(np.ones((1, 1, 1), bool), 0.02, spots), CONCRETE), TimeSteps(1, 60.0))
     assert solution.converged and solution.energy_residual < 1e-14
 
 
 def test_differences_of_a_nanokelvin_survive() -> None:
     """Temperatures relative to a reference: at 300 K a difference of 1e-9 K is still followed."""
-    mesh = body(np.ones((6, 2, 2), bool), 0.05, lambda points: 26.85 + 1e-9 * (points[:, 0] > 0.14))
+    mesh = make_body(np.ones((6, 2, 2), bool), 0.05, lambda points: 26.85 + 1e-9 * (points[:, 0] > 0.14))
     solution = solve_heat(HeatProblem(mesh, CONCRETE), TimeSteps(10, 600.0))
     assert solution.energy_residual_of_spread < 1e-9
     assert 1e-11 < np.ptp(solution.temperature_c[-1]) < 0.9e-9
@@ -128,7 +110,7 @@ def test_differences_of_a_nanokelvin_survive() -> None:
 def test_a_level_body_stays_level(shape: str, voxel_m: float, dt: float) -> None:
     """Once the differences are gone, K T is round-off and M / dt + K all but singular: nothing may move or fail."""
     cells = {"cube": np.ones((6, 6, 6), bool), "carved": carved(), "bar": np.ones((60, 1, 1), bool)}[shape]
-    solution = solve_heat(HeatProblem(body(cells, voxel_m, spots), CONCRETE), TimeSteps(10, dt))
+    solution = solve_heat(HeatProblem(make_body(cells, voxel_m, spots), CONCRETE), TimeSteps(10, dt))
     states = solution.temperature_c
     assert solution.converged and solution.energy_residual < 1e-14
     assert states.min() >= -30.0 - 1e-9 and states.max() <= 90.0 + 1e-9

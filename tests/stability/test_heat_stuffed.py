@@ -1,7 +1,3 @@
-"""Hard cases of the heat solver on conforming meshes, whose angles are obtuse here and there."""
-
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 
@@ -9,32 +5,17 @@ import numpy as np
 import pytest
 
 from tests.support.heat_meshes import box_mesh
-from tests.support.obtuse_bodies import AT_THE_BOUNDS, CONCRETE, STEP_S, body, spots, stuffed
+from tests.support.obtuse_bodies import AT_THE_BOUNDS, BLOCKS, CONCRETE, STEP_S, body, faults, spots, stuffed
 from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, box_distance, centres, stiffness, tet_mesh, turn
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.schemes import CRANK_NICOLSON, SDIRK2
-from thermoxels_ns.fem.solution import HeatSolution
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, Radiation
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.quality.checks import check_mesh
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
-
-
-def faults(solution: HeatSolution, low: float, high: float) -> list[str]:
-    """What is wrong: not converged, not finite, not balanced, or out of range by more than round-off."""
-    slack, temperature_c = 1e-8 * (high - low), solution.temperature_c
-    found = {
-        "not converged": not solution.converged,
-        "not finite": not np.isfinite(temperature_c).all(),
-        f"energy {solution.energy_residual:.1e}": not solution.energy_residual < 1e-9,
-        f"spread {solution.energy_residual_of_spread:.1e}": not solution.energy_residual_of_spread < 1e-9,
-        f"lowest {temperature_c.min()}": not temperature_c.min() >= low - slack,
-        f"highest {temperature_c.max()}": not temperature_c.max() <= high + slack,
-    }
-    return [f"{name}: {solution.status}" for name, wrong in found.items() if wrong]
 
 
 def test_these_meshes_do_have_obtuse_angles() -> None:
@@ -52,52 +33,56 @@ def test_one_of_them_is_as_bad_as_is_promised() -> None:
     assert low <= quality.min_dihedral_deg <= low + 0.2 and high - 0.2 <= quality.max_dihedral_deg <= high
 
 
-@pytest.mark.parametrize("shape", ["sphere", "slab at 30 degrees", AT_THE_BOUNDS])
+@pytest.mark.parametrize("shape", [*BLOCKS, "sphere", "slab at 30 degrees", AT_THE_BOUNDS])
 @pytest.mark.parametrize("fourier", [1e-3, 1e-1, 1.0, 1e3, 1e6])
-@pytest.mark.parametrize("strength", [0.0, 1e-9, 1e6])
-def test_range_and_balance_at_any_step_and_any_cooling(shape, fourier, strength) -> None:
-    effects: tuple[Effect, ...] = () if strength == 0.0 else (Convection(("*",), strength, -40.0),)
-    if strength == 1e6:
-        effects = (*effects, Radiation(("*",), 0.9, 100.0))
-    low, high = (-30.0, 90.0) if strength == 0.0 else (-40.0, 100.0)
+@pytest.mark.parametrize(("strength", "sky"), [(0.0, False), (1e-9, False), (1e-9, True), (1e6, True)])
+def test_range_and_balance_at_any_step_and_any_cooling(shape, fourier, strength, sky) -> None:
+    effects: tuple[Effect, ...] = (Convection(("*",), strength, -40.0),) if strength else ()
+    effects += (Radiation(("*",), 0.9, 100.0),) if sky else ()
+    low, high = (-40.0 if strength else -30.0), (100.0 if sky else 90.0)
     problem = HeatProblem(body(shape, spots), CONCRETE, effects=effects)
     assert faults(solve_heat(problem, TimeSteps(3, fourier * STEP_S)), low, high) == []
 
 
-@pytest.mark.parametrize("shape", ["slab at 30 degrees", AT_THE_BOUNDS])
+@pytest.mark.parametrize("shape", [*BLOCKS, "slab at 30 degrees", AT_THE_BOUNDS])
 @pytest.mark.parametrize("contrast", [1e-6, 1e6])
 def test_two_materials_in_turns(shape, contrast) -> None:
+    """Neighbouring voxels conduct a million times better or worse."""
     materials = {"even": CONCRETE, "odd": replace(CONCRETE, conductivity_w_mk=1.7 * contrast)}
     effects = (Convection(("*",), 10.0, -10.0), Radiation(("*",), 0.9, 30.0))
     problem = HeatProblem(body(shape, 20.0, regions=True), materials, effects=effects)
     for fourier in (1e-3, 1.0, 1e6):
-        assert faults(solve_heat(problem, TimeSteps(2, fourier * STEP_S)), -10.0, 30.0) == []
+        assert faults(solve_heat(problem, TimeSteps(3, fourier * STEP_S)), -10.0, 30.0) == []
+    steady = solve_steady(problem)
+    assert steady.energy_residual < 1e-9
+    assert steady.temperature_c.min() >= -10.0 - 1e-2 and steady.temperature_c.max() <= 30.0 + 1e-2
 
 
-@pytest.mark.parametrize("shape", ["sphere", AT_THE_BOUNDS])
+@pytest.mark.parametrize("shape", [*BLOCKS, "sphere", AT_THE_BOUNDS])
 @pytest.mark.parametrize(
     ("start_c", "sky_c"), [(726.85, -270.15), (-270.15, 726.85), (-273.15, -270.15), (-273.15, 20.0)]
 )
 def test_radiation_between_1000_k_and_3_k(shape, start_c, sky_c) -> None:
-    problem = HeatProblem(body(shape, start_c), CONCRETE, effects=(Radiation(("*",), 1.0, sky_c),))
+    problem = HeatProblem(body(shape, start_c, size=4), CONCRETE, effects=(Radiation(("*",), 1.0, sky_c),))
+    low, high = sorted((start_c, sky_c))
     for fourier in (1e-3, 10.0, 1e6):
-        assert (
-            faults(solve_heat(problem, TimeSteps(2, fourier * STEP_S)), min(start_c, sky_c), max(start_c, sky_c)) == []
-        )
+        assert faults(solve_heat(problem, TimeSteps(3, fourier * STEP_S)), low, high) == []
     np.testing.assert_allclose(solve_steady(problem).temperature_c, sky_c, atol=1e-4)
 
 
-@pytest.mark.parametrize("shape", ["slab at 30 degrees", AT_THE_BOUNDS])
+@pytest.mark.parametrize("shape", [*BLOCKS, "slab at 30 degrees", AT_THE_BOUNDS])
 def test_adaptive_steps_through_a_shock(shape) -> None:
     effects = (Convection(("*",), 1e4, -50.0), Radiation(("*",), 0.9, -80.0))
     problem = HeatProblem(body(shape, 200.0), CONCRETE, effects=effects)
-    assert faults(solve_heat(problem, AdaptiveSteps(1800.0, 0.5, outputs=2)), -80.0, 200.0) == []
+    time = AdaptiveSteps(3600.0, 0.1, outputs=4) if shape in BLOCKS else AdaptiveSteps(1800.0, 0.5, outputs=2)
+    assert faults(solve_heat(problem, time), -80.0, 200.0) == []
 
 
-@pytest.mark.parametrize("shape", ["slab at 30 degrees", AT_THE_BOUNDS])
+@pytest.mark.parametrize("shape", [*BLOCKS, "slab at 30 degrees", AT_THE_BOUNDS])
 def test_no_heat_capacity_to_speak_of(shape) -> None:
     empty = Material("nearly nothing", 1.7, 1e-9, 1e-6)
-    effects = (Convection(("x0",), 10.0, -10.0), Radiation(("x1",), 0.9, 30.0))
+    where = (("*",), ("*",)) if shape in BLOCKS else (("x0",), ("x1",))
+    effects = (Convection(where[0], 10.0, -10.0), Radiation(where[1], 0.9, 30.0))
     problem = HeatProblem(body(shape), empty, effects=effects)
     end = solve_heat(problem, TimeSteps(1, 1.0)).temperature_c[-1]
     np.testing.assert_allclose(end, solve_steady(problem).temperature_c, atol=1e-6)
@@ -113,7 +98,6 @@ def test_a_wall_of_one_element() -> None:
 
 
 def test_a_disconnected_piece() -> None:
-    """Two balls, one held: fine in time, and a clear error when steady."""
     points = centres(14, 7, 7)
     distance = np.minimum(
         np.linalg.norm(points - [-3.5, 0.1, 0.2], axis=-1), np.linalg.norm(points - [3.6, 0.1, 0.2], axis=-1)
@@ -125,10 +109,10 @@ def test_a_disconnected_piece() -> None:
         solve_steady(problem)
 
 
-@pytest.mark.parametrize("shape", ["sphere", AT_THE_BOUNDS])
+@pytest.mark.parametrize("shape", ["regular", "sphere", AT_THE_BOUNDS])
 @pytest.mark.parametrize("temperature_c", [-273.15, -273.1499])
 def test_near_absolute_zero(shape, temperature_c) -> None:
-    problem = HeatProblem(body(shape, temperature_c), CONCRETE, effects=(Radiation(("*",), 1.0, -273.15),))
+    problem = HeatProblem(body(shape, temperature_c, size=3), CONCRETE, effects=(Radiation(("*",), 1.0, -273.15),))
     solution = solve_heat(problem, TimeSteps(3, STEP_S))
     assert solution.temperature_c.min() >= -273.15 and solution.temperature_c.max() <= temperature_c + 1e-12
 

@@ -1,7 +1,3 @@
-"""Fields that break a naive mesher, through the whole chain from field to tagged mesh, with both kinds of boundary."""
-
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

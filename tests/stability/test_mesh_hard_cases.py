@@ -1,7 +1,3 @@
-"""Fields that break a naive mesher: NaN, huge and tiny density, one-voxel walls, bodies cut by the box."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Steady states stay in the range of what surrounds the body, also where obtuse angles would let them leave it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

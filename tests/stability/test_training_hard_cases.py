@@ -1,7 +1,3 @@
-"""Scenes that break naive training: nothing to learn, one view, drift, texture without temperature, coarse sensors."""
-
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pictures of a checker board in five places, by two cameras whose rig is known."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +50,6 @@ def board_pairs(visible: Camera, thermal: Camera, rig: np.ndarray) -> list[tuple
 
 
 def write_board_folder(folder: Path, pairs: list[tuple[np.ndarray, np.ndarray]]) -> Path:
-    """Write pairs as a memory card has them."""
     for number, (grey, temperature_c) in enumerate(pairs):
         photograph(folder / f"board{number}-visible.jpg", np.dstack([np.round(grey).astype(np.uint8)] * 3))
         np.save(folder / f"board{number}-thermal.npy", temperature_c.astype(np.float32))

@@ -1,7 +1,5 @@
 """Synthetic scenes for tests of what comes after the box is found."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Case 3 of ISO 10211: an outer corner of two insulated walls, with a floor slab that goes through one to a balcony."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

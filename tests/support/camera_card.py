@@ -1,7 +1,5 @@
 """Small camera files for tests: photographs with EXIF, count images, and a FLIR file with a photograph inside."""
 
-from __future__ import annotations
-
 import io
 from datetime import datetime
 from pathlib import Path
@@ -68,6 +66,14 @@ def counts(path: Path, temperature_c: np.ndarray | None = None, taken_at: dateti
         tags[306] = taken_at.strftime("%Y:%m:%d %H:%M:%S")
     image.save(path, format="TIFF", tiffinfo=tags)
     return path
+
+
+def write_pairs(card: Path, names: str = "abc") -> Path:
+    """Grey photographs and counts, a pair for each letter."""
+    for name in names:
+        photograph(card / f"{name}-visible.jpg")
+        counts(card / f"{name}-radiometric.tiff")
+    return card
 
 
 def jpeg_bytes(pixels: np.ndarray) -> bytes:

@@ -1,7 +1,5 @@
 """Writes FLIR R-JPEG files whose every number is known."""
 
-from __future__ import annotations
-
 import io
 import struct
 from dataclasses import dataclass, field

@@ -1,28 +1,23 @@
-"""Bodies for the tests of the heat solver."""
-
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
+from tests.support.heat_meshes import Nodal, mesh_from
 from thermoxels_ns.heat.materials import Material
-from thermoxels_ns.mesh.quality.face_count import boundary_facets
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
+CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
+STEEL = Material("steel", 50.0, 7800.0, 450.0)
 
-def make_body(cells: np.ndarray, voxel_m: float, temperature_c: Callable[[np.ndarray], np.ndarray]) -> TetMesh:
+
+def make_body(cells: np.ndarray, voxel_m: float, temperature_c: Nodal = 20.0) -> TetMesh:
     corners, tets = kuhn_tets(cells)
-    points, facets = corners * voxel_m, boundary_facets(tets)
-    seen, tags, region = np.ones(len(points), bool), np.zeros(len(facets), np.int64), np.zeros(len(tets), np.int64)
-    return TetMesh(points, tets, temperature_c(points), seen, facets, tags, region)
+    return mesh_from(corners * voxel_m, tets, temperature_c)
 
 
 @pytest.fixture
 def concrete() -> Material:
-    return Material("concrete", 1.7, 2200.0, 880.0)
+    return CONCRETE
 
 
 @pytest.fixture

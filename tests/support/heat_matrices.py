@@ -1,7 +1,5 @@
 """Stiffness and mass of linear tetrahedra, for tests that step or solve by themselves."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

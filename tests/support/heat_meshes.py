@@ -1,9 +1,9 @@
-"""Boxes cut into tetrahedra along given planes, with named sides and regions, for problems of heat flow."""
-
-from __future__ import annotations
+"""Meshes for problems of heat flow: of any tetrahedra, and boxes cut along planes, with named sides and regions."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,16 @@ SIDES = ("x0", "x1", "y0", "y1", "z0", "z1")
 """Patches of a box: the lower and the upper end of each axis."""
 
 Nodal = float | Callable[[npt.NDArray[np.float64]], npt.NDArray[np.float64]]
+
+
+def mesh_from(
+    points: npt.NDArray[np.float64], tets: npt.NDArray[np.int64], temperature_c: Nodal = 20.0, **fields: Any
+) -> TetMesh:
+    """A mesh of any tetrahedra with the boundary that they have, seen everywhere and of one region unless told."""
+    facets = boundary_facets(tets)
+    nodal = temperature_c(points) if callable(temperature_c) else np.full(len(points), float(temperature_c))
+    seen, tags, region = np.ones(len(points), bool), np.zeros(len(facets), np.int64), np.zeros(len(tets), np.int64)
+    return replace(TetMesh(points, tets, nodal, seen, facets, tags, region), **fields)
 
 
 def planes(*knots: float, step: float) -> npt.NDArray[np.float64]:
@@ -85,19 +95,8 @@ def box_mesh(
         for index, rule in enumerate(regions.values()):
             number[rule(centre)] = index
         assert (number[cells] >= 0).all(), "cells without a region"
-    facets = boundary_facets(tets)
-    nodal = temperature_c(points) if callable(temperature_c) else np.full(len(points), float(temperature_c))
-    return TetMesh(
-        points_m=points,
-        tets=tets,
-        temperature_c=nodal,
-        observed=np.ones(len(points), bool),
-        facets=facets,
-        facet_tags=np.zeros(len(facets), np.int64),
-        region=np.repeat(number[cells], 6),
-        region_names=names,
-        boundary=_tags(points, facets, axes, patches or {}),
-    )
+    mesh = mesh_from(points, tets, temperature_c, region=np.repeat(number[cells], 6), region_names=names)
+    return replace(mesh, boundary=_tags(points, mesh.facets, axes, patches or {}))
 
 
 def _tags(points, facets, axes, patches) -> Boundary:

@@ -1,7 +1,5 @@
 """A tagged mesh like a small house, for the tests of files and of the programs that read them."""
 
-from __future__ import annotations
-
 from itertools import permutations
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Captures of a synthetic scene by two cameras whose rig, drift and vignetting are known exactly."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
@@ -64,7 +62,6 @@ def projection_difference_px(
 
 
 def turned(x_deg: float, y_deg: float, z_deg: float) -> FloatArray:
-    """Rotation matrix Rz Ry Rx."""
     x, y, z = np.radians([x_deg, y_deg, z_deg])
     about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
     about_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])

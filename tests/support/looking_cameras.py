@@ -1,7 +1,5 @@
 """Cameras for tests that look at a point."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

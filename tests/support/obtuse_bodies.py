@@ -1,20 +1,18 @@
 """Bodies from isosurface stuffing with patches and regions, whose angles between faces are obtuse here and there."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 
-from tests.support.heat_meshes import Nodal
+from tests.support.heat_bodies import CONCRETE
+from tests.support.heat_meshes import Nodal, box_mesh
 from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, tet_mesh
-from thermoxels_ns.heat.materials import Material
-from thermoxels_ns.mesh.quality.checks import dihedral_range_deg
+from thermoxels_ns.fem.solution import HeatSolution
+from thermoxels_ns.mesh.quality.checks import volumes_and_angles
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 
-CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
 H = 0.05
 """Size of a voxel, [m]."""
 STEP_S = H**2 / CONCRETE.diffusivity_m2_s
@@ -49,9 +47,22 @@ NEAR_THE_BOUNDS_DEG = 0.1
 """How far inside the promised range its worst angles are."""
 
 
-def body(shape: str = "slab at 30 degrees", temperature_c: Nodal = 20.0, regions: bool = False) -> TetMesh:
-    """One of the known shapes, 8 voxels wide, or `AT_THE_BOUNDS`."""
-    mesh = at_the_angle_bounds() if shape == AT_THE_BOUNDS else tet_mesh(stuff(SHAPES[shape].level(8)), H)
+BLOCKS = ("regular", "carved", "shaken")
+"""Names of blocks of cells: whole, with a third taken out, and with nodes moved so that angles are obtuse."""
+
+
+def body(
+    shape: str = "slab at 30 degrees", temperature_c: Nodal = 20.0, regions: bool = False, size: int = 6
+) -> TetMesh:
+    """One of the known shapes, 8 voxels wide, `AT_THE_BOUNDS`, or one of `BLOCKS`, `size` voxels wide."""
+    if shape in BLOCKS:
+        keep = (lambda p: np.random.default_rng(5).random(p.shape[:3]) < 0.65) if shape == "carved" else None
+        mesh = box_mesh(*[np.arange(size + 1) * H] * 3, keep=keep)
+        if shape == "shaken":
+            moves = np.random.default_rng(6).uniform(-0.1 * H, 0.1 * H, mesh.points_m.shape)
+            mesh = replace(mesh, points_m=mesh.points_m + moves)
+    else:
+        mesh = at_the_angle_bounds() if shape == AT_THE_BOUNDS else tet_mesh(stuff(SHAPES[shape].level(8)), H)
     return dressed(mesh, temperature_c, regions)
 
 
@@ -73,7 +84,7 @@ def at_the_angle_bounds() -> TetMesh:
         for _ in range(26):
             before = points[node].copy()
             points[node] = before + step * direction
-            least, most = dihedral_range_deg(points, tets)
+            _, least, most = volumes_and_angles(points, tets)
             corner = points[tets]
             if least < low or most > high or np.linalg.det(corner[:, 1:] - corner[:, :1]).min() <= 0.0:
                 points[node], step = before, 0.5 * step
@@ -83,3 +94,17 @@ def at_the_angle_bounds() -> TetMesh:
 def spots(points: np.ndarray) -> np.ndarray:
     """Single hot and cold nodes in an even body."""
     return np.random.default_rng(1).choice([-30.0, 20.0, 90.0], len(points))
+
+
+def faults(solution: HeatSolution, low: float, high: float) -> list[str]:
+    """What is wrong: not converged, not finite, not balanced, or out of range by more than round-off."""
+    slack, temperature_c = 1e-8 * (high - low), solution.temperature_c
+    found = {
+        "not converged": not solution.converged,
+        "not finite": not np.isfinite(temperature_c).all(),
+        f"energy {solution.energy_residual:.1e}": not solution.energy_residual < 1e-9,
+        f"spread {solution.energy_residual_of_spread:.1e}": not solution.energy_residual_of_spread < 1e-9,
+        f"lowest {temperature_c.min()}": not temperature_c.min() >= low - slack,
+        f"highest {temperature_c.max()}": not temperature_c.max() <= high + slack,
+    }
+    return [f"{name}: {solution.status}" for name, wrong in found.items() if wrong]

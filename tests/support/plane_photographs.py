@@ -1,7 +1,3 @@
-"""Photographs of a textured plane whose place is known."""
-
-from __future__ import annotations
-
 import numpy as np
 
 from thermoxels_ns.core.lattice import Lattice

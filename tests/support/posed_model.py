@@ -1,6 +1,4 @@
-"""A model of structure from motion whose truth is known."""
-
-from __future__ import annotations
+from dataclasses import replace
 
 import numpy as np
 
@@ -36,14 +34,9 @@ def ring_model(count: int = 8, points: int = 300, seed: int = 0, unit_m: float =
         frames.append(np.full(len(inside), index))
         seen.append(inside)
         pixels.append(at[inside])
-    return SfmModel(
-        model.frames,
-        model.camera,
-        model.camera_to_world,
-        model.points,
-        model.colours,
-        model.point_error_px,
-        np.concatenate(frames),
-        np.concatenate(seen),
-        np.concatenate(pixels),
+    return replace(
+        model,
+        sighting_frame=np.concatenate(frames),
+        sighting_point=np.concatenate(seen),
+        sighting_pixel=np.concatenate(pixels),
     )

@@ -1,13 +1,11 @@
-"""Tagged bodies for the tests of heat scenes."""
-
-from __future__ import annotations
+from dataclasses import replace
 
 import numpy as np
 
+from tests.support.heat_bodies import make_body
 from thermoxels_ns.mesh.boundary.patches import default_patches
-from thermoxels_ns.mesh.quality.face_count import boundary_facets
+from thermoxels_ns.mesh.quality.checks import facet_normals
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
-from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 Z_UP = (0.0, 0.0, 1.0)
 
@@ -24,35 +22,25 @@ def tagged_body(
         cut_below_x: Facets whose middle has an x below it, in voxels, are cut by the box around the scene.
         temperature_c: Of all nodes.
     """
-    corners, tets = kuhn_tets(cells)
-    facets = boundary_facets(tets)
-    corner = corners[facets]
-    normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).astype(float)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    middle = corner.mean(axis=1)
+    mesh = make_body(cells, voxel_m, temperature_c)
+    corners = np.rint(mesh.points_m / voxel_m)
+    normals, middle = facet_normals(corners, mesh.facets), corners[mesh.facets].mean(axis=1)
     beyond = np.floor(middle + 0.5 * normals).astype(int) + 1
     patch, names = default_patches(normals, Z_UP, outside[tuple(beyond.T)], middle[:, 0] < cut_below_x)
-    tags = Boundary(normals, np.ones(len(facets)), np.ones(len(facets), bool), patch, names)
-    return TetMesh(
-        points_m=corners * voxel_m,
-        tets=tets,
-        temperature_c=np.full(len(corners), temperature_c),
-        observed=np.ones(len(corners), bool),
-        facets=facets,
-        facet_tags=np.zeros(len(facets), np.int64),
-        region=np.zeros(len(tets), np.int64),
-        region_names=("solid", "slab"),
-        boundary=tags,
-    )
+    tags = Boundary(normals, np.ones(len(normals)), np.ones(len(normals), bool), patch, names)
+    return replace(mesh, region_names=("solid", "slab"), boundary=tags)
 
 
-def room() -> TetMesh:
-    """A closed room of 4 m with walls, floor and ceiling of 1 m; its side at x = 0 is cut by the box."""
+def room(from_within: bool = False) -> TetMesh:
+    """A closed room of 4 m with walls, floor and ceiling of 1 m; its side at x = 0 is cut by the box.
+
+    Or all of it, photographed from within.
+    """
     cells = np.ones((4, 4, 4), dtype=bool)
     cells[1:3, 1:3, 1:3] = False
-    outside = np.ones((6, 6, 6), dtype=bool)
-    outside[2:4, 2:4, 2:4] = False
-    return tagged_body(cells, 1.0, outside, cut_below_x=1e-6)
+    outside = np.full((6, 6, 6), not from_within)
+    outside[2:4, 2:4, 2:4] = from_within
+    return tagged_body(cells, 1.0, outside, cut_below_x=0.0 if from_within else 1e-6)
 
 
 def wall() -> TetMesh:
@@ -64,7 +52,4 @@ def wall() -> TetMesh:
     assert mesh.boundary is not None
     across = np.abs(mesh.boundary.normal[:, 1]) < 0.5
     patch = np.where(across, mesh.boundary.patch_names.index("cut"), mesh.boundary.patch)
-    tags = Boundary(
-        mesh.boundary.normal, mesh.boundary.area_factor, mesh.boundary.seen, patch, mesh.boundary.patch_names
-    )
-    return TetMesh(**{**vars(mesh), "boundary": tags})
+    return replace(mesh, boundary=replace(mesh.boundary, patch=patch))

@@ -1,7 +1,5 @@
 """A maker of tiny scene folders whose every pixel is known."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -57,7 +55,7 @@ def write_counts(path: Path, counts: np.ndarray) -> None:
 
 @pytest.fixture
 def scene_folder(tmp_path: Path) -> Callable[..., Folder]:
-    """Make a ThermoScenes folder: random 16-bit counts, bounds 10 to 30 C, cameras on a circle, box -1..1."""
+    """Make a ThermoScenes folder: random 16-bit counts, bounds 10 to 30 C, cameras on a circle, box -1..1 or None."""
 
     def make(
         frames: int = 10,
@@ -91,6 +89,7 @@ def scene_folder(tmp_path: Path) -> Callable[..., Folder]:
             "frames": [],
             **extra,
         }
+        meta = {key: value for key, value in meta.items() if value is not None}
         folder = Folder(root, meta, names)
         for number, name in enumerate(names):
             pixels = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)

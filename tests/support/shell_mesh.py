@@ -1,10 +1,10 @@
 """A whole spherical shell whose nodes lie on the spheres, as a cubed sphere cut into tetrahedra."""
 
-from __future__ import annotations
+from dataclasses import replace
 
 import numpy as np
 
-from thermoxels_ns.mesh.quality.face_count import boundary_facets
+from tests.support.heat_meshes import mesh_from
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
@@ -40,23 +40,13 @@ def shell_mesh(
     every = np.concatenate(points)
     _, first, number = np.unique(np.round(every / outer_m, 9) + 0.0, axis=0, return_index=True, return_inverse=True)
     nodes, tets = every[first], number.ravel()[np.concatenate(blocks)]
-    facets = boundary_facets(tets)
-    corner = nodes[facets]
+    mesh = mesh_from(nodes, tets, temperature_c)
+    corner, facets = nodes[mesh.facets], mesh.facets
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     normal /= np.linalg.norm(normal, axis=1)[:, None]
     radius = np.linalg.norm(corner, axis=2)
     patch = np.full(len(facets), 2)
     patch[np.all(np.abs(radius - inner_m) < 1e-9 * outer_m, axis=1)] = 0
     patch[np.all(np.abs(radius - outer_m) < 1e-9 * outer_m, axis=1)] = 1
-    return TetMesh(
-        points_m=nodes,
-        tets=tets,
-        temperature_c=np.full(len(nodes), temperature_c),
-        observed=np.ones(len(nodes), bool),
-        facets=facets,
-        facet_tags=np.zeros(len(facets), np.int64),
-        region=np.zeros(len(tets), np.int64),
-        boundary=Boundary(
-            normal, np.ones(len(facets)), np.ones(len(facets), bool), patch, ("inside", "outside", "cut")
-        ),
-    )
+    seen, names = np.ones(len(facets), bool), ("inside", "outside", "cut")
+    return replace(mesh, boundary=Boundary(normal, np.ones(len(facets)), seen, patch, names))

@@ -4,8 +4,6 @@ A script, so that a test can look at a process that does nothing else. Prints a 
 the imports, the peak, the bytes that stay, and what was predicted.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 

@@ -3,19 +3,79 @@
 The optimisers, their schedules and the callbacks are those of the default method.
 """
 
-from __future__ import annotations
-
+import io
 from copy import deepcopy
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import torch
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.engine.optimizers import Optimizers
 
 from thermoxels_ns.config import thermoxels
 from thermoxels_ns.core.yaml_records import with_overrides
 from thermoxels_ns.training.pipeline import ThermoxelsPipeline
+
+
+class Training:
+    """A training that can be stepped, saved and resumed at any step.
+
+    Args:
+        overrides: What differs from the pipeline's default configuration, nested as in a preset.
+        steps: Its length, for callbacks.
+        config: A method to begin with in place of the default one.
+        rate: Factor on all learning rates.
+        saved: A checkpoint to go on from.
+    """
+
+    def __init__(
+        self, overrides: dict[str, Any], steps: int, config: Any = None, rate: float = 1.0, saved: bytes | None = None
+    ):
+        config = deepcopy(config or thermoxels.config)  # nerfstudio writes the folder into it
+        pipeline = with_overrides(config.pipeline, overrides).setup(device="cpu", test_mode="val")
+        assert isinstance(pipeline, ThermoxelsPipeline)
+        pipeline.train()
+        self.pipeline, self.step, self.loss = pipeline, 0, torch.zeros(())
+        for group in config.optimizers.values():
+            group["optimizer"].lr *= rate
+            group["scheduler"].lr_final *= rate
+        self.optimizers = Optimizers(config.optimizers, pipeline.get_param_groups())
+        if saved is not None:
+            # In the order of nerfstudio's trainer: callbacks come after the checkpoint.
+            state = torch.load(io.BytesIO(saved), weights_only=True)
+            pipeline.load_pipeline(state["pipeline"], state["step"])
+            self.optimizers.load_optimizers(state["optimizers"])
+            self.optimizers.load_schedulers(state["schedulers"])
+            self.step = state["step"] + 1
+        trainer: Any = SimpleNamespace(_start_step=self.step, config=SimpleNamespace(max_num_iterations=steps))
+        attributes = TrainingCallbackAttributes(self.optimizers, None, pipeline, trainer)  # type: ignore[arg-type]
+        self.callbacks = pipeline.get_training_callbacks(attributes)
+
+    def advance(self, until: int) -> "Training":
+        """Train; the loss of the step before, with its graph, is there while callbacks run, as in nerfstudio."""
+        while self.step < until:
+            for callback in self.callbacks:
+                callback.run_callback(self.step)
+            self.take_step()
+            for scheduler in self.optimizers.schedulers.values():
+                scheduler.step()
+            self.step += 1
+        return self
+
+    def take_step(self) -> None:
+        self.optimizers.zero_grad_all()
+        self.loss = torch.stack(list(self.pipeline.get_train_loss_dict(self.step)[1].values())).sum()
+        self.loss.backward()
+        self.optimizers.optimizer_step_all()
+
+    def save(self) -> bytes:
+        """A checkpoint of the last step."""
+        file = io.BytesIO()
+        parts = {"optimizers": self.optimizers.optimizers, "schedulers": self.optimizers.schedulers}
+        states = {part: {name: one.state_dict() for name, one in held.items()} for part, held in parts.items()}
+        torch.save({"step": self.step - 1, "pipeline": self.pipeline.state_dict(), **states}, file)
+        return file.getvalue()
 
 
 def train(scene: Path, steps: int, model: dict[str, Any] | None = None, rays: int = 512, rate: float = 1.0):
@@ -42,37 +102,8 @@ def train_with_optimizers(
         threads: Threads of the compiled kernels.
     """
     plain = {"resolutions": [16], "refine_at": [], "prune_at": [], "thin_at": []}
-    config = with_overrides(
-        deepcopy(thermoxels.config.pipeline),  # nerfstudio writes the folder into it
-        {
-            "cpu_threads": threads,
-            "datamanager": {
-                "data": scene,
-                "train_num_rays_per_batch": rays,
-                "thermal_num_rays_per_batch": rays,
-            },
-            "model": plain | (model or {}),
-        },
-    )
-    pipeline = config.setup(device="cpu", test_mode="val")
-    assert isinstance(pipeline, ThermoxelsPipeline)
-    pipeline.train()
-    settings = deepcopy(thermoxels.config.optimizers)
-    for group in settings.values():
-        group["optimizer"].lr *= rate
-        group["scheduler"].lr_final *= rate
-    optimizers = Optimizers(settings, pipeline.get_param_groups())
-    trainer: Any = SimpleNamespace(_start_step=0, config=SimpleNamespace(max_num_iterations=steps))
-    attributes = TrainingCallbackAttributes(optimizers, None, pipeline, trainer)
-    callbacks = pipeline.get_training_callbacks(attributes)
-    for step in range(steps):
-        for callback in callbacks:
-            callback.run_callback(step)
-        optimizers.zero_grad_all()
-        _, losses, _ = pipeline.get_train_loss_dict(step)
-        sum(losses.values()).backward()  # type: ignore[union-attr]
-        optimizers.optimizer_step_all()
-        for scheduler in optimizers.schedulers.values():
-            scheduler.step()
-    pipeline.eval()
-    return pipeline, optimizers
+    data = {"data": scene, "train_num_rays_per_batch": rays, "thermal_num_rays_per_batch": rays}
+    overrides = {"cpu_threads": threads, "datamanager": data, "model": plain | (model or {})}
+    training = Training(overrides, steps, rate=rate).advance(steps)
+    training.pipeline.eval()
+    return training.pipeline, training.optimizers

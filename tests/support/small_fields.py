@@ -1,7 +1,5 @@
 """Small trained fields and meshes, made by hand."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -9,11 +7,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from tests.support.heat_meshes import mesh_from
 from tests.support.house_mesh import house_mesh
 from thermoxels_ns.core.lattice import CORNER_OFFSETS, Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh
-from thermoxels_ns.mesh.quality.face_count import boundary_facets
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -48,12 +46,12 @@ def box_mesh(snapshot_of) -> TetMesh:
     return replace(build_mesh(snapshot, selection, np.eye(4), MeshOptions("voxel")).mesh, boundary=None)
 
 
-def mesh_from(points: npt.NDArray[np.float64], tets: npt.NDArray[np.int64]) -> TetMesh:
-    """A mesh of any tetrahedra at 20 degrees, with the boundary that they have."""
-    facets = boundary_facets(tets)
-    none = np.zeros(len(facets), dtype=np.int64)
-    warm = np.full(len(points), 20.0)
-    return TetMesh(points, tets, warm, warm > 0, facets, none, np.zeros(len(tets), dtype=np.int64))
+def crossed_diagonals() -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Two voxels side by side, and the same with the second mirrored: diagonals on the face that they share cross."""
+    corners, tets = kuhn_tets(np.ones((2, 1, 1), dtype=bool))
+    number = {tuple(c): n for n, c in enumerate(corners.tolist())}
+    mirrored = np.array([[number[(x, 1 - y, z)] for x, y, z in corners[t].tolist()] for t in tets[6:]])
+    return corners.astype(float), tets, np.vstack([tets[:6], mirrored[:, [0, 2, 1, 3]]])
 
 
 @pytest.fixture
@@ -62,19 +60,9 @@ def mesh_of_cells() -> Callable[[npt.NDArray[np.bool_]], TetMesh]:
 
     def make(cells: npt.NDArray[np.bool_], voxel_size: float = 0.5) -> TetMesh:
         corners, tets = kuhn_tets(cells)
-        facets = boundary_facets(tets)
-        nx, ny, nz = cells.shape
-        points = corners * voxel_size
-        assert np.all(signed_volumes(points, tets) > 0)
-        return TetMesh(
-            points_m=points,
-            tets=tets,
-            temperature_c=np.full(len(points), 20.0),
-            observed=np.ones(len(points), dtype=bool),
-            facets=facets,
-            facet_tags=boundary_tags(facets, corners, (nx + 1, ny + 1, nz + 1)),
-            region=np.zeros(len(tets), dtype=np.int64),
-        )
+        mesh = mesh_from(corners * voxel_size, tets)
+        assert np.all(signed_volumes(mesh.points_m, tets) > 0)
+        return replace(mesh, facet_tags=boundary_tags(mesh.facets, corners, tuple(n + 1 for n in cells.shape)))
 
     return make
 

@@ -1,7 +1,5 @@
 """Levels of known bodies for the tests of isosurface stuffing, and what their meshes must be."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -55,7 +53,6 @@ def stiffness(points: np.ndarray, tets: np.ndarray) -> sparse.csr_array:
 
 
 def turn(degrees: float) -> np.ndarray:
-    """Rotation about the z axis."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 

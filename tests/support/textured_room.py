@@ -1,7 +1,5 @@
 """Photographs and thermal images of a room corner with rich texture, by two cameras whose places are known."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

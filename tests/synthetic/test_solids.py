@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -23,7 +21,7 @@ SOLIDS = {
     **{f"cylinder-{axis}": Cylinder((0.3, -0.2, 0.5), 0.4, 1.5, axis) for axis in range(3)},
     "disc": Cylinder((0.0, 0.1, 0.2), 0.5, 0.1, 2),
     "union": SolidUnion((NOTCHED, Sphere((0.5, 0.5, 1.25), 0.25))),
-    **{name: make_scene(name).solid for name in SCENE_NAMES},
+    **{name: make_scene(name).solid for name in (*SCENE_NAMES, *(f"random-{family}" for family in range(5)))},
 }
 
 

@@ -1,7 +1,3 @@
-"""Pruning by what rays see, on a slab whose answer is known, and what a schedule does to optimisers."""
-
-from __future__ import annotations
-
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any

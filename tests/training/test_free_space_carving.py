@@ -1,7 +1,3 @@
-"""Voxels that lines of sight show to be air."""
-
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -17,7 +13,6 @@ BOX = Lattice.covering((-1, -1, -1), (1, 1, 1), 20)
 
 
 def lines(origins, points, uncertainty=0.0) -> FeatureRays:
-    """Every camera sees every point."""
     origins, points = np.atleast_2d(origins).astype(float), np.atleast_2d(points).astype(float)
     number = np.repeat(np.arange(len(points)), len(origins))
     return FeatureRays(

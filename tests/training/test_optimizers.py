@@ -1,7 +1,3 @@
-"""Optimisers that touch only rows with a gradient: torch's own where all rows are touched, nothing where none is."""
-
-from __future__ import annotations
-
 import copy
 import io
 
@@ -12,12 +8,7 @@ import torch
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.refine import prune, refine
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.training.optimizers import (
-    RowAdam,
-    RowOptimizer,
-    RowRMSprop,
-    touched_rows,
-)
+from thermoxels_ns.training.optimizers import RowAdam, RowOptimizer, RowRMSprop, touched_rows
 
 ROWS, CHANNELS = 50, 6
 KINDS = {"adam": RowAdam, "rmsprop": RowRMSprop}

@@ -1,7 +1,3 @@
-"""A house before a plain grey sky, in a box much larger than it."""
-
-from __future__ import annotations
-
 import json
 
 import pytest

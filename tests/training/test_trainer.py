@@ -1,7 +1,3 @@
-"""How a training goes on from a checkpoint, and what a quality replaces."""
-
-from __future__ import annotations
-
 import resource
 import time
 from copy import deepcopy
@@ -38,12 +34,10 @@ def one_writer_at_a_time(monkeypatch) -> None:
 
 
 def trainer(scene: Path, folder: Path, *options: str) -> ThermoxelsTrainer:
-    """The trainer that ns-train would make."""
     return configured(scene, folder, *options).setup(local_rank=0, world_size=1)
 
 
 def configured(scene: Path, folder: Path, *options: str) -> Any:
-    """What ns-train reads from its command line."""
     fixed = ["--vis", "tensorboard", "--machine.device-type", "cpu"]
     fixed += ["--output-dir", str(folder), "--experiment-name", "e", "--timestamp", "run", "--data", str(scene)]
     before = deepcopy(thermoxels.config)

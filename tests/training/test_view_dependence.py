@@ -1,25 +1,14 @@
-"""Colour is stored as one per corner until it depends on the direction: a training notices nothing of it."""
-
-from __future__ import annotations
-
-import io
-from copy import deepcopy
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from nerfstudio.engine.callbacks import TrainingCallbackAttributes
-from nerfstudio.engine.optimizers import Optimizers
 
 from tests.support.boxed_scene import write_boxed_scene
-from thermoxels_ns.config import thermoxels
+from tests.support.short_training import Training
 from thermoxels_ns.core.errors import CheckpointError
-from thermoxels_ns.core.yaml_records import with_overrides
 from thermoxels_ns.synthetic.scene_folder import make_scene
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig
-from thermoxels_ns.training.pipeline import ThermoxelsPipeline
 
 RISES = 9
 """Step from which colour depends on the direction."""
@@ -41,59 +30,21 @@ def stored_whole(monkeypatch):
     monkeypatch.setattr(ThermoxelsModelConfig, "first_sh_degree", lambda config: config.sh_degree)
 
 
-class Training:
-    """A training that can be saved and resumed at any step."""
+def begin(scene: Path, options: dict[str, Any] | None = None, saved: bytes | None = None) -> Training:
+    rays = {"data": scene, "train_num_rays_per_batch": 300}
+    return Training({"datamanager": rays, "model": COURSE | (options or {})}, STEPS, saved=saved)
 
-    def __init__(self, scene: Path, options: dict[str, Any] | None = None, saved: bytes | None = None):
-        rays = {"data": scene, "train_num_rays_per_batch": 300}
-        overrides = {"datamanager": rays, "model": COURSE | (options or {})}
-        pipeline = with_overrides(deepcopy(thermoxels.config.pipeline), overrides).setup(device="cpu", test_mode="val")
-        assert isinstance(pipeline, ThermoxelsPipeline)
-        pipeline.train()
-        self.pipeline: Any = pipeline
-        self.step, self.loss = 0, torch.zeros(())
-        self.optimizers = Optimizers(deepcopy(thermoxels.config.optimizers), pipeline.get_param_groups())
-        if saved is not None:
-            # In the order of nerfstudio's trainer: callbacks come after the checkpoint.
-            state = torch.load(io.BytesIO(saved), weights_only=True)
-            pipeline.load_pipeline(state["pipeline"], state["step"])
-            self.optimizers.load_optimizers(state["optimizers"])
-            self.step = state["step"] + 1
-        trainer: Any = SimpleNamespace(_start_step=self.step, config=SimpleNamespace(max_num_iterations=STEPS))
-        attributes = TrainingCallbackAttributes(self.optimizers, None, pipeline, trainer)  # type: ignore[arg-type]
-        self.callbacks = pipeline.get_training_callbacks(attributes)
 
-    @property
-    def columns(self) -> int:
-        """Columns of colour."""
-        return self.pipeline.model.grid.sh.shape[1]
+def columns(training: Training) -> int:
+    return training.pipeline.model.grid.sh.shape[1]
 
-    def advance(self, until: int) -> Training:
-        """Train; the loss of the step before, with its graph, is there while callbacks run, as in nerfstudio."""
-        while self.step < until:
-            for callback in self.callbacks:
-                callback.run_callback(self.step)
-            self.optimizers.zero_grad_all()
-            self.loss = torch.stack(list(self.pipeline.get_train_loss_dict(self.step)[1].values())).sum()
-            self.loss.backward()
-            self.optimizers.optimizer_step_all()
-            self.step += 1
-        return self
 
-    def save(self) -> bytes:
-        """A checkpoint of the last step."""
-        file = io.BytesIO()
-        optimizers = {name: o.state_dict() for name, o in self.optimizers.optimizers.items()}
-        torch.save({"step": self.step - 1, "pipeline": self.pipeline.state_dict(), "optimizers": optimizers}, file)
-        return file.getvalue()
-
-    def tensors(self) -> dict[str, torch.Tensor]:
-        """Everything that a checkpoint holds."""
-        found = dict(self.pipeline.state_dict())
-        for group, optimizer in self.optimizers.optimizers.items():
-            for place, state in optimizer.state_dict()["state"].items():
-                found |= {f"{group}.{place}.{name}": value for name, value in state.items()}
-        return {name: torch.as_tensor(value).clone() for name, value in found.items()}
+def tensors(training: Training) -> dict[str, torch.Tensor]:
+    found = dict(training.pipeline.state_dict())
+    for group, optimizer in training.optimizers.optimizers.items():
+        for place, state in optimizer.state_dict()["state"].items():
+            found |= {f"{group}.{place}.{name}": value for name, value in state.items()}
+    return {name: torch.as_tensor(value).clone() for name, value in found.items()}
 
 
 def differing(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> list[str]:
@@ -107,34 +58,34 @@ def differing(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> l
     ids=lambda options: "-".join(map(str, options.values())) or "default",
 )
 def test_a_training_ends_with_the_bits_of_one_that_stores_everything(scene, request, options):
-    narrow = Training(scene, options)
-    seen = [(narrow.advance(step + 1).columns) for step in range(STEPS)]
+    narrow = begin(scene, options)
+    seen = [columns(narrow.advance(step + 1)) for step in range(STEPS)]
     all_columns = 3 * (options.get("sh_degree", 2) + 1) ** 2
     assert seen == [3] * RISES + [all_columns] * (STEPS - RISES)
     request.getfixturevalue("stored_whole")
-    whole = Training(scene, options)
-    assert whole.columns == all_columns
+    whole = begin(scene, options)
+    assert columns(whole) == all_columns
     whole.advance(STEPS)
     assert narrow.pipeline.model.grid.lattice.cell_shape[0] == 16
     higher = narrow.pipeline.model.grid.sh.detach().view(-1, 3, all_columns // 3)[..., 1:]
     assert float(higher.abs().max()) > 0
-    assert differing(narrow.tensors(), whole.tensors()) == []
+    assert differing(tensors(narrow), tensors(whole)) == []
 
 
 @pytest.mark.parametrize("stop", [1, 5, RISES - 1, RISES, RISES + 1, STEPS - 1])
 def test_a_training_resumed_at_any_step_ends_with_the_same_bits(scene, stop):
-    straight = Training(scene).advance(STEPS)
-    saved = Training(scene).advance(stop).save()
-    resumed = Training(scene, saved=saved)
-    assert resumed.columns == (3 if stop <= RISES else 27)
-    assert differing(resumed.advance(STEPS).tensors(), straight.tensors()) == []
+    straight = begin(scene).advance(STEPS)
+    saved = begin(scene).advance(stop).save()
+    resumed = begin(scene, saved=saved)
+    assert columns(resumed) == (3 if stop <= RISES else 27)
+    assert differing(tensors(resumed.advance(STEPS)), tensors(straight)) == []
 
 
 @pytest.mark.parametrize("stop", [5, STEPS])
 def test_images_and_snapshots_need_no_further_columns(scene, stop):
     """A model loaded for evaluation shows what the trained one does, before and after colour depends on directions."""
-    trained = Training(scene).advance(stop)
-    loaded = Training(scene, saved=trained.save()).pipeline
+    trained = begin(scene).advance(stop)
+    loaded = begin(scene, saved=trained.save()).pipeline
     shown = []
     for pipeline in (trained.pipeline, loaded):
         pipeline.eval()
@@ -148,7 +99,7 @@ def test_images_and_snapshots_need_no_further_columns(scene, stop):
 
 @pytest.mark.parametrize("options, columns, expected", [({}, 12, "sh 3 or 27"), ({"sh_degree": 0}, 27, "sh 3,")])
 def test_a_checkpoint_of_another_degree_is_refused(scene, options, columns, expected):
-    training = Training(scene, options)
+    training = begin(scene, options)
     state = dict(training.pipeline.state_dict())
     name = "_model.field.grid.sh"
     state[name] = torch.zeros(len(state[name]), columns)

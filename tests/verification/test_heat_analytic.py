@@ -1,29 +1,13 @@
-"""The heat solver against closed solutions of the heat equation."""
-
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 from scipy.linalg import eigh
 
+from tests.support.heat_bodies import CONCRETE, make_body
 from tests.support.heat_matrices import assemble
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.time_loop import solve_heat
-from thermoxels_ns.heat.materials import Material
-from thermoxels_ns.mesh.quality.face_count import boundary_facets
-from thermoxels_ns.mesh.tetrahedra import TetMesh
-from thermoxels_ns.mesh.voxel_tets import kuhn_tets
-
-CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
-
-
-def body(cells: np.ndarray, voxel_m: float, temperature_c=lambda points: np.full(len(points), 20.0)) -> TetMesh:
-    corners, tets = kuhn_tets(cells)
-    points, facets = corners * voxel_m, boundary_facets(tets)
-    seen, tags, region = np.ones(len(points), bool), np.zeros(len(facets), np.int64), np.zeros(len(tets), np.int64)
-    return TetMesh(points, tets, temperature_c(points), seen, facets, tags, region)
 
 
 def test_step_between_two_half_spaces() -> None:
@@ -32,7 +16,7 @@ def test_step_between_two_half_spaces() -> None:
     erfc(0.05 m, 3600 s) = 0.5294616, erfc(0.10 m, 3600 s) = 0.2085161 for a = 1.7 / (2200 * 880).
     """
     middle = 0.6
-    mesh = body(np.ones((120, 1, 1), bool), 0.01, lambda p: 0.5 - 0.5 * np.sign(np.round(p[:, 0] - middle, 9)))
+    mesh = make_body(np.ones((120, 1, 1), bool), 0.01, lambda p: 0.5 - 0.5 * np.sign(np.round(p[:, 0] - middle, 9)))
     end = solve_heat(HeatProblem(mesh, CONCRETE), TimeSteps(720, 5.0)).temperature_c[-1]
     for distance, expected in ((0.05, 0.5294616), (0.10, 0.2085161)):
         assert math.erfc(distance / (2 * math.sqrt(CONCRETE.diffusivity_m2_s * 3600))) == pytest.approx(
@@ -45,7 +29,7 @@ def test_step_between_two_half_spaces() -> None:
 def test_each_mode_decays_exactly_as_backward_euler_says() -> None:
     """An eigenvector of (K, M) shrinks by 1 / (1 + dt lambda) per step and keeps its shape."""
     rng = np.random.default_rng(4)
-    mesh = body(rng.random((4, 4, 4)) < 0.8, 0.05)
+    mesh = make_body(rng.random((4, 4, 4)) < 0.8, 0.05)
     matrices = assemble(mesh, CONCRETE)
     values, vectors = eigh(matrices.stiffness_w_k.toarray(), matrices.mass_j_k.toarray())
     for number in (len(values) // 4, len(values) - 1):
@@ -58,7 +42,7 @@ def test_each_mode_decays_exactly_as_backward_euler_says() -> None:
 
 def test_slowest_mode_of_a_box() -> None:
     """Smallest rate of an insulated box of length L: a (pi / L)^2, to the accuracy of 16 voxels."""
-    mesh = body(np.ones((16, 3, 2), bool), 0.05)
+    mesh = make_body(np.ones((16, 3, 2), bool), 0.05)
     matrices = assemble(mesh, CONCRETE)
     values = eigh(matrices.stiffness_w_k.toarray(), matrices.mass_j_k.toarray(), eigvals_only=True)
     exact = CONCRETE.diffusivity_m2_s * (np.pi / 0.8) ** 2

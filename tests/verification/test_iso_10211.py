@@ -5,11 +5,10 @@ ones, its heat flow is within 0.1 W/m in case 2 and within 1 % in case 3, and fl
 number of subdivisions is doubled. Case 4, a bar through insulation, is beside them.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
+from tests.support.building_corner import COLDEST_C, LISTED_W, building_corner
 from tests.support.heat_meshes import box_mesh, graded, planes
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
@@ -27,7 +26,6 @@ def conductor(name: str, conductivity_w_mk: float) -> Material:
 
 
 def at(mesh: TetMesh, solution: SteadySolution, *position: float) -> float:
-    """Temperature of the node at a position."""
     distance = np.linalg.norm(mesh.points_m - np.array(position), axis=1)
     assert distance.min() < 1e-9
     return float(solution.temperature_c[distance.argmin()])
@@ -109,75 +107,20 @@ def test_case_2_metal_faced_wall(lumped_boundary, parts) -> None:
         assert at(mesh, solution, 1e-3 * px, 0.0, 1e-3 * pz) == pytest.approx(listed, abs=0.1), name
 
 
-def balcony(finest: float) -> TetMesh:
-    """An outer corner of two insulated walls with a floor slab that goes through one of them to a balcony."""
-    step = {"finest": finest, "growth": 1.3, "coarsest": 0.2}
-    x, y, z = (
-        graded(*knots, **step)
-        for knots in ((-0.1, 0, 0.05, 0.2, 1.2), (-0.7, -0.1, 0, 0.05, 0.2, 1.2), (0, 1.0, 1.15, 1.2, 2.15))
-    )
-
-    def depth(p):
-        """How far inside the outer face of the nearer wall."""
-        return np.minimum(p[..., 0], p[..., 1])
-
-    regions = {
-        "inner wall": lambda p: depth(p) > 0.05,
-        "insulation": lambda p: (depth(p) > 0) & (depth(p) < 0.05),
-        "outer wall": lambda p: depth(p) < 0,
-        "floor": lambda p: (depth(p) > 0.2) & (p[..., 2] > 1.15),
-        "slab": lambda p: (p[..., 0] > 0.05) & (p[..., 2] > 1.0) & (p[..., 2] < 1.15),
-    }
-
-    def solid(p):
-        wall, slab = (depth(p) > -0.1) & (depth(p) < 0.2), regions["slab"](p)
-        return wall | slab | ((depth(p) > 0.2) & (p[..., 2] > 1.15) & (p[..., 2] < 1.2))
-
-    def cut(c):
-        return (c[:, 0] > 1.2 - 1e-9) | (c[:, 1] > 1.2 - 1e-9) | (c[:, 2] < 1e-9) | (c[:, 2] > 2.15 - 1e-9)
-
-    def room(c):
-        return ~cut(c) & (depth(c) > 0.2 - 1e-9)
-
-    patches = {
-        "cut": lambda c, n: cut(c),
-        "outside": lambda c, n: ~cut(c) & ~room(c),
-        "lower room": lambda c, n: room(c) & (c[:, 2] < 1.0 + 1e-9),
-        "upper room": lambda c, n: room(c) & (c[:, 2] > 1.15),
-    }
-    return box_mesh(x, y, z, regions=regions, patches=patches, keep=solid)
-
-
-CASE_3_W = {"lower room": 46.09, "upper room": 13.89, "outside": -59.98}
-CASE_3_COLDEST_C = {"lower room": 11.32, "upper room": 11.11}
-
-
-def case_3(finest: float, lumped_boundary: bool) -> tuple[TetMesh, SteadySolution]:
-    mesh = balcony(finest)
-    materials = {"inner wall": 0.7, "insulation": 0.04, "outer wall": 1.0, "floor": 1.0, "slab": 2.5}
-    effects = (
-        Convection(("lower room",), 5.0, 20.0),
-        Convection(("upper room",), 5.0, 15.0),
-        Convection(("outside",), 20.0, 0.0),
-    )
-    problem = HeatProblem(mesh, {name: conductor(name, k) for name, k in materials.items()}, effects=effects)
-    return mesh, solve_steady(problem, lumped_boundary=lumped_boundary)
-
-
 @BOUNDARIES
 def test_case_3_corner_with_a_balcony(lumped_boundary) -> None:
     flows = []
     for finest in (0.025, 0.0125):
-        mesh, solution = case_3(finest, lumped_boundary)
-        heat = {heat.group_names[0]: float(heat.heat_w[0]) for heat in solution.effects}
-        for patch, listed in CASE_3_W.items():
-            assert heat[patch] == pytest.approx(listed, rel=0.01), (patch, len(mesh.tets))
+        problem = building_corner(lambda *knots, f=finest: graded(*knots, finest=f, growth=1.3, coarsest=0.2))
+        mesh, solution = problem.mesh, solve_steady(problem, lumped_boundary=lumped_boundary)
+        heat_w = [float(heat.heat_w[0]) for heat in solution.effects]
+        assert heat_w == pytest.approx(LISTED_W, rel=0.01), len(mesh.tets)
         tags = mesh.boundary
         assert tags is not None
-        for patch, listed in CASE_3_COLDEST_C.items():
+        for patch, listed in COLDEST_C.items():
             nodes = np.unique(mesh.facets[tags.patch == tags.patch_names.index(patch)])
             assert solution.temperature_c[nodes].min() == pytest.approx(listed, abs=0.1), (patch, len(mesh.tets))
         assert solution.energy_residual < 1e-9
-        flows.append(heat["outside"])
+        flows.append(heat_w[2])
     assert flows[1] == pytest.approx(flows[0], rel=0.01)
     assert abs(flows[1] + 59.98) < abs(flows[0] + 59.98)

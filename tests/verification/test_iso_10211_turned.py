@@ -4,8 +4,6 @@ Case 4 and its figures, 0.540 W and 0.805 C, are as validation reports of other 
 the flow and 0.005 C.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

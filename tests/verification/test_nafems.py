@@ -1,7 +1,5 @@
 """NAFEMS benchmarks of heat transfer T2, T3 and T4 (The Standard NAFEMS Benchmarks, TNSB rev. 3, 1990)."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

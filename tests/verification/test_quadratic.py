@@ -1,11 +1,8 @@
-"""Published benchmarks with quadratic tetrahedra."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from tests.support.building_corner import COLDEST_C, LISTED_W, building_corner
+from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh, planes
 from tests.support.shell_mesh import shell_mesh
 from thermoxels_ns.fem.problem import HeatProblem
@@ -51,9 +48,7 @@ def test_a_closed_spherical_shell(order) -> None:
     for parts in (4, 8):
         mesh = shell_mesh(0.5, 0.6, parts, parts // 4)
         effects = (Convection(("inside",), 7.69, 20.0), Convection(("outside",), 25.0, -10.0))
-        solution = solve_steady(
-            HeatProblem(mesh, Material("concrete", 1.7, 2200.0, 880.0), effects=effects), order=order
-        )
+        solution = solve_steady(HeatProblem(mesh, CONCRETE, effects=effects), order=order)
         assert solution.energy_residual < 1e-9
         errors.append(float(solution.effects[0].heat_w[0]) / 455.6634 - 1.0)
     assert abs(errors[1]) < 3e-3, errors

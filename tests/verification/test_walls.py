@@ -1,13 +1,10 @@
-"""Walls, shells and slabs with convection against closed solutions."""
-
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh, graded, planes
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.schemes import SDIRK2
@@ -16,8 +13,6 @@ from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection, FixedTemperature
 from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
-
-CONCRETE = Material("concrete", 1.7, 2200.0, 880.0)
 
 LAYERS = {"plaster": (0.015, 0.40), "concrete": (0.20, 2.0), "insulation": (0.12, 0.035), "mortar": (0.01, 1.0)}
 """Thickness, [m], and conductivity, [W / (m K)], from inside to outside."""

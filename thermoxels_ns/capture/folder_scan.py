@@ -32,8 +32,6 @@ _PHOTOGRAPH_WORDS = frozenset({"visible", "vis", "rgb", "colour", "color", "phot
 _OTHER_WORDS = frozenset({"image", "images", "raw"})
 ROLE_WORDS = _THERMAL_WORDS | _PHOTOGRAPH_WORDS | _OTHER_WORDS
 _UNPRINTED = ("Cc", "Cs")  # kinds of characters that break a line or a terminal, or are bytes that no encoding explains
-_LAST_LETTERS = {"t": "thermal", "v": "photograph", "w": "photograph", "r": "thermal"}
-"""Single letters that stand for a camera at the end of a name, after a separator."""
 
 
 @dataclass(frozen=True)
@@ -176,20 +174,13 @@ def _identify(path: Path, folder: Path) -> CameraFile:
         if is_dji_rjpeg(head) or is_dji_rjpeg(path.read_bytes()):
             return CameraFile(path, "thermal", read_photograph_facts(path).taken_at, dji=True)
     else:
-        found = _count_image(path)
-        if found is not None:
-            return found
+        with errors_name(path, "a TIFF or PNG that can be decoded"), Image.open(path) as image:
+            # One channel of more than 8 bits, which no photograph is.
+            if image.mode == "F" or image.mode.startswith("I"):
+                check_thermal_size(path, *image.size)
+                return CameraFile(path, "thermal", read_exif_facts(image).taken_at)
     facts = read_photograph_facts(path)
     return CameraFile(path, "thermal picture" if _named_thermal(path, folder) else "photograph", facts.taken_at)
-
-
-def _count_image(path: Path) -> CameraFile | None:
-    """A TIFF or PNG of one channel of more than 8 bits, which no photograph is; None for others."""
-    with errors_name(path, "a TIFF or PNG that can be decoded"), Image.open(path) as image:
-        if image.mode != "F" and not image.mode.startswith("I"):
-            return None
-        check_thermal_size(path, *image.size)
-        return CameraFile(path, "thermal", read_exif_facts(image).taken_at)
 
 
 def _named_thermal(path: Path, folder: Path) -> bool:

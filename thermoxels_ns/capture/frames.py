@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -78,7 +77,10 @@ class CaptureFrames:
             for name in ("photograph", "thermal"):
                 inside, relative = row[name]
                 row[name] = (folder if inside else root) / relative
-        frames, size = tuple(_frame_of(row) for row in content["frames"]), content["thermal_size"]
+            for name, kind in (("gps", GpsFix), ("picture_in_picture", PictureInPicture), ("conditions", Conditions)):
+                row[name] = None if row[name] is None else kind(**row[name])
+            row["gimbal_deg"] = None if row["gimbal_deg"] is None else tuple(row["gimbal_deg"])
+        frames, size = tuple(CaptureFrame(**row) for row in content["frames"]), content["thermal_size"]
         return cls(frames, (size[0], size[1]), content["dead_pixels"], content["dropped"])
 
 
@@ -201,13 +203,6 @@ def _without_stuck_pixels(
         np.save(frame.thermal, temperature_c)
         changed.append(replace(frame, masked=int(np.isnan(temperature_c).sum())))
     return dead, changed
-
-
-def _frame_of(row: dict[str, Any]) -> CaptureFrame:
-    for name, kind in (("gps", GpsFix), ("picture_in_picture", PictureInPicture), ("conditions", Conditions)):
-        row[name] = None if row[name] is None else kind(**row[name])
-    row["gimbal_deg"] = None if row["gimbal_deg"] is None else tuple(row["gimbal_deg"])
-    return CaptureFrame(**row)
 
 
 def measurement_rows(frames: Sequence[CaptureFrame]) -> list[tuple[str, str]]:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from thermoxels_ns.capture.folder_scan import ROLE_WORDS, CameraFile, CameraFolder, natural_key, shown_name, words_of
+from thermoxels_ns.core.checks import remedy_of
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.transforms_json import path_inside
 
@@ -106,7 +107,7 @@ def read_pair_list(file: Path, folder: Path) -> PairSearch:
     try:
         rows = [row for row in csv.reader(file.read_text(encoding="utf-8-sig").splitlines()) if any(row)]
     except (OSError, UnicodeDecodeError, csv.Error) as problem:
-        got, remedy = str(problem), "Write it again."
+        got, remedy = str(problem), remedy_of(problem, "Write it again.")
         raise SceneError(str(file), expected="a CSV file of pairs", got=got, remedy=remedy) from problem
     pairs = []
     for number, row in enumerate(rows, start=1):

@@ -73,8 +73,14 @@ def write_scene_folder(scene: Scene, output: Path, say: Callable[[str], None] = 
         entries.append(_write_frame(scene, number, frame, name, new))
         if (number + 1) % 20 == 0:
             say(f"scene: {number + 1} of {len(scene.frames)} frames")
-    write_points(new / POINTS_NAME, *_good_points(scene.model))
-    write_tracks(new / TRACKS_NAME, _tracks(scene.model, [entry["file_path"] for entry in entries]))
+    model, names = scene.model, tuple(entry["file_path"] for entry in entries)
+    sightings = np.bincount(model.sighting_point, minlength=len(model.points))
+    good = (sightings >= _LEAST_SIGHTINGS) & (model.point_error_px <= _MOST_POINT_ERROR_PX)
+    if np.count_nonzero(good) < 100:
+        good[:] = True
+    write_points(new / POINTS_NAME, model.points[good], model.colours[good])
+    tracks = SparseTracks(model.points, model.point_error_px, names, model.sighting_frame, model.sighting_point)
+    write_tracks(new / TRACKS_NAME, tracks)
     write_json(new / JSON_NAME, _content(scene, entries))
     remove_file(output / JSON_NAME)
     for name in _FOLDERS:
@@ -113,7 +119,7 @@ def _write_frame(scene: Scene, number: int, frame: CaptureFrame, name: str, fold
     else:
         open_photograph(frame.photograph).save(photograph)
     temperature_c = scene.drift.corrected(number, np.load(frame.thermal))
-    Image.fromarray(temperature_c.astype(np.float32)).save(folder / "thermal" / f"{name}.tiff")
+    Image.fromarray(temperature_c).save(folder / "thermal" / f"{name}.tiff")
     pose = scene.model.camera_to_world[number]
     entry: dict[str, Any] = {
         "file_path": f"images/{photograph.name}",
@@ -128,18 +134,6 @@ def _write_frame(scene: Scene, number: int, frame: CaptureFrame, name: str, fold
         Image.fromarray(mask).save(folder / "masks" / f"{name}.png")
         entry["mask_path"] = f"masks/{name}.png"
     return entry
-
-
-def _good_points(model: SfmModel) -> tuple[FloatArray, npt.NDArray[np.uint8]]:
-    sightings = np.bincount(model.sighting_point, minlength=len(model.points))
-    good = (sightings >= _LEAST_SIGHTINGS) & (model.point_error_px <= _MOST_POINT_ERROR_PX)
-    if np.count_nonzero(good) < 100:
-        good = np.ones(len(model.points), dtype=bool)
-    return model.points[good], model.colours[good]
-
-
-def _tracks(model: SfmModel, names: Sequence[str]) -> SparseTracks:
-    return SparseTracks(model.points, model.point_error_px, tuple(names), model.sighting_frame, model.sighting_point)
 
 
 def _content(scene: Scene, entries: list[dict[str, Any]]) -> dict[str, Any]:

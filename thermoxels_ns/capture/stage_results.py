@@ -69,7 +69,10 @@ def save_pairs(folder: Path, search: PairSearch, root: Path) -> None:
     for pair in search.pairs:
         files = (file.resolve().relative_to(real).as_posix() for file in (pair.photograph, pair.thermal))
         rows.append([pair.name, *files, pair.how])
-    unpaired = {_relative_name(path, root): why for path, why in search.unpaired.items()}
+    unpaired = {}
+    for path, why in search.unpaired.items():
+        parts = path.relative_to(root).parts if path.is_relative_to(root) else (path.name,)
+        unpaired["/".join(shown_name(Path(part)) for part in parts)] = why
     write_json(folder / "pairs.json", {"pairs": rows, "unpaired": unpaired})
 
 
@@ -80,19 +83,9 @@ def load_pairs(folder: Path, root: Path) -> tuple[tuple[Pair, ...], dict[str, st
     return tuple(Pair(name, root / first, root / second, how) for name, first, second, how in rows), content["unpaired"]
 
 
-def save_scale(folder: Path, scale: MetricScale | None, missing: str, up: Up) -> None:
-    """Write scale and up as ``scale.json``."""
-    write_json(folder / "scale.json", {"scale": scale, "missing": missing, "up": up})
-
-
-def load_scale(folder: Path) -> tuple[MetricScale | None, str, Up]:
+def load_scale(file: Path) -> tuple[MetricScale | None, str, Up]:
     """Read the scale, why there is none, and up."""
-    content = load_json(folder / "scale.json")
+    content = load_json(file)
     scale, up = content["scale"], content["up"]
     up["direction"] = np.array(up["direction"], dtype=np.float64)
     return None if scale is None else MetricScale(**scale), content["missing"], Up(**up)
-
-
-def _relative_name(path: Path, root: Path) -> str:
-    parts = path.relative_to(root).parts if path.is_relative_to(root) else (path.name,)
-    return "/".join(shown_name(Path(part)) for part in parts)

@@ -141,7 +141,13 @@ class _Capture:
         board = self.board_rig(model, read)
         rig, start = self.rig(model, frames, read, scale, scale_missing, board)
         drift = self.drift(model, frames, rig)
-        scene = Scene(frames, model, rig, drift, scale, up, self.photograph_masks(frames, model))
+        # What the stage of the poses found drawn over the photographs, and the user's masks.
+        size, file = (model.camera.width, model.camera.height), self.output / CACHE_FOLDER / "poses" / _OVERLAY_FILE
+        drawn = np.load(file) if file.is_file() else None
+        if drawn is not None and drawn.shape != size[::-1]:
+            drawn = None
+        masks = PhotographMasks(size, drawn, user_masks(frames, self.settings.masks))
+        scene = Scene(frames, model, rig, drift, scale, up, masks)
         written = [self.output / name for name in SCENE_CONTENT]
         self.cache.run("scene", {}, lambda _: write_scene_folder(scene, self.output, self.say), written)
         given = self.settings.poses
@@ -260,15 +266,6 @@ class _Capture:
         self.dropped |= stage_results.load_json(folder / "dropped.json")
         return stage_results.load(folder / "model.npz", SfmModel)
 
-    def photograph_masks(self, frames: list[CaptureFrame], model: SfmModel) -> PhotographMasks:
-        """What the stage of the poses found drawn over the photographs, and the user's masks."""
-        size = (model.camera.width, model.camera.height)
-        file = self.output / CACHE_FOLDER / "poses" / _OVERLAY_FILE
-        drawn = np.load(file) if file.is_file() else None
-        if drawn is not None and drawn.shape != (size[1], size[0]):
-            drawn = None
-        return PhotographMasks(size, drawn, user_masks(frames, self.settings.masks))
-
     def scale(self, found: SfmModel, read: CaptureFrames) -> tuple[SfmModel, MetricScale | None, str, Up]:
         """Find metres per unit and up; turn a model that was found here upright, keep one that was given."""
         settings = self.settings
@@ -290,11 +287,11 @@ class _Capture:
                 model = found.moved(rotation, origin)
                 up = Up(rotation @ up.direction, up.source, up.spread_deg)
             stage_results.save(folder / "model.npz", model)
-            stage_results.save_scale(folder, scale, missing, up)
+            write_json(folder / "scale.json", {"scale": scale, "missing": missing, "up": up})
             self.say(f"scale: {missing}" if scale is None else f"scale: {scale.metres_per_unit:.5g} m per unit")
 
         folder = self.cache.run("scale", depends, work)
-        return stage_results.load(folder / "model.npz", SfmModel), *stage_results.load_scale(folder)
+        return stage_results.load(folder / "model.npz", SfmModel), *stage_results.load_scale(folder / "scale.json")
 
     def _metric_scale(self, model: SfmModel, frames: list[CaptureFrame]) -> tuple[MetricScale | None, str]:
         """Metres per unit from the surest source that there is; where there is none, why."""

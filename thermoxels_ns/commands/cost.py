@@ -20,7 +20,7 @@ import tyro
 
 from thermoxels_ns import __version__
 from thermoxels_ns.commands.installed_commands import ProcessCost, Watch, run_command
-from thermoxels_ns.core.checks import check_positive, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import check_positive, remedy_of, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.reports.cost_report import (
@@ -326,7 +326,7 @@ def read_runs(path: Path) -> list[CostRun]:
     except (OSError, KeyError, TypeError, ValueError, csv.Error) as problem:
         expected = "the finished runs of an earlier start"
         got = f"{type(problem).__name__}: {problem}"
-        remedy = "Remove the file to measure again, or choose another --output-dir."
+        remedy = remedy_of(problem, "Remove the file to measure again, or choose another --output-dir.")
         raise ThermoxelsError(str(path), expected=expected, got=got, remedy=remedy) from problem
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import re
@@ -108,6 +109,12 @@ def plain_os_errors(
     except OSError as problem:
         name, got = str(problem.filename or what)[:300], problem.strerror or str(problem)
         raise error(name, expected=expected, got=got, remedy=remedy) from problem
+
+
+def remedy_of(problem: Exception, remedy: str) -> str:
+    """Give what helps against an error of reading a file: `remedy`, unless the system refused to read it at all."""
+    refused = isinstance(problem, OSError) and problem.errno not in (None, errno.ENOENT)
+    return "Check its permissions and the disk, or copy it again." if refused else remedy
 
 
 def hold_folder(file: Path, remedy: str, say: Callable[[str], None]) -> FileLock:

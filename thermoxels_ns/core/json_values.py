@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.core.checks import replace_when_done
+from thermoxels_ns.core.checks import remedy_of, replace_when_done
 from thermoxels_ns.core.errors import ThermoxelsError
 
 
@@ -59,7 +59,7 @@ def read_json(
         return json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as problem:
         if isinstance(problem, OSError) and path.exists():
-            expected, remedy = "a file that can be read", "Check its permissions and the disk."
+            expected, remedy = "a file that can be read", remedy_of(problem, remedy)
         raise error(str(path), expected=expected, got=str(problem), remedy=remedy) from problem
 
 

@@ -52,7 +52,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except RecursionError as problem:
         raise wrong(path.name, "a yaml file", "entries nested too deeply to read") from problem
     except (yaml.YAMLError, UnicodeDecodeError) as problem:
-        raise wrong(path.name, "a yaml file", problem) from problem
+        raise wrong(path.name, "a yaml file", " ".join(str(problem).split())) from problem
     except ValueError as problem:  # a date such as 2025-13-01
         raise wrong(path.name, "a yaml file with dates that exist", problem) from problem
     return as_mapping(path.name, content)

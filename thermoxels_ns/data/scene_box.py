@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from thermoxels_ns.core.checks import remedy_of
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.data.colmap_model import COLMAP_FOLDERS, read_model
 from thermoxels_ns.data.scene_file import Frame, SceneFile
@@ -37,7 +38,10 @@ _LEAST_SHOWN, _MOST_WITHOUT = 0.15, 0.1
 _WORTH_LEAVING_OUT = 1.5  # Points per length that a box without the distant points must gain
 _NEARLY_BEST = 0.9
 _FEW_IN_VIEW = 0.05  # Points in view relative to the most that one has, below which a photograph tells nothing
-_MOST_WITHIN = 0.1  # Share of the cameras that may stand within the box for it to be something looked at from outside
+_LEVEL = 0.01  # Height of a level of points, relative to the distance of the cameras from what they look at
+_ABOVE_GROUND = 0.06  # Height above the ground from which on something stands, relative to the same
+_LEAST_GROUND, _LEAST_STANDING = 0.05, 0.06  # Shares of the points on a ground and of those above it
+_MUCH_SMALLER = 1.5  # Box with what lies on the ground, relative to the box without, from which on that is left out
 _CONVERGING = 0.5  # Distance to where cameras look, relative to their spread, below which they look outwards
 # The axes that ns-process-data swapped in old versions, before it wrote applied_transform into the json.
 _LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
@@ -126,8 +130,9 @@ def box_of_points(
     Per axis of the rotated world all but `tail` [%] of them at either end, and 8 % of the longest extent more on every
     side (parts without texture have no points, and a flat scene keeps some depth). Points that are not finite or in no
     photograph's view do not count; nor do those that lie far behind others, or that few photographs have in view, where
-    they cost too much, see `_worth_keeping`. A photograph with hardly any of what is left in view, as of a plain wall,
-    is taken to show something as far away as in the others.
+    they cost too much, see `_worth_keeping`; nor a ground that runs on, see `_standing`, if the box is much
+    smaller without it: the slab on which a house stands stays. A photograph with hardly any
+    of what is left in view, as of a plain wall, is taken to show something as far away as in the others.
     """
     points = points[np.isfinite(points).all(axis=1)]
     points, frames = points[:: max(len(points) // _MOST_POINTS, 1)], _spread(frames, _MOST_PHOTOGRAPHS)
@@ -141,6 +146,9 @@ def box_of_points(
         expected = f"at least {_FEWEST_POINTS} points in front of the cameras to find the scene box"
         raise SceneError("sparse points", expected=expected, got=len(points), remedy=_REMEDY)
     low, high = np.percentile(points, (tail, 100.0 - tail), axis=0)
+    standing = _standing(points, frames, rotation)
+    if standing is not None and (high - low).max() >= _MUCH_SMALLER * (standing[1] - standing[0]).max():
+        low, high = standing
     margin = _MARGIN * (high - low).max()
     shown = np.isfinite(depth).sum(axis=1)
     few = shown < _FEW_IN_VIEW * shown.max()
@@ -150,7 +158,7 @@ def box_of_points(
         low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
     # Rounded outwards: another processor, on which a few depths differ, shall find the same.
     step = _ROUNDED * 2.0 ** np.floor(np.log2(max((high - low).max(), 1e-300)))
-    low, high = _cut_to_view(np.stack([low - margin, high + margin]), frames, rotation)
+    low, high = low - margin, high + margin
     low, high = np.floor(low / step) * step, np.ceil(high / step) * step
     return _checked(np.stack([low, high]), "box of the points")
 
@@ -249,33 +257,48 @@ def _cube(centre: FloatArray, half: float) -> Box:
     return np.stack([centre - half, centre + half])
 
 
-def _cut_to_view(box: Box, frames: Sequence[Frame], rotation: FloatArray) -> Box:
-    """Leave out what an average photograph does not show, where cameras outside the box look at one place in it.
+def _standing(points: FloatArray, frames: Sequence[Frame], rotation: FloatArray) -> FloatArray | None:
+    """What stands on a ground that runs on, where cameras outside look at one place; None without such a ground.
 
-    A ground or a street that runs on from the body is as close and as dense as the body itself.
+    Ground is as close and as dense as the body itself. It is the lowest level with many points; what is farther from
+    the place looked at than cameras are stands behind. Of the rest, what is far from the middle goes where it costs too
+    much, see `_worth_keeping`. Points are those of the rotated world. Returns the lowest and the highest corner.
     """
     looked_at = _looked_at(frames, rotation)
+    if looked_at is None or looked_at[1] <= 0.0:
+        return None
     origins = np.stack([rotation @ frame.pose[:3, 3] for frame in frames])
-    within = ((origins > box[0]) & (origins < box[1])).all(axis=1).mean()
-    if looked_at is None or looked_at[1] <= 0.0 or within > _MOST_WITHIN:
-        return box
-    cube = _cube(*looked_at)
-    cut = np.stack([np.maximum(box[0], cube[0]), np.minimum(box[1], cube[1])])
-    return cut if bool((cut[1] > cut[0]).all()) else box
+    reach = float(np.median(np.linalg.norm(origins - looked_at[0], axis=1)))
+    near = points[np.linalg.norm(points - looked_at[0], axis=1) < reach]
+    if len(near) < _FEWEST_POINTS:
+        return None
+    lowest = near[:, 2].min()
+    levels = np.bincount(((near[:, 2] - lowest) / (_LEVEL * reach)).astype(np.int64))
+    grounds = np.flatnonzero(levels + np.append(levels[1:], 0) >= _LEAST_GROUND * len(near))
+    if len(grounds) == 0:
+        return None
+    ground = lowest + grounds[0] * _LEVEL * reach
+    above = near[near[:, 2] > ground + _ABOVE_GROUND * reach]
+    if len(above) < max(_LEAST_STANDING * len(near), _FEWEST_POINTS):
+        return None
+    away = np.abs(above - np.median(above, axis=0))[:, :2].max(axis=1).astype(np.float32)
+    above = above[_worth_keeping(above, away[None], away, _TAIL_OF_POINTS)]
+    low, high = np.percentile(above, (_TAIL_OF_POINTS, 100.0 - _TAIL_OF_POINTS), axis=0)
+    return np.stack([[*low[:2], ground], high])
 
 
 def _checked(corners: Any, name: str) -> Box:
     expected = "two corners [[xmin, ymin, zmin], [xmax, ymax, zmax]] with min below max on every axis"
     try:
         box = np.array(corners, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         box = np.zeros(0)
     good = box.shape == (2, 3) and np.isfinite(box).all()
     if good:
         sides = box[1] - box[0]
         good = bool((sides > 1e-6 * np.abs(sides).max()).all())
     if not good:
-        raise SceneError(name, expected=expected, got=np.asarray(corners).tolist(), remedy=_REMEDY)
+        raise SceneError(name, expected=expected, got=corners, remedy=_REMEDY)
     return box
 
 
@@ -296,7 +319,9 @@ def _read_ply(path: Path) -> npt.NDArray[np.float64]:
         loaded: Any = trimesh.load(path)
         points = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
     except Exception as problem:  # trimesh raises whatever its parsers meet
-        raise SceneError(str(path), expected="a readable .ply", got=problem, remedy=_REMEDY) from problem
+        raise SceneError(
+            str(path), expected="a readable .ply", got=problem, remedy=remedy_of(problem, _REMEDY)
+        ) from problem
     return points
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thermoxels_ns.core.checks import replace_when_done
+from thermoxels_ns.core.checks import remedy_of, replace_when_done
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.feature_rays import FeatureRays, FloatArray, IntArray, agrees_with_neighbours
 from thermoxels_ns.data.scene_file import Frame
@@ -58,7 +58,7 @@ def read_tracks(path: Path) -> SparseTracks:
             points, error, frames, frame, point = (file[name] for name in names)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, AttributeError, TypeError) as problem:
         expected = f"an .npz with {', '.join(names)}"
-        raise SceneError(path.name, expected=expected, got=problem, remedy=_REMEDY) from problem
+        raise SceneError(path.name, expected=expected, got=problem, remedy=remedy_of(problem, _REMEDY)) from problem
     good = (
         points.ndim == 2
         and points.shape[1] == 3

@@ -38,7 +38,7 @@ def read_pose(values: Any, where: str, turned: bool = True) -> npt.NDArray[np.fl
     """
     try:
         matrix = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape not in ((3, 4), (4, 4)):
         raise SceneError(where, expected="4 x 4 numbers", got=f"shape {matrix.shape}", remedy="Correct the json.")
@@ -103,14 +103,15 @@ def _refuse_odd(camera: Camera, where: str) -> None:
     """Refuse a principal point or a distortion that no lens has."""
     if camera.lens == "equirectangular":
         return
-    corner = 0.5 * float(np.hypot(camera.width / camera.fl_x, camera.height / camera.fl_y))
+    corner = min(0.5 * float(np.hypot(camera.width / camera.fl_x, camera.height / camera.fl_y)), 1e30)
     shifts = {"cx": camera.cx / camera.width, "cy": camera.cy / camera.height}
     odd = [name for name, shift in shifts.items() if not -1.0 <= shift <= 2.0]
     odd += [f"k{n}" for n in (1, 2, 3, 4) if abs(camera.distortion[n - 1]) * corner ** (2 * n) > _MOST_DISTORTION]
+    odd += [name for name in ("p1", "p2") if abs(getattr(camera, name)) * corner > _MOST_DISTORTION]
     if odd:
         expected = "a principal point in or near the image, and distortion that leaves the corners where they can be"
         got = ", ".join(f"{name} {getattr(camera, name):g}" for name in odd)
-        remedy = "Correct the json; lengths are in pixels, k1 to k4 as in OpenCV."
+        remedy = "Correct the json; lengths are in pixels, k1 to k4, p1 and p2 as in OpenCV."
         raise SceneError(where, expected=expected, got=got, remedy=remedy)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_finite, check_shape
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
@@ -104,11 +104,15 @@ def build_mesh(
     solid, num_parts, num_voxels = _without_unobserved(solid, snapshot.observed_weight >= least)
 
     if options.boundary == "voxel":
-        shape = _voxel_shape(solid.cells)
+        (corners, tets), facets = kuhn_tets(solid.cells), voxel_facets(solid.cells)
+        tags = boundary_tags(facets, corners, tuple(n + 1 for n in solid.cells.shape))
+        shape = _Shape(corners.astype(np.float64), tets, facets, tags)
         temperature_c, weight = _measured(snapshot, shape.points, least)
         edges, conductance = lattice_edges(solid.cells)
     else:
-        shape = _stuffed_shape(solid.level, options.coarsest_cell)
+        stuffed = sharpen(stuff(solid.level, options.coarsest_cell), solid.level.shape)
+        tags = np.where(stuffed.on_box, FACET_BOX, FACET_SURFACE).astype(np.int64)
+        shape = _Shape(stuffed.points, stuffed.tets, stuffed.facets, tags)
         temperature_c, weight = _measured(snapshot, shape.points, least)
         stays, dropped = _with_a_measurement(shape, weight >= least)
         if dropped:
@@ -123,7 +127,10 @@ def build_mesh(
     if np.linalg.det(transform[:3, :3]) < 0.0:
         tets, facets = tets[:, [0, 2, 1, 3]], facets[:, ::-1]
     points_m = apply_transform(transform, snapshot.lattice.index_to_world(shape.points))
-    colour = _colour(snapshot, shape.points)
+    colour = None
+    if snapshot.colour is not None:  # from corners with density, grey where there is none around
+        found, known = interpolate_corners(shape.points, snapshot.colour, snapshot.density > 0.0)
+        colour = np.where(known[:, None] > 0.0, found, 0.5).astype(np.float32)
     of_tets = points_m[tets].mean(axis=1), None if colour is None else colour[tets].mean(axis=1)
     region, region_names, idle_regions = apply_regions(options.rules, *of_tets)
     mesh = TetMesh(
@@ -146,30 +153,10 @@ def build_mesh(
     )
 
 
-def _voxel_shape(cells: BoolArray) -> _Shape:
-    (corners, tets), facets = kuhn_tets(cells), voxel_facets(cells)
-    tags = boundary_tags(facets, corners, tuple(n + 1 for n in cells.shape))
-    return _Shape(corners.astype(np.float64), tets, facets, tags)
-
-
-def _stuffed_shape(level: npt.NDArray[np.floating], coarsest_cell: int) -> _Shape:
-    stuffed = sharpen(stuff(level, coarsest_cell), level.shape)
-    tags = np.where(stuffed.on_box, FACET_BOX, FACET_SURFACE).astype(np.int64)
-    return _Shape(stuffed.points, stuffed.tets, stuffed.facets, tags)
-
-
 def _measured(snapshot: GridSnapshot, points: FloatArray, least: float) -> tuple[FloatArray, FloatArray]:
     """Temperature at fractional corner indices from measured corners alone, and their ray weight there, shape (n,)."""
     weight = np.where(snapshot.observed_weight >= least, snapshot.observed_weight, 0.0)
     return interpolate_corners(points, snapshot.temperature_c, weight)
-
-
-def _colour(snapshot: GridSnapshot, points: FloatArray) -> Float32Array | None:
-    """Colour at points from corners with density, grey where there is none around, shape (n, 3)."""
-    if snapshot.colour is None:
-        return None
-    colour, weight = interpolate_corners(points, snapshot.colour, snapshot.density > 0.0)
-    return np.where(weight[:, None] > 0.0, colour, 0.5).astype(np.float32)
 
 
 def _with_a_measurement(shape: _Shape, observed: BoolArray) -> tuple[BoolArray, int]:

@@ -2,34 +2,21 @@
 
 from __future__ import annotations
 
-from itertools import permutations
-
 import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import BoolArray, IntArray
-from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import CORNER_OFFSETS
 from thermoxels_ns.mesh.solid.morphology import bounding_box
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
 
+KUHN_PATTERN: IntArray = np.array(
+    [[0, 4, 6, 7], [0, 5, 4, 7], [0, 6, 2, 7], [0, 2, 3, 7], [0, 1, 5, 7], [0, 3, 1, 7]], dtype=np.int64
+)
+"""Voxel corners of the six tetrahedra around the main diagonal, shape (6, 4), positively oriented.
 
-def _kuhn_pattern() -> IntArray:
-    """Voxel corners of the six tetrahedra around the main diagonal, shape (6, 4), positively oriented.
-
-    Each permutation (a, b, c) of the axes is a path 000 -> e_a -> e_a + e_b -> 111 along voxel edges (Kuhn 1960,
-    Freudenthal 1942); its determinant is the permutation's sign.
-    """
-    bit = (4, 2, 1)
-    pattern = []
-    for a, b, _ in permutations(range(3)):
-        even = (b - a) % 3 == 1
-        first, second = bit[a], bit[a] + bit[b]
-        pattern.append([0, first, second, 7] if even else [0, second, first, 7])
-    return np.array(pattern, dtype=np.int64)
-
-
-KUHN_PATTERN = _kuhn_pattern()
+Each permutation of the axes a, b, c is a path 000 -> e_a -> e_a + e_b -> 111 along voxel edges (Kuhn 1960, Freudenthal
+1942); where its determinant, the permutation's sign, is negative, the two in the middle are exchanged."""
 
 
 def kuhn_tets(cells: BoolArray) -> tuple[IntArray, IntArray]:
@@ -46,7 +33,7 @@ def kuhn_tets(cells: BoolArray) -> tuple[IntArray, IntArray]:
     >>> corners.shape, tets.shape
     ((8, 3), (6, 4))
     """
-    cells, first = _cropped(_as_cells(cells))
+    cells, first = _cropped(cells)
     number = _node_numbers(cells)
     strides = np.array([number.shape[1] * number.shape[2], number.shape[2], 1], dtype=np.int64)
     corners = (np.argwhere(cells) @ strides)[:, None] + CORNER_OFFSETS @ strides
@@ -59,7 +46,7 @@ def lattice_edges(cells: BoolArray) -> tuple[IntArray, IntArray]:
 
     Two used corners across an empty gap are no edge, even if they are lattice neighbours.
     """
-    cells, _ = _cropped(_as_cells(cells))
+    cells, _ = _cropped(cells)
     number = _node_numbers(cells)
     flat_number = number.ravel()
     strides = (number.shape[1] * number.shape[2], number.shape[2], 1)
@@ -84,7 +71,7 @@ def voxel_facets(cells: BoolArray) -> IntArray:
     >>> voxel_facets(np.ones((1, 1, 1), dtype=bool)).shape
     (12, 3)
     """
-    cells, _ = _cropped(_as_cells(cells))
+    cells, _ = _cropped(cells)
     number = _node_numbers(cells)
     facets = []
     for axis in range(3):
@@ -109,16 +96,6 @@ def boundary_tags(facets: IntArray, points_index: npt.NDArray, lattice_shape: tu
         sides |= (points_index[:, axis] == count - 1).astype(np.uint8) << (2 * axis + 1)
     common = sides[facets[:, 0]] & sides[facets[:, 1]] & sides[facets[:, 2]]
     return np.where(common > 0, FACET_BOX, FACET_SURFACE).astype(np.int64)
-
-
-def _as_cells(cells: npt.NDArray) -> BoolArray:
-    cells = np.asarray(cells)
-    if cells.ndim != 3 or cells.dtype != np.bool_ or not cells.any():
-        expected = "a three-dimensional boolean array with at least one True"
-        got = f"{cells.dtype} array of shape {cells.shape} with {np.count_nonzero(cells)} solid voxels"
-        remedy = "Lower the density threshold or percentile so that some voxels are solid."
-        raise MeshError("solid voxels", expected=expected, got=got, remedy=remedy)
-    return cells
 
 
 def _cropped(cells: BoolArray) -> tuple[BoolArray, IntArray]:

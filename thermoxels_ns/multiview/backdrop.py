@@ -14,6 +14,7 @@ PLAIN = 0.03  # Difference of a channel from one pixel to the next, of 1, up to 
 STEEPEST = 0.9  # Cosine between the optical axis and the vertical above which a photograph has no top
 COLOUR_TOLERANCE = 0.06  # Difference from the backdrop's colour up to which a pixel shows it, of 1
 THERMAL_TOLERANCE = 0.1  # Difference from its temperature, of the scene's range
+VOTES = 2  # Photographs that show a surface, for each that shows a backdrop, from which on it is one
 _WIDEST, _ROUNDS = 0.3, 8
 """Difference up to which colours count in the first of some fits; it shrinks to the tolerance."""
 
@@ -36,7 +37,7 @@ def plain_backdrop(photographs: Photographs, depth: npt.NDArray[np.float32]) -> 
         columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         along = np.column_stack((columns.ravel(), rows.ravel(), np.ones(width * height))) @ inverse.T
         directions[pixels] = along / np.linalg.norm(along, axis=1, keepdims=True)
-        even = _even(photographs.colours[pixels].reshape(*shape, 3)) & np.isnan(depth[pixels]).reshape(shape)
+        even = even_pixels(photographs.colours[pixels].reshape(*shape, 3)) & np.isnan(depth[pixels]).reshape(shape)
         plain[pixels] = even.ravel()
         turns = _turns(inverse)
         if turns is not None:
@@ -55,6 +56,35 @@ def plain_backdrop(photographs: Photographs, depth: npt.NDArray[np.float32]) -> 
     return alike
 
 
+def backdrop_without_walls(
+    photographs: Photographs,
+    backdrop: npt.NDArray[np.bool_],
+    depth: npt.NDArray[np.float32],
+    tolerance: float,
+) -> npt.NDArray[np.bool_]:
+    """The backdrop without what other photographs contradict, shape (pixels,).
+
+    A plain wall of the sky's colour may be taken for a backdrop in a photograph that does not show where it ends.
+    Where a model has a surface in spite of that, at a `depth`, (pixels,), [world units], each photograph that would
+    show the point there, give or take the `tolerance`, has a vote; `VOTES` to one that it is none make it a wall.
+    """
+    (chosen,) = np.nonzero(backdrop & np.isfinite(depth))
+    origins, along = photographs.of_pixels(chosen)
+    points = origins + depth[chosen, None] * along
+    surface, empty = (np.zeros(len(chosen), dtype=np.int64) for _ in range(2))
+    for matrix, (width, height), first in zip(photographs.matrices, photographs.sizes, photographs.firsts):
+        x, y, z = matrix[:, :3] @ points.T + matrix[:, 3:]
+        scale = 1.0 / np.where(z > 0.0, z, np.inf)
+        shown = (z > 0.0) & (x >= 0.0) & (y >= 0.0) & (x * scale < width) & (y * scale < height)
+        pixel = first + ((y * scale).astype(np.int64) * width + (x * scale).astype(np.int64))[shown]
+        free = ~(depth[pixel] < z[shown] - tolerance)
+        surface[shown] += free & ~backdrop[pixel]
+        empty[shown] += free & backdrop[pixel]
+    kept = backdrop.copy()
+    kept[chosen[surface >= VOTES * empty]] = False
+    return kept
+
+
 def _turns(inverse: FloatArray) -> int | None:
     """Quarter turns (of `np.rot90`) that bring the side of a photograph at which the sky is to its top."""
     right, down, forward = (inverse[:, axis] / np.linalg.norm(inverse[:, axis]) for axis in range(3))
@@ -65,11 +95,11 @@ def _turns(inverse: FloatArray) -> int | None:
     return 1 if right[2] > 0 else 3
 
 
-def _even(picture: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
-    """Which pixels differ little from the four around them, (h, w); those at a mask do not."""
+def even_pixels(picture: npt.NDArray[np.float32], most: float = PLAIN) -> npt.NDArray[np.bool_]:
+    """Which pixels of a picture (h, w, 3) differ by at most so much from the four around; those at a mask do not."""
     even = np.ones(picture.shape[:2], dtype=bool)
     for axis in (0, 1):
-        small = np.abs(np.diff(picture, axis=axis)).max(-1) <= PLAIN
+        small = np.abs(np.diff(picture, axis=axis)).max(-1) <= most
         one, other = [slice(None)] * 2, [slice(None)] * 2
         one[axis], other[axis] = slice(1, None), slice(None, -1)
         even[tuple(one)] &= small

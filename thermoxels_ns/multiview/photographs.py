@@ -34,6 +34,13 @@ class Photographs:
     def __len__(self) -> int:
         return len(self.matrices)
 
+    def of_pixels(self, chosen: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Camera centres of the pixels `chosen` (n,), and their directions of depth 1, both (n, 3), in the world."""
+        number = np.searchsorted(self.firsts, chosen, side="right") - 1
+        place, width = chosen - self.firsts[number], self.sizes[number, 0]
+        pixel = np.column_stack((place % width + 0.5, place // width + 0.5, np.ones(len(chosen))))
+        return self.centres[number], np.einsum("nij,nj->ni", np.linalg.inv(self.matrices[:, :, :3])[number], pixel)
+
 
 def read_photographs(
     dataset: Any, near: float = 0.0, most: int = MOST_PHOTOGRAPHS, longest_side: int = LONGEST_SIDE

@@ -314,22 +314,16 @@ def feature_rays_to_depths(depths: Depths) -> FeatureRays:
     """
     (sure,) = np.nonzero(np.isfinite(depths.depth))
     depth, error = (values[sure].astype(np.float64) for values in (depths.depth, depths.error))
-    return _rays_through(depths.photographs, sure, depth, ERROR_PLANES * error)
+    return rays_through(depths.photographs, sure, depth, ERROR_PLANES * error)
 
 
-def _rays_through(
-    photographs: Photographs, chosen: npt.NDArray[np.int64], depth: FloatArray, error: FloatArray
+def rays_through(
+    photographs: Photographs, chosen: npt.NDArray[np.int64], depth: FloatArray, error: FloatArray | float = 0.0
 ) -> FeatureRays:
     """Feature rays through the pixels `chosen` (n,) to depths (n,) with standard errors (n,), [world units]."""
-    number = np.searchsorted(photographs.firsts, chosen, side="right") - 1
-    place, width = chosen - photographs.firsts[number], photographs.sizes[number, 0]
-    pixel = np.column_stack((place % width + 0.5, place // width + 0.5, np.ones(len(chosen))))
-    inverses = np.linalg.inv(photographs.matrices[:, :, :3])
-    along = np.einsum("nij,nj->ni", inverses[number], pixel)  # of depth 1
-    origins = photographs.centres[number]
-    return FeatureRays(
-        origins, np.arange(len(chosen)), origins + depth[:, None] * along, error * np.linalg.norm(along, axis=1)
-    )
+    origins, along = photographs.of_pixels(chosen)
+    points, errors = origins + depth[:, None] * along, np.asarray(error) * np.linalg.norm(along, axis=1)
+    return FeatureRays(origins, np.arange(len(chosen)), points, errors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,8 +334,6 @@ class PhotographEvidence:
     backdrop: npt.NDArray[np.bool_]  # Which of their pixels show a plain backdrop, shape (pixels,)
     feature_rays: FeatureRays | None
     """Rays to each depth that several photographs agree about; None where these are too few to tell anything."""
-    backdrop_rays: FeatureRays | None
-    """Rays through the backdrop, to points far outside the box; None where hardly any pixel shows one."""
 
 
 def evidence_of_photographs(
@@ -362,11 +354,13 @@ def evidence_of_photographs(
         f"depths: {len(photographs)} photographs agree about {depths.share:.1%} of their pixels{few}; "
         f"a plain backdrop fills {backdrop.mean():.1%}; {time.perf_counter() - began:.1f} s"
     )
+    return PhotographEvidence(photographs, backdrop, None if few else feature_rays_to_depths(depths))
+
+
+def rays_through_backdrop(
+    photographs: Photographs, backdrop: npt.NDArray[np.bool_], beyond: float
+) -> FeatureRays | None:
+    """Rays through the pixels of a backdrop, to points so far away [world units]; None where hardly any shows one."""
     (chosen,) = np.nonzero(backdrop)
-    far = np.full(len(chosen), 1e3 * np.linalg.norm(np.subtract(hi, lo)))
-    return PhotographEvidence(
-        photographs,
-        backdrop,
-        None if few else feature_rays_to_depths(depths),
-        _rays_through(photographs, chosen, far, np.zeros(len(chosen))) if backdrop.mean() >= LEAST_SHARE else None,
-    )
+    enough = len(chosen) >= LEAST_SHARE * len(backdrop)
+    return rays_through(photographs, chosen, np.full(len(chosen), beyond)) if enough else None

@@ -68,19 +68,10 @@ def recognised_camera(make: str | None, model: str | None) -> CameraName | None:
     return None
 
 
-@dataclass(frozen=True)
-class CountImage:
-    """A TIFF or PNG after reading."""
-
-    image: ThermalImage
-    exif: ExifFacts
-    celsius_per_count: float | None  # None: the file holds degrees
-
-
 def read_count_image(
     path: Path, suffix: str, camera: CameraName | None, unit: ThermalUnit | None, valid_range_c: tuple[float, float]
-) -> CountImage:
-    """Read a single-channel TIFF or PNG (`suffix` is what it is by content).
+) -> tuple[ThermalImage, ExifFacts, float | None]:
+    """Read a single-channel TIFF or PNG (`suffix` is what it is by content), and its degrees per count, if any.
 
     The unit that the user gave comes before any preset, and the user's preset before what the file says.
 
@@ -109,7 +100,7 @@ def read_count_image(
             raise ThermalFileError(str(path), expected="counts with a known unit", got=got, remedy=remedy)
         unit = COUNT_SCALES[camera].unit
     step = unit.scale if unit.kind == "linear" else None
-    return CountImage(read_thermal_file(path, unit, valid_range_c, suffix), exif, step)
+    return read_thermal_file(path, unit, valid_range_c, suffix), exif, step
 
 
 def _depth(image: Image.Image) -> str:

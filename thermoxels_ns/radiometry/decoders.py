@@ -17,14 +17,6 @@ LARGEST_FILE_BYTES = 2**29  # a table of 4096 x 4096 numbers of 30 characters; c
 
 
 @contextmanager
-def quiet_decoders() -> Iterator[None]:
-    """Drop Pillow's warnings in the block: they name no file; what is wrong with one is an error that does."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", module=r"PIL\.")
-        yield
-
-
-@contextmanager
 def errors_name(
     path: Path | str,
     expected: str,
@@ -36,7 +28,8 @@ def errors_name(
     `expected` is what the file should be, `remedy` what to do if it is damaged.
     """
     try:
-        with quiet_decoders():
+        with warnings.catch_warnings():  # Pillow's name no file; what is wrong with one is an error that does
+            warnings.filterwarnings("ignore", module=r"PIL\.")
             yield
     except ThermoxelsError:
         raise

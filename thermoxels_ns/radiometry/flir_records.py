@@ -161,6 +161,7 @@ def read_camera_info(content: bytes) -> CameraInfo:
     (o,), (r2,) = record.numbers(0x308, "i"), record.numbers(0x30C, "f")
     low, high = record.numbers(0x310, "HH")
     (field_of_view,) = record.numbers(0x1B4, "f")
+    model = record.text(0xD4, 32)
     try:
         return CameraInfo(
             planck=PlanckConstants(r1=r1, r2=r2, b=b, f=f, o=float(o)),
@@ -176,7 +177,7 @@ def read_camera_info(content: bytes) -> CameraInfo:
             ),
             raw_range=(int(low), int(high)) if low < high else (0, 0xFFFF),
             field_of_view_deg=field_of_view if field_of_view > 0 else None,
-            model=_with_maker(record.text(0xD4, 32)),
+            model=model if model is None or model.lower().startswith("flir") else f"FLIR {model}",
             serial=record.text(0x104, 16),
             lens=record.text(0x170, 32),
             taken_at=_taken_at(record),
@@ -188,10 +189,6 @@ def read_camera_info(content: bytes) -> CameraInfo:
 def _celsius(kelvin: float) -> float | None:
     """A temperature, or None where the camera has not set it and writes 0 K."""
     return float(kelvin_to_celsius(kelvin)) if kelvin != 0.0 else None
-
-
-def _with_maker(model: str | None) -> str | None:
-    return model if model is None or model.lower().startswith("flir") else f"FLIR {model}"
 
 
 def _taken_at(record: Record) -> datetime | None:

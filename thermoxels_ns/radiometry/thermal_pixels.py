@@ -197,7 +197,15 @@ def _read_raw(path: Path, suffix: str) -> _RawPixels:
 
 def _read_csv(path: Path) -> npt.NDArray[np.float64]:
     """Read rows of numbers split by commas or semicolons; empty cells and nan, NA, null, - are NaN."""
-    _check_table_size(path)
+    width = height = 0
+    with path.open(encoding="latin-1") as stream:  # counts alone, whatever the file's own encoding
+        while line := stream.readline(_LONGEST_LINE):
+            width, height = max(width, 1 + max(line.count(","), line.count(";"))), height + 1
+            if len(line) == _LONGEST_LINE:
+                expected = f"a table with lines below {_LONGEST_LINE} characters"
+                remedy = "The file is damaged or no table; write one row of the image per line."
+                raise ThermalFileError(str(path), expected=expected, got=f"a longer one, line {height}", remedy=remedy)
+            check_thermal_size(path, width, height)
     text = path.read_text(encoding="utf-8-sig")
     semicolons = ";" in text
     rows = []
@@ -211,19 +219,6 @@ def _read_csv(path: Path) -> npt.NDArray[np.float64]:
     if not rows or len({len(row) for row in rows}) != 1:
         raise _damaged(path, f"rows of lengths {sorted({len(row) for row in rows})}")
     return np.array(rows, dtype=np.float64)
-
-
-def _check_table_size(path: Path) -> None:
-    """Refuse a table larger than a thermal image, line by line."""
-    width = height = 0
-    with path.open(encoding="latin-1") as stream:  # counts alone, whatever the file's own encoding
-        while line := stream.readline(_LONGEST_LINE):
-            width, height = max(width, 1 + max(line.count(","), line.count(";"))), height + 1
-            if len(line) == _LONGEST_LINE:
-                expected = f"a table with lines below {_LONGEST_LINE} characters"
-                remedy = "The file is damaged or no table; write one row of the image per line."
-                raise ThermalFileError(str(path), expected=expected, got=f"a longer one, line {height}", remedy=remedy)
-            check_thermal_size(path, width, height)
 
 
 def _number(cell: str) -> float:
@@ -253,7 +248,16 @@ def _read_image(path: Path) -> _RawPixels:
     if mode == "L" or mode.startswith("I"):
         return _RawPixels(pixels if pixels.dtype == bits else pixels.astype(bits))
     if mode in ("RGB", "RGBA", "LA"):
-        return _one_channel(path, pixels, has_alpha=pixels.ndim == 3 and pixels.shape[-1] in (2, 4))
+        if pixels.ndim == 2:
+            return _RawPixels(pixels)
+        has_alpha = pixels.shape[-1] in (2, 4)
+        colours = pixels[..., :-1] if has_alpha else pixels
+        if not (colours == colours[..., :1]).all():
+            remedy = "Export the radiometric data (16-bit PNG or TIFF, .npy, .csv) or a grey palette."
+            got = "a false-colour picture: its palette cannot be turned back into temperatures"
+            raise ThermalFileError(str(path), expected="a grey image (all channels equal)", got=got, remedy=remedy)
+        no_data = pixels[..., -1] == 0 if has_alpha else None
+        return _RawPixels(np.ascontiguousarray(colours[..., 0]), no_data)
     got, remedy = f"image mode {mode}", "Export the thermal image as 16-bit grey PNG or TIFF."
     raise ThermalFileError(str(path), expected="a grey or floating-point image", got=got, remedy=remedy)
 
@@ -273,18 +277,6 @@ def _integer_type(path: Path, image: Image.Image) -> npt.DTypeLike:
         length = 1 if width <= 8 else 2 if width <= 16 else 4
         return np.dtype(f"{'i' if signed else 'u'}{length}")
     return np.uint8
-
-
-def _one_channel(path: Path, pixels: npt.NDArray[Any], has_alpha: bool) -> _RawPixels:
-    if pixels.ndim == 2:
-        return _RawPixels(pixels)
-    colours = pixels[..., :-1] if has_alpha else pixels
-    if not (colours == colours[..., :1]).all():
-        remedy = "Export the radiometric data (16-bit PNG or TIFF, .npy, .csv) or a grey palette."
-        got = "a false-colour picture: its palette cannot be turned back into temperatures"
-        raise ThermalFileError(str(path), expected="a grey image (all channels equal)", got=got, remedy=remedy)
-    no_data = pixels[..., -1] == 0 if has_alpha else None
-    return _RawPixels(np.ascontiguousarray(colours[..., 0]), no_data)
 
 
 def _damaged(path: Path, problem: object) -> ThermalFileError:

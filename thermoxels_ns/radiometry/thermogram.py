@@ -210,9 +210,8 @@ def _read_stored(path: Path, found: ThermogramFormat, options: RadiometryOptions
     before, after = options.stored, options.applied_to(options.stored)
     metadata = ThermogramMetadata(format=found, camera_conditions=before, conditions=after)
     if found in ("TIFF", "PNG"):
-        read = read_count_image(path, f".{found.lower()}", options.camera, options.given_unit, options.valid_range_c)
-        image = read.image
-        exif, step = read.exif, read.celsius_per_count
+        given = options.camera, options.given_unit, options.valid_range_c
+        image, exif, step = read_count_image(path, f".{found.lower()}", *given)
         metadata = replace(
             metadata, camera=exif.camera, serial=exif.serial, taken_at=exif.taken_at, celsius_per_count=step
         )

@@ -133,12 +133,10 @@ def composite(
     thermal_at: RowsFn | None = None,
     rgb_rays: Bool[Tensor, " rays"] | None = None,
     thermal_rays: Bool[Tensor, " rays"] | None = None,
-    background_rgb: Tensor | None = None,
-    background_thermal: Tensor | None = None,
     thermal_moves_density: bool = False,
     smallest_weight: float = 0.0,
 ) -> Composite:
-    """Sum colour and temperature along rays (paper, eq. 1 and 2): C = sum_i w_i c_i + (1 - sum_i w_i) c_background.
+    """Sum colour and temperature along rays (paper, eq. 1 and 2), without the background: C = sum_i w_i c_i.
 
     Appearance is asked for only at steps whose weight exceeds `smallest_weight` on rays that want it.
 
@@ -149,15 +147,13 @@ def composite(
         thermal_at: Maps flat indices of samples to normalised temperatures (n, 1); None: no temperature.
         rgb_rays: Rays that want colour; None: all. The others get 0.
         thermal_rays: Rays that want temperature; None: all. The others get 0.
-        background_rgb: Colour at infinity, (rays, 3) or (3,); None: black.
-        background_thermal: Normalised temperature at infinity, (rays, 1) or (1,); None: 0, the scene's minimum.
         thermal_moves_density: Let the thermal sum carry gradients into the weights (off: temperature never
             moves geometry).
         smallest_weight: Steps of at most this weight add no colour and no temperature; the error of a pixel is
             at most `smallest_weight` times its number of steps. 0 is exact.
 
     Returns:
-        The composite; a ray that misses is exactly its background, with depth infinite.
+        The composite; a ray that misses is 0, with depth infinite.
     """
     accumulation = along.accumulation
     expected = (along.weights * steps.t).sum(-1)
@@ -165,20 +161,13 @@ def composite(
         accumulation > 0, expected / accumulation.clamp(min=1e-30), torch.full_like(expected, torch.inf)
     )
     thermal_weights = along.weights if thermal_moves_density else along.weights.detach()
-    thermal_left = along.transmittance if thermal_moves_density else along.transmittance.detach()
-    rgb = _sum_rows(along.weights, along.transmittance, rgb_at, rgb_rays, background_rgb, 3, smallest_weight)
-    thermal = _sum_rows(thermal_weights, thermal_left, thermal_at, thermal_rays, background_thermal, 1, smallest_weight)
+    rgb = _sum_rows(along.weights, rgb_at, rgb_rays, 3, smallest_weight)
+    thermal = _sum_rows(thermal_weights, thermal_at, thermal_rays, 1, smallest_weight)
     return Composite(rgb=rgb, thermal=thermal, accumulation=accumulation, depth=depth)
 
 
 def _sum_rows(
-    weights: Tensor,
-    left: Tensor,
-    rows_at: RowsFn | None,
-    rays: Tensor | None,
-    background: Tensor | None,
-    channels: int,
-    smallest_weight: float,
+    weights: Tensor, rows_at: RowsFn | None, rays: Tensor | None, channels: int, smallest_weight: float
 ) -> Tensor | None:
     if rows_at is None:
         return None
@@ -188,11 +177,7 @@ def _sum_rows(
         wanted &= rays[:, None]
     flat = wanted.flatten().nonzero()[:, 0]
     rows = rows_at(flat) * weights.flatten()[flat][:, None]
-    total = rows.new_zeros((num_rays, channels)).index_add(0, flat // num_steps, rows)
-    if background is not None:
-        behind = left[:, None] * background
-        total = total + (behind if rays is None else behind * rays[:, None])
-    return total
+    return rows.new_zeros((num_rays, channels)).index_add(0, flat // num_steps, rows)
 
 
 def ray_sparsity(density: Float[Tensor, "rays steps"], deltas: Float[Tensor, "rays steps"]) -> Float[Tensor, " rays"]:

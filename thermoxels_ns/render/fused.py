@@ -105,7 +105,12 @@ def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple
     rows = len(volume.density)
     while True:
         room = _room.get(rows, FEWEST_SAMPLES)
-        records = _empty_records(count, (room + kernels.AHEAD) * count, volume)
+        total, dtype = (room + kernels.AHEAD) * count, volume.density.dtype
+        coloured = total if volume.sh.shape[1] else 0
+        shapes: list[Any] = [total, total, (total, 3), *[total] * 3, (coloured, 3), total]
+        kinds = [np.int32] * 2 + [dtype] * 6
+        fields = (BUFFERS.empty(shape, kind) for shape, kind in zip(shapes, kinds))
+        records = Records(np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64), *fields)
 
         def work(first: int, last: int, room: int = room, records: Records = records) -> tuple[int, int, int]:
             begin, end = ((room + kernels.AHEAD) * ray for ray in (first, last))
@@ -127,22 +132,6 @@ def _record(rays: Rays, volume: Volume, settings: Settings, sums: Sums) -> tuple
         remedy = "Lower the density learning rate and resume from the last checkpoint."
         raise ThermoxelsError("density", expected="numbers >= 0", got=f"NaN in {sum(wrong)} places", remedy=remedy)
     return records, [(begin, end) for begin, _, end in found]
-
-
-def _empty_records(rays: int, total: int, volume: Volume) -> Records:
-    dtype = volume.density.dtype
-    return Records(
-        np.zeros(rays, dtype=np.int64),
-        np.zeros(rays, dtype=np.int64),
-        BUFFERS.empty(total, np.int32),
-        BUFFERS.empty(total, np.int32),
-        BUFFERS.empty((total, 3), dtype),
-        BUFFERS.empty(total, dtype),
-        BUFFERS.empty(total, dtype),
-        BUFFERS.empty(total, dtype),
-        BUFFERS.empty((total if volume.sh.shape[1] else 0, 3), dtype),
-        BUFFERS.empty(total, dtype),
-    )
 
 
 def render(grid: VoxelGrid, request: RayRequest, options: RenderOptions) -> RayRender:

@@ -60,10 +60,6 @@ class ReferenceSamples:
     """Flat indices (into rays x steps) of the samples whose density was asked for, ascending."""
     positions: Float[Tensor, "n 3"]  # World positions of the active samples
 
-    def active_index(self, flat: Int64[Tensor, " m"]) -> Int64[Tensor, " m"]:
-        """Where the samples `flat` (all active) stand in `active`."""
-        return torch.searchsorted(self.active, flat)
-
     def rays_of(self, flat: Int64[Tensor, " m"]) -> Int64[Tensor, " m"]:
         """The ray each sample belongs to."""
         return flat // self.steps.t.shape[1]
@@ -94,7 +90,7 @@ def reference_render(grid: VoxelGrid, request: RayRequest, options: RenderOption
 
     def rows(query):
         def rows_at(flat: Tensor) -> Tensor:
-            return query(at.select(marched.active_index(flat)), request.directions[marched.rays_of(flat)])
+            return query(at.select(torch.searchsorted(marched.active, flat)), request.directions[marched.rays_of(flat)])
 
         return rows_at
 

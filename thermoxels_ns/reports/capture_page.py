@@ -12,7 +12,7 @@ import numpy.typing as npt
 from thermoxels_ns.capture.folder_scan import shown_name
 from thermoxels_ns.capture.frames import measurement_rows
 from thermoxels_ns.capture.rig.explanation import turn_deg, turn_error_deg, why_turn_is_unsure, with_error
-from thermoxels_ns.capture.rig_types import DriftEstimate, RigEstimate
+from thermoxels_ns.capture.rig_types import DriftEstimate
 from thermoxels_ns.capture.scene_writer import Scene, scene_names
 from thermoxels_ns.capture.stages import CaptureResult
 from thermoxels_ns.core.camera import Camera
@@ -33,8 +33,7 @@ class Overlay:
     start: bytes
     found: bytes
     thermal: bytes
-    shown_c: tuple[float, float] | None = None
-    """Temperatures of its darkest and its brightest colour, [degrees C]; None: it has none."""
+    colours: str = "thermal image"  # what the last one is, and what its darkest and its brightest colour stand for
 
 
 @dataclass(frozen=True)
@@ -71,25 +70,23 @@ def build_page(page: CapturePage) -> str:
 
 def _summary(page: CapturePage) -> list[tuple[str, str]]:
     registered, pairs = len(page.scene.model.frames), len(page.result.pairs)
-    error = page.scene.model.sighting_error_px()
+    error, rig = page.scene.model.sighting_error_px(), page.scene.rig
+    if not rig.determined:
+        rig_text = "not determined: the start value is kept, look at the pictures below before you trust it"
+    elif not np.isfinite(rig.projection_sigma_px):
+        rig_text = "known"
+    else:
+        rig_text = f"found from the images, a point's place is known to {rig.projection_sigma_px:.2f} thermal pixels"
     rows = [
         ("Pairs found", str(pairs)),
         ("Frames in the scene", f"{registered} of {pairs}"),
-        ("Rig", _rig_text(page.scene.rig)),
+        ("Rig", rig_text),
         ("Drift and vignetting", _drift_text(page.scene.drift)),
         ("Scale", _scale_text(page)),
     ]
     if len(error):
         rows.insert(2, ("Median reprojection error", f"{np.median(error):.2f} pixels"))
     return rows
-
-
-def _rig_text(rig: RigEstimate) -> str:
-    if not rig.determined:
-        return "not determined: the start value is kept, look at the pictures below before you trust it"
-    if not np.isfinite(rig.projection_sigma_px):
-        return "known"
-    return f"found from the images, a point's place is known to {rig.projection_sigma_px:.2f} thermal pixels"
 
 
 def _drift_text(drift: DriftEstimate) -> str:
@@ -124,7 +121,7 @@ def _overlays(page: CapturePage) -> Section:
             (
                 Picture(one.start, "start value"),
                 Picture(one.found, "as written"),
-                Picture(one.thermal, _colours_text(one.shown_c)),
+                Picture(one.thermal, one.colours),
             ),
             columns=3,
             heading=one.name,
@@ -132,12 +129,6 @@ def _overlays(page: CapturePage) -> Section:
         for one in page.overlays
     )
     return Section(heading, words=(words,), galleries=galleries)
-
-
-def _colours_text(shown_c: tuple[float, float] | None) -> str:
-    if shown_c is None:
-        return "thermal image"
-    return f"thermal image: {shown_c[0]:.1f} °C and less are black, {shown_c[1]:.1f} °C and more are bright yellow"
 
 
 def _dropped(dropped: Mapping[str, str]) -> Section:
@@ -157,11 +148,12 @@ def _cameras(page: CapturePage) -> Section:
         ("thermal, start value", page.result.start.thermal_camera, {}),
         ("thermal, as written", rig.thermal_camera, errors),
     )
+    angles = (float(2 * np.degrees(np.arctan(c.width / (2 * c.fl_x)))) for _, c, _ in columns)
     focal = (with_error(camera.fl_x, own.get("focal", math.nan), 1) for _, camera, own in columns)
     rows = (
         ("size, pixels", *(f"{camera.width} x {camera.height}" for _, camera, _ in columns)),
         ("focal length, pixels", *focal),
-        ("angle of view, degrees", *(f"{_angle(camera):.1f}" for _, camera, _ in columns)),
+        ("angle of view, degrees", *(f"{angle:.1f}" for angle in angles)),
         ("principal point, pixels", *(_principal_point(camera, own) for _, camera, own in columns)),
         ("distortion k1, k2", *(f"{camera.k1:.4f}, {camera.k2:.4f}" for _, camera, _ in columns)),
     )
@@ -189,10 +181,6 @@ def _principal_point(camera: Camera, errors: Mapping[str, float]) -> str:
     return ", ".join(
         with_error(value, errors.get(name, math.nan), 1) for name, value in (("cx", camera.cx), ("cy", camera.cy))
     )
-
-
-def _angle(camera: Camera) -> float:
-    return float(2 * np.degrees(np.arctan(camera.width / (2 * camera.fl_x))))
 
 
 def _poses(page: CapturePage) -> Section:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -33,7 +32,8 @@ def write_capture_page(result: CaptureResult) -> None:
     scene, names = result.scene, scene_names(len(result.scene.frames))
     paired = rig_frames(scene.model, scene.frames)
     overlays = []
-    for index in spread_out(len(paired), _SHOWN):
+    shown = np.linspace(0, len(paired) - 1, min(_SHOWN, len(paired))).round().astype(int)
+    for index in np.unique(shown).tolist():
         temperature_c = scene.drift.corrected(index, np.load(scene.frames[index].thermal))
         start, found = (
             jpeg_of(overlay(paired[index], temperature_c, scene.model.camera, rig)) for rig in (result.start, scene.rig)
@@ -42,7 +42,8 @@ def write_capture_page(result: CaptureResult) -> None:
         low, high = (float(each) for each in np.percentile(known, _PERCENTILES)) if known.size else (0.0, 1.0)
         alone = jpeg_of(colours(temperature_c, (low, high)).astype(np.uint8))
         title = f"{names[index]}: {scene.frames[index].photograph_source}"
-        overlays.append(Overlay(title, start, found, alone, (low, high) if known.size else None))
+        ends = f": {low:.1f} °C and less are black, {high:.1f} °C and more are bright yellow" if known.size else ""
+        overlays.append(Overlay(title, start, found, alone, f"thermal image{ends}"))
     samples, masked, pixels = [], 0, 0
     for index, frame in enumerate(scene.frames):
         temperature_c = scene.drift.corrected(index, np.load(frame.thermal)).ravel()
@@ -120,8 +121,3 @@ def jpeg_of(picture: npt.NDArray[np.uint8], quality: int = 82) -> bytes:
     stream = io.BytesIO()
     Image.fromarray(picture).save(stream, format="JPEG", quality=quality)
     return stream.getvalue()
-
-
-def spread_out(count: int, shown: int) -> Sequence[int]:
-    """Numbers of at most `shown` items evenly spread over `count`."""
-    return np.unique(np.linspace(0, count - 1, min(shown, count)).round().astype(int)).tolist() if count else []

@@ -45,13 +45,13 @@ def svg_text(figure: Figure) -> str:
     return svg[svg.index("<svg") :].rstrip()
 
 
-def histogram(values: npt.NDArray, label: str, bins: int = 60, limits: tuple[float, float] | None = None) -> str:
+def histogram(values: npt.NDArray, label: str, limits: tuple[float, float] | None = None) -> str:
     """Draw how often finite values occur between limits, None: all, as an svg element; empty without values."""
     values = values[np.isfinite(values)]
     if not values.size:
         return ""
     with chart(7.0, 2.2) as (figure, (axis,)):
-        axis.hist(values, bins=bins, range=limits, color=ACCENT, alpha=0.8)
+        axis.hist(values, bins=60, range=limits, color=ACCENT, alpha=0.8)
         axis.set_xlabel(label)
         return svg_text(figure)
 

@@ -157,7 +157,10 @@ def median_rows(settings: Iterable[CostSetting], runs: Iterable[CostRun], baseli
     for run in runs:
         by_name.setdefault(run.setting, []).append(run)
     measured = [(setting, by_name[setting.name]) for setting in settings if setting.name in by_name]
-    medians = [{name: _median([run.figures[name] for run in own]) for name in FIGURES} for _, own in measured]
+    medians = []
+    for _, own in measured:
+        known = {name: [run.figures[name] for run in own if not math.isnan(run.figures[name])] for name in FIGURES}
+        medians.append({name: statistics.median(values) if values else math.nan for name, values in known.items()})
     seconds = [median["seconds"] for median in medians]
     base = next((s for s, (setting, _) in zip(seconds, measured) if setting.name == baseline), math.nan)
     marks = {
@@ -173,11 +176,6 @@ def median_rows(settings: Iterable[CostSetting], runs: Iterable[CostRun], baseli
         )
         for index, ((setting, own), median) in enumerate(zip(measured, medians))
     ]
-
-
-def _median(values: Sequence[float]) -> float:
-    known = [value for value in values if not math.isnan(value)]
-    return statistics.median(known) if known else math.nan
 
 
 def cheapest(rows: Iterable[CostRow], targets: Targets) -> CostRow | None:

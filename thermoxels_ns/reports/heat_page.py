@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
+from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps, effect_labels
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import HeatSolution
@@ -28,7 +28,6 @@ _CAPTIONS = {
     "cut.png": "Cut through the middle at the end. Colours span the whole body.",
 }
 _LARGE_K = 100.0
-_INTO_BODY = "Heat flows are positive into the body; what is lost is negative."
 
 
 def heat_page(run: HeatRun, pictures: Mapping[str, bytes], mesh_name: str, command: str, files: Sequence[str]) -> Page:
@@ -79,7 +78,13 @@ def _figures(run: HeatRun) -> tuple[tuple[str, str], ...]:
         cards.append((f"{run.wall.temperature_factor:.3f}", "surface temperature factor f_Rsi"))
     cards.append((f"{degrees(results.coldest.temperature_c)} °C", f"coldest spot {_place(results.coldest)}"))
     cards.append((f"{degrees(results.hottest.temperature_c)} °C", f"hottest spot {_place(results.hottest)}"))
-    cards += _accuracy_card(run.accuracy)
+    accuracy = run.accuracy
+    if accuracy is not None:
+        met = "within the tolerance" if accuracy.met else "NOT within the tolerance"
+        if accuracy.tolerance_k is None:
+            cards.append((f"{100.0 * accuracy.estimated_flow:.2g} %", f"estimated error of the heat flow, {met}"))
+        else:
+            cards.append((f"{accuracy.estimated_k:.2g} K", f"estimated error of temperatures, {met}"))
     return tuple(cards)
 
 
@@ -92,14 +97,14 @@ def _results(run: HeatRun) -> Section:
         tuple(
             (
                 effect.effect,
-                _optional(effect.area_m2),
+                "" if effect.area_m2 is None else figure(effect.area_m2),
                 round_off.flow(effect.heat_w),
                 "" if effect.heat_w_m2 is None else round_off.per_area(effect.heat_w_m2, effect.heat_w),
                 *(() if steady else (round_off.flow(effect.last_heat_w),)),
             )
             for effect in results.effects
         ),
-        note=_INTO_BODY,
+        note="Heat flows are positive into the body; what is lost is negative.",
     )
     patches = Table(
         (
@@ -115,8 +120,7 @@ def _results(run: HeatRun) -> Section:
             )
             for patch in results.patches
         ),
-        note="Areas are those of the true surface. Temperatures are those at the end." * (not steady)
-        or "Areas are those of the true surface.",
+        note="Areas are those of the true surface." + ("" if steady else " Temperatures are those at the end."),
     )
     regions = Table(
         (
@@ -177,7 +181,8 @@ def _probes(run: HeatRun) -> list[Section]:
 def _balance(run: HeatRun) -> Section:
     balance = run.results.balance
     scale, unit = (1.0, "W") if balance.unit == "W" else (3.6e6, "kWh")
-    round_off = _round_off(run).below_w * (1.0 if balance.unit == "W" else _duration_s(run))
+    duration_s = float(run.nodes.times_s[-1] - run.nodes.times_s[0])
+    round_off = _round_off(run).below_w * (1.0 if balance.unit == "W" else duration_s)
     left = 0.0 if abs(balance.residual) < round_off else balance.residual
     rows = (
         ("into the body", f"{figure(balance.into_body / scale)} {unit}"),
@@ -241,18 +246,14 @@ def _built(run: HeatRun) -> Section:
         figures_from=2,
     )
     bill = run.solution.assembled
+    kinds = ("radiation", "convection", "flux", "source", "fixed", "mass")
+    absent = [kind for kind in kinds if kind not in bill.counts]
     assembled = Table(
         ("Assembled", "times", "s"),
         tuple((kind, str(count), f"{bill.seconds.get(kind, 0.0):.3f}") for kind, count in bill.counts.items()),
-        note=_absent(run.problem, run.screening.problem, dict(bill.counts)),
+        note=f"Not there, and at no cost: {', '.join(absent)}." if absent else "",
     )
     return Section("What was built and left out", words=tuple(words), tables=(left, kept, assembled))
-
-
-def _absent(named: HeatProblem, built: HeatProblem, counts: dict[str, int]) -> str:
-    """Say what costs nothing because it is not there."""
-    absent = [kind for kind in ("radiation", "convection", "flux", "source", "fixed", "mass") if kind not in counts]
-    return f"Not there, and at no cost: {', '.join(absent)}." if absent else ""
 
 
 def _made(run: HeatRun, command: str, files: Sequence[str]) -> Section:
@@ -300,10 +301,6 @@ def _round_off(run: HeatRun) -> RoundOff:
     return round_off_of(flows, sum(patch.area_m2 for patch in results.patches))
 
 
-def _duration_s(run: HeatRun) -> float:
-    return float(run.nodes.times_s[-1] - run.nodes.times_s[0])
-
-
 def _probe_names(run: HeatRun) -> list[str]:
     return [f"({', '.join(f'{part:.4g}' for part in point)}) m" for point in run.probes.points_m]
 
@@ -324,15 +321,14 @@ def _up_to(bound_k: float | None) -> str:
     return f"{bound_k:.2g}"
 
 
-def _optional(value: float | None) -> str:
-    return "" if value is None else figure(value)
-
-
 def _accuracy(accuracy: Accuracy | None) -> list[Section]:
     """Say what the error is, what was chosen, and all solutions on the way; nothing without a tolerance."""
     if accuracy is None:
         return []
-    words = [f"{'Met' if accuracy.met else 'Not met'}: {_tolerance_asked(accuracy)}. {accuracy.status}"]
+    asked = [] if accuracy.tolerance_k is None else [f"{accuracy.tolerance_k:g} K"]
+    asked += [] if accuracy.flow_tolerance is None else [f"{100.0 * accuracy.flow_tolerance:g} % of the heat flow"]
+    met = "Met" if accuracy.met else "Not met"
+    words = [f"{met}: a tolerance of {' and '.join(asked)}. {accuracy.status}"]
     if accuracy.left_out_k > 0.0:
         words.append(
             f"Of the error, {accuracy.left_out_k:.2g} K at most are what is left out; the solver had the rest of the "
@@ -349,17 +345,11 @@ def _accuracy(accuracy: Accuracy | None) -> list[Section]:
     )
     columns = ("Solution", "unknowns", "error K", "error of heat flow %", "s")
     note = "Estimated errors. The last one is the result."
-    return [Section("Accuracy", words=tuple(words), tables=(Table(columns, _levels(accuracy), note=note),))]
-
-
-def _accuracy_card(accuracy: Accuracy | None) -> list[tuple[str, str]]:
-    """Give the figure for the top of the page: value with unit, and what it is; nothing without a tolerance."""
-    if accuracy is None:
-        return []
-    met = "within the tolerance" if accuracy.met else "NOT within the tolerance"
-    if accuracy.tolerance_k is None:
-        return [(f"{100.0 * accuracy.estimated_flow:.2g} %", f"estimated error of the heat flow, {met}")]
-    return [(f"{accuracy.estimated_k:.2g} K", f"estimated error of temperatures, {met}")]
+    return [
+        Section(
+            "Accuracy", words=tuple(words), tables=(Table(columns, tuple(map(_level, accuracy.levels)), note=note),)
+        )
+    ]
 
 
 def _how_time_was_followed(time: TimeSteps | AdaptiveSteps | None, accuracy: Accuracy | None) -> str:
@@ -372,16 +362,6 @@ def _how_time_was_followed(time: TimeSteps | AdaptiveSteps | None, accuracy: Acc
     if isinstance(time, TimeSteps):
         return f"{time.steps} steps of {time.step_seconds:g} s"
     return f"{in_words(time.duration_s)} in steps that keep within {time.tolerance_k:g} K"
-
-
-def _tolerance_asked(accuracy: Accuracy) -> str:
-    parts = [] if accuracy.tolerance_k is None else [f"{accuracy.tolerance_k:g} K"]
-    parts += [] if accuracy.flow_tolerance is None else [f"{100.0 * accuracy.flow_tolerance:g} % of the heat flow"]
-    return f"a tolerance of {' and '.join(parts)}"
-
-
-def _levels(accuracy: Accuracy) -> tuple[tuple[str, ...], ...]:
-    return tuple(_level(level) for level in accuracy.levels)
 
 
 def _level(level: dict[str, Any]) -> tuple[str, ...]:

@@ -37,7 +37,12 @@ def draw_surface(
         seen = seen & mesh.boundary.seen
     shown = np.unique(mesh.facets[seen] if seen.any() else mesh.facets)
     steady = len(times_s) == 1
-    (low, high), beyond = _colour_ends(states_c[[0, -1]][:, shown])
+    ends_c = states_c[[0, -1]][:, shown]
+    least, most = float(ends_c.min()), float(ends_c.max())
+    low, high = (float(end) for end in np.quantile(ends_c, (0.005, 0.995)))
+    # Colours span the middle 99 % where a few values stretch the scale to more than twice that.
+    beyond = most - least > 2.0 * (high - low) > 0.0
+    low, high = (low, high) if beyond else (least, most)
     same: Any = {"clim": (low, high), "up": up}
     few = "; colours: middle 99 %" if beyond else ""
     first, last = in_words(float(times_s[0])), in_words(float(times_s[-1]))
@@ -54,15 +59,6 @@ def draw_surface(
     title = f"Change from {first} to {last}"
     picture_of_mesh(folder / change, mesh, difference, title=title, note=note, up=up, **diverging)
     return list(PICTURES)
-
-
-def _colour_ends(values: Vector) -> tuple[tuple[float, float], bool]:
-    """Ends of a scale, and whether values lie beyond: where a few stretch it to more than twice the middle 99 %."""
-    low, high = (float(end) for end in np.quantile(values, (0.005, 0.995)))
-    least, most = float(values.min()), float(values.max())
-    if most - least > 2.0 * (high - low) > 0.0:
-        return (low, high), True
-    return (least, most), False
 
 
 def cut_open(mesh: TetMesh, nodal_c: Vector, up: tuple[float, float, float]) -> tuple[TetMesh, Vector, Vector]:

@@ -22,7 +22,6 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 if TYPE_CHECKING:
     import pyvista as pv
-    from matplotlib.colors import ListedColormap
 
     from thermoxels_ns.fem.solution import HeatSolution
 
@@ -78,7 +77,9 @@ def picture_of_mesh(
     # after that ends in a segmentation fault; loaded before, both work.
     with suppress(ImportError):
         import triton  # noqa: F401
+    import matplotlib
     import pyvista as pv
+    from matplotlib.colors import ListedColormap
 
     path = Path(path)
     if path.suffix != ".png":
@@ -86,7 +87,10 @@ def picture_of_mesh(
     values = np.asarray(mesh.temperature_c if temperature_c is None else temperature_c, dtype=np.float64)
     right, true_up, towards_camera = _view_axes(up, view_direction)
     shown = values[np.unique(mesh.facets)]
-    low, high = _colour_limits(_without_outliers(shown) if clim is None else np.asarray(clim, dtype=np.float64))
+    ends = _without_outliers(shown) if clim is None else np.asarray(clim, dtype=np.float64)
+    low, high = float(ends.min()), float(ends.max())
+    if not high - low > 1e-3:  # a constant temperature gets 1 K around it
+        low, high = low - 0.5, high + 0.5
     beyond = clim is None and (float(shown.min()) < low or float(shown.max()) > high)
     extremes = (float(shown.min()), float(shown.max())) if beyond else None
 
@@ -97,15 +101,17 @@ def picture_of_mesh(
         try:
             plotter.renderer.set_background("white")
             _add_lights(plotter, right, true_up, towards_camera)
-            font = _font_file()
+            # DejaVu Sans, which comes with matplotlib and has every sign the pictures need.
+            font = str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf")
             matter = {"ambient": 0.62, "diffuse": 0.45, "specular": 0.0, "smooth_shading": False}
             if not plain.all():
+                start = _DARKEST if colour_map == "inferno" else 0.0
                 surface = pv.PolyData.from_regular_faces(mesh.points_m, mesh.facets[~plain])
                 surface.point_data["temperature_c"] = values
                 plotter.add_mesh(
                     surface,
                     scalars="temperature_c",
-                    cmap=_colour_map(colour_map),
+                    cmap=ListedColormap(matplotlib.colormaps[colour_map](np.linspace(start, 1.0, 256))),
                     clim=(low, high),
                     show_scalar_bar=False,
                     **matter,
@@ -166,28 +172,6 @@ def _without_outliers(values: FloatArray) -> FloatArray:
     low, high = np.quantile(values, (0.005, 0.995))
     few = np.ptp(values) > 2.0 * (high - low) > 0.0
     return values[(values >= low) & (values <= high)] if few else values
-
-
-def _colour_limits(values: FloatArray) -> tuple[float, float]:
-    """Ends of the colour bar; a constant temperature gets 1 K around it."""
-    low, high = float(values.min()), float(values.max())
-    return (low, high) if high - low > 1e-3 else (low - 0.5, high + 0.5)
-
-
-def _colour_map(name: str) -> ListedColormap:
-    """A colour map; inferno (perceptually uniform, readable in grey) without its black end."""
-    import matplotlib
-    from matplotlib.colors import ListedColormap
-
-    start = _DARKEST if name == "inferno" else 0.0
-    return ListedColormap(matplotlib.colormaps[name](np.linspace(start, 1.0, 256)))
-
-
-def _font_file() -> str:
-    """DejaVu Sans, which comes with matplotlib and has every sign the pictures need."""
-    import matplotlib
-
-    return str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf")
 
 
 def _add_colour_bar(plotter: pv.Plotter, font: str, title: str, span: float) -> None:

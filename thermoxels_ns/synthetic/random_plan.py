@@ -92,7 +92,7 @@ class Plan:
 
     def put(self, shape: Shape, paint: int, warmth: float) -> None:
         """Add a piece, with a gentle slope of its warmth."""
-        lo, hi = _bounds(shape)
+        lo, hi = bounds_of(shape)
         slope = self.draw.uniform(-0.12, 0.12, 3) / max(float(np.subtract(hi, lo).max()), 1.0)
         self.pieces.append(Piece(shape, paint, warmth, slope))
 
@@ -151,10 +151,6 @@ class Plan:
         joined = BoxSolid(boxes, self.removed)
         return SolidUnion((joined, *round_things)) if round_things else joined
 
-    def boxes_around(self) -> list[Box]:
-        """Boxes around all pieces."""
-        return [_bounds(piece.shape) for piece in self.pieces]
-
     def part(self, points: npt.ArrayLike, normals: npt.ArrayLike) -> npt.NDArray[np.int64]:
         """Paint of the last piece that holds a point just below the surface: points and normals (n, 3) to (n,)."""
         inner = np.asarray(points, dtype=np.float64) - 0.01 * self.unit * np.asarray(normals, dtype=np.float64)
@@ -178,7 +174,7 @@ class Plan:
         points = np.asarray(points, dtype=np.float64)
         far = np.array([_distance(points, piece.shape) for piece in self.pieces])
         share = np.exp((far.min(axis=0) - far) / (_BLEND * self.unit))
-        own = np.array([p.warmth + (points - np.mean(_bounds(p.shape), axis=0)) @ p.slope for p in self.pieces])
+        own = np.array([p.warmth + (points - np.mean(bounds_of(p.shape), axis=0)) @ p.slope for p in self.pieces])
         warmth = np.einsum("pn,pn->n", share, own) / share.sum(axis=0)
         for glow in self.glows:
             near = np.maximum(1.0 - distance_to_box(points, *glow.core) / glow.reach, 0.0)
@@ -186,7 +182,8 @@ class Plan:
         return warmth
 
 
-def _bounds(shape: Shape) -> Box:
+def bounds_of(shape: Shape) -> Box:
+    """The smallest box around a shape."""
     return shape if isinstance(shape, tuple) else shape.bounds
 
 

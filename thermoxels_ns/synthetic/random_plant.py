@@ -104,7 +104,7 @@ def _tank(plan: Plan, middle: Range, half: Range) -> None:
     """An upright cylinder on a foot."""
     u = plan.u
     radius, length, foot = u(7, 0.95 * min(half)), u(22, 48), u(3.4, 6)
-    plan.put(_pillar(middle, 0.55 * radius, 0.0, foot), plan.paint("stone"), u(0.2, 0.4))
+    plan.put(_pillar(middle, 0.55 * radius, foot), plan.paint("stone"), u(0.2, 0.4))
     centre = (*middle, foot + HAIR + 0.5 * length)
     plan.put(Cylinder(centre, radius, length, 2), plan.paint("metal"), u(0.4, 1.0))
 
@@ -132,7 +132,7 @@ def _ball(plan: Plan, middle: Range, half: Range) -> None:
     radius, foot = u(8, 0.95 * min(half)), 0.0
     if plan.chance(0.6):
         foot = u(4, 14)
-        plan.put(_pillar(middle, 0.45 * radius, 0.0, foot), plan.paint("stone"), u(0.2, 0.4))
+        plan.put(_pillar(middle, 0.45 * radius, foot), plan.paint("stone"), u(0.2, 0.4))
     plan.put(Sphere((*middle, foot + radius), radius), plan.paint("metal"), u(0.4, 1.0))
 
 
@@ -164,13 +164,13 @@ def _frame(plan: Plan, middle: Range, half: Range) -> None:
         at = list(middle)
         at[axis] += sign * (reach - 0.5 * thick)
         ends.append(at)
-        plan.put(_pillar((at[0], at[1]), 0.5 * thick, 0.0, high), paint, u(0.2, 0.7))
+        plan.put(_pillar((at[0], at[1]), 0.5 * thick, high), paint, u(0.2, 0.7))
     (x0, y0), (x1, y1) = ends
     side = 0.5 * thick
     plan.put(((x0 - side, y0 - side, high), (x1 + side, y1 + side, high + beam)), paint, u(0.3, 0.8))
 
 
-def _pillar(middle: Range, half: float, low: float, high: float) -> Box:
+def _pillar(middle: Range, half: float, high: float) -> Box:
     """A square box around a vertical axis."""
     x, y = middle
-    return (x - half, y - half, low), (x + half, y + half, high)
+    return (x - half, y - half, 0.0), (x + half, y + half, high)

@@ -17,7 +17,7 @@ from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.synthetic.appearance import SolidTexture, SunLight, painted, room_rgb, sky_rgb, sky_temperature_c
 from thermoxels_ns.synthetic.camera_rings import CameraRing
 from thermoxels_ns.synthetic.random_buildings import detached_house, facade, railing, wings
-from thermoxels_ns.synthetic.random_plan import Plan
+from thermoxels_ns.synthetic.random_plan import Plan, bounds_of
 from thermoxels_ns.synthetic.random_plant import machinery, pipes_and_radiators
 from thermoxels_ns.synthetic.scene_truth import RgbFunction, SyntheticScene
 from thermoxels_ns.synthetic.solids import Box, box_between
@@ -145,13 +145,16 @@ def random_scene(seed: int, wild: bool = False) -> SyntheticScene:
     lo, hi = plan.solid().bounds
     extent = float(np.subtract(hi, lo).max())
     plan = plan.scaled(float(np.round(draw.uniform(*family.size_m), 2)) / extent)
-    texture_seed, light = int(draw.integers(2**31)), _light(draw)
+    texture_seed = int(draw.integers(2**31))
+    azimuth, height = draw.uniform(0.0, 2.0 * np.pi), draw.uniform(0.35, 1.2)
+    towards = (float(np.cos(azimuth)), float(np.sin(azimuth)), float(height))
+    light = SunLight(towards, ambient=float(draw.uniform(0.5, 0.75)))
     outdoors = draw.random() < family.outdoors
     background_rgb, background_c, surface_c, bounds_c = _surroundings(draw, outdoors)
     focal_share = round(float(draw.uniform(0.78, 1.05)), 3)
     span = 360.0 if family.arc_deg is None else round(float(draw.uniform(*family.arc_deg)), 1)
     start = round(float(draw.uniform(0.0, 360.0)), 1) if family.arc_deg is None else -90.0 - 0.5 * span
-    rings = random_rings(draw, plan.boxes_around(), focal_share, (start, span))
+    rings = random_rings(draw, [bounds_of(piece.shape) for piece in plan.pieces], focal_share, (start, span))
     rest: dict[str, Any] = {"background_rgb": background_rgb, "background_temperature_c": background_c}
     rest |= {"temperature_bounds_c": bounds_c, "rings": rings, "focal_share": focal_share}
     name = f"{'wild' if wild else 'random'}-{seed}"
@@ -175,7 +178,9 @@ def scene_of_plan(
     The scene's other fields are passed by name.
     """
     solid = plan.solid()
-    box = _box_around(solid.bounds)
+    lo, hi = np.asarray(solid.bounds)  # to reconstruct: with a margin of 4 % of the longest side all round
+    margin = float((hi - lo).max()) * _MARGIN_SHARE / (1.0 - 2.0 * _MARGIN_SHARE)
+    box = box_between(np.round(lo - margin, 3), np.round(hi + margin, 3))
     texture = SolidTexture(box, seed=texture_seed)
     sampled = plan.warmth(solid.surface_points(_SURFACE_SAMPLES, seed=1)[0])
     coldest, hottest = round(float(sampled.min()), 6), round(float(sampled.max()), 6)
@@ -195,19 +200,6 @@ def scene_of_plan(
         mirror=(lambda points, normals: mirrors[plan.part(points, normals)]) if mirrors.any() else None,
         **rest,
     )
-
-
-def _box_around(bounds: Box) -> Box:
-    """The box to reconstruct: the solid and a margin of 4 % of the longest side all round."""
-    lo, hi = np.asarray(bounds[0]), np.asarray(bounds[1])
-    margin = float((hi - lo).max()) * _MARGIN_SHARE / (1.0 - 2.0 * _MARGIN_SHARE)
-    return box_between(np.round(lo - margin, 3), np.round(hi + margin, 3))
-
-
-def _light(draw: np.random.Generator) -> SunLight:
-    azimuth, height = draw.uniform(0.0, 2.0 * np.pi), draw.uniform(0.35, 1.2)
-    towards = (float(np.cos(azimuth)), float(np.sin(azimuth)), float(height))
-    return SunLight(towards, ambient=float(draw.uniform(0.5, 0.75)))
 
 
 def _surroundings(

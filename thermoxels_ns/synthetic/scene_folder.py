@@ -16,7 +16,7 @@ from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_f
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.synthetic.catalogue import SCENE_NAMES, make_scene
-from thermoxels_ns.synthetic.raycast import RenderedView, render_view, visible_surface_points
+from thermoxels_ns.synthetic.raycast import render_view, visible_surface_points
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 __all__ = [
@@ -83,14 +83,22 @@ def write_scene(
     thermal_size = _thermal_size(width, height, thermal_width, own_thermal_camera)
     _check_options(photo_format, thermal_format, noise_k, drift_k)
     camera = scene.camera(width, height)
-    thermal_camera = _second_camera(scene, *thermal_size) if own_thermal_camera else scene.camera(*thermal_size)
+    thermal_camera = scene.camera(*thermal_size)
+    if own_thermal_camera:  # a slightly different field of view and an off-centre principal point
+        plain, (dx, dy) = thermal_camera, (thermal_size[0] * shift for shift in _THERMAL_CENTRE_SHIFT)
+        focal = plain.fl_x * _THERMAL_ZOOM
+        thermal_camera = Camera(*thermal_size, focal, focal, plain.cx + dx, plain.cy + dy)
     train, held_out = scene.poses(num_train, num_eval)
     names = [f"frame_{kind}_{i + 1:05d}" for kind, n in (("train", num_train), ("eval", num_eval)) for i in range(n)]
     poses = np.concatenate([train, held_out])
     thermal_poses = poses @ _second_camera_offset(scene) if own_thermal_camera else poses
     drifts = drift_k * np.random.default_rng([seed, 0]).standard_normal(len(poses))
-    bounds = _bounds_with_errors(scene, drifts, noise_k)
-    unit = _count_unit(thermal_format, bounds)
+    # Drifting, noisy images stay within these.
+    (lowest, highest), margin = scene.temperature_bounds_c, _NOISE_SIGMAS * noise_k
+    bounds = lowest + min(float(drifts.min()), 0.0) - margin, highest + max(float(drifts.max()), 0.0) + margin
+    # How counts become degrees: Celsius = count * celsius_per_count + celsius_offset; None for floats.
+    unit: dict[str, float] | None = {"celsius_per_count": (bounds[1] - bounds[0]) / _LARGEST_COUNT}
+    unit = {"tiff": _CENTIKELVIN, "npy": None}.get(thermal_format, unit | {"celsius_offset": bounds[0]})
 
     target = _prepared_folder(folder)
     frames: list[dict[str, Any]] = []
@@ -100,7 +108,10 @@ def write_scene(
         thermal_view = view
         if thermal_camera != camera or own_thermal_camera:
             thermal_view = render_view(scene, thermal_pose, thermal_camera)
-        measured_c = _measured(thermal_view, float(drifts[number]), noise_k, np.random.default_rng([seed, 1, number]))
+        measured_c = thermal_view.temperature_c + float(drifts[number])
+        if noise_k > 0.0:
+            noise = np.random.default_rng([seed, 1, number]).standard_normal(measured_c.shape)
+            measured_c += noise_k * noise
         frame: dict[str, Any] = {
             "file_path": f"images/{name}{_PHOTO_SUFFIXES[photo_format]}",
             "thermal_file_path": f"thermal/{name}{_SUFFIXES[thermal_format]}",
@@ -111,7 +122,11 @@ def write_scene(
         with replace_when_done(target / frame["file_path"]) as path:
             Image.fromarray(np.round(view.rgb * 255.0).astype(np.uint8)).save(path, quality=_JPEG_QUALITY)
         with replace_when_done(target / frame["thermal_file_path"]) as path:
-            _save_thermal(path, measured_c, unit)
+            if unit is None:
+                np.save(path, measured_c.astype(np.float32))
+            else:
+                counts = np.round((measured_c - unit["celsius_offset"]) / unit["celsius_per_count"])
+                Image.fromarray(np.clip(counts, 0, _LARGEST_COUNT).astype(np.uint16)).save(path)
         frames.append(frame)
 
     names_of_bounds = ("absolute_min_temperature", "absolute_max_temperature")
@@ -183,30 +198,16 @@ def _prepared_folder(folder: Path | str) -> Path:
             expected = "an empty folder or one with an earlier synthetic scene"
             got = f"{target}, whose transforms.json describes other photographs"
             raise SceneError("output folder", expected=expected, got=got, remedy="Choose another folder.")
-        for path in _listed_files(target, content):
-            remove_file(path)
+        listed = content.get("frames")
+        frames = [frame for frame in listed if isinstance(frame, dict)] if isinstance(listed, list) else []
+        names = [frame.get(key) for frame in frames for key in ("file_path", "thermal_file_path")]
+        for path in [target / name for name in names if isinstance(name, str)]:
+            if path.resolve().is_relative_to(target.resolve()) and path.is_file():
+                remove_file(path)
         remove_file(old)
     for name in ("images", "thermal"):
         writable_folder(target / name)
     return target
-
-
-def _listed_files(folder: Path, transforms: dict[str, Any]) -> list[Path]:
-    """Photographs and thermal files that a json lists and that lie inside the scene's folder."""
-    listed = transforms.get("frames")
-    frames = [frame for frame in listed if isinstance(frame, dict)] if isinstance(listed, list) else []
-    names = [frame.get(key) for frame in frames for key in ("file_path", "thermal_file_path")]
-    paths = [folder / name for name in names if isinstance(name, str)]
-    inside = folder.resolve()
-    return [path for path in paths if path.resolve().is_relative_to(inside) and path.is_file()]
-
-
-def _second_camera(scene: SyntheticScene, width: int, height: int) -> Camera:
-    """Intrinsics of the thermal camera: a slightly different field of view and an off-centre principal point."""
-    plain = scene.camera(width, height)
-    dx, dy = _THERMAL_CENTRE_SHIFT
-    focal = plain.fl_x * _THERMAL_ZOOM
-    return Camera(width, height, focal, focal, plain.cx + dx * width, plain.cy + dy * width)
 
 
 def _second_camera_offset(scene: SyntheticScene) -> FloatArray:
@@ -219,36 +220,6 @@ def _second_camera_offset(scene: SyntheticScene) -> FloatArray:
     offset[:3, :3] = turn_z @ turn_y @ turn_x
     offset[:3, 3] = np.multiply(_RIG_SHIFT_SHARE, np.subtract(scene.scene_box[1], scene.scene_box[0]).max())
     return offset
-
-
-def _bounds_with_errors(scene: SyntheticScene, drifts: FloatArray, noise_k: float) -> tuple[float, float]:
-    """Temperature bounds that the drifting, noisy images stay within [degrees Celsius]."""
-    lowest, highest = scene.temperature_bounds_c
-    margin = _NOISE_SIGMAS * noise_k
-    return lowest + min(float(drifts.min()), 0.0) - margin, highest + max(float(drifts.max()), 0.0) + margin
-
-
-def _count_unit(thermal_format: ThermalFormat, bounds: tuple[float, float]) -> dict[str, float] | None:
-    """How counts become degrees: Celsius = count * celsius_per_count + celsius_offset; None for floats."""
-    if thermal_format == "npy":
-        return None
-    if thermal_format == "tiff":
-        return dict(_CENTIKELVIN)
-    return {"celsius_per_count": (bounds[1] - bounds[0]) / _LARGEST_COUNT, "celsius_offset": bounds[0]}
-
-
-def _measured(view: RenderedView, drift_k: float, noise_k: float, draw: np.random.Generator) -> FloatArray:
-    """What the thermal camera reports: the true temperature plus its drift and noise."""
-    noise = noise_k * draw.standard_normal(view.temperature_c.shape) if noise_k > 0.0 else 0.0
-    return view.temperature_c + drift_k + noise
-
-
-def _save_thermal(path: Path, temperature_c: FloatArray, unit: dict[str, float] | None) -> None:
-    if unit is None:
-        np.save(path, temperature_c.astype(np.float32))
-        return
-    counts = np.round((temperature_c - unit["celsius_offset"]) / unit["celsius_per_count"])
-    Image.fromarray(np.clip(counts, 0, _LARGEST_COUNT).astype(np.uint16)).save(path)
 
 
 def _intrinsics(camera: Camera) -> dict[str, Any]:

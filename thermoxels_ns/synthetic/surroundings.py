@@ -108,7 +108,7 @@ def _place(scene: SyntheticScene, seed: int) -> tuple[Plan, tuple[float, float],
     size, middle = float((hi - lo).max()), 0.5 * (lo + hi)
     cameras = scene.poses(48, 6)[0][:, :3, 3]
     reach = _GAP * max(float(np.linalg.norm((cameras - middle)[:, :2], axis=1).max()), size)
-    floor = min(float(lo[2]), float(cameras[:, 2].min()) - 0.1 * size) - 0.01 * size
+    floor = min(float(scene.solid.bounds[0][2]), float(cameras[:, 2].min()) - 0.1 * size)
     plan = Plan(np.random.default_rng([7412, seed]), unit=0.02 * size)
     return plan, (float(middle[0]), float(middle[1])), size, reach, floor
 

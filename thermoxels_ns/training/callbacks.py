@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
+from threadpoolctl import threadpool_limits
 from torch.nn import Parameter
 
 from thermoxels_ns.core.errors import PruningError
@@ -17,12 +18,23 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.field.refine import RowChange, prune, refine
 from thermoxels_ns.field.voxel_grid import VoxelGrid
-from thermoxels_ns.multiview.backdrop import mean_colours
-from thermoxels_ns.multiview.stereo import evidence_of_photographs
+from thermoxels_ns.multiview.backdrop import backdrop_without_walls, mean_colours
+from thermoxels_ns.multiview.planes import depths_on_planes
+from thermoxels_ns.multiview.stereo import (
+    PhotographEvidence,
+    evidence_of_photographs,
+    rays_through,
+    rays_through_backdrop,
+)
 from thermoxels_ns.training.free_space_carving import carve_free_space
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler
 from thermoxels_ns.training.model import SurroundingsSampler, ThermoxelsModel
-from thermoxels_ns.training.ray_statistics import backdrop_evidence, share_of_rays_opened, voxel_weights
+from thermoxels_ns.training.ray_statistics import (
+    backdrop_evidence,
+    half_way_points,
+    share_of_rays_opened,
+    voxel_weights,
+)
 
 FEWEST_OPEN_RAYS = 0.002  # Share of rays that must leave the box unsaturated for a background to be worth its cost
 FEWEST_SKY_DIFFERENCE = 0.01
@@ -30,6 +42,8 @@ FEWEST_SKY_DIFFERENCE = 0.01
 MOST_OPENED_RAYS = 0.01  # Share of the rays that end on something which pruning may open
 OPAQUE_DEPTH = 0.7  # Optical depth across a voxel from which it is opaque: half of the light is lost
 PRUNING_ATTEMPTS = 4  # Thresholds tried before pruning fails
+RAYS_AT_ONCE = 1 << 16
+PLANE_VOXELS = 0.5  # Voxels by which a depth may differ from the plane of its wall
 RAYS_PER_IMAGE = 4096  # Training rays per image that statistics look at
 SHORTEST_RUN_WITH_DEPTHS = 400
 """Steps that a run must have for photo_depth auto: a shorter one would spend most of its time on depths."""
@@ -38,7 +52,7 @@ SHORTEST_RUN_WITH_DEPTHS = 400
 def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> list[TrainingCallback]:
     """The callbacks of one training run, in the order in which they act at a step."""
     before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
-    follow_depths(model, attributes)
+    evidence = follow_depths(model, attributes)
     factors = model.config.refinements()
     steps = {*factors, *model.config.prune_at, *model.config.thin_at}
     end = None
@@ -90,6 +104,11 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
             follow(old, refine(grid, factors[step]), grid, prefix)
         CONSOLE.log(f"step {step}: surroundings of {len(grid.voxels):,} voxels")
 
+    def look_at_walls(step: int) -> None:
+        """Before the lattice is refined, and a third of the way to its first change: backdrops shall not eat walls."""
+        if evidence is not None:
+            follow_walls(model, evidence, step)
+
     def change_lattice(step: int) -> None:
         assert attributes.pipeline is not None and attributes.optimizers is not None
         datamanager = attributes.pipeline.datamanager
@@ -124,43 +143,87 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         TrainingCallback(before, model.update_to_step),
         TrainingCallback(before, carve, iters=(0,)),
         TrainingCallback(before, change_surroundings, iters=(0,)),
+        TrainingCallback(before, look_at_walls, iters=tuple(sorted({*factors, min(steps | decisions) // 3}))),
         TrainingCallback(before, change_lattice, iters=tuple(sorted(steps | decisions))),
         TrainingCallback(before, widen),
     ]
 
 
-def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> None:
+def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes) -> PhotographEvidence | None:
     """Give the model feature rays to depths of photographs, beside those of tracks, where it is to have them.
 
-    See `ThermoxelsModelConfig.photo_depth`; without photographs in training there are none.
+    See `ThermoxelsModelConfig.photo_depth`; without photographs in training there are none, and what is returned is
+    None.
     """
     config, pipeline, trainer = model.config, attributes.pipeline, attributes.trainer
     if config.photo_depth == "off" or not model.loss_weights.tracks or pipeline is None:
-        return
+        return None
     if config.photo_depth == "auto":
         steps = 0 if trainer is None else trainer._start_step + trainer.config.max_num_iterations
         if steps < SHORTEST_RUN_WITH_DEPTHS:
-            return
+            return None
     datamanager: Any = pipeline.datamanager
     if model.grid.sh is None or datamanager.config.streams == "thermal":
-        return
+        return None
     box = model.scene_box.aabb.double().numpy()
     lattice = Lattice.covering(box[0], box[1], config.resolutions[0])  # the same in a resumed training
     near = config.near_plane * model.unit
-    found = evidence_of_photographs(datamanager.train_dataset, near, lattice.lo, lattice.hi, CONSOLE.log)
+    with threadpool_limits(1, "blas"):  # same bits for any number of threads
+        found = evidence_of_photographs(datamanager.train_dataset, near, lattice.lo, lattice.hi, CONSOLE.log)
     if found is None:
-        return
+        return None
     tracks, depths, far = model.feature_rays, found.feature_rays, model.seen_surroundings is not None
     if depths is not None and tracks is None:
         model.feature_ray_sampler = FeatureRaySampler(depths, box, far, COARSE_LIGHT)
     elif depths is not None and tracks is not None:
         model.feature_ray_sampler = FeatureRaySampler(tracks.joined_with(depths), box, far)
-    if found.backdrop_rays is not None:
-        model.backdrop_ray_sampler = FeatureRaySampler(found.backdrop_rays, box)
-
+    if len(model.wall_depth):
+        _use_walls(model, found)
     if trainer is None or trainer._start_step == 0:
         points = model.grid.voxels.corner_index() * lattice.voxel_size + np.asarray(lattice.lo)
         model.grid.paint(torch.from_numpy(mean_colours(found.photographs, found.backdrop, points)))
+    return found
+
+
+def follow_walls(model: ThermoxelsModel, evidence: PhotographEvidence, step: int) -> None:
+    """Give the model feature rays to the planes of plain walls, as it has them now, and to the backdrop without walls.
+
+    They take the place of earlier ones.
+    """
+    photographs, size = evidence.photographs, model.grid.lattice.voxel_size
+    backdrop = evidence.backdrop.copy()
+    if len(model.wall_depth):
+        backdrop &= np.isnan(model.wall_depth.cpu().numpy())  # a wall stays one
+    depth = np.empty(len(photographs.colours), np.float32)
+    for pixels in np.array_split(np.arange(len(depth)), -(-len(depth) // RAYS_AT_ONCE)):
+        origins, along = photographs.of_pixels(pixels)
+        lengths = np.linalg.norm(along, axis=1)
+        rays = (torch.from_numpy(v).float().to(model.device) for v in (origins, along / lengths[:, None]))
+        points = half_way_points(model, *rays).cpu().numpy()
+        depth[pixels] = np.linalg.norm(points - origins, axis=1) / lengths
+    with threadpool_limits(1, "blas"):  # same bits for any number of threads
+        backdrop = backdrop_without_walls(photographs, backdrop, depth, size)
+        planes = depths_on_planes(photographs, backdrop, depth, PLANE_VOXELS * size)
+    CONSOLE.log(
+        f"step {step}: {np.isfinite(planes).mean():.1%} of the photographs' pixels show plain walls that are planes, "
+        f"{backdrop.mean():.1%} a plain backdrop"
+    )
+    planes[evidence.backdrop & ~backdrop & np.isnan(planes)] = np.inf
+    model.wall_depth = torch.from_numpy(planes).to(model.device)
+    _use_walls(model, evidence)
+
+
+def _use_walls(model: ThermoxelsModel, evidence: PhotographEvidence) -> None:
+    """Point the feature rays of planes and backdrop to what the model has kept of them, see `wall_depth`."""
+    photographs, backdrop, box = evidence.photographs, evidence.backdrop, model.scene_box.aabb.double().numpy()
+    planes = model.wall_depth.cpu().numpy()
+    (chosen,) = np.nonzero(np.isfinite(planes))
+    plane_rays = rays_through(photographs, chosen, planes[chosen].astype(np.float64))
+    model.plane_ray_sampler = FeatureRaySampler(plane_rays, box) if len(chosen) else None
+    open_rays = rays_through_backdrop(
+        photographs, backdrop & np.isnan(planes), 1e3 * float(np.linalg.norm(box[1] - box[0]))
+    )
+    model.backdrop_ray_sampler = None if open_rays is None else FeatureRaySampler(open_rays, box)
 
 
 @dataclass(frozen=True)

@@ -108,6 +108,15 @@ class ThermoxelsModel(Model):
         )
         # Through pixels of photographs that show a plain backdrop; found when a training begins.
         self.backdrop_ray_sampler: losses.FeatureRaySampler | None = None
+        # To the planes of plain walls; found when the lattice is refined.
+        self.plane_ray_sampler: losses.FeatureRaySampler | None = None
+        # Depth of the plane that each pixel of the small photographs shows; infinite: a wall, but no plane; NaN: none.
+        self.register_buffer("wall_depth", torch.zeros(0))
+
+    def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs):
+        """Make room for as many depths of walls as the checkpoint has."""
+        self.wall_depth = torch.zeros_like(state_dict.get(prefix + "wall_depth", self.wall_depth))
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     @property
     def grid(self):
@@ -332,6 +341,8 @@ class ThermoxelsModel(Model):
             terms["surroundings_loss"] = weights.surroundings * render.surroundings.mean()
         if weights.tracks and self.feature_ray_sampler is not None:
             terms["tracks_loss"] = weights.tracks * self._feature_ray_loss(self.feature_ray_sampler)
+        if weights.tracks and self.plane_ray_sampler is not None:
+            terms["planes_loss"] = weights.tracks * self._feature_ray_loss(self.plane_ray_sampler)
         if weights.backdrop and self.backdrop_ray_sampler is not None:
             terms["backdrop_loss"] = weights.backdrop * self._feature_ray_loss(self.backdrop_ray_sampler)
         return terms

@@ -1,7 +1,3 @@
-"""A heated checker board tells the rig in metres; without one the start stays."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

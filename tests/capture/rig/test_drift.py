@@ -1,7 +1,5 @@
 """Offsets and vignetting come back from readings of shared points, and only where there are any."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,18 +1,9 @@
-"""A rig and its covariance in words: errors beside numbers, what is exchanged, what is unknown."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from thermoxels_ns.capture.rig.explanation import (
-    rig_lines,
-    turn_error_deg,
-    turn_errors_deg,
-    why_turn_is_unsure,
-)
+from thermoxels_ns.capture.rig.explanation import rig_lines, turn_error_deg, turn_errors_deg, why_turn_is_unsure
 from thermoxels_ns.capture.rig.parameters import PARAMETERS
 from thermoxels_ns.capture.rig_types import RigEstimate
 from thermoxels_ns.core.camera import Camera

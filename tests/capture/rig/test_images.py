@@ -1,7 +1,3 @@
-"""Edges count by place and direction, not by sign; what stays in place while the camera moves is taken out."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

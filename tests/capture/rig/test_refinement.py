@@ -1,7 +1,5 @@
 """Windows that follow the photographs bring the rig to hundredths of a pixel, and say where they cannot."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

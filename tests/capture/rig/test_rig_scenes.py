@@ -1,7 +1,5 @@
 """Rig and drift of drawn captures with noise, drift and vignetting, and of a real room corner."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,3 @@
-"""The rig of two cameras is found from their images alone, and the search says where it cannot be."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,3 @@
-"""The rig of an earlier capture: lengths follow the scales, and what is no rotation and shift is refused."""
-
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,3 @@
-"""What ends COLMAP from inside does not end the capture, and its error says what to do."""
-
-from __future__ import annotations
-
 import importlib
 import os
 import shutil
@@ -12,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.camera_card import counts, photograph
+from tests.support.camera_card import write_pairs
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.colmap_process import disk_of, run_in_process
 from thermoxels_ns.commands.capture import capture_folder
@@ -102,9 +98,7 @@ def test_a_full_disk_is_named_whatever_colmap_says(tmp_path, work, monkeypatch, 
 
 
 def test_a_mapping_that_aborts_is_an_error_and_the_capture_goes_on_behind_its_features(tmp_path, monkeypatch):
-    for name in "abc":
-        photograph(tmp_path / "card" / f"{name}-visible.jpg")
-        counts(tmp_path / "card" / f"{name}-radiometric.tiff")
+    write_pairs(tmp_path / "card")
     said: list[str] = []
     monkeypatch.setattr("thermoxels_ns.capture.sfm.poses._map", _abort_in_the_middle)
     with pytest.raises(ThermoxelsError, match=r"COLMAP: expected to end, got exit status.*--from-stage poses"):

@@ -1,12 +1,9 @@
-"""Poses that exist already: recognised by file names, kept as they are, and never a way out of their folder."""
-
-from __future__ import annotations
-
 import json
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from tests.support.posed_model import CAMERA, ring_model
 from thermoxels_ns.capture.sfm.colmap_conversion import model_of_colmap, read_colmap
@@ -111,8 +108,6 @@ def colmap_model(folder, lens="SIMPLE_RADIAL"):
         pose = MODEL.camera_to_world[number]
         rotation = (pose[:3, :3] @ flip).T
         shift = -rotation @ pose[:3, 3]
-        from scipy.spatial.transform import Rotation
-
         x, y, z, w = Rotation.from_matrix(rotation).as_quat()
         seen, pixels = MODEL.seen_by(number)
         images.append(f"{number + 1} {w} {x} {y} {z} {shift[0]} {shift[1]} {shift[2]} 1 {name}-visible.jpg")

@@ -1,7 +1,3 @@
-"""Up from levels, and from how cameras are held."""
-
-from __future__ import annotations
-
 import io
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Poses of a corner whose truth is known; strays are dropped by name; the same seed gives the same bits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,3 @@
-"""Depth between scene points: exact on planes, the nearer one at an outline."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,3 @@
-"""Default patches, a user's rules for patches and regions, and the file that they stand in."""
-
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -71,7 +67,6 @@ BEFORE = ["exterior-up", "interior-down", "exterior-side", "exterior-side", "int
 
 
 def named(rules: PatchRules, colours: np.ndarray | None = None) -> list[str]:
-    """Name of each facet's patch."""
     patch, names, _ = apply_patches(rules, **FACETS, colours=colours)
     return [names[p] for p in patch]
 
@@ -215,10 +210,7 @@ def test_the_example_is_read_and_does_what_its_comments_say() -> None:
         ("patches: [{name: a, plane: {point: [0, 0, 0], normal: [0, 0, 0]}}]", "and a normal that is not 0"),
         ("patches: [{name: a, nearest_colour: {rgb: [0, 0, 256]}}]", "rgb: expected three numbers from 0 to 255"),
         ("patches: [{name: a, nearest_colour: {rgb: [1, 0, 0]}}]", r"got \[1, 0, 0\], which may be either\. Write"),
-        (
-            "patches: [{name: a, nearest_colour: {rgb: [9, 0, 0], max_distance: 0}}]",
-            "expected a number above 0",
-        ),
+        ("patches: [{name: a, nearest_colour: {rgb: [9, 0, 0], max_distance: 0}}]", "expected a number above 0"),
     ],
 )
 def test_wrong_files_are_refused(tmp_path: Path, text: str, message: str) -> None:

@@ -1,7 +1,5 @@
 """Normals and areas that voxel faces stand for, against shapes that are known exactly."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 

@@ -1,7 +1,3 @@
-"""Which surface the training cameras see."""
-
-from __future__ import annotations
-
 from dataclasses import astuple
 
 import numpy as np
@@ -43,6 +39,8 @@ def block(*spans: tuple[int, int]) -> np.ndarray:
 
 
 WHOLE = (0, 32)
+PLATE = block(WHOLE, WHOLE, (15, 16))
+ABOVE = LATTICE.index_to_world([16.0, 16.0, 36.0])
 
 
 def test_a_sphere_is_seen_up_to_its_horizon() -> None:
@@ -66,10 +64,9 @@ def test_a_sphere_is_seen_up_to_its_horizon() -> None:
 
 
 def test_a_plate_is_seen_from_the_side_of_the_cameras() -> None:
-    cells = block(WHOLE, WHOLE, (15, 16))
-    centroids, normals = voxel_surface(cells)
+    centroids, normals = voxel_surface(PLATE)
     above = views(MIDDLE + np.array([1.0, 0.5, 7.0]), MIDDLE + np.array([-2.0, 2.0, 9.0]))
-    seen = seen_facets(cells, above, LATTICE, centroids, normals)
+    seen = seen_facets(PLATE, above, LATTICE, centroids, normals)
     assert np.array_equal(seen, normals[:, 2] > 0.5)
 
 
@@ -94,14 +91,12 @@ def test_an_obstacle_casts_its_shadow() -> None:
 
 
 def test_the_image_ends_at_its_borders() -> None:
-    cells = block(WHOLE, WHOLE, (15, 16))
-    centroids, normals = voxel_surface(cells)
-    camera = LATTICE.index_to_world([16.0, 16.0, 36.0])
-    narrow = views(camera, target=LATTICE.index_to_world([16.0, 16.0, 16.0]), focal=500.0)
+    centroids, normals = voxel_surface(PLATE)
+    narrow = views(ABOVE, target=LATTICE.index_to_world([16.0, 16.0, 16.0]), focal=500.0)
     pose = narrow.camera_to_world[0]
-    seen = seen_facets(cells, narrow, LATTICE, centroids, normals)
+    seen = seen_facets(PLATE, narrow, LATTICE, centroids, normals)
     # 20 voxels away, 400 x 300 pixels at a focal length of 500 pixels show 16 x 12 voxels around the middle.
-    right, up = ((centroids - camera) @ pose[:, k] / H for k in (0, 1))
+    right, up = ((centroids - ABOVE) @ pose[:, k] / H for k in (0, 1))
     upper = normals[:, 2] > 0.5
     assert seen[upper & (np.abs(right) < 7.5) & (np.abs(up) < 5.5)].all()
     assert not seen[upper & ((np.abs(right) > 8.5) | (np.abs(up) > 6.5))].any()
@@ -110,25 +105,21 @@ def test_the_image_ends_at_its_borders() -> None:
 
 def test_the_principal_point_moves_the_image() -> None:
     """Columns count from the left, rows from the top: with its middle in a corner, an image shows one quarter."""
-    cells = block(WHOLE, WHOLE, (15, 16))
-    centroids, normals = voxel_surface(cells)
-    camera = LATTICE.index_to_world([16.0, 16.0, 36.0])
-    whole = views(camera, target=LATTICE.index_to_world([16.0, 16.0, 16.0]))
+    centroids, normals = voxel_surface(PLATE)
+    whole = views(ABOVE, target=LATTICE.index_to_world([16.0, 16.0, 16.0]))
     pose = whole.camera_to_world[0]
     corner = Views(whole.camera_to_world, whole.focal, np.array([[400.0, 300.0]]), whole.size)
-    seen = seen_facets(cells, corner, LATTICE, centroids, normals)
-    right, up = ((centroids - camera) @ pose[:, k] / H for k in (0, 1))
+    seen = seen_facets(PLATE, corner, LATTICE, centroids, normals)
+    right, up = ((centroids - ABOVE) @ pose[:, k] / H for k in (0, 1))
     upper = normals[:, 2] > 0.5
     assert seen[upper & (right < -0.5) & (up > 0.5)].all()
     assert not seen[upper & ((right > 0.5) | (up < -0.5))].any()
 
 
 def test_nothing_behind_a_camera_is_seen() -> None:
-    cells = block(WHOLE, WHOLE, (15, 16))
-    centroids, normals = voxel_surface(cells)
-    camera = LATTICE.index_to_world([16.0, 16.0, 36.0])
-    away = views(camera, target=LATTICE.index_to_world([16.0, 16.0, 50.0]))
-    assert not seen_facets(cells, away, LATTICE, centroids, normals).any()
+    centroids, normals = voxel_surface(PLATE)
+    away = views(ABOVE, target=LATTICE.index_to_world([16.0, 16.0, 50.0]))
+    assert not seen_facets(PLATE, away, LATTICE, centroids, normals).any()
 
 
 def room() -> np.ndarray:

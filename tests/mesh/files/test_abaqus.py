@@ -1,7 +1,5 @@
 """Input files of CalculiX and Abaqus; CalculiX runs them in tests/external."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 
@@ -98,11 +96,11 @@ def test_fields_and_lines_are_short_enough(written):
 
 
 def test_other_temperatures_and_a_mesh_without_tags(tmp_path, box_mesh):
-    unseen = dataclasses.replace(box_mesh, observed=np.zeros_like(box_mesh.observed))
-    write_inp(tmp_path / "box.inp", unseen, STEP, temperature_c=box_mesh.temperature_c - 40.0)
+    unseen, cold_c = np.zeros_like(box_mesh.observed), box_mesh.temperature_c - 40.0
+    write_inp(tmp_path / "box.inp", dataclasses.replace(box_mesh, observed=unseen, temperature_c=cold_c), STEP)
     written = sections(tmp_path / "box.inp")
     start = np.array(written["*INITIAL CONDITIONS, TYPE=TEMPERATURE"], dtype=float)
-    assert np.abs(start[:, 1] - (box_mesh.temperature_c - 40.0)).max() < 1e-10
+    assert np.abs(start[:, 1] - cold_c).max() < 1e-10
     assert len(written["*SURFACE, NAME=PATCH-BOUNDARY, TYPE=ELEMENT"]) == len(box_mesh.facets)
     assert "*NSET, NSET=OBSERVED" not in written
 

@@ -1,7 +1,3 @@
-"""glTF files, read back by trimesh and byte by byte."""
-
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -69,12 +65,11 @@ def test_arrays_are_the_surface_with_its_temperatures(tmp_path, tagged_mesh):
     assert extras == {"colours": "temperature", "lowest_c": temperature.min(), "highest_c": temperature.max()}
 
 
-def test_colours_are_stored_as_light(tmp_path, tagged_mesh):
+def test_colours_are_stored_as_light(tmp_path, tagged_mesh, monkeypatch):
     """Half of the screen's range is 21.4 % of the light (sRGB)."""
-    grey = np.full((len(tagged_mesh.points_m), 3), 0.5, dtype=np.float32)
-    grey[:, 1], grey[:, 2] = 1.0, 0.02
-    mesh = tagged_mesh.__class__(**{**vars(tagged_mesh), "colour": grey})
-    write_glb(tmp_path / "house.glb", mesh, colouring="photographs")
+    colours = "thermoxels_ns.mesh.files.gltf.temperature_colours"
+    monkeypatch.setattr(colours, lambda surface, _: np.tile([0.5, 1.0, 0.02], (len(surface.nodes), 1)))
+    write_glb(tmp_path / "house.glb", tagged_mesh)
     _, arrays = read_glb(tmp_path / "house.glb")
     assert np.unique(arrays["COLOR_0"], axis=0) / 65535.0 == pytest.approx(
         np.array([[0.21404, 1.0, 0.02 / 12.92, 1.0]]), abs=2e-5

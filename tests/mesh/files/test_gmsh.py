@@ -1,7 +1,5 @@
 """Gmsh files as meshio reads them; Gmsh itself reads them in tests/external."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import meshio
@@ -34,7 +32,7 @@ def test_groups_carry_names_numbers_and_elements(tmp_path, tagged_mesh):
 
 def test_temperatures_are_at_their_nodes(tmp_path, tagged_mesh):
     shown = tagged_mesh.temperature_c[::-1].copy()
-    write_msh(tmp_path / "house.msh", tagged_mesh, temperature_c=shown)
+    write_msh(tmp_path / "house.msh", dataclasses.replace(tagged_mesh, temperature_c=shown))
     read = meshio.read(tmp_path / "house.msh")
     assert len(read.points) == len(tagged_mesh.points_m)
     # The nodes come sorted by where they lie.

@@ -1,17 +1,16 @@
-"""What is written comes back."""
-
-from __future__ import annotations
-
 import dataclasses
+import resource
 import shutil
 
 import numpy as np
 import pytest
 
-from thermoxels_ns.core.errors import MeshError
+from tests.support.unreadable import forbid
+from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.mesh.files.content import colour_bytes
 from thermoxels_ns.mesh.files.formats import write_mesh
 from thermoxels_ns.mesh.files.read import read_mesh
+from thermoxels_ns.mesh.files.vtu import write_vtu
 from thermoxels_ns.mesh.tetrahedra import Boundary
 
 
@@ -123,3 +122,29 @@ def test_a_tetrahedron_listed_again_is_refused(tmp_path, box_mesh) -> None:
     write_mesh(tmp_path / "mesh.vtu", again)
     with pytest.raises(MeshError, match=r"mesh.vtu: expected every tetrahedron once, got 1 of \d+ listed again"):
         read_mesh(tmp_path / "mesh.vtu")
+
+
+def test_a_full_disk_is_one_line_and_the_old_file_stays(tmp_path, box_mesh, capfd) -> None:
+    write_mesh(tmp_path / "box.vtu", box_mesh)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))  # a disk that takes a kilobyte of each file
+    try:
+        with pytest.raises(
+            OutputError, match=r"^mesh file: expected to write .*, got (no space|.*too large).* Check the"
+        ):
+            write_vtu(tmp_path / "box.vtu", box_mesh)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("name", ["box.vtu", "box-boundary.vtp"])
+def test_a_file_that_may_not_be_read_is_not_called_damaged(tmp_path, box_mesh, monkeypatch, name) -> None:
+    write_mesh(tmp_path / "box.vtu", box_mesh)
+    forbid(monkeypatch, name)
+    with pytest.raises(
+        MeshError, match=rf"{name}: expected a VTK file that can be read, got Permission denied\. Check"
+    ):
+        read_mesh(tmp_path / "box.vtu")

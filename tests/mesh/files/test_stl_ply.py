@@ -1,7 +1,3 @@
-"""Surfaces for people: .stl and .ply, read back by trimesh and meshio."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import meshio

@@ -1,7 +1,5 @@
 """XDMF files as VTK (and so ParaView) reads them; FEniCSx reads them in tests/external."""
 
-from __future__ import annotations
-
 from xml.etree import ElementTree
 
 import h5py

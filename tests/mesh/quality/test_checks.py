@@ -1,26 +1,22 @@
-"""The mesh check finds each kind of damage."""
-
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.support.small_fields import mesh_from
+from tests.support.heat_meshes import mesh_from
+from tests.support.small_fields import crossed_diagonals
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import (
     check_mesh,
     count_overlaps,
     count_twin_nodes,
-    dihedral_range_deg,
     facet_areas,
     facet_normals,
+    volumes_and_angles,
 )
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.quality.topology import group_sides
-from thermoxels_ns.mesh.voxel_tets import kuhn_tets
 
 CORNER_TET = np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 4]])
 
@@ -36,7 +32,7 @@ def test_volume_area_and_normal_by_hand():
 
 def test_dihedral_angles_of_the_regular_tetrahedron():
     points = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-    low, high = dihedral_range_deg(points, np.array([[0, 1, 2, 3]]))
+    _, low, high = volumes_and_angles(points, np.array([[0, 1, 2, 3]]))
     assert low == pytest.approx(np.degrees(np.arccos(1 / 3)))
     assert high == pytest.approx(np.degrees(np.arccos(1 / 3)))
 
@@ -78,12 +74,7 @@ def test_rotated_node_order_of_a_triangle_is_fine(box_mesh):
 
 
 def test_diagonals_that_do_not_match_are_found():
-    # Two voxels side by side; the second is mirrored, so its diagonals on the shared face cross the first's.
-    corners, tets = kuhn_tets(np.ones((2, 1, 1), dtype=bool))
-    mirrored = {tuple(c): n for n, c in enumerate(corners.tolist())}
-    second = [[mirrored[(x, 1 - y, z)] for x, y, z in corners[t].tolist()] for t in tets[6:]]
-    crossed = np.vstack([tets[:6], np.array(second)[:, [0, 2, 1, 3]]])
-    points = corners.astype(float)
+    points, tets, crossed = crossed_diagonals()
     check_mesh(mesh_from(points, tets))
     assert np.all(signed_volumes(points, crossed) > 0)
     with pytest.raises(MeshError, match="a crack"):
@@ -138,13 +129,9 @@ POINTS = np.array(
 """An edge along x; two points on one side of it in one plane, and two in planes of their own."""
 
 
-@pytest.mark.parametrize("order", itertools.permutations(range(4)))
-def test_two_of_four_triangles_at_an_edge_that_lie_on_each_other_are_found_in_any_order(order) -> None:
-    facets = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4], [0, 1, 5]])[list(order)]
-    assert count_overlaps(POINTS, facets, group_sides(facets)) == 1
-
-
-@pytest.mark.parametrize("order", itertools.permutations(range(3)))
-def test_triangles_that_only_meet_at_an_edge_do_not_count(order) -> None:
-    facets = np.array([[0, 1, 2], [0, 1, 4], [1, 0, 5]])[list(order)]
-    assert count_overlaps(POINTS, facets, group_sides(facets)) == 0
+@pytest.mark.parametrize(
+    ("facets", "overlaps"), [([[0, 1, 2], [0, 1, 3], [0, 1, 4], [0, 1, 5]], 1), ([[0, 1, 2], [0, 1, 4], [1, 0, 5]], 0)]
+)
+def test_triangles_at_an_edge_that_lie_on_each_other_are_found_in_any_order(facets, overlaps) -> None:
+    for order in itertools.permutations(facets):
+        assert count_overlaps(POINTS, np.array(order), group_sides(np.array(order))) == overlaps

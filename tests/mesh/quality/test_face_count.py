@@ -1,7 +1,3 @@
-"""Faces and edges found by grouping are those found by sorting whole rows."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

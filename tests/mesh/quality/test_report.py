@@ -1,7 +1,3 @@
-"""The quality report measures what is there, and each criterion fails for its own reason only."""
-
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -10,7 +6,8 @@ import pytest
 import skfem
 from skfem.models.poisson import laplace
 
-from tests.support.small_fields import mesh_from
+from tests.support.heat_meshes import mesh_from
+from tests.support.small_fields import crossed_diagonals
 from thermoxels_ns.mesh.quality.checks import check_mesh
 from thermoxels_ns.mesh.quality.criteria import DIHEDRAL_BOUNDS_DEG, BoundaryMode, angle_bins
 from thermoxels_ns.mesh.quality.report import QualityReport, quality_report
@@ -86,11 +83,7 @@ def test_turned_over_tetrahedron_fails_its_criteria(box_mesh):
 
 
 def test_crack_twin_nodes_and_third_owner_are_not_conforming():
-    corners, tets = kuhn_tets(np.ones((2, 1, 1), dtype=bool))
-    number = {tuple(c): n for n, c in enumerate(corners.tolist())}
-    mirrored = np.array([[number[(x, 1 - y, z)] for x, y, z in corners[t].tolist()] for t in tets[6:]])
-    points = corners.astype(float)
-    crossed = np.vstack([tets[:6], mirrored[:, [0, 2, 1, 3]]])
+    points, tets, crossed = crossed_diagonals()
     report = quality_report(mesh_from(points, crossed), "voxel")
     assert "conforming" in report.unmet and "volumes_positive" not in report.unmet
     apart = tets.copy()

@@ -1,7 +1,3 @@
-"""Volumes, angles, radius ratios and stiffness of tetrahedra against values by hand and against scikit-fem."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import skfem

@@ -1,7 +1,3 @@
-"""Genus, components and pinches of surfaces whose answer is known."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -48,21 +44,13 @@ def test_cubes_that_touch_at_a_point():
     assert found.euler_characteristic == 3  # two spheres share one vertex
 
 
-def test_cubes_that_touch_along_an_edge():
-    cells = np.zeros((2, 2, 1), dtype=bool)
-    cells[0, 0] = cells[1, 1] = True
+@pytest.mark.parametrize(("depth", "chain", "edges", "vertices"), [(1, False, 1, 2), (2, True, 0, 1)])
+def test_cubes_that_touch_along_an_edge_and_a_body_pinched_at_a_vertex_have_no_genus(depth, chain, edges, vertices):
+    # The chain of voxels goes around two opposite corners of a cube, which meet at its middle only.
+    cells = np.full((2, 2, depth), chain)
+    cells[0, 0, 0] = cells[1, 1, -1] = not chain
     found = topology_of(cells)
-    assert (found.num_non_manifold_edges, found.num_non_manifold_vertices) == (1, 2)
-    assert [component.genus for component in found.components] == [None]
-    assert found.num_open_edges == 0
-
-
-def test_a_body_pinched_at_a_vertex_of_its_own_has_no_genus():
-    # A chain of voxels around two opposite corners of a cube, which meet at its middle only.
-    cells = np.ones((2, 2, 2), dtype=bool)
-    cells[0, 0, 0] = cells[1, 1, 1] = False
-    found = topology_of(cells)
-    assert (found.num_non_manifold_edges, found.num_non_manifold_vertices) == (0, 1)
+    assert (found.num_open_edges, found.num_non_manifold_edges, found.num_non_manifold_vertices) == (0, edges, vertices)
     assert [component.genus for component in found.components] == [None]
 
 

@@ -1,7 +1,5 @@
 """The automatic threshold puts the surface where rays end: from the field through its evidence to the solid voxels."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,3 @@
-"""Which voxels cameras see: against straight lines of sight, one by one."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,3 @@
-"""The inside of bodies of which only a shell is known."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

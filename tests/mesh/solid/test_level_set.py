@@ -1,7 +1,3 @@
-"""The level on voxel centres: its sign is the choice of voxels, its zero the surface."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

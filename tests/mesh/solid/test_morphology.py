@@ -1,7 +1,3 @@
-"""Bodies, gaps, cavities and hulls of voxels."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import ndimage

@@ -1,7 +1,3 @@
-"""Where density is a smooth ramp across the surface, and what is believed of it."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

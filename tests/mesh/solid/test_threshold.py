@@ -1,7 +1,3 @@
-"""Which density is the threshold, and what is said about it."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

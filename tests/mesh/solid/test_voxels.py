@@ -1,7 +1,3 @@
-"""Which voxels are solid, and what each step says it did."""
-
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +12,6 @@ from thermoxels_ns.mesh.solid.voxels import SolidCells, SolidSelection, SolidSte
 
 
 def step_of(solid: SolidCells, name: str) -> SolidStep:
-    """The one step of that name."""
     (found,) = (step for step in solid.steps if step.name == name)
     return found
 

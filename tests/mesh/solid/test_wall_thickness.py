@@ -1,7 +1,3 @@
-"""Walls grown behind surfaces that cameras see."""
-
-from __future__ import annotations
-
 from dataclasses import astuple
 
 import numpy as np

@@ -1,7 +1,3 @@
-"""How far surfaces surround a place: against solid angles."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,13 +1,9 @@
-"""Sharp edges won back: exact planes, areas, edges, and everything that must not move."""
-
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
 from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, Shape, box_distance, centres, tet_mesh, turn
-from thermoxels_ns.mesh.quality.checks import check_mesh, dihedral_range_deg, facet_areas, facet_normals
+from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas, facet_normals, volumes_and_angles
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.stuffing.edge_planes import Surface
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
@@ -21,7 +17,6 @@ EDGED = ("cylinder", "slab at 0 degrees", "slab at 30 degrees", "slab at 45 degr
 
 
 def turned(seed: int) -> np.ndarray:
-    """A rotation."""
     axes, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     return axes * np.linalg.det(axes)
 
@@ -53,7 +48,6 @@ def moved(before: StuffedSolid, after: StuffedSolid) -> np.ndarray:
 
 
 def relative_errors(shape: Shape, solid: StuffedSolid) -> tuple[float, float]:
-    """Of volume and area."""
     points = solid.points * VOXEL
     volume, area = signed_volumes(points, solid.tets).sum(), facet_areas(points, solid.facets).sum()
     return volume / shape.volume - 1.0, area / shape.area - 1.0
@@ -125,7 +119,7 @@ def test_angles_move_length_and_topology_are_as_promised():
         assert solid.on_surface[nodes].all()
         assert sharp.tets is solid.tets and sharp.facets is solid.facets
         around = solid.tets[np.isin(solid.tets, nodes).any(axis=1)]
-        low, high = dihedral_range_deg(sharp.points, around)
+        _, low, high = volumes_and_angles(sharp.points, around)
         assert ANGLES_DEG[0] - 1e-9 <= low <= high <= ANGLES_DEG[1] + 1e-9
 
 

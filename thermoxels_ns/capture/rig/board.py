@@ -33,6 +33,7 @@ _CORNER_SIGMA_PX = 0.3
 _PERCENTILES = (1.0, 99.0)
 _SMALLEST_SIDE_PX = 480
 _LARGEST_ENLARGEMENT = 6
+_MOST_LISTED = 10  # pairs that an error names
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,9 @@ def rig_from_boards(
             continue
         if np.dot(there[-1] - there[0], here[-1] - here[0]) < 0.0:  # warm squares may be the light ones or the dark
             here = here[::-1]
-        points.append(_board_in_camera(there, visible, board))
+        plane = np.ascontiguousarray(visible.rays(there)[:, :2])
+        _, turn, shift = cv2.solvePnP(board.corners, plane, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE)
+        points.append(board.corners @ cv2.Rodrigues(turn)[0].T + shift.ravel())
         seen.append(here)
     depth = float(np.median(np.concatenate(points)[:, 2])) if points else 1.0
     rig = RigModel(start.thermal_camera, np.asarray(start.visible_to_thermal, dtype=np.float64))
@@ -131,13 +134,6 @@ def rig_from_boards(
     uncertain_px = float(np.sqrt(np.trace(best.jac[: target.size] @ inverse @ best.jac[: target.size].T) / len(every)))
     sigma_px = uncertain_px * _CORNER_SIGMA_PX
     return RigEstimate(camera, transform, True, text, PARAMETERS, covariance, projection_sigma_px=sigma_px)
-
-
-def _board_in_camera(pixels: FloatArray, camera: Camera, board: CheckerBoard) -> FloatArray:
-    """The board's corners in the camera's OpenCV axes, shape (n, 3) [m]."""
-    plane = np.ascontiguousarray(camera.rays(pixels)[:, :2])
-    _, turn, shift = cv2.solvePnP(board.corners, plane, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE)
-    return board.corners @ cv2.Rodrigues(turn)[0].T + shift.ravel()
 
 
 def board_of(settings: CaptureSettings) -> CheckerBoard | None:
@@ -188,18 +184,18 @@ def rig_from_board_photos(
     read = read_frames(search.pairs, source, folder, radiometry, settings.skip_bad, settings.thermal_mask, say)
     if read.thermal_size != thermal_size:
         raise _another_camera("thermal images", thermal_size, read.thermal_size)
-    pairs, names = [], []
+    pairs, names = [], [frame.name for frame in read.frames]
     for frame in read.frames:
         photograph = open_photograph(frame.photograph)
         if photograph.size != (visible.width, visible.height):
             raise _another_camera(frame.photograph_source, (visible.width, visible.height), photograph.size)
         pairs.append((np.asarray(photograph.convert("L")), np.load(frame.thermal, allow_pickle=False)))
-        names.append(frame.name)
     start = rig_start(read.frames, visible, thermal_size, settings.thermal_field_of_view_deg)
     estimate = rig_from_boards(pairs, visible, replace(start, translation_sigma=BASELINE_SIGMA_M), board)
     if not estimate.determined:
         expected = f"at least three pairs in which both cameras show the {board.columns} x {board.rows} corners"
-        got = estimate.explanation + f" Pairs: {_listed(names)}"
+        more = f" and {len(names) - _MOST_LISTED} more" if len(names) > _MOST_LISTED else ""
+        got = f"{estimate.explanation} Pairs: {', '.join(names[:_MOST_LISTED])}{more}"
         remedy = "Check --board; heat the board evenly, hold it still, and let it fill a third of the picture."
         raise SceneError(f"board pictures in {source}", expected=expected, got=got, remedy=remedy)
     say(f"board: {estimate.explanation}")
@@ -223,8 +219,3 @@ def _another_camera(name: str, wanted: Sequence[int], got: Sequence[int]) -> Sce
     expected = f"{wanted[0]} x {wanted[1]} pixels, as in the capture"
     remedy = "Photograph the board with the same cameras in the same mode."
     return SceneError(f"board pictures: {name}", expected=expected, got=f"{got[0]} x {got[1]}", remedy=remedy)
-
-
-def _listed(names: Sequence[str], most: int = 10) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more

@@ -51,9 +51,8 @@ class CoarseSearch:
     def best(self) -> list[RigFit]:
         """Find the best few places that differ, best first."""
         found = self._found([self._spectra(edges.field, edges.weight) for edges in self._thermal])
-        found.sort(key=lambda rig: -rig.score)
         kept: list[RigFit] = []
-        for rig in found:
+        for rig in sorted(found, key=lambda rig: -rig.score):
             apart = [np.abs((rig.change - other.change)[:2]).max() * self._rig.camera.fl_x for other in kept]
             if not apart or min(apart) >= _APART_PX:
                 kept.append(rig)

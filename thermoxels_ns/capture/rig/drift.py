@@ -199,7 +199,10 @@ def sample_shared_points(frames: Sequence[RigFrame], camera: Camera, visible_to_
         visible = ((world - pose[:3, 3]) @ pose[:3, :3]) * (1.0, -1.0, -1.0)
         pixels = camera.project(visible @ visible_to_thermal[:3, :3].T + visible_to_thermal[:3, 3])
         near = np.flatnonzero(camera.contains(pixels, _BORDER_PX) & (visible[:, 2] > 0.0))
-        near = near[tracked[number][near] | _unhidden(visible[near], SparseDepth(frame.points_visible()))]
+        ahead = visible[near]
+        around, distance = SparseDepth(frame.points_visible()).at(ahead / ahead[:, 2:])
+        unhidden = (np.abs(ahead[:, 2] - around) < _DEPTH_TOLERANCE * around) & (distance < _DEPTH_TOLERANCE)
+        near = near[tracked[number][near] | unhidden]
         reading, steepness = _read(read_temperatures(frame, camera), pixels[near])
         known = np.isfinite(reading) & np.isfinite(steepness)
         near, reading, steepness = near[known], reading[known], steepness[known]
@@ -230,14 +233,6 @@ def _chosen_points(frames: Sequence[RigFrame]) -> tuple[FloatArray, npt.NDArray[
     for number, members in enumerate(seen):
         tracked[number, members] = True
     return world[chosen], tracked[:, chosen]
-
-
-def _unhidden(points: FloatArray, depth: SparseDepth) -> npt.NDArray[np.bool_]:
-    """Which points (n, 3) lie at the depth of the frame's own points around them."""
-    if not len(points):
-        return np.zeros(0, dtype=bool)
-    around, distance = depth.at(points / points[:, 2:])
-    return (np.abs(points[:, 2] - around) < _DEPTH_TOLERANCE * around) & (distance < _DEPTH_TOLERANCE)
 
 
 def _read(image: npt.NDArray[np.float32], pixels: FloatArray) -> tuple[FloatArray, FloatArray]:

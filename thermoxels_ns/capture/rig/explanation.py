@@ -44,11 +44,6 @@ def turn_error_deg(rig: RigEstimate) -> float:
     return float(np.degrees(np.sqrt(sum(errors.get(name, np.nan) ** 2 for name in ("rx", "ry", "rz")))))
 
 
-def found_in_images(rig: RigEstimate) -> bool:
-    """Whether the rig comes from comparing the images: neither given, nor from pictures of a board, nor the start."""
-    return rig.determined and bool(np.isfinite(rig.score_after))
-
-
 def rig_lines(rig: RigEstimate, metres_per_unit: float | None) -> tuple[str, ...]:
     """Say in two short lines what was found; of a rig that is given or not determined its explanation."""
     if not rig.determined or not np.isfinite(rig.projection_sigma_px):
@@ -56,25 +51,20 @@ def rig_lines(rig: RigEstimate, metres_per_unit: float | None) -> tuple[str, ...
     focal_px = rig.thermal_camera.fl_x
     focal = with_error(focal_px, rig.standard_errors.get("log_focal", np.nan) * focal_px, 1)
     turn = with_error(turn_deg(rig), turn_error_deg(rig), 2)
+    distance = float(np.linalg.norm(rig.visible_to_thermal[:3, 3]))
+    apart = f"{distance:.3g} units" if metres_per_unit is None else f"{100.0 * distance * metres_per_unit:.1f} cm"
     return (
-        f"turned by {turn} degrees, {distance_text(rig, metres_per_unit)} apart, focal length {focal} pixels",
+        f"turned by {turn} degrees, {apart} apart, focal length {focal} pixels",
         f"points fall within {rig.projection_sigma_px:.2f} thermal pixels (standard error); the page says more",
     )
-
-
-def distance_text(rig: RigEstimate, metres_per_unit: float | None) -> str:
-    """Distance between the two lenses, in centimetres where the scale is known."""
-    distance = float(np.linalg.norm(rig.visible_to_thermal[:3, 3]))
-    if metres_per_unit is None:
-        return f"{distance:.3g} units"
-    return f"{100.0 * distance * metres_per_unit:.1f} cm"
 
 
 def why_turn_is_unsure(rig: RigEstimate) -> str:
     """Say why the turn is less sure than the places of points; empty where it is not, or nothing was estimated."""
     error_deg = turn_error_deg(rig)
     alone_px = np.radians(error_deg) * rig.thermal_camera.fl_x
-    if not found_in_images(rig) or not alone_px > _FAR_LESS_SURE * rig.projection_sigma_px:
+    # Only a rig from comparing the images has a score: neither one that is given, nor from a board, nor the start.
+    if not (rig.determined and np.isfinite(rig.score_after) and alone_px > _FAR_LESS_SURE * rig.projection_sigma_px):
         return ""
     return (
         f"The turn is sure to {error_deg:.2f} degrees only, though points fall within {rig.projection_sigma_px:.2f} "

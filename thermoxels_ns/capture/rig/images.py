@@ -37,13 +37,13 @@ _STRONG_PERCENTILE, _SMALLEST_SHARE = 98.0, 3e-3
 _CONTRAST_SIGMA_PX, _CONTRAST_SIGMA_SHARE = 6.0, 0.02
 _FEWEST_FOR_PATTERN = 8
 _PATTERN_CORRELATION = 0.25
+_NEIGHBOURS = 20
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedFrame:
     """One frame, read and checked."""
 
-    name: str
     grey: FloatImage  # photograph, shape (height, width)
     contrast: FloatImage  # local contrast of the temperatures, shape (height, width) of the thermal camera [K]
     depth: SparseDepth
@@ -125,7 +125,7 @@ def prepare_frames(frames: Sequence[RigFrame], visible: Camera, thermal: Camera)
     for frame, contrast in zip(frames, contrasts):
         points = frame.points_visible()
         depths.append(points[points[:, 2] > 0.0, 2])
-        prepared.append(PreparedFrame(frame.name, read_photograph(frame, visible), contrast, SparseDepth(points)))
+        prepared.append(PreparedFrame(read_photograph(frame, visible), contrast, SparseDepth(points)))
     return PreparedFrames(tuple(prepared), visible, thermal, float(np.median(np.concatenate(depths))))
 
 
@@ -192,7 +192,7 @@ def edge_field(image: FloatImage, blur_px: float, pixels_per_pixel: float = 1.0)
     return (parts[0] + 1j * parts[1]).astype(np.complex64)
 
 
-def without_fixed_pattern(images: Sequence[FloatImage], neighbours: int = 20) -> tuple[list[FloatImage], float]:
+def without_fixed_pattern(images: Sequence[FloatImage]) -> tuple[list[FloatImage], float]:
     """Local contrasts without what stays in place while the camera moves, and how far two halves of the frames agree.
 
     Rows, columns and single pixels may read differently. The pattern is the median local contrast over the frames
@@ -202,10 +202,13 @@ def without_fixed_pattern(images: Sequence[FloatImage], neighbours: int = 20) ->
     if len(contrast) < _FEWEST_FOR_PATTERN:
         return contrast, 0.0
     stack = np.nan_to_num(np.stack(contrast), nan=0.0)
-    agreement = _correlation(np.median(stack[::2], axis=0), np.median(stack[1::2], axis=0))
+    halves = (np.median(stack[start::2], axis=0) for start in (0, 1))
+    a, b = (half.ravel().astype(np.float64) - float(half.mean(dtype=np.float64)) for half in halves)
+    scale = np.sqrt(float(a @ a) * float(b @ b))
+    agreement = float(a @ b) / scale if scale > 0.0 else 0.0
     if not agreement > _PATTERN_CORRELATION:
         return contrast, agreement
-    cleaned, window = [], min(neighbours, len(stack))
+    cleaned, window = [], min(_NEIGHBOURS, len(stack))
     step = max(window // 4, 1)
     for first in range(0, len(stack), step):  # one median serves a few neighbouring frames
         start = min(max(first + step // 2 - window // 2, 0), len(stack) - window)
@@ -225,9 +228,3 @@ def local_contrast(image: FloatImage) -> FloatImage:
     weight = cv2.GaussianBlur(known, (0, 0), reach)
     around = cv2.GaussianBlur(filled, (0, 0), reach) / np.maximum(weight, 1e-6)
     return np.where(bad, np.float32(np.nan), filled - around).astype(np.float32)
-
-
-def _correlation(first: FloatImage, second: FloatImage) -> float:
-    a, b = (image.ravel().astype(np.float64) - float(image.mean(dtype=np.float64)) for image in (first, second))
-    scale = np.sqrt(float(a @ a) * float(b @ b))
-    return float(a @ b) / scale if scale > 0.0 else 0.0

@@ -69,7 +69,13 @@ def refine(prepared: PreparedFrames, rig: RigModel, change: FloatArray, sigmas: 
         blur_px: WindowScore([_design(frame, prepared, view, blur_px, _BLUR_WINDOWS) for frame in few], smooth, rig)
         for blur_px in _LENS_BLURS_PX
     }
-    blur_px = max(trials, key=lambda tried: _explained(trials[tried], change))
+
+    def explained(tried: float) -> float:
+        """How well the windows that agree do so: the sum of -log(1 - R2)."""
+        counted = [found[found > _AGREEMENT] for found in trials[tried].agreement(change)]
+        return float(np.sum(-np.log1p(-np.concatenate([np.zeros(0), *counted]))))
+
+    blur_px = max(trials, key=explained)
     if not _agrees(trials[blur_px], change, _FEWEST_WINDOWS * len(few) / count):
         return None
     thermal = [SmoothThermal(frame.contrast) for frame in prepared.frames]
@@ -77,7 +83,10 @@ def refine(prepared: PreparedFrames, rig: RigModel, change: FloatArray, sigmas: 
     score = WindowScore(designs, thermal, rig)
     start, chosen, maximizer = change, score, RigMaximizer(score, sigmas, prepared.median_depth)
     for reach_px in _REACHES_PX:
-        chosen = score.selected(_agreeing(score, change, reach_px))
+        steps = (-reach_px, 0.0, reach_px) if reach_px > 0.0 else (0.0,)
+        around = [score.agreement(change, (x, y)) for x in steps for y in steps]
+        agree = (np.max(found, axis=0) > _AGREEMENT for found in zip(*around))
+        chosen = WindowScore([design.chosen(mask) for design, mask in zip(designs, agree)], thermal, rig)
         if chosen.windows < _FEWEST_WINDOWS:
             return None
         maximizer = RigMaximizer(chosen, sigmas, prepared.median_depth, min(count, _CORRELATED_FRAMES))
@@ -113,19 +122,6 @@ def _positive_part(symmetric: FloatArray) -> FloatArray:
     """A symmetric matrix with its negative eigenvalues set to 0."""
     values, vectors = np.linalg.eigh(0.5 * (symmetric + symmetric.T))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T, dtype=np.float64)
-
-
-def _agreeing(score: WindowScore, change: FloatArray, reach_px: float) -> list[npt.NDArray[np.bool_]]:
-    """Which windows of each frame agree at their place or near it."""
-    steps = (-reach_px, 0.0, reach_px) if reach_px > 0.0 else (0.0,)
-    around = [score.agreement(change, (x, y)) for x in steps for y in steps]
-    return [np.max(found, axis=0) > _AGREEMENT for found in zip(*around)]
-
-
-def _explained(score: WindowScore, change: FloatArray) -> float:
-    """How well the windows that agree do so: the sum of -log(1 - R2)."""
-    counted = [found[found > _AGREEMENT] for found in score.agreement(change)]
-    return float(np.sum(-np.log1p(-np.concatenate([np.zeros(0), *counted]))))
 
 
 def _agrees(score: WindowScore, change: FloatArray, fewest: float) -> bool:

@@ -13,7 +13,6 @@ from thermoxels_ns.capture.rig.fit import RigFit, RigMaximizer
 from thermoxels_ns.capture.rig.images import PreparedFrames, prepare_frames
 from thermoxels_ns.capture.rig.parameters import PARAMETERS, RigModel, prior_sigmas
 from thermoxels_ns.capture.rig.refinement import refine
-from thermoxels_ns.capture.rig.score import RigScore
 from thermoxels_ns.capture.rig_types import FloatArray, RigEstimate, RigFrame, RigStart
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
@@ -89,7 +88,11 @@ class _RigSearch:
                 f"chance ({chance:.3f}): the thermal images are too flat or show other things"
             )
             return self._kept(rig, sigmas, before, reason)
-        change = self._best_maximum(coarse, coarse_rigs, sigmas)
+        maxima = []
+        for one in coarse_rigs:
+            if one.score >= _WORTH_TRYING * coarse_rigs[0].score:
+                maxima.append(RigMaximizer(coarse.around(one.change), sigmas, depth).maximize(one.change))
+        change = max(maxima, key=lambda fit: fit.score).change
         finer = sizes[level + 1 :] or sizes[-1:]
         score, maximizer = coarse, RigMaximizer(coarse, sigmas, depth)
         for number, size in enumerate(finer):
@@ -125,15 +128,6 @@ class _RigSearch:
             f"{uncertainty_text(covariance, sigmas)}"
         ).rstrip()
         return RigEstimate(camera, transform, True, explanation, PARAMETERS, covariance, before, after, error_px)
-
-    def _best_maximum(self, coarse: RigScore, coarse_rigs: Sequence[RigFit], sigmas: FloatArray) -> FloatArray:
-        """Maximise from every coarse rig worth it; the ten changes of the maximum that agrees best."""
-        maxima = []
-        for one in coarse_rigs:
-            if one.score >= _WORTH_TRYING * coarse_rigs[0].score:
-                maximizer = RigMaximizer(coarse.around(one.change), sigmas, self.prepared.median_depth)
-                maxima.append(maximizer.maximize(one.change))
-        return max(maxima, key=lambda fit: fit.score).change
 
     def _rejection(
         self, change: FloatArray, sigmas: FloatArray, before: float, after: float, error_px: float

@@ -70,7 +70,11 @@ def rig_start(
         camera = Camera(width, height, focal, focal, width / 2, height / 2)
         x, y = (median(getattr(each, name) for each in flir) for name in ("offset_x", "offset_y"))
         # The thermal image's centre lies at the photograph's centre plus the offset.
-        transform[:3, :3] = _turn(x / visible.fl_x, y / visible.fl_y)
+        ahead = np.array([x / visible.fl_x, y / visible.fl_y, 1.0])
+        ahead /= np.linalg.norm(ahead)
+        right = np.cross([0.0, 1.0, 0.0], ahead)
+        right /= np.linalg.norm(right)
+        transform[:3, :3] = np.stack([right, np.cross(ahead, right), ahead])
         sigma, source = _FROM_FLIR, f"FLIR's alignment of the pictures (Real2IR {ratio:.3f}, offset {x:g}, {y:g})"
     elif angles:
         angle = median(angles)
@@ -105,7 +109,12 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
             raise
         got = f"no {problem}" if isinstance(problem, KeyError) else str(problem)
         raise SceneError(str(file), expected="'thermal_camera' and 'rig'", got=got, remedy=remedy) from problem
-    if not _is_rigid(transform):
+    rigid = transform.shape == (4, 4) and bool(np.isfinite(transform).all())
+    if rigid:  # a rotation, which keeps left and right, and a shift
+        rotation = transform[:3, :3]
+        rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() <= 1e-2 and np.linalg.det(rotation) > 0.0
+        rigid &= np.array_equal(transform[3], [0.0, 0.0, 0.0, 1.0])
+    if not rigid:
         expected, got = "4 x 4 numbers, a rotation and a shift", transform.tolist()
         raise SceneError(f"{file}: rig", expected=expected, got=got, remedy=remedy)
     if (camera.width, camera.height) != thermal_size:
@@ -121,25 +130,7 @@ def read_rig(file: Path, thermal_size: tuple[int, int], metres_per_unit: float |
     return RigEstimate(camera, transform, True, f"Given in {file.name}, {lengths}.")
 
 
-def _is_rigid(transform: np.ndarray) -> bool:
-    """Whether a 4 x 4 is a rotation, which keeps left and right, and a shift."""
-    if transform.shape != (4, 4) or not np.isfinite(transform).all():
-        return False
-    rotation = transform[:3, :3]
-    turns = np.abs(rotation @ rotation.T - np.eye(3)).max() <= 1e-2 and np.linalg.det(rotation) > 0.0
-    return bool(turns) and np.array_equal(transform[3], [0.0, 0.0, 0.0, 1.0])
-
-
 def kept_start(start: RigStart, why: str) -> RigEstimate:
     """The start value as an estimate, where nothing can be compared."""
     text = f"{why} The start value is kept: {start.source}."
     return RigEstimate(start.thermal_camera, start.visible_to_thermal, False, text)
-
-
-def _turn(right: float, down: float) -> np.ndarray:
-    """Rotation from visible to thermal axes of a thermal camera that looks that far to the right and down, [rad]."""
-    ahead = np.array([right, down, 1.0])
-    ahead /= np.linalg.norm(ahead)
-    x = np.cross([0.0, 1.0, 0.0], ahead)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(ahead, x), ahead])

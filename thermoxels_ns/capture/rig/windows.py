@@ -64,7 +64,10 @@ class SmoothThermal:
         """Take local contrasts, shape (height, width) [K]; NaN where there is none."""
         bad = ~np.isfinite(contrast)
         filled = np.where(bad, 0.0, contrast).astype(np.float64)
-        self.noise_k = _noise(np.where(bad, np.nan, filled))
+        # From second differences along both axes at once (Immerkaer 1996).
+        curved = ndimage.convolve(np.where(bad, np.nan, filled), _NOISE_KERNEL, mode="nearest")
+        curved = np.abs(curved[np.isfinite(curved)])
+        self.noise_k = float(np.median(curved)) / _NOISE_TO_MEDIAN if len(curved) else 0.0
         """Standard deviation of the noise from pixel to pixel [K]."""
         smooth = cv2.GaussianBlur(filled, (0, 0), THERMAL_BLUR_PX, borderType=cv2.BORDER_REFLECT)
         self._spline = np.asarray(ndimage.spline_filter(smooth, order=3, mode="mirror"))
@@ -126,10 +129,6 @@ class WindowScore:
             result.append(np.where(inside[design.index].all(axis=1), gain**2 / spread, 0.0))
         return result
 
-    def selected(self, keep: Sequence[npt.NDArray]) -> WindowScore:
-        """Some windows of each frame only."""
-        return WindowScore([design.chosen(mask) for design, mask in zip(self.designs, keep)], self.thermal, self.rig)
-
     def value(self, change: FloatArray) -> float:
         """Log likelihood per window."""
         total = 0.0
@@ -152,7 +151,10 @@ class WindowScore:
             by_value *= 2.0 * share * design.trust[:, None] * design.weight
             slope = thermal.slope(pixels)
             centre = pixels[design.index[:, design.index.shape[1] // 2]]
-            for part in _parts(centre, thermal):
+            share_of_image = np.nan_to_num(centre, nan=0.0) / thermal.shape[::-1]
+            column, row = np.clip((share_of_image * _BLOCKS).astype(int), 0, _BLOCKS - 1).T
+            label = row * _BLOCKS + column
+            for part in (np.flatnonzero(label == number) for number in np.unique(label)):
                 summed = np.bincount(design.index[part].ravel(), by_value[part].ravel(), len(design.points))
                 touched = np.flatnonzero(summed)
                 rows.append(self.rig.pull_back(change, design.points[touched], summed[touched, None] * slope[touched]))
@@ -223,22 +225,6 @@ def _contrast(photograph: FloatImage, near: npt.NDArray[np.bool_], plain: FloatA
     return np.sqrt(np.maximum(left, 0.0))
 
 
-def _noise(image: FloatArray) -> float:
-    """Standard deviation of the noise, from second differences along both axes at once (Immerkaer 1996)."""
-    curved = ndimage.convolve(image, _NOISE_KERNEL, mode="nearest")
-    curved = np.abs(curved[np.isfinite(curved)])
-    return float(np.median(curved)) / _NOISE_TO_MEDIAN if len(curved) else 0.0
-
-
 def _sampled(spline: FloatArray, pixels: FloatArray) -> FloatArray:
     place = np.nan_to_num(pixels, nan=-9.0)[:, ::-1].T - 0.5
     return np.asarray(ndimage.map_coordinates(spline, place, order=3, prefilter=False, mode="nearest"))
-
-
-def _parts(centre: FloatArray, thermal: SmoothThermal) -> list[IntArray]:
-    """Numbers of the windows in each part of the image that has some."""
-    height, width = thermal.shape
-    share = np.nan_to_num(centre, nan=0.0) / (width, height)
-    column, row = np.clip((share * _BLOCKS).astype(int), 0, _BLOCKS - 1).T
-    label = row * _BLOCKS + column
-    return [np.flatnonzero(label == number) for number in np.unique(label)]

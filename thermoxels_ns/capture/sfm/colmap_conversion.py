@@ -23,19 +23,6 @@ _FIELDS = {
 """COLMAP's lens models that ours can hold, and the order of their numbers."""
 
 
-def camera_of_colmap(camera: Any) -> Camera:
-    """Turn a pycolmap camera into ours; a `SceneError` where its lens model has terms that ours does not have."""
-    name = camera.model.name
-    if name not in _FIELDS:
-        remedy = "Run COLMAP with --ImageReader.camera_model OPENCV, or let thermoxels capture find the poses."
-        raise SceneError("COLMAP camera", expected="a lens model out of " + ", ".join(_FIELDS), got=name, remedy=remedy)
-    values: dict[str, Any] = dict(zip(_FIELDS[name], map(float, camera.params)))
-    focal = values.pop("f", None)
-    if focal is not None:
-        values |= {"fl_x": focal, "fl_y": focal}
-    return Camera(int(camera.width), int(camera.height), **values)
-
-
 def model_of_colmap(
     reconstruction: Any, frame_of_image: Mapping[str, str], size: tuple[int, int] | None = None
 ) -> SfmModel:
@@ -51,7 +38,16 @@ def model_of_colmap(
         remedy = "Give a model of these photographs with one camera (--ImageReader.single_camera 1)."
         got = f"{len(posed)} of the {len(frame_of_image)} photographs, of {len(cameras)} cameras"
         raise SceneError("COLMAP model", expected="photographs of one camera", got=got, remedy=remedy)
-    found = camera_of_colmap(reconstruction.cameras[cameras.pop()])
+    camera = reconstruction.cameras[cameras.pop()]
+    name = camera.model.name
+    if name not in _FIELDS:
+        remedy = "Run COLMAP with --ImageReader.camera_model OPENCV, or let thermoxels capture find the poses."
+        raise SceneError("COLMAP camera", expected="a lens model out of " + ", ".join(_FIELDS), got=name, remedy=remedy)
+    values: dict[str, Any] = dict(zip(_FIELDS[name], map(float, camera.params)))
+    focal = values.pop("f", None)
+    if focal is not None:
+        values |= {"fl_x": focal, "fl_y": focal}
+    found = Camera(int(camera.width), int(camera.height), **values)
     size = size or (found.width, found.height)
     factor = np.array([size[0] / found.width, size[1] / found.height])
     ids = sorted(reconstruction.points3D)

@@ -40,8 +40,11 @@ def find_up(
     rotations = camera_to_world[:, :3, :3]
     measured = [i for i, angles in enumerate(gimbal_deg) if angles is not None]
     if measured:
-        local = np.array([_up_of_angles(*angles) for angles in gimbal_deg if angles is not None])
-        each = np.einsum("nij,nj->ni", rotations[measured], local)
+        local = []
+        for pitch, roll in (map(math.radians, angles) for angles in gimbal_deg if angles is not None):
+            # Rolled clockwise as seen from behind, the camera finds up to its left.
+            local.append((-math.sin(roll) * math.cos(pitch), math.cos(roll) * math.cos(pitch), -math.sin(pitch)))
+        each = np.einsum("nij,nj->ni", rotations[measured], np.array(local))
         up = _robust_mean(each)
         spread = _median_angle(each, up)
         return Up(up, f"From the pitch and roll that {len(measured)} photographs state.", spread)
@@ -74,12 +77,6 @@ def level_rotation(up: npt.ArrayLike, ahead: npt.ArrayLike) -> FloatArray:
         y = y - (y @ z) * z
     y = y / np.linalg.norm(y)
     return np.stack([np.cross(y, z), y, z]) + 0.0
-
-
-def _up_of_angles(pitch_deg: float, roll_deg: float) -> FloatArray:
-    pitch, roll = math.radians(pitch_deg), math.radians(roll_deg)
-    # Rolled clockwise as seen from behind, the camera finds up to its left.
-    return np.array([-math.sin(roll) * math.cos(pitch), math.cos(roll) * math.cos(pitch), -math.sin(pitch)])
 
 
 def _robust_mean(directions: FloatArray) -> FloatArray:

@@ -47,12 +47,12 @@ class SfmModel:
 
     def sighting_error_px(self) -> FloatArray:
         """Distance between where each point is seen and where it projects to, shape (s,), [pixels]."""
-        error = np.zeros(len(self.sighting_frame))
+        errors = [np.zeros(0)]
         for frame in range(len(self.frames)):
-            first, last = np.searchsorted(self.sighting_frame, [frame, frame + 1])
-            projected = self.camera.project(self.in_camera(frame, self.points[self.sighting_point[first:last]]))
-            error[first:last] = np.linalg.norm(projected - self.sighting_pixel[first:last], axis=1)
-        return error
+            seen, pixels = self.seen_by(frame)
+            projected = self.camera.project(self.in_camera(frame, self.points[seen]))
+            errors.append(np.linalg.norm(projected - pixels, axis=1))
+        return np.concatenate(errors)
 
     def moved(self, rotation: FloatArray, origin: FloatArray) -> SfmModel:
         """Same model in other axes: p_new = rotation (p - origin); `rotation` (3, 3), `origin` (3,) in old axes."""

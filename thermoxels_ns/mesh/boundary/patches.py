@@ -136,7 +136,16 @@ def _rule_of_each(
     remedy = f"Pass one centroid and one colour per element that gets a {kind}."
     check_shape("centroids", centroids, (count, 3), remedy, MeshError)
     check_finite("centroids", centroids, remedy, MeshError)
-    matches = [mask & _in_space(rule, centroids) for rule, mask in zip(rules, allowed)]
+    matches = []
+    for rule, mask in zip(rules, allowed):  # the borders of boxes and planes belong to them
+        inside = mask.copy()
+        if rule.box is not None:
+            lower, upper = rule.box
+            inside &= np.all((centroids >= lower) & (centroids <= upper), axis=1)
+        if rule.plane is not None:
+            point, normal = rule.plane
+            inside &= (centroids - point) @ np.array(normal) >= 0.0
+        matches.append(inside)
 
     coloured = [number for number, rule in enumerate(rules) if rule.colour is not None]
     if coloured:
@@ -162,15 +171,3 @@ def _rule_of_each(
     for number, match in enumerate(matches):
         owner[match] = number
     return owner
-
-
-def _in_space(rule: Rule, centroids: FloatArray) -> BoolArray:
-    """Where a rule's box and plane hold, their borders included."""
-    inside = np.ones(len(centroids), dtype=bool)
-    if rule.box is not None:
-        lower, upper = rule.box
-        inside &= np.all((centroids >= lower) & (centroids <= upper), axis=1)
-    if rule.plane is not None:
-        point, normal = rule.plane
-        inside &= (centroids - point) @ np.array(normal) >= 0.0
-    return inside

@@ -13,7 +13,7 @@ from thermoxels_ns.core.kernel_cache import kernel
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.solid.free_space import CLEAR_OF_CAMERA
-from thermoxels_ns.mesh.solid.morphology import bounding_box
+from thermoxels_ns.mesh.solid.morphology import bounding_box, halved, repeated
 
 START_ABOVE_SURFACE = (1.0, 0.5)
 """A line of sight starts this far out along the normal, [voxels]: past the steps of a staircase, or, if something solid
@@ -63,7 +63,17 @@ def facet_views(
     pixels, depth positive in front; `centres` (cameras, 3) and `centroids_world` (f, 3) are in [world units], `sizes`
     (cameras, 2) in [pixels], `normals_world` (f, 3) unit vectors. After `enough` cameras no others are tried.
     """
-    group, middle, normal = _grouped(lattice.world_to_index(centroids_world), normals_world, lattice.cell_shape)
+    # Triangles of one voxel and main direction. The shift decides for one of two voxels where a triangle lies on their
+    # common face.
+    centroids, shape = lattice.world_to_index(centroids_world), lattice.cell_shape
+    voxel = np.clip(np.floor(centroids - 1e-3).astype(np.int64) + 1, 0, np.array(shape))
+    axis = np.argmax(np.abs(normals_world), axis=1)
+    side = 2 * axis + (normals_world[np.arange(len(axis)), axis] > 0.0)
+    key = np.ravel_multi_index((*voxel.T, side), (*(n + 1 for n in shape), 6))
+    _, group, count = np.unique(key, return_inverse=True, return_counts=True)
+    mean = [np.bincount(group, column, len(count)) / count for column in (*centroids.T, *normals_world.T)]
+    middle, normal = np.stack(mean[:3], axis=1), np.stack(mean[3:], axis=1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)  # not zero: the main components of a group have one sign
     space = _EmptySpace(cells)
     start = middle + START_ABOVE_SURFACE[0] * normal
     inside = space.solid_at(start)
@@ -86,22 +96,6 @@ def facet_views(
         seen,
     )
     return FacetViews(group, lattice.index_to_world(middle), normal, seen)
-
-
-def _grouped(
-    centroids: FloatArray, normals: FloatArray, shape: tuple[int, int, int]
-) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Group triangles by voxel and main direction: group of each, mean centroid and unit mean normal of each group."""
-    # The shift decides for one of two voxels where a triangle lies on their common face.
-    voxel = np.clip(np.floor(centroids - 1e-3).astype(np.int64) + 1, 0, np.array(shape))
-    axis = np.argmax(np.abs(normals), axis=1)
-    side = 2 * axis + (normals[np.arange(len(normals)), axis] > 0.0)
-    key = np.ravel_multi_index((*voxel.T, side), (*(n + 1 for n in shape), 6))
-    _, group, count = np.unique(key, return_inverse=True, return_counts=True)
-    mean = [np.bincount(group, column, len(count)) / count for column in (*centroids.T, *normals.T)]
-    normal = np.stack(mean[3:], axis=1)
-    # The main components of a group have one sign, so the mean is not zero.
-    return group, np.stack(mean[:3], axis=1), normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
 def _spread(centres: FloatArray) -> list[int]:
@@ -131,14 +125,11 @@ class _EmptySpace:
         self.block = np.where(self.cells, -1, 0).astype(np.int8)
         occupied = self.cells
         for k in range(1, _LARGEST_BLOCK + 1):
-            occupied = _any_of_pairs(occupied)
-            empty = ~occupied
-            if not empty.any():
+            occupied = halved(occupied, np.logical_or)
+            if occupied.all():
                 break
-            for along in range(3):
-                empty = np.repeat(empty, 1 << k, axis=along)
             nx, ny, nz = self.cells.shape
-            self.block[empty[:nx, :ny, :nz]] = k
+            self.block[repeated(~occupied, 1 << k)[:nx, :ny, :nz]] = k
 
     def solid_at(self, points: FloatArray) -> BoolArray:
         """Whether points, in corner indices, are in solid voxels, shape (points,)."""
@@ -242,12 +233,3 @@ def _find_cameras(block, lowest, middle, normal, start, open_start, centres, mat
                 count += 1
                 if count == enough:
                     break
-
-
-def _any_of_pairs(cells: BoolArray) -> BoolArray:
-    """Whether any voxel is solid in each aligned block of 2 x 2 x 2, the last ones cut off by the border."""
-    cells = np.pad(cells, [(0, n % 2) for n in cells.shape])
-    for axis in range(3):
-        row = np.moveaxis(cells, axis, 0)
-        cells = np.moveaxis(row[0::2] | row[1::2], 0, axis)
-    return cells

@@ -54,13 +54,7 @@ class HeatStep:
             raise HeatError("steps", expected=expected, got=repr(self.steps), remedy="Pass 10, for example.")
 
 
-def write_inp(
-    path: Path | str,
-    mesh: TetMesh,
-    heat_step: HeatStep | None,
-    *,
-    temperature_c: npt.NDArray[np.floating] | None = None,
-) -> None:
+def write_inp(path: Path | str, mesh: TetMesh, heat_step: HeatStep | None) -> None:
     """Write a mesh as an input file of CalculiX and Abaqus that runs as it is: ``ccx NAME`` for ``NAME.inp``.
 
     Metres, kilograms, seconds and degrees Celsius; absolute zero and the Stefan-Boltzmann constant are in the file,
@@ -86,7 +80,7 @@ def write_inp(
         expected = "material and times, which an .inp file runs with"
         remedy = "Pass heat_step=HeatStep(...), or choose another format."
         raise MeshError("heat_step", expected=expected, got=None, remedy=remedy)
-    content = file_content(mesh, temperature_c)
+    content = file_content(mesh)
     regions = _set_names("region_names", content.region_names)
     patches = _set_names("boundary.patch_names", content.patch_names)
     # All that can fail on a bad mesh comes before the file is opened.
@@ -100,18 +94,19 @@ def write_inp(
         file.write("*INITIAL CONDITIONS, TYPE=TEMPERATURE\n")
         numbers_from_1 = np.arange(1, len(content.points_m) + 1)
         file.writelines(_rows(f"%d, {_REAL}\n", numbers_from_1, content.temperature_c))
-        file.write(_step(heat_step))
+        # Equal steps: the shortest and the longest that the solver may take are the one asked for.
+        length, total = _REAL % heat_step.step_seconds, _REAL % (heat_step.steps * heat_step.step_seconds)
+        file.write(f"*STEP, INC={heat_step.steps}\n*HEAT TRANSFER\n{length}, {total}, {length}, {length}\n")
+        file.write("*NODE PRINT, NSET=NALL\nNT\n*NODE FILE\nNT\n*END STEP\n")
 
 
 def _set_names(name: str, names: Sequence[str]) -> list[str]:
     """Names that every reader of .inp files takes."""
     written = [re.sub(r"[^A-Za-z0-9_]+", "_", entry).upper() for entry in names]
     if len(set(written)) != len(written) or max(map(len, written)) > _LONGEST_NAME:
-        expected = (
-            f"names that differ in their letters and digits (capitals or not), of at most {_LONGEST_NAME} characters"
-        )
-        got, remedy = list(names), "Rename them."
-        raise MeshError(name, expected=f"{expected}, as .inp files ask for", got=got, remedy=remedy)
+        expected = "names that differ in their letters and digits (capitals or not), "
+        expected += f"of at most {_LONGEST_NAME} characters, as .inp files ask for"
+        raise MeshError(name, expected=expected, got=list(names), remedy="Rename them.")
     return written
 
 
@@ -176,13 +171,3 @@ def _materials(content: FileContent, regions: Sequence[str], step: HeatStep) -> 
         yield f"*SPECIFIC HEAT\n{_REAL}\n" % step.specific_heat_j_kgk
     for name in used:
         yield f"*SOLID SECTION, ELSET=REGION-{name}, MATERIAL=MATERIAL-{name}\n"
-
-
-def _step(step: HeatStep) -> str:
-    """Equal steps: the shortest and the longest that the solver may take are the one asked for."""
-    length = _REAL % step.step_seconds
-    total = _REAL % (step.steps * step.step_seconds)
-    return (
-        f"*STEP, INC={step.steps}\n*HEAT TRANSFER\n{length}, {total}, {length}, {length}\n"
-        "*NODE PRINT, NSET=NALL\nNT\n*NODE FILE\nNT\n*END STEP\n"
-    )

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +18,6 @@ from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 UNTAGGED_PATCH = "boundary"  # name of the one patch that a mesh without tags is written with
 _REMEDY = "Build the mesh with thermoxels_ns.mesh.build."
-Colouring = Literal["temperature", "photographs"]
-"""What the colours of a surface show: temperatures through a colour map, or what the photographs saw."""
 COLOUR_MAP = "inferno"  # colour map of temperatures: perceptually uniform, readable in grey
 _DARKEST = 0.1  # share of the colour map left out at its dark end, where shading could not be told from cold
 _FAR_SIZES = 16.0
@@ -179,20 +176,11 @@ def far_origin(points_m: FloatArray) -> FloatArray | None:
     return np.round(0.5 * (low + high)) if far else None
 
 
-def surface_colours(mesh: TetMesh, surface: Surface, temperature_c: FloatArray, colouring: Colouring) -> FloatArray:
+def temperature_colours(surface: Surface, temperature_c: FloatArray) -> FloatArray:
     """Colours of a surface's nodes, red, green, blue in [0, 1] as screens show them (sRGB), shape (m, 3).
 
     The colour map spans the surface's own temperatures; a surface of one temperature gets the map's middle.
     """
-    if colouring == "photographs":
-        if mesh.colour is None:
-            expected = "a mesh whose nodes have colours"
-            remedy = "Choose the colouring 'temperature', or build the mesh from a field that has colours."
-            raise MeshError("colouring 'photographs'", expected=expected, got="a mesh without", remedy=remedy)
-        return np.clip(np.asarray(mesh.colour, dtype=np.float64)[surface.nodes], 0.0, 1.0)
-    if colouring != "temperature":
-        expected = "'temperature' or 'photographs'"
-        raise MeshError("colouring", expected=expected, got=repr(colouring), remedy="Choose one.")
     import matplotlib
 
     low, high = surface_range_c(surface, temperature_c)

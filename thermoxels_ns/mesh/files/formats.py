@@ -6,12 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
-
 from thermoxels_ns.core.errors import OutputError
 from thermoxels_ns.mesh.files.abaqus import HeatStep, write_inp
-from thermoxels_ns.mesh.files.content import Colouring
 from thermoxels_ns.mesh.files.gltf import write_glb
 from thermoxels_ns.mesh.files.gmsh import write_msh
 from thermoxels_ns.mesh.files.stl_ply import check_stl, write_ply, write_stl
@@ -26,15 +22,15 @@ class MeshFormat:
 
     description: str  # what it holds and who reads it, in one line
     write: Callable[..., None]  # writes the files; takes the path, the mesh and `options`
-    options: tuple[str, ...] = ("temperature_c",)  # arguments of `write_mesh` that it looks at
+    options: tuple[str, ...] = ()  # arguments of `write_mesh` that it looks at
     companion: Callable[[Path], Path] | None = None  # names the second file, if the format takes two
     refuse: Callable[[TetMesh], None] | None = None
     """Raises if the format cannot hold a mesh that others can; so an export knows before anything slow runs."""
 
 
-def _write_body_and_boundary(path: Path, mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None) -> None:
-    write_boundary_vtp(boundary_path(path), mesh, temperature_c=temperature_c)
-    write_vtu(path, mesh, temperature_c=temperature_c)
+def _write_body_and_boundary(path: Path, mesh: TetMesh) -> None:
+    write_boundary_vtp(boundary_path(path), mesh)
+    write_vtu(path, mesh)
 
 
 MESH_FORMATS: dict[str, MeshFormat] = {
@@ -48,19 +44,11 @@ MESH_FORMATS: dict[str, MeshFormat] = {
     ),
     ".msh": MeshFormat("body and boundary as physical groups, MSH 4.1: Gmsh and what reads its files", write_msh),
     ".inp": MeshFormat(
-        "sets, surfaces and a heat transfer step that runs: CalculiX, Abaqus", write_inp, ("temperature_c", "heat_step")
+        "sets, surfaces and a heat transfer step that runs: CalculiX, Abaqus", write_inp, ("heat_step",)
     ),
-    ".stl": MeshFormat("surface, shape only: CAD and 3D printing", write_stl, (), refuse=check_stl),
-    ".ply": MeshFormat(
-        "surface with colours and temperatures: MeshLab, CloudCompare, Blender",
-        write_ply,
-        ("temperature_c", "colouring"),
-    ),
-    ".glb": MeshFormat(
-        "surface coloured by temperature or by the photographs (glTF): browsers, phones, office programs",
-        write_glb,
-        ("temperature_c", "colouring", "up"),
-    ),
+    ".stl": MeshFormat("surface, shape only: CAD and 3D printing", write_stl, refuse=check_stl),
+    ".ply": MeshFormat("surface with colours and temperatures: MeshLab, CloudCompare, Blender", write_ply),
+    ".glb": MeshFormat("surface coloured by temperature (glTF): browsers, phones, office programs", write_glb, ("up",)),
 }
 """All formats by suffix, those of solvers first."""
 
@@ -100,9 +88,7 @@ def write_mesh(
     path: Path | str,
     mesh: TetMesh,
     *,
-    temperature_c: npt.NDArray[np.floating] | None = None,
     heat_step: HeatStep | None = None,
-    colouring: Colouring | None = None,
     up: Sequence[float] = (0.0, 0.0, 1.0),
 ) -> list[Path]:
     """Write a mesh in the format that the file's ending stands for, see `MESH_FORMATS`.
@@ -110,9 +96,7 @@ def write_mesh(
     Args:
         path: File to write; its folder is made if need be.
         mesh: The mesh.
-        temperature_c: Temperatures to write in place of the mesh's own, shape (n,), [degrees Celsius].
         heat_step: Material and times; .inp needs it, the others do not look at it.
-        colouring: What the colours of .ply and .glb show; None: each format's own choice.
         up: Direction that points up, in mesh coordinates, for .glb.
 
     Returns:
@@ -120,11 +104,11 @@ def write_mesh(
 
     Raises:
         MeshError: An array does not fit the mesh or is not finite, or the format needs what is not there: material and
-            times, colours, an up direction, coordinates near the origin, or short and different names.
+            times, an up direction, coordinates near the origin, or short and different names.
         OutputError: No format has this ending, or a file cannot be written.
     """
     path = Path(path)
-    given = {"temperature_c": temperature_c, "heat_step": heat_step, "colouring": colouring, "up": up}
+    given = {"heat_step": heat_step, "up": up}
     chosen = mesh_format(path)
     chosen.write(path, mesh, **{name: given[name] for name in chosen.options})
     return mesh_file_paths(path)

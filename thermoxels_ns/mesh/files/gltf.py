@@ -9,19 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.checks import check_direction
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.content import (
-    Colouring,
     check_suffix,
     far_origin,
     file_content,
-    surface_colours,
     surface_of,
     surface_range_c,
+    temperature_colours,
     write_bytes,
 )
 from thermoxels_ns.mesh.tetrahedra import TetMesh
@@ -31,14 +28,7 @@ _UNSIGNED_SHORT, _UNSIGNED_INT, _FLOAT = 5123, 5125, 5126
 _VERTICES, _INDICES = 34962, 34963
 
 
-def write_glb(
-    path: Path | str,
-    mesh: TetMesh,
-    *,
-    temperature_c: npt.NDArray[np.floating] | None = None,
-    colouring: Colouring | None = None,
-    up: Sequence[float] = (0.0, 0.0, 1.0),
-) -> None:
+def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.0, 1.0)) -> None:
     """Write the boundary as binary glTF 2.0 with a colour per node; lengths are metres.
 
     glTF's up is +y: the file holds mesh coordinates and a rotation that turns `up` to it. Colours are stored as light
@@ -52,18 +42,23 @@ def write_glb(
     Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
     """
     path = check_suffix(path, ".glb")
-    colouring = colouring or "temperature"
-    content = file_content(mesh, temperature_c)
+    content = file_content(mesh)
     surface = surface_of(content.points_m, content.facets)
     if not len(surface.triangles):
         remedy = "Build the mesh with its boundary."
         raise MeshError("facets", expected="at least one triangle", got="none", remedy=remedy)
     rotation = _turn_to_y(up)
-    light = _linear(surface_colours(mesh, surface, content.temperature_c, colouring))
+    shown = temperature_colours(surface, content.temperature_c)
+    # Light intensity of screen colours (IEC 61966-2-1, sRGB), both in [0, 1].
+    light = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
     colours = np.full((len(light), 4), 65535, dtype="<u2")
     colours[:, :3] = np.floor(light * 65535.0 + 0.5)
     origin = far_origin(surface.points_m)
     positions = (surface.points_m if origin is None else surface.points_m - origin).astype("<f4")
+    node: dict[str, Any] = {"name": "surface", "mesh": 0, "rotation": rotation}
+    if origin is not None:  # the quaternion (x, y, z, w) turns it too
+        axis, w = np.array(rotation[:3]), rotation[3]
+        node["translation"] = (origin + 2.0 * np.cross(axis, np.cross(axis, origin) + w * origin)).tolist()
     blocks = {
         "POSITION": (positions, _FLOAT, "VEC3"),
         "COLOR_0": (colours, _UNSIGNED_SHORT, "VEC4"),
@@ -83,16 +78,16 @@ def write_glb(
     low, high = surface_range_c(surface, content.temperature_c)
     attributes = {name: number for number, name in enumerate(blocks) if name != "indices"}
     primitive = {"attributes": attributes, "indices": len(attributes), "material": 0}
-    extras = {"colours": colouring, "lowest_c": low, "highest_c": high}
+    extras = {"colours": "temperature", "lowest_c": low, "highest_c": high}
     dull = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
     scene: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "thermoxels"},
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "surface", "mesh": 0, "rotation": rotation, **_moved_by(origin, rotation)}],
+        "nodes": [node],
         "meshes": [{"name": "surface", "primitives": [primitive], "extras": extras}],
-        "materials": [{"name": colouring, "pbrMetallicRoughness": dull, "extensions": {"KHR_materials_unlit": {}}}],
+        "materials": [{"name": "temperature", "pbrMetallicRoughness": dull, "extensions": {"KHR_materials_unlit": {}}}],
         "buffers": [{"byteLength": len(data)}],
         "bufferViews": views,
         "accessors": accessors,
@@ -108,20 +103,6 @@ def _write(path: Path, text: bytes, data: bytes) -> None:
     chunks = ((text, _JSON_CHUNK), (data, _BINARY_CHUNK))
     sizes = [np.array([len(chunk), kind], dtype="<u4").tobytes() for chunk, kind in chunks]
     write_bytes(path, [header, sizes[0], text, sizes[1], data])
-
-
-def _linear(colours: FloatArray) -> FloatArray:
-    """Light intensity of screen colours (IEC 61966-2-1, sRGB), both in [0, 1]."""
-    return np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
-
-
-def _moved_by(origin: FloatArray | None, rotation: list[float]) -> dict[str, list[float]]:
-    """Translation of a node whose positions count from `origin`, which the quaternion (x, y, z, w) turns too."""
-    if origin is None:
-        return {}
-    axis, w = np.array(rotation[:3]), rotation[3]
-    turned = origin + 2.0 * np.cross(axis, np.cross(axis, origin) + w * origin)
-    return {"translation": turned.tolist()}
 
 
 def _turn_to_y(up: Sequence[float]) -> list[float]:

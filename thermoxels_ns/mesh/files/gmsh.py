@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.checks import replace_when_done, writable_folder
@@ -25,7 +24,7 @@ _TRIANGLE, _TETRAHEDRON = 2, 4
 _SIZE, _INT, _DOUBLE = np.dtype("<u8"), np.dtype("<i4"), np.dtype("<f8")
 
 
-def write_msh(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.floating] | None = None) -> None:
+def write_msh(path: Path | str, mesh: TetMesh) -> None:
     """Write a mesh as a Gmsh file, MSH 4.1, binary, with one physical group per region and per patch.
 
     Regions are physical volumes and patches are physical surfaces, both numbered from 1 in the order of their names;
@@ -40,7 +39,7 @@ def write_msh(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
     Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
     """
     path = check_suffix(path, ".msh")
-    content = file_content(mesh, temperature_c)
+    content = file_content(mesh)
     for name in (*content.region_names, *content.patch_names):
         if len(name.encode()) > _LONGEST_NAME:
             expected = f"at most {_LONGEST_NAME} bytes, which is what Gmsh reads"
@@ -55,7 +54,9 @@ def write_msh(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
     writable_folder(path.parent)
     with replace_when_done(path) as temporary, open(temporary, "wb") as file:
         file.write(b"$MeshFormat\n4.1 1 8\n" + _ints(1) + b"\n$EndMeshFormat\n")
-        file.write(_physical_names(content))
+        lines = [f'2 {group + 1} "{content.patch_names[group]}"' for group in _used(content.patch)]
+        lines += [f'3 {group + 1} "{content.region_names[group]}"' for group in _used(content.region)]
+        file.write("\n".join(["$PhysicalNames", str(len(lines)), *lines, "$EndPhysicalNames", ""]).encode())
         for section, chunks in (
             ("Entities", _entities(content, owner)),
             ("Nodes", _nodes(blocks, content)),
@@ -64,7 +65,11 @@ def write_msh(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.
             file.write(f"${section}\n".encode())
             file.writelines(chunks)
             file.write(f"\n$End{section}\n".encode())
-        file.writelines(_node_data(content.temperature_c[order]))
+        count = len(order)
+        table = np.empty(count, dtype=[("tag", _INT), ("value", _DOUBLE)])
+        table["tag"] = np.arange(1, count + 1)
+        table["value"] = content.temperature_c[order]
+        file.writelines([_header("NodeData", TEMPERATURE_VIEW, 1, count), table.tobytes(), b"\n$EndNodeData\n"])
         if np.any(content.area_factor != 1.0):
             for name, values in ((FACTOR_VIEW, content.area_factor[:, None]), (NORMAL_VIEW, content.normal)):
                 file.writelines(_triangle_view(name, len(content.tets) + 1, values))
@@ -83,19 +88,13 @@ def _used(index: IntArray) -> list[int]:
     return np.flatnonzero(np.bincount(index)).tolist() if len(index) else []
 
 
-def _physical_names(content: FileContent) -> bytes:
-    lines = [f'2 {group + 1} "{content.patch_names[group]}"' for group in _used(content.patch)]
-    lines += [f'3 {group + 1} "{content.region_names[group]}"' for group in _used(content.region)]
-    return "\n".join(["$PhysicalNames", str(len(lines)), *lines, "$EndPhysicalNames", ""]).encode()
-
-
 def _bounds(content: FileContent, nodes: IntArray) -> bytes:
     points = content.points_m[nodes.ravel()]
     return np.concatenate([points.min(axis=0), points.max(axis=0)]).astype(_DOUBLE).tobytes()
 
 
 def _entities(content: FileContent, owner: IntArray) -> Iterator[bytes]:
-    """One surface per patch and one volume per region, each in the physical group of its own number."""
+    # One surface per patch and one volume per region, each in the physical group of its own number.
     patches, regions = _used(content.patch), _used(content.region)
     yield _sizes(0, 0, len(patches), len(regions))
     for group in patches:
@@ -155,17 +154,6 @@ def _elements(content: FileContent, tag: IntArray) -> Iterator[bytes]:
 def _header(section: str, name: str, components: int, count: int) -> bytes:
     """Start of a view: name, time 0, then step 0, number of components, number of nodes or elements."""
     return f'${section}\n1\n"{name}"\n1\n0.0\n3\n0\n{components}\n{count}\n'.encode()
-
-
-def _node_data(temperature_c: FloatArray) -> Iterator[bytes]:
-    """One view of temperatures in the order of the tags."""
-    count = len(temperature_c)
-    yield _header("NodeData", TEMPERATURE_VIEW, 1, count)
-    table = np.empty(count, dtype=[("tag", _INT), ("value", _DOUBLE)])
-    table["tag"] = np.arange(1, count + 1)
-    table["value"] = temperature_c
-    yield table.tobytes()
-    yield b"\n$EndNodeData\n"
 
 
 def _triangle_view(name: str, first_tag: int, values: FloatArray) -> Iterator[bytes]:

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import check_finite, check_shape
+from thermoxels_ns.core.checks import check_finite, check_shape, plain_os_errors
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.files.vtu import boundary_path
+from thermoxels_ns.mesh.files.vtu import boundary_path, silent_vtk
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, Boundary, TetMesh
 
 _REMEDY = "Export the mesh again with ns-export thermoxels-mesh."
@@ -61,25 +61,20 @@ def read_mesh(path: Path | str) -> TetMesh:
 def _read(path: Path) -> Any:
     """Read a VTK file; a damaged one is an error, not an empty mesh."""
     import pyvista as pv
-    from vtkmodules.vtkCommonCore import vtkLogger
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader
 
     if not path.is_file():
         raise _wrong(path.name, f"a file at {path}", "none", _REMEDY)
     reader: Any = vtkXMLPolyDataReader() if path.suffix == ".vtp" else vtkXMLUnstructuredGridReader()
     reader.SetFileName(str(path))
-    data, complaints = None, []
-    before = vtkLogger.GetCurrentVerbosityCutoff()
-    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
-    try:
-        with pv.VtkErrorCatcher(raise_errors=False, send_to_logging=False) as catcher:
-            if reader.CanReadFile(str(path)):
-                reader.Update()
-                data = pv.wrap(reader.GetOutput())
-        complaints = catcher.events
-    finally:
-        vtkLogger.SetStderrVerbosity(before)
-    if data is None or complaints or reader.GetErrorCode() or not data.n_cells:
+    data = None
+    with plain_os_errors(path, "a VTK file that can be read", "Check its permissions.", MeshError), path.open("rb"):
+        pass
+    with silent_vtk() as complaints:
+        if reader.CanReadFile(str(path)):
+            reader.Update()
+            data = pv.wrap(reader.GetOutput())
+    if data is None or complaints.events or reader.GetErrorCode() or not data.n_cells:
         raise _wrong(path.name, f"a VTK file ({path.suffix})", "a damaged or empty one", _REMEDY)
     return data
 
@@ -90,7 +85,7 @@ def _region_names(body: Any, name: str) -> tuple[str, ...]:
     numbers = {}
     for place in range(arrays.GetNumberOfArrays()):
         array = arrays.GetAbstractArray(place)
-        if array.GetName().startswith(_REGION):
+        if (array.GetName() or "").startswith(_REGION):
             numbers[int(array.GetVariantValue(0).ToInt())] = array.GetName().removeprefix(_REGION)
     if sorted(numbers) != list(range(len(numbers))) or not numbers:
         raise _wrong(name, f"field arrays {_REGION}NAME numbered from 0", sorted(numbers) or "none", _REMEDY)

@@ -5,18 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.content import (
     COLOUR_MAP,
-    Colouring,
     check_suffix,
     colour_bytes,
     file_content,
-    surface_colours,
     surface_of,
     surface_range_c,
+    temperature_colours,
     write_bytes,
 )
 from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
@@ -59,26 +57,23 @@ def check_stl(mesh: TetMesh) -> None:
         raise MeshError("mesh for .stl", expected=expected, got=got, remedy=remedy)
 
 
-def write_ply(
-    path: Path | str,
-    mesh: TetMesh,
-    *,
-    temperature_c: npt.NDArray[np.floating] | None = None,
-    colouring: Colouring | None = None,
-) -> None:
+def write_ply(path: Path | str, mesh: TetMesh) -> None:
     """Write the boundary as binary PLY with colours and temperatures (read by MeshLab, CloudCompare, Blender).
 
     Vertex properties: x, y, z [m], red, green, blue, `temperature_c` [degrees Celsius] and `observed` (1: measured,
-    0: extended). A comment says what the colours show.
+    0: extended). Colours are those of the photographs, of temperatures where the mesh has none; a comment says which.
 
     Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
     """
     path = check_suffix(path, ".ply")
-    content = file_content(mesh, temperature_c)
+    content = file_content(mesh)
     surface = surface_of(content.points_m, content.facets)
-    if colouring is None:
-        colouring = "temperature" if mesh.colour is None else "photographs"
-    colours = colour_bytes(surface_colours(mesh, surface, content.temperature_c, colouring))
+    if mesh.colour is None:
+        low, high = surface_range_c(surface, content.temperature_c)
+        shown = f"{COLOUR_MAP} from {low:.6g} to {high:.6g} degrees Celsius"
+        colours = colour_bytes(temperature_colours(surface, content.temperature_c))
+    else:
+        shown, colours = "photographs", colour_bytes(np.asarray(mesh.colour, dtype=np.float64)[surface.nodes])
     columns = {
         "x": ("double", "<f8", surface.points_m[:, 0]),
         "y": ("double", "<f8", surface.points_m[:, 1]),
@@ -96,9 +91,6 @@ def write_ply(
     faces["count"] = 3
     faces["nodes"] = surface.triangles
 
-    low, high = surface_range_c(surface, content.temperature_c)
-    scale = f"{COLOUR_MAP} from {low:.6g} to {high:.6g} degrees Celsius"
-    shown = colouring if colouring == "photographs" else scale
     header = [
         "ply",
         "format binary_little_endian 1.0",

@@ -3,40 +3,36 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.checks import check_finite, check_shape, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import check_shape, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.core.json_values import plain_values
 from thermoxels_ns.mesh.files.content import check_suffix, colour_bytes, file_content, node_arrays, surface_of
 from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
 
-_OWN_ARRAYS = ("temperature_c", "temperature_k", "observed", "colour")
+_DISK_IS_FULL = 20007  # VTK's own number
 
 
-def write_vtu(
-    path: Path | str,
-    mesh: TetMesh,
-    point_data: Mapping[str, npt.NDArray] | None = None,
-    *,
-    temperature_c: npt.NDArray[np.floating] | None = None,
-) -> None:
+def write_vtu(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.floating] | None = None) -> None:
     """Write a mesh as a VTK unstructured grid (.vtu, read by ParaView, pyvista and meshio).
 
     Point arrays: `temperature_c` [degrees Celsius], `temperature_k` [K], `observed` (1: measured, 0: extended) and,
     if the mesh has colours, `colour` (red, green, blue as bytes). Cell array: `region`; field
     arrays `region:NAME` hold the number of each region.
 
-    `point_data` holds more arrays to write, one row per node; `temperature_c` takes the place of the mesh's own.
+    `temperature_c` takes the place of the mesh's own.
 
     Raises:
-        MeshError: An array does not fit the mesh, is not finite, or takes a name that is in use.
+        MeshError: An array does not fit the mesh or is not finite.
         OutputError: The file cannot be written.
     """
     import pyvista as pv
@@ -44,19 +40,8 @@ def write_vtu(
 
     path = check_suffix(path, ".vtu")
     content = file_content(mesh, temperature_c)
-    num_nodes = len(content.points_m)
-    remedy = "Pass one finite value per mesh node."
-    arrays = node_arrays(mesh, content)
-    for name, values in (point_data or {}).items():
-        values = np.asarray(values)
-        if name in _OWN_ARRAYS:
-            expected = f"names other than {_OWN_ARRAYS}"
-            raise MeshError("point_data", expected=expected, got=repr(name), remedy="Rename it.")
-        check_shape(f"point_data[{name!r}]", values, (num_nodes, *values.shape[1:]), remedy, MeshError)
-        arrays[name] = check_finite(f"point_data[{name!r}]", values, remedy, MeshError)
-
     grid = pv.UnstructuredGrid({pv.CellType.TETRA: content.tets}, content.points_m)
-    for name, values in arrays.items():
+    for name, values in node_arrays(mesh, content).items():
         grid.point_data[name] = values
     grid.cell_data["region"] = content.region
     # As numbers: meshio refuses a file that holds text.
@@ -73,10 +58,28 @@ def write_vtk(writer: Any, path: Path, data: Any) -> None:
         writer.SetFileName(str(temporary))
         writer.SetInputData(data)
         writer.SetCompressionLevel(1)  # a quarter of the time of the default, for files 5 % larger
-        if not writer.Write() or writer.GetErrorCode() or not temporary.is_file():
+        with silent_vtk():
+            written = writer.Write() and not writer.GetErrorCode() and temporary.is_file()
+        if not written:
             remedy = "Check the free space and the permissions of the folder."
-            got = f"VTK error {writer.GetErrorCode()}"
+            code = writer.GetErrorCode()  # below 20,000 it is the system's
+            got = "no space left for it" if code == _DISK_IS_FULL else os.strerror(code)
             raise OutputError("mesh file", expected=f"to write {path}", got=got, remedy=remedy)
+
+
+@contextmanager
+def silent_vtk() -> Iterator[Any]:
+    """Keep VTK from writing to the terminal; gives what collects its complaints as `events`."""
+    import pyvista as pv
+    from vtkmodules.vtkCommonCore import vtkLogger
+
+    before = vtkLogger.GetCurrentVerbosityCutoff()
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+    try:
+        with pv.VtkErrorCatcher(raise_errors=False, send_to_logging=False) as catcher:
+            yield catcher
+    finally:
+        vtkLogger.SetStderrVerbosity(before)
 
 
 def write_summary(path: Path | str, summary: Mapping[str, Any]) -> None:
@@ -107,9 +110,7 @@ def boundary_path(path: Path | str) -> Path:
     return path.with_name(f"{path.stem}-boundary.vtp")
 
 
-def write_boundary_vtp(
-    path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.floating] | None = None
-) -> None:
+def write_boundary_vtp(path: Path | str, mesh: TetMesh) -> None:
     """Write the boundary triangles and their tags as VTK polygons (.vtp, read by ParaView and pyvista).
 
     Cell arrays: `normal` (outward, of the true surface), `area_m2` (of the true surface that the triangle stands
@@ -128,7 +129,7 @@ def write_boundary_vtp(
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
     path = check_suffix(path, ".vtp")
-    content = file_content(mesh, temperature_c)
+    content = file_content(mesh)
     surface = surface_of(content.points_m, content.facets)
     arrays: dict[str, npt.NDArray] = {
         "area_factor": content.area_factor,

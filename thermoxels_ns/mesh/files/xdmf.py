@@ -28,7 +28,7 @@ def heavy_data_path(path: Path | str) -> Path:
     return Path(path).with_suffix(".h5")
 
 
-def write_xdmf(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np.floating] | None = None) -> None:
+def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
     """Write a mesh as ``NAME.xdmf`` and ``NAME.h5``.
 
     The grid "mesh" holds the tetrahedra with `region` per cell and `temperature_c`, `temperature_k`, `observed` and,
@@ -50,7 +50,7 @@ def write_xdmf(path: Path | str, mesh: TetMesh, *, temperature_c: npt.NDArray[np
     import h5py
 
     path = check_suffix(path, ".xdmf")
-    content = file_content(mesh, temperature_c)
+    content = file_content(mesh)
     arrays: dict[str, npt.NDArray] = {
         "points_m": content.points_m,
         "tets": content.tets.astype(np.int64),
@@ -83,12 +83,8 @@ def _index(content: FileContent, arrays: dict[str, npt.NDArray], data_file: str)
     domain = add(root, "Domain")
 
     def add_data(parent: ElementTree.Element, name: str) -> None:
-        values = arrays[name]
-        size, kind, width = (
-            " ".join(map(str, values.shape)),
-            _NUMBER_TYPES[values.dtype.kind],
-            str(values.dtype.itemsize),
-        )
+        shape, number = arrays[name].shape, arrays[name].dtype
+        size, kind, width = " ".join(map(str, shape)), _NUMBER_TYPES[number.kind], str(number.itemsize)
         item = add(parent, "DataItem", Format="HDF", Dimensions=size, NumberType=kind, Precision=width)
         item.text = f"{data_file}:/{name}"
 

@@ -52,11 +52,6 @@ def facet_normals(points: FloatArray, facets: IntArray) -> FloatArray:
     return vectors / np.where(length > 0.0, length, 1.0)
 
 
-def dihedral_range_deg(points: FloatArray, tets: IntArray) -> tuple[float, float]:
-    """Smallest and largest angle between two faces of a tetrahedron, [degrees]; 0 at a face without area."""
-    return _volumes_and_angles(points, tets)[1:]
-
-
 def check_mesh(mesh: TetMesh) -> MeshQuality:
     """Check that a mesh is what a finite-element solver needs, and measure it.
 
@@ -75,7 +70,7 @@ def check_mesh(mesh: TetMesh) -> MeshQuality:
     twins = count_twin_nodes(mesh.points_m)
     if twins:
         _fail("points_m", "different positions", f"{twins} nodes at the place of another")
-    volumes, smallest, largest = _volumes_and_angles(mesh.points_m, mesh.tets)
+    volumes, smallest, largest = volumes_and_angles(mesh.points_m, mesh.tets)
     bad = np.flatnonzero(~(volumes > 0.0))
     if len(bad):
         _fail("tetrahedra", "volumes above 0", f"{len(bad)} of {len(volumes)} at or below 0, the first is {bad[0]}")
@@ -177,8 +172,8 @@ def count_overlaps(points: FloatArray, facets: IntArray, sides: Groups) -> int:
     return overlaps
 
 
-def _volumes_and_angles(points: FloatArray, tets: IntArray) -> tuple[FloatArray, float, float]:
-    """Signed volumes, shape (t,), [m^3], and the smallest and largest dihedral angle, [degrees]."""
+def volumes_and_angles(points: FloatArray, tets: IntArray) -> tuple[FloatArray, float, float]:
+    """Signed volumes (t,), [m^3], smallest and largest dihedral angle, [degrees]; 0 at a face without area."""
     volumes = np.empty(len(tets))
     low, high = 1.0, -1.0
     for which, shapes in shapes_in_chunks(points, tets):

@@ -78,7 +78,11 @@ def group_pairs(first: IntArray, second: IntArray) -> Groups:
 def group_faces(tets: IntArray) -> Groups:
     """Find the faces that tetrahedra share; row 4 t + f is the face of tetrahedron t opposite its node f."""
     node = [np.ascontiguousarray(tets[:, n]) for n in range(4)]
-    s0, s1, s2, s3 = _sorted_four(node)
+    # Sorted element by element with five comparisons.
+    a, b = np.minimum(node[0], node[1]), np.maximum(node[0], node[1])
+    c, d = np.minimum(node[2], node[3]), np.maximum(node[2], node[3])
+    s0, low, high, s3 = np.minimum(a, c), np.maximum(a, c), np.minimum(b, d), np.maximum(b, d)
+    s1, s2 = np.minimum(low, high), np.maximum(low, high)
     size = int(s3.max()) + 1 if len(tets) else 1
     lowest, others = np.empty((len(tets), 4), dtype=np.int64), np.empty((len(tets), 4), dtype=np.int64)
     for n, left_out in enumerate(node):
@@ -114,14 +118,6 @@ def edges_of_rows(tets: IntArray, rows: IntArray) -> IntArray:
     """Node numbers of the ends of edges numbered as in `group_edges`, shape (rows, 2)."""
     tet, edge = np.divmod(rows, 6)
     return tets[tet[:, None], TET_EDGES[edge]]
-
-
-def _sorted_four(values: list[IntArray]) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Sort four numbers element by element with five comparisons."""
-    a, b = np.minimum(values[0], values[1]), np.maximum(values[0], values[1])
-    c, d = np.minimum(values[2], values[3]), np.maximum(values[2], values[3])
-    m, n = np.maximum(a, c), np.minimum(b, d)
-    return np.minimum(a, c), np.minimum(m, n), np.maximum(m, n), np.maximum(b, d)
 
 
 def facet_owners(tets: IntArray, facets: IntArray) -> tuple[IntArray, IntArray]:

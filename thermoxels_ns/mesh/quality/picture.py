@@ -19,8 +19,8 @@ _BARS, _BOUND, _INK, _PALE = "#4a78b0", "#b8571b", "#202020", "#606060"
 _MET, _UNMET = "#2a7f3f", "#b3261e"
 
 
-def picture_of_quality(path: Path | str, report: QualityReport, title: str = "") -> None:
-    """Draw the report as a PNG: two histograms above, figures and criteria below; without `title`, counts."""
+def picture_of_quality(path: Path | str, report: QualityReport) -> None:
+    """Draw the report as a PNG: two histograms above, figures and criteria below."""
     from matplotlib.figure import Figure
 
     path = Path(path)
@@ -28,13 +28,17 @@ def picture_of_quality(path: Path | str, report: QualityReport, title: str = "")
         raise OutputError("picture", expected="a name that ends in .png", got=path.name, remedy="Rename the file.")
     # Counts are on a logarithmic axis, because a solver stumbles over the few worst tetrahedra.
     figure = Figure(figsize=(12.5, 9.0), dpi=110, facecolor="white", layout="constrained")
-    title = title or f"Mesh quality, {report.boundary_mode} boundary: {report.num_tets:,} tetrahedra"
+    title = f"Mesh quality, {report.boundary_mode} boundary: {report.num_tets:,} tetrahedra"
     figure.suptitle(title, fontsize=14, color=_INK)
     grid = figure.add_gridspec(2, 2, height_ratios=(1.0, 1.05))
     _draw_angles(figure.add_subplot(grid[0, 0]), report)
     _draw_ratios(figure.add_subplot(grid[0, 1]), report)
     sizes, criteria = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
-    _write_lines(sizes, "Figures", _size_lines(report))
+    _write(sizes, 0.0, 0.98, "Figures", _INK, size=12.0, bold=True)
+    for number, (name, value) in enumerate(_size_lines(report)):
+        y = 0.89 - 0.07 * number
+        _write(sizes, 0.0, y, name, _PALE)
+        _write(sizes, 0.55, y, value, _INK)
     _write_criteria(criteria, report)
     for axis in (sizes, criteria):
         axis.set_axis_off()
@@ -102,14 +106,6 @@ def _size_lines(report: QualityReport) -> list[tuple[str, str]]:
         ("tetrahedra with an obtuse angle", in_percent(report.share_obtuse)),
         ("edges with a positive stiffness entry", in_percent(report.share_positive_edges)),
     ]
-
-
-def _write_lines(axis: Axes, heading: str, lines: list[tuple[str, str]]) -> None:
-    _write(axis, 0.0, 0.98, heading, _INK, size=12.0, bold=True)
-    for number, (name, value) in enumerate(lines):
-        y = 0.89 - 0.07 * number
-        _write(axis, 0.0, y, name, _PALE)
-        _write(axis, 0.55, y, value, _INK)
 
 
 def _write_criteria(axis: Axes, report: QualityReport) -> None:

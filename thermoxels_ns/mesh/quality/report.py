@@ -127,7 +127,11 @@ def quality_report(
         modes = " or ".join(get_args(BoundaryMode))
         raise MeshError("boundary_mode", expected=modes, got=repr(boundary_mode), remedy="Pass one of these.")
     check_arrays(mesh)
-    low_c, high_c = _observed_range(mesh, observed_range_c)
+    observed_c = mesh.temperature_c[np.asarray(mesh.observed, dtype=bool)]
+    if observed_range_c is None and len(observed_c) == 0:
+        remedy = "Pass observed_range_c, the lowest and the highest observed temperature."
+        raise MeshError("mesh observed", expected="at least one node that a thermal ray saw", got="none", remedy=remedy)
+    low_c, high_c = observed_range_c or (float(observed_c.min()), float(observed_c.max()))
     shapes, volumes, stiffness = _measure_shapes(mesh, angle_bins(boundary_mode))
     edges = group_edges(mesh.tets)
     ends = edges_of_rows(mesh.tets, edges.order[edges.start])
@@ -142,6 +146,8 @@ def quality_report(
     areas = facet_areas(mesh.points_m, mesh.facets)
     overlaps = count_overlaps(mesh.points_m, mesh.facets, sides)
     temperature = mesh.temperature_c
+    used = np.zeros(int(mesh.tets.max()) + 1, dtype=bool)
+    used[mesh.tets.ravel()] = True
     figures = Figures(
         min_volume_m3=float(volumes.min()),
         num_non_positive=int(np.count_nonzero(~(volumes > 0.0))),
@@ -167,7 +173,8 @@ def quality_report(
         edge_length_m=(float(lengths.min()), float(lengths.mean()), float(lengths.max())),
         **shapes,
         share_positive_edges=share_positive,
-        bodies_by_node=_bodies_by_node(mesh.tets, ends),
+        # Nodes without a tetrahedron are none.
+        bodies_by_node=count_bodies(len(used), ends) - int(np.count_nonzero(~used)),
         bodies_by_face=count_bodies(len(mesh.tets), tets_across_faces(faces)),
         euler_characteristic=surface.euler_characteristic,
         genus=None if None in genera else sum(genus for genus in genera if genus is not None),
@@ -208,21 +215,3 @@ def _measure_shapes(mesh: TetMesh, bins: AngleBins) -> tuple[dict[str, Any], Flo
 def _histogram(bin_of: FloatArray, bins: int) -> IntArray:
     """Counts of numbers of at least 0 by their whole part; what lies beyond the last bin counts in it."""
     return np.bincount(np.minimum(bin_of.astype(np.int64), bins - 1), minlength=bins)
-
-
-def _observed_range(mesh: TetMesh, given: tuple[float, float] | None) -> tuple[float, float]:
-    """Lowest and highest observed temperature, [degrees Celsius]."""
-    if given is not None:
-        return given
-    observed = mesh.temperature_c[np.asarray(mesh.observed, dtype=bool)]
-    if len(observed) == 0:
-        remedy = "Pass observed_range_c, the lowest and the highest observed temperature."
-        raise MeshError("mesh observed", expected="at least one node that a thermal ray saw", got="none", remedy=remedy)
-    return float(observed.min()), float(observed.max())
-
-
-def _bodies_by_node(tets: IntArray, edges: IntArray) -> int:
-    """Connected components by nodes; nodes without a tetrahedron are none."""
-    used = np.zeros(int(tets.max()) + 1, dtype=bool)
-    used[tets.ravel()] = True
-    return count_bodies(len(used), edges) - int(np.count_nonzero(~used))

@@ -46,15 +46,12 @@ class TetShapes:
             scale = lengths[i] * lengths[j]
             cosine = np.divide(-_dot(self.normals[i], self.normals[j]), scale, out=cosines[edge], where=scale > 0.0)
             cosine[scale == 0.0] = 1.0
-        cosines[np.abs(cosines) < self._right_angle()] = 0.0
+        right: float | FloatArray = _RIGHT_ANGLE
+        if self.rounding != 0.0:
+            shortest = np.sqrt(np.minimum.reduce([_dot(side, side) for side in self.sides]))
+            right = np.maximum(angle_rounding(self.rounding, np.maximum(shortest, self.rounding)), _RIGHT_ANGLE)
+        cosines[np.abs(cosines) < right] = 0.0
         return np.clip(cosines, -1.0, 1.0, out=cosines)
-
-    def _right_angle(self) -> float | FloatArray:
-        """Cosines below this are those of a right angle, one for all or shape (t,)."""
-        if self.rounding == 0.0:
-            return _RIGHT_ANGLE
-        shortest = np.sqrt(np.minimum.reduce([_dot(side, side) for side in self.sides]))
-        return np.maximum(angle_rounding(self.rounding, np.maximum(shortest, self.rounding)), _RIGHT_ANGLE)
 
     def radius_ratios(self) -> FloatArray:
         """Three times the radius of the inscribed over that of the circumscribed sphere, shape (t,).

@@ -87,7 +87,10 @@ def surface_topology(points: FloatArray, facets: IntArray, sides: Groups | None 
     odd_edges = np.bincount(edge_component, weights=uses != 2, minlength=count)
     closed = (odd_edges == 0) & (np.bincount(component[a_corner // 3], minlength=count) == num_vertices)
     is_open = np.bincount(edge_component, weights=uses % 2, minlength=count) > 0
-    cavity = ~is_open & (np.bincount(component, weights=_cone_volumes(points, facets), minlength=count) < 0.0)
+    # Signed volumes between triangles and the middle of the nodes.
+    corner = (points - points.mean(axis=0))[facets]
+    cones = np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6.0
+    cavity = ~is_open & (np.bincount(component, weights=cones, minlength=count) < 0.0)
     order = np.argsort(-num_triangles, kind="stable")
     return SurfaceTopology(
         num_open_edges=num_open,
@@ -120,9 +123,3 @@ def component_of(num: int, first: IntArray, second: IntArray) -> IntArray:
         return np.zeros(0, dtype=np.int64)
     links = sparse.coo_array((np.ones(len(first), dtype=bool), (first, second)), shape=(num, num))
     return connected_components(links, directed=False)[1].astype(np.int64)
-
-
-def _cone_volumes(points: FloatArray, facets: IntArray) -> FloatArray:
-    """Signed volumes between triangles and the middle of the nodes, shape (f,), [m^3]."""
-    corner = (points - points.mean(axis=0))[facets]
-    return np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6.0

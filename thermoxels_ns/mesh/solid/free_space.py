@@ -115,10 +115,10 @@ def _count_along(
     ray_u, ray_v, voxel_u, voxel_v = u.of_voxels(away), v.of_voxels(away), u.at_voxels(away), v.at_voxels(away)
     in_the_way = blocks[ahead] & (away > CLEAR_OF_CAMERA)
     for step, layer in enumerate(ahead.tolist()):
-        (voxels_u, from_u), (voxels_v, from_v) = ray_u.at(step), ray_v.at(step)
+        (voxels_u, from_u), (voxels_v, from_v) = ray_u[step], ray_v[step]
         counts[layer, voxels_u, voxels_v] += now.take(from_u, axis=0).take(from_v, axis=1)
         if in_the_way[step]:
-            (rays_u, from_u), (rays_v, from_v) = voxel_u.at(step), voxel_v.at(step)
+            (rays_u, from_u), (rays_v, from_v) = voxel_u[step], voxel_v[step]
             now[rays_u, rays_v] &= passes[layer].take(from_u, axis=0).take(from_v, axis=1)
 
 
@@ -137,7 +137,7 @@ class _Rays:
     def slopes(self) -> FloatArray:
         return self.low + (np.arange(self.count) + 0.5) * self.step
 
-    def of_voxels(self, away: FloatArray) -> _Runs:
+    def of_voxels(self, away: FloatArray) -> list[tuple[slice, IntArray]]:
         """For layers so far away: the voxels that lie within the pyramid, and the ray nearest to each of them."""
         slope = (np.arange(self.voxels) + 0.5 - self.eye) / away[:, None]
         number = np.clip(np.floor((slope - self.low) / self.step), -1, self.count).astype(np.int64)
@@ -145,25 +145,14 @@ class _Rays:
             number[slope == 1.0] = self.count - 1
         else:
             number[slope == -1.0] = -1
-        return _Runs.inside(number, self.count)
+        return _runs(number, self.count)
 
-    def at_voxels(self, away: FloatArray) -> _Runs:
+    def at_voxels(self, away: FloatArray) -> list[tuple[slice, IntArray]]:
         """For layers so far away: the rays that lie within the layer, and the voxel that each of them meets."""
-        return _Runs.inside(np.floor(self.eye + self.slopes * away[:, None]).astype(np.int64), self.voxels)
+        return _runs(np.floor(self.eye + self.slopes * away[:, None]).astype(np.int64), self.voxels)
 
 
-@dataclass(frozen=True)
-class _Runs:
+def _runs(number: IntArray, count: int) -> list[tuple[slice, IntArray]]:
     """In each row of ascending numbers, the run of those that lie in 0..count - 1."""
-
-    number: IntArray
-    start: list[int]
-    stop: list[int]
-
-    @classmethod
-    def inside(cls, number: IntArray, count: int) -> _Runs:
-        return cls(number, (number < 0).sum(axis=1).tolist(), (number < count).sum(axis=1).tolist())
-
-    def at(self, row: int) -> tuple[slice, IntArray]:
-        run = slice(self.start[row], self.stop[row])
-        return run, self.number[row, run]
+    starts, stops = ((number < end).sum(axis=1).tolist() for end in (0, count))
+    return [(slice(a, b), row[a:b]) for row, a, b in zip(number, starts, stops)]

@@ -15,7 +15,7 @@ from thermoxels_ns.core.arrays import BoolArray, Float32Array
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.mesh.solid.free_space import count_cameras
-from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected, grow
+from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, convex_hull, face_connected, grow, repeated
 
 LARGEST_PASS = 4_000_000  # lattices with more voxels than this are looked at in blocks of 2^3, 4^3, ... voxels.
 SHADOW_SURROUNDED = 0.1
@@ -113,7 +113,10 @@ def _hidden(sealed: BoolArray, lattice: Lattice, views: Views, seal: int) -> Boo
         block *= 2
     if block > 1:
         return _hidden_in_blocks(sealed, lattice, views, seal, block)
-    hull = _hulls(sealed)
+    # The convex hull of every body, strays of which do not count.
+    labels, hull = connected(sealed), np.zeros_like(sealed)
+    for number, box in enumerate(ndimage.find_objects(labels), start=1):
+        hull[box] |= convex_hull(_without_strays(labels[box] == number), of_centres=True)
     if not (hull & ~sealed).any():
         return np.zeros_like(hull)
     shadow = _behind(sealed, lattice, views, SHADOW_SURROUNDED) & hull
@@ -136,26 +139,13 @@ def _hidden_in_blocks(sealed: BoolArray, lattice: Lattice, views: Views, seal: i
     coarse_lattice = Lattice(lattice.lo, lattice.voxel_size * block, (cx + 1, cy + 1, cz + 1))
     hidden = _hidden(coarse, coarse_lattice, views, seal // block)
 
-    def fine(cells: BoolArray) -> BoolArray:
-        for axis in range(3):
-            cells = np.repeat(cells, block, axis=axis)
-        return cells[: shape[0], : shape[1], : shape[2]]
-
     # A block that holds a piece of the shell has an inner and an outer side; its empty voxels go with what they touch.
-    seeds, partly = fine(hidden & ~coarse), fine(coarse) & ~sealed
+    inside = tuple(slice(n) for n in shape)
+    seeds, partly = repeated(hidden & ~coarse, block)[inside], repeated(coarse, block)[inside] & ~sealed
     touching = ndimage.generate_binary_structure(3, 1)
     # In a corner of the shell the way is longest: across the block along all three axes.
     inner = ndimage.binary_dilation(seeds, touching, iterations=3 * (block - 1), mask=partly)
     return np.logical_or(seeds, inner)
-
-
-def _hulls(cells: BoolArray) -> BoolArray:
-    """Voxels within the convex hull of a body, strays of which do not count."""
-    labels = connected(cells)
-    hull = np.zeros_like(cells)
-    for number, box in enumerate(ndimage.find_objects(labels), start=1):
-        hull[box] |= convex_hull(_without_strays(labels[box] == number), of_centres=True)
-    return hull
 
 
 def _without_strays(body: BoolArray) -> BoolArray:
@@ -188,34 +178,27 @@ def winding_number(solid: BoolArray, air: BoolArray) -> Float32Array:
     sources = np.zeros(blocks, dtype=np.float32)
     for axis in range(3):
         jumps = _jumps(side, axis)
-        near, far = [slice(None)] * 3, [slice(None)] * 3
-        near[axis], far[axis] = slice(None, -1), slice(1, None)
         sources += jumps
-        sources[tuple(far)] -= jumps[tuple(near)]
+        np.moveaxis(sources, axis, 0)[1:] -= np.moveaxis(jumps, axis, 0)[:-1]
     waves = np.asarray(fft.dstn(sources, type=1, overwrite_x=True), dtype=np.float32)
     stiffness = [2.0 - 2.0 * np.cos(np.pi * np.arange(1, n + 1) / (n + 1)) for n in blocks]
     waves /= np.add.outer(np.add.outer(stiffness[0], stiffness[1]), stiffness[2]).astype(np.float32)
     winding = np.asarray(fft.idstn(waves, type=1, overwrite_x=True), dtype=np.float32)
     winding = winding[tuple(slice(b, b + (n + 1) // 2) for b, n in zip(before, shape))]
-    for axis in range(3):
-        winding = np.repeat(winding, 2, axis=axis)
-    return winding[tuple(slice(n) for n in shape)]
+    return repeated(winding, 2)[tuple(slice(n) for n in shape)]
 
 
 def _jumps(side: npt.NDArray[np.int8], axis: int) -> Float32Array:
     """Jump from each block to the next along an axis: 1 where all faces are solid before air, -1 air before solid."""
     # A face in the middle of a block counts half at each of the block's ends.
-    near, far = [slice(None)] * 3, [slice(None)] * 3
-    near[axis], far[axis] = slice(None, -1), slice(1, None)
-    first, second = side[tuple(near)], side[tuple(far)]
-    jump = np.zeros_like(side)
-    jump[tuple(near)] = np.where(first * second == -1, first, 0)
+    row, jump = np.moveaxis(side, axis, 0), np.zeros_like(side)
+    np.moveaxis(jump, axis, 0)[:-1] = np.where(row[:-1] * row[1:] == -1, row[:-1], 0)
     nx, ny, nz = (n // 2 for n in side.shape)
     others = tuple(2 * other + 1 for other in range(3) if other != axis)
     pairs = jump.reshape(nx, 2, ny, 2, nz, 2).sum(axis=others, dtype=np.float32) * np.float32(0.25)
     middle, end = np.moveaxis(pairs, axis + 1, 0)
     total = end + 0.5 * middle
-    total[tuple(near)] += 0.5 * middle[tuple(far)]
+    np.moveaxis(total, axis, 0)[:-1] += 0.5 * np.moveaxis(middle, axis, 0)[1:]
     return total
 
 

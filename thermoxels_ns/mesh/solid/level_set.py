@@ -128,10 +128,5 @@ def _thin(cells: BoolArray) -> BoolArray:
 
 def _beside(cells: BoolArray, axis: int, step: int) -> BoolArray:
     """The neighbour of every voxel along an axis; on the border of the lattice, where there is none, the voxel."""
-    ahead, here, border = [slice(None)] * 3, [slice(None)] * 3, [slice(None)] * 3
-    ahead[axis], here[axis] = (slice(1, None), slice(None, -1)) if step > 0 else (slice(None, -1), slice(1, None))
-    border[axis] = slice(-1, None) if step > 0 else slice(0, 1)
-    neighbour = np.empty_like(cells)
-    neighbour[tuple(here)] = cells[tuple(ahead)]
-    neighbour[tuple(border)] = cells[tuple(border)]
-    return neighbour
+    row = np.moveaxis(cells, axis, 0)
+    return np.moveaxis(np.concatenate((row[1:], row[-1:]) if step > 0 else (row[:1], row[:-1])), 0, axis)

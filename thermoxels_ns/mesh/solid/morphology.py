@@ -39,6 +39,30 @@ def connected(cells: BoolArray) -> npt.NDArray[np.int32]:
     return _numbered(cells, np.ones((3, 3, 3)))
 
 
+def repeated(values: npt.NDArray, times: int) -> npt.NDArray:
+    """Repeat every entry of an array so many times along each axis.
+
+    >>> repeated(np.array([[[1, 2]]]), 2)[1].tolist()
+    [[1, 1, 2, 2], [1, 1, 2, 2]]
+    """
+    for axis in range(3):
+        values = np.repeat(values, times, axis=axis)
+    return values
+
+
+def halved(cells: BoolArray, join: np.ufunc) -> BoolArray:
+    """Join each aligned block of 2 x 2 x 2 to one by `np.logical_or` or `np.logical_and`; none lies beyond the border.
+
+    >>> halved(np.array([[[True, False, True]]]), np.logical_or).tolist()
+    [[[True, True]]]
+    """
+    cells = np.pad(cells, [(0, n % 2) for n in cells.shape])
+    for axis in range(3):
+        row = np.moveaxis(cells, axis, 0)
+        cells = np.moveaxis(join(row[0::2], row[1::2]), 0, axis)
+    return cells
+
+
 def grow(cells: BoolArray, by: int) -> BoolArray:
     """Add all voxels that a cube of 2 `by` + 1 voxels around a solid one reaches.
 
@@ -129,10 +153,8 @@ def _spread(cells: BoolArray, axis: int, by: int) -> BoolArray:
     reach = 0
     while reach < by:
         step = min(reach + 1, by - reach)
-        near, far = [slice(None)] * 3, [slice(None)] * 3
-        near[axis], far[axis] = slice(step, None), slice(None, -step)
-        before = grown.copy()
-        grown[tuple(near)] |= before[tuple(far)]
-        grown[tuple(far)] |= before[tuple(near)]
+        row, before = np.moveaxis(grown, axis, 0), np.moveaxis(grown.copy(), axis, 0)
+        row[step:] |= before[:-step]
+        row[:-step] |= before[step:]
         reach += step
     return grown

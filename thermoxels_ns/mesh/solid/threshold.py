@@ -9,7 +9,7 @@ import numpy as np
 
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
+from thermoxels_ns.core.snapshot import GridSnapshot
 
 FALLBACK_OPTICAL_DEPTH = 0.5
 """Density times voxel edge from which on a voxel is solid where rays say nothing: it takes 39 % of the light."""
@@ -66,8 +66,10 @@ def automatic_threshold(snapshot: GridSnapshot, density: FloatArray) -> Threshol
     threshold = min(max(float(np.quantile(met, 1.0 - SHARE_OF_RAYS, method="lower")), low), high)
     # The densities of rays are float32; the threshold is one of them, and its own voxel must reach it.
     dense = density >= np.float32(threshold)
-    cells = dense & ~_leaked_into(evidence, density * voxel)
-    weight = evidence.voxel_weight
+    cells, weight = dense, evidence.voxel_weight
+    if evidence.voxel_ends is not None:
+        passed = (evidence.voxel_ends <= SHARE_THAT_ENDS * weight) & (weight >= LEAST_WEIGHT)
+        cells = dense & ~(passed & (density * voxel < OPAQUE_OPTICAL_DEPTH))
     held = float(weight[cells].sum(dtype=np.float64) / max(weight.sum(dtype=np.float64), 1e-300))
     share = float(np.mean(met >= np.float32(threshold)))
     bound = {low: ", the least that is not half-transparent", high: ", the most that is asked"}.get(threshold, "")
@@ -84,14 +86,6 @@ def automatic_threshold(snapshot: GridSnapshot, density: FloatArray) -> Threshol
         f"there, a voxel of density {threshold:.4g} or more (optical depth {threshold * voxel:.2g} per voxel{bound}). "
         f"{left_out}Those that are solid hold {held:.0%} of the weight that rays spent.",
     )
-
-
-def _leaked_into(evidence: RayEvidence, optical_depth: FloatArray) -> BoolArray:
-    """Voxels that rays pass through rather than end in, and that are not opaque by themselves; none if not known."""
-    if evidence.voxel_ends is None:
-        return np.zeros(optical_depth.shape, dtype=bool)
-    passed = evidence.voxel_ends <= SHARE_THAT_ENDS * evidence.voxel_weight
-    return passed & (evidence.voxel_weight >= LEAST_WEIGHT) & (optical_depth < OPAQUE_OPTICAL_DEPTH)
 
 
 def optical_depth_threshold(snapshot: GridSnapshot, density: FloatArray, optical_depth: float) -> Threshold:

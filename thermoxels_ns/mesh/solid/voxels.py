@@ -160,7 +160,11 @@ def select_solid(
     if thickness is not None:
         assert snapshot.views is not None
         wall = cells | wall_behind(cells, snapshot.lattice, snapshot.views, thickness)
-        cells = step("wall", wall, _wall_remark(selection, thickness))
+        asked = f"{selection.wall_thickness:g} m thick ({thickness:.3g} voxels)"
+        remark = f"The seen surface is made {asked}."
+        if thickness < THINNEST_GROWN:
+            remark = f"A wall {asked} is thinner than one and a half voxels; the seen surface stays as thick as it is."
+        cells = step("wall", wall, remark)
     elif selection.interior == "solid":
         cells = step("interior", *_filled(cells, snapshot, selection))
     return SolidCells(
@@ -211,13 +215,6 @@ def _filled(cells: BoolArray, snapshot: GridSnapshot, selection: SolidSelection)
     if inside.rooms:
         remark += f" {inside.rooms} cavities with a camera in them stay empty."
     return cells | inside.enclosed | inside.hidden, remark
-
-
-def _wall_remark(selection: SolidSelection, thickness: float) -> str:
-    asked = f"{selection.wall_thickness:g} m thick ({thickness:.3g} voxels)"
-    if thickness < THINNEST_GROWN:
-        return f"A wall {asked} is thinner than one and a half voxels; the seen surface stays as thick as it is."
-    return f"The seen surface is made {asked}."
 
 
 def _wall_voxels(

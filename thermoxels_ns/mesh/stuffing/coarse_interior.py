@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermoxels_ns.core.arrays import BoolArray, IntArray
-from thermoxels_ns.mesh.solid.morphology import bounding_box, grow
+from thermoxels_ns.mesh.solid.morphology import bounding_box, grow, halved, repeated
 from thermoxels_ns.mesh.stuffing.bcc_lattice import BccLattice
 
 # The sides of a face lie between its corners 0-1, 1-2, 2-3 and 3-0, counter-clockwise seen from where its axis points.
@@ -48,7 +48,7 @@ def balanced_octree(cells: BoolArray, largest: int) -> tuple[BoolArray, ...]:
     while size < largest:
         # A cube of one voxel touches any cube of two; larger ones need neighbours of at least half their size.
         halves = whole if size == 1 else eroded(whole, 1)
-        whole = _all_of_eight(halves)
+        whole = halved(halves, np.logical_and)
         if not whole.any():
             break
         levels.append(whole)
@@ -58,17 +58,7 @@ def balanced_octree(cells: BoolArray, largest: int) -> tuple[BoolArray, ...]:
 
 def split_in_eight(level: BoolArray, shape: tuple[int, ...]) -> BoolArray:
     """Give each of the eight halves of a cube its value, and cut the array to the shape of the level below."""
-    for axis in range(3):
-        level = np.repeat(level, 2, axis=axis)
-    return level[tuple(slice(n) for n in shape)]
-
-
-def _all_of_eight(level: BoolArray) -> BoolArray:
-    level = np.pad(level, [(0, n % 2) for n in level.shape])
-    for axis in range(3):
-        row = np.moveaxis(level, axis, 0)
-        level = np.moveaxis(row[0::2] & row[1::2], 0, axis)
-    return level
+    return repeated(level, 2)[tuple(slice(n) for n in shape)]
 
 
 @dataclass(frozen=True)

@@ -63,15 +63,6 @@ class Surface:
         squared = np.einsum("ij,ij->i", self.node_normals, self.node_normals)
         return squared > (1.0 - 0.5 * np.radians(_FLAT_DEG) ** 2) ** 2
 
-    def flat_share(self, flat: BoolArray) -> FloatArray:
-        """Share of the area around each triangle that is of flat ones, shape (f,)."""
-        area = np.maximum(_sum_at_nodes(self.facets, self.areas, len(self.points)), np.finfo(np.float64).tiny)
-        share = flat.astype(np.float64)
-        for _ in range(_SHARE_RINGS):
-            at_nodes = _sum_at_nodes(self.facets, self.areas * share, len(self.points)) / area
-            share = at_nodes[self.facets].mean(axis=1)
-        return share
-
 
 @dataclass(frozen=True)
 class Planes:
@@ -94,7 +85,11 @@ def edge_planes(surface: Surface) -> Planes:
     flat = flat_nodes[surface.facets].all(axis=1)
     chamfer = np.zeros(len(surface.points), dtype=bool)
     if flat.any() and not flat.all():
-        chamfer[surface.facets[surface.flat_share(flat) > _LEAST_FLAT_SHARE]] = True
+        count, around = len(surface.points), _sum_at_nodes(surface.facets, surface.areas, len(surface.points))
+        area, share = np.maximum(around, np.finfo(np.float64).tiny), flat.astype(np.float64)
+        for _ in range(_SHARE_RINGS):  # of the area around each triangle, how much is of flat ones
+            share = (_sum_at_nodes(surface.facets, surface.areas * share, count) / area)[surface.facets].mean(axis=1)
+        chamfer[surface.facets[share > _LEAST_FLAT_SHARE]] = True
     nodes = np.flatnonzero(chamfer & ~flat_nodes & ~surface.on_border)
     if len(nodes) == 0:
         none = np.empty((0, 3, 3))

@@ -49,7 +49,12 @@ def sharpen(solid: StuffedSolid, shape: tuple[int, ...]) -> StuffedSolid:
     """
     assert solid.points.min() >= 0.0 and np.all(solid.points.max(axis=0) <= shape)
     surface = Surface.of(solid)
-    moves = _moves(surface, edge_planes(surface))
+    planes = edge_planes(surface)
+    parts = [_ways(surface, planes, which) for which in ([0, 1], [0, 2], [1, 2], [0, 1, 2])]
+    node, to, is_corner, length = (np.concatenate(column) for column in zip(*parts))
+    # Corners first: the nodes nearest to one would otherwise end on the edges beside it.
+    order = np.lexsort((node, length, ~is_corner))
+    moves = _Moves(node[order], to[order], _same_corners(to[order], is_corner[order]))
     moves = moves.keep(np.all((moves.to > 0.0) & (moves.to < shape), axis=1))
     moves = moves.keep(_clear(surface, moves))
     if len(moves.node) == 0:
@@ -69,15 +74,6 @@ class _Moves:
     def keep(self, which: npt.NDArray) -> _Moves:
         """Some of them, by mask or number."""
         return _Moves(self.node[which], self.to[which], self.corner[which])
-
-
-def _moves(surface: Surface, planes: Planes) -> _Moves:
-    """Moves to the edges of two planes and the corners of three."""
-    parts = [_ways(surface, planes, which) for which in ([0, 1], [0, 2], [1, 2], [0, 1, 2])]
-    node, to, is_corner, length = (np.concatenate(column) for column in zip(*parts))
-    # Corners first: the nodes nearest to one would otherwise end on the edges beside it.
-    order = np.lexsort((node, length, ~is_corner))
-    return _Moves(node[order], to[order], _same_corners(to[order], is_corner[order]))
 
 
 def _ways(surface: Surface, planes: Planes, which: list[int]) -> tuple[IntArray, FloatArray, BoolArray, FloatArray]:
@@ -157,7 +153,10 @@ def _carry_out(points: FloatArray, tets: IntArray, moves: _Moves) -> FloatArray:
         next_in_tet = turn[around].min(axis=1)
         np.minimum.at(turn, around.ravel(), np.repeat(next_in_tet, 4))
         now = waiting[turn[node[waiting]] == waiting]
-        now = _first_of_corner(now, waiting, moves.corner)
+        # Without moves to a corner that an earlier one waits for.
+        numbers, earlier = np.unique(moves.corner[waiting], return_index=True)
+        earliest = waiting[earlier][np.searchsorted(numbers, moves.corner[now])]
+        now = now[(moves.corner[now] < 0) | (earliest == now)]
 
         mine = node[now]
         counts = first[mine + 1] - first[mine]
@@ -175,13 +174,6 @@ def _carry_out(points: FloatArray, tets: IntArray, moves: _Moves) -> FloatArray:
     result = points.copy()
     result[nodes] = place
     return result
-
-
-def _first_of_corner(now: IntArray, waiting: IntArray, corner: IntArray) -> IntArray:
-    """Leave out moves to a corner that an earlier one waits for."""
-    numbers, first = np.unique(corner[waiting], return_index=True)
-    earliest = waiting[first][np.searchsorted(numbers, corner[now])]
-    return now[(corner[now] < 0) | (earliest == now)]
 
 
 def _sound(corners: FloatArray) -> BoolArray:

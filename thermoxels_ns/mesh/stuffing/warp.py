@@ -74,7 +74,13 @@ def warp(lattice: BccLattice, buried: BoolArray | None = None) -> WarpedLattice:
     sign = (level > 0.0).astype(np.int8)
     sign -= level < 0.0
     inner = np.flatnonzero(sign > 0 if buried is None else (sign > 0) & ~buried)
-    inside, outside = _ends_of_cut_edges(lattice, sign, inner)
+    touches, touched = np.zeros(len(inner), dtype=bool), np.zeros(len(sign), dtype=bool)
+    for neighbour in lattice.each_neighbour(inner):
+        crosses = sign[neighbour] < 0
+        touches |= crosses
+        touched[neighbour[crosses]] = True
+    # Points inside with a neighbour outside, and points outside with one inside.
+    inside, outside = inner[touches], np.flatnonzero(touched)
 
     moved, moved_to = [], []
     for points, own, alpha in ((inside, 1, ALPHA_INSIDE), (outside, -1, ALPHA_OUTSIDE)):
@@ -86,7 +92,16 @@ def warp(lattice: BccLattice, buried: BoolArray | None = None) -> WarpedLattice:
         behind = points + lattice.offsets[lattice.is_corner(points), OPPOSITE[nearest]]
         thick = sign[behind] == own
         points, nearest, share = points[thick], nearest[thick], share[thick]
-        free = _move_onto_surface(lattice, sign, points, own)
+        # Taking a point away leaves the topology as it is if its neighbours of the same sign can be shrunk to a point.
+        # No two points of one of the four classes (centre or corner, even or odd sum of indices) are neighbours, so
+        # each class may be decided at once.
+        free = np.zeros(len(points), dtype=bool)
+        group = 2 * lattice.is_corner(points) + lattice.block_index(points).sum(axis=1) % 2
+        for number in range(4):
+            members = np.flatnonzero(group == number)
+            alike = sign[lattice.neighbours(points[members])] == own
+            free[members] = _CONTRACTIBLE[alike @ (1 << np.arange(NUM_DIRECTIONS))]
+            sign[points[members[free[members]]]] = 0
         moved.append(points[free])
         moved_to.append(lattice.positions(points[free]) + share[free, None] * DIRECTIONS[nearest[free]])
 
@@ -106,17 +121,6 @@ def warp(lattice: BccLattice, buried: BoolArray | None = None) -> WarpedLattice:
     )
 
 
-def _ends_of_cut_edges(lattice: BccLattice, sign: npt.NDArray[np.int8], inner: IntArray) -> tuple[IntArray, IntArray]:
-    """Points inside with a neighbour outside, and points outside with one inside, both ascending."""
-    touches = np.zeros(len(inner), dtype=bool)
-    touched = np.zeros(len(sign), dtype=bool)
-    for neighbour in lattice.each_neighbour(inner):
-        crosses = sign[neighbour] < 0
-        touches |= crosses
-        touched[neighbour[crosses]] = True
-    return inner[touches], np.flatnonzero(touched)
-
-
 def _cut_shares(lattice: BccLattice, sign: npt.NDArray[np.int8], points: IntArray) -> FloatArray:
     """Share of each edge from the point to its cut, infinite where none is; shape (n, 14)."""
     neighbours = lattice.neighbours(points)
@@ -127,19 +131,3 @@ def _cut_shares(lattice: BccLattice, sign: npt.NDArray[np.int8], points: IntArra
         share = 1.0 / (1.0 - other / own[:, None])
     share[sign[neighbours] != -sign[points][:, None]] = np.inf
     return share
-
-
-def _move_onto_surface(lattice: BccLattice, sign: npt.NDArray[np.int8], points: IntArray, own: int) -> BoolArray:
-    """Set the sign of points to 0 where that keeps the topology of all points of sign `own`; tell which."""
-    # Taking a point away leaves the topology as it is if its neighbours of the same sign can be shrunk to a point. No
-    # two points of one of the four classes (centre or corner, even or odd sum of indices) are neighbours, so each class
-    # may be decided at once.
-    free = np.zeros(len(points), dtype=bool)
-    group = 2 * lattice.is_corner(points) + lattice.block_index(points).sum(axis=1) % 2
-    bits = 1 << np.arange(NUM_DIRECTIONS)
-    for number in range(4):
-        members = np.flatnonzero(group == number)
-        alike = sign[lattice.neighbours(points[members])] == own
-        free[members] = _CONTRACTIBLE[alike @ bits]
-        sign[points[members[free[members]]]] = 0
-    return free

@@ -1,0 +1,68 @@
+"""What may not be read is named as such, not as damaged."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.support.unreadable import forbid
+from thermoxels_ns.capture.pairs import read_pair_list
+from thermoxels_ns.commands.cost import read_runs
+from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.json_values import read_json
+from thermoxels_ns.core.yaml_records import read_yaml
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig
+from thermoxels_ns.data.dataset import ThermalDataset
+from thermoxels_ns.data.scene_box import _read_ply
+from thermoxels_ns.data.sparse_tracks import read_tracks
+from thermoxels_ns.radiometry.thermogram import read_thermogram
+
+READERS = {
+    "tracks.npz": read_tracks,
+    "runs.csv": read_runs,
+    "pairs.csv": lambda path: read_pair_list(path, path.parent),
+    "points.ply": _read_ply,
+    "any.json": read_json,
+    "any.yaml": read_yaml,
+    "thermal.csv": read_thermogram,
+    "thermal.jpg": read_thermogram,
+    "thermal.tiff": read_thermogram,
+}
+
+
+def refused(read) -> None:
+    with pytest.raises(ThermoxelsError) as caught:
+        read()
+    said = str(caught.value)
+    assert "Permission denied" in said and "permissions" in said and "\n" not in said, said
+    assert "damaged" not in said and "Write it again" not in said, said
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_file_that_may_not_be_read(tmp_path: Path, monkeypatch, name) -> None:
+    path = tmp_path / name
+    path.write_text("1,2\n3,4\n")
+    forbid(monkeypatch, name)
+    refused(lambda: READERS[name](path))
+
+
+@pytest.mark.parametrize("part", ["images", "thermal"])
+@pytest.mark.parametrize("suffix", [".png", ".npy"])
+def test_images_of_a_scene(scene_folder, monkeypatch, part, suffix) -> None:
+    def celsius(number: int, shape: tuple[int, int]) -> np.ndarray:
+        return np.full(shape, 20.0 + number, np.float32)
+
+    scene = scene_folder(frames=5, suffix=suffix, counts=celsius if suffix == ".npy" else None)
+    stem = Path(json.loads((scene.path / "transforms.json").read_text())["frames"][0]["file_path"]).stem
+    forbid(monkeypatch, f"{part}/{stem}{'.png' if part == 'images' else suffix}")
+
+    def read() -> None:
+        outputs = ThermalDataParserConfig(data=scene.path).setup().get_dataparser_outputs("train")
+        data = ThermalDataset(outputs)
+        for number in range(len(outputs.image_filenames)):
+            data[number]
+
+    refused(read)

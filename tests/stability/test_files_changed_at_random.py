@@ -1,0 +1,247 @@
+"""Valid files changed at random: each run ends with a right result or with one error that a user can act on."""
+
+from __future__ import annotations
+
+import copy
+import json
+import multiprocessing
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from tests.support.heat_meshes import box_mesh
+from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.yaml_records import configs_folder
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.heat.materials import Material
+from thermoxels_ns.heat.run import run_scene
+from thermoxels_ns.heat.scene_file import load_heat_scene
+from thermoxels_ns.heat.solving import Goals
+from thermoxels_ns.mesh.boundary.patch_rules import load_patch_rules
+from thermoxels_ns.mesh.files.formats import write_mesh
+from thermoxels_ns.mesh.files.read import read_mesh
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+NIGHTLY = "NIGHTLY" in os.environ
+EXAMPLES = settings(
+    max_examples=2000 if NIGHTLY else 100,
+    derandomize=not NIGHTLY,
+    deadline=None,
+    database=None,
+    suppress_health_check=list(HealthCheck),
+)
+LONGEST = 50  # Times of a scene that is also solved
+HOSTILE: list[Any] = [
+    None, True, False, 0, -1, 1, 3, 0.5, -2.5, 1e-300, 1e30, 1e308, 10**400, float("nan"), float("inf"), "", " ", "x",
+    "1", "nan", "x" * 300, "../../etc/passwd", "ü\0", [], {}, [[]], [0, 0, 0], {"a": 1}, "*", "[", "exterior-*",
+]  # fmt: skip
+
+
+def places(tree: Any, path: tuple = ()) -> list[tuple]:
+    """All places in nested lists and mappings."""
+    items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+    return [path] * bool(path) + [place for key, value in items for place in places(value, (*path, key))]
+
+
+@st.composite
+def changed_trees(draw, tree: Any) -> Any:
+    """One to three changes: a value replaced, scaled, nested, doubled or removed, a key renamed."""
+    tree = copy.deepcopy(tree)
+    for _ in range(draw(st.integers(1, 3))):
+        place = draw(st.sampled_from(places(tree)))
+        inside = tree
+        for key in place[:-1]:
+            inside = inside[key]
+        key, what = place[-1], draw(st.sampled_from(["replace", "replace", "scale", "nest", "remove", "rename"]))
+        value = inside[key]
+        if what == "scale" and isinstance(value, (int, float)) and not isinstance(value, bool):
+            inside[key] = value * draw(st.sampled_from([-1.0, 0.0, 1e-9, 1e-3, 1e3, 1e9, 1.0000001]))
+        elif what == "nest":
+            inside[key] = [value, value] if draw(st.booleans()) else {"x": value}
+        elif what == "remove":
+            del inside[key]
+        elif what == "rename" and isinstance(inside, dict):
+            inside[draw(st.sampled_from([f"{key}s", "x", ""]))] = inside.pop(key)
+        else:
+            inside[key] = copy.deepcopy(draw(st.sampled_from(HOSTILE)))
+        if not places(tree):
+            break
+    return tree
+
+
+@st.composite
+def changed_bytes(draw, content: bytes) -> bytes:
+    """Some bytes replaced, cut out or doubled."""
+    for _ in range(draw(st.integers(1, 3))):
+        start = draw(st.integers(0, max(len(content) - 1, 0)))
+        length = draw(st.sampled_from([0, 1, 1, 4, 50, len(content)]))
+        new = draw(st.sampled_from([b"", b"\0", b"9", b"-", b"e9", b"\xff", b"{", b"]", b":", b"\n", content[:40]]))
+        content = content[:start] + new + content[start + length :]
+    return content
+
+
+def either(tree: Any, write: Callable[[Any], str]) -> st.SearchStrategy[bytes]:
+    """Content changed as a tree or as bytes."""
+    text = write(tree).encode()
+    return changed_trees(tree).map(lambda changed: write(changed).encode("utf-8", "replace")) | changed_bytes(text)
+
+
+def ends_well(run: Callable[[], Any]) -> bool:
+    """Whether it had a result; a refusal is one line with a remedy."""
+    try:
+        run()
+    except ThermoxelsError as problem:
+        said = str(problem)
+        assert "\n" not in said and 20 < len(said) < 3000, said
+        return False
+    return True
+
+
+def to_json(tree: Any) -> str:
+    return json.dumps(tree)
+
+
+def to_yaml(tree: Any) -> str:
+    return yaml.safe_dump(tree, allow_unicode=True)
+
+
+def test_transforms_json(scene_folder) -> None:
+    scene, solved = scene_folder(frames=5), [0, 0]
+    camera = dict.fromkeys(("k1", "k2", "p1", "p2"), 0.001)
+    meta = {**scene.meta, **camera, "test_filenames": [scene.meta["frames"][2]["file_path"]], "metres_per_unit": 1.0}
+
+    @EXAMPLES
+    @example(to_json(meta).encode())
+    @given(either(meta, to_json))
+    def check(content: bytes) -> None:
+        (scene.path / "transforms.json").write_bytes(content)
+
+        def run() -> None:
+            parser = ThermalDataParserConfig(data=scene.path).setup()
+            for split in ("train", "val"):
+                found = parser.get_dataparser_outputs(split)
+                cameras = found.cameras
+                assert len(found.image_filenames) == len(found.metadata["thermal_filenames"]) == len(cameras) > 0
+                assert all(path.is_file() for path in (*found.image_filenames, *found.metadata["thermal_filenames"]))
+                for values in (cameras.camera_to_worlds, cameras.fx, cameras.fy, cameras.cx, found.scene_box.aabb):
+                    assert bool(np.isfinite(values.numpy()).all())
+                assert bool((cameras.fx > 0).all()) and bool((found.scene_box.aabb[1] > found.scene_box.aabb[0]).all())
+
+        solved[ends_well(run)] += 1
+
+    check()
+    assert min(solved) > 0, "some are refused, the unchanged one at least is read"
+
+
+def building() -> TetMesh:
+    """A box of 27 nodes whose sides have the names of an export's patches."""
+    names = ("exterior-up", "exterior-side", "exterior-down", "interior-up", "interior-side", "interior-down", "cut")
+    side = np.linspace(0.0, 1.0, 3)
+    mesh = box_mesh(side, side, side)
+    boundary = mesh.boundary
+    patch = np.arange(len(boundary.patch)) % len(names)
+    return replace(mesh, boundary=replace(boundary, patch=patch, patch_names=names))
+
+
+def test_scene_yaml(tmp_path) -> None:
+    """Every effect that a scene may name."""
+    tree = yaml.safe_load((configs_folder() / "scene-all-effects.yaml").read_text(encoding="utf-8"))
+    tree["time"] = {"steps": 3, "step_seconds": 600.0}
+    tree["materials"] = {"*": {"conductivity_w_mk": 1.7, "density_kg_m3": 2200.0, "specific_heat_j_kgk": 880.0}}
+    mesh, path, solved = building(), tmp_path / "scene.yaml", [0, 0]
+
+    @EXAMPLES
+    @example(to_yaml(tree).encode())
+    @given(either(tree, to_yaml))
+    def check(content: bytes) -> None:
+        path.write_bytes(content)
+
+        def run() -> None:
+            scene = load_heat_scene(path)
+            if scene.time is not None and scene.time.num_times > LONGEST:
+                return
+            found = run_scene(scene, mesh, Goals(memory_gb=1.0))
+            assert found.solution.converged and np.isfinite(found.nodes.states_c).all()
+            assert found.solution.energy_residual < 1e-9
+            assert all(np.isfinite(effect.heat_w) for effect in found.results.effects)
+
+        solved[ends_well(run)] += 1
+
+    check()
+    assert min(solved) > 0
+
+
+@pytest.mark.parametrize("kind", ["materials", "patches"])
+def test_conditions(tmp_path, kind) -> None:
+    """Materials in a scene, and rules for patches."""
+    name = {"materials": "scene-concrete.yaml", "patches": "patches-example.yaml"}[kind]
+    tree, path = yaml.safe_load((configs_folder() / name).read_text(encoding="utf-8")), tmp_path / "file.yaml"
+    read, solved = {"materials": load_heat_scene, "patches": load_patch_rules}[kind], [0, 0]
+
+    @EXAMPLES
+    @example(to_yaml(tree).encode())
+    @given(either(tree, to_yaml))
+    def check(content: bytes) -> None:
+        path.write_bytes(content)
+        solved[ends_well(lambda: read(path))] += 1
+
+    check()
+    assert min(solved) > 0
+
+
+def read_changed(folder: Path, examples: list[tuple[str, bytes]], said) -> None:
+    """In a process of its own: VTK may end it."""
+    whole = {name: (folder / name).read_bytes() for name in ("mesh.vtu", "mesh-boundary.vtp")}
+    for name, content in examples:
+        (folder / name).write_bytes(content)
+        try:
+
+            def run() -> None:
+                mesh = read_mesh(folder / "mesh.vtu")
+                HeatProblem(mesh, Material("concrete", 1.7, 2200.0, 880.0))
+                assert (
+                    mesh.tets.min() >= 0 and mesh.tets.max() < len(mesh.points_m) and np.isfinite(mesh.points_m).all()
+                )
+
+            said.send(("ok", ends_well(run)))
+        except BaseException as problem:
+            said.send(("wrong", f"{name}: {problem!r}"))
+        (folder / name).write_bytes(whole[name])
+    said.send(("done", True))
+
+
+def test_mesh_files(tmp_path) -> None:
+    write_mesh(tmp_path / "mesh.vtu", building())
+    examples: list[tuple[str, bytes]] = []
+
+    @EXAMPLES
+    @given(st.data())
+    def collect(data) -> None:
+        name = data.draw(st.sampled_from(["mesh.vtu", "mesh-boundary.vtp"]))
+        examples.append((name, data.draw(changed_bytes((tmp_path / name).read_bytes()))))
+
+    collect()
+    context = multiprocessing.get_context("fork")
+    receive, send = context.Pipe(duplex=False)
+    process = context.Process(target=read_changed, args=(tmp_path, examples, send))
+    process.start()
+    send.close()
+    said: list[tuple[str, Any]] = []
+    while not said or said[-1][0] != "done":
+        assert receive.poll(300), f"no end of example {len(said)}"
+        try:
+            said.append(receive.recv())
+        except EOFError:
+            pytest.fail(f"the process ended in example {len(said)}: {examples[len(said)]}")
+    process.join()
+    assert [what for kind, what in said if kind == "wrong"] == []
+    assert 0 < sum(what for kind, what in said if kind == "ok") < len(examples)

@@ -1,0 +1,23 @@
+"""Files that may not be read, also for root."""
+
+import builtins
+import errno
+import io
+import os
+from pathlib import Path
+
+import pytest
+
+
+def forbid(monkeypatch: pytest.MonkeyPatch, ending: str) -> None:
+    """Let no file whose path ends so be opened from Python."""
+    true_open = io.open
+
+    def refusing(file, *arguments, **options):
+        if isinstance(file, (str, os.PathLike)) and os.fspath(file).endswith(ending):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(file))
+        return true_open(file, *arguments, **options)
+
+    monkeypatch.setattr(builtins, "open", refusing)
+    monkeypatch.setattr(io, "open", refusing)
+    monkeypatch.setattr(Path, "open", lambda path, *arguments, **options: refusing(path, *arguments, **options))
