@@ -1,3 +1,4 @@
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -5,9 +6,12 @@ import pytest
 
 from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh, planes
-from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
+from thermoxels_ns.fem.quantities import tabulated
 from thermoxels_ns.heat import solving as heat_solving
 from thermoxels_ns.heat.effects import Convection, HeatFlux
+from thermoxels_ns.heat.materials import Material
 
 
 class Clock:
@@ -95,3 +99,48 @@ def test_what_is_left_out_counts_against_the_tolerance(monkeypatch) -> None:
 def test_what_may_be_left_out_unless_it_is_said(tolerance_k, share, given, expected) -> None:
     goals = heat_solving.Goals(tolerance_k=tolerance_k, flow_tolerance=share, leave_out_below_k=given)
     assert goals.left_out_k == pytest.approx(expected) and np.isfinite(expected)
+
+
+def tight_wall(flux_w_m2: float) -> HeatProblem:
+    """A wall of U = 0.1 W/(m2 K) between airs of 20 and 0 degrees, with a flux on its outer face."""
+    mesh = box_mesh(planes(0.0, 0.34, step=0.034), [0.0, 0.1], [0.0, 0.1], temperature_c=20.0)
+    effects = Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, 0.0), HeatFlux(("x1",), flux_w_m2)
+    return HeatProblem(mesh, Material("wool", 0.035, 30.0, 1000.0), effects=effects)
+
+
+@pytest.mark.parametrize("time", [None, TimeSteps(10, 1e6)])
+def test_what_matters_to_heat_flows_is_built_however_little_it_warms(time) -> None:
+    """0.2 W/m2 warm a face with 25 W/(m2 K) by 0.008 K, but 2 W/m2 are all that flows through the wall."""
+    lines: list[str] = []
+    found = heat_solving.solve_problem(tight_wall(0.2), time, heat_solving.Goals(), lines.append)
+    assert found.screening.left_out == () and len(found.solution.effects) == 3
+    assert found.screening.kept[2].reason == "it matters to heat flows"
+    assert any("solved again" in line and "--leave-out-below-k 0.01" in line for line in lines)
+    in_kelvin = heat_solving.solve_problem(tight_wall(0.2), time, heat_solving.Goals(leave_out_below_k=0.01))
+    assert len(in_kelvin.screening.left_out) == 1, "if kelvins are asked for, they count alone"
+    outside_w = [float(np.mean(each.solution.effects[1].heat_w)) for each in (found, in_kelvin)]
+    assert outside_w[0] / outside_w[1] > 1.05
+    little = heat_solving.solve_problem(tight_wall(0.01), time, heat_solving.Goals())
+    assert [entry.effect for entry in little.screening.left_out] == ["heat flux on x1"]
+    assert little.screening.bound_w == pytest.approx(0.01 * 0.01)
+
+
+def test_nothing_that_brings_heat_is_left_out_beside_a_tolerance_of_heat_flows() -> None:
+    found = solved(tight_wall(0.01), flow_tolerance=0.05, leave_out_below_k=0.1)
+    assert found.screening.left_out == ()
+
+
+def test_to_a_tolerance_effects_are_looked_at_as_steps_are_taken(monkeypatch) -> None:
+    """Steps are then chosen by their error: what happens between the scene's own steps counts."""
+    pulse = tabulated([0.0, 600.0, 1200.0, 1800.0], [0.0, 500.0, 0.0, 0.0])
+    problem = replace(tight_wall(0.0), effects=(HeatFlux(("x1",), pulse),))
+    asked: list[Any] = []
+
+    def remember(kept, tolerance, **named):
+        asked.append(kept)
+        raise HeatError("enough")
+
+    monkeypatch.setattr(heat_solving, "solve_to_tolerance", remember)
+    with pytest.raises(HeatError, match="enough"):
+        heat_solving.solve_problem(problem, TimeSteps(1, 1800.0), heat_solving.Goals(tolerance_k=0.5))
+    assert asked[0].effects == problem.effects

@@ -36,8 +36,9 @@ class HeatOptions:
     Through time the first estimate needs room for a mesh of half the size."""
     leave_out_below_k: float | None = None
     """Effects that together can change no temperature by more than this are left out, [K]; the report lists each with
-    its bound. 0 builds everything that the scene names. Left out: a fifth of --tolerance, which counts against it; 0.01
-    without one (a fifth of the default tolerance of the time steps); 0 beside --flow-tolerance."""
+    its bound. 0 builds all that brings heat; so do meshes with obtuse angles, as exports are, and --flow-tolerance.
+    Left out: a fifth of --tolerance, which counts against it, or 0.01 without one (a fifth of the default tolerance of
+    the time steps), and what may change a mean heat flow by more than 1 % of all heat that flows is built, too."""
     up: tuple[float, float, float] | None = None
     """Direction that points up in the coordinates of the mesh, if the scene does not say. Default: that of the
     export's summary.json beside the mesh, or else z."""

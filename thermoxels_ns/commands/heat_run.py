@@ -117,6 +117,7 @@ def answers_of(options: HeatOptions, run: HeatRun) -> dict[str, Any]:
         "built": [asdict(entry) for entry in screening.kept],
         "left_out": [asdict(entry) for entry in screening.left_out],
         "left_out_bound_k": screening.bound_k,
+        "left_out_bound_w": screening.bound_w,
         "left_out_note": screening.note,
         "assembled": dict(run.solution.assembled.counts),
         "newton_iterations": int(np.sum(run.solution.newton_iterations)),

@@ -13,7 +13,7 @@ from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.memory import DEFAULT_MEMORY_BYTES, check_memory, describe_bytes, peak_bytes
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.quantities import Bounds
-from thermoxels_ns.fem.solution import Solution
+from thermoxels_ns.fem.solution import Solution, mean_flows_w
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.fem.tolerance import Tolerance, ToleratedSolution, solve_to_tolerance
@@ -25,6 +25,8 @@ Time = TimeSteps | AdaptiveSteps | None  # How a body is followed; None: its ste
 LEFT_OUT_SHARE = 0.2
 """Share of the tolerance that effects which are left out may use together; the solver gets what they do not use."""
 LEAVE_OUT_BELOW_K = 0.01  # The same without a tolerance, [K]: a fifth of the default tolerance of the time steps
+LEFT_OUT_FLOW = 0.01
+"""Share of all heat that flows by which what is left out may change the mean heat flow of any effect (ISO 10211)."""
 SAY_EVERY_S = 10.0  # Time between two lines of progress, [s]
 SAY_FIRST_S = 1.0  # Time of a first step from which on it is said, [s]: then the next ones will take some, too
 
@@ -46,7 +48,8 @@ class Goals:
     flow_tolerance: float | None = None
     """Largest error of the mean heat flow of any effect, as a share of all heat; None: any."""
     leave_out_below_k: float | None = None
-    """Effects that together can change no temperature by more than this are left out, [K]; None: `left_out_k`."""
+    """Effects that together can change no temperature by more than this are left out, [K]; None: `left_out_k`, and no
+    mean heat flow of an effect by more than a hundredth of all heat that flows."""
     memory_gb: float | None = 4.0  # Most memory that solving may take, [GiB]; None: any
     allow_unmet: bool = False  # Whether the best that fits into the memory will do if a tolerance cannot be met
 
@@ -72,6 +75,11 @@ class Goals:
         if self.flow_tolerance is not None:
             return 0.0
         return LEAVE_OUT_BELOW_K if self.tolerance_k is None else LEFT_OUT_SHARE * self.tolerance_k
+
+    @property
+    def left_out_w(self) -> float:
+        """Heat that they may bring, [W]: none beside a tolerance of heat flows, otherwise as it turns out."""
+        return np.inf if self.flow_tolerance is None else 0.0
 
     def check_fits(self, time: Time) -> None:
         """Raise `HeatError` for a tolerance of heat flows alone beside a duration: it does not choose the steps."""
@@ -122,7 +130,21 @@ def solve_problem(problem: HeatProblem, time: Time, goals: Goals, say: Say = lam
         allowed = DEFAULT_MEMORY_BYTES if goals.memory_gb is None else goals.memory_gb * 2**30
         remedy = "Keep temperatures at fewer times: fewer steps or outputs; or pass a larger --memory-gb."
         check_memory(8.0 * time.num_times * len(problem.mesh.points_m), allowed, remedy)
-    screening = screen(problem, time, goals.left_out_k)
+    # To a tolerance steps are chosen by their error, whatever the scene says.
+    asked = AdaptiveSteps(time.duration_s) if goals.estimated and time is not None else time
+    found = _solve_screened(screen(problem, asked, goals.left_out_k, goals.left_out_w), time, goals, say)
+    through_w = 0.5 * sum(map(abs, mean_flows_w(found.solution).values()))
+    if goals.leave_out_below_k is None and found.screening.bound_w > LEFT_OUT_FLOW * through_w:
+        say(
+            f"What is left out may bring {found.screening.bound_w:.3g} W beside {through_w:.3g} W that flow, more "
+            f"than {LEFT_OUT_FLOW:.0%}: solved again with it (not if you pass --leave-out-below-k 0.01)."
+        )
+        again = screen(problem, asked, goals.left_out_k, LEFT_OUT_FLOW * through_w)
+        found = _solve_screened(again, time, goals, say)
+    return found
+
+
+def _solve_screened(screening: Screening, time: Time, goals: Goals, say: Say) -> SolvedProblem:
     _say_what_is_built(screening, say)
     kept, memory_bytes = screening.problem, np.inf if goals.memory_gb is None else goals.memory_gb * 2**30
     if goals.estimated:

@@ -228,8 +228,8 @@ def _built(run: HeatRun) -> Section:
         words.append("The scene names nothing that acts on the body: its surface is insulated.")
     elif screening.left_out:
         words.append(
-            f"Left out, together they could change temperatures by {screening.bound_k:.2g} K at most; the tolerance is "
-            f"{screening.tolerance_k:g} K. {screening.note}"
+            f"Left out, together they could change temperatures by {screening.bound_k:.2g} K and mean heat flows by "
+            f"{screening.bound_w:.2g} W at most; the tolerance is {screening.tolerance_k:g} K. {screening.note}"
         )
         words.append(f"To find out took {screening.seconds:.2f} s.")
     else:
