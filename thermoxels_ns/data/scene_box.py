@@ -30,7 +30,6 @@ _MOST_POINTS = 20_000
 _MOST_PHOTOGRAPHS = 64  # Photographs in which points are looked at
 _STEREO_PHOTOGRAPHS, _STEREO_SIDE = 32, 96
 """Photographs whose depths are compared, and pixels along their longer side: some seconds."""
-_FEWEST_VIEWS = 2  # Other photographs that a depth must agree with: within a room hardly a place is in view of more
 _FEWEST_POINTS = 10
 _FEWEST_DEPTHS = 200
 _LEAST_SHOWN, _MOST_WITHOUT = 0.15, 0.1
@@ -119,7 +118,7 @@ def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
         camera = frame.intrinsics.resized(picture.shape[1], picture.shape[0])
         pinholes.append(photographs.pinhole(picture, mask, camera, frame.pose, _STEREO_SIDE))
     seen = photographs.gathered(pinholes, [frame.pose[:3, 3] for frame in frames])
-    return stereo.feature_rays_to_depths(stereo.depths_of(seen, fewest_views=_FEWEST_VIEWS)).points, len(frames)
+    return stereo.feature_rays_to_depths(stereo.depths_of(seen)).points, len(frames)
 
 
 def box_of_points(

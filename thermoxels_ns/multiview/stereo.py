@@ -15,7 +15,7 @@ from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.threads import run_ranges
 from thermoxels_ns.multiview.backdrop import plain_backdrop
 from thermoxels_ns.multiview.photographs import Photographs, read_photographs
-from thermoxels_ns.multiview.stereo_kernels import OUTSIDE, agreeing_views, correlate, weigh_patches
+from thermoxels_ns.multiview.stereo_kernels import OUTSIDE, correlate, other_views, weigh_patches
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -36,8 +36,9 @@ SMALLEST_CONTRAST = 1.5 / 255.0  # Standard deviation of brightness within a pat
 LEAST_CORRELATION = 0.6  # Correlation below which photographs do not agree
 TOLERANCE = 0.3
 """Share of the distance between planes, of both photographs together, by which depths that agree may differ."""
-FEWEST_VIEWS = 3  # Photographs whose own depths must lie where a sure one does
+FEWEST_VIEWS = 2  # Photographs whose own depths must lie where a sure one does
 VIEWS_PER_CONTRADICTION = 2  # As many must do so for each photograph that looks through the point
+VIEWS_TO_CONTRADICT = 3  # Photographs that must agree with a depth behind the point, which is else likely to be wrong
 FEWEST_AROUND = 6
 """Of the eight pixels around a sure one, those whose depths agree with its own too: outlines and noise have fewer."""
 LEAST_SHARE = 0.01  # Share of the pixels whose depth must be sure; less is chance
@@ -70,20 +71,19 @@ def depths_of(
     photographs: Photographs,
     lo: npt.ArrayLike | None = None,
     hi: npt.ArrayLike | None = None,
-    fewest_views: int = FEWEST_VIEWS,
 ) -> Depths:
     """Find the depths of photographs: in a box and behind it, or wherever they see the same from different directions.
 
     For each photograph, its neighbours are drawn onto planes parallel to it, one behind the other, and compared with it
     patch by patch (plane sweep, Collins 1996; normalised cross-correlation). The plane on which they agree best is the
-    depth of a pixel. It counts where depths of other photographs, found on their own, lie in the same place. Within a
-    patch only pixels of the middle one's colour count: else an outline gives its depth to all that lies beside it.
+    depth of a pixel. It counts where depths of other photographs, found on their own, lie in the same place, and not
+    too many that others confirm lie behind it. Within a patch only pixels of the middle one's colour count: else an
+    outline gives its depth to all that lies beside it.
 
     Args:
         photographs: Pinhole photographs, best some 160 pixels wide: cost grows with the third power of their size.
         lo: Lower corner of the box, [world units]. None: no box.
         hi: Upper corner.
-        fewest_views: Photographs whose own depths must lie where a sure one does.
 
     Returns:
         Depths; not known anywhere where no photograph has a neighbour.
@@ -105,19 +105,20 @@ def depths_of(
 
     run_ranges(work, len(views), 1)
     depth[~(correlation >= LEAST_CORRELATION)] = np.nan
-    agreeing, looking_through = (np.zeros(total, dtype=np.int32) for _ in range(2))
+    agreeing, behind = (np.zeros(total, dtype=np.int32) for _ in range(2))
     matrices, inverses = photographs.matrices, np.stack([view.inverse for view in views])
-    centres, sizes, firsts = photographs.centres, photographs.sizes, photographs.firsts
+    cameras = (matrices, inverses, photographs.centres, photographs.sizes, photographs.firsts)
 
     def compare(begin: int, end: int) -> None:
-        agreeing_views(
-            begin, end, matrices, inverses, centres, sizes, firsts, depth, error, TOLERANCE, agreeing, looking_through
-        )
+        other_views(begin, end, *cameras, depth, error, TOLERANCE, confirmed, agreeing, behind)
 
+    confirmed = np.zeros(total, dtype=bool)
     run_ranges(compare, total, 4096)
-    sure = (agreeing >= fewest_views) & (agreeing >= VIEWS_PER_CONTRADICTION * looking_through)
+    confirmed = agreeing >= VIEWS_TO_CONTRADICT
+    run_ranges(compare, total, 4096)
+    sure = (agreeing >= FEWEST_VIEWS) & (agreeing >= VIEWS_PER_CONTRADICTION * behind)
     depth[~sure] = np.nan
-    for view, first in zip(views, firsts):
+    for view, first in zip(views, photographs.firsts):
         shape = view.brightness.shape
         pixels = slice(first, first + view.brightness.size)
         depth[pixels][~_backed(depth[pixels].reshape(shape), error[pixels].reshape(shape)).ravel()] = np.nan

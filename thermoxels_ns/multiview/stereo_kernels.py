@@ -112,14 +112,14 @@ def correlate(brightness, others, radius, weights, means, variances, noise, coun
 
 
 @kernel
-def agreeing_views(
-    begin: int, end: int, matrices, inverses, centres, sizes, firsts, depth, error, tolerance, agreeing, looking_through
+def other_views(
+    begin: int, end: int, matrices, inverses, centres, sizes, firsts, depth, error, tolerance, asked, agreeing, behind
 ):
-    """Count the other photographs whose own depth lies where that of a pixel does, and those that look through it.
+    """Count the other photographs whose own depth lies where that of a pixel does, and those where it lies behind.
 
     Depths agree if they differ by no more than `tolerance` times the sum of both pixels' errors; a photograph looks
-    through the point if its own depth is farther by more than twice that sum. Pixels `begin` to `end`; 0 where a depth
-    is NaN.
+    through the point if its own depth is farther by more than twice that sum. Only pixels that are `asked` can look
+    through. Pixels `begin` to `end`; 0 where a depth is NaN.
     """
     number = len(firsts) - 1
     while number > 0 and firsts[number] > begin:
@@ -127,7 +127,7 @@ def agreeing_views(
     for n in range(begin, end):
         while number + 1 < len(firsts) and firsts[number + 1] <= n:
             number += 1
-        agreeing[n], looking_through[n] = 0, 0
+        agreeing[n], behind[n] = 0, 0
         if np.isnan(depth[n]):
             continue
         u = (n - firsts[number]) % sizes[number, 0] + 0.5
@@ -148,8 +148,8 @@ def agreeing_views(
             if not (column >= 0.0 and column < sizes[k, 0] and row >= 0.0 and row < sizes[k, 1]):
                 continue
             at = firsts[k] + int(row) * sizes[k, 0] + int(column)
-            behind, planes = depth[at] - far, error[at] + error[n]  # neither is true where they are NaN
-            if abs(behind) <= tolerance * planes:
+            farther, planes = depth[at] - far, error[at] + error[n]  # neither is true where they are NaN
+            if abs(farther) <= tolerance * planes:
                 agreeing[n] += 1
-            elif behind > 2.0 * planes:
-                looking_through[n] += 1
+            elif asked[at] and farther > 2.0 * planes:
+                behind[n] += 1
