@@ -246,11 +246,12 @@ class HeatProblem:
 
 def effect_labels(problem: HeatProblem) -> tuple[str, ...]:
     """Names of a problem's effects for reports, all different: a second one of the same kind and place is numbered."""
-    labels: list[str] = []
-    for effect in problem.effects:
-        label, number = effect.label, 1
-        while label in labels:
+    numbers: dict[str, int] = {}
+    for own in (effect.label for effect in problem.effects):
+        label, number = own, numbers.get(own, 1)
+        while label in numbers:
             number += 1
-            label = f"{effect.label} ({number})"
-        labels.append(label)
-    return tuple(labels)
+            label = f"{own} ({number})"
+        numbers[own] = number
+        numbers.setdefault(label, 1)
+    return tuple(numbers)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from fnmatch import fnmatchcase
 from functools import cached_property
 
@@ -97,13 +98,24 @@ def _check_indices(name: str, indices: npt.NDArray[np.int64], count: int, remedy
         raise HeatError(name, expected=f"numbers from 0 to {count - 1}", got=got, remedy=remedy)
 
 
+def matching_names(names: Collection[str], pattern: str) -> list[str]:
+    """Names that a pattern means; one without `*`, `?` and `[` is a name itself, which only has to be there.
+
+    >>> [matching_names(["wall-7", "wall"], pattern) for pattern in ("wall-7", "wall*", "Wall")]
+    [['wall-7'], ['wall-7', 'wall'], []]
+    """
+    if any(sign in pattern for sign in "*?["):
+        return [name for name in names if fnmatchcase(name, pattern)]
+    return [pattern] if pattern in names else []
+
+
 def _matching(field: str, patterns: tuple[str, ...], names: tuple[str, ...]) -> npt.NDArray[np.bool_]:
     """Mark the names that match any pattern; each pattern must match one. Letters count as upper and lower case."""
     chosen = np.zeros(len(names), dtype=bool)
     for pattern in patterns:
-        matches = np.array([fnmatchcase(name, pattern) for name in names], dtype=bool)
-        if not matches.any():
+        matches = matching_names(names, pattern)
+        if not matches:
             expected, remedy = ", ".join(names), "Correct the name, or tag the mesh so that it has such a part."
             raise HeatError(field, expected=f"names or patterns of {expected}", got=repr(pattern), remedy=remedy)
-        chosen |= matches
+        chosen |= np.isin(names, matches) if len(matches) > 1 else np.array(names) == matches[0]
     return chosen

@@ -412,7 +412,8 @@ def heat_by_part(
         groups += held.groups
         kept_w = -system.net_heat_at_fixed(temperature_c - system.reference_c, time_s)
         flows.append(held.shares @ kept_w)
-    named = [label for label in effect_labels(problem) if any(owner == label for owner, _ in groups)]
+    owners = {owner for owner, _ in groups}
+    named = [label for label in effect_labels(problem) if label in owners]
     return heat_by_effect(named, groups, np.concatenate([np.zeros(0), *flows])[None])
 
 
@@ -424,9 +425,9 @@ def heat_through_parts(effects: Sequence[EffectHeat], part_names: Sequence[str])
     [[2.0, 0.0, 4.0]]
     """
     rows = len(effects[0].heat_w) if effects else 1
-    total = np.zeros((rows, len(part_names)))
+    total, columns = np.zeros((rows, len(part_names))), {name: number for number, name in enumerate(part_names)}
     for effect in effects:
         for column, name in enumerate(effect.group_names):
-            if name in part_names:
-                total[:, list(part_names).index(name)] += effect.group_heat_w[:, column]
+            if name in columns:
+                total[:, columns[name]] += effect.group_heat_w[:, column]
     return total

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
-from itertools import combinations
 
 import numpy as np
 import yaml
 
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.selection import Selection, matching_names
 from thermoxels_ns.heat.scene_fields import Surface
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -33,7 +32,7 @@ class ScenePatches:
         """Give the patches that match any pattern of the entry `name`; raises `HeatError` if one matches none."""
         found: set[str] = set()
         for pattern in patterns:
-            matches = {patch for patch in self.area_m2 if fnmatchcase(patch, pattern)}
+            matches = set(matching_names(self.area_m2, pattern))
             if not matches:
                 expected = f"names or patterns of the patches {', '.join(self.area_m2)}"
                 remedy = "Correct the name, or tag the mesh so that it has such a patch."
@@ -76,11 +75,13 @@ class ScenePatches:
 
 def check_disjoint(what: str, entries: Sequence[tuple[str, set[str]]], remedy: str) -> None:
     """Refuse entries, given by name and patches, of which two act on one patch."""
-    for (first, where), (second, elsewhere) in combinations(entries, 2):
-        both = sorted(where & elsewhere)
-        if both:
+    taken: dict[str, str] = {}
+    for second, elsewhere in entries:
+        for first in sorted({taken[patch] for patch in elsewhere & taken.keys()})[:1]:
+            both = sorted(patch for patch in elsewhere if taken.get(patch) == first)
             got = f"{second} on {', '.join(both)} as well"
             raise HeatError(first, expected=f"{what} once on each patch", got=got, remedy=remedy)
+        taken |= dict.fromkeys(elsewhere, second)
 
 
 def _what_may_act(acting: set[str], forgotten: Sequence[str]) -> str:

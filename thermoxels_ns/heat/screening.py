@@ -190,6 +190,7 @@ _WORTH_A_STEP = 1e4
 """Bound over tolerance above which the implicit step is not tried: it would not bring the bound below the tolerance."""
 _STEP_TOLERANCE = 1e-3
 """Relative tolerance of the linear solver in the implicit step; the bound of `screen` holds for an inexact v too."""
+_ROUND_OFF = 1e-12  # Share of the convection at a node below which nothing of it is kept
 
 
 @dataclass(frozen=True)
@@ -282,9 +283,7 @@ def screen(
     return Screening(
         problem=replace(problem, effects=kept_effects) if left else problem,
         kept=tuple(screener.why_kept(number) for number in range(len(names)) if number not in left),
-        left_out=tuple(
-            LeftOut(names[n], left[n].value_k, float(screener.largest_w[n].sum()), left[n].reason) for n in sorted(left)
-        ),
+        left_out=tuple(LeftOut(names[n], left[n].value_k, screener.brings_w[n], left[n].reason) for n in sorted(left)),
         tolerance_k=tolerance_k,
         note=screener.note(),
         seconds=clock.perf_counter() - begin,
@@ -305,7 +304,8 @@ class _Screener:
         self._mass: Vector = np.ones(0)
         if time is not None:
             self._mass = lumped_mass(mesh.points_m, mesh.tets, problem.heat_capacity_j_m3k)
-        self._holds = [bool(heat.held_w_k.any()) for heat in self.heats]
+        self._held_w_k: Vector = sum((heat.held_w_k for heat in self.heats), np.zeros(self._space.num_nodes))
+        self._holding: Vector = sum((heat.holds.astype(float) for heat in self.heats), np.zeros(self._space.num_nodes))
         self._free = ~np.logical_or.reduce([heat.fixed for heat in self.heats])
         self._stiffness: sparse.csr_matrix | None = None
         self._obtuse = False
@@ -313,24 +313,35 @@ class _Screener:
         span = self._range()
         self._one_temperature = bool(span.low == span.high)
         self.largest_w = [heat.largest_w(span) for heat in self.heats]
+        self.brings_w = [float(heat_w.sum()) for heat_w in self.largest_w]
         self._alone_bounds = [self._alone(number) for number in range(len(self.heats))]
         if min(bound.value_k for bound in self._alone_bounds) <= _WORTH_A_STEP * tolerance_k:
             self._stiffness = self._space.stiffness(problem.conductivity_w_mk)
             self._obtuse = not holds_maximum_principle(self._stiffness)
+            self._pieces = Pieces(self._stiffness)
 
     def left_out(self) -> dict[int, _Bound]:
         """Choose what is left out: the least first, as long as all bounds together keep within the tolerance."""
         left: dict[int, _Bound] = {}
         if self._stiffness is None:
             return left
+        gone_w_k, gone, total_k, total_w = np.zeros_like(self._held_w_k), np.zeros_like(self._holding), 0.0, 0.0
         for number in sorted(range(len(self.heats)), key=lambda n: self._alone_bounds[n].value_k):
-            # Bounds of what is left already change only with the convection that is kept.
-            again = (*left, number) if self._holds[number] else (number,)
-            tried = {**left, **{n: self._bound(n, {*left, number}) for n in again}}
-            within = sum(bound.value_k for bound in tried.values()) <= self._tolerance
-            within = within and sum(float(self.largest_w[n].sum()) for n in tried) <= self._most_w
-            if within and self._may_go(number) and self._still_held({*left, number}):
-                left = tried
+            if self._alone_bounds[number].value_k > _WORTH_A_STEP * self._tolerance or not self._may_go(number):
+                continue
+            heat = self.heats[number]
+            held, holding = self._held(gone_w_k + heat.held_w_k), self._holding > gone + heat.holds
+            tried = {number: self._bound(number, held)}
+            if total_k + tried[number].value_k > self._tolerance:
+                continue
+            if heat.held_w_k.any():  # bounds of what is left already change only with the convection that is kept
+                tried |= {n: self._bound(n, held) for n in left if self.brings_w[n] > 0.0}
+            more_k = sum(bound.value_k - (left[n].value_k if n in left else 0.0) for n, bound in tried.items())
+            within = total_k + more_k <= self._tolerance and total_w + self.brings_w[number] <= self._most_w
+            if within and self._still_held(holding):
+                left |= tried
+                total_k, total_w = total_k + more_k, total_w + self.brings_w[number]
+                gone_w_k, gone = gone_w_k + heat.held_w_k, gone + heat.holds
         return left
 
     def why_kept(self, number: int) -> Kept:
@@ -345,7 +356,7 @@ class _Screener:
             return Kept(name, None, "nothing that is kept bounds what it could do")
         if bound.value_k <= self._tolerance and not self._may_go(number):
             return Kept(name, bound.value_k, "on a mesh with obtuse angles only what brings no heat is left out")
-        if bound.value_k <= self._tolerance and self.largest_w[number].sum() > self._most_w:
+        if bound.value_k <= self._tolerance and self.brings_w[number] > self._most_w:
             return Kept(name, bound.value_k, "it matters to heat flows")
         if bound.value_k <= self._tolerance:
             return Kept(name, bound.value_k, "with what is left out already, or as the only exchange, it matters")
@@ -367,24 +378,23 @@ class _Screener:
         high = max([float(span.high.max()) for span in spans if span.high.size], default=-np.inf)
         if np.isfinite(self._duration_s):
             low, high = min(low, float(start.min())), max(high, float(start.max()))
-        held = sum((heat.held_w_k for heat in self.heats), np.zeros(self._space.num_nodes))
         cooling = sum((heat.cooling_w for heat in self.heats), np.zeros(self._space.num_nodes))
         heating = sum((heat.heating_w for heat in self.heats), np.zeros(self._space.num_nodes))
-        low -= self._even_rise(cooling, held).value_k
-        high += self._even_rise(heating, held).value_k
+        low -= self._even_rise(cooling, self._held_w_k).value_k
+        high += self._even_rise(heating, self._held_w_k).value_k
         return Span(np.array(max(low, -ZERO_CELSIUS_K)), np.array(high))
 
     def _alone(self, number: int) -> _Bound:
         """Bound of an effect if all others are kept, without the implicit step."""
         if self.heats[number].fixed.any():
             return _Bound(np.inf, "")
-        return self._even_rise(self.largest_w[number], self._held({number}))
+        return self._even_rise(self.largest_w[number], self._held(self.heats[number].held_w_k))
 
-    def _bound(self, number: int, left: set[int]) -> _Bound:
-        """Bound of an effect if it and others are left out."""
+    def _bound(self, number: int, held_w_k: Vector) -> _Bound:
+        """Bound of an effect if convection of `held_w_k` at each node is kept."""
         if self.heats[number].fixed.any():
             return _Bound(np.inf, "")
-        bound = self._even_rise(self.largest_w[number], self._held(left))
+        bound = self._even_rise(self.largest_w[number], held_w_k)
         worth = self._tolerance < bound.value_k <= _WORTH_A_STEP * self._tolerance
         if np.isfinite(self._duration_s) and worth:
             if number not in self._steps:
@@ -392,10 +402,10 @@ class _Screener:
             bound = min(bound, self._steps[number], key=lambda entry: entry.value_k)
         return bound
 
-    def _held(self, left: set[int]) -> Vector:
-        """Convection that is kept at each node, [W / K]."""
-        kept = [self.heats[number].held_w_k for number in np.flatnonzero(self._holds) if number not in left]
-        return sum(kept, np.zeros(self._space.num_nodes))
+    def _held(self, gone_w_k: Vector) -> Vector:
+        """Convection that is kept at each node, [W / K], without `gone_w_k`."""
+        kept = self._held_w_k - gone_w_k
+        return np.where(kept > _ROUND_OFF * self._held_w_k, kept, 0.0)
 
     def _even_rise(self, heat_w: Vector, held_w_k: Vector) -> _Bound:
         """The bound that rises at an even rate towards a ceiling."""
@@ -431,11 +441,6 @@ class _Screener:
         silent = not self.largest_w[number].any() and (self._one_temperature or not named)
         return silent or not self._obtuse
 
-    def _still_held(self, left: set[int]) -> bool:
-        """Whether every piece of a body whose steady state is asked for still exchanges heat with something."""
-        if np.isfinite(self._duration_s):
-            return True
-        assert self._stiffness is not None
-        kept = [heat.holds for number, heat in enumerate(self.heats) if number not in left]
-        holding = np.logical_or.reduce([np.zeros(self._space.num_nodes, dtype=bool), *kept])
-        return bool(Pieces(self._stiffness).touched(np.flatnonzero(holding)).all())
+    def _still_held(self, holding: npt.NDArray[np.bool_]) -> bool:
+        """Whether every piece of a body whose steady state is asked for still has nodes that are held, shape (n,)."""
+        return np.isfinite(self._duration_s) or bool(self._pieces.touched(np.flatnonzero(holding)).all())

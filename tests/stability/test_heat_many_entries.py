@@ -1,0 +1,100 @@
+"""Scenes with hundreds of entries: the work grows with their number, not with its square."""
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.support.heat_bodies import CONCRETE
+from tests.support.heat_meshes import box_mesh, planes
+from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, effect_labels
+from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.heat.effects import Convection, HeatFlux
+from thermoxels_ns.heat.scene import HeatScene
+from thermoxels_ns.heat.screening import screen
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+MOST_RATIO = 2.6
+"""Twice the entries may take this many times as long: quadratic work comes to 4, linear work to 2."""
+
+
+def many_patches(count: int) -> TetMesh:
+    """A box whose surface is divided into patches p0, p1, ..."""
+    mesh = box_mesh(*(planes(0.0, 1.0, step=0.125) for _ in range(3)))
+    assert mesh.boundary is not None
+    names = tuple(f"p{number}" for number in range(count))
+    return replace(mesh, boundary=replace(mesh.boundary, patch=np.arange(len(mesh.facets)) % count, patch_names=names))
+
+
+def lines_run(work: Callable[[], Any]) -> int:
+    """Lines of our code that run, those of loops and comprehensions every time."""
+    count = 0
+
+    def trace(frame, event, argument):
+        nonlocal count
+        if "thermoxels_ns" not in frame.f_code.co_filename:
+            return None
+        count += event == "line"
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        work()
+    finally:
+        sys.settrace(before)
+    return count
+
+
+def entries(count: int, alike: bool = False) -> tuple[tuple[Convection, ...], tuple[HeatFlux, ...]]:
+    names = [("*",) if alike else (f"p{number}",) for number in range(count)]
+    airs = (Convection(name, 5.0, 5.0 + number % 2) for number, name in enumerate(names))
+    return tuple(airs), tuple(HeatFlux(name, 1e-9) for name in names)
+
+
+WORK: dict[str, tuple[bool, Callable[[HeatProblem], Any]]] = {
+    "labels of effects alike": (True, effect_labels),
+    "assembling": (False, HeatSystem),
+    "screening": (False, lambda problem: screen(problem, TimeSteps(2, 60.0), 0.01)),
+    "screening, steady": (False, lambda problem: screen(problem, None, 0.01)),
+}
+
+
+@pytest.mark.parametrize("name", list(WORK))
+def test_twice_the_entries_are_about_twice_the_work(name) -> None:
+    alike, work = WORK[name]
+    few, many = (
+        lines_run(partial(work, HeatProblem(many_patches(count), CONCRETE, effects=sum(entries(count, alike), ()))))
+        for count in (60, 120)
+    )
+    assert many < MOST_RATIO * few, (few, many)
+
+
+def test_twice_the_entries_of_a_scene_are_about_twice_the_work() -> None:
+    few, many = (
+        lines_run(
+            partial(HeatScene({"*": CONCRETE}, convection=airs, heat_flux=fluxes).problem, many_patches(len(airs)))
+        )
+        for airs, fluxes in map(entries, (60, 120))
+    )
+    assert many < MOST_RATIO * few, (few, many)
+
+
+def test_two_of_many_entries_on_one_patch_are_found() -> None:
+    airs = [Convection((f"p{number}",), 5.0, 5.0) for number in range(200)]
+    airs[150] = Convection(("p151", "p7", "p3"), 5.0, 5.0)
+    with pytest.raises(HeatError, match=r"convection entry 4: expected .* got convection entry 151 on p3 as well"):
+        HeatScene({"*": CONCRETE}, convection=tuple(airs)).problem(many_patches(200))
+
+
+def test_effects_of_one_name_are_numbered_whatever_others_are_called() -> None:
+    flux, odd = HeatFlux(("p0",), 1.0), HeatFlux(("p0 (2)",), 1.0)
+    mesh = many_patches(2)
+    problem = HeatProblem(mesh, CONCRETE, effects=(flux, odd, flux, odd, flux, flux))
+    labels = ("", " (2)", " (3)", " (2) (2)", " (4)", " (5)")
+    assert effect_labels(problem) == tuple(f"heat flux on p0{label}" for label in labels)
