@@ -4,11 +4,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh
 from tests.support.stuffed_shapes import SHAPES, tet_mesh
 from thermoxels_ns.core.errors import HeatError
+from thermoxels_ns.fem import memory
 from thermoxels_ns.fem.memory import check_memory, peak_bytes
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.space import Space
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection, Radiation
@@ -61,3 +65,12 @@ def test_what_does_not_fit_is_refused() -> None:
         HeatError, match=r"memory of the heat problem: expected at most 1 GiB, got about 2 GiB\. Wait\."
     ):
         check_memory(2.0**31, 2.0**30, "Wait.")
+
+
+def test_edges_are_counted_from_nodes_tetrahedra_and_facets(monkeypatch) -> None:
+    """The unknowns of quadratic tetrahedra, in a body of one piece without holes."""
+    monkeypatch.setattr(memory, "_BYTES_PER_TET_OF_ORDER_2", 0.0)
+    monkeypatch.setattr(memory, "_BYTES_PER_UNKNOWN_OF_ORDER_2", 1.0)
+    box = box_mesh(*[np.linspace(0.0, 1.0, 5)] * 3)
+    unknowns = Space(Selection(box), order=2, lumped=False).num_nodes
+    assert peak_bytes(HeatProblem(box, CONCRETE), order=2) - 8.0 * len(box.points_m) == unknowns + 1

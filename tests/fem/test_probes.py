@@ -4,6 +4,8 @@ import pytest
 from tests.support.heat_meshes import box_mesh, mesh_from, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.probes import place_probes
+from thermoxels_ns.fem.selection import Selection
+from thermoxels_ns.fem.space import Space
 
 
 def linear(points: np.ndarray) -> np.ndarray:
@@ -47,3 +49,13 @@ def test_a_point_just_beyond_a_slanted_face_is_outside() -> None:
     assert place_probes(tet, [on_it]).at(tet.temperature_c)[0] == pytest.approx(2.0)
     with pytest.raises(HeatError, match="probe 1: expected a point inside"):
         place_probes(tet, [on_it + 1e-5])
+
+
+def test_a_quadratic_field_is_interpolated_exactly_by_quadratic_tetrahedra(box) -> None:
+    def curved(points: np.ndarray) -> np.ndarray:
+        x, y, z = points.T
+        return linear(points) + x * x - 3.0 * y * z + 2.0 * x * z + 0.5 * z * z
+
+    points = np.random.default_rng(1).uniform([0, 0, -1], [1, 0.5, 0], (100, 3))
+    values = curved(Space(Selection(box), order=2, lumped=False).points_m)
+    np.testing.assert_allclose(place_probes(box, points).at_quadratic(box, values), curved(points), atol=1e-12)

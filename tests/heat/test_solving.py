@@ -144,3 +144,13 @@ def test_to_a_tolerance_effects_are_looked_at_as_steps_are_taken(monkeypatch) ->
     with pytest.raises(HeatError, match="enough"):
         heat_solving.solve_problem(problem, TimeSteps(1, 1800.0), heat_solving.Goals(tolerance_k=0.5))
     assert asked[0].effects == problem.effects
+
+
+def test_a_body_on_which_nothing_acts_is_said_to_be_insulated() -> None:
+    lines: dict[int, list[str]] = {0: [], 1: []}
+    for count, said_of in lines.items():
+        effects = (HeatFlux(("x1",), 5.0),) * count
+        heat_solving.solve_problem(
+            replace(tight_wall(0.0), effects=effects), TimeSteps(1, 60.0), heat_solving.Goals(), said_of.append
+        )
+    assert [any("Nothing acts" in line for line in said_of) for said_of in lines.values()] == [True, False]

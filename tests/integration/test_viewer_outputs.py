@@ -73,6 +73,11 @@ def quaternion(rotation: np.ndarray) -> list[float]:
     return [w, x, y, z]
 
 
+def files_below(folder: Path) -> dict[Path, tuple[int, int]]:
+    """All that is in a folder, with when it was changed, [ns], and its size."""
+    return {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in [folder, *folder.rglob("*")]}
+
+
 def test_every_output_is_drawn_for_who_chooses_it(trained: Trained, tmp_path) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -80,6 +85,7 @@ def test_every_output_is_drawn_for_who_chooses_it(trained: Trained, tmp_path) ->
     script, log = Path(sys.executable).with_name("ns-viewer"), tmp_path / "log"
     command = [str(script), "--load-config", str(trained.config), "--viewer.websocket-port", str(port)]
     outputs = ("thermal", "temperature_c", "depth", "accumulation", "rgb")
+    before = files_below(trained.config.parent)
     with log.open("w") as file:
         viewer = subprocess.Popen(
             command, stdout=file, stderr=subprocess.STDOUT, env={**os.environ, "OMP_NUM_THREADS": "1"}
@@ -92,6 +98,7 @@ def test_every_output_is_drawn_for_who_chooses_it(trained: Trained, tmp_path) ->
             viewer.wait()
     said = log.read_text()
     assert "Traceback" not in said and "Error" not in said, said
+    assert files_below(trained.config.parent) == before, "a run folder that cannot be written to is shown as well"
     assert set(seen) == set(outputs)
     assert all(picture.ndim == 3 and np.ptp(picture) > 20 for picture in seen.values())
     small = {name: np.asarray(Image.fromarray(picture).resize((32, 24)), float) for name, picture in seen.items()}
