@@ -118,7 +118,9 @@ def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
         camera = frame.intrinsics.resized(picture.shape[1], picture.shape[0])
         pinholes.append(photographs.pinhole(picture, mask, camera, frame.pose, _STEREO_SIDE))
     seen = photographs.gathered(pinholes, [frame.pose[:3, 3] for frame in frames])
-    return stereo.feature_rays_to_depths(stereo.depths_of(seen)).points, len(frames)
+    return stereo.feature_rays_to_depths(stereo.depths_of(seen, views_to_contradict=0)).points, len(
+        frames
+    )  # strays cost most
 
 
 def box_of_points(

@@ -71,6 +71,7 @@ def depths_of(
     photographs: Photographs,
     lo: npt.ArrayLike | None = None,
     hi: npt.ArrayLike | None = None,
+    views_to_contradict: int = VIEWS_TO_CONTRADICT,
 ) -> Depths:
     """Find the depths of photographs: in a box and behind it, or wherever they see the same from different directions.
 
@@ -84,6 +85,7 @@ def depths_of(
         photographs: Pinhole photographs, best some 160 pixels wide: cost grows with the third power of their size.
         lo: Lower corner of the box, [world units]. None: no box.
         hi: Upper corner.
+        views_to_contradict: Photographs that must agree with a depth for it to contradict others.
 
     Returns:
         Depths; not known anywhere where no photograph has a neighbour.
@@ -114,7 +116,7 @@ def depths_of(
 
     confirmed = np.zeros(total, dtype=bool)
     run_ranges(compare, total, 4096)
-    confirmed = agreeing >= VIEWS_TO_CONTRADICT
+    confirmed = agreeing >= views_to_contradict
     run_ranges(compare, total, 4096)
     sure = (agreeing >= FEWEST_VIEWS) & (agreeing >= VIEWS_PER_CONTRADICTION * behind)
     depth[~sure] = np.nan

@@ -190,7 +190,7 @@ def test_mapping_is_json_and_complete(mesh_of_cells):
     angles = mapping["dihedral_counts"]
     assert angles["bin_width"] == pytest.approx(4.5) and sum(angles["counts"]) == 6 * 180
     assert angles["first_centre"] == pytest.approx(2.25, abs=1e-4)
-    assert mapping["dihedral_range_deg"] == {"min": 45.0, "max": 90.0}
+    assert mapping["dihedral_range_deg"] == pytest.approx({"min": 45.0, "max": 90.0})
     assert mapping["length_unit"] == "input unit"
     assert [criterion["name"] for criterion in mapping["promises"]] == list(VOXEL_NAMES)
     assert set(mapping["promises"][0]) == {"name", "sentence", "kept", "figure", "found"}
