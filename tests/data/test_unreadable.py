@@ -1,7 +1,5 @@
 """What may not be read is named as such, not as damaged."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

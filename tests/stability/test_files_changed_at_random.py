@@ -1,7 +1,5 @@
 """Valid files changed at random: each run ends with a right result or with one error that a user can act on."""
 
-from __future__ import annotations
-
 import copy
 import json
 import multiprocessing

@@ -118,9 +118,8 @@ def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
         camera = frame.intrinsics.resized(picture.shape[1], picture.shape[0])
         pinholes.append(photographs.pinhole(picture, mask, camera, frame.pose, _STEREO_SIDE))
     seen = photographs.gathered(pinholes, [frame.pose[:3, 3] for frame in frames])
-    return stereo.feature_rays_to_depths(stereo.depths_of(seen, views_to_contradict=0)).points, len(
-        frames
-    )  # strays cost most
+    depths = stereo.depths_of(seen, views_to_contradict=0)  # a stray costs the box more than a depth that is lacking
+    return stereo.feature_rays_to_depths(depths).points, len(frames)
 
 
 def box_of_points(
@@ -320,9 +319,8 @@ def _read_ply(path: Path) -> npt.NDArray[np.float64]:
         loaded: Any = trimesh.load(path)
         points = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
     except Exception as problem:  # trimesh raises whatever its parsers meet
-        raise SceneError(
-            str(path), expected="a readable .ply", got=problem, remedy=remedy_of(problem, _REMEDY)
-        ) from problem
+        remedy = remedy_of(problem, _REMEDY)
+        raise SceneError(str(path), expected="a readable .ply", got=problem, remedy=remedy) from problem
     return points
 
 

@@ -113,13 +113,25 @@ def correlate(brightness, others, radius, weights, means, variances, noise, coun
 
 @kernel
 def other_views(
-    begin: int, end: int, matrices, inverses, centres, sizes, firsts, depth, error, tolerance, asked, agreeing, behind
+    begin: int,
+    end: int,
+    matrices,
+    inverses,
+    centres,
+    sizes,
+    firsts,
+    depth,
+    error,
+    tolerance,
+    confirmed,
+    agreeing,
+    behind,
 ):
     """Count the other photographs whose own depth lies where that of a pixel does, and those where it lies behind.
 
     Depths agree if they differ by no more than `tolerance` times the sum of both pixels' errors; a photograph looks
-    through the point if its own depth is farther by more than twice that sum. Only pixels that are `asked` can look
-    through. Pixels `begin` to `end`; 0 where a depth is NaN.
+    through the point if its own depth is farther by more than twice that sum. Only `confirmed` depths count as
+    looking through. Pixels `begin` to `end`; 0 where a depth is NaN.
     """
     number = len(firsts) - 1
     while number > 0 and firsts[number] > begin:
@@ -151,5 +163,5 @@ def other_views(
             farther, planes = depth[at] - far, error[at] + error[n]  # neither is true where they are NaN
             if abs(farther) <= tolerance * planes:
                 agreeing[n] += 1
-            elif asked[at] and farther > 2.0 * planes:
+            elif confirmed[at] and farther > 2.0 * planes:
                 behind[n] += 1
