@@ -30,9 +30,10 @@ MAY_IMPORT = {
     "mesh": {"core"},
     "fem": {"core", "mesh"},
     "heat": {"core", "mesh", "fem"},
+    "audit": {"core", "mesh", "fem", "heat"},
     "evaluation": {"core", "synthetic", "data", "field", "render", "training", "mesh", "fem", "heat"},
     # Pages and pictures show results: they import the types of what they show.
-    "reports": {"core", "radiometry", "capture", "mesh", "fem", "heat"},
+    "reports": {"core", "radiometry", "capture", "mesh", "fem", "heat", "audit"},
     "commands": None,
     "root": None,
 }
@@ -57,6 +58,7 @@ NEVER = {
     "mesh": RADIANCE | HEAT,
     "fem": RADIANCE,
     "heat": RADIANCE,
+    "audit": RADIANCE | DRAWING,
     "reports": RADIANCE,
 }
 """Other packages that a room does not import, not even inside a function."""

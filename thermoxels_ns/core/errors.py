@@ -36,6 +36,10 @@ class HeatError(ThermoxelsError, ValueError):
     """A heat problem is not well posed or its solver did not converge."""
 
 
+class AuditError(ThermoxelsError, ValueError):
+    """The conditions of a survey, or its mesh, do not give the answers that are asked for."""
+
+
 class OutputError(ThermoxelsError, OSError):
     """A result cannot be written where it was asked for."""
 

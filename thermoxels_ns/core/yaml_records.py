@@ -12,11 +12,12 @@ from contextlib import contextmanager
 from datetime import date, datetime
 from numbers import Real
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
 from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.core.measured import read_measured
 
 Record = TypeVar("Record")
 
@@ -75,7 +76,7 @@ def as_record(name: str, content: object, target: type[Record]) -> Record:
     unknown or missing, or a value is of the wrong kind or out of range.
     """
     content = as_mapping(name, content)
-    hints = get_type_hints(target)
+    hints = get_type_hints(target, include_extras=True)
     own = {field.name: field for field in dataclasses.fields(target) if field.init}  # type: ignore[arg-type]
     check_keys(name, content, tuple(own))
     missing = [key for key, field in own.items() if key not in content and _is_required(field)]
@@ -101,11 +102,17 @@ def as_value(name: str, content: object, hint: Any) -> Any:
     """Turn what was read into a value of the type that a dataclass field has, or raise `ThermoxelsError`.
 
     Numbers (`Real`: as written, whole or not), truth values, texts, moments, choices (Literal), tuples of fixed or any
-    length, and dataclasses are known; of a union, a field takes the first of these kinds.
+    length, mappings from text, dataclasses and ``Annotated[Measured, unit]`` are known; of a union, a field takes the
+    first of these kinds.
     """
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
         return as_value(name, content, next(kind for kind in arguments if kind is not type(None)))
+    if origin is Annotated:
+        return read_measured(name, content, arguments[1])
+    if origin is dict:
+        entries = as_mapping(name, content).items()
+        return {key: as_value(f"{name}: {key}", value, arguments[1]) for key, value in entries}
     if origin is Literal:
         if content not in arguments or isinstance(content, bool):
             raise wrong(name, f"one of {', '.join(map(str, arguments))}", shown(content))

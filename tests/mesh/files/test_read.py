@@ -35,6 +35,13 @@ def test_a_tagged_mesh_comes_back_bit_for_bit(tmp_path, tagged_mesh, name) -> No
     assert np.array_equal(colour_bytes(read.colour), colour_bytes(tagged_mesh.colour))
 
 
+def test_photographs_that_see_and_support_come_back(tmp_path, tagged_mesh) -> None:
+    count = np.random.default_rng(2).integers(0, 9, (len(tagged_mesh.facets), 2))
+    counted = dataclasses.replace(tagged_mesh, boundary=dataclasses.replace(tagged_mesh.boundary, photographs=count))
+    write_mesh(tmp_path / "mesh.vtu", counted)
+    assert np.array_equal(read_mesh(tmp_path / "mesh.vtu").boundary.photographs, count)
+
+
 def test_an_untagged_mesh_stays_untagged(tmp_path, box_mesh) -> None:
     write_mesh(tmp_path / "box.vtu", box_mesh)
     read = read_mesh(tmp_path / "box.vtu")

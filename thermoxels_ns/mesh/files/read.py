@@ -112,7 +112,16 @@ def _boundary(surface: Any, points: FloatArray, name: str) -> tuple[IntArray, Bo
         seen=_array(surface.cell_data, "seen", name) != 0,
         patch=_cell_numbers(surface, "patch", name, len(names)),
         patch_names=names,
+        photographs=_photographs(surface, name),
     )
+
+
+def _photographs(surface: Any, name: str) -> IntArray | None:
+    """Photographs that see and support each triangle, (f, 2); None in files of meshes that do not know."""
+    counts = [f"photographs_{what}" for what in ("seen", "supporting")]
+    if not any(count in surface.cell_data for count in counts):
+        return None
+    return np.stack([_array(surface.cell_data, count, name).astype(np.int64) for count in counts], axis=1)
 
 
 def _cell_numbers(data: Any, array: str, name: str, count: int) -> IntArray:

@@ -53,6 +53,11 @@ def tets_across_faces(face_groups: Groups) -> IntArray:
     return np.stack(_neighbours(face_groups), axis=1) >> 2
 
 
+def triangles_across_edges(sides: Groups) -> IntArray:
+    """Pairs of triangles that share an edge, shape (p, 2), from `group_sides`."""
+    return np.stack(_neighbours(sides), axis=1) // 3
+
+
 def surface_topology(points: FloatArray, facets: IntArray, sides: Groups | None = None) -> SurfaceTopology:
     """Count the components of a triangulated surface, their handles, and where it is no manifold.
 

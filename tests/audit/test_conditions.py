@@ -1,0 +1,121 @@
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+from thermoxels_ns.audit.conditions import EXAMPLE, load_conditions, write_example
+from thermoxels_ns.audit.survey_rules import check_survey
+from thermoxels_ns.core.errors import AuditError
+from thermoxels_ns.core.measured import Measured
+from thermoxels_ns.core.yaml_records import configs_folder
+
+PLAIN = """
+side: outside
+inside: {air: 20 +- 0.5 C}
+outside: {air: 0 +- 0.5 C, wind: 1 +- 0.5 m/s}
+surroundings: {reflected: -3 +- 3 C}
+film: {model: iso-6946, factor: 1.0 +- 0.2}
+camera: {offset: 0 +- 1 K, repeatability: 0 +- 0.2 K}
+surfaces: [{emissivity: 0.93 +- 0.02}]
+"""
+
+
+@pytest.fixture
+def changed(tmp_path: Path):
+    """Write conditions in which one entry is another one, given by its path; None removes it."""
+
+    def change(*keys: str, value: object) -> Path:
+        content = yaml.safe_load(PLAIN)
+        at = content
+        for key in keys[:-1]:
+            at = at[int(key)] if isinstance(at, list) else at.setdefault(key, {})
+        at[keys[-1]] = value
+        if value is None:
+            del at[keys[-1]]
+        path = tmp_path / "conditions.yaml"
+        path.write_text(yaml.safe_dump(content))
+        return path
+
+    return change
+
+
+def test_the_example_is_read_and_lacks_nothing_that_en_13187_asks_for(tmp_path) -> None:
+    write_example(tmp_path / "new" / "mine.yaml")
+    conditions = load_conditions(tmp_path / "new" / "mine.yaml")
+    assert conditions == load_conditions(configs_folder() / EXAMPLE)
+    found = check_survey(conditions)
+    assert (found.forbidden, found.missing) == ((), ())
+    assert conditions.film.factor == Measured(1.0, 0.2) and conditions.survey.date.hour == 6
+    with pytest.raises(AuditError, match=r"expected a name that is free"):
+        write_example(tmp_path / "new" / "mine.yaml")
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "message"),
+    [
+        (("inside", "air"), "0.5 C", r"inside: air: expected air that is warmer than outside .*no U-value follows"),
+        (("inside", "air"), "-5 C", r"inside: air: expected air that is warmer than outside"),
+        (("inside", "air"), 20.0, r"inside: air: expected a number with its unit, C, got 20\.0 .* Write 20\.0 C\."),
+        (("inside", "air"), "-300 C", r"air: expected a temperature above absolute zero"),
+        (("outside", "wind"), "-1 m/s", r"wind: expected a speed of at least 0"),
+        (("outside", "wind"), None, r"outside: wind: expected a speed, because iso-6946 needs it.*Add wind: 1\.5"),
+        (("surfaces", "0", "emissivity"), 0, r"emissivity: expected a number that is surely above 0 and at most 1"),
+        (("surfaces", "0", "emissivity"), "0.99 +- 0.02", r"emissivity: expected .* at most 1, got 0\.99 \+- 0\.02"),
+        (("surfaces", "0", "emissivity"), 1.2, r"emissivity: expected .* at most 1"),
+        (("surfaces", "0", "emisivity"), 0.9, r"Did you mean emissivity"),
+        (("surfaces",), [], r"surfaces: expected at least one entry"),
+        (("surroundings",), {"ground": "1 C"}, r"surroundings: expected either reflected or sky, got neither"),
+        (("surroundings", "ground"), "1 C", r"ground: expected none beside reflected"),
+        (("surroundings",), {"sky": {"cloud": 2, "dew_point": "0 C"}}, r"cloud: expected a share from 0 to 1"),
+        (("film", "model"), "madding", r"film: model of surfaces seen from outside: expected one of iso-6946"),
+        (("film", "model"), "given", r"coefficient: expected one beside the model given"),
+        (("film", "coefficient"), "8 W/(m2 K)", r"coefficient: expected none beside the model iso-6946"),
+        (("film", "factor"), "0.1 +- 0.2", r"factor: expected a number that is surely at least 0"),
+        (("camera", "offset"), None, r"expected the key offset"),
+        (("camera", "emissivity"), 0.95, r"reflected: expected a temperature.*Add what the camera was set to"),
+        (("limits", "u"), {"*": "0.3 W"}, r"limits: u: \*: expected a number with its unit, W/\(m2 K\)"),
+    ],
+)
+def test_bad_conditions_are_one_clear_error(changed, keys, value, message) -> None:
+    with pytest.raises(AuditError, match=message):
+        load_conditions(changed(*keys, value=value))
+
+
+def test_a_sky_is_none_of_a_room(changed) -> None:
+    path = changed("surroundings", value={"sky": {"cloud": 0.5, "dew_point": "0 C"}})
+    path.write_text(path.read_text().replace("outside", "inside", 1).replace("side: outside", "side: inside"))
+    content = yaml.safe_load(PLAIN) | {
+        "side": "inside",
+        "film": {"model": "madding", "factor": 1.0},
+        "surroundings": {"sky": {"cloud": 0.5, "dew_point": "0 C"}},
+    }
+    path.write_text(yaml.safe_dump(content))
+    with pytest.raises(AuditError, match=r"surroundings: expected a reflected temperature inside, got a sky"):
+        load_conditions(path)
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "words"),
+    [
+        (("inside", "air"), "9 +- 0.5 C", "The airs differ by 9.0 K; EN 13187 asks for 10 K."),
+        (("survey",), {"least_difference_24h": "7 K"}, "the airs differed by 7 K at times"),
+        (("outside", "wind"), "6 m/s", "The wind was 6.0 m/s; EN 13187 allows 5 m/s."),
+        (("survey",), {"hours_since_sun": "1 h"}, "The sun shone on the surface 1 hours before"),
+        (("survey",), {"hours_dry": "3 h"}, "The surface was wet 3 hours before"),
+    ],
+)
+def test_what_en_13187_forbids_is_named(changed, keys, value, words) -> None:
+    found = check_survey(load_conditions(changed(*keys, value=value))).forbidden
+    assert len(found) == 1 and words in found[0]
+
+
+def test_what_is_missing_and_what_is_doubtful_is_named(changed) -> None:
+    conditions = load_conditions(changed("camera", "offset", value="0 K"))
+    found = check_survey(conditions)
+    assert {"client", "serial number of the camera", "wind direction", "pressure difference"} <= set(found.missing)
+    assert any("Taken as exact" in one and "camera offset" in one and "inside air" not in one for one in found.doubts)
+    assert sum("Heat flow is taken as steady" in one for one in found.doubts) == 2
+    swung = replace(conditions.outside, lowest_24h=Measured(-8.0), highest_24h=Measured(4.0))
+    doubts = check_survey(replace(conditions, outside=swung)).doubts
+    assert any("The air outside changed by 12.0 K within 24 hours, 60 % of" in one for one in doubts)

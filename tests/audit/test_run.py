@@ -1,0 +1,255 @@
+"""Audits of a wall with a window and a balcony slab of known construction, solved by finite elements."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.support.audited_wall import (
+    CONDUCTIVITY,
+    LENGTH_M,
+    R_INSIDE,
+    SLAB_M,
+    STATED,
+    UP,
+    WALL_M,
+    Truth,
+    audited_wall,
+    photographed,
+    solve_wall,
+    true_draws,
+)
+from thermoxels_ns.audit.conditions import Camera, Film, Limits, Surface, Surroundings, Year
+from thermoxels_ns.audit.results import Audit
+from thermoxels_ns.audit.run import audit
+from thermoxels_ns.core.errors import AuditError
+from thermoxels_ns.core.measured import Measured
+
+EXACT = replace(STATED, camera=Camera(Measured(0.0), Measured(0.0)))
+
+
+@pytest.fixture(scope="module")
+def walls() -> dict[str, Truth]:
+    """Solved walls whose conditions are exactly as stated."""
+    draws = true_draws(STATED, None)
+    return {
+        "plain": solve_wall(audited_wall(slab=False, window=False), STATED, draws),
+        "window": solve_wall(audited_wall(slab=False), STATED, draws),
+        "balcony": solve_wall(audited_wall(), STATED, draws),
+    }
+
+
+@pytest.fixture(scope="module")
+def balcony(walls) -> Audit:
+    return audit(photographed(walls["balcony"], STATED), STATED, UP)
+
+
+def test_a_plain_wall_has_the_u_value_of_its_construction(walls) -> None:
+    found = audit(photographed(walls["plain"], STATED), STATED, UP)
+    assert found.whole.u_w_m2k.value == pytest.approx(walls["plain"].u_w_m2k["facade"], rel=1e-9)
+    # 1 / U = Rsi + d / k + 1 / (h_c + h_r) with what radiates to surroundings that are not as warm as the air.
+    flow = found.whole.loss_w.value / found.whole.area_m2
+    inner = 20.0 - flow * R_INSIDE
+    assert inner - flow * WALL_M / CONDUCTIVITY["wall"] == pytest.approx(found.whole.surface_c.value, abs=1e-9)
+    assert found.defects == () and found.whole.area_m2 == pytest.approx(12.0)
+
+
+def test_elements_have_their_true_u_value_and_loss(walls, balcony) -> None:
+    """Only what triangles average over is lost: the solver takes radiation at nodes."""
+    truth = walls["balcony"]
+    assert {one.name: one.u_w_m2k.value for one in balcony.patches} == pytest.approx(truth.u_w_m2k, rel=1e-3)
+    assert balcony.whole.loss_w.value == pytest.approx(truth.loss_w, rel=1e-3)
+    assert balcony.whole.area_m2 == pytest.approx(12.0 + 2 * 0.6 * LENGTH_M)
+    assert sum(one.loss_w.value for one in balcony.patches) == pytest.approx(balcony.whole.loss_w.value, rel=1e-12)
+
+
+def test_the_balcony_is_found_with_its_psi(walls, balcony) -> None:
+    """External dimensions: what the slab adds to the loss of the same wall without it, per metre and kelvin."""
+    psi = (walls["balcony"].loss_w - walls["window"].loss_w) / LENGTH_M / STATED.difference_k
+    (bridge,) = balcony.defects
+    assert (bridge.kind, bridge.patch, bridge.not_counted) == ("line", "facade", "")
+    assert bridge.coefficient.value == pytest.approx(psi, rel=0.05)
+    assert bridge.length_m == pytest.approx(LENGTH_M - 0.2, abs=0.1)  # without the rims beside the cuts
+    assert bridge.height_m == pytest.approx(sum(SLAB_M) / 2, abs=0.1)
+    assert bridge.extra_w.value == pytest.approx(bridge.coefficient.value * bridge.length_m * 20.0, rel=1e-12)
+
+
+def test_the_same_conditions_give_the_same_intervals(walls) -> None:
+    mesh = photographed(walls["balcony"], STATED, 3)
+    first, second = (audit(mesh, STATED, UP) for _ in range(2))
+    assert first.whole == second.whole and first.defects == second.defects
+    assert np.array_equal(first.triangle_u, second.triangle_u, equal_nan=True)
+
+
+def test_triangles_add_up_to_the_whole(balcony) -> None:
+    counted = balcony.surface.counted
+    assert (
+        np.isnan(balcony.triangle_flow_w_m2[~counted]).all() and np.isfinite(balcony.triangle_flow_w_m2[counted]).all()
+    )
+    total = float(balcony.surface.area_m2[counted] @ balcony.triangle_flow_w_m2[counted])
+    assert total == pytest.approx(balcony.whole.loss_w.value, rel=1e-5)
+    mean = float(np.average(balcony.triangle_u[counted, 0], weights=balcony.surface.area_m2[counted]))
+    assert mean == pytest.approx(balcony.whole.u_w_m2k.value, rel=1e-9)
+    assert (balcony.triangle_u[counted, 1] <= balcony.triangle_u[counted, 0]).all()
+
+
+def test_common_errors_stay_common(walls) -> None:
+    """An offset of the camera shifts all parts together: the interval of the whole is the sum of those of the parts."""
+    stated = replace(STATED, camera=Camera(Measured(0.0, 1.0), Measured(0.0)))
+    found = audit(photographed(walls["window"], stated), stated, UP)
+    width = [one.loss_w.high - one.loss_w.low for one in (*found.patches, found.whole)]
+    assert width[0] + width[1] == pytest.approx(width[2], rel=0.01)
+
+
+def test_an_upper_bound_alone_is_said_to_be_one(walls) -> None:
+    stated = replace(STATED, camera=Camera(Measured(0.0, 2.0), Measured(0.0, 0.2)))
+    u = audit(photographed(walls["plain"], stated), stated, UP).whole.u_w_m2k
+    assert u.at_most and not u.unknown and u.low < 0.0 < walls["plain"].u_w_m2k["facade"] < u.high
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_intervals_hold_the_truth_though_all_is_off(seed) -> None:
+    """Air, wind, sky, emissivity, film and camera are off by up to what is stated; noise and drift come on top."""
+    draws = true_draws(STATED, seed)
+    truth = solve_wall(audited_wall(slab=False), STATED, draws)
+    found = audit(photographed(truth, STATED, seed), STATED, UP)
+    assert found.whole.loss_w.low < truth.loss_w < found.whole.loss_w.high
+    for one in found.patches:
+        assert one.u_w_m2k.low < truth.u_w_m2k[one.name] < one.u_w_m2k.high
+    assert found.defects == ()
+
+
+def test_an_emissivity_left_uncorrected_would_be_wrong(walls) -> None:
+    """Walls of 0.8 under a cold sky look colder than they are."""
+    low = replace(STATED, surfaces=(Surface(Measured(0.80)),))
+    truth = solve_wall(audited_wall(slab=False, window=False), low, true_draws(low, None))
+    mesh = photographed(truth, low)
+    assert audit(mesh, low, UP).whole.loss_w.value == pytest.approx(truth.loss_w, rel=1e-6)
+    assert audit(mesh, STATED, UP).whole.loss_w.value < 0.97 * truth.loss_w
+
+
+def test_storeys_divide_the_whole(walls) -> None:
+    storeys = {"upper": Measured(1.5), "lower": Measured(0.0)}
+    found = audit(photographed(walls["plain"], STATED), replace(STATED, storeys=storeys), UP)
+    assert {one.name for one in found.storeys} == {"lower", "upper"}
+    assert sum(one.area_m2 for one in found.storeys) == pytest.approx(found.whole.area_m2)
+    assert sum(one.loss_w.value for one in found.storeys) == pytest.approx(found.whole.loss_w.value)
+    assert sum(one.loss_w.high for one in found.storeys) == pytest.approx(found.whole.loss_w.high, rel=0.01)
+
+
+def test_limits_are_judged_by_intervals(walls) -> None:
+    u = walls["window"].u_w_m2k
+    limits = Limits(
+        u={"*": Measured(2.5), "window": Measured(0.2)}, psi=Measured(0.1), loss=Measured(1.0), f_rsi=Measured(0.7)
+    )
+    near = replace(STATED, camera=Camera(Measured(0.0, 0.1), Measured(0.0, 0.05)), limits=limits)
+    verdicts = {one.name: one.verdict for one in audit(photographed(walls["window"], near), near, UP).limits}
+    assert u["facade"] < 2.5 and u["window"] > 0.2
+    assert verdicts == {
+        "U-value of facade": "met",
+        "U-value of window": "not met",
+        "heat loss of what was observed": "not met",
+    }
+
+
+def test_a_heating_season_is_coupling_times_degree_days(walls) -> None:
+    year = Year(Measured(3000.0), price=Measured(0.1), currency="EUR", co2=Measured(0.2))
+    found = audit(photographed(walls["plain"], STATED), replace(STATED, year=year), UP)
+    heat = found.whole.loss_w.value / 20.0 * 3000.0 * 0.024
+    assert found.year is not None and found.year.cost is not None and found.year.co2_kg is not None
+    assert found.year.heat_kwh.value == pytest.approx(heat)
+    assert (found.year.cost.value, found.year.co2_kg.value) == pytest.approx((0.1 * heat, 0.2 * heat))
+
+
+def test_what_was_not_measured_never_counts(walls) -> None:
+    """A hole in the readings: neither its triangles nor its rim make a defect, and its area is named."""
+    mesh = photographed(walls["plain"], STATED)
+    hole = np.linalg.norm(mesh.points_m - np.array([1.0, 0.0, 1.5]), axis=1) < 0.35
+    holed = replace(mesh, observed=mesh.observed & ~hole, temperature_c=np.where(hole, 25.0, mesh.temperature_c))
+    found = audit(holed, STATED, UP)
+    assert found.defects == () and found.patches[0].unobserved_m2 > 0.3
+    assert found.whole.unobserved_m2 == found.patches[0].unobserved_m2
+    assert found.whole.u_w_m2k.value == pytest.approx(walls["plain"].u_w_m2k["facade"], rel=1e-6)
+    assert found.not_counted_m2["no thermal ray, or not on all of the triangle"] > 0.3
+    # A hot edge that leaks into the triangles around it is a rim.
+    leaked = replace(holed, temperature_c=np.where(_ring(holed, hole), 4.0, holed.temperature_c))
+    assert audit(leaked, STATED, UP).defects == ()
+
+
+def _ring(mesh, hole) -> np.ndarray:
+    around = np.zeros(len(hole), dtype=bool)
+    around[mesh.facets[hole[mesh.facets].any(axis=1)]] = True
+    return around & ~hole
+
+
+def test_what_no_photograph_supports_is_listed_and_not_counted(walls) -> None:
+    mesh = photographed(walls["balcony"], STATED)
+    photographs = np.full((len(mesh.facets), 2), 5)
+    photographs[:, 1] = 0
+    found = audit(replace(mesh, boundary=replace(mesh.boundary, photographs=photographs)), STATED, UP)
+    assert [one.not_counted for one in found.defects] == ["No photograph says that the surface lies there."]
+    assert found.whole.unsupported_share == pytest.approx(1.0)
+    photographs[:, 0] = 0
+    with pytest.raises(AuditError, match=r"boundary triangles with a reading, got none"):
+        audit(replace(mesh, boundary=replace(mesh.boundary, photographs=photographs)), STATED, UP)
+
+
+def test_mirrors_are_left_out(walls) -> None:
+    found = audit(photographed(walls["window"], STATED), replace(STATED, leave_out=("window",)), UP)
+    assert [one.name for one in found.patches] == ["facade"]
+    assert found.not_counted_m2["left out by the conditions"] == pytest.approx(0.96)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"surfaces": (Surface(Measured(0.9), ("roof",)),)}, r"surfaces entry 1: patches: expected patches out of"),
+        ({"surfaces": (Surface(Measured(0.9), ("facade",)),)}, r"emissivity for every patch .* none for window"),
+        ({"leave_out": ("glass*",)}, r"leave_out: expected patches out of .* got 'glass\*'"),
+        ({"limits": Limits(u={"Facade": Measured(0.3)})}, r"limits: u: expected patches out of .* got 'Facade'"),
+    ],
+)
+def test_patches_that_do_not_fit_the_mesh_are_refused(walls, change, message) -> None:
+    with pytest.raises(AuditError, match=message):
+        audit(photographed(walls["window"], STATED), replace(STATED, **change), UP)
+
+
+def test_film_models_are_shown_beside_each_other(walls) -> None:
+    found = audit(photographed(walls["plain"], STATED), STATED, UP)
+    assert set(found.whole.u_by_model) == {"iso-6946", "iso-6946-combined", "albatici-tonelli", "dallo"}
+    assert found.whole.u_by_model["iso-6946"] == pytest.approx(found.whole.u_w_m2k.value)
+    above = found.whole.surface_c.value
+    assert found.whole.u_by_model["iso-6946-combined"] == pytest.approx(25.0 * above / 20.0)
+    assert found.whole.u_by_model["dallo"] == pytest.approx((5.8 + 3.8054) * above / 20.0)
+
+
+def test_a_room_seen_from_within(walls) -> None:
+    """Surface temperatures inside: heat flow by the coefficient of the solver, temperature factor by the wall's own
+    resistances."""
+    truth = walls["plain"]
+    names = truth.mesh.boundary.patch_names
+    seen = truth.mesh.boundary.patch == names.index("room")
+    mesh = replace(truth.mesh, boundary=replace(truth.mesh.boundary, seen=seen))
+    inside = replace(
+        STATED,
+        side="inside",
+        surroundings=Surroundings(reflected=Measured(20.0, 0.1)),
+        film=Film("iso-6946-combined", Measured(1.0, 0.05)),
+        camera=Camera(Measured(0.0, 0.1), Measured(0.0, 0.05)),
+        surfaces=(Surface(Measured(1.0)),),
+        limits=Limits(f_rsi=Measured(0.7)),
+    )
+    nodes = np.zeros(len(mesh.points_m), dtype=bool)
+    nodes[mesh.facets[seen]] = True
+    found = audit(replace(mesh, observed=nodes), inside, UP)
+    assert found.whole.loss_w.value == pytest.approx(truth.loss_w, rel=1e-6)
+    to_outside = (found.whole.surface_c.value - 0.0) / (truth.loss_w / 12.0)
+    assert found.f_rsi[0].value == pytest.approx(to_outside / (to_outside + 0.13), rel=1e-6)
+    assert found.f_rsi[1].value == pytest.approx(to_outside / (to_outside + 0.25), rel=1e-6)
+    assert [one.verdict for one in found.limits] == ["met"]
+
+
+def test_the_budget_names_what_matters_most(balcony) -> None:
+    assert next(iter(balcony.budget)) == "camera offset"
+    assert all(value >= 0.0 for value in balcony.budget.values())
+    assert balcony.budget["inside air"] == pytest.approx(0.0, abs=1e-9)  # the heat flow outside does not see it

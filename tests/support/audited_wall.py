@@ -1,0 +1,158 @@
+"""A wall with a window and a balcony slab of known construction, solved by finite elements, as a camera sees it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from tests.support.heat_meshes import box_mesh, planes
+from thermoxels_ns.audit.conditions import (
+    Camera,
+    Conditions,
+    Film,
+    InsideAir,
+    OutsideAir,
+    SkyModel,
+    Surface,
+    Surroundings,
+)
+from thermoxels_ns.audit.draws import Draws, draw, emissivity_name
+from thermoxels_ns.audit.exchange import radiant_k4
+from thermoxels_ns.core.measured import Measured
+from thermoxels_ns.core.units import celsius_to_kelvin, kelvin_to_celsius
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.heat.effects import Convection, Radiation
+from thermoxels_ns.heat.materials import Material
+from thermoxels_ns.heat.results import heat_results
+from thermoxels_ns.heat.scene_fields import INSIDE_RESISTANCE_M2K_W
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
+
+UP = (0.0, 0.0, 1.0)
+WALL_M, LENGTH_M, HEIGHT_M = 0.3, 4.0, 3.0
+SLAB_M = (1.4, 1.6)  # From where to where the balcony slab goes, [m] above the floor
+SLAB_DEPTH_M = 0.6
+WINDOW_M = ((2.2, 3.4), (0.3, 1.1))
+CONDUCTIVITY = {"wall": 0.30, "glazing": 0.36, "slab": 2.3}  # [W/(m K)]
+R_INSIDE = INSIDE_RESISTANCE_M2K_W["horizontal"]
+
+STATED = Conditions(
+    side="outside",
+    inside=InsideAir(Measured(20.0, 0.5)),
+    outside=OutsideAir(Measured(0.0, 0.5), wind=Measured(1.0, 0.4)),
+    surroundings=Surroundings(sky=SkyModel(Measured(0.7, 0.15), Measured(-4.0, 1.0)), ground=Measured(-0.5, 1.0)),
+    film=Film("iso-6946", Measured(1.0, 0.2)),
+    camera=Camera(offset=Measured(0.0, 1.0), repeatability=Measured(0.0, 0.2)),
+    surfaces=(Surface(Measured(0.93, 0.02)),),
+)
+
+
+def audited_wall(step: float = 0.1, slab: bool = True, window: bool = True) -> TetMesh:
+    """The mesh: outside at y = 0, the room at y = 0.3 m, the slab reaches out to y = -0.6 m; all else is cut."""
+    low, high = SLAB_M
+    (left, right), (bottom, top) = WINDOW_M
+    x = planes(0.0, left, right, LENGTH_M, step=step)
+    z = planes(0.0, bottom, top, low, high, HEIGHT_M, step=step)
+    y = np.concatenate([planes(-SLAB_DEPTH_M, 0.0, step=step)[:-1], planes(0.0, WALL_M, step=0.05)])
+    if not slab:
+        y = y[y > -1e-9]
+
+    def in_slab(p: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+        return (p[..., 2] > low) & (p[..., 2] < high)
+
+    def in_window(p: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+        across = (p[..., 0] > left) & (p[..., 0] < right)
+        return across & (p[..., 2] > bottom) & (p[..., 2] < top)
+
+    regions = {"wall": lambda p: np.ones(p.shape[:-1], dtype=bool)}
+    if window:
+        regions["glazing"] = lambda p: in_window(p) & (p[..., 1] > 0.0)
+    if slab:
+        regions["slab"] = in_slab
+
+    def outer(c: npt.NDArray[np.float64], n: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+        ends = (np.abs(n[:, 0]) > 0.5) & ((c[:, 0] < 1e-9) | (c[:, 0] > LENGTH_M - 1e-9))
+        ends |= (np.abs(n[:, 2]) > 0.5) & ((c[:, 2] < 1e-9) | (c[:, 2] > HEIGHT_M - 1e-9))
+        return ~ends & (c[:, 1] < WALL_M - 1e-9)
+
+    patches = {
+        "cut": lambda c, n: np.ones(len(c), dtype=bool),
+        "room": lambda c, n: c[:, 1] > WALL_M - 1e-9,
+        "facade": outer,
+    }
+    if window:
+        patches["window"] = lambda c, n: outer(c, n) & in_window(c) & (np.abs(c[:, 1]) < 1e-9)
+    mesh = box_mesh(x, y, z, regions=regions, patches=patches, keep=lambda p: (p[..., 1] > 0.0) | in_slab(p))
+    assert mesh.boundary is not None
+    names, patch = mesh.boundary.patch_names, mesh.boundary.patch
+    tags = np.where(patch == names.index("cut"), FACET_BOX, 0)
+    seen = np.isin(patch, [names.index(name) for name in ("facade", "window") if name in names])
+    return replace(mesh, facet_tags=tags, boundary=replace(mesh.boundary, seen=seen))
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is so: the state of the wall, and what audits are to find."""
+
+    mesh: TetMesh  # With true temperatures
+    loss_w: float  # Through facade and window
+    u_w_m2k: dict[str, float]  # By patch
+    draws: Draws  # The true value of each quantity, one draw
+
+
+def true_draws(conditions: Conditions, seed: int | None) -> Draws:
+    """True values of what the conditions state, drawn from their ranges; None: as stated."""
+    if seed is None:
+        stated = draw(conditions, 1)
+        return Draws({name: values[:1] for name, values in stated.values.items()})
+    return Draws({name: values[1:] for name, values in draw(conditions, 1, 1000 + seed).values.items()})
+
+
+def solve_wall(mesh: TetMesh, conditions: Conditions, draws: Draws) -> Truth:
+    """Let heat flow through the wall under the true conditions (film model iso-6946)."""
+    value = {name: float(values[0]) for name, values in draws.values.items()}
+    patches = tuple(name for name in ("facade", "window") if name in mesh.boundary.patch_names)
+    coefficient = value["film factor"] * (4.0 + 4.0 * value["wind"])
+
+    def around_c(places, _):
+        return kelvin_to_celsius(radiant_k4(conditions, draws, places.normals, UP)[:, 0] ** 0.25)
+
+    effects = (
+        Convection(("room",), 1.0 / R_INSIDE, value["inside air"]),
+        Convection(patches, coefficient, value["outside air"]),
+        Radiation(patches, value[emissivity_name(conditions, 0)], Varying(around_c, in_time=False)),
+    )
+    materials = {name: Material(name, k, 1000.0, 1000.0) for name, k in CONDUCTIVITY.items()}
+    problem = HeatProblem(mesh, {n: materials[n] for n in mesh.region_names}, effects=effects, up=UP)
+    solution = solve_steady(problem)
+    results = heat_results(problem, solution)
+    flow = {one.patch: -one.heat_w for one in results.patches if one.patch in patches}
+    area = {one.patch: one.area_m2 for one in results.patches}
+    difference = value["inside air"] - value["outside air"]
+    u = {name: flow[name] / area[name] / difference for name in patches}
+    return Truth(replace(mesh, temperature_c=solution.temperature_c), sum(flow.values()), u, draws)
+
+
+def photographed(truth: Truth, conditions: Conditions, seed: int | None = None) -> TetMesh:
+    """The mesh with what a camera says of each node: offset, drift over the wall, noise, emissivity, reflection."""
+    mesh, draws = truth.mesh, truth.draws
+    nodes = np.unique(mesh.facets[mesh.boundary.seen])
+    normal = np.zeros((len(mesh.points_m), 3))
+    np.add.at(normal, mesh.facets[mesh.boundary.seen], mesh.boundary.normal[mesh.boundary.seen][:, None])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = normal / np.where(length > 0.0, length, 1.0)
+    emissivity = float(draws[emissivity_name(conditions, 0)][0])
+    around_k4 = radiant_k4(conditions, draws, normal, UP)[:, 0]
+    arrives = emissivity * celsius_to_kelvin(mesh.temperature_c) ** 4 + (1.0 - emissivity) * around_k4
+    reading = kelvin_to_celsius(arrives**0.25) - float(draws["camera offset"][0])
+    if seed is not None:
+        generator = np.random.default_rng((seed, 7))
+        # What is left of drift between images: smooth over the wall, within what the conditions state.
+        size = conditions.camera.repeatability.off_by
+        waves = generator.uniform(-1.0, 1.0, (3, 3)) @ mesh.points_m.T * 2.0 + generator.uniform(0, 6, (3, 1))
+        reading = reading + size * 0.5 * np.sin(waves).mean(axis=0)
+        reading = reading + generator.normal(0.0, 0.1, len(reading)) / np.sqrt(4.0)
+    observed = np.zeros(len(mesh.points_m), dtype=bool)
+    observed[nodes] = True
+    return replace(mesh, temperature_c=np.where(observed, reading, -50.0), observed=observed)

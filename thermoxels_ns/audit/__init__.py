@@ -1,0 +1,1 @@
+"""Answers from measured surface temperatures: heat flows, U-values, thermal bridges, with intervals."""

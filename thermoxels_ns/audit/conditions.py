@@ -1,0 +1,268 @@
+"""The conditions of a survey, from a yaml file; ``configs/conditions-example.yaml`` explains every key."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+from thermoxels_ns.core.checks import replace_when_done, writable_folder
+from thermoxels_ns.core.errors import AuditError
+from thermoxels_ns.core.measured import Measured
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
+from thermoxels_ns.core.yaml_records import as_record, configs_folder, raising, read_yaml
+
+Share: TypeAlias = Annotated[Measured, "1"]
+Temperature: TypeAlias = Annotated[Measured, "C"]
+Difference: TypeAlias = Annotated[Measured, "K"]
+Hours: TypeAlias = Annotated[Measured, "h"]
+
+Side = Literal["outside", "inside"]
+FilmModel = Literal["iso-6946", "iso-6946-combined", "albatici-tonelli", "dallo", "madding", "given"]
+"""How a surface exchanges heat with what is around it; the formulas stand in `thermoxels_ns.audit.heat_flow`."""
+
+FILM_MODELS: Mapping[Side, tuple[FilmModel, ...]] = {
+    "outside": ("iso-6946", "iso-6946-combined", "albatici-tonelli", "dallo", "given"),
+    "inside": ("madding", "iso-6946", "iso-6946-combined", "given"),
+}
+WINDY: tuple[FilmModel, ...] = ("iso-6946", "albatici-tonelli", "dallo")  # Models of the open air that need the wind
+
+EXAMPLE = "conditions-example.yaml"
+
+
+@dataclass(frozen=True)
+class Camera:
+    """The thermal camera and how far its readings may be off."""
+
+    offset: Difference  # What to add to all readings alike, [K]; 0 +- 1 K: they may all be 1 K too low or too high
+    repeatability: Difference
+    """What to add to the readings of one part of the surface but not of another, 0 +- 0.2 K: what is left of drift
+    between images, and of how the model was made from them."""
+    emissivity: Share = field(
+        default_factory=lambda: Measured(1.0)
+    )  # Emissivity that the readings were taken with, 0 to 1
+    reflected: Temperature | None = None  # Reflected temperature that they were taken with, if that is below 1
+    model: str = ""
+    serial_number: str = ""
+
+    def __post_init__(self) -> None:
+        _check_emissivity("emissivity", self.emissivity)
+        if self.emissivity.low < 1.0 and self.reflected is None:
+            got, remedy = "none beside an emissivity below 1", "Add what the camera was set to, such as 20 C."
+            raise AuditError("reflected", expected="a temperature", got=got, remedy=remedy)
+        _check_temperatures(reflected=self.reflected)
+
+
+@dataclass(frozen=True)
+class InsideAir:
+    """The air behind the surface, or, seen from inside, before it."""
+
+    air: Temperature  # [degrees Celsius]
+    lowest_24h: Temperature | None = None  # During the last 24 hours
+    highest_24h: Temperature | None = None
+
+    def __post_init__(self) -> None:
+        _check_temperatures(air=self.air, lowest_24h=self.lowest_24h, highest_24h=self.highest_24h)
+
+
+@dataclass(frozen=True)
+class OutsideAir(InsideAir):
+    """The open air."""
+
+    wind: Annotated[Measured, "m/s"] | None = None  # Wind speed near the surface, [m/s], at least 0
+    wind_direction: str = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.wind is not None and self.wind.value < 0.0:
+            raise _out_of_range("wind", "a speed of at least 0", f"{self.wind.value:g} m/s", "1.5 +- 0.5 m/s")
+
+
+@dataclass(frozen=True)
+class SkyModel:
+    """A sky whose radiation follows from the air, its moisture and clouds."""
+
+    cloud: Share  # Share of the sky that clouds cover, 0 to 1
+    dew_point: Temperature  # Dew point of the outside air, [degrees Celsius]
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.cloud.value <= 1.0:
+            raise _out_of_range("cloud", "a share from 0 to 1", f"{self.cloud.value:g}", "0.3 +- 0.1")
+        _check_temperatures(dew_point=self.dew_point)
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What the surface reflects and exchanges radiation with: one reflected temperature, or a sky above the ground."""
+
+    reflected: Temperature | None = None  # As measured with crumpled foil, for all of the surface alike
+    sky: SkyModel | None = None  # Each triangle then sees as much of sky, horizon and ground as its tilt says
+    ground: Temperature | None = None  # Of the ground, for a sky model; None: as the outside air
+
+    def __post_init__(self) -> None:
+        if (self.reflected is None) == (self.sky is None):
+            got = "neither" if self.sky is None else "both"
+            remedy = "Write reflected: -3 +- 3 C, or sky: {cloud: 0.3 +- 0.1, dew_point: -4 +- 1 C}."
+            raise AuditError("surroundings", expected="either reflected or sky", got=got, remedy=remedy)
+        if self.ground is not None and self.sky is None:
+            remedy = "Remove ground, or give a sky instead of reflected."
+            raise AuditError("ground", expected="none beside reflected", got="one", remedy=remedy)
+        _check_temperatures(reflected=self.reflected, ground=self.ground)
+
+
+@dataclass(frozen=True)
+class Film:
+    """The model of heat exchange between surface and surroundings, and how far it may be off."""
+
+    model: FilmModel
+    factor: Share  # What to multiply its convective part by, such as 1.0 +- 0.2
+    coefficient: Annotated[Measured, "W/(m2 K)"] | None = None  # Convection, for the model "given" and no other
+
+    def __post_init__(self) -> None:
+        if (self.model == "given") != (self.coefficient is not None):
+            needed = self.model == "given"
+            expected = f"{'one' if needed else 'none'} beside the model {self.model}"
+            remedy = "Add coefficient: 8 +- 1 W/(m2 K)." if needed else "Remove coefficient, or write model: given."
+            raise AuditError("coefficient", expected=expected, got="none" if needed else "one", remedy=remedy)
+        if self.factor.low < 0.0:
+            raise _out_of_range("factor", "a number that is surely at least 0", f"{self.factor.low:g}", "1.0 +- 0.2")
+        if self.coefficient is not None and self.coefficient.low < 0.0:
+            got = f"{self.coefficient.low:g} W/(m2 K)"
+            raise _out_of_range("coefficient", "one that is surely at least 0", got, "8 +- 1 W/(m2 K)")
+
+
+@dataclass(frozen=True)
+class Surface:
+    """How patches emit. Of several entries for one patch, the last one holds."""
+
+    emissivity: Share  # For long-wave radiation, above 0 and at most 1
+    patches: tuple[str, ...] = ("*",)  # Patches, by name or pattern
+
+    def __post_init__(self) -> None:
+        _check_emissivity("emissivity", self.emissivity)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a report after EN 13187 says, and nothing is computed from."""
+
+    client: str = ""
+    operator: str = ""
+    place: str = ""
+    construction: str = ""  # How the building is built, as far as known
+    date: datetime | None = None
+    camera_positions: str = ""
+    parts_observed: str = ""
+    hours_since_sun: Hours | None = None  # Since the sun last shone on the surface
+    sun_last_12h: str = ""
+    hours_dry: Hours | None = None  # Since the surface was last wet
+    precipitation: str = ""
+    least_difference_24h: Difference | None = None  # Smallest difference of the airs during the last 24 hours
+    pressure_difference: Annotated[Measured, "Pa"] | None = None
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the user asks for; the page says what meets it."""
+
+    u: dict[str, Annotated[Measured, "W/(m2 K)"]] = field(default_factory=dict)
+    """Largest U-value of patches, by name or pattern; of several that match, the last one holds."""
+    psi: Annotated[Measured, "W/(m K)"] | None = None  # Largest psi of a linear thermal bridge
+    f_rsi: Share | None = None  # Smallest temperature factor for a resistance inside of 0.25 m2 K / W
+    loss: Annotated[Measured, "W"] | None = None  # Largest heat loss of what was observed
+
+
+@dataclass(frozen=True)
+class Year:
+    """A heating season, and what heat costs."""
+
+    degree_days: Annotated[Measured, "K d"]  # Difference of the airs times time
+    price: Annotated[Measured, "/kWh"] | None = None
+    currency: str = ""
+    co2: Annotated[Measured, "kg/kWh"] | None = None
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """All that is known beside the photographs."""
+
+    side: Side  # From where the surface was seen
+    inside: InsideAir
+    outside: OutsideAir
+    surroundings: Surroundings
+    film: Film
+    camera: Camera
+    surfaces: tuple[Surface, ...]
+    leave_out: tuple[str, ...] = ()  # Patches that mirror, by name or pattern: glass, metal
+    storeys: dict[str, Annotated[Measured, "m"]] = field(default_factory=dict)
+    """Height at which each storey begins, above the lowest point of the mesh, [m]."""
+    survey: Survey = field(default_factory=Survey)
+    limits: Limits = field(default_factory=Limits)
+    year: Year | None = None
+    title: str = ""
+
+    def __post_init__(self) -> None:
+        _check_models(self)
+        inside, outside = self.inside.air, self.outside.air
+        if inside.low <= outside.high:
+            expected = "air that is warmer than outside by more than both may be off"
+            got = f"{inside.value:g} +- {inside.off_by:g} C inside, {outside.value:g} +- {outside.off_by:g} C outside"
+            remedy = "Measure while the building is heated and it is cold outside; no U-value follows from this."
+            raise AuditError("inside: air", expected=expected, got=got, remedy=remedy)
+        if not self.surfaces:
+            remedy = 'Write surfaces: [{patches: ["*"], emissivity: 0.93 +- 0.02}].'
+            raise AuditError("surfaces", expected="at least one entry", got="none", remedy=remedy)
+        if self.side == "inside" and self.surroundings.sky is not None:
+            remedy = "Write surroundings: {reflected: 19.5 +- 0.5 C}."
+            raise AuditError("surroundings", expected="a reflected temperature inside", got="a sky", remedy=remedy)
+
+    @property
+    def difference_k(self) -> float:
+        """Difference of the airs as stated, [K]."""
+        return self.inside.air.value - self.outside.air.value
+
+
+@raising(AuditError)
+def load_conditions(path: Path | str) -> Conditions:
+    """Read conditions from a yaml file, or raise `AuditError` for what is wrong in it."""
+    path = Path(path)
+    return as_record(path.name, read_yaml(path), Conditions)
+
+
+def write_example(path: Path) -> None:
+    """Write a file of conditions in which every key is explained; one that is there stays (`AuditError`)."""
+    if path.exists():
+        remedy = "Choose another name."
+        raise AuditError("conditions file", expected="a name that is free", got=str(path), remedy=remedy)
+    writable_folder(path.parent)
+    with replace_when_done(path) as temporary:
+        temporary.write_text((configs_folder() / EXAMPLE).read_text(encoding="utf-8"), encoding="utf-8")
+
+
+def _check_models(conditions: Conditions) -> None:
+    known, model = FILM_MODELS[conditions.side], conditions.film.model
+    if model not in known:
+        remedy = f"Write model: {known[0]}, for example."
+        raise AuditError(f"film: model of surfaces seen from {conditions.side}", expected=f"one of {', '.join(known)}",
+                         got=model, remedy=remedy)  # fmt: skip
+    if conditions.side == "outside" and model in WINDY and conditions.outside.wind is None:
+        remedy = "Add wind: 1.5 +- 0.5 m/s, for example."
+        raise AuditError("outside: wind", expected=f"a speed, because {model} needs it", got="none", remedy=remedy)
+
+
+def _check_emissivity(name: str, value: Measured) -> None:
+    if not (value.low > 0.0 and value.high <= 1.0 + 1e-12):
+        got = f"{value.value:g} +- {value.off_by:g}"
+        raise _out_of_range(name, "a number that is surely above 0 and at most 1", got, "0.93 +- 0.02")
+
+
+def _check_temperatures(**values: Measured | None) -> None:
+    for name, value in values.items():
+        if value is not None and value.low < -ZERO_CELSIUS_K:
+            raise _out_of_range(name, "a temperature above absolute zero", f"{value.low:g} C", "20.0 +- 0.5 C")
+
+
+def _out_of_range(name: str, expected: str, got: Any, example: str) -> AuditError:
+    return AuditError(name, expected=expected, got=got, remedy=f"Write {example}, for example.")

@@ -1,0 +1,262 @@
+"""Thermal bridges and defects: places where a surface departs from the undisturbed temperature of its patch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from thermoxels_ns.audit.surface import AuditedSurface
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
+from thermoxels_ns.mesh.quality.topology import component_of, group_sides, triangles_across_edges
+
+DefectKind = Literal["line", "point", "area"]
+
+LEAST_DEPARTURE_K = 0.1  # What no camera tells from noise, [K]
+_DEVIATIONS = 3.0  # Standard deviations of the undisturbed surface from which on a triangle departs
+_SHORTH = 1.349  # Width of the shortest half of a normal distribution, in standard deviations
+_SURE = 2.0  # A defect reaches this many times the least departure somewhere
+LEAST_AREA_M2 = 0.01  # Of what departs: a square decimetre
+_LEAST_TRIANGLES = 4
+_STRAIGHT = 3.0  # A straight line is this many times as long as wide
+_BENT = 6.0  # So is one that bends, or closes, as around a window
+_POINT_M = 0.5  # A point is no longer than this
+_NARROWEST_ZONE_M = 0.3  # About a wall's thickness, over which heat spreads sideways
+_WIDEST_ZONE_M = {"line": 0.5, "point": 0.5, "area": 0.3}
+_FARTHEST_OUT_M = 2.0  # What stands out farther from the surface does not belong to a defect
+_GAP_M = 0.3  # Sets of triangles this near to each other are one defect
+_NEIGHBOURS = 16
+SPOT_M2 = 0.01  # Area over which the coldest or hottest spot is averaged
+
+
+@dataclass(frozen=True)
+class Undisturbed:
+    """The temperature that most of a patch has."""
+
+    temperature_c: float  # Mean of the narrowest range of temperatures that half of the area has
+    least_departure_k: float  # From where on a triangle departs from it
+
+
+@dataclass(frozen=True)
+class FoundDefect:
+    """Triangles that depart, and those that they are compared with."""
+
+    kind: DefectKind
+    patch: int
+    core: IntArray  # Triangles that depart by more than noise
+    zone: IntArray  # Those and what is around them, where heat still flows to them
+    reference: IntArray  # Undisturbed triangles near by
+    base_area_m2: float  # Area of the undisturbed surface that the zone stands on
+    length_m: float  # Of a line, else the largest extent
+    spot: IntArray  # Triangles of the core that depart most, together at least `SPOT_M2`
+    not_counted: str  # Why it is not to be believed, a sentence; else empty
+
+
+def find_defects(
+    surface: AuditedSurface, surface_c: FloatArray, warm: bool, least_k: float
+) -> tuple[dict[int, Undisturbed], list[FoundDefect]]:
+    """Find what departs from the undisturbed temperature of its patch.
+
+    A triangle departs where its difference is more than three standard deviations of its patch, `least_k` and 0.1 K;
+    triangles that hang together and reach twice that somewhere are a defect. Rims of what was not measured never count.
+
+    Args:
+        surface: The surface.
+        surface_c: Its temperature, corrected, shape (f,), [degrees Celsius].
+        warm: Look for what is warmer (seen from outside) or colder (seen from inside).
+        least_k: Smallest departure that counts, [K].
+
+    Returns:
+        undisturbed: By patch.
+        defects: Those with the largest departure times area first.
+    """
+    sure = surface.counted & ~surface.rim
+    away = np.zeros(len(surface_c))
+    undisturbed = dict[int, Undisturbed]()
+    least = np.full(len(surface_c), np.inf)
+    for patch in np.unique(surface.selection.facet_patch[sure]):
+        on_patch = np.flatnonzero(sure & (surface.selection.facet_patch == patch))
+        found = undisturbed_temperature(surface_c[on_patch], surface.area_m2[on_patch], least_k)
+        undisturbed[int(patch)] = found
+        away[on_patch] = (surface_c[on_patch] - found.temperature_c) * (1.0 if warm else -1.0)
+        least[on_patch] = found.least_departure_k
+    cores = _cores(surface, away, least)
+    departs = sure & (np.abs(away) > least)
+    zones = _Zones(surface, sure, departs, cores)
+    defects = [zones.around(core, away) for core in cores]
+    return undisturbed, sorted(defects, key=lambda one: -float(surface.area_m2[one.core] @ away[one.core]))
+
+
+def undisturbed_temperature(surface_c: FloatArray, area_m2: FloatArray, least_k: float = 0.0) -> Undisturbed:
+    """Find the temperature that most of a patch has: the mean of the shortest range that holds half of its area.
+
+    Of values that scatter normally that range is 1.349 standard deviations wide (Rousseeuw and Leroy 1988, the shorth),
+    whatever the other half does.
+
+    >>> undisturbed_temperature(np.array([1.0, 1.1, 1.05, 4.0]), np.ones(4)).temperature_c
+    1.025
+    """
+    order = np.argsort(surface_c, kind="stable")
+    values, weights = surface_c[order], area_m2[order]
+    reach = np.cumsum(weights)
+    last = np.searchsorted(reach, reach - weights + 0.5 * reach[-1] * (1.0 - 1e-12))
+    fits = np.flatnonzero(last < len(values))
+    start = fits[np.argmin(values[last[fits]] - values[fits])]
+    inside = slice(start, last[start] + 1)
+    scatter = float(values[last[start]] - values[start]) / _SHORTH
+    middle = float(np.average(values[inside], weights=weights[inside]))
+    return Undisturbed(middle, max(_DEVIATIONS * scatter, least_k, LEAST_DEPARTURE_K))
+
+
+def _cores(surface: AuditedSurface, away: FloatArray, least: FloatArray) -> list[IntArray]:
+    """Triangles that depart and hang together within a patch, by edges or over a gap of 0.3 m, if they are enough."""
+    which = np.flatnonzero(away > least)
+    pairs, patch = _neighbours(surface, which), surface.selection.facet_patch
+    component = component_of(len(which), pairs[:, 0], pairs[:, 1])
+    sure = np.bincount(component, away[which] > _SURE * least[which]) > 0
+    kept = sure[component] if len(which) else np.zeros(0, dtype=bool)
+    which = which[kept]
+    if not len(which):
+        return []
+    pairs = _neighbours(surface, which)
+    edge = np.flatnonzero(np.bincount(pairs.ravel(), minlength=len(which)) < 3)  # a neighbour is missing: at the border
+    gaps = edge[KDTree(surface.centroid_m[which[edge]]).query_pairs(_GAP_M, output_type="ndarray")].reshape(-1, 2)
+    gaps = gaps[patch[which[gaps[:, 0]]] == patch[which[gaps[:, 1]]]]
+    pairs = np.concatenate([pairs, gaps])
+    component = component_of(len(which), pairs[:, 0], pairs[:, 1])
+    size = np.bincount(component, surface.area_m2[which])
+    enough = (size >= LEAST_AREA_M2) & (np.bincount(component) >= _LEAST_TRIANGLES)
+    order = np.argsort(component, kind="stable")
+    sets = np.split(which[order], np.cumsum(np.bincount(component))[:-1])
+    return [sets[number] for number in np.flatnonzero(enough)]
+
+
+def _neighbours(surface: AuditedSurface, which: IntArray) -> IntArray:
+    """Pairs among some triangles, by their place in `which`, that share an edge and a patch, shape (p, 2)."""
+    pairs = triangles_across_edges(group_sides(surface.mesh.facets[which]))
+    patch = surface.selection.facet_patch[which]
+    return pairs[patch[pairs[:, 0]] == patch[pairs[:, 1]]]
+
+
+class _Zones:
+    """What lies around cores."""
+
+    def __init__(self, surface: AuditedSurface, sure: BoolArray, departs: BoolArray, cores: list[IntArray]) -> None:
+        self.surface, self.sure, self.departs, self.cores = surface, sure, departs, cores
+        self.patch, self.at = surface.selection.facet_patch, surface.centroid_m
+        self.normal = surface.selection.facet_normal
+        self.edge_m = np.sqrt(2.0 * np.maximum(surface.area_m2, 0.0))
+
+    def around(self, core: IntArray, away: FloatArray) -> FoundDefect:
+        """Describe a core: its zone, what it is compared with, its kind and its length."""
+        surface, patch = self.surface, int(self.patch[core[0]])
+        area = surface.area_m2[core]
+        edge = float(np.average(self.edge_m[core], weights=area))
+        same = np.flatnonzero(self.sure & (self.patch == patch))
+        width = max(self._width(core), edge)
+        reach = float(np.clip(0.5 * width, _NARROWEST_ZONE_M, _WIDEST_ZONE_M["line"]))
+        distance = self._distance(core, same)
+        near = self._nearest(core, same, distance, distance <= reach)
+        axes = self._plane(core, self._calm(same, near, distance, reach))
+        kind, length = _kind(self.at[core] @ axes, area, width, edge)
+        reach = min(reach, _WIDEST_ZONE_M[kind])
+        # What stands out from the surface, as a balcony, loses its heat through all of its sides.
+        beside, _ = KDTree(self.at[core] @ axes).query(self.at[same] @ axes, distance_upper_bound=reach)
+        near = self._nearest(core, same, distance, (beside <= reach) & (distance <= _FARTHEST_OUT_M))
+        near = self._hangs_together(core, same, near)
+        zone, reference = same[near], self._calm(same, near, distance, reach)
+        towards = self._reference_normal(zone, reference)
+        base = float(surface.area_m2[zone] @ np.einsum("ij,ij->i", self.normal[zone], towards))
+        ranked = core[np.argsort(-away[core], kind="stable")]
+        enough = int(np.searchsorted(np.cumsum(surface.area_m2[ranked]), SPOT_M2 * (1.0 - 1e-9))) + 1
+        unsupported = float(area @ surface.unsupported[core]) / float(area.sum())
+        return FoundDefect(
+            kind=kind,
+            patch=patch,
+            core=core,
+            zone=zone,
+            reference=reference,
+            base_area_m2=max(base, 0.0),
+            length_m=length,
+            spot=ranked[:enough],
+            not_counted="No photograph says that the surface lies there." if unsupported > 0.5 else "",
+        )
+
+    def _distance(self, core: IntArray, same: IntArray) -> FloatArray:
+        """Distance of triangles to a core, shape (k,), [m]; infinite far away."""
+        return KDTree(self.at[core]).query(self.at[same], distance_upper_bound=_FARTHEST_OUT_M)[0]
+
+    def _nearest(self, core: IntArray, same: IntArray, distance: FloatArray, near: BoolArray) -> BoolArray:
+        """Take from what is near a core what is nearer to another one."""
+        patch, near = self.patch[core[0]], near.copy()
+        others = [other for other in self.cores if other is not core and self.patch[other[0]] == patch]
+        candidates = np.flatnonzero(near)
+        if others and len(candidates):
+            nearest, _ = KDTree(self.at[np.concatenate(others)]).query(self.at[same[candidates]])
+            near[candidates[nearest < distance[candidates]]] = False
+        return near | np.isin(same, core)
+
+    def _hangs_together(self, core: IntArray, same: IntArray, near: BoolArray) -> BoolArray:
+        """Leave what hangs together with the core by edges."""
+        chosen = np.flatnonzero(near)
+        pairs = _neighbours(self.surface, same[chosen])
+        component = component_of(len(chosen), pairs[:, 0], pairs[:, 1])
+        kept = np.isin(component, np.unique(component[np.isin(same[chosen], core)]))
+        found = np.zeros(len(same), dtype=bool)
+        found[chosen[kept]] = True
+        return found
+
+    def _calm(self, same: IntArray, near: BoolArray, distance: FloatArray, reach: float) -> IntArray:
+        """Undisturbed triangles around a zone, of half its area or more; else all undisturbed ones of the patch."""
+        calm = ~near & ~self.departs[same]
+        ring = calm & (distance <= 2.0 * reach + 0.5)
+        wanted = 0.5 * float(self.surface.area_m2[same[near]].sum())
+        if float(self.surface.area_m2[same[ring]].sum()) < wanted:
+            ring = calm
+        return same[ring] if ring.any() else same[~near]
+
+    def _plane(self, core: IntArray, reference: IntArray) -> FloatArray:
+        """Two axes across the mean normal of the undisturbed surface, shape (3, 2)."""
+        normal = self.surface.area_m2[core] @ self._reference_normal(core, reference)
+        normal /= max(float(np.linalg.norm(normal)), 1e-12)
+        first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+        first /= np.linalg.norm(first)
+        return np.stack([first, np.cross(normal, first)], axis=1)
+
+    def _reference_normal(self, which: IntArray, reference: IntArray) -> FloatArray:
+        """Mean normal of the undisturbed surface next to triangles, shape (k, 3); their own where there is none."""
+        if not len(reference):
+            return self.normal[which]
+        count = min(_NEIGHBOURS, len(reference))
+        _, nearest = KDTree(self.at[reference]).query(self.at[which], k=count)
+        mean = self.normal[reference[np.reshape(nearest, (len(which), count))]].mean(axis=1)
+        length = np.linalg.norm(mean, axis=1, keepdims=True)
+        return np.where(length > 0.1, mean / np.maximum(length, 0.1), self.normal[which])
+
+    def _width(self, core: IntArray) -> float:
+        """Width of a strip, [m]: four times the mean distance of its points to its edge."""
+        facets, points = self.surface.mesh.facets[core], self.surface.mesh.points_m
+        sides = group_sides(facets)
+        alone = sides.order[sides.start[sides.sizes == 1]]
+        start, end = facets.ravel()[alone], np.roll(facets, -1, axis=1).ravel()[alone]
+        middles = 0.5 * (points[start] + points[end])
+        if not len(middles):
+            return float(np.sqrt(self.surface.area_m2[core].sum()))
+        distance, _ = KDTree(middles).query(self.at[core])
+        return 4.0 * float(np.average(distance, weights=self.surface.area_m2[core]))
+
+
+def _kind(footprint: FloatArray, area_m2: FloatArray, width_m: float, edge_m: float) -> tuple[DefectKind, float]:
+    """Tell lines, points and areas apart by the footprint, and measure the length."""
+    centred = footprint - np.average(footprint, axis=0, weights=area_m2)
+    _, axes = np.linalg.eigh((centred * area_m2[:, None]).T @ centred)
+    along = centred @ axes[:, ::-1]
+    long, wide = (float(np.ptp(side)) + 0.5 * edge_m for side in along.T)
+    if long >= _STRAIGHT * wide and long > _POINT_M:
+        return "line", long
+    bent = float(area_m2.sum()) / width_m
+    if bent >= _BENT * width_m and bent > 2.0 * _POINT_M:
+        return "line", bent
+    return ("point", long) if max(long, wide) <= _POINT_M else ("area", max(long, wide))

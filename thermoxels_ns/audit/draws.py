@@ -1,0 +1,124 @@
+"""Draws of all that is not known exactly and acts on every triangle alike: the common errors of a survey."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermoxels_ns.audit.conditions import Conditions
+from thermoxels_ns.core.arrays import FloatArray
+from thermoxels_ns.core.measured import Measured
+
+COUNT, SEED = 1000, 20260115
+"""How many draws intervals are made from, and the seed that makes them the same for the same conditions."""
+
+CONFIDENCE = 0.90  # Share of the draws that lie in an interval, as many below it as above
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A number that follows from the stated values, and the range that holds 90 % of the draws."""
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def at_most(self) -> bool:
+        """Whether only an upper bound is known: the lower end of the range is 0 or less."""
+        return self.low <= 0.0 < self.high
+
+    @property
+    def unknown(self) -> bool:
+        """Whether not even an upper bound above 0 is known."""
+        return self.high <= 0.0
+
+
+def interval_of(values: FloatArray) -> Interval:
+    """Make an interval of draws, shape (1 + k,), the first of which is made of the stated values.
+
+    >>> found = interval_of(np.array([20.0, *np.linspace(0.0, 40.0, 41)]))
+    >>> round(found.low, 9), found.value, round(found.high, 9)
+    (2.0, 20.0, 38.0)
+    """
+    low, high = np.quantile(values[1:], (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE))
+    return Interval(float(values[0]), float(low), float(high))
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Values of each uncertain quantity by its name, shape (1 + k,) each; the first are those that are stated."""
+
+    values: Mapping[str, FloatArray]
+    seed: int = SEED
+
+    @property
+    def count(self) -> int:
+        """1 + k."""
+        return len(next(iter(self.values.values())))
+
+    def __getitem__(self, name: str) -> FloatArray:
+        return self.values[name]
+
+    def local(self, off_by: float, number: int) -> FloatArray:
+        """Draws of the error of one part of the surface, independent for each `number`, shape (1 + k,)."""
+        drawn = np.random.default_rng((self.seed, number)).uniform(-off_by, off_by, self.count)
+        drawn[0] = 0.0
+        return drawn
+
+
+def draw(conditions: Conditions, count: int = COUNT, seed: int = SEED) -> Draws:
+    """Draw each quantity from its own range, all values as likely, one draw in each of `count` equal parts of it."""
+    generator = np.random.default_rng(seed)
+    values = {}
+    for name, what in uncertain(conditions).items():
+        parts = (generator.permutation(count) + generator.uniform(size=count)) / count
+        values[name] = np.concatenate([[what.value], what.low + (what.high - what.low) * parts])
+    return Draws(_possible(values), seed)
+
+
+def one_at_a_time(conditions: Conditions) -> Iterator[tuple[str, Draws]]:
+    """Yield for each quantity that is not exact draws of the stated value, its lowest, its highest, the rest as stated.
+
+    What depends on it is the same to first order in each half of its range.
+    """
+    every = uncertain(conditions)
+    for name, what in every.items():
+        if what.off_by > 0.0:
+            values = {other: np.full(3, it.value) for other, it in every.items()}
+            values[name] = np.array([what.value, what.low, what.high])
+            yield name, Draws(_possible(values))
+
+
+def uncertain(conditions: Conditions) -> dict[str, Measured]:
+    """All quantities that results follow from, by the names that reports call them."""
+    film, camera, around = conditions.film, conditions.camera, conditions.surroundings
+    named: dict[str, Measured | None] = {
+        "inside air": conditions.inside.air,
+        "outside air": conditions.outside.air,
+        "wind": conditions.outside.wind,
+        "film factor": film.factor,
+        "film coefficient": film.coefficient,
+        "camera offset": camera.offset,
+        "emissivity set in the camera": camera.emissivity,
+        "reflected temperature set in the camera": camera.reflected,
+        "reflected temperature": around.reflected,
+        "cloud": None if around.sky is None else around.sky.cloud,
+        "dew point": None if around.sky is None else around.sky.dew_point,
+        "ground": around.ground,
+    }
+    named |= {emissivity_name(conditions, n): surface.emissivity for n, surface in enumerate(conditions.surfaces)}
+    return {name: what for name, what in named.items() if what is not None}
+
+
+def emissivity_name(conditions: Conditions, number: int) -> str:
+    """What reports call the emissivity of an entry of `surfaces`."""
+    return f"emissivity of {', '.join(conditions.surfaces[number].patches)}, entry {number + 1}"
+
+
+def _possible(values: dict[str, FloatArray]) -> dict[str, FloatArray]:
+    """Cut off what cannot be: wind below 0, and clouds over less than none or more than all of the sky."""
+    limits = {"wind": (0.0, np.inf), "cloud": (0.0, 1.0)}
+    return {name: np.clip(drawn, *limits[name]) if name in limits else drawn for name, drawn in values.items()}

@@ -1,0 +1,164 @@
+"""Heat exchange of groups of triangles in every draw: surface temperature, heat flow and U-value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import sparse
+
+from thermoxels_ns.audit.conditions import FILM_MODELS, WINDY, Conditions, Film, FilmModel
+from thermoxels_ns.audit.draws import Draws, emissivity_name
+from thermoxels_ns.audit.heat_flow import (
+    albatici_tonelli_w_m2,
+    dallo_w_m2,
+    fourth_power,
+    madding_w_m2,
+    radiation_w_m2,
+    surface_temperature_k,
+)
+from thermoxels_ns.audit.surface import AlikeTriangles
+from thermoxels_ns.audit.surroundings import sky_emissivity, view_shares
+from thermoxels_ns.core.arrays import FloatArray
+from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin
+from thermoxels_ns.fem.quantities import Places
+from thermoxels_ns.heat.scene_fields import inside_coefficient, outside_coefficient
+
+CHUNK = 2000  # Groups whose draws are in memory together
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """What groups of triangles do in every draw; the first draw is made of the stated values."""
+
+    surface_c: FloatArray  # Surface temperature, corrected, shape (g, k), [degrees Celsius]
+    flow_w_m2: FloatArray  # Heat flow from inside to outside, shape (g, k)
+    inside_c: FloatArray  # Air inside, shape (k,), [degrees Celsius]
+    outside_c: FloatArray  # Air outside, shape (k,), [degrees Celsius]
+
+    @property
+    def difference_k(self) -> FloatArray:
+        """Difference of the airs, shape (k,), [K], above 0."""
+        return self.inside_c - self.outside_c
+
+
+@dataclass(frozen=True)
+class PartTotals:
+    """What parts of the surface do together in every draw."""
+
+    area_m2: FloatArray  # (p,)
+    flow_w: FloatArray  # Heat flow from inside to outside, shape (p, k), [W]
+    surface_c: FloatArray  # Mean surface temperature, shape (p, k), [degrees Celsius]
+    inside_c: FloatArray  # Air inside, shape (k,), [degrees Celsius]
+    outside_c: FloatArray  # Air outside, shape (k,), [degrees Celsius]
+
+    @property
+    def difference_k(self) -> FloatArray:
+        """Difference of the airs, shape (k,), [K], above 0."""
+        return self.inside_c - self.outside_c
+
+
+def exchange(
+    conditions: Conditions,
+    groups: AlikeTriangles,
+    draws: Draws,
+    up: tuple[float, float, float],
+    warmer_k: float = 0.0,
+) -> Exchange:
+    """Correct the readings of groups for emissivity and reflection, and let heat flow by the film model.
+
+    `warmer_k` is added to all readings, [K]: how results change with it.
+    """
+    emissivity = np.stack([draws[emissivity_name(conditions, n)] for n in range(len(conditions.surfaces))])
+    emissivity = emissivity[groups.surface_entry]
+    around_k4 = radiant_k4(conditions, draws, groups.normal, up)
+    set_k = celsius_to_kelvin(draws.values.get("reflected temperature set in the camera", np.zeros(draws.count)))
+    reading_k = celsius_to_kelvin(groups.reading_c + warmer_k)[:, None] + draws["camera offset"]
+    surface_k = surface_temperature_k(reading_k, emissivity, around_k4, draws["emissivity set in the camera"], set_k)
+    flow = film_flow_w_m2(conditions, draws, surface_k, around_k4, emissivity, groups.normal, up)
+    return Exchange(surface_k - ZERO_CELSIUS_K, flow, draws["inside air"], draws["outside air"])
+
+
+def part_totals(
+    conditions: Conditions,
+    groups: AlikeTriangles,
+    draws: Draws,
+    up: tuple[float, float, float],
+    area_m2: sparse.csr_array,
+    warmer_k: float = 0.0,
+) -> PartTotals:
+    """Add up heat flow and surface temperature over parts of the surface; `area_m2` has shape (parts, g)."""
+    columns, count = area_m2.tocsc(), len(groups.reading_c)
+    total = np.asarray(area_m2.sum(axis=1)).reshape(-1, 1)
+    flow_w, temperature = np.zeros((len(total), draws.count)), np.zeros((len(total), draws.count))
+    for start in range(0, count, CHUNK):
+        part = slice(start, min(start + CHUNK, count))
+        some = exchange(conditions, groups.some(part), draws, up, warmer_k)
+        flow_w += columns[:, part] @ some.flow_w_m2
+        temperature += columns[:, part] @ some.surface_c
+    mean = temperature / np.where(total > 0.0, total, 1.0)
+    return PartTotals(total[:, 0], flow_w, mean, draws["inside air"], draws["outside air"])
+
+
+def radiant_k4(conditions: Conditions, draws: Draws, normals: FloatArray, up: tuple[float, float, float]) -> FloatArray:
+    """Fourth power of the radiant temperature of what surfaces see, shape (g, k), [K^4]; normals (g, 3)."""
+    if conditions.surroundings.sky is None:
+        return np.broadcast_to(
+            fourth_power(celsius_to_kelvin(draws["reflected temperature"])), (len(normals), draws.count)
+        )
+    air_k4 = fourth_power(celsius_to_kelvin(draws["outside air"]))
+    sky_k4 = sky_emissivity(draws["dew point"], draws["cloud"]) * air_k4
+    ground_k4 = fourth_power(celsius_to_kelvin(draws.values.get("ground", draws["outside air"])))
+    return view_shares(normals, up) @ np.stack([sky_k4, air_k4, ground_k4])
+
+
+def film_flow_w_m2(
+    conditions: Conditions,
+    draws: Draws,
+    surface_k: FloatArray,
+    around_k4: FloatArray,
+    emissivity: FloatArray,
+    normals: FloatArray,
+    up: tuple[float, float, float],
+) -> FloatArray:
+    """Heat flow from inside to outside by the film model, shape (g, k), [W/m2].
+
+    Surface temperatures, what is around and emissivities have shape (g, k), normals (g, 3).
+    """
+    model, factor = conditions.film.model, draws["film factor"]
+    around_k = np.sqrt(np.sqrt(around_k4))
+    inside = conditions.side == "inside"
+    air_k = celsius_to_kelvin(draws["inside air" if inside else "outside air"])
+    if model == "albatici-tonelli":
+        return albatici_tonelli_w_m2(emissivity, draws["wind"], surface_k, air_k, factor)
+    if model == "dallo":
+        return dallo_w_m2(draws["wind"], surface_k, air_k, factor)
+    if model == "madding":
+        return madding_w_m2(emissivity, surface_k, around_k, air_k, factor)
+    outward = -1.0 if inside else 1.0
+    combined = model == "iso-6946-combined"
+    if model == "given":
+        coefficient = draws["film coefficient"]
+    elif inside:
+        name = "iso-6946-combined" if combined else "iso-6946-convection"
+        here = Places(np.zeros_like(normals), normals, up)
+        coefficient = np.asarray(inside_coefficient(name).function(here, 0.0))[:, None]
+    elif combined:
+        coefficient = outside_coefficient("iso-6946-combined")
+    else:
+        coefficient = 4.0 + 4.0 * draws["wind"]
+    flow = outward * factor * coefficient * (surface_k - air_k)
+    if not combined:
+        flow = flow + outward * radiation_w_m2(emissivity, surface_k, around_k)
+    return flow
+
+
+def other_models(conditions: Conditions) -> tuple[tuple[FilmModel, Conditions], ...]:
+    """All film models that the conditions have the figures for, their own one first."""
+    found: list[tuple[FilmModel, Conditions]] = [(conditions.film.model, conditions)]
+    for model in FILM_MODELS[conditions.side]:
+        windless = conditions.side == "outside" and conditions.outside.wind is None
+        needs_wind = model in WINDY and windless
+        if model not in (conditions.film.model, "given") and not needs_wind:
+            found.append((model, replace(conditions, film=Film(model, conditions.film.factor))))
+    return tuple(found)

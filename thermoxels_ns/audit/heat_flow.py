@@ -1,0 +1,86 @@
+"""Heat flow through a surface from its temperature: the published formulas, and the conversion of camera readings.
+
+Heat flows are densities, [W/m2], positive from inside to outside; temperatures are in kelvin; arguments broadcast.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4
+
+Values: TypeAlias = Any  # A number or an array
+
+WIND_W_S_M3K = 3.8054  # Coefficient of the wind in the formulas of Albatici and Tonelli and of Dall'O, [W s / (m3 K)]
+
+
+def fourth_power(values: Values) -> Values:
+    """The fourth power, ten times as fast as ``values**4``."""
+    return np.square(np.square(values))
+
+
+def radiation_w_m2(emissivity: Values, surface_k: Values, surroundings_k: Values) -> Values:
+    """Net radiation from a surface, eps sigma (Ts^4 - Trefl^4) (Fokaides and Kalogirou 2011)."""
+    return emissivity * STEFAN_BOLTZMANN_W_M2K4 * (fourth_power(surface_k) - fourth_power(surroundings_k))
+
+
+def albatici_tonelli_w_m2(
+    emissivity: Values, wind_m_s: Values, surface_k: Values, air_k: Values, factor: Values = 1.0
+) -> Values:
+    """Outside, 5.67 eps ((Ts/100)^4 - (Te/100)^4) + 3.8054 v (Ts - Te) (Albatici and Tonelli 2010).
+
+    `factor` multiplies convection.
+    """
+    radiation = 5.67 * emissivity * (fourth_power(surface_k / 100.0) - fourth_power(air_k / 100.0))
+    return radiation + factor * WIND_W_S_M3K * wind_m_s * (surface_k - air_k)
+
+
+def dallo_w_m2(wind_m_s: Values, surface_k: Values, air_k: Values, factor: Values = 1.0) -> Values:
+    """Outside, (5.8 + 3.8054 v) (Ts - Te) (Dall'O, Sarto and Panza 2013); `factor` multiplies all of it."""
+    return factor * (5.8 + WIND_W_S_M3K * wind_m_s) * (surface_k - air_k)
+
+
+def madding_w_m2(
+    emissivity: Values, surface_k: Values, reflected_k: Values, air_k: Values, factor: Values = 1.0
+) -> Values:
+    """Inside, 4 eps sigma Tm^3 (Trefl - Ts) + 1.31 (Ti - Ts)^(4/3), Tm the mean of Trefl and Ts (Madding 2008).
+
+    Where the surface is warmer than the air, convection changes its sign. `factor` multiplies convection.
+    """
+    mean = 0.5 * (reflected_k + surface_k)
+    radiation = 4.0 * emissivity * STEFAN_BOLTZMANN_W_M2K4 * mean**3 * (reflected_k - surface_k)
+    colder = air_k - surface_k
+    return radiation + factor * 1.31 * colder * np.cbrt(np.abs(colder))
+
+
+def surface_temperature_k(
+    reading_k: Values, emissivity: Values, surroundings_k4: Values, set_emissivity: Values, set_reflected_k: Values
+) -> Values:
+    """Temperature of a surface from a camera's reading of it.
+
+    The camera took eps_set T_read^4 + (1 - eps_set) T_set^4 for what arrives; eps Ts^4 + (1 - eps) T_surr^4 is what
+    arrives. The law of total radiation stands for the camera's band.
+
+    Args:
+        reading_k: What the camera says, [K].
+        emissivity: Of the surface, above 0, at most 1.
+        surroundings_k4: Fourth power of the radiant temperature of what it reflects, [K^4].
+        set_emissivity: What the camera was set to.
+        set_reflected_k: Reflected temperature that the camera was set to, [K].
+
+    >>> round(float(surface_temperature_k(280.0, 0.9, 260.0**4, 1.0, 0.0)), 3)
+    281.974
+    """
+    arrives = set_emissivity * fourth_power(reading_k) + (1.0 - set_emissivity) * fourth_power(set_reflected_k)
+    emitted = (arrives - (1.0 - emissivity) * surroundings_k4) / emissivity
+    return np.sqrt(np.sqrt(np.maximum(emitted, 1.0)))
+
+
+def temperature_factor(resistance_to_outside_m2k_w: Values, inside_resistance_m2k_w: float) -> Values:
+    """Temperature factor of an inner surface, f_Rsi = R / (R + Rsi) (ISO 13788).
+
+    `resistance_to_outside_m2k_w` is that between the surface and the air outside, (Ts - Te) / q.
+    """
+    return resistance_to_outside_m2k_w / (resistance_to_outside_m2k_w + inside_resistance_m2k_w)

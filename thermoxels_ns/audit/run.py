@@ -1,0 +1,272 @@
+"""The course of an audit: from a mesh with readings and conditions to answers with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermoxels_ns.audit.conditions import Conditions
+from thermoxels_ns.audit.defect_figures import PartFigures, describe_defect
+from thermoxels_ns.audit.defects import SPOT_M2, find_defects
+from thermoxels_ns.audit.draws import CONFIDENCE, Draws, Interval, draw, interval_of, one_at_a_time
+from thermoxels_ns.audit.exchange import CHUNK, exchange, other_models, part_totals
+from thermoxels_ns.audit.results import Audit, Defect, Element, Limit, Verdict, YearResult
+from thermoxels_ns.audit.surface import WHY_NOT, AlikeTriangles, AuditedSurface, alike_triangles, audited_surface
+from thermoxels_ns.audit.survey_rules import check_survey
+from thermoxels_ns.core.arrays import FloatArray, IntArray
+from thermoxels_ns.core.measured import Measured
+from thermoxels_ns.fem.selection import matching_names
+from thermoxels_ns.mesh.tetrahedra import TetMesh
+
+_HALF_STEP_K = 0.05  # For differences with respect to readings, [K]
+_OF_A_TRIANGLE, _OF_THE_YEAR = 10**6, 10**6 + 1  # Numbers of errors of their own, beyond those of parts
+
+
+def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Audit:
+    """Answer what a survey asks: heat flow, U-values, thermal bridges and their intervals.
+
+    `up` is a unit vector. Raises `AuditError` if the conditions do not fit the mesh.
+    """
+    work = _Work(mesh, conditions, up)
+    surface, side = work.surface, conditions.side
+    surface_c, flow = work.triangles()
+    repeatability = conditions.camera.repeatability.off_by
+    undisturbed, found = find_defects(surface, surface_c, side == "outside", repeatability)
+
+    patch, names = surface.selection.facet_patch, surface.selection.patch_names
+    counted = np.flatnonzero(surface.counted)
+    patches = [int(n) for n in np.unique(patch[counted])]
+    storey = work.storey_of()
+    storeys = [int(n) for n in np.unique(storey[counted]) if n >= 0]
+    parts = [counted[patch[counted] == n] for n in patches]
+    parts += [counted[storey[counted] == n] for n in storeys]
+    parts += [part for one in found for part in (one.zone, one.reference, one.spot)]
+    parts.append(_worst(surface, surface_c, side))
+    rows = work.groups.rows(parts, surface.area_m2)
+    totals, slope = part_totals(conditions, work.groups, work.draws, up, rows), work.slopes(parts)
+
+    # Readings of each patch have an error of their own, those of a storey the errors of the patches in it.
+    own = np.stack([slope[n] * work.draws.local(repeatability, n) for n in range(len(patches))])
+    models = work.u_by_model(parts[: len(patches)])
+    elements = []
+    for row, number in enumerate(patches):
+        u = {model: float(values[row]) for model, (values, _) in models.items()}
+        every = np.flatnonzero(patch == number)
+        element = _Part(names[number], parts[row], every, totals.surface_c[row], totals.flow_w[row] + own[row], u)
+        elements.append(work.element(element, totals.difference_k))
+    of_storeys = []
+    for row, number in enumerate(storeys, start=len(patches)):
+        every, error = (
+            np.flatnonzero((storey == number) & np.isin(patch, patches)),
+            _shares(surface, parts[row], parts[: len(patches)]) @ own,
+        )
+        name = list(conditions.storeys)[number]
+        element = _Part(name, parts[row], every, totals.surface_c[row], totals.flow_w[row] + error, {})
+        of_storeys.append(work.element(element, totals.difference_k))
+    area, whole_flow = totals.area_m2[: len(patches)], totals.flow_w[: len(patches)].sum(axis=0) + own.sum(axis=0)
+    mean_c = area @ totals.surface_c[: len(patches)] / area.sum()
+    u = {model: mean for model, (_, mean) in models.items()}
+    name, every = "all that was observed", np.flatnonzero(np.isin(patch, patches))
+    whole = work.element(_Part(name, counted, every, mean_c, whole_flow, u), totals.difference_k)
+
+    defects = []
+    first = len(patches) + len(storeys)
+    for number, one in enumerate(found):
+        figures = PartFigures(totals, slope, work.draws.local(repeatability, first + number))
+        at = storey[one.spot[0]]
+        where = list(conditions.storeys)[at] if at >= 0 else ""
+        defects.append(
+            describe_defect(
+                surface, conditions, one, undisturbed[one.patch], figures, first + 3 * number, where, whole.loss_w.value
+            )
+        )
+    last = len(parts) - 1
+    f_rsi = PartFigures(totals, slope, work.draws.local(repeatability, last)).factors(last, side)
+    left = {why: float(surface.area_m2[surface.why_not == n].sum()) for n, why in enumerate(WHY_NOT.values())}
+    return Audit(
+        conditions=conditions,
+        surface=surface,
+        check=check_survey(conditions),
+        patches=tuple(elements),
+        storeys=tuple(of_storeys),
+        whole=whole,
+        defects=tuple(defects),
+        found=tuple(found),
+        limits=_limits(conditions, elements, defects, whole, f_rsi),
+        year=_year(conditions, work.draws, whole_flow / totals.difference_k),
+        f_rsi=f_rsi,
+        budget=work.budget(own),
+        not_counted_m2={why: area for why, area in left.items() if area > 0.0},
+        triangle_surface_c=surface_c,
+        triangle_flow_w_m2=flow,
+        triangle_u=work.triangle_u(),
+    )
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A part of the surface in every draw."""
+
+    name: str
+    counted: IntArray  # Its triangles that count
+    every: IntArray  # All of its triangles
+    surface_c: FloatArray  # (k,)
+    flow_w: FloatArray  # (k,)
+    u_by_model: Mapping[str, float]
+
+
+class _Work:
+    """A surface, its groups of triangles, and the draws."""
+
+    def __init__(self, mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float]) -> None:
+        self.conditions, self.up = conditions, up
+        self.surface: AuditedSurface = audited_surface(mesh, conditions, up)
+        self.groups: AlikeTriangles = alike_triangles(self.surface)
+        self.draws = draw(conditions)
+        self.stated = Draws({name: values[:1] for name, values in self.draws.values.items()})
+
+    def element(self, part: _Part, difference_k: FloatArray) -> Element:
+        """Put figures to a part of the envelope."""
+        surface = self.surface
+        area = float(surface.area_m2[part.counted].sum())
+        uncut = part.every[surface.why_not[part.every] != list(WHY_NOT).index("cut")]
+        return Element(
+            name=part.name,
+            area_m2=area,
+            unobserved_m2=max(float(surface.area_m2[uncut].sum()) - area, 0.0),
+            surface_c=interval_of(part.surface_c),
+            loss_w=interval_of(part.flow_w),
+            u_w_m2k=interval_of(part.flow_w / area / difference_k),
+            u_by_model=part.u_by_model,
+            unsupported_share=float(surface.area_m2[part.counted] @ surface.unsupported[part.counted]) / area,
+        )
+
+    def triangles(self) -> tuple[FloatArray, FloatArray]:
+        """Surface temperature and heat flow of each triangle by the stated values, NaN where it does not count."""
+        steps = (-_HALF_STEP_K, 0.0, _HALF_STEP_K)
+        low, mean, high = (exchange(self.conditions, self.groups, self.stated, self.up, step) for step in steps)
+        group = self.groups.of_triangle
+        off = (self.surface.reading_c - self.groups.reading_c[group]) / (2.0 * _HALF_STEP_K)
+        values = []
+        for name in ("surface_c", "flow_w_m2"):
+            at, change = getattr(mean, name)[:, 0], (getattr(high, name) - getattr(low, name))[:, 0]
+            values.append(np.where(self.surface.counted, at[group] + off * change[group], np.nan))
+        return values[0], values[1]
+
+    def triangle_u(self) -> FloatArray:
+        """U-value of each triangle and the ends of its interval, shape (f, 3); NaN where it does not count."""
+        off = self.draws.local(self.conditions.camera.repeatability.off_by, _OF_A_TRIANGLE)
+        ends, found = (0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE), []
+        for start in range(0, len(self.groups.reading_c), CHUNK):
+            some = self.groups.some(slice(start, start + CHUNK))
+            here = exchange(self.conditions, some, self.draws, self.up)
+            warmer = exchange(self.conditions, some, self.stated, self.up, _HALF_STEP_K)
+            slope = (warmer.flow_w_m2 - here.flow_w_m2[:, :1]) / _HALF_STEP_K
+            u = (here.flow_w_m2 + slope * off) / here.difference_k
+            found.append(np.concatenate([u[:, :1], np.quantile(u[:, 1:], ends, axis=1).T], axis=1))
+        of_group = np.concatenate(found)
+        return np.where(self.surface.counted[:, None], of_group[self.groups.of_triangle], np.nan)
+
+    def slopes(self, parts: Sequence[IntArray]) -> FloatArray:
+        """How the heat flow of each part changes with its readings, shape (parts,), [W/K]."""
+        rows = self.groups.rows(list(parts), self.surface.area_m2)
+        low, high = (
+            part_totals(self.conditions, self.groups, self.stated, self.up, rows, step)
+            for step in (-_HALF_STEP_K, _HALF_STEP_K)
+        )
+        return (high.flow_w - low.flow_w)[:, 0] / (2.0 * _HALF_STEP_K)
+
+    def u_by_model(self, parts: Sequence[IntArray]) -> dict[str, tuple[FloatArray, float]]:
+        """U-values of parts, shape (parts,), and of all together, by each film model from the stated values."""
+        rows, found = self.groups.rows(list(parts), self.surface.area_m2), {}
+        for model, conditions in other_models(self.conditions):
+            one = part_totals(conditions, self.groups, self.stated, self.up, rows)
+            per_kelvin = one.flow_w[:, 0] / one.difference_k[0]
+            found[model] = per_kelvin / one.area_m2, float(per_kelvin.sum() / one.area_m2.sum())
+        return found
+
+    def storey_of(self) -> IntArray:
+        """Number of the storey of each triangle, in the order of the conditions; -1 below all and without storeys."""
+        begins = np.array([what.value for what in self.conditions.storeys.values()])
+        order = np.argsort(begins, kind="stable")
+        place = np.searchsorted(begins[order], self.surface.height_m + 1e-9, side="right")
+        return np.concatenate([[-1], order])[place].astype(np.int64)
+
+    def budget(self, own: FloatArray) -> dict[str, float]:
+        """How far each uncertain quantity alone moves the loss from one end of its range to the other, [W]."""
+        rows, found = self.groups.rows([np.flatnonzero(self.surface.counted)], self.surface.area_m2), {}
+        for name, draws in one_at_a_time(self.conditions):
+            found[name] = float(np.ptp(part_totals(self.conditions, self.groups, draws, self.up, rows).flow_w[0][1:]))
+        if self.conditions.camera.repeatability.off_by > 0.0:
+            found["camera repeatability"] = float(np.ptp(own.sum(axis=0)))
+        return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+def verdict(found: Interval, limit: float, at_most: bool = True) -> Verdict:
+    """Say whether an interval lies within a limit, beyond it, or on both sides.
+
+    >>> verdict(Interval(0.3, 0.2, 0.4), 0.5), verdict(Interval(0.3, 0.2, 0.4), 0.25)
+    ('met', 'cannot tell')
+    """
+    low, high, edge = (found.low, found.high, limit) if at_most else (-found.high, -found.low, -limit)
+    return "met" if high <= edge else "not met" if low > edge else "cannot tell"
+
+
+def _worst(surface: AuditedSurface, surface_c: FloatArray, side: str) -> IntArray:
+    """Triangles of the square decimetre, no rim, that is warmest from outside or coldest from inside."""
+    sure = np.flatnonzero(surface.counted & ~surface.rim)
+    sure = sure if len(sure) else np.flatnonzero(surface.counted)
+    ranked = sure[np.argsort(surface_c[sure] * (1.0 if side == "inside" else -1.0), kind="stable")]
+    enough = int(np.searchsorted(np.cumsum(surface.area_m2[ranked]), SPOT_M2 * (1.0 - 1e-9))) + 1
+    return ranked[:enough]
+
+
+def _shares(surface: AuditedSurface, part: IntArray, patches: Sequence[IntArray]) -> FloatArray:
+    """Share of each patch's area that lies in a part, shape (patches,)."""
+    within = np.zeros(len(surface.area_m2))
+    within[part] = surface.area_m2[part]
+    return np.array([within[patch].sum() / surface.area_m2[patch].sum() for patch in patches])
+
+
+def _limits(
+    conditions: Conditions,
+    patches: Sequence[Element],
+    defects: Sequence[Defect],
+    whole: Element,
+    f_rsi: tuple[Interval, ...],
+) -> tuple[Limit, ...]:
+    limits, found = conditions.limits, list[Limit]()
+
+    def judge(name: str, limit: Measured, unit: str, value: Interval, at_most: bool = True) -> None:
+        found.append(Limit(name, limit.value, unit, at_most, value, verdict(value, limit.value, at_most)))
+
+    for patch in patches:
+        chosen = [limit for pattern, limit in limits.u.items() if matching_names([patch.name], pattern)]
+        if chosen:
+            judge(f"U-value of {patch.name}", chosen[-1], "W/(m2 K)", patch.u_w_m2k)
+    lines = [one for one in defects if one.kind == "line" and not one.not_counted]
+    if limits.psi is not None and lines:
+        worst = max(lines, key=lambda one: one.coefficient.value)
+        judge(f"psi of the worst linear thermal bridge, in {worst.patch}", limits.psi, "W/(m K)", worst.coefficient)
+    if limits.f_rsi is not None and f_rsi:
+        judge("lowest temperature factor for Rsi = 0.25", limits.f_rsi, "", f_rsi[-1], at_most=False)
+    if limits.loss is not None:
+        judge("heat loss of what was observed", limits.loss, "W", whole.loss_w)
+    return tuple(found)
+
+
+def _year(conditions: Conditions, draws: Draws, coupling_w_k: FloatArray) -> YearResult | None:
+    """Heat, cost and carbon dioxide of a heating season: coupling times degree days times 0.024 kWh / (W d)."""
+    year = conditions.year
+    if year is None:
+        return None
+
+    def drawn(what: Measured, number: int) -> FloatArray:
+        return what.value + draws.local(what.off_by, _OF_THE_YEAR + number)
+
+    heat = 0.024 * coupling_w_k * drawn(year.degree_days, 0)
+    cost = None if year.price is None else interval_of(heat * drawn(year.price, 1))
+    co2 = None if year.co2 is None else interval_of(heat * drawn(year.co2, 2))
+    return YearResult(interval_of(heat), cost, co2)

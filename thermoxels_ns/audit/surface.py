@@ -1,0 +1,169 @@
+"""Which boundary triangles count, and groups of triangles that are so alike that one heat flow holds for all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from thermoxels_ns.audit.conditions import Conditions
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
+from thermoxels_ns.core.errors import AuditError
+from thermoxels_ns.fem.selection import Selection, matching_names
+from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
+
+_CUT = "cut"
+_STEP_K, _STEP_COSINE = 0.05, 0.05
+"""Widths of the bins of readings, [K], and of normals, within which triangles are alike."""
+
+WHY_NOT = {
+    "cut": "where the scene box cuts the body",
+    "unseen": "seen by no photograph",
+    "no reading": "no thermal ray, or not on all of the triangle",
+    "left out": "left out by the conditions",
+}
+"""Why a triangle does not count."""
+
+
+@dataclass(frozen=True)
+class AuditedSurface:
+    """The boundary of a mesh with what was measured on it; arrays have one entry per boundary triangle, shape (f,)."""
+
+    selection: Selection
+    reading_c: FloatArray  # What the thermal camera says, mean of the triangle, [degrees Celsius]
+    area_m2: FloatArray  # True area
+    centroid_m: FloatArray  # (f, 3)
+    counted: BoolArray  # Where thermal rays measured, and nothing speaks against it
+    why_not: IntArray  # Place in `WHY_NOT` of what speaks against it; -1 where nothing does
+    unsupported: BoolArray  # Photographs see the triangle, but none says that the surface lies there
+    surface_entry: IntArray  # Entry of `Conditions.surfaces` that holds
+    base_m: float  # Height of the lowest node of the mesh
+
+    @property
+    def mesh(self) -> TetMesh:
+        """The mesh."""
+        return self.selection.mesh
+
+    @property
+    def height_m(self) -> FloatArray:
+        """Height of each triangle above the lowest node of the mesh, shape (f,), [m]."""
+        return self.centroid_m @ np.array(self.selection.up) - self.base_m
+
+    @property
+    def rim(self) -> BoolArray:
+        """Where a triangle that counts shares a node with one of which nothing is known, shape (f,)."""
+        facets = self.mesh.facets
+        unknown = np.zeros(len(self.mesh.points_m), dtype=bool)
+        unknown[facets[~self.counted & (self.why_not != list(WHY_NOT).index("left out"))]] = True
+        return self.counted & unknown[facets].any(axis=1)
+
+
+@dataclass(frozen=True)
+class AlikeTriangles:
+    """Groups of triangles that count, of one patch, with nearly the same reading and normal."""
+
+    reading_c: FloatArray  # Mean of each group, weighted by area, shape (g,), [degrees Celsius]
+    normal: FloatArray  # Mean unit normal, shape (g, 3)
+    surface_entry: IntArray  # Entry of `Conditions.surfaces`, shape (g,)
+    of_triangle: IntArray  # Group of each boundary triangle, -1 where it does not count, shape (f,)
+
+    def some(self, part: slice) -> AlikeTriangles:
+        """Take some of the groups; which triangles they are made of is lost."""
+        none = np.zeros(0, dtype=np.int64)
+        return AlikeTriangles(self.reading_c[part], self.normal[part], self.surface_entry[part], none)
+
+    def rows(self, parts: list[IntArray], area_m2: FloatArray) -> sparse.csr_array:
+        """Area of each group in each part of the surface (given by its triangles, all counted), shape (parts, g)."""
+        row = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+        which = np.concatenate([*parts, np.zeros(0, dtype=np.int64)]).astype(np.int64)
+        shape = (len(parts), len(self.reading_c))
+        return sparse.coo_array((area_m2[which], (row, self.of_triangle[which])), shape=shape).tocsr()
+
+
+def audited_surface(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float]) -> AuditedSurface:
+    """Find what counts: seen, measured by thermal rays at all three nodes, not cut and not left out.
+
+    Raises:
+        AuditError: The mesh has no boundary tags, the conditions name a patch that it does not have or no emissivity
+            for one, or nothing counts.
+    """
+    if mesh.boundary is None:
+        remedy = "Export it with ns-export thermoxels-mesh."
+        raise AuditError("mesh", expected="one whose boundary has tags", got="one without", remedy=remedy)
+    selection, tags = Selection(mesh, up), mesh.boundary
+    names = selection.patch_names
+    entry_of_patch = np.full(len(names), -1)
+    for number, surface in enumerate(conditions.surfaces):
+        entry_of_patch[_chosen(f"surfaces entry {number + 1}: patches", names, surface.patches)] = number
+    left_out = np.zeros(len(names), dtype=bool)
+    left_out[_chosen("leave_out", names, conditions.leave_out)] = True
+    _chosen("limits: u", names, tuple(conditions.limits.u))
+
+    patch = tags.patch
+    unseen = ~tags.seen
+    unsupported = np.zeros(len(patch), dtype=bool)
+    if tags.photographs is not None:
+        unseen = unseen | (tags.photographs[:, 0] == 0)
+        unsupported = tags.photographs[:, 1] == 0
+    cut = (mesh.facet_tags == FACET_BOX) | np.array([name == _CUT for name in names])[patch]
+    no_reading = ~mesh.observed[mesh.facets].all(axis=1)
+    why_not = np.select([cut, unseen, no_reading, left_out[patch]], [0, 1, 2, 3], default=-1)
+    counted = why_not < 0
+    if not counted.any():
+        counts = ", ".join(f"{np.count_nonzero(why_not == n)} {why}" for n, why in enumerate(WHY_NOT.values()))
+        remedy = "Export again, of a training with thermal images that show the surface."
+        raise AuditError("mesh", expected="boundary triangles with a reading", got=f"none: {counts}", remedy=remedy)
+    bare = sorted({names[number] for number in np.unique(patch[counted]) if entry_of_patch[number] < 0})
+    if bare:
+        remedy = f"Add {{patches: [{bare[0]}], emissivity: 0.93 +- 0.02}} to surfaces."
+        got = f"none for {', '.join(bare)}"
+        raise AuditError("surfaces", expected="an emissivity for every patch with readings", got=got, remedy=remedy)
+    return AuditedSurface(
+        selection=selection,
+        reading_c=mesh.temperature_c[mesh.facets].mean(axis=1),
+        area_m2=selection.facet_area_m2,
+        centroid_m=mesh.points_m[mesh.facets].mean(axis=1),
+        counted=counted,
+        why_not=why_not,
+        unsupported=unsupported & counted,
+        surface_entry=entry_of_patch[patch],
+        base_m=float((mesh.points_m @ np.array(up)).min()),
+    )
+
+
+def alike_triangles(surface: AuditedSurface) -> AlikeTriangles:
+    """Group the triangles that count by patch, reading and normal."""
+    which = np.flatnonzero(surface.counted)
+    normal, area = surface.selection.facet_normal[which], np.maximum(surface.area_m2[which], 1e-300)
+    reading, upward = surface.reading_c[which], normal @ np.array(surface.selection.up)
+    # Of normals, only how far they look up matters.
+    key = np.rint(reading / _STEP_K).astype(np.int64)
+    key = (key - key.min()) * (2 + round(2.0 / _STEP_COSINE)) + np.rint((upward + 1.0) / _STEP_COSINE).astype(np.int64)
+    key = key * len(surface.selection.patch_names) + surface.selection.facet_patch[which]
+    _, first, group = np.unique(key, return_index=True, return_inverse=True)
+    total = np.bincount(group, area)
+    up = np.array(surface.selection.up)
+    mean_up = np.clip(np.bincount(group, area * upward) / total, -1.0, 1.0)
+    across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    across /= np.linalg.norm(across)
+    of_triangle = np.full(len(surface.counted), -1)
+    of_triangle[which] = group
+    return AlikeTriangles(
+        reading_c=np.bincount(group, area * reading) / total,
+        normal=mean_up[:, None] * up + np.sqrt(1.0 - mean_up**2)[:, None] * across,
+        surface_entry=surface.surface_entry[which[first]],
+        of_triangle=of_triangle,
+    )
+
+
+def _chosen(name: str, names: tuple[str, ...], patterns: tuple[str, ...]) -> IntArray:
+    """Number the patches that match any pattern; raises `AuditError` for one that matches none."""
+    chosen = set[int]()
+    for pattern in patterns:
+        found = matching_names(names, pattern)
+        if not found:
+            remedy = "Correct the name; patches are those of the mesh, see --patches of ns-export thermoxels-mesh."
+            raise AuditError(name, expected=f"patches out of {', '.join(names)}", got=repr(pattern), remedy=remedy)
+        chosen |= {names.index(one) for one in found}
+    return np.array(sorted(chosen), dtype=np.int64)

@@ -1,0 +1,85 @@
+"""Measured values: a number, how far it may be off, and its unit, as people write them."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+from thermoxels_ns.core.errors import ThermoxelsError
+
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_WRITTEN = re.compile(rf"\s*({_NUMBER})\s*(?:(?:\+-|\+/-|±)\s*({_NUMBER})\s*)?(\S.*)?", re.DOTALL)
+
+_UNITS: dict[str, dict[str, tuple[float, float]]] = {
+    "1": {"": (1.0, 0.0), "%": (0.01, 0.0)},
+    "C": {"C": (1.0, 0.0), "°C": (1.0, 0.0), "K": (1.0, -273.15)},
+    "K": {"K": (1.0, 0.0), "C": (1.0, 0.0), "°C": (1.0, 0.0)},
+    "m": {"m": (1.0, 0.0), "cm": (0.01, 0.0), "mm": (1e-3, 0.0)},
+    "m/s": {"m/s": (1.0, 0.0), "km/h": (1.0 / 3.6, 0.0)},
+    "h": {"h": (1.0, 0.0), "d": (24.0, 0.0)},
+    "Pa": {"Pa": (1.0, 0.0)},
+    "W": {"W": (1.0, 0.0), "kW": (1e3, 0.0)},
+    "W/K": {"W/K": (1.0, 0.0)},
+    "W/(m K)": {"W/mK": (1.0, 0.0)},
+    "W/(m2 K)": {"W/m2K": (1.0, 0.0)},
+    "K d": {"Kd": (1.0, 0.0), "Kh": (1.0 / 24.0, 0.0)},
+    "/kWh": {"/kWh": (1.0, 0.0), "/MWh": (1e-3, 0.0)},
+    "kg/kWh": {"kg/kWh": (1.0, 0.0), "g/kWh": (1e-3, 0.0)},
+}
+"""Units by the one that values are kept in: factor and summand that lead from each to it. Spaces, brackets and powers
+are written as people like."""
+_EXAMPLES = {"1": "0.93 +- 0.02", "C": "20.0 +- 0.5 C", "K": "0 +- 1 K"}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A number and the half width of the range that holds the true value, every value in it as likely."""
+
+    value: float
+    off_by: float = 0.0  # At least 0; 0: taken as exact
+
+    @property
+    def low(self) -> float:
+        """Least true value."""
+        return self.value - self.off_by
+
+    @property
+    def high(self) -> float:
+        """Largest true value."""
+        return self.value + self.off_by
+
+
+def read_measured(name: str, content: object, unit: str) -> Measured:
+    """Read a value as people write it: ``20.0 +- 0.5 C``, ``3 ± 1 m/s``, ``0.93``; kept in `unit`, "1" for none.
+
+    Raises `ThermoxelsError`, which calls the value `name`, for a text that is none, another unit, or none where there
+    is one.
+
+    >>> read_measured("wind", "3.6 +- 1.8 km/h", "m/s")
+    Measured(value=1.0, off_by=0.5)
+    """
+    example = _EXAMPLES.get(unit, f"1.5 +- 0.5 {unit}")
+    plain = isinstance(content, (int, float)) and not isinstance(content, bool)
+    written = _WRITTEN.fullmatch(content if isinstance(content, str) else str(content) if plain else "")
+    got = "nothing" if content is None else repr(content)
+    if written is None:
+        raise _wrong(name, "a number" if unit == "1" else f"a number in {unit}", got, f"Write {example}, for example.")
+    number, off_by, ending = written.groups()
+    known = _UNITS[unit]
+    short = re.sub(r"[\s()^]", "", ending or "").replace("²", "2")
+    if short not in known:
+        says = "without a unit, or in %" if unit == "1" else f"with its unit, {unit}"
+        if short:
+            raise _wrong(name, f"a number {says}", got, f"Write {example}, for example.")
+        off = f" +- {off_by}" if off_by else ""
+        raise _wrong(name, f"a number {says}", f"{got} without one", f"Write {number}{off} {unit}.")
+    factor, summand = known[short]
+    value, half = float(number) * factor + summand, float(off_by or 0.0) * factor
+    if not (math.isfinite(value) and math.isfinite(half) and half >= 0.0):
+        raise _wrong(name, "a finite number, and behind +- one of at least 0", got, f"Write {example}, for example.")
+    return Measured(value, half)
+
+
+def _wrong(name: str, expected: str, got: str, remedy: str) -> ThermoxelsError:
+    return ThermoxelsError(name, expected=expected, got=got, remedy=remedy)
