@@ -12,6 +12,7 @@ from typing import Annotated, Literal, Union
 
 import tyro
 
+from thermoxels_ns.commands.audit import Audit
 from thermoxels_ns.commands.capture import Capture
 from thermoxels_ns.commands.cost import Cost
 from thermoxels_ns.commands.demo import Demo
@@ -90,6 +91,7 @@ Commands = tyro.conf.FlagConversionOff[
         Annotated[Synthetic, tyro.conf.subcommand(name="synthetic")],
         Annotated[Cost, tyro.conf.subcommand(name="cost")],
         Annotated[Heat, tyro.conf.subcommand(name="heat")],
+        Annotated[Audit, tyro.conf.subcommand(name="audit")],
     ]
 ]
 
@@ -103,7 +105,7 @@ def main(arguments: list[str] | None = None) -> int:
     Returns:
         The exit status: 0, 1 for an error of the input (which is printed), 130 if the user interrupted it.
     """
-    join_help_lines(Capture, Demo, Synthetic, Cost, Heat)
+    join_help_lines(Capture, Demo, Synthetic, Cost, Heat, Audit)
     command = tyro.cli(
         Commands, prog="thermoxels", args=arguments, description="RGB and thermal photographs to a solid with heat."
     )

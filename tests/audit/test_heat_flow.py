@@ -8,6 +8,7 @@ from thermoxels_ns.audit.heat_flow import (
     dallo_w_m2,
     madding_w_m2,
     radiation_w_m2,
+    reading_k,
     surface_temperature_k,
     temperature_factor,
 )
@@ -68,6 +69,9 @@ def test_a_reading_set_to_the_true_emissivity_and_reflection_is_the_temperature(
 def test_readings_come_back_from_what_a_surface_emits_and_reflects() -> None:
     surface, around, emissivity = 279.0, 262.0, 0.8
     reading = (emissivity * surface**4 + (1.0 - emissivity) * around**4) ** 0.25
+    assert reading_k(surface, emissivity, around**4, 1.0, 0.0) == pytest.approx(reading, rel=1e-12)
+    told = reading_k(surface, emissivity, around**4, 0.95, 290.0)
+    assert surface_temperature_k(told, emissivity, around**4, 0.95, 290.0) == pytest.approx(surface, rel=1e-12)
     assert surface_temperature_k(reading, emissivity, around**4, 1.0, 0.0) == pytest.approx(surface, rel=1e-12)
 
 

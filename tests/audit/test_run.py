@@ -19,7 +19,7 @@ from tests.support.audited_wall import (
     solve_wall,
     true_draws,
 )
-from thermoxels_ns.audit.conditions import Camera, Film, Limits, Surface, Surroundings, Year
+from thermoxels_ns.audit.conditions import Camera, Film, Limits, Reference, Surface, Surroundings, Year
 from thermoxels_ns.audit.results import Audit
 from thermoxels_ns.audit.run import audit
 from thermoxels_ns.core.errors import AuditError
@@ -247,6 +247,31 @@ def test_a_room_seen_from_within(walls) -> None:
     assert found.f_rsi[0].value == pytest.approx(to_outside / (to_outside + 0.13), rel=1e-6)
     assert found.f_rsi[1].value == pytest.approx(to_outside / (to_outside + 0.25), rel=1e-6)
     assert [one.verdict for one in found.limits] == ["met"]
+
+
+def test_a_contact_temperature_takes_the_place_of_the_offset(walls) -> None:
+    """A camera that is 0.9 K off and a thermometer that is right to 0.1 K."""
+    truth = walls["plain"]
+    off = replace(truth, draws=replace(truth.draws, values={**truth.draws.values, "camera offset": np.array([0.9])}))
+    mesh = photographed(off, STATED)
+    surface_c = float(
+        truth.mesh.temperature_c[np.argmin(np.linalg.norm(truth.mesh.points_m - [2.0, 0.0, 1.0], axis=1))]
+    )
+    known = replace(STATED, references=(Reference((2.0, 0.0, 1.0), Measured(surface_c, 0.1)),))
+    without, found = audit(mesh, STATED, UP).whole, audit(mesh, known, UP)
+    assert without.loss_w.value < 0.5 * truth.loss_w
+    assert found.whole.loss_w.value == pytest.approx(truth.loss_w, rel=1e-6)
+    assert found.whole.loss_w.high - found.whole.loss_w.low < 0.75 * (without.loss_w.high - without.loss_w.low)
+    assert found.budget["camera offset"] == 0.0 < found.budget["contact temperature 1"]
+    assert not any("contact temperatures ask for" in one for one in found.check.doubts)
+    sure = replace(known, camera=Camera(Measured(0.0, 0.2), Measured(0.0, 0.2)))
+    doubts = audit(mesh, sure, UP).check.doubts
+    assert any(
+        "The contact temperatures ask for +0.9 K on all readings; stated are -0.2 to +0.2 K" in one for one in doubts
+    )
+    far = replace(STATED, references=(Reference((2.0, -5.0, 1.0), Measured(1.0)),))
+    with pytest.raises(AuditError, match=r"references entry 1: at: expected a point within 0\.5 m of surface"):
+        audit(mesh, far, UP)
 
 
 def test_the_budget_names_what_matters_most(balcony) -> None:

@@ -145,6 +145,17 @@ class Surface:
 
 
 @dataclass(frozen=True)
+class Reference:
+    """A surface temperature that was measured by contact, from which the camera's offset follows."""
+
+    at: tuple[float, float, float]  # Where, in the coordinates of the mesh, [m]
+    temperature: Temperature  # [degrees Celsius]
+
+    def __post_init__(self) -> None:
+        _check_temperatures(temperature=self.temperature)
+
+
+@dataclass(frozen=True)
 class Survey:
     """What a report after EN 13187 says, and nothing is computed from."""
 
@@ -196,6 +207,7 @@ class Conditions:
     camera: Camera
     surfaces: tuple[Surface, ...]
     leave_out: tuple[str, ...] = ()  # Patches that mirror, by name or pattern: glass, metal
+    references: tuple[Reference, ...] = ()  # Without any, the offset of the camera is what is stated
     storeys: dict[str, Annotated[Measured, "m"]] = field(default_factory=dict)
     """Height at which each storey begins, above the lowest point of the mesh, [m]."""
     survey: Survey = field(default_factory=Survey)

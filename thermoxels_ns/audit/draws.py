@@ -53,6 +53,7 @@ class Draws:
 
     values: Mapping[str, FloatArray]
     seed: int = SEED
+    errors_of_parts: bool = True  # Whether parts of the surface have errors of their own, besides the common ones
 
     @property
     def count(self) -> int:
@@ -64,6 +65,8 @@ class Draws:
 
     def local(self, off_by: float, number: int) -> FloatArray:
         """Draws of the error of one part of the surface, independent for each `number`, shape (1 + k,)."""
+        if not self.errors_of_parts:
+            return np.zeros(self.count)
         drawn = np.random.default_rng((self.seed, number)).uniform(-off_by, off_by, self.count)
         drawn[0] = 0.0
         return drawn
@@ -89,7 +92,7 @@ def one_at_a_time(conditions: Conditions) -> Iterator[tuple[str, Draws]]:
         if what.off_by > 0.0:
             values = {other: np.full(3, it.value) for other, it in every.items()}
             values[name] = np.array([what.value, what.low, what.high])
-            yield name, Draws(_possible(values))
+            yield name, Draws(_possible(values), errors_of_parts=False)
 
 
 def uncertain(conditions: Conditions) -> dict[str, Measured]:
@@ -110,7 +113,13 @@ def uncertain(conditions: Conditions) -> dict[str, Measured]:
         "ground": around.ground,
     }
     named |= {emissivity_name(conditions, n): surface.emissivity for n, surface in enumerate(conditions.surfaces)}
+    named |= {contact_name(number): one.temperature for number, one in enumerate(conditions.references)}
     return {name: what for name, what in named.items() if what is not None}
+
+
+def contact_name(number: int) -> str:
+    """What reports call the temperature of an entry of `references`."""
+    return f"contact temperature {number + 1}"
 
 
 def emissivity_name(conditions: Conditions, number: int) -> str:

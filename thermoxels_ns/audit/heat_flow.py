@@ -78,6 +78,15 @@ def surface_temperature_k(
     return np.sqrt(np.sqrt(np.maximum(emitted, 1.0)))
 
 
+def reading_k(
+    surface_k: Values, emissivity: Values, surroundings_k4: Values, set_emissivity: Values, set_reflected_k: Values
+) -> Values:
+    """What a camera says of a surface: the inverse of `surface_temperature_k`, with the same arguments."""
+    arrives = emissivity * fourth_power(surface_k) + (1.0 - emissivity) * surroundings_k4
+    taken_for = (arrives - (1.0 - set_emissivity) * fourth_power(set_reflected_k)) / set_emissivity
+    return np.sqrt(np.sqrt(np.maximum(taken_for, 1.0)))
+
+
 def temperature_factor(resistance_to_outside_m2k_w: Values, inside_resistance_m2k_w: float) -> Values:
     """Temperature factor of an inner surface, f_Rsi = R / (R + Rsi) (ISO 13788).
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from thermoxels_ns.audit.defect_figures import PartFigures, describe_defect
 from thermoxels_ns.audit.defects import SPOT_M2, find_defects
 from thermoxels_ns.audit.draws import CONFIDENCE, Draws, Interval, draw, interval_of, one_at_a_time
 from thermoxels_ns.audit.exchange import CHUNK, exchange, other_models, part_totals
+from thermoxels_ns.audit.references import reference_doubts, with_references
 from thermoxels_ns.audit.results import Audit, Defect, Element, Limit, Verdict, YearResult
 from thermoxels_ns.audit.surface import WHY_NOT, AlikeTriangles, AuditedSurface, alike_triangles, audited_surface
 from thermoxels_ns.audit.survey_rules import check_survey
@@ -82,13 +83,13 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
                 surface, conditions, one, undisturbed[one.patch], figures, first + 3 * number, where, whole.loss_w.value
             )
         )
-    last = len(parts) - 1
+    last, check = len(parts) - 1, check_survey(conditions)
     f_rsi = PartFigures(totals, slope, work.draws.local(repeatability, last)).factors(last, side)
     left = {why: float(surface.area_m2[surface.why_not == n].sum()) for n, why in enumerate(WHY_NOT.values())}
     return Audit(
         conditions=conditions,
         surface=surface,
-        check=check_survey(conditions),
+        check=replace(check, doubts=(*check.doubts, *reference_doubts(conditions, work.draws))),
         patches=tuple(elements),
         storeys=tuple(of_storeys),
         whole=whole,
@@ -124,7 +125,7 @@ class _Work:
         self.conditions, self.up = conditions, up
         self.surface: AuditedSurface = audited_surface(mesh, conditions, up)
         self.groups: AlikeTriangles = alike_triangles(self.surface)
-        self.draws = draw(conditions)
+        self.draws = with_references(self.surface, conditions, draw(conditions))
         self.stated = Draws({name: values[:1] for name, values in self.draws.values.items()})
 
     def element(self, part: _Part, difference_k: FloatArray) -> Element:
@@ -197,7 +198,8 @@ class _Work:
     def budget(self, own: FloatArray) -> dict[str, float]:
         """How far each uncertain quantity alone moves the loss from one end of its range to the other, [W]."""
         rows, found = self.groups.rows([np.flatnonzero(self.surface.counted)], self.surface.area_m2), {}
-        for name, draws in one_at_a_time(self.conditions):
+        for name, stated in one_at_a_time(self.conditions):
+            draws = with_references(self.surface, self.conditions, stated)
             found[name] = float(np.ptp(part_totals(self.conditions, self.groups, draws, self.up, rows).flow_w[0][1:]))
         if self.conditions.camera.repeatability.off_by > 0.0:
             found["camera repeatability"] = float(np.ptp(own.sum(axis=0)))

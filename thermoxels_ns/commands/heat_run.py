@@ -58,7 +58,7 @@ def compute_heat(options: HeatOptions, say: Say = lambda _: None) -> HeatRun:
     )
     goals.check_fits(scene.time)
     mesh = read_mesh(options.mesh)
-    export = _export_summary(options.mesh, say)
+    export = read_export_summary(options.mesh, say)
     up = export.get("up") if options.up is None else options.up
     say(f"Mesh: {len(mesh.tets):,} tetrahedra, {len(mesh.points_m):,} nodes.")
     say(f"Scene: {scene.description or options.scene}.")
@@ -67,8 +67,8 @@ def compute_heat(options: HeatOptions, say: Say = lambda _: None) -> HeatRun:
     return replace(run, seconds={"read": read_s, **run.seconds})
 
 
-def _export_summary(mesh: Path, say: Say) -> dict[str, Any]:
-    """What the export says about a mesh: heat needs metres."""
+def read_export_summary(mesh: Path, say: Say) -> dict[str, Any]:
+    """Read what the export says about a mesh (empty without summary.json); `HeatError` for one without a scale."""
     path = mesh.with_name("summary.json")
     if not path.is_file():
         say(f"Warning: {path} is missing; the mesh is taken to be in metres.")

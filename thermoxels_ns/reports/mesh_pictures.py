@@ -50,6 +50,8 @@ def picture_of_mesh(
     colour_map: str = "inferno",
     bar_title: str = BAR_TITLE,
     note: str = "",
+    labels: Sequence[tuple[str, Sequence[float]]] = (),
+    size: bool = True,
     window_size: tuple[int, int] = (1200, 900),
 ) -> None:
     """Draw the surface of a mesh, coloured by temperature, as a PNG: all of it, in parallel projection.
@@ -71,6 +73,8 @@ def picture_of_mesh(
         colour_map: Name of a colour map of matplotlib, such as "coolwarm" for changes to both sides of 0.
         bar_title: Quantity and unit, written beside the colour bar.
         note: Words below the size of the mesh.
+        labels: Short words and the points of the mesh that they stand at, in front of everything.
+        size: Write the size of the mesh below the picture.
         window_size: Width and height, [pixels].
     """
     # Without a screen VTK draws through Mesa, which loads the system's LLVM. A triton (torch's compiler) that is loaded
@@ -122,7 +126,10 @@ def picture_of_mesh(
                     surface = pv.PolyData.from_regular_faces(mesh.points_m, mesh.facets[which])
                     plotter.add_mesh(surface, color=colour, **matter)
             words = "; ".join(f"{colour}: {what}" for what, colour, which in painted if which.any())
-            _add_words(plotter, mesh, title, font, length_unit, note, words, None if plain.all() else extremes)
+            about = _size_of(mesh, length_unit) if size else ""
+            _add_words(plotter, title, font, about, note, words, None if plain.all() else extremes)
+            if labels:
+                _add_labels(plotter, font, labels)
             _frame(plotter, mesh.points_m[np.unique(mesh.facets)], right, true_up, towards_camera)
             plotter.screenshot(str(temporary), return_img=False)
         finally:
@@ -217,10 +224,9 @@ def _add_lights(plotter: pv.Plotter, right: npt.NDArray, up: npt.NDArray, toward
 
 def _add_words(
     plotter: pv.Plotter,
-    mesh: TetMesh,
     title: str,
     font: str,
-    length_unit: str,
+    about: str,
     note: str,
     painted: str,
     extremes: tuple[float, float] | None,
@@ -230,16 +236,31 @@ def _add_words(
     how: Any = {"viewport": True, "color": _INK, "font_file": font}
     if title:
         plotter.add_text(title, position=(0.04, 0.925), font_size=round(height / 60), **how)
-    size = mesh.points_m.max(axis=0) - mesh.points_m.min(axis=0)
-    words = f"{size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} {length_unit}, {len(mesh.tets):,} tetrahedra"
-    if painted:
-        words += "\n" + textwrap.fill(painted, 58)
-    if extremes is not None:
-        words += f"\ncolours: middle 99 %; all: {extremes[0]:.1f} to {extremes[1]:.1f}"
-    if note:
-        words += f"\n{note}"
+    beyond = "" if extremes is None else f"colours: middle 99 %; all: {extremes[0]:.1f} to {extremes[1]:.1f}"
+    words = "\n".join(line for line in (about, textwrap.fill(painted, 58), beyond, note) if line)
     plotter.add_text(words, position=(0.17, 0.04), font_size=round(height / 78), **how)
     plotter.renderer.add_axes(viewport=(0.0, 0.0, 0.15, 0.155), line_width=3, color=_INK)
+
+
+def _size_of(mesh: TetMesh, length_unit: str) -> str:
+    size = mesh.points_m.max(axis=0) - mesh.points_m.min(axis=0)
+    return f"{size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} {length_unit}, {len(mesh.tets):,} tetrahedra"
+
+
+def _add_labels(plotter: pv.Plotter, font: str, labels: Sequence[tuple[str, Sequence[float]]]) -> None:
+    plotter.add_point_labels(
+        np.array([point for _, point in labels], dtype=np.float64),
+        [words for words, _ in labels],
+        font_size=round(plotter.window_size[1] / 45),
+        font_file=font,
+        text_color=_INK,
+        shape_color="white",
+        shape_opacity=0.85,
+        margin=4,
+        show_points=False,
+        always_visible=True,
+        reset_camera=False,
+    )
 
 
 def _frame(

@@ -1,0 +1,115 @@
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pyvista as pv
+
+from tests.support.audited_wall import STATED, audited_wall, photographed, solve_wall, true_draws
+from thermoxels_ns import cli
+from thermoxels_ns.commands.audit_options import AuditOptions
+from thermoxels_ns.commands.audit_run import run_audit
+from thermoxels_ns.core.errors import AuditError, HeatError, OutputError
+from thermoxels_ns.core.yaml_records import configs_folder
+from thermoxels_ns.mesh.files.formats import write_mesh
+
+
+@pytest.fixture(scope="module")
+def export(tmp_path_factory) -> Path:
+    """A wall with a balcony slab, as exported, with conditions beside it."""
+    folder = tmp_path_factory.mktemp("audit")
+    mesh = photographed(solve_wall(audited_wall(), STATED, true_draws(STATED, None)), STATED, 2)
+    write_mesh(folder / "mesh.vtu", mesh)
+    text = (configs_folder() / "conditions-example.yaml").read_text()
+    text = text.replace("title: Example house, north side", "title: A <b>house</b> & garden")
+    (folder / "conditions.yaml").write_text(text.replace("offset: 0.0 +- 1.0 K", "offset: 0.0 +- 0.2 K"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def done(export) -> Path:
+    """Results of the command with pictures."""
+    words = ["audit", str(export / "mesh.vtu"), "--conditions", str(export / "conditions.yaml")]
+    assert cli.main([*words, "--output-dir", str(export / "out")]) == 0
+    return export / "out"
+
+
+def test_the_command_writes_answers_page_and_surface(done) -> None:
+    assert sorted(path.name for path in done.iterdir()) == ["answers.json", "audit.html", "surface.vtp"]
+    answers = json.loads((done / "answers.json").read_text())
+    assert {one["name"] for one in answers["patches"]} == {"facade", "window"}
+    assert [one["name"] for one in answers["storeys"]] == ["ground floor", "upper floor"]
+    assert [one["kind"] for one in answers["defects"]] == ["line"]
+    loss = answers["whole"]["loss_w"]
+    assert loss["low"] < loss["value"] < loss["high"]
+    assert answers["missing_for_en_13187"] == [] and answers["conditions"]["survey"]["date"].startswith("2026-01-15")
+    surface = pv.read(done / "surface.vtp")
+    counted = surface.cell_data["counted"] == 1
+    assert (
+        np.isfinite(surface.cell_data["u_w_m2k"][counted]).all()
+        and np.isnan(surface.cell_data["u_w_m2k"][~counted]).all()
+    )
+    assert set(np.unique(surface.cell_data["defect"])) == {0, 1}
+
+
+def test_the_page_is_complete_in_itself_and_escapes_what_users_write(done) -> None:
+    page = (done / "audit.html").read_text()
+    assert "<h1>A &lt;b&gt;house&lt;/b&gt; &amp; garden</h1>" in page
+    assert not re.search(r'(?:src|href)="(?!data:)', page) and "<script" not in page
+    headings = re.findall(r"<h2>(.*?)</h2>", page)
+    assert headings == [
+        *("What was asked for", "What was seen", "The envelope, element by element", "Thermal bridges and defects"),
+        *("Conditions", "The survey", "How sure this is", "Method and its limits", "How it was made"),
+    ]
+    answers = json.loads((done / "answers.json").read_text())
+    assert page.count("<article") == len(answers["defects"]) and page.count("data:image/png") == 3
+    assert "EN 13187 also says" not in page and "lose " in page
+
+
+def test_what_forbids_a_survey_stands_first(export, tmp_path) -> None:
+    text = (export / "conditions.yaml").read_text().replace("wind: 1.0 +- 0.5 m/s", "wind: 7.0 +- 0.5 m/s")
+    (tmp_path / "c.yaml").write_text(re.sub(r"  client:.*\n", "", text))
+    words = ["audit", str(export / "mesh.vtu"), "--conditions", str(tmp_path / "c.yaml"), "--pictures", "False"]
+    assert cli.main([*words, "--output-dir", str(tmp_path / "out")]) == 0
+    page = (tmp_path / "out" / "audit.html").read_text()
+    assert page.index("Look at this first") < page.index("The wind was 7.0 m/s") < page.index('class="cards')
+    assert "this one does not know: client." in page and "data:image/png" not in page
+
+
+def test_an_example_of_conditions_is_written_and_read(export, tmp_path, capsys) -> None:
+    assert cli.main(["audit", "--write-conditions", str(tmp_path / "c.yaml")]) == 0
+    assert "pass it with --conditions" in capsys.readouterr().out
+    options = AuditOptions(export / "mesh.vtu", tmp_path / "c.yaml", tmp_path / "out", pictures=False)
+    found = run_audit(options)
+    assert found is not None and found.conditions.title == "Example house, north side"
+
+
+def test_the_same_input_gives_the_same_page(export, done, tmp_path) -> None:
+    run_audit(AuditOptions(export / "mesh.vtu", export / "conditions.yaml", tmp_path / "again", pictures=False))
+    again = json.loads((tmp_path / "again" / "answers.json").read_text())
+    assert again == json.loads((done / "answers.json").read_text())
+
+
+def test_the_up_of_the_export_counts(export, tmp_path) -> None:
+    for name in ("mesh.vtu", "mesh-boundary.vtp"):
+        (tmp_path / name).write_bytes((export / name).read_bytes())
+    (tmp_path / "summary.json").write_text(json.dumps({"length_unit": "m", "up": [0.0, -3.0, 0.0]}))
+    options = AuditOptions(tmp_path / "mesh.vtu", export / "conditions.yaml", tmp_path / "out", pictures=False)
+    found = run_audit(options)
+    assert found is not None and found.surface.selection.up == (0.0, -1.0, 0.0)
+    (tmp_path / "summary.json").write_text(json.dumps({"length_unit": "unit"}))
+    with pytest.raises(HeatError, match=r"scale of the mesh: expected an export in metres"):
+        run_audit(options)
+
+
+@pytest.mark.parametrize("given", [{}, {"mesh": Path("mesh.vtu")}])
+def test_what_is_missing_is_named(given) -> None:
+    with pytest.raises(AuditError, match=r"expected a file, got none\. Pass the mesh\.vtu .*--write-conditions"):
+        run_audit(AuditOptions(**given))
+
+
+def test_results_of_other_commands_are_not_replaced(export, tmp_path) -> None:
+    (tmp_path / "summary.json").write_text("{}")
+    with pytest.raises(OutputError, match=r"no files but those of an earlier run"):
+        run_audit(AuditOptions(export / "mesh.vtu", export / "conditions.yaml", tmp_path))

@@ -1,0 +1,147 @@
+"""From an exported mesh and the conditions of a survey to the files that ``thermoxels audit`` writes."""
+
+from __future__ import annotations
+
+import shlex
+import time as clock
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thermoxels_ns.audit.conditions import load_conditions, write_example
+from thermoxels_ns.audit.results import Audit
+from thermoxels_ns.audit.run import audit
+from thermoxels_ns.commands.audit_options import AuditOptions
+from thermoxels_ns.commands.heat_run import read_export_summary
+from thermoxels_ns.core.checks import (
+    check_direction,
+    refuse_files_of_others,
+    refuse_what_is_in_the_way,
+    remove_file,
+    remove_stale_temporaries,
+    writable_folder,
+)
+from thermoxels_ns.core.errors import AuditError
+from thermoxels_ns.mesh.files.content import surface_of
+from thermoxels_ns.mesh.files.read import read_mesh
+from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtk
+from thermoxels_ns.reports.audit_page import audit_page
+from thermoxels_ns.reports.audit_pictures import draw_audit
+from thermoxels_ns.reports.interval_text import interval_text
+from thermoxels_ns.reports.page import build_page, write_page
+
+ANSWERS, PAGE, SURFACE = "answers.json", "audit.html", "surface.vtp"
+"""Files of an audit."""
+
+Say = Callable[[str], None]
+
+
+def run_audit(options: AuditOptions, say: Say = lambda _: None) -> Audit | None:
+    """Audit, then write everything, answers.json last; or write an example of conditions, which gives None."""
+    if options.write_conditions is not None:
+        write_example(options.write_conditions)
+        say(f"Written to {options.write_conditions}: put in what you measured, and pass it with --conditions.")
+        return None
+    if options.mesh is None or options.conditions is None:
+        missing = "mesh" if options.mesh is None else "conditions"
+        remedy = "Pass the mesh.vtu of an export, and --conditions; --write-conditions writes an example of these."
+        raise AuditError(missing, expected="a file", got="none", remedy=remedy)
+    begin = clock.perf_counter()
+    folder = _prepared_folder(options.output_dir)
+    conditions = load_conditions(options.conditions)
+    mesh = read_mesh(options.mesh)
+    up = read_export_summary(options.mesh, say).get("up") if options.up is None else options.up
+    direction = check_direction("up", up or (0.0, 0.0, 1.0), "Pass --up 0 0 1.", AuditError)
+    x, y, z = (direction / float(np.linalg.norm(direction))).tolist()
+    say(f"Mesh: {len(mesh.tets):,} tetrahedra, {len(mesh.facets):,} boundary triangles.")
+    found = audit(mesh, conditions, (x, y, z))
+    for words in (*found.check.forbidden, *found.check.doubts):
+        say(f"Warning: {words}")
+    if found.check.missing:
+        say(f"Missing for a report after EN 13187: {', '.join(found.check.missing)}.")
+    whole = found.whole
+    say(f"Heat loss: {interval_text(whole.loss_w, 'W')}; U-value: {interval_text(whole.u_w_m2k, 'W/(m2 K)')}.")
+    say(f"{sum(not one.not_counted for one in found.defects)} thermal bridges or defects.")
+    _write(folder, options, found)
+    say(f"Written to {folder}: {PAGE}, {ANSWERS}, {SURFACE} ({clock.perf_counter() - begin:.1f} s)")
+    return found
+
+
+def answers_of(options: AuditOptions, found: Audit) -> dict[str, Any]:
+    """Everything that answers.json says."""
+    date = found.conditions.survey.date
+    conditions = asdict(replace(found.conditions, survey=replace(found.conditions.survey, date=None)))
+    conditions["survey"]["date"] = None if date is None else date.isoformat()
+    return {
+        "mesh": options.mesh,
+        "conditions": conditions,
+        "whole": asdict(found.whole),
+        "patches": [asdict(one) for one in found.patches],
+        "storeys": [asdict(one) for one in found.storeys],
+        "defects": [asdict(one) for one in found.defects],
+        "limits": [asdict(one) for one in found.limits],
+        "f_rsi": [asdict(one) for one in found.f_rsi],
+        "year": None if found.year is None else asdict(found.year),
+        "forbidden": list(found.check.forbidden),
+        "doubts": list(found.check.doubts),
+        "missing_for_en_13187": list(found.check.missing),
+        "loss_moved_by_w": dict(found.budget),
+        "not_counted_m2": dict(found.not_counted_m2),
+    }
+
+
+def _prepared_folder(output_dir: Path) -> Path:
+    """Make the folder, and raise `OutputError` for what is in the way before anything is computed."""
+    folder = writable_folder(output_dir)
+    names = (ANSWERS, PAGE, SURFACE)
+    refuse_what_is_in_the_way(folder, names)
+    refuse_files_of_others(folder, names, (PAGE, ANSWERS), ("summary.json", "quality.json", "series.csv"))
+    remove_stale_temporaries(folder, names)
+    return folder
+
+
+def _write(folder: Path, options: AuditOptions, found: Audit) -> None:
+    answers = answers_of(options, found)
+    summary_text(answers)  # raises if json cannot hold it
+    remove_file(folder / ANSWERS)
+    _write_surface(folder / SURFACE, found)
+    pictures = draw_audit(found) if options.pictures else None
+    assert options.mesh is not None
+    page = audit_page(found, pictures, options.mesh.name, _command_line(options), (PAGE, ANSWERS, SURFACE))
+    write_page(folder / PAGE, build_page(page, "audit.html.j2"))
+    write_summary(folder / ANSWERS, answers)
+
+
+def _write_surface(path: Path, found: Audit) -> None:
+    """Write what was found of each boundary triangle, NaN where it does not count, and the number of its defect."""
+    import pyvista as pv
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+    mesh = found.surface.mesh
+    surface = surface_of(mesh.points_m, mesh.facets)
+    data = pv.PolyData.from_regular_faces(surface.points_m, surface.triangles)
+    numbers = np.zeros(len(mesh.facets), dtype=np.int32)
+    for number, one in enumerate(found.found, start=1):
+        numbers[one.core] = number
+    for name, values in {
+        "surface_temperature_c": found.triangle_surface_c,
+        "heat_flow_w_m2": found.triangle_flow_w_m2,
+        "u_w_m2k": found.triangle_u[:, 0],
+        "u_low_w_m2k": found.triangle_u[:, 1],
+        "u_high_w_m2k": found.triangle_u[:, 2],
+        "counted": found.surface.counted.astype(np.uint8),
+        "defect": numbers,
+    }.items():
+        data.cell_data[name] = values
+    write_vtk(vtkXMLPolyDataWriter(), path, data)
+
+
+def _command_line(options: AuditOptions) -> str:
+    words = ["thermoxels", "audit", str(options.mesh), "--conditions", str(options.conditions)]
+    words += ["--output-dir", str(options.output_dir)]
+    if options.up is not None:
+        words += ["--up", *map(str, options.up)]
+    return shlex.join(words)
