@@ -44,7 +44,7 @@ def test_a_steady_balance_that_is_wrong_is_seen(monkeypatch, effects, thickness_
 
     def wrong(*arguments) -> np.ndarray:
         heat_w = right(*arguments)
-        heat_w[0] += WRONG * np.abs(heat_w).max() * np.sign(heat_w.sum())
+        heat_w[0] += WRONG * np.abs(heat_w).max() * (1.0 if heat_w.sum() >= 0.0 else -1.0)
         return heat_w
 
     monkeypatch.setattr(steady, "heat_of_groups_w", wrong)

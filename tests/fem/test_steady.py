@@ -9,6 +9,7 @@ from thermoxels_ns.fem import implicit_equation, steady
 from thermoxels_ns.fem.conjugate_gradients import PATIENCE, LinearSolver
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.solution import heat_by_effect
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.heat.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
@@ -154,3 +155,22 @@ def test_the_residual_is_round_off_also_where_nothing_flows_or_flows_cancel() ->
     system = HeatSystem(still)
     warm = np.full(len(mesh.points_m), 21.0 - system.reference_c)
     assert steady._residual(system, warm, 0.0, steady.heat_of_groups_w(system, warm, 0.0)) == pytest.approx(1.0)
+
+
+def test_heat_is_sorted_by_effect_in_linear_time() -> None:
+    """Groups are looked at once, however many effects there are."""
+
+    class Counted(list):
+        looks = 0
+
+        def __iter__(self):
+            Counted.looks += len(self)
+            return super().__iter__()
+
+    names = [f"air {i}" for i in range(300)]
+    groups = Counted((name, patch) for name in names for patch in ("wall", "roof"))
+    heat_w = np.arange(600.0)[None]
+    sorted_heat = heat_by_effect(names[::-1], groups, heat_w)
+    assert Counted.looks == 600
+    assert [heat.effect for heat in sorted_heat] == names[::-1]
+    assert sorted_heat[0].group_names == ("wall", "roof") and sorted_heat[0].group_heat_w.tolist() == [[598.0, 599.0]]

@@ -145,14 +145,14 @@ def test_what_changes_in_time_is_assembled_again(box, concrete) -> None:
     matrices = [system.matrix(time_s, np.inf) for time_s in (0.0, 1.0)]
     change = (matrices[1] - matrices[0]).sum()
     assert change == pytest.approx(0.06, rel=1e-12)
-    loads = [system.load(time_s).sum() for time_s in (0.0, 1.0)]
+    loads = [system.exchanged_heat(np.zeros(system.num_nodes), time_s)[0].sum() for time_s in (0.0, 1.0)]
     relative = np.array([0.0, 1.0]) + 20.0 - system.reference_c
     air_w = 5.0 * 0.06 * relative
     wind_w = np.array([5.0, 6.0]) * 0.06 * (20.0 - system.reference_c)
     still_w = 5.0 * 0.08 * (20.0 - system.reference_c)
     np.testing.assert_allclose(loads, air_w + wind_w + still_w, rtol=1e-12)
-    # Matrix: 2 constant, 1 changing, twice. Load: 1 constant, 2 changing, twice.
-    assert system.assembled.counts["convection"] == (2 + 2) + (1 + 4)
+    # Matrix: 2 constant, 1 changing, twice. Heat at the mean of the airs around a node: all, twice.
+    assert system.assembled.counts["convection"] == (2 + 2) + 6
 
 
 def test_labels_differ_even_where_a_patch_is_named_like_a_number() -> None:

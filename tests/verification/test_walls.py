@@ -6,12 +6,14 @@ import pytest
 
 from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import box_mesh, graded, planes
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.schemes import SDIRK2
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection, FixedTemperature
 from thermoxels_ns.heat.materials import Material
+from thermoxels_ns.heat.results import wall_result
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 LAYERS = {"plaster": (0.015, 0.40), "concrete": (0.20, 2.0), "insulation": (0.12, 0.035), "mortar": (0.01, 1.0)}
@@ -36,6 +38,48 @@ def test_u_value_of_a_wall(lumped_boundary) -> None:
     x = mesh.points_m[:, 0]
     np.testing.assert_allclose(solution.temperature_c[x == 0.0], 18.95891, atol=1e-5)
     np.testing.assert_allclose(solution.temperature_c[x == ends[-1]], -9.67966, atol=1e-5)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize(("axis", "squashed"), [(0, 1e-7), (1, 1e-6), (1, 1e-7), (2, 1e-8)])
+def test_u_value_of_a_wall_squashed_in_one_direction(axis, squashed, order) -> None:
+    """U = 1 / (1 / 8 + d / k + 1 / 25), or a sentence that says that the digits do not suffice."""
+    sides = [0.3, 0.5, 1.0]
+    sides[axis] *= squashed
+    mesh = wall_mesh(*sides)
+    wall = HeatProblem(mesh, CONCRETE, effects=(Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, -10.0)))
+    exact = 1.0 / (1.0 / 8.0 + sides[0] / CONCRETE.conductivity_w_mk + 1.0 / 25.0)
+    try:
+        solution = solve_steady(wall, order=order)
+    except HeatError as refusal:
+        assert (order == 2 or squashed < 1e-7) and "No steady state was found" in str(refusal)
+        return
+    flow_w = 30.0 * exact * sides[1] * sides[2]
+    heat = solution.effects[0]
+    assert heat.heat_w[0] == pytest.approx(flow_w, rel=1e-6)
+    assert heat.uncertainty_w[0] < 0.01 * flow_w
+
+
+@pytest.mark.parametrize("coefficient", [1e13, 1e15, 1e17])
+@pytest.mark.parametrize("order", [1, 2])
+def test_u_value_of_a_wall_with_next_to_perfect_convection(coefficient, order) -> None:
+    """U = k / d where h is next to infinite: T_air - T is far below the round-off of either."""
+    wall = HeatProblem(
+        wall_mesh(0.3, 0.5, 1.0),
+        CONCRETE,
+        effects=(Convection(("x0",), coefficient, 20.0), Convection(("x1",), coefficient, -10.0)),
+    )
+    solution = solve_steady(wall, order=order)
+    exact = CONCRETE.conductivity_w_mk / 0.3
+    assert wall_result(wall, solution, ("x0",), 20.0, -10.0).u_value_w_m2k == pytest.approx(exact, rel=1e-9)
+    for heat, sign in zip(solution.effects, (1.0, -1.0)):
+        assert heat.heat_w[0] == pytest.approx(sign * 30.0 * exact * 0.5, rel=1e-9)
+
+
+def wall_mesh(x: float, y: float, z: float, **options) -> TetMesh:
+    """A wall with x0 and x1 as named sides, however thin it is."""
+    mesh = box_mesh(np.linspace(0.0, 0.3, 5), np.linspace(0.0, 0.5, 3), np.linspace(0.0, 1.0, 3), **options)
+    return replace(mesh, points_m=mesh.points_m * (np.array([x, y, z]) / [0.3, 0.5, 1.0]))
 
 
 def sixth_of_a_shell(inner_m: float, outer_m: float, parts: int) -> TetMesh:

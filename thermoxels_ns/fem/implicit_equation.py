@@ -13,6 +13,7 @@ from scipy import sparse
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.conjugate_gradients import LinearSolution
 from thermoxels_ns.fem.forms import COLDEST_SLOPE_K
+from thermoxels_ns.fem.p1_kernels import exact_sum, size_of
 from thermoxels_ns.fem.system import HeatSystem, SystemSolver
 
 Vector = npt.NDArray[np.float64]
@@ -33,6 +34,10 @@ _ENOUGH = 0.5
 """The line search ends where the slope of the energy along the step has fallen to this share of what it was at its
 start, or has changed sign and is no larger than that."""
 _MOST_SEARCHES = 200  # Bisections of the line search
+MOST_REFINEMENTS = 6  # Corrections of a solution from its own residual before giving up
+_UNBALANCED = 1e-6  # Share of the heat flow that may be left unbalanced, if the linear solver's tolerance allows it
+_UNBALANCED_OVER_TOLERANCE = 1e3  # The same over the linear solver's tolerance
+_LEVEL = 1e-9  # Differences below this share of the absolute temperature let no heat flow to speak of
 _UNEXPLAINED = 1e-11  # Largest share of the stored heat that may be unaccounted for where nodes are fixed
 _EPS = float(np.finfo(np.float64).eps)
 ROUND_OFF = 8.0 * _EPS  # Round-off of a sum as a share of the sum of sizes
@@ -46,6 +51,22 @@ class Residual:
     piece_heat_w: Vector  # Summed over each connected piece, without the round-off of what flows inside, [W]
     round_off_w: Vector  # What round-off may leave at each free node, [W]
     piece_round_off_w: Vector  # The same for each piece, [W]
+    flows_w: float  # Heat that flows through the body or is stored in it, [W]
+    stored_w: float  # Sum of the sizes of what free nodes store, [W]
+
+    @cached_property
+    def unbalanced_w(self) -> float:
+        """Sum of the sizes of what is not balanced at nodes, [W]."""
+        return float(np.sum(np.abs(self.heat_w)))
+
+    @cached_property
+    def uncertain_w(self) -> float:
+        """The same with what round-off may hide, [W]."""
+        return self.unbalanced_w + float(np.sum(self.round_off_w))
+
+    def is_balanced(self, share: float) -> bool:
+        """Whether no more than a share of the heat flow, or round-off, is left unbalanced."""
+        return self.unbalanced_w <= max(share * self.flows_w, float(np.sum(self.round_off_w)))
 
     @property
     def is_round_off(self) -> bool:
@@ -67,6 +88,9 @@ class ImplicitSolution:
     relative_k: Vector  # Relative to the system's reference, shape (n,), [K]
     change_k: Vector
     """T - T_0 as it was solved for, shape (n,), [K]: the difference of the temperatures has lost its last digits."""
+    rest_k: Vector | None
+    """Digits of the temperatures below their round-off, shape (n,), [K]; None: not known where no heat is exchanged."""
+    uncertain_w: float  # Bound of what is unbalanced at all nodes, [W]
     iterations: int
     newton_iterations: int
     converged: bool
@@ -113,38 +137,97 @@ class ImplicitEquation:
         balance = _Balance(self, start_k, time_s, given_w, given_to_pieces_w)
         first = balance.residual()
         if first.is_round_off:
-            status = "The temperature is level: nothing flows."
-            return ImplicitSolution(balance.base_k, balance.base_k - start_k, 0, 0, True, status)
+            status, nothing = "The temperature is level: nothing flows.", np.zeros_like(first.heat_w)
+            outcome = _Outcome(nothing, None, float(np.sum(first.round_off_w)), 0, True, status)
+            return balance.solution(outcome, 0)
         if self.system.nonlinear:
             found = newton(balance, len(first.heat_w), relative_tolerance=self._relative_tolerance)
-            u, spent = found.u, found.linear_iterations
-            rest = self._unexplained(found.residual, u) if found.converged else None
-            if rest is not None:
-                more, linear = balance.correction(u, rest)
-                u, spent = u + more if linear.converged else u, spent + linear.iterations
-            return balance.solution(u, spent, found.iterations, found.converged, found.status)
+            spent, status = found.linear_iterations, found.status
+            if not found.converged:
+                return balance.solution(_Outcome(found.u, None, np.inf, spent, False, status), found.iterations)
+            outcome = self._refined(balance, found.u, lambda rest: balance.correction(found.u, rest), spent, status)
+            return balance.solution(outcome, found.iterations)
         change, linear = self.correction(self._own_solver, self.held_w_k, first)
-        iterations = linear.iterations
-        rest = None
-        if linear.converged and self._may_be_unexplained:
-            rest = self._unexplained(balance.residual(change), change)
-        if rest is not None:
-            more, again = self.correction(self._own_solver, self.held_w_k, rest)
-            iterations += again.iterations
-            change = change + more if again.converged else change
-        return balance.solution(change, iterations, 0, linear.converged, linear.status)
+        uncertain_w = self._uncertain_w(first, change, linear)
+        if not linear.converged:
+            return balance.solution(_Outcome(change, None, np.inf, linear.iterations, False, linear.status), 0)
+        if np.isfinite(uncertain_w):
+            return balance.solution(_Outcome(change, None, uncertain_w, linear.iterations, True, linear.status), 0)
 
-    @property
-    def _may_be_unexplained(self) -> bool:
-        return self._free is not None and bool(np.isfinite(self.step_s))
+        def correction(rest: Residual) -> tuple[Vector, LinearSolution]:
+            return self.correction(self._own_solver, self.held_w_k, rest)
 
-    def _unexplained(self, rest: Residual, change: Vector) -> Residual | None:
-        """What is left to balance after a step with fixed nodes, if it is much beside what is stored."""
-        if not self._may_be_unexplained:
-            return None
-        stored_w = self.at_free(self.system.mass_product(self.everywhere(change))) / self.step_s
-        much = abs(np.sum(rest.heat_w)) > _UNEXPLAINED * np.sum(np.abs(stored_w))
-        return rest if much and not rest.is_round_off else None
+        return balance.solution(self._refined(balance, change, correction, linear.iterations, linear.status), 0)
+
+    def _uncertain_w(self, first: Residual, change: Vector, linear: LinearSolution) -> float:
+        """Bound of what a step without fixed nodes leaves unbalanced, [W]; inf if that is worth to be looked at."""
+        if self._free is not None or np.isinf(self.step_s):
+            return np.inf
+        # What the solver left, and what the round-off of the matrix's diagonal hides from it.
+        left_w = np.sqrt(len(change)) * linear.residual * _norm(first.heat_w)
+        hidden_w = _EPS * size_of(self.diagonal_w_k, change)
+        uncertain_w = left_w + 4.0 * hidden_w + float(np.sum(first.round_off_w))
+        stored_w = size_of(self.system.nodal_mass_j_k, change) / self.step_s
+        return uncertain_w if uncertain_w <= self._share * stored_w else np.inf
+
+    def _refined(
+        self,
+        balance: _Balance,
+        u: Vector,
+        correction: Callable[[Residual], tuple[Vector, LinearSolution]],
+        iterations: int,
+        status: str,
+    ) -> _Outcome:
+        """Correct a solution by what its residual, from differences, leaves unbalanced, until that is small.
+
+        Temperatures are sums of two numbers meanwhile (iterative refinement with a residual of higher precision:
+        Higham, Accuracy and Stability of Numerical Algorithms, chapter 12).
+        """
+        rest, count = balance.residual(u), 0
+        if rest.uncertain_w <= self._share * rest.flows_w and not self._is_unexplained(rest):
+            return _Outcome(u, None, rest.uncertain_w, iterations, True, status)
+        now = exact_sum(balance.base_k, self.everywhere(u))
+        rest = balance.residual(u, now)
+        while count < MOST_REFINEMENTS:
+            if rest.is_balanced(self._share) and (count > 0 or not self._is_unexplained(rest)):
+                break
+            if count > 0 and balance.is_still(now[0]):
+                break
+            more, linear = correction(rest)
+            iterations += linear.iterations
+            total, lost = exact_sum(now[0], self.everywhere(more))
+            then = exact_sum(total, lost + now[1])
+            after = balance.residual(u + more, then)
+            count += 1
+            if not after.unbalanced_w < rest.unbalanced_w:
+                break
+            u, now, rest = u + more, then, after
+        converged = rest.is_balanced(self._share) or balance.is_still(now[0])
+        share = rest.unbalanced_w / rest.flows_w if rest.flows_w > 0.0 else 0.0
+        if converged and count > 0:
+            status += f" {count} corrections left {rest.unbalanced_w:.1e} W unbalanced, a share of {share:.0e}."
+        elif not converged:
+            status = (
+                f"{rest.unbalanced_w:.1e} W of {rest.flows_w:.1e} W are not balanced after {count} corrections: cells "
+                "are too flat, or conductivities or coefficients of convection too far apart, for the digits of "
+                "floating point."
+            )
+        return _Outcome(u, now[1], rest.uncertain_w, iterations, converged, status)
+
+    @cached_property
+    def _share(self) -> float:
+        return max(_UNBALANCED, _UNBALANCED_OVER_TOLERANCE * self._relative_tolerance)
+
+    @cached_property
+    def diagonal_w_k(self) -> Vector:
+        """Diagonal of M / step + K + R, 0 at fixed nodes, shape (n,), [W / K]."""
+        return self.everywhere(self.matrix.diagonal())
+
+    def _is_unexplained(self, rest: Residual) -> bool:
+        """Whether what a step with fixed nodes leaves to balance is much beside what is stored."""
+        if self._free is None or np.isinf(self.step_s):
+            return False
+        return abs(float(np.sum(rest.heat_w))) > _UNEXPLAINED * rest.stored_w and not rest.is_round_off
 
     @cached_property
     def _own_solver(self) -> SystemSolver:
@@ -169,7 +252,8 @@ class ImplicitEquation:
         if not self.floats:
             return self.everywhere(solver.solve(heat_w).x)
         nothing = np.zeros_like(heat_w)
-        balance = Residual(heat_w, np.where(self.floating, piece_heat_w, 0.0), nothing, np.zeros_like(piece_heat_w))
+        pieces_w, none = np.where(self.floating, piece_heat_w, 0.0), np.zeros_like(piece_heat_w)
+        balance = Residual(heat_w, pieces_w, nothing, none, 0.0, 0.0)
         return self.everywhere(self.correction(solver, held_w_k, balance)[0])
 
     def correction(self, solver: SystemSolver, held_w_k: Vector, residual: Residual) -> tuple[Vector, LinearSolution]:
@@ -207,6 +291,18 @@ class ImplicitEquation:
         return full
 
 
+@dataclass(frozen=True)
+class _Outcome:
+    """A change of the free nodes, shape (m,), [K], and how it was found; fields as in `ImplicitSolution`."""
+
+    u: Vector
+    rest_k: Vector | None  # None: what the sum of start and change loses
+    uncertain_w: float
+    iterations: int
+    converged: bool
+    status: str
+
+
 class _Balance:
     """The residual of an implicit equation as a function of the change of the free nodes."""
 
@@ -229,29 +325,46 @@ class _Balance:
                 moved_w = system.mass_product(self.base_k - start_k) / equation.step_s
                 self._given_w = -moved_w if given_w is None else given_w - moved_w
 
-    def solution(
-        self, u: Vector, iterations: int, newton_iterations: int, converged: bool, status: str
-    ) -> ImplicitSolution:
+    def solution(self, found: _Outcome, newton_iterations: int) -> ImplicitSolution:
         """Temperatures after a change of the free nodes, with how it was found."""
-        change_k = self._equation.everywhere(u)
-        end_k = self.base_k + change_k
-        fixed = self._equation.system.fixed.nodes
+        change_k = self._equation.everywhere(found.u)
+        end_k, rest_k, system = self.base_k + change_k, found.rest_k, self._equation.system
+        if rest_k is None and system.groups:
+            rest_k = exact_sum(self.base_k, change_k)[1]
+        fixed = system.fixed.nodes
         if len(fixed):
             change_k[fixed] = self.base_k[fixed] - self._start_k[fixed]
-        return ImplicitSolution(end_k, change_k, iterations, newton_iterations, converged, status)
+        how = found.uncertain_w, found.iterations, newton_iterations, found.converged, found.status
+        return ImplicitSolution(end_k, change_k, rest_k, *how)
 
-    def residual(self, u: Vector | None = None) -> Residual:
-        """Heat that is not balanced at a change of the temperature; None: at no change."""
+    def is_still(self, relative_k: Vector) -> bool:
+        """Whether each piece is level, and nothing makes heat flow."""
+        system = self._equation.system
+        level_k = system.level_k(relative_k)
+        apart_k = float(np.max(np.abs(relative_k - level_k)))
+        absolute_k = float(np.max(np.abs(level_k))) + abs(system.reference_c + ZERO_CELSIUS_K)
+        return apart_k <= _LEVEL * absolute_k and system.is_still(relative_k, self._time_s)
+
+    def residual(self, u: Vector | None = None, now: tuple[Vector, Vector] | None = None) -> Residual:
+        """Heat that is not balanced at a change of the temperature; None: at no change.
+
+        `now` are the temperatures after it, with the digits below their round-off; None: they are rounded.
+        """
         equation, system, pieces = self._equation, self._equation.system, self._equation.system.pieces
-        now_k = self.base_k if u is None else self.base_k + equation.everywhere(u)
-        conducted_w, bound_w = system.conducted_heat(now_k)
+        now_k, rest_k = (self._now(u), None) if now is None else now
+        conducted_w, bound_w = system.conducted_heat(now_k, rest_k)
+        flows_w, stored_sum_w = float(np.sum(np.abs(conducted_w[system.fixed.nodes]))), 0.0
         heat_w = np.negative(conducted_w, out=conducted_w)
         piece_w, piece_bound_w = np.zeros(pieces.count), np.zeros(pieces.count)
         if system.exchanges:
-            exchanged_w, exchanged_bound_w = system.exchanged_heat(now_k, self._time_s)
+            exchanged_w, exchanged_bound_w = system.exchanged_heat(now_k, self._time_s, rest_k)
+            flows_w += float(np.sum(np.abs(exchanged_w)))
             heat_w += exchanged_w
             bound_w += exchanged_bound_w
             piece_w, piece_bound_w = pieces.sums(exchanged_w), pieces.sums(exchanged_bound_w)
+        if u is not None and now is None:
+            # That of the temperatures themselves.
+            bound_w += 2.0 * equation.diagonal_w_k * np.abs(now_k)
         if self._given_to_pieces_w is not None:
             piece_w += self._given_to_pieces_w
             piece_bound_w += np.abs(self._given_to_pieces_w)
@@ -260,6 +373,7 @@ class _Balance:
             bound_w += np.abs(self._given_w)
         if u is not None and np.isfinite(equation.step_s):
             stored_w = system.mass_product(equation.everywhere(u)) / equation.step_s
+            stored_sum_w = float(np.sum(np.abs(equation.at_free(stored_w))))
             heat_w -= stored_w
             bound_w += np.abs(stored_w)
             piece_w -= pieces.sums(stored_w)
@@ -269,6 +383,8 @@ class _Balance:
             np.where(equation.floating, piece_w, 0.0),
             equation.at_free(np.multiply(bound_w, ROUND_OFF, out=bound_w)),
             ROUND_OFF * piece_bound_w,
+            0.5 * (flows_w + stored_sum_w),
+            stored_sum_w,
         )
 
     def correction(self, u: Vector, residual: Residual) -> tuple[Vector, LinearSolution]:
@@ -304,8 +420,8 @@ class _Balance:
     def _radiated(self, u: Vector) -> Vector:
         return self._equation.at_free(self._equation.system.radiation_load(self._now(u), self._time_s))
 
-    def _now(self, u: Vector) -> Vector:
-        return self.base_k + self._equation.everywhere(u)
+    def _now(self, u: Vector | None) -> Vector:
+        return self.base_k if u is None else self.base_k + self._equation.everywhere(u)
 
 
 @dataclass(frozen=True)

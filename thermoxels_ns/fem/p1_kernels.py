@@ -141,6 +141,32 @@ def product_and_bound(matrix: sparse.csr_matrix, vector: Vector) -> tuple[Vector
     return product, bound
 
 
+def conducted_and_bound(stiffness: sparse.csr_matrix, vector: Vector, own: Vector) -> tuple[Vector, Vector]:
+    """Compute K T as sums of K_ij (T_j - T_i), and the same of sizes, because the rows of K sum to 0.
+
+    A large constant in T then does not cancel, and the round-off of K's diagonal does not count. `own` is T at the
+    nodes of the rows, which may be some of all.
+
+    >>> values = np.array([1e16, 1e16 + 2.0])
+    >>> conducted_and_bound(sparse.csr_matrix([[3.0, -3.0], [-3.0, 3.0]]), values, values)
+    (array([-6.,  6.]), array([6., 6.]))
+    """
+    product, bound = np.empty(len(own)), np.empty(len(own))
+    _conducted_and_bound(stiffness.indptr, stiffness.indices, stiffness.data, vector, own, product, bound)
+    return product, bound
+
+
+def exact_sum(first: Vector, second: Vector) -> tuple[Vector, Vector]:
+    """Add up to a sum and what it lost to round-off (Knuth, The Art of Computer Programming 2, section 4.2.2).
+
+    >>> exact_sum(np.array([1.0]), np.array([1e-20]))
+    (array([1.]), array([1.e-20]))
+    """
+    total, lost = np.empty_like(first), np.empty_like(first)
+    _exact_sum(first, second, total, lost)
+    return total, lost
+
+
 def _capacities(points_m, tets, heat_capacity_j_m3k, edges: MeshEdges) -> tuple[npt.NDArray, npt.NDArray]:
     points_m, tets, unit_m = _checked(points_m, tets)
     capacity = _per_tet("heat_capacity_j_m3k", heat_capacity_j_m3k, len(tets))
@@ -342,6 +368,40 @@ def _product_and_bound(indptr, indices, data, vector, product, bound):
         total = size = 0.0
         for k in range(np.uint64(indptr[row]), np.uint64(indptr[row + 1])):
             term = data[k] * vector[np.uint64(indices[k])]  # unsigned: no test for negative numbers
+            total += term
+            size += abs(term)
+        product[row], bound[row] = total, size
+
+
+@kernel
+def size_of(weights, values):
+    """Sum of weights times sizes of values.
+
+    >>> size_of(np.array([1.0, 2.0]), np.array([3.0, -4.0]))
+    11.0
+    """
+    total = 0.0
+    for i in range(len(weights)):
+        total += weights[i] * abs(values[i])
+    return total
+
+
+@kernel
+def _exact_sum(first, second, total, lost):
+    for i in range(len(first)):
+        a, b = first[i], second[i]
+        both = a + b
+        taken = both - a
+        total[i], lost[i] = both, (a - (both - taken)) + (b - taken)
+
+
+@kernel
+def _conducted_and_bound(indptr, indices, data, vector, own, product, bound):
+    for row in range(len(own)):
+        total = size = 0.0
+        here = own[row]
+        for k in range(np.uint64(indptr[row]), np.uint64(indptr[row + 1])):
+            term = data[k] * (vector[np.uint64(indices[k])] - here)
             total += term
             size += abs(term)
         product[row], bound[row] = total, size

@@ -15,6 +15,7 @@ from thermoxels_ns.fem.system import HeatSystem
 Vector = npt.NDArray[np.float64]
 
 _KEPT_EQUATIONS = 2  # Implicit equations, one for each length of a stage, whose matrices are kept
+_ROUND_OFF = 4.0 * float(np.finfo(np.float64).eps)  # Of heat flows from temperatures that are rounded
 _SAME_LENGTH = 1e-12  # Relative difference up to which two lengths are one
 
 
@@ -30,6 +31,7 @@ class Step:
     """Estimated largest error that the step made, [K]; NaN if the scheme has no estimate or none was asked for."""
     converged: bool
     status: str
+    uncertain_w: float = 0.0  # Bound of what is unbalanced at all nodes, [W]
     limited: bool = False  # Whether the maximum-principle limiter changed the equations
     in_range: bool = True  # Whether all temperatures are in the range of the start and of the surroundings
 
@@ -44,7 +46,8 @@ class RungeKutta:
     def step(self, start_k: Vector, time_s: float, step_s: float, *, estimate: bool = False) -> Step:
         """Take one step from `start_k`, shape (n,), [K], relative to the reference; estimate its error if asked."""
         system, scheme = self._system, self.scheme
-        states: list[Vector] = []
+        states: list[tuple[Vector, Vector | None]] = []
+        uncertain_w = 0.0
         inner_w: list[Vector] = []
         pieces_w: list[Vector] = []
         iterations = newton_iterations = 0
@@ -52,7 +55,8 @@ class RungeKutta:
         for number, (row, node) in enumerate(zip(scheme.weights, scheme.nodes)):
             now_s, implicit = time_s + node * step_s, row[number]
             if implicit == 0.0:
-                states.append(start_k)
+                states.append((start_k, None))
+                uncertain_w += _ROUND_OFF * float(np.sum(self._diagonal_w_k(now_s) * np.abs(start_k)))
                 inner_w.append(system.net_heat(start_k, now_s)[0])
                 pieces_w.append(system.pieces.sums(system.exchanged_heat(start_k, now_s)[0]))
                 continue
@@ -63,7 +67,8 @@ class RungeKutta:
             iterations += solution.iterations
             newton_iterations += solution.newton_iterations
             status = solution.status
-            states.append(solution.relative_k)
+            states.append((solution.relative_k, solution.rest_k))
+            uncertain_w += solution.uncertain_w
             if not solution.converged:
                 unknown = np.full(len(system.groups), np.nan)
                 return Step(solution.relative_k, unknown, iterations, newton_iterations, np.nan, False, status)
@@ -73,19 +78,24 @@ class RungeKutta:
                 pieces_w.append(system.pieces.sums(system.exchanged_heat(solution.relative_k, now_s)[0]))
         heat_w = self._heat(start_k, states, time_s, step_s)
         error_k = self._error(start_k, inner_w, pieces_w, time_s, step_s) if estimate and scheme.estimate else np.nan
-        return Step(states[-1], heat_w, iterations, newton_iterations, error_k, True, status)
+        return Step(states[-1][0], heat_w, iterations, newton_iterations, error_k, True, status, uncertain_w)
 
-    def _heat(self, start_k: Vector, states: list[Vector], time_s: float, step_s: float) -> Vector:
+    def _diagonal_w_k(self, time_s: float) -> Vector:
+        return self._system.matrix(time_s, np.inf).diagonal()
+
+    def _heat(
+        self, start_k: Vector, states: list[tuple[Vector, Vector | None]], time_s: float, step_s: float
+    ) -> Vector:
         """Mean heat flow of each group: the stages' flows, and what the balance of the fixed nodes leaves."""
         system, scheme = self._system, self.scheme
         if not system.groups:
             return np.zeros(0)
         flows, fixed = np.zeros(len(system.groups) - len(system.fixed.groups)), system.fixed
-        kept_w = system.mass_product(states[-1] - start_k)[fixed.nodes] / step_s if len(fixed.nodes) else np.zeros(0)
-        for weight, node, state in zip(scheme.ends, scheme.nodes, states):
+        kept_w = system.mass_product(states[-1][0] - start_k)[fixed.nodes] / step_s if len(fixed.nodes) else np.zeros(0)
+        for weight, node, (state, rest_k) in zip(scheme.ends, scheme.nodes, states):
             if weight != 0.0:
-                flows += weight * system.group_heat_w(state, time_s + node * step_s)
-                kept_w -= weight * system.net_heat_at_fixed(state, time_s + node * step_s)
+                flows += weight * system.group_heat_w(state, time_s + node * step_s, rest_k)
+                kept_w -= weight * system.net_heat_at_fixed(state, time_s + node * step_s, rest_k)
         return np.concatenate([flows, fixed.shares @ kept_w])
 
     def _error(

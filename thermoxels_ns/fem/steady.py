@@ -9,20 +9,18 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
+from thermoxels_ns.fem.flow_uncertainty import steady_uncertainty
 from thermoxels_ns.fem.implicit_equation import ImplicitEquation, ImplicitSolution
 from thermoxels_ns.fem.limiter import LEVEL_ROUND_OFF, MOST_SLACK, RANGE_ROUND_OFF, PositiveOffDiagonals, solve_in_range
 from thermoxels_ns.fem.p1_error import p1_error
+from thermoxels_ns.fem.p1_kernels import exact_sum
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.solution import SteadySolution, heat_by_effect
 from thermoxels_ns.fem.system import HeatSystem
 
 _SUSPICIOUS = 1e-12  # Residual from which on it is worth to look whether it is a share of nothing
-_ROUND_OFF = 64.0 * float(np.finfo(np.float64).eps)
-"""Share of the absolute temperature below which a difference is round-off."""
 _ERROR_OVER_TOLERANCE = 1e3
 """Error of a temperature that the linear solver's tolerance may leave, as a share of the range over the tolerance."""
-_LEVEL = 1e-10
-"""Share of the terms of a sum below which a level temperature balances them, if the linear solver allows it."""
 MOST_RISE_K = 1e6
 """Change of a temperature beyond which a piece without heat capacity does not hold what flows into it, [K]."""
 LEAST_CAPACITY_J_M3K = 1.0
@@ -66,21 +64,26 @@ def solve_steady(
     failure = too_cold(system, solution.relative_k)
     if not solution.converged:
         failure = f"No steady state was found. {solution.status} Check the mesh's quality and the effects."
+    relative_k, rest_k = solution.relative_k, solution.rest_k
+    group_heat = heat_of_groups_w(system, relative_k, time_s, rest_k)
+    uncertain = steady_uncertainty(system, relative_k, rest_k, time_s, 0.5 * float(np.abs(group_heat).sum()))
+    failure = failure or uncertain.refusal
     if failure and not allow_unconverged:
         raise HeatError(failure)
-    relative_k = solution.relative_k
-    group_heat = heat_of_groups_w(system, relative_k, time_s)
-    num_mesh_nodes = len(problem.mesh.points_m)
+    num_mesh_nodes, uncertain_w = len(problem.mesh.points_m), np.array([uncertain.heat_w])
+    temperature_c, lost_k = exact_sum(relative_k, np.full_like(relative_k, system.reference_c))
     found = SteadySolution(
-        temperature_c=relative_k[:num_mesh_nodes] + system.reference_c,
-        effects=heat_by_effect(effect_labels(problem), system.groups, group_heat[None]),
+        temperature_c=temperature_c[:num_mesh_nodes],
+        effects=heat_by_effect(effect_labels(problem), system.groups, group_heat[None], uncertain_w),
         energy_residual=_residual(system, relative_k, time_s, group_heat, relative_tolerance),
         status=failure or f"The steady state was found. {solution.status}{state.describe()}",
         converged=not failure,
         iterations=solution.iterations,
         newton_iterations=solution.newton_iterations,
         assembled=system.assembled,
-        edge_temperature_c=relative_k[num_mesh_nodes:] + system.reference_c,
+        edge_temperature_c=temperature_c[num_mesh_nodes:],
+        rest_k=lost_k if rest_k is None else lost_k + rest_k,
+        uncertainty_k=uncertain.temperature_k,
     )
     estimated = order == 1 and given.lumped and not failure
     return replace(found, error=p1_error(given, found, time_s)) if estimated else found
@@ -163,30 +166,20 @@ def _residual(
     exchanged_w, terms_w = system.exchanged_heat(relative_k, time_s)
     flows_w = float(np.abs(exchanged_w).sum() + np.abs(system.net_heat_at_fixed(relative_k, time_s)).sum())
     surplus_w = abs(float(group_heat_w.sum()))
-    if surplus_w > _SUSPICIOUS * flows_w and is_still(system, relative_k, time_s, relative_tolerance):
-        # What flows to and from fixed nodes is a difference of conduction's terms.
-        conducted_w = system.conducted_heat(relative_k)[1][system.fixed.nodes]
-        flows_w = max(flows_w, float(terms_w.sum() + conducted_w.sum()))
+    if surplus_w > _SUSPICIOUS * flows_w and system.is_still(relative_k, time_s, relative_tolerance):
+        level_k = np.abs(relative_k) + abs(system.reference_c + ZERO_CELSIUS_K)
+        per_kelvin_w = system.held_w_k(time_s, np.inf)
+        per_kelvin_w[system.fixed.nodes] += system.stiffness.diagonal()[system.fixed.nodes]
+        flows_w = max(flows_w, float(np.sum(terms_w + per_kelvin_w * level_k)))
     return surplus_w / flows_w if flows_w > 0.0 else 0.0
 
 
-def is_still(system: HeatSystem, relative_k: np.ndarray, time_s: float, relative_tolerance: float = 1e-12) -> bool:
-    """Whether nothing makes heat flow: each connected piece, at one temperature, balances what acts on every node."""
-    pieces, fixed = system.pieces, system.fixed.nodes
-    mean_k = pieces.sums(relative_k) / pieces.sums(np.ones_like(relative_k))
-    level_k = np.zeros_like(relative_k) + pieces.at_nodes(mean_k)
-    round_off_k = _ROUND_OFF * (np.abs(level_k).max() + abs(system.reference_c + ZERO_CELSIUS_K))
-    share = max(_LEVEL, 100.0 * relative_tolerance)
-    heat_w, terms_w = system.exchanged_heat(level_k, time_s)
-    allowed_w = share * terms_w + round_off_k * system.held_w_k(time_s, np.inf)
-    apart_k = np.abs(relative_k[fixed] - level_k[fixed])
-    return bool(np.all(apart_k <= share * np.abs(level_k[fixed]) + round_off_k) and np.all(np.abs(heat_w) <= allowed_w))
-
-
-def heat_of_groups_w(system: HeatSystem, relative_k: np.ndarray, time_s: float) -> np.ndarray:
+def heat_of_groups_w(
+    system: HeatSystem, relative_k: np.ndarray, time_s: float, rest_k: np.ndarray | None = None
+) -> np.ndarray:
     """Heat flow into the body of each group in a steady state, fixed nodes included, shape (g,), [W]."""
-    kept = -system.net_heat_at_fixed(relative_k, time_s)
-    return np.concatenate([system.group_heat_w(relative_k, time_s), system.fixed.shares @ kept])
+    kept = -system.net_heat_at_fixed(relative_k, time_s, rest_k)
+    return np.concatenate([system.group_heat_w(relative_k, time_s, rest_k), system.fixed.shares @ kept])
 
 
 def too_cold(system: HeatSystem, relative_k: np.ndarray) -> str:

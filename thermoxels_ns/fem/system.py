@@ -10,9 +10,10 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients, LinearSolver, TwoLevel
-from thermoxels_ns.fem.forms import ConvectionForm, FixedNodes, RadiationForm, at_time, effect_forms
-from thermoxels_ns.fem.p1_kernels import product_and_bound
+from thermoxels_ns.fem.forms import ConvectionForm, FixedNodes, RadiationForm, SourceForm, at_time, effect_forms
+from thermoxels_ns.fem.p1_kernels import conducted_and_bound, product_and_bound
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import Assembled
@@ -23,6 +24,11 @@ Vector = npt.NDArray[np.float64]
 SystemSolver: TypeAlias = LinearSolver | ConjugateGradients
 """What solves the equations of a system, by the order of its tetrahedra."""
 
+_ROUND_OFF = 64.0 * float(np.finfo(np.float64).eps)
+"""Share of the absolute temperature below which a difference is round-off."""
+_LEVEL = 1e-10
+"""Share of the terms of a sum below which a level temperature balances them, if the linear solver allows it."""
+_LEAST = float(np.finfo(np.float64).tiny)
 _KEPT_RANGES = 64  # Times at which the range of the surroundings is kept
 
 
@@ -87,6 +93,8 @@ class HeatSystem:
         self._convection, self._loads, self._radiation = forms.convection, forms.loads, forms.radiation
         self.surface_forms: tuple[ConvectionForm | RadiationForm, ...] = (*forms.convection, *forms.radiation)
         """Heat flows through the surface that depend on its temperature."""
+        self.sources: tuple[SourceForm, ...] = tuple(form for form in forms.loads if isinstance(form, SourceForm))
+        """Heat sources."""
         self.fixed: FixedNodes = FixedNodes(forms.fixed, self.num_nodes)
         """Nodes whose temperature is given."""
         with self.assembled.form("stiffness"):
@@ -110,6 +118,7 @@ class HeatSystem:
         self._kept_matrix: sparse.csr_matrix | None = None
         self._kept_load: Vector | None = None
         self._kept_loads: dict[float, Vector] = {}
+        self._kept_outside: dict[float, tuple[Vector, Vector, Vector]] = {}
         self._fixed_rows: sparse.csr_matrix | None = None
         self._kept_ranges: dict[float, tuple[float, float]] = {}
         self._prolongation: sparse.csr_matrix | None = None
@@ -149,6 +158,11 @@ class HeatSystem:
     def nodal_mass_j_k(self) -> Vector:
         """Row sums of the mass matrix, shape (n,), [J / K]."""
         return self._masses()[1]
+
+    @property
+    def total_mass_j_k(self) -> float:
+        """Heat capacity of the whole body, [J / K]."""
+        return float(np.sum(self.nodal_mass_j_k))
 
     @property
     def mass_matrix(self) -> sparse.csr_matrix | None:
@@ -202,13 +216,22 @@ class HeatSystem:
         return held if convection is None else held + convection @ np.ones(self.num_nodes)
 
     def load(self, time_s: float) -> Vector:
-        """Heat that does not depend on the temperature: R T_ambient, fluxes and sources, shape (n,), [W]."""
+        """Heat that does not depend on the temperature, fluxes and sources, shape (n,), [W]."""
         if self._kept_load is None:
             self._kept_load = self._sum_of_loads(False, 0.0)
-        if not any(form.load_in_time for form in (*self._convection, *self._loads)):
+        if not any(form.load_in_time for form in self._loads):
             return self._kept_load
         constant = self._kept_load
         return at_time(self._kept_loads, time_s, lambda t: constant + self._sum_of_loads(True, t))
+
+    def _outside(self, time_s: float) -> tuple[Vector, Vector, Vector]:
+        """Mean temperature of the air at each node, what comes in if the body has it, and the sum of sizes added up.
+
+        Shapes (n,), [K], [W] and [W]; 0 where there is no air. Convection is R times a difference from this
+        temperature, and what different airs at one node leave.
+        """
+        in_time = any(form.load_in_time for form in (*self._convection, *self._loads))
+        return at_time(self._kept_outside, time_s if in_time else 0.0, self._outside_at)
 
     def radiation_load(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat radiated into the body, shape (n,), [W]."""
@@ -226,18 +249,21 @@ class HeatSystem:
                 total = sparse.csr_matrix(total + form.slope(relative_k, time_s))
         return total
 
-    def exchanged_heat(self, relative_k: Vector, time_s: float) -> tuple[Vector, Vector]:
-        """Heat from outside the body into each node, load - R T + radiation(T), and the sum of sizes added up, [W].
+    def exchanged_heat(self, relative_k: Vector, time_s: float, rest_k: Vector | None = None) -> tuple[Vector, Vector]:
+        """Heat from outside into each node, load + R (T_air - T) + radiation(T), and the sum of sizes added up, [W].
 
-        Round-off in the first is a few eps of the second.
+        Round-off in the first is a few eps of the second. The temperatures are T + `rest_k`.
         """
-        heat = self.load(time_s).copy()
-        bound = np.abs(heat)
+        around_k, heat, bound = self._outside(time_s)
         convection = self.convection_matrix(time_s)
-        if convection is not None:
-            lost, size = product_and_bound(convection, relative_k)
-            heat -= lost
-            bound += size
+        if convection is None:
+            heat, bound = heat.copy(), bound.copy()
+        else:
+            apart_k = relative_k - around_k
+            if rest_k is not None:
+                apart_k += rest_k
+            lost, size = product_and_bound(convection, apart_k)
+            heat, bound = np.subtract(heat, lost, out=lost), np.add(bound, size, out=size)
         if self.nonlinear:
             heat += self.radiation_load(relative_k, time_s)
             bound += self.radiation_magnitude(relative_k, time_s)
@@ -252,19 +278,27 @@ class HeatSystem:
         conducted, size = self.conducted_heat(relative_k)
         return heat - conducted, bound + size
 
-    def conducted_heat(self, relative_k: Vector) -> tuple[Vector, Vector]:
+    def conducted_heat(self, relative_k: Vector, rest_k: Vector | None = None) -> tuple[Vector, Vector]:
         """Heat that flows from each node to its neighbours, K T, and its bound as in `exchanged_heat`."""
-        return product_and_bound(self._stiffness, relative_k)
+        heat, bound = conducted_and_bound(self._stiffness, relative_k, relative_k)
+        if rest_k is not None:
+            more, size = conducted_and_bound(self._stiffness, rest_k, rest_k)
+            heat += more
+            bound += size
+        return heat, bound
 
-    def net_heat_at_fixed(self, relative_k: Vector, time_s: float) -> Vector:
+    def net_heat_at_fixed(self, relative_k: Vector, time_s: float, rest_k: Vector | None = None) -> Vector:
         """`net_heat` at the fixed nodes only, shape (d,), [W]."""
         nodes = self.fixed.nodes
         if len(nodes) == 0:
             return np.zeros(0)
         if self._fixed_rows is None:
             self._fixed_rows = sparse.csr_matrix(self._stiffness[nodes])
-        from_nodes_w = self._fixed_rows @ relative_k
-        return self.exchanged_heat(relative_k, time_s)[0][nodes] - from_nodes_w if self.exchanges else -from_nodes_w
+        rows, parts = self._fixed_rows, (relative_k,) if rest_k is None else (relative_k, rest_k)
+        from_nodes_w = sum((conducted_and_bound(rows, part, part[nodes])[0] for part in parts), np.zeros(len(nodes)))
+        if not self.exchanges:
+            return -from_nodes_w
+        return self.exchanged_heat(relative_k, time_s, rest_k)[0][nodes] - from_nodes_w
 
     def radiation_magnitude(self, relative_k: Vector, time_s: float) -> Vector:
         """Sum of the sizes of what `radiation_load` adds up, shape (n,), [W]."""
@@ -273,15 +307,10 @@ class HeatSystem:
             total += form.magnitude(relative_k, time_s)
         return total
 
-    def group_heat_w(self, relative_k: Vector, time_s: float, *, radiating_k: Vector | None = None) -> Vector:
-        """Heat flow into the body of each group but those of fixed nodes, [W].
-
-        `radiating_k` are temperatures of radiation, such as those of a mean fourth power; None: the same.
-        """
-        radiating_k = relative_k if radiating_k is None else radiating_k
-        given = (form.group_heat_w(relative_k, time_s) for form in (*self._convection, *self._loads))
-        radiated = (form.group_heat_w(radiating_k, time_s) for form in self._radiation)
-        return np.concatenate([np.zeros(0), *given, *radiated])
+    def group_heat_w(self, relative_k: Vector, time_s: float, rest_k: Vector | None = None) -> Vector:
+        """Heat flow into the body of each group but those of fixed nodes, [W]."""
+        forms = (*self._convection, *self._loads, *self._radiation)
+        return np.concatenate([np.zeros(0), *(form.group_heat_w(relative_k, time_s, rest_k) for form in forms)])
 
     def exchanging_pieces(self, time_s: float) -> npt.NDArray[np.bool_]:
         """Mark the pieces whose temperature convection, radiation or fixed nodes hold, shape (p,)."""
@@ -289,6 +318,31 @@ class HeatSystem:
         for form in self.surface_forms:
             marks |= self.pieces.touched(form.exchanging_nodes(time_s))
         return marks
+
+    def level_k(self, relative_k: Vector) -> Vector:
+        """Mean temperature of each connected piece at its nodes, shape (n,), [K]."""
+        mean_k = self.pieces.sums(relative_k) / self.pieces.sums(np.ones_like(relative_k))
+        return np.zeros_like(relative_k) + self.pieces.at_nodes(mean_k)
+
+    def is_still(self, relative_k: Vector, time_s: float, relative_tolerance: float = 1e-12) -> bool:
+        """Whether nothing makes heat flow: each connected piece, at one temperature, balances what acts on it."""
+        fixed, level_k, held_w_k = self.fixed.nodes, self.level_k(relative_k), self.held_w_k(time_s, np.inf)
+        round_off_k = _ROUND_OFF * (np.abs(level_k).max() + abs(self.reference_c + ZERO_CELSIUS_K))
+        share = max(_LEVEL, 100.0 * relative_tolerance)
+        heat_w, terms_w = self.exchanged_heat(level_k, time_s)
+        allowed_w = share * (terms_w + 2.0 * held_w_k * np.abs(level_k)) + round_off_k * held_w_k
+        apart_k = np.abs(relative_k[fixed] - level_k[fixed])
+        allowed_k = share * np.abs(level_k[fixed]) + round_off_k
+        return bool(np.all(apart_k <= allowed_k) and np.all(np.abs(heat_w) <= allowed_w))
+
+    def surface_w_k(self, relative_k: Vector, time_s: float, *, inside: bool = True) -> float:
+        """Heat that leaves the body per kelvin through its surface, and through the cells there if asked, [W / K]."""
+        held_w_k, inside_w_k = self.held_w_k(time_s, np.inf), np.maximum(self._stiffness.diagonal(), _LEAST)
+        if self.nonlinear:
+            held_w_k = held_w_k + self.radiation_slope(relative_k, time_s) @ np.ones(self.num_nodes)
+        through_w_k = held_w_k / (1.0 + held_w_k / inside_w_k) if inside else held_w_k.copy()
+        through_w_k[self.fixed.nodes] = inside_w_k[self.fixed.nodes]
+        return float(np.sum(through_w_k))
 
     def allowed_range_k(self, start_k: tuple[float, float], times_s: tuple[float, ...]) -> tuple[float, float]:
         """Range that temperatures cannot leave in a step: from the start's and all surroundings' at these times.
@@ -330,11 +384,24 @@ class HeatSystem:
 
     def _sum_of_loads(self, in_time: bool, time_s: float) -> Vector:
         total = np.zeros(self.num_nodes)
-        for form in (*self._convection, *self._loads):
+        for form in self._loads:
             if form.load_in_time == in_time:
                 with self.assembled.form(form.kind):
                     total += form.load(time_s)
         return total
+
+    def _outside_at(self, time_s: float) -> tuple[Vector, Vector, Vector]:
+        weight, weighted, heat = (np.zeros(self.num_nodes) for _ in range(3))
+        given = self.load(time_s)
+        for form in self._convection:
+            sums = form.ambient_sums(time_s)
+            weight += sums[0]
+            weighted += sums[1]
+        around_k = np.divide(weighted, weight, out=np.zeros_like(weight), where=weight > 0.0)
+        for form in self._convection:
+            with self.assembled.form(form.kind):
+                heat += form.load(around_k, time_s)
+        return around_k, given + heat, np.add(np.abs(given), np.abs(heat))
 
 
 def _sum_of(first: sparse.csr_matrix | None, second: sparse.csr_matrix | None) -> sparse.csr_matrix | None:

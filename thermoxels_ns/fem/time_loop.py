@@ -10,12 +10,13 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import celsius_to_kelvin
+from thermoxels_ns.fem.flow_uncertainty import MOST_UNCERTAIN, TimeUncertainty, describe
 from thermoxels_ns.fem.limiter import AllowedRange, Limiter, is_in_range
 from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.runge_kutta import RungeKutta, Step
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, SDIRK2, Scheme
 from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect, left_out
-from thermoxels_ns.fem.steady import check_stored, is_still, too_cold
+from thermoxels_ns.fem.steady import check_stored, too_cold
 from thermoxels_ns.fem.system import HeatSystem
 
 Vector = npt.NDArray[np.float64]
@@ -35,6 +36,8 @@ _KEEP_BELOW = 1.25  # Factor below which a step is not lengthened, so that its m
 _SHORTEST = 1e-60
 """Shortest step as a share of the duration; bodies with next to no heat capacity begin with such short ones."""
 _ROUND_OFF = 64.0 * float(np.finfo(np.float64).eps)  # Share of the terms of a sum that round-off leaves of it at most
+_NOTHING = 1e-9  # Share of the heat content above absolute zero that is no exchange of heat to speak of
+_LEAST_K = 1.0  # Absolute temperature below which such shares are no smaller, [K]
 _SUSPICIOUS = 1e-12  # Energy residual above which it is checked whether round-off explains it
 
 
@@ -92,6 +95,7 @@ def solve_heat(
         balance.add(taken.step, taken.step_s, ends_interval=taken.ends_interval)
         if progress is not None:
             progress(balance.followed_s / time.duration_s, balance.steps)
+    failure = failure or balance.refusal()
     if failure and not allow_unconverged:
         raise HeatError(failure)
     status = failure or balance.success(loop.describe()) + _skips(problem, time)
@@ -253,6 +257,7 @@ class HeatBalance:
         self._error_k = 0.0
         self._lengths_s: list[list[float]] = [[] for _ in times_s[1:]]
         self._limited = self._out_of_range = 0
+        self._uncertain, self._uncertain_j = TimeUncertainty(), np.zeros(1)
 
     @property
     def steps(self) -> int:
@@ -265,16 +270,44 @@ class HeatBalance:
         self.followed_s += step_s
         self._lengths_s[row].append(step_s)
         self._heat_j[row] += step_s * step.group_heat_w
-        self._exchanged_j[row] += step_s * float(np.abs(step.group_heat_w).sum())
         self._iterations[row] += step.iterations, step.newton_iterations
         self._most_iterations = max(self._most_iterations, step.iterations)
         self._error_k += step.error_k
         self._steps += 1
+        exchanged_j = step_s * float(np.abs(step.group_heat_w).sum())
+        self._exchanged_j[row] += exchanged_j
+        self._uncertain.add(self._system, step.relative_k, step.uncertain_w, exchanged_j, step_s)
         self._limited += step.limited
         self._out_of_range += not step.in_range
         if ends_interval:
             self._done += 1
             self._states[self._done] = step.relative_k
+
+    def refusal(self) -> str:
+        """Say that heat flows are too uncertain, or nothing; where next to no heat was exchanged, that is no matter."""
+        end_k, exchanged_j = self._states[self._done], float(self._exchanged_j.sum())
+        if self._system.groups:
+            self._uncertain_j = self._uncertain.heat_j(self._system, end_k)
+        if self._uncertain_j[-1] <= MOST_UNCERTAIN * exchanged_j:
+            return ""
+        # Heat may come in and leave through one patch.
+        at_nodes_w = np.abs(self._system.exchanged_heat(end_k, self.followed_s)[0]).sum()
+        exchanged_j = max(exchanged_j, self.followed_s * float(at_nodes_w))
+        # What is unbalanced inside leaves no faster than its temperatures let it.
+        held_j_k = self.followed_s * self._system.surface_w_k(end_k, self.followed_s, inside=False)
+        uncertain_k = self._uncertain.temperature_k(self._system, float(np.abs(end_k).max()))
+        self._uncertain_j = np.minimum(self._uncertain_j, held_j_k * uncertain_k)
+        uncertain_j = float(self._uncertain_j[-1])
+        if uncertain_j <= MOST_UNCERTAIN * exchanged_j:
+            return ""
+        level_k = abs(celsius_to_kelvin(self._system.reference_c)) + float(np.abs(end_k).max())
+        # By a difference that is round-off of an absolute temperature, a body stores and exchanges:
+        per_kelvin_j = self._system.total_mass_j_k + self.followed_s * self._system.surface_w_k(end_k, self.followed_s)
+        return (
+            ""
+            if uncertain_j <= _NOTHING * max(level_k, _LEAST_K) * per_kelvin_j
+            else describe(uncertain_j, exchanged_j, "J")
+        )
 
     def success(self, of_steps: str) -> str:
         """Say that all went well, and how; `of_steps` is what is to be said about other steps."""
@@ -310,8 +343,12 @@ class HeatBalance:
             terms = self._terms_j(states_k, times_s, unexplained / _ROUND_OFF)
             if unexplained <= _ROUND_OFF * terms:
                 scale, spread_scale = max(scale, terms), max(spread_scale, terms)
-        states_k += system.reference_c
         lengths = np.diff(times_s)
+        ends = np.cumsum([len(lengths_s) for lengths_s in self._lengths_s[:done]]) - 1
+        uncertain_w = np.broadcast_to(self._uncertain_j, self._steps)[ends] / lengths if done else np.zeros(0)
+        highest_k = max(abs(float(states_k.min())), abs(float(states_k.max())))
+        uncertain_k = self._uncertain.temperature_k(system, highest_k) if done else 0.0
+        states_k += system.reference_c
         kinds = [effect.kind for effect in system.problem.effects]
         return HeatSolution(
             times_s=times_s,
@@ -324,11 +361,14 @@ class HeatBalance:
             converged=converged,
             iterations=self._iterations[:done, 0],
             skipped_effects=left_out(kinds),
-            effects=heat_by_effect(effect_labels(system.problem), system.groups, heat_j / lengths[:, None]),
+            effects=heat_by_effect(
+                effect_labels(system.problem), system.groups, heat_j / lengths[:, None], uncertain_w
+            ),
             newton_iterations=self._iterations[:done, 1],
             steps=self._steps,
             step_lengths_s=tuple(np.array(lengths) for lengths in self._lengths_s[:done]),
             time_error_k=self._error_k if adaptive else float("nan"),
+            uncertainty_k=uncertain_k,
             assembled=system.assembled,
         )
 
@@ -349,7 +389,7 @@ class HeatBalance:
             return 0.0
         total_j = 0.0
         for (state_k, time_s), length_s in zip(states, lengths_s.tolist()):
-            if not is_still(system, state_k, time_s):
+            if not system.is_still(state_k, time_s):
                 continue
             terms_w = float(system.exchanged_heat(state_k, time_s)[1].sum())
             if len(fixed):
