@@ -13,7 +13,7 @@ from scipy import sparse
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 from thermoxels_ns.fem.conjugate_gradients import LinearSolution
 from thermoxels_ns.fem.forms import COLDEST_SLOPE_K
-from thermoxels_ns.fem.p1_kernels import exact_sum, size_of
+from thermoxels_ns.fem.p1_kernels import add_sizes, exact_sum, size_of, weighted_size_of
 from thermoxels_ns.fem.system import HeatSystem, SystemSolver
 
 Vector = npt.NDArray[np.float64]
@@ -51,13 +51,13 @@ class Residual:
     piece_heat_w: Vector  # Summed over each connected piece, without the round-off of what flows inside, [W]
     round_off_w: Vector  # What round-off may leave at each free node, [W]
     piece_round_off_w: Vector  # The same for each piece, [W]
-    flows_w: float  # Heat that flows through the body or is stored in it, [W]
+    flows_w: float  # Heat that flows through the body or is stored in it, [W]; at no change not known
     stored_w: float  # Sum of the sizes of what free nodes store, [W]
 
     @cached_property
     def unbalanced_w(self) -> float:
         """Sum of the sizes of what is not balanced at nodes, [W]."""
-        return float(np.sum(np.abs(self.heat_w)))
+        return float(size_of(self.heat_w))
 
     @cached_property
     def uncertain_w(self) -> float:
@@ -165,9 +165,9 @@ class ImplicitEquation:
             return np.inf
         # What the solver left, and what the round-off of the matrix's diagonal hides from it.
         left_w = np.sqrt(len(change)) * linear.residual * _norm(first.heat_w)
-        hidden_w = _EPS * size_of(self.diagonal_w_k, change)
+        hidden_w = _EPS * weighted_size_of(self.diagonal_w_k, change)
         uncertain_w = left_w + 4.0 * hidden_w + float(np.sum(first.round_off_w))
-        stored_w = size_of(self.system.nodal_mass_j_k, change) / self.step_s
+        stored_w = weighted_size_of(self.system.nodal_mass_j_k, change) / self.step_s
         return uncertain_w if uncertain_w <= self._share * stored_w else np.inf
 
     def _refined(
@@ -217,6 +217,11 @@ class ImplicitEquation:
     @cached_property
     def _share(self) -> float:
         return max(_UNBALANCED, _UNBALANCED_OVER_TOLERANCE * self._relative_tolerance)
+
+    @cached_property
+    def twice_diagonal_w_k(self) -> Vector:
+        """Twice `diagonal_w_k`."""
+        return 2.0 * self.diagonal_w_k
 
     @cached_property
     def diagonal_w_k(self) -> Vector:
@@ -358,13 +363,13 @@ class _Balance:
         piece_w, piece_bound_w = np.zeros(pieces.count), np.zeros(pieces.count)
         if system.exchanges:
             exchanged_w, exchanged_bound_w = system.exchanged_heat(now_k, self._time_s, rest_k)
-            flows_w += float(np.sum(np.abs(exchanged_w)))
+            flows_w += 0.0 if u is None else float(size_of(exchanged_w))
             heat_w += exchanged_w
             bound_w += exchanged_bound_w
             piece_w, piece_bound_w = pieces.sums(exchanged_w), pieces.sums(exchanged_bound_w)
         if u is not None and now is None:
             # That of the temperatures themselves.
-            bound_w += 2.0 * equation.diagonal_w_k * np.abs(now_k)
+            add_sizes(bound_w, equation.twice_diagonal_w_k, now_k)
         if self._given_to_pieces_w is not None:
             piece_w += self._given_to_pieces_w
             piece_bound_w += np.abs(self._given_to_pieces_w)
@@ -373,7 +378,7 @@ class _Balance:
             bound_w += np.abs(self._given_w)
         if u is not None and np.isfinite(equation.step_s):
             stored_w = system.mass_product(equation.everywhere(u)) / equation.step_s
-            stored_sum_w = float(np.sum(np.abs(equation.at_free(stored_w))))
+            stored_sum_w = float(size_of(stored_w))
             heat_w -= stored_w
             bound_w += np.abs(stored_w)
             piece_w -= pieces.sums(stored_w)

@@ -35,8 +35,8 @@ def p1_error(system: HeatSystem, solution: SteadySolution, time_s: float) -> Err
     with radiation's slope in h. The flows of T + b + c less those of T are the errors of flows. Where temperatures are
     singular b is not all that is missed, only what half the mesh size would find, 1 - 0.3 of it (Richardson).
 
-    Where sources act the error is at least s h^2 / (8 k), by which a source curves the temperature inside a tetrahedron
-    of the extent h along its gradient.
+    Where sources act the error is at least s h^2 / (16 k), half of what a source curves the temperature in a tetrahedron
+    of the extent h along its gradient; what leaves at once through the surface beside it is not in s.
 
     Effects that change are taken at `time_s`. None where the estimates are no numbers.
     """
@@ -79,11 +79,15 @@ def p1_error(system: HeatSystem, solution: SteadySolution, time_s: float) -> Err
             missed_w[effect] += float(heat_w)
         largest_w = max(map(abs, missed_w.values()), default=0.0) / (1.0 - _LEFT)
         largest_k = float(np.max(np.abs(error_k)))
+        kept_w = np.abs(system.exchanged_heat(relative_k, time_s)[0]) if system.sources else np.zeros(0)
         for form in system.sources:
             inside, slope = tets[form.term.tets], mean[tets[form.term.tets]].mean(axis=1)
             along = np.square(np.ptp(relative_k[inside], axis=1)) / np.sum(np.square(slope), axis=1)
             square_m2 = np.fmin(along, np.sum(np.square(np.ptp(points[inside], axis=1)), axis=1))
-            curved_k = form.mean_w_m3(time_s) * square_m2 / (8.0 * conductivity[form.term.tets])
+            volumes_m3 = system.space.tet_volumes_m3(np.arange(len(tets)))
+            volume_m3 = sums_by_number(tets.ravel(), np.repeat(volumes_m3, 4), num_nodes)
+            density_w_m3 = np.fmin(form.mean_w_m3(time_s), (4.0 * kept_w / volume_m3)[inside].mean(axis=1))
+            curved_k = density_w_m3 * square_m2 / (16.0 * conductivity[form.term.tets])
             largest_k = max(largest_k, float(np.max(curved_k)))
         found = ErrorSize(largest_k, share_of_heat(largest_w, solution))
     return found if np.isfinite(found.temperature_k + found.heat_flow) else None

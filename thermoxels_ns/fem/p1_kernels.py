@@ -373,17 +373,43 @@ def _product_and_bound(indptr, indices, data, vector, product, bound):
         product[row], bound[row] = total, size
 
 
-@kernel
-def size_of(weights, values):
+@kernel(fastmath={"reassoc"})
+def size_of(values):
+    """Sum of the sizes of values.
+
+    >>> size_of(np.array([3.0, -4.0]))
+    7.0
+    """
+    total = 0.0
+    for i in range(len(values)):
+        total += abs(values[i])
+    return total
+
+
+@kernel(fastmath={"reassoc"})
+def weighted_size_of(weights, values):
     """Sum of weights times sizes of values.
 
-    >>> size_of(np.array([1.0, 2.0]), np.array([3.0, -4.0]))
+    >>> weighted_size_of(np.array([1.0, 2.0]), np.array([3.0, -4.0]))
     11.0
     """
     total = 0.0
     for i in range(len(weights)):
         total += weights[i] * abs(values[i])
     return total
+
+
+@kernel
+def add_sizes(bound, weights, values):
+    """Add weights times sizes of values to a bound, in place.
+
+    >>> bound = np.ones(2)
+    >>> add_sizes(bound, np.array([1.0, 2.0]), np.array([3.0, -4.0]))
+    >>> bound
+    array([4., 9.])
+    """
+    for i in range(len(bound)):
+        bound[i] += weights[i] * abs(values[i])
 
 
 @kernel
