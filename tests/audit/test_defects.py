@@ -64,7 +64,7 @@ def test_cold_places_are_no_defects_from_outside_and_are_from_inside(plate) -> N
     cold = painted(plate, block, 0.5)
     surface = audited_surface(cold, STATED, UP)
     assert audit(cold, STATED, UP).defects == ()
-    _, found = find_defects(surface, surface.reading_c, False, 0.2)
+    found = find_defects(surface, surface.reading_c, False, 0.2)
     assert [one.kind for one in found] == ["area"]
 
 
@@ -74,6 +74,16 @@ def test_noise_and_drift_make_no_defect(plate) -> None:
         drift = 0.2 * np.sin(plate.points_m @ generator.uniform(-2, 2, 3) + generator.uniform(0, 6))
         noisy = replace(plate, temperature_c=2.0 + drift + generator.normal(0, 0.15, len(drift)))
         assert audit(noisy, STATED, UP).defects == ()
+
+
+def test_a_bridge_weaker_than_the_slow_changes_of_a_wall_is_found(plate) -> None:
+    """A wall 1 K warmer at its foot than at its top: the strip is 0.6 K warmer than what is beside it."""
+    slow = 2.0 + plate.points_m[:, 2] / 3.0
+    weak = replace(plate, temperature_c=slow + np.where(strip(plate.points_m), 0.6, 0.0))
+    (found,) = audit(weak, STATED, UP).defects
+    assert found.kind == "line" and found.length_m == pytest.approx(2.2, rel=0.1)
+    assert found.departure_k == pytest.approx(0.6 / 0.93, rel=0.1)
+    assert audit(replace(plate, temperature_c=slow), STATED, UP).defects == ()
 
 
 def test_what_departs_less_than_readings_repeat_is_none(plate) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermoxels_ns.audit.conditions import Conditions, Side
-from thermoxels_ns.audit.defects import FoundDefect, Undisturbed
+from thermoxels_ns.audit.defects import FoundDefect
 from thermoxels_ns.audit.draws import Interval, interval_of
 from thermoxels_ns.audit.exchange import PartTotals
 from thermoxels_ns.audit.heat_flow import temperature_factor
@@ -58,7 +58,6 @@ def describe_defect(
     surface: AuditedSurface,
     conditions: Conditions,
     one: FoundDefect,
-    undisturbed: Undisturbed,
     figures: PartFigures,
     first_part: int,
     storey: str,
@@ -76,6 +75,7 @@ def describe_defect(
     extra = figures.flow_w(zone) - calm_w_m2 * one.base_area_m2
     per_kelvin = extra / totals.difference_k / (one.length_m if one.kind == "line" else 1.0)
     extra_w, f_rsi = interval_of(extra), figures.factors(spot, side)
+    around_c = float(totals.surface_c[reference, 0])
     area, spot_c = surface.area_m2[one.core], interval_of(totals.surface_c[spot] + figures.off_k)
     x, y, z = np.average(surface.centroid_m[one.core], axis=0, weights=area).tolist()
     return Defect(
@@ -86,9 +86,9 @@ def describe_defect(
         height_m=float(np.average(surface.height_m[one.core], weights=area)),
         length_m=one.length_m,
         area_m2=float(area.sum()),
-        departure_k=abs(spot_c.value - undisturbed.temperature_c),
+        departure_k=abs(spot_c.value - around_c),
         spot_c=spot_c,
-        undisturbed_c=undisturbed.temperature_c,
+        undisturbed_c=around_c,
         incidence=figures.incidence(zone, reference, side),
         extra_w=extra_w,
         coefficient=interval_of(per_kelvin),

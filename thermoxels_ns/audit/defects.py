@@ -16,6 +16,8 @@ DefectKind = Literal["line", "point", "area"]
 
 LEAST_DEPARTURE_K = 0.1  # What no camera tells from noise, [K]
 _DEVIATIONS = 3.0  # Standard deviations of the undisturbed surface from which on a triangle departs
+_CELL_M, _AROUND_M = 0.25, 1.25
+"""The background of a place is the median of medians of cells of the first size within the second distance, [m]."""
 _SHORTH = 1.349  # Width of the shortest half of a normal distribution, in standard deviations
 _SURE = 2.0  # A defect reaches this many times the least departure somewhere
 LEAST_AREA_M2 = 0.01  # Of what departs: a square decimetre
@@ -54,13 +56,13 @@ class FoundDefect:
     not_counted: str  # Why it is not to be believed, a sentence; else empty
 
 
-def find_defects(
-    surface: AuditedSurface, surface_c: FloatArray, warm: bool, least_k: float
-) -> tuple[dict[int, Undisturbed], list[FoundDefect]]:
+def find_defects(surface: AuditedSurface, surface_c: FloatArray, warm: bool, least_k: float) -> list[FoundDefect]:
     """Find what departs from the undisturbed temperature of its patch.
 
-    A triangle departs where its difference is more than three standard deviations of its patch, `least_k` and 0.1 K;
-    triangles that hang together and reach twice that somewhere are a defect. Rims of what was not measured never count.
+    A triangle departs where it differs by more than three standard deviations, `least_k` and 0.1 K from what most of
+    its patch has, or from its background: what most of the patch has within 1.25 m. The first finds what is large, the
+    second what is weaker than the slow changes over a wall. Triangles that hang together and reach twice that somewhere
+    are a defect. Rims of what was not measured never count.
 
     Args:
         surface: The surface.
@@ -69,24 +71,42 @@ def find_defects(
         least_k: Smallest departure that counts, [K].
 
     Returns:
-        undisturbed: By patch.
-        defects: Those with the largest departure times area first.
+        Those with the largest departure times area first.
     """
     sure = surface.counted & ~surface.rim
-    away = np.zeros(len(surface_c))
-    undisturbed = dict[int, Undisturbed]()
-    least = np.full(len(surface_c), np.inf)
+    sign = 1.0 if warm else -1.0
+    away, share, calm = np.zeros(len(surface_c)), np.zeros(len(surface_c)), np.ones(len(surface_c), dtype=bool)
     for patch in np.unique(surface.selection.facet_patch[sure]):
         on_patch = np.flatnonzero(sure & (surface.selection.facet_patch == patch))
-        found = undisturbed_temperature(surface_c[on_patch], surface.area_m2[on_patch], least_k)
-        undisturbed[int(patch)] = found
-        away[on_patch] = (surface_c[on_patch] - found.temperature_c) * (1.0 if warm else -1.0)
-        least[on_patch] = found.least_departure_k
-    cores = _cores(surface, away, least)
-    departs = sure & (np.abs(away) > least)
-    zones = _Zones(surface, sure, departs, cores)
+        values, area = surface_c[on_patch], surface.area_m2[on_patch]
+        whole = undisturbed_temperature(values, area, least_k)
+        differs = values - whole.temperature_c
+        beside = values - background_c(surface.centroid_m[on_patch], values, area)
+        near = undisturbed_temperature(beside, area, least_k)
+        beside -= near.temperature_c
+        away[on_patch] = np.maximum(sign * differs, sign * beside)
+        parts = np.stack([differs / whole.least_departure_k, beside / near.least_departure_k])
+        share[on_patch] = (sign * parts).max(axis=0)
+        calm[on_patch] = (np.abs(parts) < 1.0).all(axis=0)
+    cores = _cores(surface, share)
+    zones = _Zones(surface, sure, ~calm, cores)
     defects = [zones.around(core, away) for core in cores]
-    return undisturbed, sorted(defects, key=lambda one: -float(surface.area_m2[one.core] @ away[one.core]))
+    return sorted(defects, key=lambda one: -float(surface.area_m2[one.core] @ away[one.core]))
+
+
+def background_c(points_m: FloatArray, surface_c: FloatArray, area_m2: FloatArray) -> FloatArray:
+    """Temperature that most of the surface has around each point, shape (k,), [degrees Celsius].
+
+    The median, by area, of the means of cells of 0.25 m within 1.25 m; strips and spots of less than half of that area
+    do not change it.
+    """
+    _, cell = np.unique(np.floor(points_m / _CELL_M).astype(np.int64), axis=0, return_inverse=True)
+    cell = cell.ravel()
+    weight: FloatArray = np.bincount(cell, area_m2)
+    mean: FloatArray = np.bincount(cell, area_m2 * surface_c) / weight
+    middle = np.stack([np.bincount(cell, area_m2 * axis) / weight for axis in points_m.T], axis=1)
+    around: list[list[int]] = KDTree(middle).query_ball_point(middle, _AROUND_M).tolist()
+    return np.array([_weighted_median(mean[near], weight[near]) for near in around])[cell]
 
 
 def undisturbed_temperature(surface_c: FloatArray, area_m2: FloatArray, least_k: float = 0.0) -> Undisturbed:
@@ -110,12 +130,21 @@ def undisturbed_temperature(surface_c: FloatArray, area_m2: FloatArray, least_k:
     return Undisturbed(middle, max(_DEVIATIONS * scatter, least_k, LEAST_DEPARTURE_K))
 
 
-def _cores(surface: AuditedSurface, away: FloatArray, least: FloatArray) -> list[IntArray]:
-    """Triangles that depart and hang together within a patch, by edges or over a gap of 0.3 m, if they are enough."""
-    which = np.flatnonzero(away > least)
+def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
+    order = np.argsort(values, kind="stable")
+    reach = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(reach, 0.5 * reach[-1])])
+
+
+def _cores(surface: AuditedSurface, share: FloatArray) -> list[IntArray]:
+    """Triangles that depart and hang together within a patch, by edges or over a gap of 0.3 m, if they are enough.
+
+    `share` is the departure over the least one that counts, shape (f,).
+    """
+    which = np.flatnonzero(share > 1.0)
     pairs, patch = _neighbours(surface, which), surface.selection.facet_patch
     component = component_of(len(which), pairs[:, 0], pairs[:, 1])
-    sure = np.bincount(component, away[which] > _SURE * least[which]) > 0
+    sure = np.bincount(component, share[which] > _SURE) > 0
     kept = sure[component] if len(which) else np.zeros(0, dtype=bool)
     which = which[kept]
     if not len(which):

@@ -54,9 +54,9 @@ class Defect:
     height_m: float  # Of its middle above the lowest point of the mesh
     length_m: float  # Of a line, else its largest extent
     area_m2: float  # Of what departs by more than noise
-    departure_k: float  # Of its worst square decimetre from the undisturbed temperature, above 0
+    departure_k: float  # Of its worst square decimetre from the undisturbed surface near by, above 0
     spot_c: Interval  # Temperature of that, [degrees Celsius]
-    undisturbed_c: float
+    undisturbed_c: float  # Mean temperature of that, [degrees Celsius]
     incidence: Interval | None  # I_tb; None where the undisturbed surface may be as warm as the air
     extra_w: Interval  # Extra heat flow
     coefficient: Interval

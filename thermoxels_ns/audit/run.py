@@ -34,7 +34,7 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
     surface, side = work.surface, conditions.side
     surface_c, flow = work.triangles()
     repeatability = conditions.camera.repeatability.off_by
-    undisturbed, found = find_defects(surface, surface_c, side == "outside", repeatability)
+    found = find_defects(surface, surface_c, side == "outside", repeatability)
 
     patch, names = surface.selection.facet_patch, surface.selection.patch_names
     counted = np.flatnonzero(surface.counted)
@@ -79,9 +79,7 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
         at = storey[one.spot[0]]
         where = list(conditions.storeys)[at] if at >= 0 else ""
         defects.append(
-            describe_defect(
-                surface, conditions, one, undisturbed[one.patch], figures, first + 3 * number, where, whole.loss_w.value
-            )
+            describe_defect(surface, conditions, one, figures, first + 3 * number, where, whole.loss_w.value)
         )
     last, check = len(parts) - 1, check_survey(conditions)
     f_rsi = PartFigures(totals, slope, work.draws.local(repeatability, last)).factors(last, side)

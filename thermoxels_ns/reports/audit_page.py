@@ -341,8 +341,8 @@ def _method(audit: Audit) -> Section:
         "Readings on the surface of a three-dimensional model are corrected for emissivity and for reflection "
         f"({reflection}). Heat flow follows from the corrected temperature by the film model; the U-value is that heat "
         "flow per area and difference of the airs. A thermal bridge is a place that departs from the temperature that "
-        "most of its patch has by more than three standard deviations, by more than readings repeat and by more than "
-        "0.1 K.",
+        "most of its patch has, or most of it within 1.25 m, by more than three standard deviations, by more than "
+        "readings repeat and by more than 0.1 K.",
         "Intervals: every uncertain quantity is drawn a thousand times from its stated range, the same for all of the "
         "surface; the error of each part's own readings is drawn apart.",
         "What this cannot say: heat flow is taken as steady, while heavy walls store heat for hours; air leakage is "

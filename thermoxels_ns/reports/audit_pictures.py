@@ -37,11 +37,11 @@ def draw_audit(audit: Audit) -> AuditPictures:
     ends = np.quantile(surface_c[np.unique(surface.mesh.facets[counted])], (0.005, 0.995))
     u_ends = np.quantile(u[np.unique(surface.mesh.facets[counted])], (0.02, 0.98))
     same: dict[str, Any] = {"clim": (float(ends[0]), float(ends[1])), "up": surface.selection.up}
-    labels = [(str(n + 1), one.centre_m) for n, one in enumerate(audit.defects[:MOST_DEFECTS]) if not one.not_counted]
     temperature, u_value = [], []
     for direction in _views(audit):
         view = {"view_direction": direction.tolist()}
         facing = surface.selection.facet_normal @ direction < 0.0
+        labels = _labels(audit, direction)
         title = "Surface temperature, corrected for emissivity and reflection"
         temperature.append(_drawn(audit, facing, surface_c, title=title, labels=labels, **same, **view))
         look: dict[str, Any] = {"clim": (float(u_ends[0]), float(u_ends[1])), "colour_map": "viridis"}
@@ -59,6 +59,16 @@ def _at_nodes(audit: Audit, values: FloatArray) -> FloatArray:
     total = np.bincount(facets.ravel(), weight * np.repeat(values[surface.counted], 3), count)
     share = np.bincount(facets.ravel(), weight, count)
     return total / np.where(share > 0.0, share, 1.0)
+
+
+def _labels(audit: Audit, direction: FloatArray) -> list[tuple[str, tuple[float, float, float]]]:
+    """Numbers of the defects that face the camera, and where they are."""
+    surface, labels = audit.surface, []
+    for number, (one, found) in enumerate(zip(audit.defects, audit.found), start=1):
+        normal = surface.area_m2[found.core] @ surface.selection.facet_normal[found.core]
+        if not one.not_counted and normal @ direction < 0.0:
+            labels.append((str(number), one.centre_m))
+    return labels
 
 
 def _views(audit: Audit) -> list[FloatArray]:
