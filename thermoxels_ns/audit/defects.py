@@ -102,8 +102,8 @@ def background_c(points_m: FloatArray, surface_c: FloatArray, area_m2: FloatArra
     """
     _, cell = np.unique(np.floor(points_m / _CELL_M).astype(np.int64), axis=0, return_inverse=True)
     cell = cell.ravel()
-    weight: FloatArray = np.bincount(cell, area_m2)
-    mean: FloatArray = np.bincount(cell, area_m2 * surface_c) / weight
+    weight = np.bincount(cell, area_m2).astype(np.float64)
+    mean = np.bincount(cell, area_m2 * surface_c) / weight
     middle = np.stack([np.bincount(cell, area_m2 * axis) / weight for axis in points_m.T], axis=1)
     around: list[list[int]] = KDTree(middle).query_ball_point(middle, _AROUND_M).tolist()
     return np.array([_weighted_median(mean[near], weight[near]) for near in around])[cell]

@@ -23,5 +23,8 @@ class AuditOptions:
     up: tuple[float, float, float] | None = None
     """Direction that points up in the coordinates of the mesh. Default: that of the export's summary.json beside the
     mesh, or else z."""
+    scene: Path | None = None
+    """Folder of the photographs that the mesh was made from, the --data of the training: the page then shows each
+    defect in the photograph and thermal image that show it best."""
     pictures: bool = True
     """Draw pictures for the page."""

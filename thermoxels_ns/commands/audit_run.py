@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,11 @@ from thermoxels_ns.audit.conditions import load_conditions, write_example
 from thermoxels_ns.audit.results import Audit
 from thermoxels_ns.audit.run import audit
 from thermoxels_ns.commands.audit_options import AuditOptions
+from thermoxels_ns.commands.audit_photographs import photographs_of_defects
 from thermoxels_ns.commands.heat_run import read_export_summary
 from thermoxels_ns.core.checks import (
     check_direction,
+    check_positive,
     refuse_files_of_others,
     refuse_what_is_in_the_way,
     remove_file,
@@ -31,7 +33,7 @@ from thermoxels_ns.mesh.files.vtu import summary_text, write_summary, write_vtk
 from thermoxels_ns.reports.audit_page import audit_page
 from thermoxels_ns.reports.audit_pictures import draw_audit
 from thermoxels_ns.reports.interval_text import interval_text
-from thermoxels_ns.reports.page import build_page, write_page
+from thermoxels_ns.reports.page import Picture, build_page, write_page
 
 ANSWERS, PAGE, SURFACE = "answers.json", "audit.html", "surface.vtp"
 """Files of an audit."""
@@ -53,7 +55,8 @@ def run_audit(options: AuditOptions, say: Say = lambda _: None) -> Audit | None:
     folder = _prepared_folder(options.output_dir)
     conditions = load_conditions(options.conditions)
     mesh = read_mesh(options.mesh)
-    up = read_export_summary(options.mesh, say).get("up") if options.up is None else options.up
+    export = read_export_summary(options.mesh, say)
+    up = export.get("up") if options.up is None else options.up
     direction = check_direction("up", up or (0.0, 0.0, 1.0), "Pass --up 0 0 1.", AuditError)
     x, y, z = (direction / float(np.linalg.norm(direction))).tolist()
     say(f"Mesh: {len(mesh.tets):,} tetrahedra, {len(mesh.facets):,} boundary triangles.")
@@ -65,7 +68,11 @@ def run_audit(options: AuditOptions, say: Say = lambda _: None) -> Audit | None:
     whole = found.whole
     say(f"Heat loss: {interval_text(whole.loss_w, 'W')}; U-value: {interval_text(whole.u_w_m2k, 'W/(m2 K)')}.")
     say(f"{sum(not one.not_counted for one in found.defects)} thermal bridges or defects.")
-    _write(folder, options, found)
+    photographs = {}
+    if options.scene is not None:
+        photographs = photographs_of_defects(options.scene, _metres_per_unit(export), found)
+        say(f"Photographs show {len(photographs)} of them.")
+    _write(folder, options, found, photographs)
     say(f"Written to {folder}: {PAGE}, {ANSWERS}, {SURFACE} ({clock.perf_counter() - begin:.1f} s)")
     return found
 
@@ -103,14 +110,22 @@ def _prepared_folder(output_dir: Path) -> Path:
     return folder
 
 
-def _write(folder: Path, options: AuditOptions, found: Audit) -> None:
+def _metres_per_unit(export: dict[str, Any]) -> float:
+    """Scale of the mesh over the poses of its scene, 1 where the export does not say."""
+    scale = export.get("scale") or {}
+    value = scale.get("metres_per_unit", 1.0) if isinstance(scale, dict) else 1.0
+    return check_positive("summary.json: metres_per_unit", value, "Export the mesh again.", AuditError)
+
+
+def _write(folder: Path, options: AuditOptions, found: Audit, photographs: Mapping[int, tuple[Picture, ...]]) -> None:
     answers = answers_of(options, found)
     summary_text(answers)  # raises if json cannot hold it
     remove_file(folder / ANSWERS)
     _write_surface(folder / SURFACE, found)
     pictures = draw_audit(found) if options.pictures else None
     assert options.mesh is not None
-    page = audit_page(found, pictures, options.mesh.name, _command_line(options), (PAGE, ANSWERS, SURFACE))
+    command, files = _command_line(options), (PAGE, ANSWERS, SURFACE)
+    page = audit_page(found, pictures, photographs, options.mesh.name, command, files)
     write_page(folder / PAGE, build_page(page, "audit.html.j2"))
     write_summary(folder / ANSWERS, answers)
 
@@ -142,6 +157,8 @@ def _write_surface(path: Path, found: Audit) -> None:
 def _command_line(options: AuditOptions) -> str:
     words = ["thermoxels", "audit", str(options.mesh), "--conditions", str(options.conditions)]
     words += ["--output-dir", str(options.output_dir)]
+    if options.scene is not None:
+        words += ["--scene", str(options.scene)]
     if options.up is not None:
         words += ["--up", *map(str, options.up)]
     return shlex.join(words)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -35,8 +35,8 @@ class DefectCard:
     number: int
     heading: str
     severity: str
-    picture: bytes | None
-    caption: str
+    picture: Picture | None  # Drawn from the model
+    photographs: tuple[Picture, ...]  # A photograph and a thermal image
     rows: tuple[tuple[str, str], ...]
 
 
@@ -52,9 +52,17 @@ class AuditPage(Page):
 
 
 def audit_page(
-    audit: Audit, pictures: AuditPictures | None, mesh_name: str, command: str, files: Sequence[str]
+    audit: Audit,
+    pictures: AuditPictures | None,
+    photographs: Mapping[int, tuple[Picture, ...]],
+    mesh_name: str,
+    command: str,
+    files: Sequence[str],
 ) -> AuditPage:
-    """Put an audit into words: the client's questions first, then elements and defects, method and limits last."""
+    """Put an audit into words: the client's questions first, then elements and defects, method and limits last.
+
+    `photographs` are those of defects, by their place.
+    """
     conditions = audit.conditions
     return AuditPage(
         title=conditions.title or "Thermographic audit",
@@ -65,7 +73,7 @@ def audit_page(
         limit_rows=tuple(_limit(one) for one in audit.limits),
         sections=(*_overview(audit, pictures), _envelope(audit)),
         defects=tuple(
-            _card(audit, number, defect, pictures)
+            _card(audit, number, defect, pictures, photographs.get(number - 1, ()))
             for number, defect in enumerate(audit.defects, start=1)
             if not defect.not_counted
         ),
@@ -194,7 +202,9 @@ def _element(one: Element) -> tuple[str, ...]:
     )
 
 
-def _card(audit: Audit, number: int, one: Defect, pictures: AuditPictures | None) -> DefectCard:
+def _card(
+    audit: Audit, number: int, one: Defect, pictures: AuditPictures | None, photographs: tuple[Picture, ...]
+) -> DefectCard:
     symbol, unit = _COEFFICIENTS[one.kind]
     where = ", ".join(map(coordinate, one.centre_m))
     storey = f", {one.storey}" if one.storey else ""
@@ -215,8 +225,8 @@ def _card(audit: Audit, number: int, one: Defect, pictures: AuditPictures | None
     for resistance, factor in zip(F_RSI_M2K_W, one.f_rsi):
         rows.append((f"temperature factor, Rsi {resistance:g}", interval_text(factor, "", bounds=False)))
     shown = pictures.defects[number - 1] if pictures is not None and number <= len(pictures.defects) else None
-    caption = f"Defect {number}, drawn from the model."
-    return DefectCard(number, _KINDS[one.kind], one.severity, shown, caption, tuple(rows))
+    drawn = None if shown is None else Picture(shown, f"Defect {number}, drawn from the model.")
+    return DefectCard(number, _KINDS[one.kind], one.severity, drawn, photographs, tuple(rows))
 
 
 def _defects_note(audit: Audit) -> str:

@@ -1,0 +1,127 @@
+"""Photographs and thermal images of defects, cut out of the view that shows each best."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image, ImageDraw
+
+from thermoxels_ns.audit.results import Audit
+from thermoxels_ns.capture.photograph import open_photograph
+from thermoxels_ns.core.arrays import BoolArray, FloatArray
+from thermoxels_ns.core.camera import Camera
+from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
+from thermoxels_ns.radiometry.thermal_pixels import read_thermal_file
+from thermoxels_ns.reports.audit_pictures import MOST_DEFECTS
+from thermoxels_ns.reports.capture_pictures import colours, jpeg_of
+from thermoxels_ns.reports.page import Picture
+
+_MOST_POINTS = 1000  # Triangles of a defect that are looked for in photographs
+_CELLS = 64  # Cells across a photograph in which the nearest triangle hides others
+_HIDDEN = 1.05  # What is this many times as far as the nearest triangle of its cell is hidden
+_MARGIN, _LEAST_SHARE = 0.6, 0.3
+"""What a cut-out shows around a defect, of its size on each side, and its least width as a share of the image's."""
+_WIDTH = 480
+
+
+def photographs_of_defects(folder: Path, metres_per_unit: float, found: Audit) -> dict[int, tuple[Picture, Picture]]:
+    """Cut the photograph and the thermal image of each defect out of the view that shows it largest.
+
+    Mesh coordinates are those of the scene's poses times `metres_per_unit`. Defects, by their place in `found`, that no
+    photograph shows are left out; raises `SceneError` for a folder that is no scene.
+    """
+    scene = read_scene_file(folder, "skip")
+    frames = [frame for frame in scene.frames if frame.intrinsics.lens == "perspective"]
+    surface = found.surface
+    every = surface.centroid_m / metres_per_unit
+    hidden_behind = [_nearest(frame, every) for frame in frames]
+    readings = surface.reading_c[surface.counted]
+    low, high = np.quantile(readings, (0.005, 0.995)).tolist()
+    pictures = dict[int, tuple[Picture, Picture]]()
+    for number, one in enumerate(found.found[:MOST_DEFECTS]):
+        some = one.core[:: max(1, len(one.core) // _MOST_POINTS)]
+        points, normals, area = every[some], surface.selection.facet_normal[some], surface.area_m2[some]
+        scores = [_size_in_view(frame, nearest, points, normals, area) for frame, nearest in zip(frames, hidden_behind)]
+        if not scores or max(scores) <= 0.0:
+            continue
+        frame = frames[int(np.argmax(scores))]
+        shown = _cut_out(scene, frame, points, (low, high))
+        if shown is not None:
+            name = frame.image.name
+            ends = f"{low:.1f} °C and less black, {high:.1f} °C and more bright"
+            pictures[number] = (Picture(shown[0], name), Picture(shown[1], f"Thermal image, as read: {ends}"))
+    return pictures
+
+
+def _nearest(frame: Frame, points: FloatArray) -> FloatArray:
+    """Distance of the nearest point in each cell of a photograph, (cells, cells); infinite where there is none."""
+    pixels, distance = frame.intrinsics.project_world(frame.pose, points), _distance(frame.pose, points)
+    inside = frame.intrinsics.contains(pixels)
+    nearest = np.full((_CELLS, _CELLS), np.inf)
+    np.minimum.at(nearest, _cells(frame.intrinsics, pixels[inside]), distance[inside])
+    return nearest
+
+
+def _cells(camera: Camera, pixels: FloatArray) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    share = pixels / (camera.width, camera.height)
+    x, y = np.clip((share * _CELLS).astype(np.int64), 0, _CELLS - 1).T
+    return x, y
+
+
+def _distance(pose: FloatArray, points: FloatArray) -> FloatArray:
+    return np.linalg.norm(points - pose[:3, 3], axis=1)
+
+
+def _size_in_view(
+    frame: Frame, nearest: FloatArray, points: FloatArray, normals: FloatArray, area: FloatArray
+) -> float:
+    """Solid angle of what a photograph shows of some triangles: in the image, facing, nothing nearer in their cell."""
+    pixels, distance = frame.intrinsics.project_world(frame.pose, points), _distance(frame.pose, points)
+    seen: BoolArray = frame.intrinsics.contains(pixels)
+    if not seen.any():
+        return 0.0
+    seen[seen] = distance[seen] <= _HIDDEN * nearest[_cells(frame.intrinsics, pixels[seen])]
+    towards = (frame.pose[:3, 3] - points) / distance[:, None]
+    facing = np.maximum(np.einsum("ij,ij->i", normals, towards), 0.0)
+    return float((area * facing / distance**2)[seen].sum())
+
+
+def _cut_out(
+    scene: SceneFile, frame: Frame, points: FloatArray, limits: tuple[float, float]
+) -> tuple[bytes, bytes] | None:
+    """The parts of photograph and thermal image around some points, as JPEG; None where one does not show them."""
+    temperature_c = read_thermal_file(frame.thermal, scene.unit).temperature_c
+    height, width = temperature_c.shape
+    thermal = frame.thermal_intrinsics or frame.intrinsics.resized(width, height)
+    thermal_pose = frame.pose if frame.thermal_pose is None else frame.thermal_pose
+    photograph = np.asarray(open_photograph(frame.image).convert("RGB"))
+    visible = frame.intrinsics.resized(photograph.shape[1], photograph.shape[0])
+    cut = []
+    for picture, camera, pose in (
+        (photograph, visible, frame.pose),
+        (colours(temperature_c, limits).astype(np.uint8), thermal, thermal_pose),
+    ):
+        pixels = camera.project_world(pose, points)
+        pixels = pixels[camera.contains(pixels)]
+        if not len(pixels):
+            return None
+        cut.append(_framed(picture, pixels))
+    return cut[0], cut[1]
+
+
+def _framed(picture: npt.NDArray[np.uint8], pixels: FloatArray) -> bytes:
+    """Cut a picture around some pixels and draw a frame around them."""
+    size = np.array(picture.shape[1::-1], dtype=np.float64)
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    half = np.maximum((0.5 + _MARGIN) * (high - low), 0.5 * _LEAST_SHARE * size)
+    half = np.minimum(np.maximum(half, half[::-1] * size / size[::-1]), 0.5 * size)  # as wide as it is high
+    middle = np.clip(0.5 * (low + high), half, size - half)
+    (left, top), (right, bottom) = np.floor(middle - half).astype(int), np.ceil(middle + half).astype(int)
+    image = Image.fromarray(picture).crop((left, top, right, bottom))
+    zoom = _WIDTH / image.width
+    image = image.resize((_WIDTH, max(1, round(image.height * zoom))))
+    frame = [*((low - (left, top)) * zoom - 4.0), *((high - (left, top)) * zoom + 4.0)]
+    ImageDraw.Draw(image).rectangle([float(edge) for edge in frame], outline=(255, 255, 255), width=2)
+    return jpeg_of(np.asarray(image))
