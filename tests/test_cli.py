@@ -47,7 +47,7 @@ def test_synthetic_writes_the_scene_that_was_asked_for(tmp_path, capsys):
     content = json.loads((folder / "transforms.json").read_text())
     assert (content["w"], content["h"], len(content["frames"])) == (16, 12, 4)
     written = json.loads((folder / "truth.json").read_text())
-    assert (written["seed"], written["noise_k"], len(written["drift_k"])) == (3, 0.5, 4)
+    assert (written["seed"], written["imperfections"]["noise_k"], len(written["drift_k"])) == (3, 0.5, 4)
     assert "thermal_camera" not in content
     assert all((folder / frame["thermal_file_path"]).suffix == ".tiff" for frame in content["frames"])
     truth = load_truth(folder)
@@ -58,7 +58,9 @@ def test_synthetic_writes_the_scene_that_was_asked_for(tmp_path, capsys):
 def test_bad_input_is_one_sentence_and_exit_status_1(tmp_path, capsys):
     assert cli.main(["synthetic", "sphere", "--output-dir", str(tmp_path), "--noise-k", "-1"]) == 1
     shown = capsys.readouterr()
-    assert shown.err.splitlines() == ["Error: noise_k: expected a finite number of at least 0, got -1.0. Pass 0."]
+    assert shown.err.splitlines() == [
+        "Error: noise_k: expected a finite number of at least 0, got -1.0. Correct --noise-k."
+    ]
     assert "Traceback" not in shown.out
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import shlex
 import sys
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal, Union
 
@@ -20,6 +20,7 @@ from thermoxels_ns.commands.heat import Heat
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.option_help import join_help_lines
 from thermoxels_ns.synthetic.catalogue import SceneWord
+from thermoxels_ns.synthetic.imperfections import Imperfections
 
 _NEWS_FOR_PROGRAMMERS = r"`torch\.jit\.script` is deprecated"
 """How the warning begins that newer versions of torch give when nerfstudio 1.1.5 is imported."""
@@ -51,16 +52,14 @@ class Synthetic:
     thermal_format: Literal["png16", "tiff", "npy"] = "png16"
     """16-bit PNG that spans the temperature bounds, 16-bit TIFF of centikelvin counts, or float32 numpy in degrees
     Celsius."""
-    noise_k: float = 0.0
-    """Standard deviation of the noise in every thermal pixel, [K]."""
-    drift_k: float = 0.0
-    """Standard deviation of one temperature offset per thermal image, [K], as uncooled cameras have it."""
     photo_format: Literal["jpeg", "png"] = "jpeg"
-    """JPEG of quality 92, as cameras write it, or PNG, which loses nothing."""
+    """JPEG, as cameras write it, or PNG, which loses nothing."""
     seed: int = 0
-    """Seed of noise and drift; the same seed writes the same files."""
+    """Seed of what the imperfections draw; the same seed writes the same files."""
     own_thermal_camera: bool = False
     """Take the thermal images with a second camera beside the first, with a lens and poses of its own."""
+    imperfections: tyro.conf.OmitArgPrefixes[Imperfections] = field(default_factory=Imperfections)
+    """What cameras and poses are off by; nothing unless given. Its truth is written to truth.json."""
 
     def main(self) -> None:
         """Write the scene.

@@ -9,6 +9,7 @@ from tests.support.boxed_scene import write_boxed_scene
 from tests.support.short_training import train
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.ray_streams import RGB_STREAM
+from thermoxels_ns.synthetic.imperfections import Imperfections
 from thermoxels_ns.synthetic.raycast import render_view
 from thermoxels_ns.synthetic.scene_folder import make_scene
 
@@ -126,7 +127,7 @@ def test_thermal_sensor_twenty_times_coarser(tmp_path):
 
 
 def test_drift_is_found_by_the_offsets(tmp_path):
-    scene = sphere(tmp_path / "scene", views=16, drift_k=4.0)
+    scene = sphere(tmp_path / "scene", views=16, imperfections=Imperfections(drift_k=4.0))
     drift = np.array(json.loads((scene / "truth.json").read_text())["drift_k"])
     pipeline = train(scene, 250, {"per_image_offset": True}, rate=2.0)
     offset = pipeline.model.thermal_offset.detach()

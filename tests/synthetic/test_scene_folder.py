@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from thermoxels_ns.core.errors import OutputError, SceneError
+from thermoxels_ns.core.errors import OutputError, SceneError, ThermoxelsError
+from thermoxels_ns.synthetic.imperfections import Imperfections
 from thermoxels_ns.synthetic.raycast import render_view
 from thermoxels_ns.synthetic.scene_folder import SCENE_NAMES, load_truth, make_scene, write_scene
 
@@ -122,7 +123,15 @@ def test_own_thermal_camera_has_the_keys_of_real_data(tmp_path: Path, shared_dat
 def test_noise_and_drift_have_the_size_asked_for_and_are_not_clipped(tmp_path: Path) -> None:
     scene = make_scene("sphere")
     write_scene(
-        scene, tmp_path, num_train=8, num_eval=0, width=40, height=30, noise_k=0.5, drift_k=2.0, seed=3, progress=False
+        scene,
+        tmp_path,
+        num_train=8,
+        num_eval=0,
+        width=40,
+        height=30,
+        imperfections=Imperfections(noise_k=0.5, drift_k=2.0),
+        seed=3,
+        progress=False,
     )
     content = transforms(tmp_path)
     drifts = json.loads((tmp_path / "truth.json").read_text())["drift_k"]
@@ -138,7 +147,13 @@ def test_noise_and_drift_have_the_size_asked_for_and_are_not_clipped(tmp_path: P
 
 def test_same_seed_same_bytes(tmp_path: Path) -> None:
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        write_scene(make_scene("sphere"), tmp_path / name, noise_k=0.1, drift_k=0.1, seed=seed, **SMALL)
+        write_scene(
+            make_scene("sphere"),
+            tmp_path / name,
+            imperfections=Imperfections(noise_k=0.1, drift_k=0.1),
+            seed=seed,
+            **SMALL,
+        )
     assert all_bytes(tmp_path / "a") == all_bytes(tmp_path / "b")
     assert all_bytes(tmp_path / "a") != all_bytes(tmp_path / "c")
 
@@ -204,14 +219,14 @@ def test_an_interrupted_write_leaves_no_scene_that_loads(tmp_path: Path) -> None
         ({"thermal_width": 7}, "thermal_width.*aspect 40:30"),
         ({"thermal_format": "jpeg"}, "thermal_format.*png16"),
         ({"photo_format": "npy"}, "photo_format.*jpeg, png"),
-        ({"noise_k": -1.0}, "noise_k"),
-        ({"drift_k": float("nan")}, "drift_k"),
+        ({"imperfections": Imperfections(noise_k=-1.0)}, "noise_k"),
+        ({"imperfections": Imperfections(drift_k=float("nan"))}, "drift_k"),
         ({"num_train": 0}, "number of views"),
         ({"width": 0}, "width.*at least 1"),
     ],
 )
 def test_bad_options_say_what_is_wrong_and_write_nothing(tmp_path: Path, options: dict, match: str) -> None:
-    with pytest.raises(SceneError, match=match):
+    with pytest.raises(ThermoxelsError, match=match):
         write_scene(make_scene("sphere"), tmp_path / "new", **{**SMALL, **options})
     assert not (tmp_path / "new").exists()
 

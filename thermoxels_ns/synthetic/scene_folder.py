@@ -16,6 +16,7 @@ from thermoxels_ns.core.checks import remove_file, replace_when_done, writable_f
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json_object
 from thermoxels_ns.synthetic.catalogue import SCENE_NAMES, make_scene
+from thermoxels_ns.synthetic.imperfections import PERFECT, DrawnFlaws, Imperfections
 from thermoxels_ns.synthetic.raycast import render_view, visible_surface_points
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
@@ -31,17 +32,15 @@ __all__ = [
 
 ThermalFormat = Literal["png16", "tiff", "npy"]
 """16-bit PNG that spans the temperature bounds; uint16 TIFF of centikelvin counts; float32 numpy in Celsius."""
-PhotoFormat = Literal["jpeg", "png"]  # JPEG of quality 92, as cameras write it; PNG, which loses nothing
+PhotoFormat = Literal["jpeg", "png"]  # JPEG, as cameras write it, of quality 92 by default; PNG, which loses nothing
 
 FloatArray = npt.NDArray[np.float64]
 
 _SUFFIXES = {"png16": ".png", "tiff": ".tiff", "npy": ".npy"}
 _PHOTO_SUFFIXES: dict[str, str] = {"jpeg": ".jpg", "png": ".png"}
-_JPEG_QUALITY = 92
 _TRUTH = "truth.json"
 _LARGEST_COUNT = 65535
 _CENTIKELVIN = {"celsius_per_count": 0.01, "celsius_offset": -273.15}
-_NOISE_SIGMAS = 6.0
 # The second camera: what its lens and mounting differ by from the first. About 1 degree and a few centimetres.
 _THERMAL_ASPECT, _THERMAL_ZOOM, _THERMAL_CENTRE_SHIFT = 0.8, 0.95, (-0.012, 0.008)
 _RIG_ROTATION_RAD = (0.005, -0.018, 0.003)
@@ -57,11 +56,10 @@ def write_scene(
     height: int = 240,
     thermal_width: int | None = None,
     thermal_format: ThermalFormat = "png16",
-    noise_k: float = 0.0,
-    drift_k: float = 0.0,
     seed: int = 0,
     own_thermal_camera: bool = False,
     photo_format: PhotoFormat = "jpeg",
+    imperfections: Imperfections = PERFECT,
     progress: bool = True,
 ) -> Path:
     """Photograph a scene in both bands and write the folder; ``transforms.json`` comes last.
@@ -73,7 +71,7 @@ def write_scene(
     The folder is made if absent; an earlier synthetic scene in it is removed, any other refused. Held-out views lie
     half-way between training views. `thermal_width` [pixels] is by default that of the photographs, half of it for a
     camera of their own, whose lens and poses are written under ``thermal_camera`` and ``thermal_transform_matrix``.
-    `noise_k` and `drift_k` are standard deviations, of every thermal pixel and of one offset per image [K]; the same
+    What `imperfections` do to photographs, thermal images and the poses given is written to ``truth.json``; the same
     `seed` writes the same bytes. The unit of TIFF counts is written under ``thermal_unit``.
 
     Raises:
@@ -81,7 +79,8 @@ def write_scene(
         OutputError: The folder cannot be written to.
     """
     thermal_size = _thermal_size(width, height, thermal_width, own_thermal_camera)
-    _check_options(photo_format, thermal_format, noise_k, drift_k)
+    _check_options(photo_format, thermal_format)
+    imperfections.check()
     camera = scene.camera(width, height)
     thermal_camera = scene.camera(*thermal_size)
     if own_thermal_camera:  # a slightly different field of view and an off-centre principal point
@@ -91,11 +90,13 @@ def write_scene(
     train, held_out = scene.poses(num_train, num_eval)
     names = [f"frame_{kind}_{i + 1:05d}" for kind, n in (("train", num_train), ("eval", num_eval)) for i in range(n)]
     poses = np.concatenate([train, held_out])
-    thermal_poses = poses @ _second_camera_offset(scene) if own_thermal_camera else poses
-    drifts = drift_k * np.random.default_rng([seed, 0]).standard_normal(len(poses))
+    offset = _second_camera_offset(scene) if own_thermal_camera else np.eye(4)
+    lowest, highest = scene.temperature_bounds_c
+    flaws = DrawnFlaws.of(imperfections, seed, poses, np.mean(scene.scene_box, axis=0), (lowest, highest))
+    given_poses, given_offset = flaws.given_poses(poses), offset @ flaws.given_rig_turn
     # Drifting, noisy images stay within these.
-    (lowest, highest), margin = scene.temperature_bounds_c, _NOISE_SIGMAS * noise_k
-    bounds = lowest + min(float(drifts.min()), 0.0) - margin, highest + max(float(drifts.max()), 0.0) + margin
+    low, high = flaws.added_k
+    bounds = lowest + low, highest + high
     # How counts become degrees: Celsius = count * celsius_per_count + celsius_offset; None for floats.
     unit: dict[str, float] | None = {"celsius_per_count": (bounds[1] - bounds[0]) / _LARGEST_COUNT}
     unit = {"tiff": _CENTIKELVIN, "npy": None}.get(thermal_format, unit | {"celsius_offset": bounds[0]})
@@ -103,24 +104,21 @@ def write_scene(
     target = _prepared_folder(folder)
     frames: list[dict[str, Any]] = []
     for number in track(range(len(names)), description=f"Photographing {scene.name}", disable=not progress):
-        name, pose, thermal_pose = names[number], poses[number], thermal_poses[number]
-        view = render_view(scene, pose, camera)
+        name = names[number]
+        view = render_view(scene, poses[number], camera)
         thermal_view = view
         if thermal_camera != camera or own_thermal_camera:
-            thermal_view = render_view(scene, thermal_pose, thermal_camera)
-        measured_c = thermal_view.temperature_c + float(drifts[number])
-        if noise_k > 0.0:
-            noise = np.random.default_rng([seed, 1, number]).standard_normal(measured_c.shape)
-            measured_c += noise_k * noise
+            thermal_view = render_view(scene, poses[number] @ offset, thermal_camera)
+        measured_c = flaws.thermogram(number, thermal_view.temperature_c)
         frame: dict[str, Any] = {
             "file_path": f"images/{name}{_PHOTO_SUFFIXES[photo_format]}",
             "thermal_file_path": f"thermal/{name}{_SUFFIXES[thermal_format]}",
-            "transform_matrix": pose.tolist(),
+            "transform_matrix": given_poses[number].tolist(),
         }
         if own_thermal_camera:
-            frame["thermal_transform_matrix"] = thermal_pose.tolist()
+            frame["thermal_transform_matrix"] = (given_poses[number] @ given_offset).tolist()
         with replace_when_done(target / frame["file_path"]) as path:
-            Image.fromarray(np.round(view.rgb * 255.0).astype(np.uint8)).save(path, quality=_JPEG_QUALITY)
+            Image.fromarray(flaws.photograph(number, view.rgb)).save(path, quality=imperfections.jpeg_quality)
         with replace_when_done(target / frame["thermal_file_path"]) as path:
             if unit is None:
                 np.save(path, measured_c.astype(np.float32))
@@ -131,14 +129,14 @@ def write_scene(
 
     names_of_bounds = ("absolute_min_temperature", "absolute_max_temperature")
     _write_json(target / "temperature_bounds.json", dict(zip(names_of_bounds, bounds)))
-    transforms: dict[str, Any] = _intrinsics(camera)
+    transforms: dict[str, Any] = _intrinsics(flaws.given_camera(camera))
     if own_thermal_camera:
         transforms["thermal_camera"] = _intrinsics(thermal_camera)
     if thermal_format == "tiff":  # a 16-bit PNG has its unit in the bounds, and count 0 is a temperature there
         transforms["thermal_unit"] = unit
     transforms |= {"metres_per_unit": 1.0, "up": [0, 0, 1], "frames": frames}
-    truth = {"synthetic_scene": scene.name, "scene_box": scene.scene_box, "seed": seed, "noise_k": noise_k}
-    _write_json(target / _TRUTH, truth | {"drift_k": drifts.tolist()})
+    truth = {"synthetic_scene": scene.name, "scene_box": scene.scene_box, "seed": seed}
+    _write_json(target / _TRUTH, truth | flaws.truth(poses))
     _write_json(target / "transforms.json", transforms)
     return target
 
@@ -176,15 +174,12 @@ def _thermal_size(width: int, height: int, thermal_width: int | None, own_camera
     return chosen, height * chosen // width
 
 
-def _check_options(photo_format: str, thermal_format: str, noise_k: float, drift_k: float) -> None:
+def _check_options(photo_format: str, thermal_format: str) -> None:
     formats = (("photo_format", photo_format, PhotoFormat), ("thermal_format", thermal_format, ThermalFormat))
     for name, text, known in formats:
         if text not in get_args(known):
             expected = f"one of {', '.join(get_args(known))}"
             raise SceneError(name, expected=expected, got=repr(text), remedy="Choose one of these formats.")
-    for name, value in (("noise_k", noise_k), ("drift_k", drift_k)):
-        if not (np.isfinite(value) and value >= 0.0):
-            raise SceneError(name, expected="a finite number of at least 0", got=value, remedy="Pass 0.")
 
 
 def _prepared_folder(folder: Path | str) -> Path:

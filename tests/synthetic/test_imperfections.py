@@ -1,0 +1,120 @@
+import json
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from thermoxels_ns.core.errors import ThermoxelsError
+from thermoxels_ns.synthetic.imperfections import DrawnFlaws, Imperfections
+from thermoxels_ns.synthetic.raycast import render_view
+from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+
+SHAPE = (60, 80)
+POSES = np.stack([np.eye(4)] * 200)
+POSES[:, 2, 3] = 5.0
+
+
+def drawn(seed: int = 0, **flaws) -> DrawnFlaws:
+    return DrawnFlaws.of(Imperfections(**flaws), seed, POSES, (0.0, 0.0, 0.0), (10.0, 30.0))
+
+
+def picture() -> np.ndarray:
+    return np.random.default_rng(0).uniform(0.2, 0.6, (*SHAPE, 3)).astype(np.float32)
+
+
+def test_without_flaws_nothing_changes():
+    flaws, seen = drawn(), picture()
+    np.testing.assert_array_equal(flaws.photograph(3, seen), np.round(255.0 * seen.astype(np.float64)))
+    warm = np.random.default_rng(1).uniform(10.0, 30.0, SHAPE)
+    np.testing.assert_array_equal(flaws.thermogram(3, warm), warm)
+    np.testing.assert_array_equal(flaws.given_poses(POSES), POSES)
+
+
+def test_gains_multiply_the_photograph():
+    flaws, seen = drawn(exposure_stops=0.3, white_balance=0.03), np.full((*SHAPE, 3), 0.3, np.float32)
+    np.testing.assert_allclose(np.log2(flaws.gains.mean(1)).std(), 0.3, rtol=0.15)
+    spread = (flaws.gains / flaws.gains.mean(1, keepdims=True)).std()
+    np.testing.assert_allclose(spread, 0.03 * np.sqrt(2 / 3), rtol=0.15)
+    np.testing.assert_allclose(flaws.photograph(7, seen).mean((0, 1)) / (0.3 * 255.0), flaws.gains[7], rtol=0.01)
+
+
+def test_poses_are_turned_and_moved_by_as_much_as_asked_for():
+    flaws = drawn(pose_error_deg=0.15)
+    given = flaws.given_poses(POSES)
+    cosine = 0.5 * (np.trace(given[:, :3, :3], axis1=1, axis2=2) - 1.0)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    np.testing.assert_allclose(np.sqrt(np.mean(angle**2)), np.sqrt(3) * 0.15, rtol=0.1)
+    np.testing.assert_allclose((given - POSES)[:, :3, 3].std(), np.deg2rad(0.15) * 5.0, rtol=0.1)
+
+
+def test_errors_of_a_walk_are_like_those_of_its_neighbours():
+    alone, walk = (drawn(pose_error_deg=0.15, pose_correlation=share).turns_rad for share in (0.0, 0.95))
+    assert np.diff(walk, axis=0).std() < 0.5 * np.diff(alone, axis=0).std()
+
+
+@pytest.mark.parametrize(
+    "flaw",
+    [
+        {"vignetting": 0.3},
+        {"noise_counts": 2.0},
+        {"motion_blur_px": 3.0},
+        {"rolling_shutter_px": 4.0},
+        {"passers_by": 1.0},
+    ],
+)
+def test_flaws_of_photographs_change_photographs_alone(flaw):
+    flaws, seen, warm = drawn(**flaw), picture(), np.full(SHAPE, 20.0)
+    assert np.abs(flaws.photograph(0, seen) - 255.0 * seen).mean() > 1.0
+    if "passers_by" not in flaw:
+        np.testing.assert_array_equal(flaws.thermogram(0, warm), warm)
+
+
+def test_vignetting_darkens_the_corners_by_the_share():
+    dark = drawn(vignetting=0.3).photograph(0, np.full((*SHAPE, 3), 0.5, np.float32)) / 127.5
+    np.testing.assert_allclose([dark[0, 0, 0], dark[30, 40, 0]], [0.7, 1.0], atol=0.02)
+
+
+def test_a_blurred_point_keeps_its_sum():
+    warm = np.zeros(SHAPE)
+    warm[30, 40] = 100.0
+    seen = drawn(thermal_blur_px=1.5).thermogram(0, warm)
+    np.testing.assert_allclose(seen.sum(), 100.0, rtol=1e-6)
+    rows = np.arange(SHAPE[0])[:, None] - 30.0
+    np.testing.assert_allclose(np.sqrt((seen * rows**2).sum() / 100.0), 1.5, rtol=0.05)
+
+
+def test_dead_pixels_read_the_same_in_all_images():
+    flaws = drawn(dead_pixels=0.01)
+    first, second = (flaws.thermogram(n, np.full(SHAPE, value)) for n, value in ((0, 15.0), (1, 25.0)))
+    same = first == second
+    assert 0.003 < same.mean() < 0.03
+
+
+def test_twice_as_large_is_twice_as_large():
+    flaws = Imperfections(exposure_stops=0.3, drift_k=1.0, jpeg_quality=80, passers_by=0.2, pose_correlation=0.5)
+    assert flaws.times(2.0) == replace(flaws, exposure_stops=0.6, drift_k=2.0)
+
+
+@pytest.mark.parametrize("field", [f.name for f in fields(Imperfections)])
+def test_what_cannot_be_drawn_is_refused(field):
+    with pytest.raises(ThermoxelsError, match=field):
+        replace(Imperfections(), **{field: float("nan")}).check()
+
+
+def test_the_folder_gives_wrong_poses_and_tells_the_truth(tmp_path: Path):
+    scene, flaws = make_scene("sphere"), Imperfections(pose_error_deg=1.0, rig_error_deg=1.0, focal_error=0.01)
+    write_scene(
+        scene, tmp_path, 4, 1, 40, 30, own_thermal_camera=True, imperfections=flaws, photo_format="png", progress=False
+    )
+    content, truth = (json.loads((tmp_path / name).read_text()) for name in ("transforms.json", "truth.json"))
+    poses = np.array(truth["poses"])
+    given = np.array([frame["transform_matrix"] for frame in content["frames"]])
+    assert 0.003 < np.abs(given - poses)[:, :3, :3].max() < 0.1
+    photograph = np.asarray(Image.open(tmp_path / content["frames"][2]["file_path"]))
+    view = render_view(scene, poses[2], scene.camera(40, 30))
+    np.testing.assert_allclose(photograph, 255.0 * view.rgb, atol=0.51)
+    np.testing.assert_allclose(content["fl_x"], 1.01 * scene.camera(40, 30).fl_x)
+    rig = np.linalg.inv(given) @ np.array([frame["thermal_transform_matrix"] for frame in content["frames"]])
+    np.testing.assert_allclose(rig, np.broadcast_to(rig[0], rig.shape), atol=1e-12)

@@ -1,0 +1,246 @@
+"""What real cameras do to photographs, as switches of the synthetic scenes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.core.camera import Camera
+from thermoxels_ns.core.checks import check_ranges
+
+FloatArray = npt.NDArray[np.float64]
+
+_NOISE_SIGMAS = 6.0  # Noise that thermal files leave room for
+_PASSER_BY = ((0.09, 0.03, 0.03), 31.0)  # Colour and temperature, [degrees Celsius], of somebody in dark clothes
+_PASSER_BY_SIZE = (0.06, 0.35)  # Half width and half height, relative to the photograph's height
+
+
+@dataclass(frozen=True)
+class Imperfections:
+    """Flaws of cameras and of their poses. All are off unless given; random ones are drawn from the scene's seed."""
+
+    exposure_stops: float = 0.0
+    """Standard deviation of the exposure of each photograph, [stops]: pixel values are multiplied by 2^x."""
+    white_balance: float = 0.0
+    """Standard deviation of each channel's gain of each photograph, relative."""
+    vignetting: float = 0.0
+    """Share of the light that the corners of the photographs lose; it grows with the square of the distance."""
+    noise_counts: float = 0.0
+    """Standard deviation of the noise in every pixel of the photographs, [counts of 255]."""
+    jpeg_quality: int = 92
+    """Quality of JPEG files, 1 to 95."""
+    motion_blur_px: float = 0.0
+    """Length of the line that each point of the photographs draws while the shutter is open, [pixels], in a direction
+    of its own in each."""
+    rolling_shutter_px: float = 0.0
+    """How far the photograph moves between its first and its last row, [pixels]; the pose is that of the middle row."""
+    pose_error_deg: float = 0.0
+    """Standard deviation of the angle, about each axis, by which the poses given are turned, [degrees]; they are also
+    moved, by as much as that turn moves what the scene's middle shows."""
+    pose_correlation: float = 0.0
+    """Share of a pose's error that the next photograph has too, below 1: 0 for poses found one by one, 0.95 for those
+    of a walk."""
+    focal_error: float = 0.0
+    """How much longer the focal length given is than the true one, relative."""
+    noise_k: float = 0.0
+    """Standard deviation of the noise in every thermal pixel, [K]."""
+    drift_k: float = 0.0
+    """Standard deviation of one temperature offset per thermal image, [K], as uncooled cameras have it."""
+    thermal_blur_px: float = 0.0
+    """Standard deviation of the thermal camera's Gaussian point spread, [thermal pixels]."""
+    thermal_vignetting_k: float = 0.0
+    """How much too cold the corners of the thermal images read, [K]; it grows with the square of the distance."""
+    fixed_pattern_k: float = 0.0
+    """Standard deviation of an offset of each thermal pixel that is the same in all images, [K]."""
+    dead_pixels: float = 0.0
+    """Share of the thermal pixels that always read the same value."""
+    rig_error_deg: float = 0.0
+    """Standard deviation of the angle, about each axis, by which all given poses of a thermal camera of its own are
+    turned against the photographs', [degrees]."""
+    passers_by: float = 0.0
+    """Share of the pairs in which somebody walks before the scene, 31 C warm."""
+
+    def check(self) -> None:
+        """Refuse what cannot be drawn.
+
+        Raises:
+            ThermoxelsError: Names the option, what it takes and what it got.
+        """
+        limits = {field.name: (0.0, 1e6, "a finite number of at least 0") for field in fields(self)}
+        limits |= dict.fromkeys(("vignetting", "dead_pixels", "passers_by"), (0.0, 1.0, "from 0 to 1"))
+        limits |= {"pose_correlation": (0.0, 0.999, "from 0 to 0.999"), "focal_error": (-0.5, 1.0, "from -0.5 to 1")}
+        limits |= {"jpeg_quality": (1, 95, "from 1 to 95"), "white_balance": (0.0, 0.3, "from 0 to 0.3")}
+        check_ranges("--", {name: (getattr(self, name), *limit) for name, limit in limits.items()})
+
+    def times(self, factor: float) -> Imperfections:
+        """The same flaws, so many times as large; shares, counts of pixels that are dead and JPEG stay."""
+        same = ("jpeg_quality", "pose_correlation", "dead_pixels", "passers_by")
+        return replace(self, **{f.name: factor * getattr(self, f.name) for f in fields(self) if f.name not in same})
+
+
+PERFECT = Imperfections()
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnFlaws:
+    """What was drawn for the photographs of one scene: the truth that corrections are to find."""
+
+    flaws: Imperfections
+    seed: int
+    gains: FloatArray  # Of each photograph and channel, (photographs, 3)
+    drifts_k: FloatArray  # Offset of each thermal image, (photographs,)
+    turns_rad: FloatArray  # Turn of each pose given about its camera's axes, (photographs, 3)
+    moves: FloatArray  # Move of each camera's centre given, [m], (photographs, 3)
+    rig_turn_rad: FloatArray  # The same turn of all thermal cameras, (3,)
+    passing: npt.NDArray[np.bool_]  # Pairs in which somebody walks by, (photographs,)
+    range_c: tuple[float, float]  # Between which dead thermal pixels read, [degrees Celsius]
+
+    @classmethod
+    def of(
+        cls,
+        flaws: Imperfections,
+        seed: int,
+        poses: FloatArray,
+        middle: npt.ArrayLike,
+        range_c: tuple[float, float],
+    ) -> DrawnFlaws:
+        """Draw the flaws of photographs from true camera poses (n, 4, 4) of a scene around `middle` (3,), [m]."""
+        count = len(poses)
+
+        def normal(stream: int, *shape: int) -> FloatArray:
+            return np.random.default_rng([seed, stream]).standard_normal(shape)
+
+        gains = 2.0 ** (flaws.exposure_stops * normal(2, count, 1)) * (1.0 + flaws.white_balance * normal(3, count, 3))
+        errors = normal(4, count, 6)
+        keep = flaws.pose_correlation
+        for number in range(1, count):
+            errors[number] = keep * errors[number - 1] + np.sqrt(1.0 - keep * keep) * errors[number]
+        errors *= np.deg2rad(flaws.pose_error_deg)
+        far = np.linalg.norm(poses[:, :3, 3] - np.asarray(middle, dtype=np.float64), axis=1)
+        return cls(
+            flaws,
+            seed,
+            gains,
+            flaws.drift_k * np.random.default_rng([seed, 0]).standard_normal(count),
+            errors[:, :3],
+            errors[:, 3:] * far[:, None],
+            np.deg2rad(flaws.rig_error_deg) * normal(5, 3),
+            np.random.default_rng([seed, 6]).random(count) < flaws.passers_by,
+            range_c,
+        )
+
+    def given_poses(self, poses: FloatArray) -> FloatArray:
+        """The poses (n, 4, 4) that a scene folder gives for true ones (n, 4, 4)."""
+        from scipy.spatial.transform import Rotation  # not loaded by --help
+
+        given = poses.copy()
+        given[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(self.turns_rad).as_matrix()
+        given[:, :3, 3] += self.moves
+        return given
+
+    @property
+    def given_rig_turn(self) -> FloatArray:
+        """By what (4, 4) all poses of a thermal camera of its own are turned."""
+        from scipy.spatial.transform import Rotation  # not loaded by --help
+
+        turn = np.eye(4)
+        turn[:3, :3] = Rotation.from_rotvec(self.rig_turn_rad).as_matrix()
+        return turn
+
+    @property
+    def added_k(self) -> tuple[float, float]:
+        """By how much thermal images read less and more than the scene has, at most, [K]."""
+        flaws = self.flaws
+        margin = _NOISE_SIGMAS * float(np.hypot(flaws.noise_k, flaws.fixed_pattern_k))
+        low = min(float(self.drifts_k.min()), 0.0) - margin - flaws.thermal_vignetting_k
+        return low, max(float(self.drifts_k.max()), 0.0) + margin
+
+    def given_camera(self, camera: Camera) -> Camera:
+        """The intrinsics that a scene folder gives."""
+        stretch = 1.0 + self.flaws.focal_error
+        return replace(camera, fl_x=stretch * camera.fl_x, fl_y=stretch * camera.fl_y)
+
+    def photograph(self, number: int, rgb: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+        """What the camera stores of a view (h, w, 3) in [0, 1]: counts (h, w, 3)."""
+        flaws, draw = self.flaws, np.random.default_rng([self.seed, 7, number])
+        angle, side, place = draw.uniform(0.0, 2.0 * np.pi), draw.random(), draw.random()
+        seen = rgb.astype(np.float64)
+        if self.passing[number]:
+            seen[_passer_by(seen.shape[:2], place)] = _PASSER_BY[0]
+        if flaws.rolling_shutter_px > 0.0:
+            seen = _sheared(seen, flaws.rolling_shutter_px * (1.0 if side < 0.5 else -1.0))
+        if flaws.motion_blur_px > 0.0:
+            seen = _moved_along(seen, flaws.motion_blur_px, angle)
+        if flaws.vignetting > 0.0:
+            seen *= 1.0 - flaws.vignetting * _corner_distance(seen.shape[:2])[..., None] ** 2
+        counts = 255.0 * seen * self.gains[number]
+        if flaws.noise_counts > 0.0:
+            counts += flaws.noise_counts * draw.standard_normal(counts.shape)
+        return np.clip(np.round(counts), 0, 255).astype(np.uint8)
+
+    def thermogram(self, number: int, temperature_c: FloatArray) -> FloatArray:
+        """What the thermal camera reads of true apparent temperatures (h, w), [degrees Celsius]."""
+        from scipy import ndimage
+
+        flaws, shape = self.flaws, temperature_c.shape
+        seen = temperature_c.copy()
+        if self.passing[number]:
+            seen[_passer_by(shape, np.random.default_rng([self.seed, 7, number]).random(3)[2])] = _PASSER_BY[1]
+        if flaws.thermal_blur_px > 0.0:
+            seen = ndimage.gaussian_filter(seen, flaws.thermal_blur_px, mode="nearest")
+        seen += self.drifts_k[number]
+        if flaws.thermal_vignetting_k > 0.0:
+            seen -= flaws.thermal_vignetting_k * _corner_distance(shape) ** 2
+        if flaws.noise_k > 0.0:
+            seen += flaws.noise_k * np.random.default_rng([self.seed, 1, number]).standard_normal(shape)
+        if flaws.fixed_pattern_k > 0.0:
+            seen += flaws.fixed_pattern_k * np.random.default_rng([self.seed, 8]).standard_normal(shape)
+        if flaws.dead_pixels > 0.0:
+            draw = np.random.default_rng([self.seed, 9])
+            seen = np.where(draw.random(shape) < flaws.dead_pixels, draw.uniform(*self.range_c, shape), seen)
+        return seen
+
+    def truth(self, poses: FloatArray) -> dict[str, object]:
+        """What ``truth.json`` says of it; `poses` (n, 4, 4) are the true ones."""
+        return {
+            "imperfections": vars(self.flaws),
+            "gains": self.gains.tolist(),
+            "drift_k": self.drifts_k.tolist(),
+            "rig_turn_deg": np.rad2deg(self.rig_turn_rad).tolist(),
+            "passers_by": np.flatnonzero(self.passing).tolist(),
+            "poses": poses.tolist(),
+        }
+
+
+def _corner_distance(shape: tuple[int, ...]) -> FloatArray:
+    """Distance of pixels from the middle of an image (h, w), 1 at its corners."""
+    y, x = (np.linspace(-1.0, 1.0, side + 2)[1:-1] for side in shape)
+    return np.sqrt(0.5 * (y[:, None] ** 2 + x**2))
+
+
+def _passer_by(shape: tuple[int, ...], place: float) -> npt.NDArray[np.bool_]:
+    """Pixels (h, w) of somebody who walks by at a share of the width: an upright ellipse."""
+    height, width = shape
+    rows, columns = np.mgrid[:height, :width] + 0.5
+    x, y = (columns - place * width) / height, (rows - 0.6 * height) / height
+    return (x / _PASSER_BY_SIZE[0]) ** 2 + (y / _PASSER_BY_SIZE[1]) ** 2 <= 1.0
+
+
+def _sheared(image: FloatArray, pixels: float) -> FloatArray:
+    """An image (h, w, 3) whose last row stands so many pixels to the side of its first."""
+    from scipy import ndimage
+
+    height = len(image)
+    shift = pixels * ((np.arange(height) + 0.5) / height - 0.5)
+    return np.stack([ndimage.shift(row, (by, 0.0), order=1, mode="nearest") for row, by in zip(image, shift)])
+
+
+def _moved_along(image: FloatArray, length: float, angle: float) -> FloatArray:
+    """Mean of an image (h, w, 3) over shifts along a line of some pixels at an angle [rad]."""
+    from scipy import ndimage
+
+    steps = 2 * int(np.ceil(length)) + 1
+    shifts = np.linspace(-0.5, 0.5, steps)[:, None] * length * np.array([np.sin(angle), np.cos(angle)])
+    return np.mean([ndimage.shift(image, (*by, 0.0), order=1, mode="nearest") for by in shifts], axis=0)
