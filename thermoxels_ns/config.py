@@ -59,7 +59,7 @@ def _trainer(
             "surroundings_density": _group(0.3, 0.03, optimizer),
             "surroundings_sh": _group(0.1, 0.01, optimizer),
             "surroundings_temperature": _group(0.02, 0.002, optimizer),
-            "thermal_offset": _group(0.002, 0.0002, dense),
+            "corrections": _group(0.002, 0.0002, dense),
         },
         viewer=ViewerConfig(websocket_host=LOCAL_HOST, quit_on_train_completion=True),
         vis="viewer",

@@ -1,10 +1,12 @@
 """Runs in turns, csv files and logarithmic panels for the other benchmarks, which may then import tests.support."""
 
 import csv
+import json
 import sys
 import time
 import types
 from collections.abc import Callable, Sequence
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,36 @@ def take_turns(
             if run:
                 seconds[name].append(clock() - begin)
     return seconds, results
+
+
+def train_and_evaluate(scene: Path, folder: Path, options: Sequence[str] = ()) -> tuple[float, dict[str, float]]:
+    """Train and evaluate a scene by the commands that a user types, with `options` for ns-train; logs stay in `folder`.
+
+    Returns:
+        Seconds of the whole `ns-train`, and what `ns-eval` reports.
+    """
+    from rich.console import Console
+
+    from thermoxels_ns.commands.installed_commands import run_command
+
+    run, results = folder / "outputs" / "scene" / "thermoxels" / "run", folder / "eval.json"
+    quiet = Console(file=StringIO(), width=200)
+    began = time.perf_counter()
+    run_command(
+        [
+            *("ns-train", "thermoxels", "--output-dir", str(folder / "outputs"), "--experiment-name", "scene"),
+            *("--timestamp", "run", "--vis", "tensorboard", "--logging.steps-per-log", "100"),
+            *("--logging.local-writer.max-log-size", "0", *options),
+            *("thermal-data", "--data", str(scene)),
+        ],
+        folder / "train.log",
+        quiet,
+    )
+    seconds = time.perf_counter() - began
+    command = ["ns-eval", "--load-config", str(run / "config.yml"), "--output-path", str(results)]
+    run_command(command, folder / "eval.log", quiet)
+    figures = json.loads(results.read_text(encoding="utf-8"))["results"]
+    return seconds, {name: float(value) for name, value in figures.items() if value is not None}
 
 
 def write_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:

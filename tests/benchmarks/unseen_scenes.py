@@ -13,18 +13,15 @@ mean anything. F-scores are those at 1.5 voxels of 128 along the exact box.
 import json
 import math
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from io import StringIO
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import tyro
-from rich.console import Console
+from measuring import train_and_evaluate
 
-from thermoxels_ns.commands.installed_commands import run_command
 from thermoxels_ns.synthetic.random_scene import FAMILIES
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
@@ -89,30 +86,10 @@ class UnseenScenes:
         scene, folder = make_scene(f"{self.family}-{seed}"), self.output / f"{self.family}-{seed}"
         if not _is_written(scene, folder / "scene"):
             write_scene(scene, folder / "scene", *_VIEWS, progress=False)
-        run = folder / "outputs" / scene.name / "thermoxels" / "run"
-        quiet = Console(file=StringIO(), width=200)
-        began = time.perf_counter()
-        run_command(
-            [
-                *("ns-train", "thermoxels", "--output-dir", str(folder / "outputs"), "--experiment-name", scene.name),
-                *("--timestamp", "run", "--vis", "tensorboard", "--logging.steps-per-log", "100"),
-                *("--logging.local-writer.max-log-size", "0", *options),
-                *("thermal-data", "--data", str(folder / "scene")),
-            ],
-            folder / "train.log",
-            quiet,
-        )
-        seconds = time.perf_counter() - began
-        results = folder / "eval.json"
-        run_command(
-            ["ns-eval", "--load-config", str(run / "config.yml"), "--output-path", str(results)],
-            folder / "eval.log",
-            quiet,
-        )
-        figures: dict[str, Any] = json.loads(results.read_text(encoding="utf-8"))["results"]
-        figures = {"psnr_box": figures.get("psnr"), "thermal_mae_box_c": figures.get("thermal_mae_c")} | figures
-        numbers = {name: float(value) for name, value in figures.items() if value is not None}
-        return Outcome(scene, FAMILIES[seed % len(FAMILIES)].name, seconds, numbers)
+        seconds, figures = train_and_evaluate(folder / "scene", folder, options)
+        for name, whole in (("psnr_box", "psnr"), ("thermal_mae_box_c", "thermal_mae_c")):
+            figures.setdefault(name, figures.get(whole, math.nan))
+        return Outcome(scene, FAMILIES[seed % len(FAMILIES)].name, seconds, figures)
 
 
 def _is_written(scene: SyntheticScene, folder: Path) -> bool:

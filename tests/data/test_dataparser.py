@@ -457,9 +457,8 @@ def test_corrupt_photograph_and_thermal_file(scene_folder):
     path = scene.path / "images" / "frame_train_001.png"
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    dataset = ThermalDataset(parse(scene.path))
     with pytest.raises(SceneError, match=r"frame_train_001\.png.*readable photograph"):
-        dataset[1]
+        ThermalDataset(parse(scene.path))[1]
     path.write_bytes(b"no picture")
     with pytest.raises(SceneError, match="frame_train_001"):
         parse(scene.path)

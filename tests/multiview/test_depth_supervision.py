@@ -9,11 +9,11 @@ from tests.support.boxed_scene import write_boxed_scene
 from tests.support.plane_photographs import EYES, LATTICE, PLANE, SIZE, photographs
 from tests.support.short_training import train
 from thermoxels_ns.core.feature_rays import FeatureRays
+from thermoxels_ns.multiview.evidence import evidence_of_photographs
 from thermoxels_ns.multiview.stereo import (
     ERROR_PLANES,
     Depths,
     depths_of,
-    evidence_of_photographs,
     feature_rays_to_depths,
 )
 from thermoxels_ns.synthetic.scene_folder import make_scene
@@ -78,7 +78,7 @@ def asked_boxes(monkeypatch, found=None) -> list:
     """The boxes in which a training looks for depths, which are then `found`."""
     boxes: list[Any] = []
 
-    def recorded(dataset, near, lo, hi, say):
+    def recorded(dataset, near, lo, hi, say, gains, offsets):
         boxes.append((lo, hi))
         return found
 

@@ -166,7 +166,7 @@ def test_a_training_with_large_batches(tmp_path):
     """Every tensor with a row per ray is one that torch splits among its threads."""
     scene = write_boxed_scene(make_scene("sphere"), tmp_path / "scene", 6, 1, width=40, height=30)
     settings = {"resolutions": [8], "refine_at": [], "start_density": 3.0, "prune_at": [3], "prune_threshold": 0.02}
-    settings |= {"per_image_offset": True, "thermal_background": "learned", "background": "on"}
+    settings |= {"per_image_offset": "on", "thermal_background": "learned", "background": "on"}
     results = []
     for count in COUNTS:
         torch.set_num_threads(count)

@@ -129,7 +129,7 @@ def test_thermal_sensor_twenty_times_coarser(tmp_path):
 def test_drift_is_found_by_the_offsets(tmp_path):
     scene = sphere(tmp_path / "scene", views=16, imperfections=Imperfections(drift_k=4.0))
     drift = np.array(json.loads((scene / "truth.json").read_text())["drift_k"])
-    pipeline = train(scene, 250, {"per_image_offset": True}, rate=2.0)
+    pipeline = train(scene, 250, {"per_image_offset": "on"}, rate=2.0)
     offset = pipeline.model.thermal_offset.detach()
     found = ((offset - offset.mean()) * pipeline.model.temperature_range.span_k).numpy()
     names = [p.stem for p in pipeline.datamanager.train_dataset.image_filenames]

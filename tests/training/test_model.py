@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +13,7 @@ from thermoxels_ns.core.snapshot import Views
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.field.refine import prune
 from thermoxels_ns.training import pipeline
+from thermoxels_ns.training.image_metrics import fitted_gain
 from thermoxels_ns.training.model import ThermoxelsModel
 from thermoxels_ns.training.model_config import LOSS_RECIPES, ThermoxelsModelConfig
 
@@ -114,7 +117,7 @@ def test_a_stream_renders_only_what_it_needs(stream, absent, backend):
 
 
 def test_offset_has_a_fixed_gauge_and_shifts_only_its_image():
-    model = make(per_image_offset=True).train()
+    model = make(per_image_offset="on").train()
     plain = model(rays())["thermal"].detach()
     model.thermal_offset.data[:] = 0.3  # the same for all: the gauge removes it
     torch.testing.assert_close(model(rays())["thermal"].detach(), plain)
@@ -123,6 +126,41 @@ def test_offset_has_a_fixed_gauge_and_shifts_only_its_image():
     torch.testing.assert_close(shift[::4], torch.full((15,), 0.3))
     torch.testing.assert_close(shift[1::4], torch.full((15,), -0.1))
     assert torch.equal(model.eval()(rays())["thermal"], make().eval()(rays())["thermal"])  # not in evaluation
+
+
+def test_gain_has_a_fixed_gauge_and_brightens_only_its_photograph():
+    model = make(exposure="on").train()
+    plain = model(rays())["rgb"].detach()
+    model.log_gain.data[:] = 0.3  # the same for all: the gauge removes it
+    torch.testing.assert_close(model(rays())["rgb"].detach(), plain)
+    model.log_gain.data[:] = torch.tensor([-0.4, 0.0, 0.0, 0.0])[:, None]
+    ratio = model(rays())["rgb"].detach() / plain
+    torch.testing.assert_close(ratio[::4], torch.full((15, 3), math.exp(-0.3)))
+    torch.testing.assert_close(ratio[1::4], (math.exp(0.1) * plain[1::4]).clamp(max=1.0) / plain[1::4])
+    assert torch.equal(model.eval()(rays())["rgb"], make().eval()(rays())["rgb"])  # not in evaluation
+
+
+def test_photographs_are_corrected_by_what_was_found_and_only_then():
+    model = make().train()
+    plain = model(rays())
+    model.correct_photographs(np.array([1, 3]), None, None)
+    for name in ("rgb", "thermal"):
+        assert torch.equal(model(rays())[name], plain[name])
+    model.correct_photographs(np.array([1, 3]), None, np.array([0.2, -0.2]))
+    assert torch.equal(model(rays())["rgb"], plain["rgb"])
+    shift = (model(rays())["thermal"] - plain["thermal"]).detach()[:, 0]
+    torch.testing.assert_close(shift[1::4], torch.full((15,), 0.2))
+    torch.testing.assert_close(shift[::4], torch.zeros(15))
+    assert model.state_dict()["corrected"].tolist() == [False, True]
+
+
+def test_gain_that_photographs_are_fitted_by():
+    draw = torch.Generator().manual_seed(0)
+    seen = torch.rand(2000, 3, generator=draw)
+    gain = torch.tensor([1.3, 0.8, 1.0])
+    target = (seen * gain).clamp(max=1.0)
+    target[:100] = 0.0  # something stood before it
+    torch.testing.assert_close(fitted_gain(seen, target), gain, atol=0.01, rtol=0.0)
 
 
 def test_temperature_does_not_move_geometry_unless_asked():

@@ -42,7 +42,7 @@ _RUNS, _TABLE, _PLOT, _PAGE = "runs.csv", "cost.csv", "cost.png", "cost.md"
 _QUIET_S = 60.0
 _EVALUATED = tuple(FIGURES)[3:]
 _KEYS = ("setting", "repeat", "scene", "version", "training")
-_GROUPS = ("density", "sh", "temperature", "background", "thermal_offset")
+_GROUPS = ("density", "sh", "temperature", "background", "corrections")
 
 
 @dataclass

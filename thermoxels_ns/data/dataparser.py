@@ -21,6 +21,7 @@ from thermoxels_ns.core.errors import SceneError, ThermalFileError
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, TemperatureRange
 from thermoxels_ns.data.colmap_tracks import TrackSource, find_feature_rays
+from thermoxels_ns.data.pose_refinement import PoseSource, refine_poses
 from thermoxels_ns.data.scene_box import BoxEvidence, find_scene_box
 from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
 from thermoxels_ns.data.splits import Split, split_frames
@@ -78,6 +79,9 @@ class ThermalDataParserConfig(DataParserConfig):
     """Which photographs saw which points, from structure from motion: they tell training what is air. auto: the file
     that the json names (tracks_file_path), else a COLMAP model in the scene's folder (colmap/sparse/0, colmap or
     sparse/0) whose poses are those of the json; given: only the file; off: none."""
+    refine_poses: PoseSource = "auto"
+    """Whose poses train. auto: where the scene has no tracks, and features that photographs share fit better with
+    poses adjusted to them (bundle adjustment), those; given: the json's."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +125,8 @@ class _Scene:
     world: _World
     box: SceneBox
     feature_rays: FeatureRays | None  # what the training photographs see of the tracks; nerfstudio's world
+    fitted: dict[int, npt.NDArray[np.float64]]
+    """Poses (4, 4) that held-out photographs themselves say, in input coordinates, by number of the frame."""
 
 
 class ThermalDataParser(DataParser):
@@ -129,7 +135,8 @@ class ThermalDataParser(DataParser):
     The outputs' metadata hold: ``temperature_range`` (`TemperatureRange`), ``thermal_filenames``, ``thermal_cameras``
     (`Cameras` of the split, or None where a pair shares camera and resolution), ``thermal_unit``, ``valid_range_c``,
     ``thermal_dead_pixels`` (a mask per resolution), ``image_scale`` (1 / downscale_factor), ``scene_name`` and, for
-    train, ``feature_rays`` (`FeatureRays`, or None where the scene has no tracks).
+    train, ``feature_rays`` (`FeatureRays`, or None where the scene has no tracks). ``fitted_poses`` (n, 3, 4) say where
+    held-out photographs themselves say that they were taken, None where nobody's pose was adjusted.
     """
 
     config: ThermalDataParserConfig
@@ -173,8 +180,17 @@ class ThermalDataParser(DataParser):
                 "thermal_dead_pixels": scene.survey.dead_pixels,
                 "scene_name": scene.file.folder.resolve().name,
                 "feature_rays": scene.feature_rays if split == "train" else None,
+                "fitted_poses": self._fitted_poses(scene, chosen),
             },
         )
+
+    @staticmethod
+    def _fitted_poses(scene: _Scene, chosen: Sequence[int]) -> torch.Tensor | None:
+        """Poses (n, 3, 4) in nerfstudio's world that held-out photographs say; None where nobody's differ."""
+        if not any(number in scene.fitted for number in chosen):
+            return None
+        frames = scene.file.frames
+        return scene.world.poses(np.stack([scene.fitted.get(number, frames[number].pose) for number in chosen]))
 
     def _downscale(self) -> float:
         factor = self.config.downscale_factor
@@ -195,6 +211,9 @@ class ThermalDataParser(DataParser):
         names = [frame.name for frame in file.frames]
         every = config.eval_interval, config.eval_offset
         split = split_frames(names, file.meta, config.eval_mode, *every, file.left_out)
+        rays, fitted = find_feature_rays(file, split.train, config.tracks), {}
+        if rays is None and config.refine_poses == "auto":
+            file, fitted = refine_poses(file, split.train, CONSOLE.print)
         evidence = find_scene_box(file, config.scene_box, split.train)
         world, box = self._place(file, evidence)
         paths, training = [f.thermal for f in file.frames], {file.frames[index].thermal for index in split.train}
@@ -212,10 +231,9 @@ class ThermalDataParser(DataParser):
         )
         if file.left_out:
             CONSOLE.print(f"Left out, no pair: {', '.join(file.left_out)}", style="bold yellow")
-        rays = find_feature_rays(file, split.train, config.tracks)
         if rays is not None:
             rays = rays.moved(world.rotation, world.translation, world.scale)
-        return _Scene(file, split, survey, world, box, rays)
+        return _Scene(file, split, survey, world, box, rays, fitted)
 
     def _oriented(self, poses: npt.NDArray[np.float64]) -> torch.Tensor:
         """nerfstudio's choice of rotation and shift for these poses (n, 4, 4), shape (3, 4) float32."""

@@ -27,7 +27,8 @@ class ThermalDataset(InputDataset):
 
     An item holds ``image_idx``, ``image`` (h, w, 3), ``mask`` where the scene has masks, ``thermal`` (ht, wt, 1)
     float32 normalised by the scene's range and 0 where invalid, ``thermal_valid`` (ht, wt, 1) bool, and
-    ``thermal_camera``, nerfstudio `Cameras` of shape (1,), where the thermal camera is not the photograph's.
+    ``thermal_camera``, nerfstudio `Cameras` of shape (1,), where the thermal camera is not the photograph's; and, where
+    held-out photographs say that they were taken from elsewhere, ``fitted_camera`` and ``fitted_thermal_camera``.
     """
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
@@ -76,7 +77,19 @@ class ThermalDataset(InputDataset):
         data["thermal"], data["thermal_valid"] = self.get_thermal(image_idx)
         if self.thermal_cameras is not None:
             data["thermal_camera"] = self.thermal_cameras[image_idx : image_idx + 1]
+        if self.metadata.get("fitted_poses") is not None:
+            data["fitted_camera"] = self._fitted(self.cameras, image_idx)
+            if self.thermal_cameras is not None:
+                data["fitted_thermal_camera"] = self._fitted(self.thermal_cameras, image_idx)
         return data
+
+    def _fitted(self, cameras: Cameras, image_idx: int) -> Cameras:
+        """One of the cameras, `Cameras` of shape (1,), moved as its photograph moves to the pose that it says."""
+        moved = deepcopy(cameras[image_idx : image_idx + 1])
+        given, own = (_square(c.camera_to_worlds[image_idx]) for c in (self.cameras, cameras))
+        pose = _square(self.metadata["fitted_poses"][image_idx]) @ torch.linalg.inv(given) @ own
+        moved.camera_to_worlds = pose[None, :3].to(moved.camera_to_worlds.dtype)
+        return moved
 
     def get_mask(self, image_idx: int) -> Bool[Tensor, "h w 1"] | None:
         """Return where the photograph may be used, or None if the scene has no masks."""
@@ -128,3 +141,8 @@ class ThermalDataset(InputDataset):
         factor = 1.0 / (self.scale_factor * self.metadata["image_scale"])
         part = (0.0, 0.0, min(width * factor, picture.size[0]), min(height * factor, picture.size[1]))
         return picture.resize((width, height), filter_, box=part)
+
+
+def _square(pose: Tensor) -> Tensor:
+    """A pose (3, 4) as (4, 4), float64."""
+    return torch.cat((pose.double().cpu(), torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)))

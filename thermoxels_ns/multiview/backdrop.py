@@ -15,6 +15,7 @@ STEEPEST = 0.9  # Cosine between the optical axis and the vertical above which a
 COLOUR_TOLERANCE = 0.06  # Difference from the backdrop's colour up to which a pixel shows it, of 1
 THERMAL_TOLERANCE = 0.1  # Difference from its temperature, of the scene's range
 VOTES = 2  # Photographs that show a surface, for each that shows a backdrop, from which on it is one
+_FEWEST_TOLD = 0.1
 _WIDEST, _ROUNDS = 0.3, 8
 """Difference up to which colours count in the first of some fits; it shrinks to the tolerance."""
 
@@ -45,7 +46,7 @@ def plain_backdrop(photographs: Photographs, depth: npt.NDArray[np.float32]) -> 
     if open_above.mean() < 1e-3:
         return np.zeros_like(open_above)
     values = np.column_stack((photographs.colours, photographs.thermal))
-    alike = plain & _alike(values, directions, open_above)
+    alike = plain & _alike(values, directions, open_above, photographs.saturated)
     open_above &= alike
     for (width, height), first in zip(photographs.sizes, photographs.firsts):
         pixels = slice(first, first + width * height)
@@ -108,9 +109,19 @@ def even_pixels(picture: npt.NDArray[np.float32], most: float = PLAIN) -> npt.ND
 
 
 def _alike(
-    values: npt.NDArray[np.float32], directions: FloatArray, chosen: npt.NDArray[np.bool_]
+    values: npt.NDArray[np.float32],
+    directions: FloatArray,
+    chosen: npt.NDArray[np.bool_],
+    saturated: npt.NDArray[np.bool_] | None = None,
 ) -> npt.NDArray[np.bool_]:
-    """Which pixels look as most of the chosen do, by colour and, where it is known, temperature (pixels, 4)."""
+    """Which pixels look as most of the chosen do, by colour and, where it is known, temperature (pixels, 4).
+
+    What is `saturated` (pixels, 3) looks like anything as bright or brighter, and does not say what most look like
+    unless hardly any others do.
+    """
+    if saturated is not None:
+        told = chosen & ~saturated.any(1)
+        chosen = told if told.sum() >= _FEWEST_TOLD * chosen.sum() else chosen
     x, y, z = directions.T
     basis = np.column_stack((np.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3.0 * z * z - 1.0))
     tolerance = np.array([COLOUR_TOLERANCE] * 3 + [THERMAL_TOLERANCE])
@@ -132,6 +143,8 @@ def _alike(
             fitted[:, channel] = np.linalg.lstsq(rows.T @ rows + ridge, rows.T @ seen[used, channel], rcond=None)[0]
         expected = basis[some] @ fitted
     off = np.abs(values - basis @ fitted) / tolerance
+    if saturated is not None:
+        off[:, :3][saturated & (basis @ fitted[:, :3] > values[:, :3])] = 0.0
     return (np.nan_to_num(off) <= 1.0).all(1)
 
 

@@ -30,6 +30,14 @@ class Photographs:
     thermal: npt.NDArray[np.float32]
     """Normalised temperature, shape (pixels,); NaN where unknown, or measured by a camera of its own."""
     near: float = 0.0  # Depth up to which a photograph shows nothing, [world units]
+    index: npt.NDArray[np.int64] | None = None  # Number of each photograph in its dataset; None: of no dataset
+    saturated: npt.NDArray[np.bool_] | None = None
+    """Channels that were at least as bright as `colours` say, shape (pixels, 3); None: not known."""
+
+    @property
+    def numbers(self) -> npt.NDArray[np.int64]:
+        """Which photograph each pixel belongs to, shape (pixels,)."""
+        return np.repeat(np.arange(len(self)), np.prod(self.sizes, axis=1))
 
     def __len__(self) -> int:
         return len(self.matrices)
@@ -57,7 +65,8 @@ def read_photographs(
     if not len(usable):
         return None
     pinholes = [_photograph(dataset, cameras, int(index), longest_side) for index in usable]
-    return gathered(pinholes, cameras.camera_to_worlds[usable, :, 3].double().numpy(), near)
+    seen = gathered(pinholes, cameras.camera_to_worlds[usable, :, 3].double().numpy(), near)
+    return replace(seen, index=usable)
 
 
 Pinhole = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.float64]]
@@ -81,16 +90,46 @@ def gathered(pinholes: Sequence[Pinhole], centres: npt.ArrayLike, near: float = 
 
 def _photograph(dataset: Any, cameras: Cameras, index: int, longest_side: int) -> Pinhole:
     picture, mask = dataset.get_image_uint8(index).numpy(), dataset.get_mask(index)
-    distortion = [0.0] * 6 if cameras.distortion_params is None else cameras.distortion_params[index].double().tolist()
-    named: dict[str, Any] = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), distortion))
-    fx, fy, cx, cy = (float(getattr(cameras, name)[index, 0]) for name in ("fx", "fy", "cx", "cy"))
-    camera = Camera(picture.shape[1], picture.shape[0], fx, fy, cx, cy, **named)
+    camera = _camera(cameras, index)
     pose = np.asarray(cameras.camera_to_worlds[index], dtype=np.float64)
     thermal = None
     if dataset.thermal_cameras is None:
         warm, valid = (values.numpy()[..., 0] for values in dataset.get_thermal(index))
         thermal = np.where(valid, warm, np.nan).astype(np.float32)
     return pinhole(picture, None if mask is None else mask.numpy()[..., 0], camera, pose, longest_side, thermal)
+
+
+def thermal_at(dataset: Any, photographs: Photographs, depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Normalised temperature where a photograph's pixels have a known `depth` (pixels,); NaN elsewhere.
+
+    Of a thermal camera of its own: what it shows where the point stands. It is beside the photograph's, so that hardly
+    anything hides a point from it alone.
+    """
+    if dataset.thermal_cameras is None:
+        return photographs.thermal
+    cameras, found = dataset.thermal_cameras.to("cpu"), np.full(len(depth), np.nan, np.float32)
+    (sure,) = np.nonzero(np.isfinite(depth))
+    assert photographs.index is not None
+    origins, along = photographs.of_pixels(sure)
+    points, number = origins + depth[sure, None] * along, photographs.numbers[sure]
+    for place, index in enumerate(photographs.index.tolist()):
+        camera, own = _camera(cameras, index), number == place
+        pixels = camera.project_world(np.asarray(cameras.camera_to_worlds[index], dtype=np.float64), points[own])
+        warm, valid = (values.numpy()[..., 0] for values in dataset.get_thermal(index))
+        shown = camera.contains(pixels)
+        column, row = (
+            np.minimum(np.where(shown, pixels[:, axis], 0.0).astype(np.int64), warm.shape[1 - axis] - 1)
+            for axis in (0, 1)
+        )
+        found[sure[own]] = np.where(shown & valid[row, column], warm[row, column], np.nan)
+    return found
+
+
+def _camera(cameras: Cameras, index: int) -> Camera:
+    distortion = [0.0] * 6 if cameras.distortion_params is None else cameras.distortion_params[index].double().tolist()
+    named: dict[str, Any] = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), distortion))
+    fx, fy, cx, cy = (float(getattr(cameras, name)[index, 0]) for name in ("fx", "fy", "cx", "cy"))
+    return Camera(int(cameras.width[index, 0]), int(cameras.height[index, 0]), fx, fy, cx, cy, **named)
 
 
 def pinhole(

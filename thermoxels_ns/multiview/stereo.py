@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,8 +10,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.threads import run_ranges
-from thermoxels_ns.multiview.backdrop import plain_backdrop
-from thermoxels_ns.multiview.photographs import Photographs, read_photographs
+from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo_kernels import OUTSIDE, correlate, other_views, weigh_patches
 
 FloatArray = npt.NDArray[np.float64]
@@ -41,7 +37,6 @@ VIEWS_PER_CONTRADICTION = 2  # As many must do so for each photograph that looks
 VIEWS_TO_CONTRADICT = 3  # Photographs that must agree with a depth behind the point, which is else likely to be wrong
 FEWEST_AROUND = 6
 """Of the eight pixels around a sure one, those whose depths agree with its own too: outlines and noise have fewer."""
-LEAST_SHARE = 0.01  # Share of the pixels whose depth must be sure; less is chance
 ERROR_PLANES = 0.25  # Standard error of a depth, in planes of the sweep
 _NEAREST = 0.1  # Distance of the nearest plane in the box relative to the farthest
 _OUTSIDE = -100.0
@@ -327,43 +322,3 @@ def rays_through(
     origins, along = photographs.of_pixels(chosen)
     points, errors = origins + depth[:, None] * along, np.asarray(error) * np.linalg.norm(along, axis=1)
     return FeatureRays(origins, np.arange(len(chosen)), points, errors)
-
-
-@dataclass(frozen=True, eq=False)
-class PhotographEvidence:
-    """What training photographs say before there is a model."""
-
-    photographs: Photographs  # The photographs, small
-    backdrop: npt.NDArray[np.bool_]  # Which of their pixels show a plain backdrop, shape (pixels,)
-    feature_rays: FeatureRays | None
-    """Rays to each depth that several photographs agree about; None where these are too few to tell anything."""
-
-
-def evidence_of_photographs(
-    dataset: Any, near: float, lo: npt.ArrayLike, hi: npt.ArrayLike, say: Callable[[str], None]
-) -> PhotographEvidence | None:
-    """Compare training photographs with each other, and say what was found; None without perspective photographs.
-
-    Depths are looked for behind `near`, in the box from `lo` to `hi` and beyond it, [world units].
-    """
-    began = time.perf_counter()
-    photographs = read_photographs(dataset, near)
-    if photographs is None:
-        return None
-    depths = depths_of(photographs, lo, hi)
-    few = "" if depths.share >= LEAST_SHARE else ", too few to tell anything"
-    backdrop = plain_backdrop(photographs, depths.depth)
-    say(
-        f"depths: {len(photographs)} photographs agree about {depths.share:.1%} of their pixels{few}; "
-        f"a plain backdrop fills {backdrop.mean():.1%}; {time.perf_counter() - began:.1f} s"
-    )
-    return PhotographEvidence(photographs, backdrop, None if few else feature_rays_to_depths(depths))
-
-
-def rays_through_backdrop(
-    photographs: Photographs, backdrop: npt.NDArray[np.bool_], beyond: float
-) -> FeatureRays | None:
-    """Rays through the pixels of a backdrop, to points so far away [world units]; None where hardly any shows one."""
-    (chosen,) = np.nonzero(backdrop)
-    enough = len(chosen) >= LEAST_SHARE * len(backdrop)
-    return rays_through(photographs, chosen, np.full(len(chosen), beyond)) if enough else None

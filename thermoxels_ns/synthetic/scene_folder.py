@@ -38,7 +38,7 @@ FloatArray = npt.NDArray[np.float64]
 
 _SUFFIXES = {"png16": ".png", "tiff": ".tiff", "npy": ".npy"}
 _PHOTO_SUFFIXES: dict[str, str] = {"jpeg": ".jpg", "png": ".png"}
-_TRUTH = "truth.json"
+TRUTH = "truth.json"
 _LARGEST_COUNT = 65535
 _CENTIKELVIN = {"celsius_per_count": 0.01, "celsius_offset": -273.15}
 # The second camera: what its lens and mounting differ by from the first. About 1 degree and a few centimetres.
@@ -136,7 +136,7 @@ def write_scene(
         transforms["thermal_unit"] = unit
     transforms |= {"metres_per_unit": 1.0, "up": [0, 0, 1], "frames": frames}
     truth = {"synthetic_scene": scene.name, "scene_box": scene.scene_box, "seed": seed}
-    _write_json(target / _TRUTH, truth | flaws.truth(poses))
+    _write_json(target / TRUTH, truth | flaws.truth(poses))
     _write_json(target / "transforms.json", transforms)
     return target
 
@@ -146,14 +146,14 @@ def load_truth(scene_folder: Path | str) -> SyntheticScene | None:
 
     A `SceneError` is raised where the json is unreadable, or names a scene that does not exist.
     """
-    path = Path(scene_folder) / _TRUTH
+    path = Path(scene_folder) / TRUTH
     if not path.is_file():
         return None
     truth = _read_json(path)
     if not isinstance(truth.get("synthetic_scene"), str):
         expected = 'an object with the text "synthetic_scene"'
         remedy = "Write the scene again, or remove the file for real photographs."
-        raise SceneError(_TRUTH, expected=expected, got=json.dumps(truth), remedy=remedy)
+        raise SceneError(TRUTH, expected=expected, got=json.dumps(truth), remedy=remedy)
     return make_scene(truth["synthetic_scene"])
 
 
@@ -189,7 +189,7 @@ def _prepared_folder(folder: Path | str) -> Path:
     old = target / "transforms.json"
     if old.exists():
         content = _read_json(old)
-        if "truth" not in content and not (target / _TRUTH).is_file():  # earlier checkouts wrote it there
+        if "truth" not in content and not (target / TRUTH).is_file():  # earlier checkouts wrote it there
             expected = "an empty folder or one with an earlier synthetic scene"
             got = f"{target}, whose transforms.json describes other photographs"
             raise SceneError("output folder", expected=expected, got=got, remedy="Choose another folder.")

@@ -19,13 +19,9 @@ from thermoxels_ns.core.ray_streams import RGB_STREAM, THERMAL_STREAM
 from thermoxels_ns.field.refine import RowChange, prune, refine
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.multiview.backdrop import backdrop_without_walls, mean_colours
+from thermoxels_ns.multiview.evidence import PhotographEvidence, evidence_of_photographs, rays_through_backdrop
 from thermoxels_ns.multiview.planes import depths_on_planes
-from thermoxels_ns.multiview.stereo import (
-    PhotographEvidence,
-    evidence_of_photographs,
-    rays_through,
-    rays_through_backdrop,
-)
+from thermoxels_ns.multiview.stereo import rays_through
 from thermoxels_ns.training.free_space_carving import carve_free_space
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler
 from thermoxels_ns.training.model import SurroundingsSampler, ThermoxelsModel
@@ -169,9 +165,13 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
     lattice = Lattice.covering(box[0], box[1], config.resolutions[0])  # the same in a resumed training
     near = config.near_plane * model.unit
     with threadpool_limits(1, "blas"):  # same bits for any number of threads
-        found = evidence_of_photographs(datamanager.train_dataset, near, lattice.lo, lattice.hi, CONSOLE.log)
+        wanted = config.exposure == "auto", config.per_image_offset == "auto" and datamanager.config.streams != "rgb"
+        found = evidence_of_photographs(datamanager.train_dataset, near, lattice.lo, lattice.hi, CONSOLE.log, *wanted)
     if found is None:
         return None
+    if trainer is None or trainer._start_step == 0:
+        assert found.photographs.index is not None
+        model.correct_photographs(found.photographs.index, found.log_gain, found.offset)
     tracks, depths, far = model.feature_rays, found.feature_rays, model.seen_surroundings is not None
     if depths is not None and tracks is None:
         model.feature_ray_sampler = FeatureRaySampler(depths, box, far, COARSE_LIGHT)

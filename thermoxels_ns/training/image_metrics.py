@@ -15,6 +15,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 _SMALLEST_MSE = 1e-10
 _HSSIM_WINDOW = 4
 _HSSIM_C2 = 9e-4  # (0.03 x data range 1)^2
+SATURATED = 0.99  # Channel from which on a pixel may have been brighter than it says
 HALF_TRANSPARENT = (0.1, 0.9)  # A ray whose accumulation lies strictly between these is neither through nor stopped
 
 
@@ -23,6 +24,19 @@ def psnr(predicted: Tensor, target: Tensor, valid: Tensor | None = None) -> floa
     squared = (predicted - target) ** 2
     mse = squared.mean() if valid is None else squared[valid].mean()
     return float(-10.0 * torch.log10(mse.clamp(min=_SMALLEST_MSE)))
+
+
+def fitted_gain(predicted: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Float[Tensor, " 3"]:
+    """Gain of each channel that makes a rendered photograph most like a measured one, robustly (Huber).
+
+    Saturated pixels do not count.
+    """
+    gain, weight = torch.ones(3, device=predicted.device), (target < SATURATED).to(predicted.dtype)
+    for _ in range(8):
+        gain = (weight * predicted * target).sum(0) / (weight * predicted**2).sum(0).clamp(min=1e-12)
+        off = (target - gain * predicted).abs()
+        weight = (target < SATURATED) * (off.median(0).values / off.clamp(min=1e-6)).clamp(max=1.0)
+    return gain
 
 
 def ssim(

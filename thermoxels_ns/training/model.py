@@ -7,7 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.models.base_model import Model
 from nerfstudio.utils import colormaps
@@ -31,7 +33,7 @@ from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
 from thermoxels_ns.render.renderers import GridSamples, render_rays, sample_rays
 from thermoxels_ns.render.surroundings_render import render_surroundings
 from thermoxels_ns.training import losses
-from thermoxels_ns.training.image_metrics import lpips, lpips_available, psnr, ssim, thermal_metrics
+from thermoxels_ns.training.image_metrics import fitted_gain, lpips, lpips_available, psnr, ssim, thermal_metrics
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig
 from thermoxels_ns.training.ray_statistics import FieldEvidence, field_evidence
 
@@ -50,6 +52,7 @@ class ThermoxelsModel(Model):
     config: ThermoxelsModelConfig
     temperature_bounds_c: Tensor
     backdrop_on: Tensor
+    corrected: Tensor
     trained_steps: Tensor
 
     def populate_modules(self) -> None:
@@ -94,7 +97,11 @@ class ThermoxelsModel(Model):
         # Which of colour at infinity, temperature at infinity and surroundings take part; kept in the checkpoint.
         on = [wants_rgb, self.background_thermal is not None, self.surroundings is not None]
         self.register_buffer("backdrop_on", torch.tensor(on))
-        self.thermal_offset = nn.Parameter(torch.zeros(self.num_train_data)) if config.per_image_offset else None
+        images, colour = self.num_train_data, config.sh_degree is not None and config.exposure != "off"
+        self.log_gain = nn.Parameter(torch.zeros(images, 3)) if colour else None
+        self.thermal_offset = nn.Parameter(torch.zeros(images)) if config.per_image_offset != "off" else None
+        # Whether gains and offsets take part; kept in the checkpoint.
+        self.register_buffer("corrected", torch.tensor([config.exposure == "on", config.per_image_offset == "on"]))
         # How far training got; part of the checkpoint, because view-dependence begins at some step.
         self.register_buffer("trained_steps", torch.tensor(0))
         self.step = 0
@@ -135,13 +142,14 @@ class ThermoxelsModel(Model):
         return TemperatureRange(low, high)
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Parameters by optimiser: density, sh, temperature, background, thermal_offset (those that exist)."""
+        """Parameters by optimiser: density, sh, temperature, background, corrections (those that exist)."""
         groups = {name: [parameter] for name, parameter in self.grid.row_parameters().items()}
         backdrop = [p for m in (self.background_rgb, self.background_thermal) if m is not None for p in m.parameters()]
         if backdrop:
             groups["background"] = backdrop
-        if self.thermal_offset is not None:
-            groups["thermal_offset"] = [self.thermal_offset]
+        corrections = [values for values in (self.log_gain, self.thermal_offset) if values is not None]
+        if corrections:
+            groups["corrections"] = corrections
         if self.surroundings is not None:
             rows = self.surroundings.grid.row_parameters()
             groups |= {f"surroundings_{name}": [parameter] for name, parameter in rows.items()}
@@ -215,6 +223,19 @@ class ThermoxelsModel(Model):
         degree = self.config.sh_degree
         return 0 if degree is not None and int(self.trained_steps) < self.config.view_dependence_from else degree
 
+    @torch.no_grad()
+    def correct_photographs(
+        self, index: npt.NDArray[np.int64], log_gain: npt.NDArray | None, offset: npt.NDArray | None
+    ) -> None:
+        """Begin with gains (n, 3) and offsets (n,) found for some training images; the others begin with none.
+
+        None: none was found, and none takes part.
+        """
+        for number, (parameter, values) in enumerate(((self.log_gain, log_gain), (self.thermal_offset, offset))):
+            if parameter is not None and values is not None:
+                parameter[torch.from_numpy(index)] = torch.from_numpy(values).to(parameter)
+                self.corrected[number] = True
+
     def sample_rays(self, origins: Tensor, directions: Tensor) -> GridSamples:
         """List the samples of rays in kept voxels and their weights, for statistics."""
         return sample_rays(self.grid, self._request(origins, directions), self._options(), self.config.backend)
@@ -285,10 +306,15 @@ class ThermoxelsModel(Model):
             return batch | self._image_outputs(request)
         request = replace(request, rgb_rays=rgb_rays, thermal_rays=thermal_rays)
         rgb, thermal, seen = self.render_rays(request, self._training_options())
-        if self.thermal_offset is not None:
+        # The gradient of `index_select` adds rays in their order; that of an index leaves the order to a race.
+        gains_on, offsets_on = self.corrected.tolist()
+        if self.log_gain is not None and gains_on and rgb is not None:
+            assert ray_bundle.camera_indices is not None
+            gain = torch.exp(self.log_gain - self.log_gain.mean(0))
+            rgb = (rgb * gain.index_select(0, ray_bundle.camera_indices[:, 0])).clamp(max=1.0)
+        if self.thermal_offset is not None and offsets_on:
             assert ray_bundle.camera_indices is not None
             offset = self.thermal_offset - self.thermal_offset.mean()
-            # The gradient of `index_select` adds rays in their order; that of an index leaves the order to a race.
             thermal = thermal + offset.index_select(0, ray_bundle.camera_indices[:, 0])[:, None]
         return batch | {"rgb": rgb, "thermal": thermal, "accumulation": seen.accumulation[:, None], "render": seen}
 
@@ -405,20 +431,51 @@ class ThermoxelsModel(Model):
             images["img"] = torch.cat((target, predicted), dim=1)
         seen = outputs
         if batch.get("thermal_camera") is not None:
-            rays = batch["thermal_camera"].to(self.device).generate_rays(camera_indices=0, keep_shape=True)
-            rays.metadata["stream"] = torch.full_like(rays.camera_indices, THERMAL_STREAM)
-            seen = self.get_outputs_for_camera_ray_bundle(rays)
+            seen = self._rendered(batch["thermal_camera"], THERMAL_STREAM)
         thermal, valid = batch["thermal"].to(self.device), batch["thermal_valid"].to(self.device)
         if "mask" in batch and batch["mask"].shape == valid.shape and seen is outputs:
             valid = valid & batch["mask"].to(self.device).bool()
         span_k = self.temperature_range.span_k
         metrics |= thermal_metrics(seen["thermal"], thermal, valid, seen["accumulation"], seen["in_box"] > 0, span_k)
+        metrics |= self._fitted_metrics(outputs, seen, batch, valid)
         images["thermal"] = colormaps.apply_float_colormap(
             torch.cat((thermal, seen["thermal"]), dim=1).clamp(0, 1), "inferno"
         )
         images["accumulation"] = colormaps.apply_colormap(outputs["accumulation"])
         images["depth"] = colormaps.apply_depth_colormap(outputs["depth"], accumulation=outputs["accumulation"])
         return metrics, images
+
+    def _fitted_metrics(
+        self, outputs: dict[str, Tensor], seen: dict[str, Tensor], batch: dict[str, Any], valid: Tensor
+    ) -> dict[str, float]:
+        """``psnr_fitted``: the corrections of training fitted to a held-out frame too.
+
+        Its pose is where its own features say that it was taken, if training poses were adjusted (then also for
+        ``thermal_mae_debiased_c``); its gains are fitted to all of its pixels. `outputs` and `seen` are its photograph
+        and its thermal image as given.
+        """
+        metrics: dict[str, float] = {}
+        if batch.get("fitted_camera") is not None:
+            outputs = self._rendered(batch["fitted_camera"], RGB_STREAM | THERMAL_STREAM)
+            own = batch.get("fitted_thermal_camera")
+            seen = outputs if own is None else self._rendered(own, THERMAL_STREAM)
+            thermal, span_k = batch["thermal"].to(self.device), self.temperature_range.span_k
+            warm = thermal_metrics(seen["thermal"], thermal, valid, seen["accumulation"], seen["in_box"] > 0, span_k)
+            metrics["thermal_mae_debiased_c"] = warm["thermal_mae_debiased_c"]
+        if self.grid.sh is not None:
+            target, predicted = batch["image"][..., :3].to(self.device), outputs["rgb"]
+            mask = (
+                batch["mask"].to(self.device).bool()[..., 0] if "mask" in batch else torch.ones_like(target[..., 0]) > 0
+            )
+            gain = fitted_gain(predicted[mask], target[mask])
+            metrics["psnr_fitted"] = psnr((gain * predicted).clamp(max=1.0)[mask], target[mask])
+        return metrics
+
+    def _rendered(self, camera: Cameras, stream: int) -> dict[str, Tensor]:
+        """What a camera, of shape (1,), sees."""
+        rays = camera.to(self.device).generate_rays(camera_indices=0, keep_shape=True)
+        rays.metadata["stream"] = torch.full((*rays.shape, 1), stream, dtype=torch.uint8, device=self.device)
+        return self.get_outputs_for_camera_ray_bundle(rays)
 
     @torch.no_grad()
     def grid_snapshot(self, rays: Iterable[RayBundle], views: Views | None = None) -> GridSnapshot:

@@ -141,8 +141,12 @@ class ThermoxelsModelConfig(ModelConfig):
     """Steps over which the distortion term grows from nothing to its weight."""
     tv_share: float = 0.1
     """Share of the lattice that each step's total variation looks at."""
-    per_image_offset: bool = False
-    """Learn one temperature offset per thermal image (mean zero), for cameras whose reading drifts."""
+    per_image_offset: Literal["auto", "on", "off"] = "auto"
+    """One temperature offset per thermal image (mean zero), for cameras whose reading drifts. auto: where thermal
+    images of the same points differ by it (it needs photo_depth); on: learned from nothing."""
+    exposure: Literal["auto", "on", "off"] = "auto"
+    """One gain per photograph and channel (mean one), for cameras that choose exposure and white balance anew. auto:
+    where photographs of the same points differ by it (it needs photo_depth); on: learned from nothing."""
     seed: int = 0
     """Seed of everything random in the model."""
 

@@ -1,0 +1,146 @@
+import cv2
+import numpy as np
+import pytest
+
+from thermoxels_ns.core.camera import Camera
+from thermoxels_ns.multiview.bundle_adjustment import (
+    FEWEST_TRACKS,
+    Tracks,
+    adjust_poses,
+    features_of,
+    find_tracks,
+)
+from thermoxels_ns.synthetic.camera_rings import look_at
+from thermoxels_ns.synthetic.imperfections import DrawnFlaws, Imperfections
+from thermoxels_ns.synthetic.raycast import render_view
+from thermoxels_ns.synthetic.scene_folder import make_scene
+
+FOCAL, VIEWS = 300.0, 12
+
+
+def poses() -> np.ndarray:
+    angles = np.linspace(0.0, 2.0 * np.pi, VIEWS, endpoint=False)
+    return np.stack([look_at((4 * np.cos(a), 4 * np.sin(a), 1.0 + 0.3 * np.sin(3 * a)), (0, 0, 0)) for a in angles])
+
+
+def off_by(angle_deg: float, seed: int = 0) -> np.ndarray:
+    flaws = Imperfections(pose_error_deg=angle_deg)
+    return DrawnFlaws.of(flaws, seed, poses(), (0.0, 0.0, 0.0), (0.0, 1.0)).given_poses(poses())
+
+
+def tracks(noise_px: float = 0.2, points: int = 400, seed: int = 1) -> Tracks:
+    """What cameras on a ring see of points in a ball; each point by about half of them."""
+    draw = np.random.default_rng(seed)
+    world = draw.normal(0.0, 0.5, (points, 3))
+    seen = draw.random((points, VIEWS)) < 0.5
+    seen[:, :2] |= (seen.sum(1) < 2)[:, None]
+    point, photograph = np.nonzero(seen)
+    turned = poses()[photograph][:, :3, :3] * np.array([1.0, -1.0, -1.0])
+    local = np.einsum("nji,nj->ni", turned, world[point] - poses()[photograph, :3, 3])
+    place = local[:, :2] / local[:, 2:] + noise_px / FOCAL * draw.standard_normal((len(local), 2))
+    return Tracks(photograph, point, place)
+
+
+def inconsistency_px(estimated: np.ndarray) -> float:
+    """Median distance between exact sightings and points triangulated from poses: what a reconstruction suffers."""
+    found = adjusted_distance(tracks(noise_px=0.0), estimated)
+    return float(np.median(found))
+
+
+def adjusted_distance(exact: Tracks, estimated: np.ndarray) -> np.ndarray:
+    from thermoxels_ns.multiview.bundle_adjustment import _distances
+
+    return _distances(exact, estimated, np.full(VIEWS, FOCAL))
+
+
+@pytest.mark.parametrize("angle_deg", [0.15, 0.3])
+def test_poses_that_are_off_are_found_fivefold_nearer(angle_deg):
+    given = off_by(angle_deg)
+    found = adjust_poses(tracks(), given, np.full(VIEWS, FOCAL))
+    assert found is not None and found.after_px < found.before_px
+    assert inconsistency_px(found.poses) < 0.2 * inconsistency_px(given)
+
+
+def test_good_poses_stay():
+    assert adjust_poses(tracks(), poses(), np.full(VIEWS, FOCAL)) is None
+
+
+def test_adjusted_poses_stand_where_the_given_ones_do_and_have_their_size():
+    given = off_by(0.3)
+    found = adjust_poses(tracks(), given, np.full(VIEWS, FOCAL))
+    assert found is not None
+    centres, before = found.poses[:, :3, 3], given[:, :3, 3]
+    np.testing.assert_allclose(centres.mean(0), before.mean(0), atol=1e-9)
+    spread = [np.sqrt(((c - c.mean(0)) ** 2).sum()) for c in (centres, before)]
+    assert abs(spread[0] / spread[1] - 1.0) < 1e-3
+    np.testing.assert_allclose(np.linalg.det(found.poses[:, :3, :3]), 1.0, atol=1e-9)
+    mean_turn = np.einsum("nij,nkj->ik", given[:, :3, :3], found.poses[:, :3, :3])
+    np.testing.assert_allclose(mean_turn, mean_turn.T, atol=1e-6)
+
+
+def test_the_size_of_the_world_does_not_matter():
+    given, big = off_by(0.3), off_by(0.3)
+    big[:, :3, 3] *= 1000.0
+    found, found_big = (adjust_poses(tracks(), each, np.full(VIEWS, FOCAL)) for each in (given, big))
+    assert found is not None and found_big is not None
+    np.testing.assert_allclose(found_big.poses[:, :3, 3] / 1000.0, found.poses[:, :3, 3], atol=1e-5)
+
+
+def test_wrong_matches_do_little_harm():
+    seen, draw = tracks(), np.random.default_rng(3)
+    wrong = draw.random(len(seen.point)) < 0.05
+    place = np.where(wrong[:, None], seen.place + 10.0 / FOCAL * draw.standard_normal(seen.place.shape), seen.place)
+    given = off_by(0.15)
+    found = adjust_poses(Tracks(seen.photograph, seen.point, place), given, np.full(VIEWS, FOCAL))
+    assert found is not None and inconsistency_px(found.poses) < 0.3 * inconsistency_px(given)
+
+
+def test_too_few_tracks_say_nothing():
+    few = tracks(points=FEWEST_TRACKS - 1)
+    assert adjust_poses(few, off_by(0.3), np.full(VIEWS, FOCAL)) is None
+    none = Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
+    assert adjust_poses(none, poses(), np.full(VIEWS, FOCAL)) is None
+
+
+def test_fixed_photographs_stay_where_they_are():
+    given = poses()
+    given[-2:] = off_by(0.3)[-2:]
+    theirs = tracks()
+    chosen = np.zeros(theirs.points, dtype=bool)
+    chosen[theirs.point[theirs.photograph >= VIEWS - 2]] = True
+    found = adjust_poses(theirs.of_points(chosen), given, np.full(VIEWS, FOCAL), fixed=VIEWS - 2)
+    assert found is not None
+    np.testing.assert_allclose(found.poses[:-2], given[:-2], atol=1e-12)
+    assert np.abs(found.poses[-2:] - poses()[-2:]).max() < 0.3 * np.abs(given[-2:] - poses()[-2:]).max()
+
+
+def test_photographs_of_other_brightness_have_the_same_tracks():
+    scene = make_scene("house-corner")
+    camera, views = scene.camera(160, 120), scene.poses(8, 0)[0]
+    pictures = [render_view(scene, view, camera).rgb for view in views]
+    found = []
+    for gains in (np.ones(8), 2.0 ** np.random.default_rng(0).normal(0.0, 0.3, 8)):
+        grey = [cv2.cvtColor(np.clip(g * p, 0, 1), cv2.COLOR_RGB2GRAY) for g, p in zip(gains, pictures)]
+        features = [features_of(np.round(255.0 * picture).astype(np.uint8)) for picture in grey]
+        found.append(find_tracks(features, [camera] * 8, views))
+    alike, changed = (each.points for each in found)
+    assert alike > 50 and changed > 0.6 * alike
+    for each in found:
+        pairs = each.point * 8 + each.photograph
+        assert len(np.unique(pairs)) == len(pairs)
+        assert np.bincount(each.point).min() >= 2
+
+
+def test_masked_features_do_not_count():
+    picture = np.random.default_rng(0).integers(0, 255, (60, 80)).astype(np.uint8)
+    picture = cv2.GaussianBlur(picture, (0, 0), 2.0)
+    picture = ((picture - picture.min()) * (255.0 / np.ptp(picture))).astype(np.uint8)
+    mask = np.zeros((60, 80), dtype=bool)
+    mask[:, :40] = True
+    assert features_of(picture, mask).pixels[:, 0].max() < 42.0 < features_of(picture).pixels[:, 0].max()
+
+
+def test_a_lens_that_distorts_is_no_pose_error():
+    camera = Camera(160, 120, 150.0, 150.0, 80.0, 60.0, k1=-0.2)
+    pixels = np.array([[10.0, 20.0], [140.0, 100.0]])
+    np.testing.assert_allclose(camera.project(camera.rays(pixels)), pixels, atol=1e-6)

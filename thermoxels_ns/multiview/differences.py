@@ -1,0 +1,162 @@
+"""How photographs of the same surface differ from each other: gain of each channel, offset of the temperature."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from thermoxels_ns.multiview.photographs import Photographs
+from thermoxels_ns.multiview.stereo import TOLERANCE, Depths
+
+FloatArray = npt.NDArray[np.float64]
+
+MOST_PIXELS = 1500  # Pixels of each photograph that are looked up in the others
+DARKEST, BRIGHTEST = 0.06, 0.94  # Channels between which a pixel tells a gain: noise below, saturation above
+SATURATED = 0.98  # Channel from which on a pixel, a mean of several, may have been brighter
+FEWEST_PAIRS = 30  # Pixels that two photographs must share to be compared
+SYSTEMATIC = 0.02
+"""Standard deviation, of 1, of what a channel's median ratio between two photographs is off by besides noise: gloss,
+shadows, depths that are wrong."""
+SYSTEMATIC_THERMAL = 0.003  # The same of a median difference of normalised temperatures
+SURE = 3.0  # Standard errors from which on values are no chance
+KNOWN = 1.0  # Standard error below which a value is known at all
+FREE = 10.0  # Standard error that stands for not known
+_ROUNDS, _HUBER = 5, 2.0  # Standard errors of a pair from which on it counts less
+
+
+@dataclass(frozen=True, eq=False)
+class Differences:
+    """By what each photograph is off, with standard errors; means over the photographs are 0."""
+
+    log_gain: FloatArray  # Natural logarithm of the gain of each channel, (photographs, 3)
+    log_gain_error: FloatArray
+    offset: FloatArray  # Of normalised temperature, (photographs,)
+    offset_error: FloatArray
+
+    def without_gains(self, photographs: Photographs) -> Photographs:
+        """The photographs as they would be had all the same gains."""
+        gain = np.exp(self.log_gain).astype(np.float32)[photographs.numbers]
+        return replace(photographs, colours=photographs.colours / gain, saturated=photographs.colours >= SATURATED)
+
+    def without_offsets(self, photographs: Photographs) -> Photographs:
+        """The photographs as they would be had all thermal images the same offset."""
+        return replace(photographs, thermal=photographs.thermal - self.offset.astype(np.float32)[photographs.numbers])
+
+
+def matters(value: FloatArray, error: FloatArray, least: float) -> bool:
+    """Whether values, as far as they are known, are larger than `least` and than `SURE` of their standard errors."""
+    known = error < KNOWN
+    if not known.any():
+        return False
+    size, doubt = (float(np.sqrt(np.mean(each[known] ** 2))) for each in (value, error))
+    return size > max(least, SURE * doubt)
+
+
+def photograph_differences(depths: Depths, thermal: npt.NDArray[np.float32]) -> Differences:
+    """Compare what photographs show of the same points, where each of the two has found its own depth there.
+
+    For two photographs a and b the median over shared pixels of ln(a / b), or of the difference of temperatures, is
+    that of their gains or offsets. All pairs together are solved by weighted least squares; only differences are seen,
+    so the mean is set to 0. Photographs that share too little with the others have values of 0 and errors of `FREE`.
+
+    Args:
+        depths: Depths of the photographs.
+        thermal: Normalised temperature of each pixel (pixels,); NaN: unknown.
+    """
+    photographs = depths.photographs
+    count = len(photographs)
+    values = np.column_stack((photographs.colours, thermal)).astype(np.float64)
+    usable = (values > DARKEST) & (values < BRIGHTEST)
+    usable[:, 3] = np.isfinite(values[:, 3])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values[:, :3] = np.log(values[:, :3])
+    values[~usable] = np.nan
+    systematic = np.array([SYSTEMATIC] * 3 + [SYSTEMATIC_THERMAL])
+    rows: list[tuple[int, int]] = []
+    seen, weight = [], []
+    number = photographs.numbers
+    (sure,) = np.nonzero(np.isfinite(depths.depth))
+    for a in range(count):
+        own = sure[number[sure] == a]
+        own = own[:: max(1, len(own) // MOST_PIXELS)]
+        if not len(own):
+            continue
+        origins, along = photographs.of_pixels(own)
+        points = origins + depths.depth[own, None] * along
+        for b in range(count):
+            if a == b:
+                continue
+            pixel, far, inside = _pixels(photographs, b, points)
+            with np.errstate(invalid="ignore"):
+                same = np.abs(depths.depth[pixel] - far) <= TOLERANCE * (depths.error[pixel] + depths.error[own])
+            met = inside & same
+            if met.sum() < FEWEST_PAIRS:
+                continue
+            off = values[own[met]] - values[pixel[met]]
+            told = np.isfinite(off).sum(0)
+            off[:, told < FEWEST_PAIRS] = 0.0
+            middle = np.nanmedian(off, axis=0)
+            spread = 1.48 * np.nanmedian(np.abs(off - middle), axis=0)  # of a normal distribution
+            # A median's variance is pi / 2 times that of a mean.
+            variance = 0.5 * np.pi * spread**2 / np.maximum(told, 1) + systematic**2
+            rows.append((a, b))
+            seen.append(middle)
+            weight.append(np.where(told >= FEWEST_PAIRS, 1.0 / variance, 0.0))
+    solved, error = np.zeros((count, 4)), np.full((count, 4), FREE)
+    if rows:
+        pairs, off, weights = np.array(rows), np.array(seen), np.array(weight)
+        for channel in range(4):
+            solved[:, channel], error[:, channel] = _solve(pairs, off[:, channel], weights[:, channel], count)
+    return Differences(solved[:, :3], error[:, :3], solved[:, 3], error[:, 3])
+
+
+def _pixels(
+    photographs: Photographs, number: int, points: FloatArray
+) -> tuple[npt.NDArray[np.int64], FloatArray, npt.NDArray[np.bool_]]:
+    """Pixels of a photograph that show points (n, 3), their depths, and whether they lie in the picture."""
+    matrix, (width, height) = photographs.matrices[number], photographs.sizes[number]
+    seen = points @ matrix[:, :3].T + matrix[:, 3]
+    far = seen[:, 2]
+    place = np.floor(seen[:, :2] / np.where(far > 0.0, far, np.inf)[:, None]).astype(np.int64)
+    inside = (far > 0.0) & ((place >= 0) & (place < (width, height))).all(1)
+    place = np.where(inside[:, None], place, 0)
+    return photographs.firsts[number] + place[:, 1] * width + place[:, 0], far, inside
+
+
+def _solve(
+    pairs: npt.NDArray[np.int64], off: FloatArray, weights: FloatArray, count: int
+) -> tuple[FloatArray, FloatArray]:
+    """Values x of photographs from differences x_a - x_b, robustly, and their standard errors.
+
+    Of the photographs that pairs link to each other; their mean is 0. Those of smaller groups have 0 and `FREE`.
+    """
+    from scipy.sparse import coo_matrix  # slow to import and only needed here
+    from scipy.sparse.csgraph import connected_components
+
+    values, errors, told = np.zeros(count), np.full(count, FREE), weights > 0.0
+    pairs, off, weights = pairs[told], off[told], weights[told]
+    if not len(pairs):
+        return values, errors
+    links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    group = np.asarray(connected_components(links, directed=False)[1])
+    linked = group == np.bincount(group).argmax()
+    inside = linked[pairs[:, 0]]
+    pairs, off, weights = (np.cumsum(linked) - 1)[pairs[inside]], off[inside], weights[inside]
+    number, use, left = int(linked.sum()), weights, off
+    matrix = np.zeros((number, number))
+    for _ in range(_ROUNDS):
+        matrix = np.full((number, number), weights.mean())  # holds the mean at 0 and changes nothing else
+        for sign, first, second in ((1, 0, 0), (1, 1, 1), (-1, 0, 1), (-1, 1, 0)):
+            np.add.at(matrix, (pairs[:, first], pairs[:, second]), sign * use)
+        right = np.bincount(pairs[:, 0], use * off, number) - np.bincount(pairs[:, 1], use * off, number)
+        solved = np.linalg.solve(matrix, right)
+        values[linked] = solved - solved.mean()
+        left = (off - solved[pairs[:, 0]] + solved[pairs[:, 1]]) * np.sqrt(weights)
+        use = weights * np.minimum(1.0, _HUBER / np.maximum(np.abs(left), 1e-12))
+    centred = np.eye(number) - 1.0 / number
+    variance = np.diag(centred @ np.linalg.inv(matrix) @ centred)
+    scale = max(1.0, float(np.sqrt(np.mean(np.minimum(np.abs(left), _HUBER) ** 2)))) * np.sqrt(2.0)
+    errors[linked] = scale * np.sqrt(np.maximum(variance, 0.0))  # each pair is seen twice, hence the 2
+    return values, errors
