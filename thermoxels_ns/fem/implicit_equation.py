@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +42,9 @@ _LEVEL = 1e-9  # Differences below this share of the absolute temperature let no
 _UNEXPLAINED = 1e-11  # Largest share of the stored heat that may be unaccounted for where nodes are fixed
 _EPS = float(np.finfo(np.float64).eps)
 ROUND_OFF = 8.0 * _EPS  # Round-off of a sum as a share of the sum of sizes
+
+
+_Correction: TypeAlias = "Callable[[Residual], tuple[Vector, LinearSolution]]"
 
 
 @dataclass(frozen=True)
@@ -145,7 +149,8 @@ class ImplicitEquation:
             spent, status = found.linear_iterations, found.status
             if not found.converged:
                 return balance.solution(_Outcome(found.u, None, np.inf, spent, False, status), found.iterations)
-            outcome = self._refined(balance, found.u, lambda rest: balance.correction(found.u, rest), spent, status)
+            linearised: _Correction = lambda rest: balance.correction(found.u, rest)  # noqa: E731
+            outcome = self._refined(balance, found.u, found.residual, linearised, spent, status)
             return balance.solution(outcome, found.iterations)
         change, linear = self.correction(self._own_solver, self.held_w_k, first)
         uncertain_w = self._uncertain_w(first, change, linear)
@@ -154,10 +159,9 @@ class ImplicitEquation:
         if np.isfinite(uncertain_w):
             return balance.solution(_Outcome(change, None, uncertain_w, linear.iterations, True, linear.status), 0)
 
-        def correction(rest: Residual) -> tuple[Vector, LinearSolution]:
-            return self.correction(self._own_solver, self.held_w_k, rest)
-
-        return balance.solution(self._refined(balance, change, correction, linear.iterations, linear.status), 0)
+        again: _Correction = lambda rest: self.correction(self._own_solver, self.held_w_k, rest)  # noqa: E731
+        rest, spent = balance.residual(change), linear.iterations
+        return balance.solution(self._refined(balance, change, rest, again, spent, linear.status), 0)
 
     def _uncertain_w(self, first: Residual, change: Vector, linear: LinearSolution) -> float:
         """Bound of what a step without fixed nodes leaves unbalanced, [W]; inf if that is worth to be looked at."""
@@ -174,7 +178,8 @@ class ImplicitEquation:
         self,
         balance: _Balance,
         u: Vector,
-        correction: Callable[[Residual], tuple[Vector, LinearSolution]],
+        rest: Residual,
+        correction: _Correction,
         iterations: int,
         status: str,
     ) -> _Outcome:
@@ -183,7 +188,7 @@ class ImplicitEquation:
         Temperatures are sums of two numbers meanwhile (iterative refinement with a residual of higher precision:
         Higham, Accuracy and Stability of Numerical Algorithms, chapter 12).
         """
-        rest, count = balance.residual(u), 0
+        count = 0
         if rest.uncertain_w <= self._share * rest.flows_w and not self._is_unexplained(rest):
             return _Outcome(u, None, rest.uncertain_w, iterations, True, status)
         now = exact_sum(balance.base_k, self.everywhere(u))

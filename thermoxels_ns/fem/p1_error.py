@@ -35,7 +35,7 @@ def p1_error(system: HeatSystem, solution: SteadySolution, time_s: float) -> Err
     with radiation's slope in h. The flows of T + b + c less those of T are the errors of flows. Where temperatures are
     singular b is not all that is missed, only what half the mesh size would find, 1 - 0.3 of it (Richardson).
 
-    Where sources act the error is at least s h^2 / (16 k), half of what a source curves the temperature in a tetrahedron
+    Where sources act the error is at least s h^2 / (16 k), half of what a source bends the temperature in a tetrahedron
     of the extent h along its gradient; what leaves at once through the surface beside it is not in s.
 
     Effects that change are taken at `time_s`. None where the estimates are no numbers.
