@@ -21,6 +21,8 @@ from thermoxels_ns.heat.materials import Material
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 CASES = {"steady P1": 200, "steady P2": 150, "in time": 150}
+ANSWERED = {"steady P1": 194, "steady P2": 135, "in time": 150}
+"""How many of them are answered; in the others the solver says that it cannot. Of all, 205 are ordinary."""
 HOSTILE = ("flat", "contrast", "size", "convection", "temperatures", "turned", "start")
 SCHEMES = (BACKWARD_EULER, CRANK_NICOLSON, theta_scheme(0.75), SDIRK2, None)
 """None: steps as long as a tolerance allows."""
@@ -255,5 +257,6 @@ def test_no_answer_lies(kind) -> None:
     count = Counter(outcome.verdict for outcome in outcomes)
     lies = [f"{n}: {o.hostile} {o.told}" for n, o in enumerate(outcomes) if o.verdict == "lied"]
     assert not lies, f"{count}:\n" + "\n".join(lies)
-    # No lazy refusal: ordinary cases are all answered, and most hostile ones.
+    # No lazy refusal: ordinary cases are all answered, most hostile ones too; at the edge digits decide.
     assert all(outcome.verdict == "right" for outcome in outcomes if not outcome.hostile)
+    assert abs(count["right"] - ANSWERED[kind]) <= 3, count

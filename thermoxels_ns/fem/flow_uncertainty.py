@@ -90,6 +90,7 @@ class TimeUncertainty:
     rounded_j: list[float] = field(default_factory=list)  # Lost when temperatures were rounded, [J]
     exchanged_j: list[float] = field(default_factory=list)  # Exchanged with the surroundings, [J]
     lengths_s: list[float] = field(default_factory=list)  # Length, [s]
+    assembly: float = 0.0  # Share of conduction that round-off changes
 
     def add(
         self, system: HeatSystem, relative_k: Vector, uncertain_w: float, exchanged_j: float, step_s: float
@@ -104,9 +105,13 @@ class TimeUncertainty:
         self.lengths_s.append(step_s)
 
     def heat_j(self, system: HeatSystem, end_k: Vector) -> Vector:
-        """Heat that may be wrong up to the end of each step, shape (s,), [J]; last temperatures, shape (n,), [K]."""
+        """Heat that may be wrong up to the end of each step, shape (s,), [J]; last temperatures, shape (n,), [K].
+
+        What round-off in the entries of K and in volumes does to temperatures is kept for `temperature_k`.
+        """
         lengths_s, inside_k = np.array(self.lengths_s), float(np.ptp(end_k))
-        wrong, _, thin = _assembly_energy(system, end_k)
+        wrong, energy, thin = _assembly_energy(system, end_k)
+        self.assembly = _ASSEMBLY * (thin + (wrong / energy if energy > 0.0 else 0.0))
         assembly_w = _ASSEMBLY * wrong / inside_k if inside_k > 0.0 else 0.0
         lost_j = np.cumsum((np.array(self.heat_w) + assembly_w) * lengths_s + np.array(self.rounded_j))
         return _SAFETY * lost_j + _ASSEMBLY * thin * np.cumsum(self.exchanged_j)
@@ -123,7 +128,7 @@ class TimeUncertainty:
             per_watt = np.minimum(per_watt, lengths_s / float(pieces.sums(mass).min()) + inside)
             if not system.matrix_in_time:
                 per_watt = np.minimum(per_watt, float(np.max(_path_resistance(system, 0.0))))
-        rounded_k += 4.0 * _EPS * (highest_k + 2.0 * abs(system.reference_c))
+        rounded_k += 4.0 * _EPS * (highest_k + 2.0 * abs(system.reference_c)) + self.assembly * highest_k
         return rounded_k + _SAFETY * float(np.sum(heat_w * per_watt))
 
 

@@ -286,8 +286,10 @@ class HeatBalance:
     def refusal(self) -> str:
         """Say that heat flows are too uncertain, or nothing; where next to no heat was exchanged, that is no matter."""
         end_k, exchanged_j = self._states[self._done], float(self._exchanged_j.sum())
-        if self._system.groups:
+        if self._steps:
             self._uncertain_j = self._uncertain.heat_j(self._system, end_k)
+        if not self._system.groups:
+            return ""
         if self._uncertain_j[-1] <= MOST_UNCERTAIN * exchanged_j:
             return ""
         # Heat may come in and leave through one patch.
