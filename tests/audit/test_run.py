@@ -7,6 +7,7 @@ import pytest
 
 from tests.support.audited_wall import (
     CONDUCTIVITY,
+    INSIDE,
     LENGTH_M,
     R_INSIDE,
     SLAB_M,
@@ -20,6 +21,8 @@ from tests.support.audited_wall import (
     true_draws,
 )
 from thermoxels_ns.audit.conditions import Camera, Film, Limits, Reference, Surface, Surroundings, Year
+from thermoxels_ns.audit.draws import Interval
+from thermoxels_ns.audit.heat_flow import radiation_w_m2
 from thermoxels_ns.audit.results import Audit
 from thermoxels_ns.audit.run import audit
 from thermoxels_ns.core.errors import AuditError
@@ -272,6 +275,45 @@ def test_a_contact_temperature_takes_the_place_of_the_offset(walls) -> None:
     far = replace(STATED, references=(Reference((2.0, -5.0, 1.0), Measured(1.0)),))
     with pytest.raises(AuditError, match=r"references entry 1: at: expected a point within 0\.5 m of surface"):
         audit(mesh, far, UP)
+
+
+def room(seed: int | None) -> tuple[Audit, dict[str, tuple[float, Interval]]]:
+    """An audit of the room, and its findings beside the truth: loss, psi on inner dimensions, temperature factor."""
+    draws = true_draws(INSIDE, seed)
+    value = {name: float(values[0]) for name, values in draws.values.items()}
+    truth, plain = (
+        solve_wall(audited_wall(slab=slab, window=False, side="inside"), INSIDE, draws) for slab in (True, False)
+    )
+    found = audit(photographed(truth, INSIDE, seed), INSIDE, UP)
+    difference = value["inside air"] - value["outside air"]
+    mesh = truth.mesh
+    surface_c = mesh.temperature_c[mesh.facets[found.found[0].spot]].mean()
+    flow = value["film factor"] * 2.5 * (value["inside air"] - surface_c)
+    flow += radiation_w_m2(
+        value["emissivity of *, entry 1"], value["reflected temperature"] + 273.15, surface_c + 273.15
+    )
+    to_outside = (surface_c - value["outside air"]) / flow
+    bridge = found.defects[0]
+    return found, {
+        "loss": (truth.loss_w, found.whole.loss_w),
+        "psi": ((truth.loss_w - plain.loss_w) / LENGTH_M / difference, bridge.coefficient),
+        "f_Rsi": (to_outside / (to_outside + 0.25), bridge.f_rsi[1]),
+    }
+
+
+def test_a_room_with_a_slab_through_its_wall() -> None:
+    found, findings = room(None)
+    (bridge,) = found.defects
+    assert (bridge.kind, bridge.patch) == ("line", "room") and abs(bridge.height_m - 1.5) < 0.1
+    for true, interval in findings.values():
+        assert interval.value == pytest.approx(true, rel=0.05)
+
+
+def test_intervals_hold_the_truth_in_a_room() -> None:
+    """Of ten draws at least seven: fewer have a chance of 1.3 % where each holds with 90 %."""
+    findings = [room(seed)[1] for seed in range(10)]
+    for name in findings[0]:
+        assert sum(one[name][1].low <= one[name][0] <= one[name][1].high for one in findings) >= 7, name
 
 
 def test_the_budget_names_what_matters_most(balcony) -> None:

@@ -12,6 +12,7 @@ from thermoxels_ns.audit.conditions import (
     Film,
     InsideAir,
     OutsideAir,
+    Side,
     SkyModel,
     Surface,
     Surroundings,
@@ -47,9 +48,20 @@ STATED = Conditions(
     surfaces=(Surface(Measured(0.93, 0.02)),),
 )
 
+INSIDE = replace(
+    STATED,
+    side="inside",
+    surroundings=Surroundings(reflected=Measured(19.6, 0.3)),
+    film=Film("iso-6946", Measured(1.0, 0.2)),
+    camera=Camera(offset=Measured(0.0, 0.5), repeatability=Measured(0.0, 0.2)),
+)
 
-def audited_wall(step: float = 0.1, slab: bool = True, window: bool = True) -> TetMesh:
-    """The mesh: outside at y = 0, the room at y = 0.3 m, the slab reaches out to y = -0.6 m; all else is cut."""
+
+def audited_wall(step: float = 0.1, slab: bool = True, window: bool = True, side: Side = "outside") -> TetMesh:
+    """The mesh: outside at y = 0, the room at y = 0.3 m, the slab reaches out to y = -0.6 m; all else is cut.
+
+    `side` is what was photographed: facade and window, or the room.
+    """
     low, high = SLAB_M
     (left, right), (bottom, top) = WINDOW_M
     x = planes(0.0, left, right, LENGTH_M, step=step)
@@ -87,7 +99,8 @@ def audited_wall(step: float = 0.1, slab: bool = True, window: bool = True) -> T
     assert mesh.boundary is not None
     names, patch = mesh.boundary.patch_names, mesh.boundary.patch
     tags = np.where(patch == names.index("cut"), FACET_BOX, 0)
-    seen = np.isin(patch, [names.index(name) for name in ("facade", "window") if name in names])
+    shown = ("room",) if side == "inside" else ("facade", "window")
+    seen = np.isin(patch, [names.index(name) for name in shown if name in names])
     return replace(mesh, facet_tags=tags, boundary=replace(mesh.boundary, seen=seen))
 
 
@@ -96,7 +109,7 @@ class Truth:
     """What is so: the state of the wall, and what audits are to find."""
 
     mesh: TetMesh  # With true temperatures
-    loss_w: float  # Through facade and window
+    loss_w: float  # Through what was photographed
     u_w_m2k: dict[str, float]  # By patch
     draws: Draws  # The true value of each quantity, one draw
 
@@ -110,27 +123,30 @@ def true_draws(conditions: Conditions, seed: int | None) -> Draws:
 
 
 def solve_wall(mesh: TetMesh, conditions: Conditions, draws: Draws) -> Truth:
-    """Let heat flow through the wall under the true conditions (film model iso-6946)."""
+    """Let heat flow through the wall under the true conditions, by iso-6946 on the side that was photographed."""
     value = {name: float(values[0]) for name, values in draws.values.items()}
     patches = tuple(name for name in ("facade", "window") if name in mesh.boundary.patch_names)
-    coefficient = value["film factor"] * (4.0 + 4.0 * value["wind"])
 
     def around_c(places, _):
         return kelvin_to_celsius(radiant_k4(conditions, draws, places.normals, UP)[:, 0] ** 0.25)
 
+    inside = conditions.side == "inside"
+    coefficient = value["film factor"] * (2.5 if inside else 4.0 + 4.0 * value["wind"])
+    seen = ("room",) if inside else patches
     effects = (
-        Convection(("room",), 1.0 / R_INSIDE, value["inside air"]),
-        Convection(patches, coefficient, value["outside air"]),
-        Radiation(patches, value[emissivity_name(conditions, 0)], Varying(around_c, in_time=False)),
+        Convection(("room",), coefficient if inside else 1.0 / R_INSIDE, value["inside air"]),
+        Convection(patches, 25.0 if inside else coefficient, value["outside air"]),
+        Radiation(seen, value[emissivity_name(conditions, 0)], Varying(around_c, in_time=False)),
     )
     materials = {name: Material(name, k, 1000.0, 1000.0) for name, k in CONDUCTIVITY.items()}
     problem = HeatProblem(mesh, {n: materials[n] for n in mesh.region_names}, effects=effects, up=UP)
     solution = solve_steady(problem)
     results = heat_results(problem, solution)
-    flow = {one.patch: -one.heat_w for one in results.patches if one.patch in patches}
+    outwards = 1.0 if inside else -1.0
+    flow = {one.patch: outwards * one.heat_w for one in results.patches if one.patch in seen}
     area = {one.patch: one.area_m2 for one in results.patches}
     difference = value["inside air"] - value["outside air"]
-    u = {name: flow[name] / area[name] / difference for name in patches}
+    u = {name: flow[name] / area[name] / difference for name in seen}
     return Truth(replace(mesh, temperature_c=solution.temperature_c), sum(flow.values()), u, draws)
 
 
