@@ -71,7 +71,7 @@ def find_defects(surface: AuditedSurface, surface_c: FloatArray, warm: bool, lea
         least_k: Smallest departure that counts, [K].
 
     Returns:
-        Those with the largest departure times area first.
+        Defects, in the order of their first triangle.
     """
     sure = surface.counted & ~surface.rim
     sign = 1.0 if warm else -1.0
@@ -90,8 +90,7 @@ def find_defects(surface: AuditedSurface, surface_c: FloatArray, warm: bool, lea
         calm[on_patch] = (np.abs(parts) < 1.0).all(axis=0)
     cores = _cores(surface, share)
     zones = _Zones(surface, sure, ~calm, cores)
-    defects = [zones.around(core, away) for core in cores]
-    return sorted(defects, key=lambda one: -float(surface.area_m2[one.core] @ away[one.core]))
+    return [zones.around(core, away) for core in cores]
 
 
 def background_c(points_m: FloatArray, surface_c: FloatArray, area_m2: FloatArray) -> FloatArray:

@@ -85,7 +85,7 @@ class Audit:
     patches: tuple[Element, ...]
     storeys: tuple[Element, ...]
     whole: Element
-    defects: tuple[Defect, ...]
+    defects: tuple[Defect, ...]  # Those with the most extra heat flow first, those that do not count last
     found: tuple[FoundDefect, ...]  # The triangles of each defect
     limits: tuple[Limit, ...]
     year: YearResult | None

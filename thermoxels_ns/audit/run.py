@@ -81,6 +81,8 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
         defects.append(
             describe_defect(surface, conditions, one, figures, first + 3 * number, where, whole.loss_w.value)
         )
+    order = sorted(range(len(found)), key=lambda n: (bool(defects[n].not_counted), -defects[n].extra_w.value))
+    found, defects = [found[n] for n in order], [defects[n] for n in order]
     last, check = len(parts) - 1, check_survey(conditions)
     f_rsi = PartFigures(totals, slope, work.draws.local(repeatability, last)).factors(last, side)
     left = {why: float(surface.area_m2[surface.why_not == n].sum()) for n, why in enumerate(WHY_NOT.values())}

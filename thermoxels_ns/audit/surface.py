@@ -18,10 +18,10 @@ _STEP_K, _STEP_COSINE = 0.05, 0.05
 """Widths of the bins of readings, [K], and of normals, within which triangles are alike."""
 
 WHY_NOT = {
-    "cut": "where the scene box cuts the body",
-    "unseen": "seen by no photograph",
-    "no reading": "no thermal ray, or not on all of the triangle",
-    "left out": "left out by the conditions",
+    "cut": "that the scene box cuts",
+    "unseen": "that no photograph shows",
+    "no reading": "that no thermal ray measured, or not on all of a triangle",
+    "left out": "that the conditions leave out",
 }
 """Why a triangle does not count."""
 
@@ -111,7 +111,7 @@ def audited_surface(mesh: TetMesh, conditions: Conditions, up: tuple[float, floa
     why_not = np.select([cut, unseen, no_reading, left_out[patch]], [0, 1, 2, 3], default=-1)
     counted = why_not < 0
     if not counted.any():
-        counts = ", ".join(f"{np.count_nonzero(why_not == n)} {why}" for n, why in enumerate(WHY_NOT.values()))
+        counts = "; ".join(f"{np.count_nonzero(why_not == n)} {why}" for n, why in enumerate(WHY_NOT.values()))
         remedy = "Export again, of a training with thermal images that show the surface."
         raise AuditError("mesh", expected="boundary triangles with a reading", got=f"none: {counts}", remedy=remedy)
     bare = sorted({names[number] for number in np.unique(patch[counted]) if entry_of_patch[number] < 0})

@@ -11,7 +11,7 @@ from thermoxels_ns.audit.defect_figures import F_RSI_M2K_W, MODERATE_SHARE, SEVE
 from thermoxels_ns.audit.draws import CONFIDENCE
 from thermoxels_ns.audit.results import Audit, Defect, Element, Limit
 from thermoxels_ns.core.measured import Measured
-from thermoxels_ns.reports.audit_pictures import AuditPictures
+from thermoxels_ns.reports.audit_pictures import MOST_DEFECTS, AuditPictures
 from thermoxels_ns.reports.heat_numbers import coordinate, unit_signs
 from thermoxels_ns.reports.interval_text import area_text, interval_lines, interval_text, number_text
 from thermoxels_ns.reports.page import Gallery, Page, Picture, Section, Table
@@ -74,11 +74,12 @@ def audit_page(
         sections=(*_overview(audit, pictures), _envelope(audit)),
         defects=tuple(
             _card(audit, number, defect, pictures, photographs.get(number - 1, ()))
-            for number, defect in enumerate(audit.defects, start=1)
+            for number, defect in enumerate(audit.defects[:MOST_DEFECTS], start=1)
             if not defect.not_counted
         ),
         defects_note=_defects_note(audit),
         after_defects=(
+            *_further(audit),
             *_not_believed(audit),
             _conditions(conditions),
             _survey(audit),
@@ -241,6 +242,18 @@ def _defects_note(audit: Audit) -> str:
         "all. These classes are ours, of no standard. Extra heat loss is what is lost beyond the undisturbed surface "
         "near by, on outer dimensions; bridges nearer than 0.3 m to each other count as one."
     )
+
+
+def _further(audit: Audit) -> list[Section]:
+    """Defects beyond those that have a card."""
+    rows = []
+    for number, one in enumerate(audit.defects, start=1):
+        if number > MOST_DEFECTS and not one.not_counted:
+            place = f"{one.patch}\nat ({', '.join(map(coordinate, one.centre_m))}) m"
+            size = f"{one.length_m:.2f} m" if one.kind == "line" else f"{area_text(one.area_m2)} m²"
+            rows.append((str(number), _KINDS[one.kind], place, size, interval_lines(one.extra_w)))
+    table = Table(("No.", "what", "where", "size", "extra heat loss W"), tuple(rows), figures_from=3)
+    return [Section("Smaller ones", tables=(table,))] if rows else []
 
 
 def _not_believed(audit: Audit) -> list[Section]:
