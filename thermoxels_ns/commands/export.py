@@ -46,6 +46,8 @@ class TrainedScene:
     """The training photographs, a `ThermalDataset`."""
     tracks: FeatureRays | None
     """Lines from photographs to points that they see, in the trained scene; None: it has no tracks."""
+    corrections: dict[str, Any]
+    """What training corrected in its photographs, see `ThermoxelsPipeline.corrections`."""
 
 
 @dataclass(kw_only=True)
@@ -107,6 +109,7 @@ class ExportThermoxelsMesh(ExportOptions):
             scene_json(scene.scene_folder),
             read_photographs(scene.dataset, most=MOST_PHOTOGRAPHS, longest_side=LONGEST_SIDE),
             scene.tracks,
+            scene.corrections,
         )
 
 
@@ -163,6 +166,7 @@ def load_trained_scene(load_config: Path, check_scene: Callable[[Path], object] 
         Path(pipeline_of_ours.datamanager.get_datapath()),
         pipeline_of_ours.datamanager.train_dataset,
         outputs.metadata["feature_rays"],
+        pipeline_of_ours.corrections(),
     )
 
 

@@ -67,6 +67,7 @@ def export_snapshot(
     scene_file: Mapping[str, Any] | None = None,
     photographs: Photographs | None = None,
     tracks: FeatureRays | None = None,
+    corrections: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Write the mesh in the formats asked for, quality.json, summary.json, and as asked pictures and the heat series.
 
@@ -78,6 +79,7 @@ def export_snapshot(
     unless the scene's json has one. If the scale is known, `compare` compares solid voxels and mesh in metres (last:
     metres per unit) with a known truth; its `ThermoxelsError` goes into the summary. All other errors are raised.
     `photographs` and `tracks`, lines from them to points that they see, say which boundary triangles are supported.
+    `corrections` are what training corrected in photographs; they go into the summary.
     """
     from thermoxels_ns.commands.export_summary import HEAT_SKIPPED, heat_summary, mesh_summary, versions
     from thermoxels_ns.fem.solution import HeatSolution
@@ -144,6 +146,7 @@ def export_snapshot(
         "up_source": up_source,
         "mesh": mesh_summary(built, report, checked.selection, scale, voxel_size),
         "heat": skipped if solution is None else heat_summary(material, time, solution),
+        "corrections": dict(corrections or {}),
         **({} if truth is None else {"truth": truth}),
         "files": [*files, _SUMMARY],
     }

@@ -125,6 +125,7 @@ class _Scene:
     world: _World
     box: SceneBox
     feature_rays: FeatureRays | None  # what the training photographs see of the tracks; nerfstudio's world
+    adjusted: bool  # whether the poses of training photographs are others than the json's
     fitted: dict[int, npt.NDArray[np.float64]]
     """Poses (4, 4) that held-out photographs themselves say, in input coordinates, by number of the frame."""
 
@@ -136,7 +137,8 @@ class ThermalDataParser(DataParser):
     (`Cameras` of the split, or None where a pair shares camera and resolution), ``thermal_unit``, ``valid_range_c``,
     ``thermal_dead_pixels`` (a mask per resolution), ``image_scale`` (1 / downscale_factor), ``scene_name`` and, for
     train, ``feature_rays`` (`FeatureRays`, or None where the scene has no tracks). ``fitted_poses`` (n, 3, 4) say where
-    held-out photographs themselves say that they were taken, None where nobody's pose was adjusted.
+    held-out photographs themselves say that they were taken, and ``adjusted_poses`` (camera to world in input
+    coordinates, by the photograph's name) those of training, both None where no pose was adjusted.
     """
 
     config: ThermalDataParserConfig
@@ -181,6 +183,9 @@ class ThermalDataParser(DataParser):
                 "scene_name": scene.file.folder.resolve().name,
                 "feature_rays": scene.feature_rays if split == "train" else None,
                 "fitted_poses": self._fitted_poses(scene, chosen),
+                "adjusted_poses": {f.image.name: f.pose for f in frames}
+                if scene.adjusted and split == "train"
+                else None,
             },
         )
 
@@ -211,9 +216,9 @@ class ThermalDataParser(DataParser):
         names = [frame.name for frame in file.frames]
         every = config.eval_interval, config.eval_offset
         split = split_frames(names, file.meta, config.eval_mode, *every, file.left_out)
-        rays, fitted = find_feature_rays(file, split.train, config.tracks), {}
+        rays, given, fitted = find_feature_rays(file, split.train, config.tracks), file, {}
         if rays is None and config.refine_poses == "auto":
-            file, fitted = refine_poses(file, split.train, CONSOLE.print)
+            file, fitted = refine_poses(given, split.train, CONSOLE.print)
         evidence = find_scene_box(file, config.scene_box, split.train)
         world, box = self._place(file, evidence)
         paths, training = [f.thermal for f in file.frames], {file.frames[index].thermal for index in split.train}
@@ -233,7 +238,7 @@ class ThermalDataParser(DataParser):
             CONSOLE.print(f"Left out, no pair: {', '.join(file.left_out)}", style="bold yellow")
         if rays is not None:
             rays = rays.moved(world.rotation, world.translation, world.scale)
-        return _Scene(file, split, survey, world, box, rays, fitted)
+        return _Scene(file, split, survey, world, box, rays, file is not given, fitted)
 
     def _oriented(self, poses: npt.NDArray[np.float64]) -> torch.Tensor:
         """nerfstudio's choice of rotation and shift for these poses (n, 4, 4), shape (3, 4) float32."""

@@ -310,13 +310,19 @@ class ThermoxelsModel(Model):
         gains_on, offsets_on = self.corrected.tolist()
         if self.log_gain is not None and gains_on and rgb is not None:
             assert ray_bundle.camera_indices is not None
-            gain = torch.exp(self.log_gain - self.log_gain.mean(0))
+            log_gain = self._refined(self.log_gain, self.config.exposure)
+            gain = torch.exp(log_gain - log_gain.mean(0))
             rgb = (rgb * gain.index_select(0, ray_bundle.camera_indices[:, 0])).clamp(max=1.0)
         if self.thermal_offset is not None and offsets_on:
             assert ray_bundle.camera_indices is not None
-            offset = self.thermal_offset - self.thermal_offset.mean()
+            offset = self._refined(self.thermal_offset, self.config.per_image_offset)
+            offset = offset - offset.mean()
             thermal = thermal + offset.index_select(0, ray_bundle.camera_indices[:, 0])[:, None]
         return batch | {"rgb": rgb, "thermal": thermal, "accumulation": seen.accumulation[:, None], "render": seen}
+
+    def _refined(self, correction: Tensor, wanted: str) -> Tensor:
+        """What was found in photographs stays until surfaces stand, which would pull at it before; then it learns."""
+        return correction.detach() if wanted == "auto" and self.step < self.config.distortion_ramp[1] else correction
 
     def _image_outputs(self, request: RayRequest) -> dict[str, Tensor]:
         rgb, thermal, seen = self.render_rays(request, self._options())

@@ -183,6 +183,26 @@ class ThermoxelsPipeline(VanillaPipeline):
                 averages[name] = average
         return averages
 
+    def corrections(self) -> dict[str, Any]:
+        """What the training corrected in its photographs, by their names; a part that was not called for is absent.
+
+        ``poses``: camera to world in input coordinates; ``gains``: of red, green and blue; ``thermal_offsets_c``: how
+        much too warm the thermal image reads, [K]. The geometric mean of gains is 1, the mean of offsets 0.
+        """
+        datamanager: Any = self.datamanager
+        metadata, model, found = datamanager.train_dataparser_outputs.metadata, self.model, {}
+        names = [path.name for path in datamanager.train_dataparser_outputs.image_filenames]
+        if metadata.get("adjusted_poses") is not None:
+            found["poses"] = {name: pose.tolist() for name, pose in metadata["adjusted_poses"].items()}
+        gains_on, offsets_on = model.corrected.tolist()
+        if gains_on and model.log_gain is not None:
+            gains = torch.exp(model.log_gain - model.log_gain.mean(0)).tolist()
+            found["gains"] = dict(zip(names, gains))
+        if offsets_on and model.thermal_offset is not None:
+            offsets = (model.thermal_offset - model.thermal_offset.mean()) * model.temperature_range.span_k
+            found["thermal_offsets_c"] = dict(zip(names, offsets.tolist()))
+        return found
+
     def grid_snapshot(self, rays_per_image: int = 20_000) -> GridSnapshot:
         """The trained field for the mesher, with what training rays of both streams say about it, and the cameras."""
         datamanager: Any = self.datamanager
