@@ -368,7 +368,9 @@ def stand_in_run(monkeypatch, ball: GridSnapshot, fail: Exception | None = None)
     datamanager = SimpleNamespace(
         train_dataparser_outputs=outputs, get_datapath=lambda: Path("no-scene"), train_dataset=dataset
     )
-    pipeline = SimpleNamespace(datamanager=datamanager, grid_snapshot=lambda: ball)
+    pipeline = SimpleNamespace(
+        datamanager=datamanager, grid_snapshot=lambda: ball, corrections=lambda: {"gains": {"1.jpg": [1.0, 1.0, 1.0]}}
+    )
 
     def eval_setup(*_, **__):
         if fail is not None:
