@@ -24,7 +24,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 DEFAULT = ("thermoxels_ns/fem/*.py", "thermoxels_ns/heat/*.py", "thermoxels_ns/render/kernels*.py")
-PLACES = ("fem", "heat", "render", "reference", "verification")  # Folders of tests that are looked through
+PLACES = ("audit", "fem", "heat", "render", "reference", "verification")  # Folders of tests that are looked through
 COPIED = ("thermoxels_ns", "tests", "configs", "docs", "pyproject.toml", "README.md")
 OPERATORS: dict[type, type] = {
     **{ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult},

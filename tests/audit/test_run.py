@@ -252,6 +252,41 @@ def test_a_room_seen_from_within(walls) -> None:
     assert [one.verdict for one in found.limits] == ["met"]
 
 
+def test_a_coefficient_of_ones_own_takes_the_place_of_the_wind(walls) -> None:
+    mesh = photographed(walls["window"], STATED)
+    own = replace(STATED, film=Film("given", Measured(1.0, 0.2), Measured(4.0 + 4.0 * 1.0)))
+    by_wind = replace(STATED, outside=replace(STATED.outside, wind=Measured(1.0)))
+    found, expected = (audit(mesh, one, UP).whole.loss_w for one in (own, by_wind))
+    assert found.value == pytest.approx(expected.value, rel=1e-12)
+
+
+@pytest.mark.parametrize("model", ["dallo", "albatici-tonelli", "iso-6946-combined"])
+def test_every_film_model_may_be_chosen(walls, model) -> None:
+    mesh = photographed(walls["plain"], STATED)
+    chosen = audit(mesh, replace(STATED, film=Film(model, Measured(1.0, 0.2))), UP).whole
+    assert chosen.u_w_m2k.value == pytest.approx(audit(mesh, STATED, UP).whole.u_by_model[model], rel=1e-12)
+    assert chosen.u_w_m2k.value == pytest.approx(chosen.u_by_model[model], rel=1e-12)
+
+
+def test_what_the_camera_was_set_to_is_undone(walls) -> None:
+    """Readings that were taken with an emissivity of 0.95 and 12 C around, instead of 1."""
+    mesh = photographed(walls["plain"], STATED)
+    kelvin = mesh.temperature_c + 273.15
+    told = ((kelvin**4 - 0.05 * 285.15**4) / 0.95) ** 0.25 - 273.15
+    camera = replace(STATED.camera, emissivity=Measured(0.95), reflected=Measured(12.0))
+    set_so = audit(replace(mesh, temperature_c=told), replace(STATED, camera=camera), UP).whole
+    assert set_so.loss_w.value == pytest.approx(walls["plain"].loss_w, rel=1e-6)
+
+
+def test_emissivities_hold_for_their_patches(walls) -> None:
+    """The last entry that names a patch; what is stated of one changes nothing of another."""
+    mesh = photographed(walls["window"], STATED)
+    mixed = replace(STATED, surfaces=(*STATED.surfaces, Surface(Measured(0.80), ("window",))))
+    before, after = ({one.name: one for one in audit(mesh, c, UP).patches} for c in (STATED, mixed))
+    assert after["facade"].u_w_m2k.value == before["facade"].u_w_m2k.value
+    assert after["window"].surface_c.value > before["window"].surface_c.value + 0.1
+
+
 def test_a_contact_temperature_takes_the_place_of_the_offset(walls) -> None:
     """A camera that is 0.9 K off and a thermometer that is right to 0.1 K."""
     truth = walls["plain"]

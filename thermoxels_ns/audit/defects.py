@@ -172,17 +172,21 @@ class _Zones:
     """What lies around cores."""
 
     def __init__(self, surface: AuditedSurface, sure: BoolArray, departs: BoolArray, cores: list[IntArray]) -> None:
-        self.surface, self.sure, self.departs, self.cores = surface, sure, departs, cores
+        self.surface, self.departs = surface, departs
         self.patch, self.at = surface.selection.facet_patch, surface.centroid_m
         self.normal = surface.selection.facet_normal
         self.edge_m = np.sqrt(2.0 * np.maximum(surface.area_m2, 0.0))
+        self.of_patch = {int(n): np.flatnonzero(sure & (self.patch == n)) for n in np.unique(self.patch[sure])}
+        self.core_of = np.full(len(self.patch), -1)
+        for number, core in enumerate(cores):
+            self.core_of[core] = number
 
     def around(self, core: IntArray, away: FloatArray) -> FoundDefect:
         """Describe a core: its zone, what it is compared with, its kind and its length."""
         surface, patch = self.surface, int(self.patch[core[0]])
         area = surface.area_m2[core]
         edge = float(np.average(self.edge_m[core], weights=area))
-        same = np.flatnonzero(self.sure & (self.patch == patch))
+        same = self._beside(core, self.of_patch[patch])
         width = max(self._width(core), edge)
         reach = float(np.clip(0.5 * width, _NARROWEST_ZONE_M, _WIDEST_ZONE_M["line"]))
         distance = self._distance(core, same)
@@ -212,26 +216,33 @@ class _Zones:
             not_counted="No photograph says that the surface lies there." if unsupported > 0.5 else "",
         )
 
+    def _beside(self, core: IntArray, same: IntArray) -> IntArray:
+        """Leave what lies in a box around a core that holds all that may belong to it or be compared with it."""
+        at, inside = self.at[same], np.ones(len(same), dtype=bool)
+        for along, ends in zip(at.T, self.at[core].T):
+            inside &= (along > ends.min() - _FARTHEST_OUT_M) & (along < ends.max() + _FARTHEST_OUT_M)
+        return same[inside]
+
     def _distance(self, core: IntArray, same: IntArray) -> FloatArray:
         """Distance of triangles to a core, shape (k,), [m]; infinite far away."""
         return KDTree(self.at[core]).query(self.at[same], distance_upper_bound=_FARTHEST_OUT_M)[0]
 
     def _nearest(self, core: IntArray, same: IntArray, distance: FloatArray, near: BoolArray) -> BoolArray:
         """Take from what is near a core what is nearer to another one."""
-        patch, near = self.patch[core[0]], near.copy()
-        others = [other for other in self.cores if other is not core and self.patch[other[0]] == patch]
+        own, near = self.core_of[core[0]], near.copy()
+        others = same[(self.core_of[same] >= 0) & (self.core_of[same] != own)]
         candidates = np.flatnonzero(near)
-        if others and len(candidates):
-            nearest, _ = KDTree(self.at[np.concatenate(others)]).query(self.at[same[candidates]])
+        if len(others) and len(candidates):
+            nearest, _ = KDTree(self.at[others]).query(self.at[same[candidates]])
             near[candidates[nearest < distance[candidates]]] = False
-        return near | np.isin(same, core)
+        return near | (self.core_of[same] == own)
 
     def _hangs_together(self, core: IntArray, same: IntArray, near: BoolArray) -> BoolArray:
         """Leave what hangs together with the core by edges."""
         chosen = np.flatnonzero(near)
         pairs = _neighbours(self.surface, same[chosen])
         component = component_of(len(chosen), pairs[:, 0], pairs[:, 1])
-        kept = np.isin(component, np.unique(component[np.isin(same[chosen], core)]))
+        kept = np.isin(component, np.unique(component[self.core_of[same[chosen]] == self.core_of[core[0]]]))
         found = np.zeros(len(same), dtype=bool)
         found[chosen[kept]] = True
         return found
@@ -241,9 +252,12 @@ class _Zones:
         calm = ~near & ~self.departs[same]
         ring = calm & (distance <= 2.0 * reach + 0.5)
         wanted = 0.5 * float(self.surface.area_m2[same[near]].sum())
-        if float(self.surface.area_m2[same[ring]].sum()) < wanted:
-            ring = calm
-        return same[ring] if ring.any() else same[~near]
+        if float(self.surface.area_m2[same[ring]].sum()) >= wanted:
+            return same[ring]
+        whole = self.of_patch[int(self.patch[same[0]])]
+        whole = whole[~np.isin(whole, same[near])]
+        calm = whole[~self.departs[whole]]
+        return calm if len(calm) else whole
 
     def _plane(self, core: IntArray, reference: IntArray) -> FloatArray:
         """Two axes across the mean normal of the undisturbed surface, shape (3, 2)."""
