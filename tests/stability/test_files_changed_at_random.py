@@ -4,6 +4,7 @@ import copy
 import json
 import multiprocessing
 import os
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,12 @@ import yaml
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from tests.support.audited_wall import STATED, audited_wall, photographed, solve_wall, true_draws
 from tests.support.heat_meshes import box_mesh
+from thermoxels_ns.audit.conditions import load_conditions
+from thermoxels_ns.audit.run import audit
+from thermoxels_ns.commands.audit_options import AuditOptions
+from thermoxels_ns.commands.audit_run import answers_of
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
@@ -27,7 +33,10 @@ from thermoxels_ns.heat.solving import Goals
 from thermoxels_ns.mesh.boundary.patch_rules import load_patch_rules
 from thermoxels_ns.mesh.files.formats import write_mesh
 from thermoxels_ns.mesh.files.read import read_mesh
+from thermoxels_ns.mesh.files.vtu import summary_text
 from thermoxels_ns.mesh.tetrahedra import TetMesh
+from thermoxels_ns.reports.audit_page import audit_page
+from thermoxels_ns.reports.page import build_page
 
 NIGHTLY = "NIGHTLY" in os.environ
 EXAMPLES = settings(
@@ -61,7 +70,8 @@ def changed_trees(draw, tree: Any) -> Any:
             inside = inside[key]
         key, what = place[-1], draw(st.sampled_from(["replace", "replace", "scale", "nest", "remove", "rename"]))
         value = inside[key]
-        if what == "scale" and isinstance(value, (int, float)) and not isinstance(value, bool):
+        number = isinstance(value, (int, float)) and not isinstance(value, bool) and not abs(value) > 1e300
+        if what == "scale" and number:
             inside[key] = value * draw(st.sampled_from([-1.0, 0.0, 1e-9, 1e-3, 1e3, 1e9, 1.0000001]))
         elif what == "nest":
             inside[key] = [value, value] if draw(st.booleans()) else {"x": value}
@@ -171,6 +181,34 @@ def test_scene_yaml(tmp_path) -> None:
             assert found.solution.converged and np.isfinite(found.nodes.states_c).all()
             assert found.solution.energy_residual < 1e-9
             assert all(np.isfinite(effect.heat_w) for effect in found.results.effects)
+
+        solved[ends_well(run)] += 1
+
+    check()
+    assert min(solved) > 0
+
+
+def test_audit_conditions(tmp_path) -> None:
+    """What a survey may state, down to the page."""
+    tree = yaml.safe_load((configs_folder() / "conditions-example.yaml").read_text(encoding="utf-8"))
+    tree["references"] = [{"at": [1.0, 0.0, 1.2], "temperature": "1.4 +- 0.2 C"}]
+    tree["leave_out"] = ["cut"]
+    mesh = photographed(solve_wall(audited_wall(0.2), STATED, true_draws(STATED, None)), STATED, 1)
+    path, solved = tmp_path / "conditions.yaml", [0, 0]
+    options = AuditOptions(tmp_path / "mesh.vtu", path)
+
+    @EXAMPLES
+    @example(to_yaml(tree).encode())
+    @given(either(tree, to_yaml))
+    def check(content: bytes) -> None:
+        path.write_bytes(content)
+
+        def run() -> None:
+            found = audit(mesh, load_conditions(path))
+            summary_text(answers_of(options, found))
+            assert found.whole.u_w_m2k.low <= found.whole.u_w_m2k.high
+            page = build_page(audit_page(found, None, {}, "mesh.vtu", "thermoxels audit", ()), "audit.html.j2")
+            assert "nan" not in re.sub(r"[a-z]nan|nan[a-z]", "", page.lower())
 
         solved[ends_well(run)] += 1
 
