@@ -1,18 +1,24 @@
+import io
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import pyvista as pv
+from PIL import Image
 
-from tests.support.audited_wall import STATED, audited_wall, photographed, solve_wall, true_draws
+from tests.support.audited_wall import INSIDE, STATED, audited_wall, photographed, solve_wall, true_draws
+from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns import cli
+from thermoxels_ns.audit.run import audit
 from thermoxels_ns.commands.audit_options import AuditOptions
 from thermoxels_ns.commands.audit_run import run_audit
 from thermoxels_ns.core.errors import AuditError, HeatError, OutputError
 from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.mesh.files.formats import write_mesh
+from thermoxels_ns.reports.audit_pictures import draw_audit
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +71,22 @@ def test_the_page_is_complete_in_itself_and_escapes_what_users_write(done) -> No
     answers = json.loads((done / "answers.json").read_text())
     assert page.count("<article") == len(answers["defects"]) and page.count("data:image/png") == 3
     assert "EN 13187 also says" not in page and "lose " in page
+
+
+def test_pictures_of_a_room_look_into_it() -> None:
+    """A closed box that was seen from within: both views show colours, not its grey outside."""
+    x = planes(0.0, 0.5, 3.5, 4.0, step=0.25)
+    hollow = {"keep": lambda p: ~((p > 0.5) & (p < 3.5)).all(axis=-1)}
+    mesh = box_mesh(x, x, x, temperature_c=lambda p: 17.0 + 0.5 * p[:, 2], **hollow)
+    middle = mesh.points_m[mesh.facets].mean(axis=1)
+    seen = ((middle > 0.4) & (middle < 3.6)).all(axis=1)
+    room = replace(mesh, boundary=replace(mesh.boundary, seen=seen))
+    pictures = draw_audit(audit(room, INSIDE))
+    assert len(pictures.temperature) == 2
+    for png in pictures.temperature:
+        drawn = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)[150:750, 50:900]
+        coloured = np.ptp(drawn, axis=2) > 40
+        assert coloured.mean() > 0.2
 
 
 def test_what_forbids_a_survey_stands_first(export, tmp_path) -> None:

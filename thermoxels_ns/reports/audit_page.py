@@ -147,7 +147,8 @@ def _in_short(audit: Audit) -> tuple[str, ...]:
         words.append(f"Worst is number {number}, {_KINDS[worst.kind].lower()} in {worst.patch}: {extra} extra.")
     missed, open_ = (sum(one.verdict == kind for one in audit.limits) for kind in ("not met", "cannot tell"))
     if audit.limits:
-        told = [f"{missed} of {len(audit.limits)} limits not met"]
+        surely = "No limit is surely missed" if open_ else "All limits are met"
+        told = [f"{missed} of {len(audit.limits)} limits not met" if missed else surely]
         told += [f"{open_} cannot be judged, because the interval holds the limit"] if open_ else []
         words.append(f"{'; '.join(told)}.")
     named = [name for name, width in audit.budget.items() if width > 0.2 * abs(whole.loss_w.value)][:3]

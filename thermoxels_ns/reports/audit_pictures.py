@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from thermoxels_ns.audit.results import Audit
+from thermoxels_ns.audit.surface import WHY_NOT
 from thermoxels_ns.core.arrays import BoolArray, FloatArray
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -83,6 +84,8 @@ def _views(audit: Audit) -> list[FloatArray]:
     side = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     side /= np.linalg.norm(side)
     corner = side + 0.7 * np.cross(up, side)
+    if audit.conditions.side == "inside":  # floor and walls, then ceiling and walls
+        return [-(corner + 0.5 * up), corner + 0.5 * up]
     return [-(corner + 0.5 * up), corner - 0.5 * up]
 
 
@@ -113,10 +116,13 @@ def _defect(audit: Audit, number: int, surface_c: FloatArray, same: dict[str, An
 
 
 def _drawn(audit: Audit, chosen: BoolArray, values: FloatArray, **look: Any) -> bytes:
-    """Draw some triangles, those that do not count in grey."""
+    """Draw some triangles, those that do not count in grey; of a room without what stands between it and the eye."""
     from thermoxels_ns.reports.mesh_pictures import picture_of_mesh
 
     mesh = audit.surface.mesh
+    if audit.conditions.side == "inside":
+        kinds = [number for number, name in enumerate(WHY_NOT) if name in ("cut", "unseen")]
+        chosen = chosen & ~np.isin(audit.surface.why_not, kinds)
     part: TetMesh = replace(mesh, facets=mesh.facets[chosen], facet_tags=mesh.facet_tags[chosen])
     painted: Sequence[tuple[str, str, BoolArray]] = [("does not count", "lightgrey", ~audit.surface.counted[chosen])]
     with tempfile.TemporaryDirectory() as scratch:
