@@ -86,6 +86,16 @@ def test_the_size_of_the_world_does_not_matter():
     np.testing.assert_allclose(found_big.poses[:, :3, 3] / 1000.0, found.poses[:, :3, 3], atol=1e-5)
 
 
+def test_where_the_world_begins_does_not_matter():
+    given, far = off_by(0.3), off_by(0.3)
+    shift = np.array([4.5e6, 5.3e6, 120.0])
+    far[:, :3, 3] += shift
+    found, found_far = (adjust_poses(tracks(), each, np.full(VIEWS, FOCAL)) for each in (given, far))
+    assert found is not None and found_far is not None
+    np.testing.assert_allclose(found_far.poses[:, :3, 3] - shift, found.poses[:, :3, 3], atol=1e-5)
+    np.testing.assert_allclose(found_far.poses[:, :3, :3], found.poses[:, :3, :3], atol=1e-6)
+
+
 def test_wrong_matches_do_little_harm():
     seen, draw = tracks(), np.random.default_rng(3)
     wrong = draw.random(len(seen.point)) < 0.05

@@ -136,8 +136,22 @@ def test_gain_has_a_fixed_gauge_and_brightens_only_its_photograph():
     model.log_gain.data[:] = torch.tensor([-0.4, 0.0, 0.0, 0.0])[:, None]
     ratio = model(rays())["rgb"].detach() / plain
     torch.testing.assert_close(ratio[::4], torch.full((15, 3), math.exp(-0.3)))
-    torch.testing.assert_close(ratio[1::4], (math.exp(0.1) * plain[1::4]).clamp(max=1.0) / plain[1::4])
+    torch.testing.assert_close(ratio[1::4], torch.full((15, 3), math.exp(0.1)))
     assert torch.equal(model.eval()(rays())["rgb"], make().eval()(rays())["rgb"])  # not in evaluation
+
+
+def test_what_saturates_a_photograph_may_be_brighter():
+    model = make(exposure="on").train()
+    model.log_gain.data[:] = torch.tensor([1.5, -0.5, -0.5, -0.5])[:, None]  # 4.5 times brighter than the others
+    outputs = model(rays())
+    assert float(outputs["rgb"][::4].detach().min()) > 1.0
+    measured = outputs["rgb"].detach().clamp(max=1.0)
+    batch = {"image": measured, "thermal": outputs["thermal"].detach()}
+    assert float(model.get_loss_dict(outputs, batch)["rgb_loss"].detach()) == 0.0
+    darker = torch.where(measured == 1.0, measured - 0.1, measured)
+    loss = model.get_loss_dict(outputs, {**batch, "image": darker})["rgb_loss"]
+    loss.backward()
+    assert float(loss.detach()) > 0.01 and float(model.log_gain.grad[0].abs().max()) > 0.0
 
 
 def test_photographs_are_corrected_by_what_was_found_and_only_then():

@@ -98,6 +98,8 @@ def find_tracks(features: Sequence[Features], cameras: Sequence[Camera], poses: 
     from scipy.sparse import coo_matrix  # slow to import and only needed here
     from scipy.sparse.csgraph import connected_components
 
+    poses = poses.copy()
+    poses[:, :3, 3] -= poses[:, :3, 3].mean(0)
     count = np.array([len(each.pixels) for each in features])
     firsts = np.concatenate(([0], np.cumsum(count)))
     places = [camera.rays(each.pixels)[:, :2] for camera, each in zip(cameras, features)]
@@ -143,6 +145,9 @@ def adjust_poses(tracks: Tracks, poses: FloatArray, focal: FloatArray, fixed: in
     Returns:
         None where tracks are too few, or those held back do not get nearer to their points.
     """
+    middle = poses[:, :3, 3].mean(0)
+    poses = poses.copy()
+    poses[:, :3, 3] -= middle  # coordinates of a country would cost digits
     tracks = _plausible(tracks, poses, focal)
     if tracks.points < FEWEST_TRACKS:
         return None
@@ -155,7 +160,10 @@ def adjust_poses(tracks: Tracks, poses: FloatArray, focal: FloatArray, fixed: in
     if not after <= WORTH_IT * before:
         return None
     adjusted = _adjust(tracks, poses, focal, fixed)
-    return None if adjusted is None else AdjustedPoses(adjusted, before, after, tracks.points)
+    if adjusted is None:
+        return None
+    adjusted[:, :3, 3] += middle
+    return AdjustedPoses(adjusted, before, after, tracks.points)
 
 
 def _pairs(rotations: FloatArray, centres: FloatArray) -> list[tuple[int, int]]:

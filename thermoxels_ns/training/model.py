@@ -33,7 +33,15 @@ from thermoxels_ns.render.ray_render import RayRender, RayRequest, RenderOptions
 from thermoxels_ns.render.renderers import GridSamples, render_rays, sample_rays
 from thermoxels_ns.render.surroundings_render import render_surroundings
 from thermoxels_ns.training import losses
-from thermoxels_ns.training.image_metrics import fitted_gain, lpips, lpips_available, psnr, ssim, thermal_metrics
+from thermoxels_ns.training.image_metrics import (
+    SATURATED,
+    fitted_gain,
+    lpips,
+    lpips_available,
+    psnr,
+    ssim,
+    thermal_metrics,
+)
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig
 from thermoxels_ns.training.ray_statistics import FieldEvidence, field_evidence
 
@@ -312,7 +320,7 @@ class ThermoxelsModel(Model):
             assert ray_bundle.camera_indices is not None
             log_gain = self._refined(self.log_gain, self.config.exposure)
             gain = torch.exp(log_gain - log_gain.mean(0))
-            rgb = (rgb * gain.index_select(0, ray_bundle.camera_indices[:, 0])).clamp(max=1.0)
+            rgb = rgb * gain.index_select(0, ray_bundle.camera_indices[:, 0])
         if self.thermal_offset is not None and offsets_on:
             assert ray_bundle.camera_indices is not None
             offset = self._refined(self.thermal_offset, self.config.per_image_offset)
@@ -353,6 +361,8 @@ class ThermoxelsModel(Model):
         (chosen,) = outputs["rgb_rays"].nonzero(as_tuple=True)
         if weights.rgb and outputs["rgb"] is not None and len(chosen):
             seen, measured = (values.index_select(0, chosen) for values in (outputs["rgb"], batch["image"]))
+            if self.training and bool(self.corrected[0]):  # what saturates a photograph may be any brighter
+                seen = torch.where(measured >= SATURATED, torch.minimum(seen, measured), seen)
             terms["rgb_loss"] = weights.rgb * losses.rgb_loss(seen, measured)
         (chosen,) = outputs["thermal_rays"].nonzero(as_tuple=True)
         if weights.thermal and len(chosen):
