@@ -48,6 +48,10 @@ def test_position_of_the_published_example() -> None:
     assert sun.azimuth_deg == pytest.approx(194.34024, abs=0.02)
     assert sun.elevation_deg == pytest.approx(39.872046, abs=0.02)
     assert sun.distance_au == pytest.approx(0.9965422974, abs=1e-4)
+    # The zenith angle of the example is refracted (its equation 42) by air of 820 hPa and 11 C.
+    height = np.radians(sun.elevation_deg + 10.3 / (sun.elevation_deg + 5.11))
+    refraction_deg = 820.0 / 1010.0 * 283.0 / (273.0 + 11.0) * 1.02 / (60.0 * np.tan(height))
+    assert 90.0 - sun.elevation_deg - refraction_deg == pytest.approx(50.11162, abs=0.005)
 
 
 def test_the_sun_goes_from_east_over_south_to_west_and_over_north_beyond_the_equator() -> None:

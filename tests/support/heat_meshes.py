@@ -70,6 +70,7 @@ def box_mesh(
     patches: dict[str, Callable[[npt.NDArray[np.float64], npt.NDArray[np.float64]], npt.NDArray[np.bool_]]]
     | None = None,
     keep: Callable[[npt.NDArray[np.float64]], npt.NDArray[np.bool_]] | None = None,
+    keep_tets: Callable[[npt.NDArray[np.float64]], npt.NDArray[np.bool_]] | None = None,
 ) -> TetMesh:
     """Cut a box along planes into cells and each cell into six tetrahedra.
 
@@ -82,6 +83,8 @@ def box_mesh(
         patches: Rules by centroid and normal of a boundary triangle; the last that holds names it. Without any it has
             the name of its side, or "other" inside the box.
         keep: Which cells to keep, by centroid; None: all.
+        keep_tets: Which of their tetrahedra to keep, by centroid; None: all. With x >= y and the same planes across
+            both axes, one side of the diagonal: tetrahedra do not cross it.
     """
     axes = [np.asarray(axis, dtype=np.float64) for axis in (x, y, z)]
     middles = [0.5 * (axis[1:] + axis[:-1]) for axis in axes]
@@ -95,7 +98,12 @@ def box_mesh(
         for index, rule in enumerate(regions.values()):
             number[rule(centre)] = index
         assert (number[cells] >= 0).all(), "cells without a region"
-    mesh = mesh_from(points, tets, temperature_c, region=np.repeat(number[cells], 6), region_names=names)
+    region = np.repeat(number[cells], 6)
+    if keep_tets is not None:
+        kept = keep_tets(points[tets].mean(axis=1))
+        used, numbers = np.unique(tets[kept], return_inverse=True)
+        points, tets, region = points[used], numbers.reshape(-1, 4), region[kept]
+    mesh = mesh_from(points, tets, temperature_c, region=region, region_names=names)
     return replace(mesh, boundary=_tags(points, mesh.facets, axes, patches or {}))
 
 
