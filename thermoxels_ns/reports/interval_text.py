@@ -52,11 +52,11 @@ def area_text(area_m2: float) -> str:
 def number_text(value: float, half_width: float) -> str:
     """Write a number to two digits of the half width of its range, at most four behind the point.
 
-    >>> number_text(1234.56, 30.0), number_text(0.123456, 0.01), number_text(-0.001, 0.5)
-    ('1,235', '0.123', '0.00')
+    >>> number_text(1234.56, 30.0), number_text(0.123456, 0.01), number_text(-0.001, 0.5), number_text(17732.0, 3800.0)
+    ('1,235', '0.123', '0.00', '17,700')
     """
     size = abs(half_width) or abs(value) * 1e-3
-    decimals = 2 if size == 0.0 else min(max(1 - math.floor(math.log10(size)), 0), 4)
+    decimals = 2 if size == 0.0 else min(1 - math.floor(math.log10(size)), 4)
     if abs(value) >= _LARGE:
         decimals = min(decimals, 1)
-    return f"{round(float(value), decimals) + 0.0:,.{decimals}f}"
+    return f"{round(float(value), decimals) + 0.0:,.{max(decimals, 0)}f}"
