@@ -1,7 +1,7 @@
 import pytest
 
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.data.transforms_json import path_inside
+from thermoxels_ns.data.transforms_json import path_inside, read_intrinsics
 
 
 @pytest.mark.parametrize("name", ["a.tiff", "thermal/a.tiff", "./a.tiff", "thermal\\a.tiff", "a..b/c.jpg"])
@@ -49,3 +49,10 @@ def test_a_link_that_leads_out_is_refused_and_one_inside_is_not(tmp_path):
     with pytest.raises(SceneError, match="a link to"):
         path_inside(folder, "out/secret.txt", "frame 0")
     assert path_inside(folder, "in/a.tiff", "frame 0") == folder.resolve() / "real" / "a.tiff"
+
+
+@pytest.mark.parametrize("size", [0, -3, 2_000_000, 10**400])
+def test_a_size_that_no_photograph_has_is_refused(size):
+    meta = {"w": size, "h": 18, "fl_x": 26.4, "fl_y": 27.6, "cx": 11.5, "cy": 9.5}
+    with pytest.raises(SceneError, match="frame 3: expected finite intrinsics"):
+        read_intrinsics(meta, {}, None, "frame 3")

@@ -208,7 +208,8 @@ def test_audit_conditions(tmp_path) -> None:
             summary_text(answers_of(options, found))
             assert found.whole.u_w_m2k.low <= found.whole.u_w_m2k.high
             page = build_page(audit_page(found, None, {}, "mesh.vtu", "thermoxels audit", ()), "audit.html.j2")
-            assert "nan" not in re.sub(r"[a-z]nan|nan[a-z]", "", page.lower())
+            if b"nan" not in content.lower():  # as the name of a client, say
+                assert "nan" not in re.sub(r"[a-z]nan|nan[a-z]", "", page.lower())
 
         solved[ends_well(run)] += 1
 

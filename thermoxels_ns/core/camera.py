@@ -16,6 +16,7 @@ FloatArray = npt.NDArray[np.float64]
 Lens = Literal["perspective", "fisheye", "equirectangular"]
 
 _UNDISTORT_STEPS = 20
+_MOST_PIXELS = 1_000_000  # Along a side
 
 
 @dataclass(frozen=True)
@@ -43,9 +44,10 @@ class Camera:
 
     def __post_init__(self) -> None:
         numbers = (self.fl_x, self.fl_y, self.cx, self.cy, *self.distortion)
-        good = all(map(math.isfinite, numbers)) and min(self.fl_x, self.fl_y) > 0 and min(self.width, self.height) > 0
-        if not good:
-            expected, remedy = "at least one pixel, focal lengths above 0 and finite numbers", "Correct the intrinsics."
+        good = all(map(math.isfinite, numbers)) and min(self.fl_x, self.fl_y) > 0
+        if not (good and 0 < self.width <= _MOST_PIXELS and 0 < self.height <= _MOST_PIXELS):
+            expected = f"1 to {_MOST_PIXELS} pixels a side, focal lengths above 0 and finite numbers"
+            remedy = "Correct the intrinsics."
             got = f"{self.width} x {self.height} pixels, {numbers}"
             raise SceneError("camera", expected=expected, got=got, remedy=remedy)
 

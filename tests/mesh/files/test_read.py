@@ -1,4 +1,5 @@
 import dataclasses
+import re
 import resource
 import shutil
 
@@ -80,6 +81,30 @@ def test_damaged_files_are_refused(tmp_path, box_mesh, name, damage, capfd) -> N
     with pytest.raises(MeshError, match=rf"{name}: expected a VTK file .*, got a damaged or empty one\. Export"):
         read_mesh(tmp_path / "box.vtu")
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("array", range(6))
+@pytest.mark.parametrize("what", [b"<?xml ver", b"////////"], ids=["text", "number"])
+def test_a_size_that_no_memory_holds_is_a_damaged_file(tmp_path, box_mesh, array, what) -> None:
+    """VTK would end the process."""
+    write_mesh(tmp_path / "box.vtu", box_mesh)
+    file = tmp_path / "box.vtu"
+    content = bytearray(file.read_bytes())
+    begin = content.index(b"_", content.index(b"<AppendedData")) + 1
+    offset = [int(found) for found in re.findall(rb'offset="(\d+)', bytes(content))][array]
+    content[begin + offset : begin + offset + len(what)] = what
+    file.write_bytes(bytes(content))
+    with pytest.raises(MeshError, match=r"box\.vtu: expected a VTK file"):
+        read_mesh(file)
+
+
+def test_a_region_without_a_number_is_none(tmp_path, box_mesh) -> None:
+    write_mesh(tmp_path / "box.vtu", box_mesh)
+    content = (tmp_path / "box.vtu").read_bytes()
+    assert content.count(b'NumberOfTuples="1"') == 1
+    (tmp_path / "box.vtu").write_bytes(content.replace(b'NumberOfTuples="1"', b'NumberOfTuples="0"'))
+    with pytest.raises(MeshError, match=r"box\.vtu: expected field arrays region:NAME numbered from 0, got none"):
+        read_mesh(tmp_path / "box.vtu")
 
 
 def test_a_changed_byte_is_never_read_as_something_else(tmp_path, box_mesh) -> None:

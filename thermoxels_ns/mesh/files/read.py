@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import binascii
+import re
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +20,7 @@ from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, Boundary, Te
 _REMEDY = "Export the mesh again with ns-export thermoxels-mesh."
 _REGION = "region:"
 _TETRAHEDRON = 10  # VTK's number for the kind of cell
+_MOST_COMPRESSION = 1040  # Bytes that zlib can make of one: 1032, and a little
 
 
 def read_mesh(path: Path | str) -> TetMesh:
@@ -70,6 +74,8 @@ def _read(path: Path) -> Any:
     data = None
     with plain_os_errors(path, "a VTK file that can be read", "Check its permissions.", MeshError), path.open("rb"):
         pass
+    if not _sizes_fit(path.read_bytes()):
+        raise _wrong(path.name, f"a VTK file ({path.suffix})", "a damaged or empty one", _REMEDY)
     with silent_vtk() as complaints:
         if reader.CanReadFile(str(path)):
             reader.Update()
@@ -79,13 +85,47 @@ def _read(path: Path) -> Any:
     return data
 
 
+def _sizes_fit(content: bytes) -> bool:
+    """Whether the arrays of a VTK file, as `write_mesh` writes them, claim no more than its bytes can hold.
+
+    VTK ends the process where a damaged size is too large for the memory. Files written otherwise are not checked.
+    """
+    header = re.search(rb'header_type="UInt(32|64)"[^>]*compressor="vtkZLibDataCompressor"', content)
+    begin = re.search(rb'<AppendedData encoding="base64">\s*_', content)
+    if header is None or begin is None:
+        return True
+    width = int(header[1]) // 8
+    most = _MOST_COMPRESSION * len(content)
+    for offset in re.findall(rb'offset="(\d+)', content[: begin.start()]):
+        start = begin.end() + int(offset)
+        # An array begins with the number of its blocks, the size of a block, that of the last one, those compressed.
+        blocks, size, last = _numbers(content[start : start + 4 * width], width, 3)
+        if blocks * width > len(content) or max(blocks * size, last) > most:
+            return False
+        letters = -(-(3 + blocks) * width // 3) * 4
+        packed = _numbers(content[start : start + letters], width, 3 + blocks)[3:]
+        if sum(packed) > len(content):
+            return False
+    return True
+
+
+def _numbers(letters: bytes, width: int, count: int) -> list[int]:
+    """Little-endian numbers of `width` bytes in base64; what is not there or no base64 is as large as can be."""
+    try:
+        found = base64.b64decode(letters + b"=" * (-len(letters) % 4), validate=True)
+    except binascii.Error:
+        found = b""
+    whole = found + b"\xff" * max(0, width * count - len(found))
+    return [int.from_bytes(whole[width * k : width * (k + 1)], "little") for k in range(count)]
+
+
 def _region_names(body: Any, name: str) -> tuple[str, ...]:
     """Names by their numbers, which the file holds one by one."""
     arrays = body.GetFieldData()
     numbers = {}
     for place in range(arrays.GetNumberOfArrays()):
         array = arrays.GetAbstractArray(place)
-        if (array.GetName() or "").startswith(_REGION):
+        if (array.GetName() or "").startswith(_REGION) and array.GetNumberOfValues() == 1:
             numbers[int(array.GetVariantValue(0).ToInt())] = array.GetName().removeprefix(_REGION)
     if sorted(numbers) != list(range(len(numbers))) or not numbers:
         raise _wrong(name, f"field arrays {_REGION}NAME numbered from 0", sorted(numbers) or "none", _REMEDY)
