@@ -59,6 +59,27 @@ def test_the_command_writes_answers_page_and_surface(done) -> None:
     assert set(np.unique(surface.cell_data["defect"])) == {0, 1}
 
 
+def test_a_calibration_stands_on_the_page_in_the_answers_and_on_the_mesh(export, tmp_path) -> None:
+    asked = """
+calibrate:
+  conductivity: {wall: 0.9 W/(m K), glazing: 0.36 W/(m K), slab: 2.3 +- 0.2 W/(m K)}
+  behind: [room]
+  unknown: [{property: conductivity, of: wall}]
+"""
+    (tmp_path / "c.yaml").write_text((export / "conditions.yaml").read_text() + asked)
+    words = ["audit", str(export / "mesh.vtu"), "--conditions", str(tmp_path / "c.yaml")]
+    assert cli.main([*words, "--output-dir", str(tmp_path / "out")]) == 0
+    found = json.loads((tmp_path / "out" / "answers.json").read_text())["calibration"]
+    ends = found["found"]["conductivity of wall"]
+    assert ends["low"] < 0.3 and (ends["high"] is None or ends["high"] > 0.3) and found["refused"] == ""
+    surface = pv.read(tmp_path / "out" / "surface.vtp")
+    off = surface.cell_data["measured_minus_computed_k"]
+    assert np.array_equal(np.isfinite(off), surface.cell_data["counted"] == 1)
+    page = (tmp_path / "out" / "audit.html").read_text()
+    assert page.index("element by element") < page.index("<h2>Calibration</h2>") < page.index("Thermal bridges and")
+    assert "conductivity of slab 2.3 ± 0.2" in page and page.count("data:image/png") == 4
+
+
 def test_the_page_is_complete_in_itself_and_escapes_what_users_write(done) -> None:
     page = (done / "audit.html").read_text()
     assert "<h1>A &lt;b&gt;house&lt;/b&gt; &amp; garden</h1>" in page

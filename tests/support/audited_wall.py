@@ -1,5 +1,6 @@
 """A wall with a window and a balcony slab of known construction, solved by finite elements, as a camera sees it."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -7,18 +8,22 @@ import numpy.typing as npt
 
 from tests.support.heat_meshes import box_mesh, planes
 from thermoxels_ns.audit.conditions import (
+    Calibrate,
     Camera,
     Conditions,
     Film,
     InsideAir,
     OutsideAir,
+    Reference,
     Side,
     SkyModel,
     Surface,
     Surroundings,
+    Unknown,
 )
-from thermoxels_ns.audit.draws import Draws, draw, emissivity_name
+from thermoxels_ns.audit.draws import Draws, Interval, draw, emissivity_name
 from thermoxels_ns.audit.exchange import radiant_k4
+from thermoxels_ns.audit.run import audit
 from thermoxels_ns.core.measured import Measured
 from thermoxels_ns.core.units import celsius_to_kelvin, kelvin_to_celsius
 from thermoxels_ns.fem.problem import HeatProblem
@@ -172,3 +177,31 @@ def photographed(truth: Truth, conditions: Conditions, seed: int | None = None) 
     observed = np.zeros(len(mesh.points_m), dtype=bool)
     observed[nodes] = True
     return replace(mesh, temperature_c=np.where(observed, reading, -50.0), observed=observed)
+
+
+CONTACT_M, CONTACT_OFF_K = (1.0, 0.0, 2.5), 0.2
+
+
+def with_contact(conditions: Conditions, truth: Truth, seed: int) -> Conditions:
+    """The conditions with a contact temperature that is as wrong as it may be."""
+    points = truth.mesh.points_m
+    nearest = int(np.argmin(np.linalg.norm(points - np.array(CONTACT_M), axis=1)))
+    off = np.random.default_rng((seed, 11)).uniform(-CONTACT_OFF_K, CONTACT_OFF_K)
+    measured = Measured(float(truth.mesh.temperature_c[nearest]) + off, CONTACT_OFF_K)
+    return replace(conditions, references=(Reference(CONTACT_M, measured),))
+
+
+def calibrated(side: Side, seed: int, step: float = 0.1) -> Iterator[tuple[str, float, Interval]]:
+    """Calibrate a wall, seen from outside with a window in it; yield each property, its truth and what was found."""
+    outside = side == "outside"
+    stated = STATED if outside else INSIDE
+    truth = solve_wall(audited_wall(step, slab=False, window=outside, side=side), stated, true_draws(stated, seed))
+    conditions = with_contact(stated, truth, seed) if outside else stated
+    names = [name for name in CONDUCTIVITY if name in truth.mesh.region_names]
+    start = {name: Measured(factor * CONDUCTIVITY[name]) for name, factor in zip(names, (2.0, 0.5))}
+    unknown = tuple(Unknown("conductivity", name) for name in names)
+    asked = Calibrate(start, unknown, behind=("room",) if outside else ("facade",))
+    found = audit(photographed(truth, conditions, seed), replace(conditions, calibrate=asked), UP).calibration
+    assert found is not None and not found.refused, found
+    for name in names:
+        yield f"conductivity of {name}", CONDUCTIVITY[name], found.found[f"conductivity of {name}"]

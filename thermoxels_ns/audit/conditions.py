@@ -18,6 +18,7 @@ Share: TypeAlias = Annotated[Measured, "1"]
 Temperature: TypeAlias = Annotated[Measured, "C"]
 Difference: TypeAlias = Annotated[Measured, "K"]
 Hours: TypeAlias = Annotated[Measured, "h"]
+Conductivity: TypeAlias = Annotated[Measured, "W/(m K)"]
 
 Side = Literal["outside", "inside"]
 FilmModel = Literal["iso-6946", "iso-6946-combined", "albatici-tonelli", "dallo", "madding", "given"]
@@ -30,6 +31,7 @@ FILM_MODELS: Mapping[Side, tuple[FilmModel, ...]] = {
 WINDY: tuple[FilmModel, ...] = ("iso-6946", "albatici-tonelli", "dallo")  # Models of the open air that need the wind
 
 EXAMPLE = "conditions-example.yaml"
+MOST_UNKNOWN = 4  # Properties that one calibration may look for
 
 
 @dataclass(frozen=True)
@@ -196,6 +198,68 @@ class Year:
 
 
 @dataclass(frozen=True)
+class Layer:
+    """A layer that the mesh does not have, such as insulation, on the far side of what was photographed."""
+
+    patches: tuple[str, ...]  # Patches behind the surface that it lies on, by name or pattern
+    thickness: Annotated[Measured, "m"]
+    conductivity: Conductivity
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A property that is to be found out; the value that stands for it is where the search starts."""
+
+    property: Literal["conductivity", "thickness", "film"]
+    of: str  # The entry of `conductivity`, `layers` or `film` that it belongs to
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """A model of what is behind the surface, some properties of which are to be found out."""
+
+    conductivity: dict[str, Conductivity]
+    """Of regions of the mesh, by name or pattern; of several that match, the last one holds."""
+    unknown: tuple[Unknown, ...]  # One to four
+    layers: dict[str, Layer] = field(default_factory=dict)
+    film: dict[str, Annotated[Measured, "W/(m2 K)"]] = field(default_factory=dict)
+    """Convection of photographed patches, by name or pattern, in place of the film model; radiation stays."""
+    behind: tuple[str, ...] = ("interior-*",)  # Patches that the air on the far side touches
+    adiabatic: tuple[str, ...] = ("cut",)  # Patches that no heat crosses
+
+    def __post_init__(self) -> None:
+        for name, value in self.stated().items():
+            if value.low <= 0.0:
+                raise _out_of_range(name, "a number that is surely above 0", f"{value.low:g}", "0.8 +- 0.1 W/(m K)")
+        both = sorted(set(self.conductivity) & set(self.layers))
+        if both:
+            remedy = "Give the layer another name."
+            raise AuditError("calibrate: layers", expected="names that no region has", got=both[0], remedy=remedy)
+        names = [unknown_name(one) for one in self.unknown]
+        if not 1 <= len(set(names)) <= MOST_UNKNOWN or len(set(names)) < len(names):
+            remedy = "Write unknown: [{property: conductivity, of: wall}], for example."
+            expected = f"one to {MOST_UNKNOWN} different entries"
+            raise AuditError("calibrate: unknown", expected=expected, got=", ".join(names) or "none", remedy=remedy)
+        for name in names:
+            if name not in self.stated():
+                remedy = "Give it there, where the search is to start."
+                expected = f"one out of {', '.join(self.stated())}"
+                raise AuditError("calibrate: unknown", expected=expected, got=name, remedy=remedy)
+
+    def stated(self) -> dict[str, Measured]:
+        """All properties by name, such as "conductivity of wall", as they are stated."""
+        every = {f"conductivity of {name}": value for name, value in self.conductivity.items()}
+        every |= {f"conductivity of {name}": layer.conductivity for name, layer in self.layers.items()}
+        every |= {f"thickness of {name}": layer.thickness for name, layer in self.layers.items()}
+        return every | {f"film of {name}": value for name, value in self.film.items()}
+
+
+def unknown_name(one: Unknown) -> str:
+    """What reports call an unknown property."""
+    return f"{one.property} of {one.of}"
+
+
+@dataclass(frozen=True)
 class Conditions:
     """All that is known beside the photographs."""
 
@@ -213,6 +277,7 @@ class Conditions:
     survey: Survey = field(default_factory=Survey)
     limits: Limits = field(default_factory=Limits)
     year: Year | None = None
+    calibrate: Calibrate | None = None
     title: str = ""
 
     def __post_init__(self) -> None:

@@ -17,7 +17,7 @@ from thermoxels_ns.audit.heat_flow import (
     radiation_w_m2,
     surface_temperature_k,
 )
-from thermoxels_ns.audit.surface import AlikeTriangles
+from thermoxels_ns.audit.surface import AlikeTriangles, AuditedSurface
 from thermoxels_ns.audit.surroundings import sky_emissivity, view_shares
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin
@@ -25,6 +25,7 @@ from thermoxels_ns.fem.quantities import Places
 from thermoxels_ns.heat.scene_fields import inside_coefficient, outside_coefficient
 
 CHUNK = 2000  # Groups whose draws are in memory together
+HALF_STEP_K = 0.05  # For differences with respect to readings, [K]
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,28 @@ def part_totals(
         temperature += columns[:, part] @ some.surface_c
     mean = temperature / np.where(total > 0.0, total, 1.0)
     return PartTotals(total[:, 0], flow_w, mean, draws["inside air"], draws["outside air"])
+
+
+def triangle_exchange(
+    conditions: Conditions,
+    surface: AuditedSurface,
+    groups: AlikeTriangles,
+    draws: Draws,
+    up: tuple[float, float, float],
+) -> tuple[FloatArray, FloatArray]:
+    """Surface temperature [degrees Celsius] and heat flow [W/m2] of each triangle by the first draw, shape (f,) each.
+
+    NaN where a triangle does not count.
+    """
+    steps = (-HALF_STEP_K, 0.0, HALF_STEP_K)
+    low, mean, high = (exchange(conditions, groups, draws, up, step) for step in steps)
+    off = (surface.reading_c - groups.reading_c[groups.of_triangle]) / (2.0 * HALF_STEP_K)
+    values = []
+    for name in ("surface_c", "flow_w_m2"):
+        at, change = getattr(mean, name)[:, 0], (getattr(high, name) - getattr(low, name))[:, 0]
+        of_triangle = at[groups.of_triangle] + off * change[groups.of_triangle]
+        values.append(np.where(surface.counted, of_triangle, np.nan))
+    return values[0], values[1]
 
 
 def radiant_k4(conditions: Conditions, draws: Draws, normals: FloatArray, up: tuple[float, float, float]) -> FloatArray:

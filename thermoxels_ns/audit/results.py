@@ -76,6 +76,19 @@ class YearResult:
 
 
 @dataclass(frozen=True)
+class Calibration:
+    """Properties with which the computed surface temperature meets the measured one."""
+
+    found: Mapping[str, Interval]  # By name, such as "conductivity of wall"; empty if refused
+    units: Mapping[str, str]  # Of each unknown
+    refused: str  # Why no values are given, in sentences; else empty
+    moved_most_by: Mapping[str, str]  # Which stated quantity moves each most within its range
+    misfit_k: float  # Root mean square of measured minus computed, by area, [K]
+    difference_k: FloatArray
+    """Measured minus computed surface temperature of each triangle, shape (f,), NaN where it does not count, [K]."""
+
+
+@dataclass(frozen=True)
 class Audit:
     """All that was found."""
 
@@ -89,6 +102,7 @@ class Audit:
     found: tuple[FoundDefect, ...]  # The triangles of each defect
     limits: tuple[Limit, ...]
     year: YearResult | None
+    calibration: Calibration | None
     f_rsi: tuple[Interval, ...]  # Of the coldest square decimetre of all, for `F_RSI_M2K_W`; empty seen from outside
     budget: Mapping[str, float]  # How far each uncertain quantity alone moves the loss from lowest to highest, [W]
     not_counted_m2: Mapping[str, float]  # True area that does not count, by reason

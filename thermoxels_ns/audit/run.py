@@ -7,11 +7,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from thermoxels_ns.audit.calibration import calibrated
 from thermoxels_ns.audit.conditions import Conditions
 from thermoxels_ns.audit.defect_figures import PartFigures, describe_defect
 from thermoxels_ns.audit.defects import SPOT_M2, find_defects
 from thermoxels_ns.audit.draws import CONFIDENCE, Draws, Interval, draw, interval_of, one_at_a_time
-from thermoxels_ns.audit.exchange import CHUNK, exchange, other_models, part_totals
+from thermoxels_ns.audit.exchange import (
+    CHUNK,
+    HALF_STEP_K,
+    exchange,
+    other_models,
+    part_totals,
+    triangle_exchange,
+)
 from thermoxels_ns.audit.references import reference_doubts, with_references
 from thermoxels_ns.audit.results import Audit, Defect, Element, Limit, Verdict, YearResult
 from thermoxels_ns.audit.surface import WHY_NOT, AlikeTriangles, AuditedSurface, alike_triangles, audited_surface
@@ -21,7 +29,6 @@ from thermoxels_ns.core.measured import Measured
 from thermoxels_ns.fem.selection import matching_names
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-_HALF_STEP_K = 0.05  # For differences with respect to readings, [K]
 _OF_A_TRIANGLE, _OF_THE_YEAR = 10**6, 10**6 + 1  # Numbers of errors of their own, beyond those of parts
 
 
@@ -32,7 +39,7 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
     """
     work = _Work(mesh, conditions, up)
     surface, side = work.surface, conditions.side
-    surface_c, flow = work.triangles()
+    surface_c, flow = triangle_exchange(conditions, surface, work.groups, work.stated, up)
     repeatability = conditions.camera.repeatability.off_by
     found = find_defects(surface, surface_c, side == "outside", repeatability)
 
@@ -97,6 +104,7 @@ def audit(mesh: TetMesh, conditions: Conditions, up: tuple[float, float, float] 
         found=tuple(found),
         limits=_limits(conditions, elements, defects, whole, f_rsi),
         year=_year(conditions, work.draws, whole_flow / totals.difference_k),
+        calibration=calibrated(conditions, surface, work.groups, work.draws),
         f_rsi=f_rsi,
         budget=work.budget(own),
         not_counted_m2={why: area for why, area in left.items() if area > 0.0},
@@ -144,18 +152,6 @@ class _Work:
             unsupported_share=float(surface.area_m2[part.counted] @ surface.unsupported[part.counted]) / area,
         )
 
-    def triangles(self) -> tuple[FloatArray, FloatArray]:
-        """Surface temperature and heat flow of each triangle by the stated values, NaN where it does not count."""
-        steps = (-_HALF_STEP_K, 0.0, _HALF_STEP_K)
-        low, mean, high = (exchange(self.conditions, self.groups, self.stated, self.up, step) for step in steps)
-        group = self.groups.of_triangle
-        off = (self.surface.reading_c - self.groups.reading_c[group]) / (2.0 * _HALF_STEP_K)
-        values = []
-        for name in ("surface_c", "flow_w_m2"):
-            at, change = getattr(mean, name)[:, 0], (getattr(high, name) - getattr(low, name))[:, 0]
-            values.append(np.where(self.surface.counted, at[group] + off * change[group], np.nan))
-        return values[0], values[1]
-
     def triangle_u(self) -> FloatArray:
         """U-value of each triangle and the ends of its interval, shape (f, 3); NaN where it does not count."""
         off = self.draws.local(self.conditions.camera.repeatability.off_by, _OF_A_TRIANGLE)
@@ -163,8 +159,8 @@ class _Work:
         for start in range(0, len(self.groups.reading_c), CHUNK):
             some = self.groups.some(slice(start, start + CHUNK))
             here = exchange(self.conditions, some, self.draws, self.up)
-            warmer = exchange(self.conditions, some, self.stated, self.up, _HALF_STEP_K)
-            slope = (warmer.flow_w_m2 - here.flow_w_m2[:, :1]) / _HALF_STEP_K
+            warmer = exchange(self.conditions, some, self.stated, self.up, HALF_STEP_K)
+            slope = (warmer.flow_w_m2 - here.flow_w_m2[:, :1]) / HALF_STEP_K
             u = (here.flow_w_m2 + slope * off) / here.difference_k
             found.append(np.concatenate([u[:, :1], np.quantile(u[:, 1:], ends, axis=1).T], axis=1))
         of_group = np.concatenate(found)
@@ -175,9 +171,9 @@ class _Work:
         rows = self.groups.rows(list(parts), self.surface.area_m2)
         low, high = (
             part_totals(self.conditions, self.groups, self.stated, self.up, rows, step)
-            for step in (-_HALF_STEP_K, _HALF_STEP_K)
+            for step in (-HALF_STEP_K, HALF_STEP_K)
         )
-        return (high.flow_w - low.flow_w)[:, 0] / (2.0 * _HALF_STEP_K)
+        return (high.flow_w - low.flow_w)[:, 0] / (2.0 * HALF_STEP_K)
 
     def u_by_model(self, parts: Sequence[IntArray]) -> dict[str, tuple[FloatArray, float]]:
         """U-values of parts, shape (parts,), and of all together, by each film model from the stated values."""

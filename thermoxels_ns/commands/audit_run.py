@@ -68,6 +68,12 @@ def run_audit(options: AuditOptions, say: Say = lambda _: None) -> Audit | None:
     whole = found.whole
     say(f"Heat loss: {interval_text(whole.loss_w, 'W')}; U-value: {interval_text(whole.u_w_m2k, 'W/(m2 K)')}.")
     say(f"{sum(not one.not_counted for one in found.defects)} thermal bridges or defects.")
+    if found.calibration is not None:
+        told = [
+            f"{name} {interval_text(value, found.calibration.units[name])}"
+            for name, value in found.calibration.found.items()
+        ]
+        say(f"Calibration: {'; '.join(told) or f'refused. {found.calibration.refused}'}")
     photographs = {}
     if options.scene is not None:
         photographs = photographs_of_defects(options.scene, _metres_per_unit(export), found)
@@ -92,12 +98,25 @@ def answers_of(options: AuditOptions, found: Audit) -> dict[str, Any]:
         "limits": [asdict(one) for one in found.limits],
         "f_rsi": [asdict(one) for one in found.f_rsi],
         "year": None if found.year is None else asdict(found.year),
+        "calibration": _calibration(found),
         "forbidden": list(found.check.forbidden),
         "doubts": list(found.check.doubts),
         "missing_for_en_13187": list(found.check.missing),
         "loss_moved_by_w": dict(found.budget),
         "not_counted_m2": dict(found.not_counted_m2),
     }
+
+
+def _calibration(found: Audit) -> dict[str, Any] | None:
+    """What a calibration found; an end that is not known is null."""
+    one = found.calibration
+    if one is None:
+        return None
+    intervals = {name: asdict(value) for name, value in one.found.items()}
+    for ends in intervals.values():
+        ends["high"] = ends["high"] if np.isfinite(ends["high"]) else None
+    told = {"found": intervals, "units": dict(one.units), "refused": one.refused}
+    return {**told, "moved_most_by": dict(one.moved_most_by), "misfit_k": one.misfit_k}
 
 
 def _prepared_folder(output_dir: Path) -> Path:
@@ -141,6 +160,8 @@ def _write_surface(path: Path, found: Audit) -> None:
     numbers = np.zeros(len(mesh.facets), dtype=np.int32)
     for number, one in enumerate(found.found, start=1):
         numbers[one.core] = number
+    calibration = found.calibration
+    off = {} if calibration is None else {"measured_minus_computed_k": calibration.difference_k}
     for name, values in {
         "surface_temperature_c": found.triangle_surface_c,
         "heat_flow_w_m2": found.triangle_flow_w_m2,
@@ -149,6 +170,7 @@ def _write_surface(path: Path, found: Audit) -> None:
         "u_high_w_m2k": found.triangle_u[:, 2],
         "counted": found.surface.counted.astype(np.uint8),
         "defect": numbers,
+        **off,
     }.items():
         data.cell_data[name] = values
     write_vtk(vtkXMLPolyDataWriter(), path, data)

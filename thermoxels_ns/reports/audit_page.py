@@ -71,7 +71,7 @@ def audit_page(
         in_short=_in_short(audit),
         figures=_figures(audit),
         limit_rows=tuple(_limit(one) for one in audit.limits),
-        sections=(*_overview(audit, pictures), _envelope(audit)),
+        sections=(*_overview(audit, pictures), _envelope(audit), *_calibration(audit, pictures)),
         defects=tuple(
             _card(audit, number, defect, pictures, photographs.get(number - 1, ()))
             for number, defect in enumerate(audit.defects[:MOST_DEFECTS], start=1)
@@ -191,6 +191,32 @@ def _envelope(audit: Audit) -> Section:
         )
     table = Table(columns, tuple(rows), note=note)
     return Section("The envelope, element by element", words=tuple(words), tables=(table,))
+
+
+def _calibration(audit: Audit, pictures: AuditPictures | None) -> list[Section]:
+    found, asked = audit.calibration, audit.conditions.calibrate
+    if found is None or asked is None:
+        return []
+    stated = asked.stated()
+    rows = tuple(
+        (f"{name}\n{unit_signs(found.units[name])}", interval_lines(value), f"{stated[name].value:g}", most)
+        for (name, value), most in zip(found.found.items(), found.moved_most_by.values())
+    )
+    known = [f"{name} {_measured(one, '')}" for name, one in stated.items() if name not in found.units]
+    words = [
+        "Which properties make the surface temperature that finite elements compute, in steady heat flow through the "
+        "mesh as thick as it is, meet the measured one."
+    ]
+    if found.refused:
+        words.append(f"Refused. {found.refused}")
+    if known:
+        words.append(f"Taken as known: {'; '.join(known)}.")
+    words.append(f"Measured and computed then differ by {found.misfit_k:.2f} K (root mean square).")
+    table = Table(("Property", "found", "start", "moved most by"), rows)
+    shown = () if pictures is None else pictures.misfit
+    drawn = tuple(Picture(png, "Where measured and computed differ, the model lacks something.") for png in shown)
+    galleries = (Gallery(drawn),) if drawn else ()
+    return [Section("Calibration", words=tuple(words), tables=(table,) if rows else (), galleries=galleries)]
 
 
 def _element(one: Element) -> tuple[str, ...]:

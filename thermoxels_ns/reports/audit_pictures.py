@@ -28,6 +28,7 @@ class AuditPictures:
     temperature: tuple[bytes, ...]  # Surface temperature with the numbers of defects, from one or two sides
     u_value: tuple[bytes, ...]  # U-value, from the same sides
     defects: tuple[bytes, ...]  # Surface temperature of each defect and what is around it
+    misfit: tuple[bytes, ...]  # Measured minus computed temperature of a calibration, from the same sides
 
 
 def draw_audit(audit: Audit) -> AuditPictures:
@@ -38,7 +39,9 @@ def draw_audit(audit: Audit) -> AuditPictures:
     ends = np.quantile(surface_c[np.unique(surface.mesh.facets[counted])], (0.005, 0.995))
     u_ends = np.quantile(u[np.unique(surface.mesh.facets[counted])], (0.02, 0.98))
     same: dict[str, Any] = {"clim": (float(ends[0]), float(ends[1])), "up": surface.selection.up}
-    temperature, u_value = [], []
+    temperature, u_value, misfit = [], [], []
+    calibration = audit.calibration
+    off_k = None if calibration is None else _at_nodes(audit, calibration.difference_k)
     for direction in _views(audit):
         view = {"view_direction": direction.tolist()}
         facing = surface.selection.facet_normal @ direction < 0.0
@@ -48,8 +51,12 @@ def draw_audit(audit: Audit) -> AuditPictures:
         look: dict[str, Any] = {"clim": (float(u_ends[0]), float(u_ends[1])), "colour_map": "viridis"}
         look |= {"bar_title": "U-value [W/(m² K)]", "up": surface.selection.up}
         u_value.append(_drawn(audit, facing, u, title="U-value by the stated values", **look, **view))
+        if off_k is not None:
+            most = float(np.quantile(np.abs(off_k[np.unique(surface.mesh.facets[counted])]), 0.98)) or 1.0
+            look |= {"clim": (-most, most), "colour_map": "coolwarm", "bar_title": "measured - computed [K]"}
+            misfit.append(_drawn(audit, facing, off_k, title="Measured minus computed", **look, **view))
     defects = [_defect(audit, number, surface_c, same) for number in range(min(len(audit.defects), MOST_DEFECTS))]
-    return AuditPictures(tuple(temperature), tuple(u_value), tuple(defects))
+    return AuditPictures(tuple(temperature), tuple(u_value), tuple(defects), tuple(misfit))
 
 
 def _at_nodes(audit: Audit, values: FloatArray) -> FloatArray:
@@ -57,7 +64,8 @@ def _at_nodes(audit: Audit, values: FloatArray) -> FloatArray:
     surface = audit.surface
     facets, area = surface.mesh.facets[surface.counted], surface.area_m2[surface.counted]
     weight, count = np.repeat(area, 3), len(surface.mesh.points_m)
-    total = np.bincount(facets.ravel(), weight * np.repeat(values[surface.counted], 3), count)
+    known = np.nan_to_num(values[surface.counted])  # a calibration may leave out patches
+    total = np.bincount(facets.ravel(), weight * np.repeat(known, 3), count)
     share = np.bincount(facets.ravel(), weight, count)
     return total / np.where(share > 0.0, share, 1.0)
 

@@ -13,17 +13,22 @@ _LARGE = 1000.0
 def interval_text(interval: Interval, unit: str, bounds: bool = True) -> str:
     """Write a number with the range that holds it, to two digits of half its width.
 
-    What is only known from above is called "at most"; of what may be nothing at all, no number is given. `bounds`:
+    What is only known from above is called "at most", from below "at least"; of what may be nothing at all, no number
+    is given. `bounds`:
     the quantity is one that cannot be below 0; else any sign is a result.
 
     >>> interval_text(Interval(0.8851, 0.211, 1.552), "W/(m2 K)").replace("\\N{NO-BREAK SPACE}", " ")
     '0.89 (0.21 to 1.55) W/(m² K)'
     >>> interval_text(Interval(0.3, -0.2, 0.8), "W"), interval_text(Interval(-3.0, -9.0, -1.0), "W")
     ('at most 0.80\\xa0W', 'not measurable')
+    >>> interval_text(Interval(0.3, 0.2, math.inf), "m"), interval_text(Interval(0.3, 0.0, math.inf), "m")
+    ('at least 0.20\\xa0m', 'not measurable')
     """
     unit = f"\N{NO-BREAK SPACE}{unit_signs(unit)}" if unit else ""
-    if bounds and interval.unknown:
+    if bounds and (interval.unknown or (interval.at_most and math.isinf(interval.high))):
         return "not measurable"
+    if math.isinf(interval.high):
+        return f"at least {number_text(interval.low, 0.5 * interval.low)}{unit}"
     if bounds and interval.at_most:
         return f"at most {number_text(interval.high, 0.5 * interval.high)}{unit}"
     half = 0.5 * (interval.high - interval.low)

@@ -1,0 +1,168 @@
+"""Walls whose construction is known are calibrated from their surface temperatures."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.support.audited_wall import (
+    CONDUCTIVITY,
+    STATED,
+    UP,
+    Truth,
+    audited_wall,
+    calibrated,
+    photographed,
+    solve_wall,
+    true_draws,
+)
+from thermoxels_ns.audit.conditions import Calibrate, Camera, Layer, Unknown
+from thermoxels_ns.audit.results import Calibration
+from thermoxels_ns.audit.run import audit
+from thermoxels_ns.core.errors import AuditError
+from thermoxels_ns.core.measured import Measured
+
+STEP_M = 0.2
+OFFSET_ALONE = replace(STATED, camera=Camera(Measured(0.0, 0.3), Measured(0.0)))
+WALL = Calibrate({"wall": Measured(0.9)}, (Unknown("conductivity", "wall"),), behind=("room",))
+
+
+@pytest.fixture(scope="module")
+def walls() -> dict[str, Truth]:
+    """A plain wall and one with a window, as stated."""
+    draws = true_draws(STATED, None)
+    meshes = {"plain": audited_wall(STEP_M, slab=False, window=False), "window": audited_wall(STEP_M, slab=False)}
+    return {name: solve_wall(mesh, STATED, draws) for name, mesh in meshes.items()}
+
+
+def calibrate(truth: Truth, asked: Calibrate, conditions=OFFSET_ALONE, seed: int | None = None) -> Calibration:
+    found = audit(photographed(truth, conditions, seed), replace(conditions, calibrate=asked), UP).calibration
+    assert found is not None
+    return found
+
+
+def test_exact_readings_give_the_true_conductivity(walls) -> None:
+    """The map of what remains is zero."""
+    found = calibrate(walls["plain"], WALL)
+    value = found.found["conductivity of wall"]
+    assert value.value == pytest.approx(CONDUCTIVITY["wall"], rel=1e-3)
+    assert value.low < CONDUCTIVITY["wall"] < value.high and found.refused == ""
+    assert found.misfit_k < 1e-6 and found.moved_most_by == {"conductivity of wall": "outside air"}
+    counted = np.isfinite(found.difference_k)
+    assert counted.any() and np.abs(found.difference_k[counted]).max() < 1e-2
+
+
+def test_no_calibration_without_being_asked(walls) -> None:
+    assert audit(photographed(walls["plain"], STATED), STATED, UP).calibration is None
+
+
+def test_two_materials_are_told_apart_where_each_has_a_surface(walls) -> None:
+    both = {"wall": Measured(0.6), "glazing": Measured(0.18)}
+    unknown = tuple(Unknown("conductivity", name) for name in both)
+    found = calibrate(walls["window"], replace(WALL, conductivity=both, unknown=unknown), seed=2)
+    for name in both:
+        assert found.found[f"conductivity of {name}"].value == pytest.approx(CONDUCTIVITY[name], rel=0.25)
+
+
+def test_an_offset_of_the_camera_counts_once_for_all_readings(walls) -> None:
+    """Drawn from -0.3 to 0.3 K: a twentieth of the draws is above 0.27 K, and so is a twentieth of the results."""
+    stated = calibrate(walls["plain"], WALL, replace(OFFSET_ALONE, **exact()))
+    shifted = replace(OFFSET_ALONE, camera=Camera(Measured(0.27), Measured(0.0)), **exact())
+    mesh = photographed(walls["plain"], OFFSET_ALONE)
+    warmer = audit(mesh, replace(shifted, calibrate=WALL), UP).calibration
+    assert warmer is not None
+    ends = [one.found["conductivity of wall"] for one in (stated, warmer)]
+    assert ends[0].high == pytest.approx(ends[1].value, rel=0.01) and ends[1].value > 1.05 * ends[0].value
+
+
+def exact() -> dict:
+    """Conditions without a range, the camera apart."""
+    return {
+        "inside": replace(STATED.inside, air=Measured(20.0)),
+        "outside": replace(STATED.outside, air=Measured(0.0), wind=Measured(1.0)),
+        "surroundings": replace(
+            STATED.surroundings,
+            sky=replace(STATED.surroundings.sky, cloud=Measured(0.7), dew_point=Measured(-4.0)),
+            ground=Measured(-0.5),
+        ),
+        "film": replace(STATED.film, factor=Measured(1.0)),
+        "surfaces": (replace(STATED.surfaces[0], emissivity=Measured(0.93)),),
+    }
+
+
+def test_what_is_known_to_a_range_widens_the_answer(walls) -> None:
+    """The wall and plaster of 0.1 +- 0.05 m2 K / W together resist as the true wall; 90 % of draws are within 0.045."""
+    layers = {"plaster": Layer(("room",), Measured(0.02, 0.01), Measured(0.2))}
+    sure = replace(STATED, camera=Camera(Measured(0.0), Measured(0.0)), **exact())
+    found = calibrate(walls["plain"], replace(WALL, layers=layers), sure).found["conductivity of wall"]
+    for value, plaster in ((found.low, 0.055), (found.value, 0.1), (found.high, 0.145)):
+        assert 0.3 / value + plaster == pytest.approx(0.3 / CONDUCTIVITY["wall"], rel=2e-3)
+
+
+def test_conductivity_and_thickness_of_one_layer_are_refused_with_their_ratio(walls) -> None:
+    """With a wall of 0.6 W/(m K) the layer must resist 0.5 m2 K / W: 2 W/(m K) per metre."""
+    layers = {"insulation": Layer(("room",), Measured(0.1), Measured(0.04))}
+    unknown = Unknown("conductivity", "insulation"), Unknown("thickness", "insulation")
+    asked = replace(WALL, conductivity={"wall": Measured(0.6)}, layers=layers, unknown=unknown)
+    found = calibrate(walls["plain"], asked)
+    assert found.found == {} and found.misfit_k < 1e-3
+    assert "conductivity of insulation" in found.refused and "cannot be told apart: their ratio is, 2" in found.refused
+    assert "W/(m K) per m" in found.refused
+
+
+def test_wall_and_insulation_are_refused_with_what_they_resist_together(walls) -> None:
+    layers = {"insulation": Layer(("room",), Measured(0.02), Measured(0.04))}
+    unknown = Unknown("conductivity", "wall"), Unknown("thickness", "insulation")
+    found = calibrate(walls["plain"], replace(WALL, layers=layers, unknown=unknown))
+    assert "cannot be told apart: conductivity of wall times thickness of insulation to the power of -" in found.refused
+
+
+def test_what_readings_do_not_show_is_refused(walls) -> None:
+    """A wall that is as warm as the air loses by convection nothing, whatever the coefficient."""
+    asked = replace(WALL, film={"facade": Measured(8.0)}, unknown=(*WALL.unknown, Unknown("film", "facade")))
+    found = calibrate(walls["plain"], asked)
+    assert found.found == {} and ("do not tell the film of facade" in found.refused or "told apart" in found.refused)
+
+
+def test_readings_that_no_wall_explains_are_refused(walls) -> None:
+    """All readings 12 K above what they are: no conductivity makes the outside of a wall warmer than its inside."""
+    warm = replace(OFFSET_ALONE, camera=Camera(Measured(25.0, 0.3), Measured(0.0)))
+    mesh = photographed(walls["plain"], OFFSET_ALONE)
+    found = audit(mesh, replace(warm, calibrate=WALL), UP).calibration
+    assert found is not None and "No conductivity of wall explains the readings: however large" in found.refused
+
+
+@pytest.mark.parametrize("side", ["outside", "inside"])
+def test_intervals_hold_the_truth_though_all_is_off(side) -> None:
+    """A small version of ``tests/benchmarks/audit_truth.py --calibrate``."""
+    held = [low.low <= true <= low.high for seed in (2, 5, 8) for _, true, low in calibrated(side, seed, STEP_M)]
+    assert sum(held) >= len(held) - 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"unknown": ()}, r"calibrate: unknown: expected one to 4 different entries, got none"),
+        ({"unknown": (*WALL.unknown, *WALL.unknown)}, r"one to 4 different entries, got conductivity of wall, cond"),
+        ({"unknown": (Unknown("thickness", "wall"),)}, r"expected one out of conductivity of wall, got thickness of"),
+        ({"conductivity": {"wall": Measured(0.1, 0.1)}}, r"conductivity of wall: expected a number that is surely abo"),
+        ({"layers": {"wall": Layer(("room",), Measured(0.1), Measured(1.0))}}, r"names that no region has, got wall"),
+    ],
+)
+def test_what_cannot_be_asked_is_said(changes, message) -> None:
+    with pytest.raises(AuditError, match=message):
+        replace(WALL, **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"behind": ("rom",)}, r"calibrate: behind: expected patches out of .*room.*, got 'rom'"),
+        ({"behind": ("room", "facade")}, r"calibrate: behind: expected another side of the body, got nothing that cou"),
+        ({"layers": {"x": Layer(("facade",), Measured(0.1), Measured(1.0))}}, r"calibrate: layers: x: expected patch"),
+        ({"film": {"room": Measured(5.0)}}, r"calibrate: film: expected patches out of facade, got 'room'"),
+    ],
+)
+def test_what_does_not_fit_the_mesh_is_said(walls, changes, message) -> None:
+    with pytest.raises(AuditError, match=message):
+        calibrate(walls["plain"], replace(WALL, **changes))

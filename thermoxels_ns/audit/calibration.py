@@ -1,0 +1,360 @@
+"""Calibration: properties of walls for which the computed surface temperature meets the measured one.
+
+Steady heat flow through the mesh is computed by `heat/`, under the film of the conditions on the photographed side and
+ISO 6946 on the other. Gauss-Newton's method finds the logarithms of the unknown properties for which the squares of
+measured minus computed, by area, are least (Beck and Arnold 1977, Parameter Estimation in Engineering and Science).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from thermoxels_ns.audit.conditions import Calibrate, Conditions, Film, unknown_name
+from thermoxels_ns.audit.draws import Draws, Interval, emissivity_name, interval_of
+from thermoxels_ns.audit.exchange import HALF_STEP_K, film_flow_w_m2, radiant_k4, triangle_exchange
+from thermoxels_ns.audit.results import Calibration
+from thermoxels_ns.audit.surface import AlikeTriangles, AuditedSurface
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
+from thermoxels_ns.core.errors import AuditError
+from thermoxels_ns.core.measured import Measured
+from thermoxels_ns.core.units import celsius_to_kelvin
+from thermoxels_ns.fem.quantities import Places, Varying
+from thermoxels_ns.fem.selection import matching_names
+from thermoxels_ns.fem.steady import solve_steady
+from thermoxels_ns.heat.effects import Convection
+from thermoxels_ns.heat.materials import Material
+from thermoxels_ns.heat.scene import HeatScene
+from thermoxels_ns.heat.scene_fields import inside_coefficient, outside_coefficient
+
+_UNITS = {"conductivity": "W/(m K)", "thickness": "m", "film": "W/(m2 K)"}
+_STEP = 1e-4  # For differences with respect to the logarithm of a property
+_MOST_STEP, _ENOUGH, _MOST_STEPS = 1.0, 1e-3, 30  # Of logarithms: largest step, last step; number of steps
+_FAR = 4.0  # Logarithm from which on a property may be as small or large as anyone likes
+_LEAST_K = 0.02  # Root mean square by which surface temperatures must change if a property becomes e times as large
+_MOST_SPREAD = 0.5  # Standard deviation of a logarithm by noise and drift alone from which on nothing is known
+_SMALL_SHARE = 0.1  # What takes part by less than this in a combination is not named
+_OF_A_PATCH, _OF_THE_NOISE, _OF_WHAT_IS_STATED = 3 * 10**6, 4 * 10**6, 5 * 10**6  # Numbers of errors of their own
+
+
+def calibrated(
+    conditions: Conditions, surface: AuditedSurface, groups: AlikeTriangles, draws: Draws
+) -> Calibration | None:
+    """Find the properties that the conditions ask for; None if they ask for none.
+
+    Raises `AuditError` or `HeatError` if the model does not fit the mesh.
+    """
+    asked = conditions.calibrate
+    if asked is None:
+        return None
+    fit = _Fit(_Wall(conditions, asked, surface, groups), draws)
+    names = fit.names
+    units = {unknown_name(one): _UNITS[one.property] for one in asked.unknown}
+    refused = fit.what_cannot_be_told(units)
+    difference = np.full(len(surface.counted), np.nan)
+    difference[fit.wall.counted] = fit.residual_k
+    misfit = float(np.sqrt(fit.weight @ fit.residual_k**2))
+    if refused:
+        return Calibration({}, units, refused, {}, misfit, difference)
+    logarithms, most = fit.spread()
+    found = {}
+    for name, drawn in zip(names, logarithms):
+        interval = interval_of(np.exp(np.clip(drawn, -20.0, 20.0)) * fit.start[name])
+        ends = [
+            np.log(end / fit.start[name]) - drawn[0] if end > 0.0 else -np.inf for end in (interval.low, interval.high)
+        ]
+        low, high = 0.0 if ends[0] < -_FAR else interval.low, np.inf if ends[1] > _FAR else interval.high
+        found[name] = Interval(interval.value, low, high)
+    return Calibration(found, units, "", dict(zip(names, most)), misfit, difference)
+
+
+class _Wall:
+    """The body with its films: surface temperatures for any properties and conditions."""
+
+    def __init__(
+        self, conditions: Conditions, asked: Calibrate, surface: AuditedSurface, groups: AlikeTriangles
+    ) -> None:
+        self.conditions, self.asked, self.surface, self.groups = conditions, asked, surface, groups
+        names, patch = surface.selection.patch_names, surface.selection.facet_patch
+        behind = _matching("behind", names, asked.behind)
+        insulated = {name for pattern in asked.adiabatic for name in matching_names(names, pattern)}
+        self.behind = np.flatnonzero(np.isin(patch, [names.index(name) for name in behind - insulated]))
+        seen = [n for n, name in enumerate(names) if name not in behind | insulated]
+        self.seen = np.flatnonzero(np.isin(patch, seen))
+        self.counted = self.seen[surface.counted[self.seen]]
+        if not len(self.counted) or not len(self.behind):
+            got = "no such surface" if not len(self.behind) else f"nothing that counts but on {', '.join(behind)}"
+            remedy = 'Name the patches on the far side of what was photographed, such as ["interior-*"].'
+            raise AuditError("calibrate: behind", expected="another side of the body", got=got, remedy=remedy)
+        bare = sorted({names[n] for n in np.unique(patch[self.seen[surface.surface_entry[self.seen] < 0]])})
+        if bare:
+            remedy = f"Add {{patches: [{bare[0]}], emissivity: 0.93 +- 0.02}} to surfaces, or name it in behind."
+            raise AuditError(
+                "surfaces", expected="an emissivity for every patch", got=f"none for {bare[0]}", remedy=remedy
+            )
+        self._layers = {
+            name: self._on(f"layers: {name}", self.behind, one.patches) for name, one in asked.layers.items()
+        }
+        self._film = {name: self._on("film", self.seen, (name,)) for name in asked.film}
+
+    def measured_c(self, draws: Draws) -> FloatArray:
+        """Corrected surface temperature of every triangle that counts, shape (c,)."""
+        up = self.surface.selection.up
+        return triangle_exchange(self.conditions, self.surface, self.groups, draws, up)[0][self.counted]
+
+    def computed_c(self, values: Mapping[str, float], draws: Draws, measured_c: FloatArray) -> FloatArray:
+        """Surface temperature of every triangle that counts, of the steady state, shape (c,).
+
+        The film of the photographed side is linear in the temperature, by its tangent at the measured one.
+        """
+        mesh, names = self.surface.mesh, np.array(self.surface.selection.patch_names)
+        start_c = np.full(len(self.surface.counted), float(measured_c.mean()))
+        start_c[self.counted] = measured_c
+        coefficient, air_c = self._photographed_side(values, draws, start_c[self.seen])
+        inside = self.conditions.side == "inside"
+        far_air_c = float(draws["outside air" if inside else "inside air"][0])
+        far = self._far_side(values)
+
+        def acting(facets: IntArray, coefficient: FloatArray, air_c: Varying | float) -> Convection:
+            patches = tuple(names[np.unique(self.surface.selection.facet_patch[facets])].tolist())
+            return Convection(patches, Varying(lambda *_: coefficient, in_time=False), air_c)
+
+        materials = {
+            name: Material(name, values[f"conductivity of {name}"], 1000.0, 1000.0) for name in self.asked.conductivity
+        }
+        near = acting(self.seen, coefficient, Varying(lambda *_: air_c, in_time=False))
+        films = near, acting(self.behind, far, far_air_c)
+        scene = HeatScene(materials, convection=films, adiabatic=self.asked.adiabatic, initial_c=far_air_c)
+        state = solve_steady(scene.problem(mesh, up=self.surface.selection.up))
+        return state.temperature_c[mesh.facets[self.counted]].mean(axis=1)
+
+    def _photographed_side(
+        self, values: Mapping[str, float], draws: Draws, at_c: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Coefficient and temperature of air, shape (s,) each, for which convection is the tangent of the film."""
+        surface, up = self.surface, self.surface.selection.up
+        normals = surface.selection.facet_normal[self.seen]
+        every = np.stack([draws[emissivity_name(self.conditions, n)] for n in range(len(self.conditions.surfaces))])
+        emissivity = every[surface.surface_entry[self.seen]]
+        around_k4 = radiant_k4(self.conditions, draws, normals, up)
+
+        def flow(conditions: Conditions, here: Draws, warmer_k: float) -> FloatArray:
+            surface_k = celsius_to_kelvin(at_c + warmer_k)[:, None]
+            out = film_flow_w_m2(conditions, here, surface_k, around_k4, emissivity, normals, up)[:, 0]
+            return -out if self.conditions.side == "inside" else out
+
+        def tangent(conditions: Conditions, here: Draws) -> tuple[FloatArray, FloatArray]:
+            low, mean, high = (flow(conditions, here, step) for step in (-HALF_STEP_K, 0.0, HALF_STEP_K))
+            coefficient = np.maximum((high - low) / (2.0 * HALF_STEP_K), 1e-3)
+            return coefficient, at_c - mean / coefficient
+
+        coefficient, air_c = tangent(self.conditions, draws)
+        for name, where in self._film.items():
+            value = values[f"film of {name}"]
+            given = replace(self.conditions, film=Film("given", Measured(1.0), Measured(value)))
+            exact = {"film coefficient": np.full(draws.count, value), "film factor": np.ones(draws.count)}
+            own = tangent(given, replace(draws, values={**draws.values, **exact}))
+            coefficient, air_c = np.where(where, own[0], coefficient), np.where(where, own[1], air_c)
+        return coefficient, air_c
+
+    def _far_side(self, values: Mapping[str, float]) -> FloatArray:
+        """Coefficient of what lies behind, layers included, shape (b,), [W/(m2 K)]."""
+        surface = self.surface
+        normals = surface.selection.facet_normal[self.behind]
+        film = outside_coefficient("iso-6946-combined") * np.ones(len(self.behind))
+        if self.conditions.side == "outside":
+            places = Places(np.zeros_like(normals), normals, surface.selection.up)
+            film = np.asarray(inside_coefficient("iso-6946-combined").function(places, 0.0))
+        resistance = 1.0 / film
+        for name, where in self._layers.items():
+            resistance = resistance + where * values[f"thickness of {name}"] / values[f"conductivity of {name}"]
+        return 1.0 / resistance
+
+    def _on(self, entry: str, facets: IntArray, patterns: tuple[str, ...]) -> BoolArray:
+        """Mark which of some triangles belong to patches that match."""
+        names, patch = self.surface.selection.patch_names, self.surface.selection.facet_patch[facets]
+        there = tuple(names[n] for n in np.unique(patch))
+        return np.isin(patch, [names.index(name) for name in _matching(entry, there, patterns)])
+
+
+class _Fit:
+    """The least squares of measured minus computed by the stated values, and how it moves with what is uncertain."""
+
+    def __init__(self, wall: _Wall, draws: Draws) -> None:
+        self.wall, self.draws = wall, draws
+        self.names = [unknown_name(one) for one in wall.asked.unknown]
+        self.stated = wall.asked.stated()
+        self.start = {name: self.stated[name].value for name in self.names}
+        area = wall.surface.area_m2[wall.counted]
+        self.weight = area / area.sum()
+        self._first = Draws({name: values[:1] for name, values in draws.values.items()})  # what is stated
+        self.logarithm = self._search()
+
+    def _residual(self, logarithm: FloatArray, draws: Draws, known: Mapping[str, float] | None = None) -> FloatArray:
+        values = {name: one.value for name, one in self.stated.items()} | dict(known or {})
+        values |= {name: self.start[name] * float(np.exp(x)) for name, x in zip(self.names, logarithm)}
+        measured = self.wall.measured_c(draws)
+        return measured - self.wall.computed_c(values, draws, measured)
+
+    def _search(self) -> FloatArray:
+        """Gauss-Newton's method; a step that does not help is halved, directions that change nothing stay at rest."""
+        x = np.zeros(len(self.names))
+        residual = self._residual(x, self._first)
+        for _ in range(_MOST_STEPS):
+            moved = [self._residual(x + _STEP * row, self._first) for row in np.eye(len(x))]
+            slope = np.stack([(residual - one) / _STEP for one in moved], axis=1)
+            normal = slope.T @ (self.weight[:, None] * slope)
+            values, vectors = np.linalg.eigh(normal)
+            self.slope, self.sensitive_k, self.directions = slope, np.sqrt(np.maximum(values, 0.0)), vectors
+            told = self.sensitive_k > 0.1 * _LEAST_K
+            pull = vectors.T @ (slope.T @ (self.weight * residual))
+            step = vectors @ np.where(told, pull / np.where(told, values, 1.0), 0.0)
+            step *= min(1.0, _MOST_STEP / max(float(np.abs(step).max()), 1e-300))
+            while True:
+                tried = self._residual(x + step, self._first)
+                if self.weight @ tried**2 <= self.weight @ residual**2 or np.abs(step).max() < _ENOUGH:
+                    break
+                step = 0.5 * step
+            x, residual = x + step, tried
+            if np.abs(step).max() < _ENOUGH or np.abs(x).max() > 2.0 * _FAR:
+                break
+        self.residual_k = residual
+        return x
+
+    def what_cannot_be_told(self, units: Mapping[str, str]) -> str:
+        """Say which properties the readings do not tell, and which combination of them they do; else nothing."""
+        far = np.abs(self.logarithm) > _FAR
+        sentences = []
+        for number, name in enumerate(self.names):
+            if far[number]:
+                end = "small" if self.logarithm[number] < 0.0 else "large"
+                sentences.append(
+                    f"No {name} explains the readings: however {end} it is, the computed surface is on one side of "
+                    "the measured one. Check the airs, the camera's offset and what is taken as known."
+                )
+        if sentences:
+            return " ".join(sentences)
+        spread = self._local_spread()
+        for direction, sensitive, off in zip(self.directions.T, self.sensitive_k, spread):
+            if sensitive < _LEAST_K or off > _MOST_SPREAD:
+                sentences.append(self._combination(direction, sensitive, units))
+        return " ".join(sentences)
+
+    def _combination(self, direction: FloatArray, sensitive_k: float, units: Mapping[str, str]) -> str:
+        """Put into words what is not known along a direction of logarithms, and what is across it."""
+        share = direction / direction[np.argmax(np.abs(direction))]
+        which = [n for n in np.argsort(-np.abs(share), kind="stable") if abs(share[n]) >= _SMALL_SHARE]
+        named = [self.names[n] for n in which]
+        if len(which) == 1:
+            return (
+                f"The readings do not tell the {named[0]}: were it twice as much, surface temperatures would change by "
+                f"{np.log(2.0) * sensitive_k:.2g} K. Take it as known, or measure a surface that it acts on."
+            )
+        told = f"{', '.join(named[:-1])} and {named[-1]} cannot be told apart"
+        if len(which) > 2:
+            return f"{told}: only combinations of them are known. Take all but one of them as known."
+        first, second = named
+        power = -float(share[which[1]])  # first times second to this power does not change along the direction
+        values = [self.start[self.names[n]] * np.exp(self.logarithm[n]) for n in which]
+        known = f"{values[0] * values[1] ** power:.3g}"
+        if abs(abs(power) - 1.0) < 0.05:
+            what, between = ("ratio", "per") if power < 0.0 else ("product", "times")
+            known = f"their {what} is, {known} {units[first]} {between} {units[second]}"
+        else:
+            known = f"{first} times {second} to the power of {power:.2g} is, {known}"
+        return f"{told}: {known}. Take one of the two as known."
+
+    def _local(self, gain: FloatArray) -> Iterator[tuple[int, FloatArray]]:
+        """Each patch, and how far its own error of 1 K moves what `gain`, (m, c), makes of residuals, shape (m,)."""
+        patch = self.wall.surface.selection.facet_patch[self.wall.counted]
+        for number in np.unique(patch):
+            yield int(number), gain[:, patch == number].sum(axis=1)
+
+    def _noise(self, gain: FloatArray) -> FloatArray:
+        """Covariance that the scatter of nodes' readings leaves in what `gain` makes of residuals, shape (m, m).
+
+        A triangle's reading is the mean of three nodes', so its variance a third of theirs.
+        """
+        facets = self.wall.surface.mesh.facets[self.wall.counted]
+        nodes, number = np.unique(facets, return_inverse=True)
+        at_nodes = np.stack([np.bincount(number.ravel(), np.repeat(row / 3.0, 3), len(nodes)) for row in gain])
+        return 3.0 * float(self.weight @ self.residual_k**2) * at_nodes @ at_nodes.T
+
+    def _local_spread(self) -> FloatArray:
+        """Standard deviation of the logarithm along each direction by noise and the patches' own errors, shape (m,)."""
+        told = np.maximum(self.sensitive_k, 1e-12)
+        gain = (self.directions.T / told[:, None] ** 2) @ (self.slope.T * self.weight)
+        variance = np.diag(self._noise(gain)).copy()
+        off = self.wall.conditions.camera.repeatability.off_by
+        for _, moved in self._local(gain):
+            variance += off**2 / 3.0 * moved**2
+        return np.sqrt(variance)
+
+    def spread(self) -> tuple[FloatArray, list[str]]:
+        """Logarithms of the properties in every draw, shape (m, k), and which quantity moves each most.
+
+        What is common to all readings is followed to both ends of its range, and in between by a parabola; effects of
+        several quantities add up.
+        """
+        gain = np.linalg.solve(self.slope.T @ (self.weight[:, None] * self.slope), self.slope.T * self.weight)
+        off, count = self.wall.conditions.camera.repeatability.off_by, self.draws.count
+        drawn = np.repeat(self.logarithm[:, None], count, axis=1)
+        moved: dict[str, FloatArray] = {}
+        for name, values in self._uncertain().items():
+            at = values - values[0]
+            low, high = at.min(), at.max()
+            below, above = (self._follow(gain, name, values[0] + end) - self.logarithm for end in (low, high))
+            # The parabola through (low, below), (0, 0) and (high, above).
+            bend = (above / high - below / low) / (high - low)
+            rise = above / high - bend * high
+            drawn += rise[:, None] * at + bend[:, None] * at**2
+            moved[name] = np.abs(above - below)
+        for number, step in self._local(gain):
+            drawn += step[:, None] * self.draws.local(off, _OF_A_PATCH + number)
+        noise = np.random.default_rng((self.draws.seed, _OF_THE_NOISE)).standard_normal((len(drawn), count))
+        noise[:, 0] = 0.0
+        drawn += np.linalg.cholesky(self._noise(gain) + 1e-18 * np.eye(len(drawn))) @ noise
+        most = [max(moved, key=lambda name: moved[name][n]) if moved else "" for n in range(len(self.names))]
+        return drawn, most
+
+    def _uncertain(self) -> dict[str, FloatArray]:
+        """All that is uncertain and common to all readings: conditions, and properties that are taken as known."""
+        common = {name: values for name, values in self.draws.values.items() if not name.startswith("contact")}
+        for number, (name, one) in enumerate(self.stated.items()):
+            if name not in self.start:
+                common[name] = one.value + self.draws.local(one.off_by, _OF_WHAT_IS_STATED + number)
+        return {name: values for name, values in common.items() if np.ptp(values) > 0.0}
+
+    def _follow(self, gain: FloatArray, name: str, value: float) -> FloatArray:
+        """Logarithms for which `gain` sees no residual with another value of a quantity (Broyden's method)."""
+        common = name in self.draws.values
+        draws = Draws({**self._first.values, name: np.array([value])}) if common else self._first
+        known = {} if common else {name: value}
+        x, inverse = self.logarithm.copy(), np.eye(len(self.logarithm))
+        pull = gain @ self._residual(x, draws, known)
+        for _ in range(_MOST_STEPS):
+            step = np.clip(inverse @ pull, -_MOST_STEP, _MOST_STEP)
+            x = x + step
+            if np.abs(step).max() < _ENOUGH or np.abs(x - self.logarithm).max() > _FAR + _MOST_STEP:
+                break
+            after = gain @ self._residual(x, draws, known)
+            change = inverse @ (pull - after)
+            if abs(step @ change) > 1e-12:
+                inverse = inverse + np.outer(step - change, step @ inverse) / (step @ change)
+            pull = after
+        return x
+
+
+def _matching(entry: str, names: tuple[str, ...], patterns: tuple[str, ...]) -> set[str]:
+    """Names that match any pattern; raises `AuditError` for one that matches none."""
+    found = set[str]()
+    for pattern in patterns:
+        here = matching_names(names, pattern)
+        if not here:
+            remedy = "Correct the name; see the patches in the summary.json of the export."
+            got, expected = repr(pattern), f"patches out of {', '.join(names)}"
+            raise AuditError(f"calibrate: {entry}", expected=expected, got=got, remedy=remedy)
+        found |= set(here)
+    return found
