@@ -1,10 +1,12 @@
 """Poses that the photographs of a scene contradict, from files to the dataset."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.dataset import ThermalDataset
@@ -127,8 +129,13 @@ def test_the_parser_gives_adjusted_poses_and_those_that_held_out_photographs_say
 
 
 def test_lenses_without_a_plane_keep_their_poses(scenes, monkeypatch):
-    from dataclasses import replace
-
     scene, training, _ = split(scenes["off"])
     scene.frames[0] = replace(scene.frames[0], intrinsics=replace(scene.frames[0].intrinsics, lens="fisheye"))
+    assert refine_poses(scene, training, lambda _: None) == (scene, {})
+
+
+def test_masked_features_move_no_pose(scenes, tmp_path):
+    Image.new("L", (32, 24)).save(tmp_path / "nothing.png")
+    scene, training, _ = split(scenes["off"])
+    scene.frames[:] = [replace(frame, mask=tmp_path / "nothing.png") for frame in scene.frames]
     assert refine_poses(scene, training, lambda _: None) == (scene, {})

@@ -1,7 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from thermoxels_ns.multiview.backdrop import mean_colours, plain_backdrop
+from thermoxels_ns.multiview.differences import Differences
 from thermoxels_ns.multiview.photographs import Photographs
 
 WIDTH, HEIGHT, FOCAL = 60, 48, 50.0
@@ -62,6 +65,17 @@ def test_a_white_wall_under_a_white_sky_is_none():
     seen, is_sky = house(sky=(0.95, 0.95, 0.95), wall=(0.95, 0.95, 0.95), wall_warmth=0.6)
     backdrop = found(seen)
     assert backdrop[~is_sky].mean() < 0.01 and backdrop[is_sky].mean() > 0.8
+
+
+def test_a_sky_that_some_photographs_show_overexposed_is_one():
+    seen, is_sky = house(sky=(0.9, 0.9, 0.9), wall=(0.5, 0.45, 0.4))
+    gain = np.array([1.0, 1.3, 0.8, 0.9, 1.2, 0.95])
+    exposed = np.minimum(seen.colours * gain[seen.numbers, None], 1.0).astype(np.float32)
+    differences = Differences(np.log(gain)[:, None].repeat(3, axis=1), np.zeros((6, 3)), np.zeros(6), np.zeros(6))
+    corrected = differences.without_gains(replace(seen, colours=exposed))
+    backdrop, bright = found(corrected), gain[seen.numbers] > 1.1
+    assert backdrop[is_sky & bright].mean() > 0.8 and backdrop[is_sky & ~bright].mean() > 0.8
+    assert not backdrop[~is_sky].any()
 
 
 def test_a_pixel_whose_depth_is_known_is_none():

@@ -1,11 +1,14 @@
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.multiview.bundle_adjustment import (
     FEWEST_TRACKS,
+    Features,
     Tracks,
+    _placed_like,
     adjust_poses,
     features_of,
     find_tracks,
@@ -96,13 +99,71 @@ def test_where_the_world_begins_does_not_matter():
     np.testing.assert_allclose(found_far.poses[:, :3, :3], found.poses[:, :3, :3], atol=1e-6)
 
 
-def test_wrong_matches_do_little_harm():
+@pytest.mark.parametrize("off_px", [3.0, 10.0, 200.0])
+def test_wrong_matches_do_little_harm(off_px):
     seen, draw = tracks(), np.random.default_rng(3)
-    wrong = draw.random(len(seen.point)) < 0.05
-    place = np.where(wrong[:, None], seen.place + 10.0 / FOCAL * draw.standard_normal(seen.place.shape), seen.place)
+    wrong = draw.random(len(seen.point)) < 0.1
+    shift = off_px / FOCAL * (1.0 + 0.3 * draw.standard_normal(seen.place.shape))  # to one side, as of a moving shadow
     given = off_by(0.15)
-    found = adjust_poses(Tracks(seen.photograph, seen.point, place), given, np.full(VIEWS, FOCAL))
-    assert found is not None and inconsistency_px(found.poses) < 0.3 * inconsistency_px(given)
+    found = adjust_poses(
+        Tracks(seen.photograph, seen.point, seen.place + wrong[:, None] * shift), given, np.full(VIEWS, FOCAL)
+    )
+    assert found is not None and inconsistency_px(found.poses) < 0.15 * inconsistency_px(given)
+
+
+def test_a_photograph_with_hardly_a_feature_stays_nearly_where_it_is():
+    seen, given = tracks(noise_px=1.0), off_by(0.3)
+    few = np.flatnonzero(seen.photograph == 5)[3:]
+    kept = np.ones(len(seen.point), dtype=bool)
+    kept[few] = False
+    seen = Tracks(seen.photograph[kept], seen.point[kept], seen.place[kept])
+    found = adjust_poses(seen, given, np.full(VIEWS, FOCAL))
+    assert found is not None
+    turn = found.poses[5, :3, :3] @ given[5, :3, :3].T
+    assert np.rad2deg(np.arccos((np.trace(turn) - 1.0) / 2.0)) < 1.0
+    assert np.linalg.norm(found.poses[5, :3, 3] - given[5, :3, 3]) < 0.05
+
+
+def test_poses_that_differ_as_a_whole_are_brought_back():
+    turned = Rotation.from_rotvec((0.1, -0.2, 0.3)).as_matrix()
+    moved = poses()
+    moved[:, :3, :3], moved[:, :3, 3] = turned @ moved[:, :3, :3], 1.1 * moved[:, :3, 3] @ turned.T + (1.0, 2.0, 3.0)
+    np.testing.assert_allclose(_placed_like(moved, poses()), poses(), atol=1e-9)
+
+
+def by_hand(*photographs: dict[tuple[float, float], np.ndarray]) -> Tracks:
+    """Tracks of features at given pixels with given descriptors, in photographs taken side by side."""
+    camera, side = Camera(200, 100, FOCAL, FOCAL, 100.0, 50.0), np.repeat(np.eye(4)[None], len(photographs), axis=0)
+    side[:, 0, 3] = 0.3 * np.arange(len(photographs))
+    features = [
+        Features(np.array(list(each)), np.array(list(each.values()), dtype=np.float32).reshape(len(each), -1))
+        for each in photographs
+    ]
+    return find_tracks(features, [camera] * len(photographs), side)
+
+
+def test_matches_far_from_their_lines_are_none():
+    looks = np.eye(16)
+    one = {(10.0 * n + 5.0, 5.0 * n + 5.0): looks[n] for n in range(12)}
+    other = {(x - 4.0, y + (40.0 if n == 3 else 0.0)): looks[n] for n, (x, y) in enumerate(one)}
+    assert by_hand(one, other).points == 11
+
+
+def test_a_track_with_two_features_of_one_photograph_is_none():
+    looks = np.eye(16)
+    between = 0.94 * looks[0] + 0.34 * looks[12]
+    one = {(10.0 * n + 5.0, 5.0 * n + 5.0): looks[n] for n in range(12)}
+    third = {(x - 8.0, y): look for (x, y), look in one.items()} | {(5.0 - 8.0, 5.0): between}
+    assert by_hand(one, {(x - 4.0, y): look for (x, y), look in one.items()}).points == 12
+    doubled = by_hand(one | {(9.0, 5.0): between}, {(x - 4.0, y): look for (x, y), look in one.items()}, third)
+    assert doubled.points == 11
+
+
+def test_features_lie_where_rays_say_that_they_do():
+    rows, columns = np.mgrid[:80, :100] + 0.5
+    spot = 255.0 * np.exp(-((columns - 40.2) ** 2 + (rows - 31.7) ** 2) / (2.0 * 4.0**2))
+    pixels = features_of(np.round(spot).astype(np.uint8)).pixels
+    assert np.abs(pixels - (40.2, 31.7)).max(1).min() < 0.2
 
 
 def test_too_few_tracks_say_nothing():

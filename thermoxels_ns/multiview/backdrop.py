@@ -15,7 +15,6 @@ STEEPEST = 0.9  # Cosine between the optical axis and the vertical above which a
 COLOUR_TOLERANCE = 0.06  # Difference from the backdrop's colour up to which a pixel shows it, of 1
 THERMAL_TOLERANCE = 0.1  # Difference from its temperature, of the scene's range
 VOTES = 2  # Photographs that show a surface, for each that shows a backdrop, from which on it is one
-_FEWEST_TOLD = 0.1
 _WIDEST, _ROUNDS = 0.3, 8
 """Difference up to which colours count in the first of some fits; it shrinks to the tolerance."""
 
@@ -116,12 +115,8 @@ def _alike(
 ) -> npt.NDArray[np.bool_]:
     """Which pixels look as most of the chosen do, by colour and, where it is known, temperature (pixels, 4).
 
-    What is `saturated` (pixels, 3) looks like anything as bright or brighter, and does not say what most look like
-    unless hardly any others do.
+    What is `saturated` (pixels, 3) looks like anything as bright or brighter.
     """
-    if saturated is not None:
-        told = chosen & ~saturated.any(1)
-        chosen = told if told.sum() >= _FEWEST_TOLD * chosen.sum() else chosen
     x, y, z = directions.T
     basis = np.column_stack((np.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3.0 * z * z - 1.0))
     tolerance = np.array([COLOUR_TOLERANCE] * 3 + [THERMAL_TOLERANCE])
