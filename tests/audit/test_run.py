@@ -355,3 +355,25 @@ def test_the_budget_names_what_matters_most(balcony) -> None:
     assert next(iter(balcony.budget)) == "camera offset"
     assert all(value >= 0.0 for value in balcony.budget.values())
     assert balcony.budget["inside air"] == pytest.approx(0.0, abs=1e-9)  # the heat flow outside does not see it
+
+
+def test_wrinkles_of_a_reconstructed_wall_are_no_heat_loss_of_a_bridge() -> None:
+    """The same warm band on a flat wall and on one whose nodes are off by 2 cm: psi is that of the drawing on both."""
+    flat = audited_wall(slab=False, window=False)
+    z = flat.points_m[:, 2]
+    drawn = 2.0 + 3.0 * np.exp(-(((z - 1.5) / 0.25) ** 2))
+    off_m = np.where(flat.points_m[:, 1] == 0.0, np.random.default_rng(4).normal(0.0, 0.02, len(z)), 0.0)
+    wrinkled = replace(flat, points_m=flat.points_m + off_m[:, None] * [0.0, 1.0, 0.0])
+    corner = wrinkled.points_m[wrinkled.facets]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    wrinkled = replace(wrinkled, boundary=replace(flat.boundary, normal=normal))
+    stated = replace(EXACT, film=Film("iso-6946-combined", Measured(1.0)), surfaces=(Surface(Measured(1.0)),))
+    seen = np.zeros(len(z), dtype=bool)
+    seen[flat.facets[flat.boundary.seen]] = True
+    for mesh in (flat, wrinkled):
+        found = audit(replace(mesh, temperature_c=drawn, observed=seen), stated, UP)
+        (bridge,) = found.defects
+        assert bridge.kind == "line"
+        assert bridge.coefficient.value == pytest.approx(25.0 * 3.0 * 0.25 * np.sqrt(np.pi) / 20.0, rel=0.08)
+    assert found.whole.area_m2 > 1.04 * 12.0

@@ -7,11 +7,17 @@ import pytest
 import tyro
 
 from thermoxels_ns import cli
+from thermoxels_ns.audit.conditions import load_conditions
+from thermoxels_ns.audit.survey_rules import check_survey
 from thermoxels_ns.commands import demo
+from thermoxels_ns.commands.audit import Audit
+from thermoxels_ns.commands.demo_audit import audit_section, audit_target, compare, true_u_of_patches
 from thermoxels_ns.commands.demo_results import Target, read_results
 from thermoxels_ns.commands.export import ExportThermoxelsMesh
 from thermoxels_ns.commands.heat import Heat
 from thermoxels_ns.core.errors import OutputError, ThermoxelsError
+from thermoxels_ns.core.yaml_records import configs_folder
+from thermoxels_ns.synthetic.house_corner import BRIDGE_PSI_W_MK
 
 IMAGES = {
     "psnr": 28.0,
@@ -186,6 +192,82 @@ def test_the_whole_demo_leaves_a_page(quick_demo, tmp_path, capfd):
         *("ns-eval.log", "ns-export.log", "ns-render.log", "ns-train.log")
     ]
     assert cli.main(["demo", "--output-dir", str(folder), "--scene", "sphere"]) == 0
+
+
+def test_the_house_has_the_u_values_that_its_elements_were_drawn_with():
+    """Panes and door are of one U-value each; the walls' means hold the band of the storey slab."""
+    true = true_u_of_patches(configs_folder() / "house-corner-patches.yaml")
+    drawn = {"window-1": 5.6, "window-2": 5.2, "balcony-door": 5.8, "window-3": 4.8, "door": 3.6}
+    drawn |= {"window-4": 5.4, "window-5": 5.6, "window-6": 5.0}
+    assert {name: true[name] for name in drawn} == pytest.approx(drawn)
+    # Without openings the mean of the side wall, 4.65 m high, would be that of the wall and of its band.
+    assert 2.0 + BRIDGE_PSI_W_MK / 4.65 < true["side-wall"] < 2.0 + BRIDGE_PSI_W_MK / 3.0
+    assert pytest.approx(1.2 * 0.35 * math.sqrt(math.pi)) == BRIDGE_PSI_W_MK
+
+
+def test_the_survey_of_the_house_is_off_by_less_than_it_says():
+    stated = load_conditions(configs_folder() / "house-corner-conditions.yaml")
+    wind = stated.outside.wind
+    for one, true in ((stated.inside.air, 20.0), (stated.outside.air, 0.0), (wind, (8.0 - 5.8) / 3.8054)):
+        assert one.value != true and one.low <= true <= one.high
+    assert check_survey(stated).missing == () and check_survey(stated).forbidden == ()
+
+
+def test_figures_of_the_audit_are_held_against_the_drawing(tmp_path):
+    def interval(value, low, high):
+        return {"value": value, "low": low, "high": high}
+
+    bridge = {"kind": "line", "patch": "side-wall", "not_counted": "", "length_m": 4.0}
+    answers = {
+        "patches": [
+            {"name": "window-1", "u_w_m2k": interval(5.7, 5.0, 6.0)},
+            {"name": "door", "u_w_m2k": interval(4.0, 3.7, 4.2)},
+        ],
+        "defects": [
+            bridge | {"coefficient": interval(0.8, 0.7, 0.9)},
+            bridge | {"length_m": 1.0, "coefficient": interval(0.1, 0.0, 0.2)},
+            bridge | {"length_m": 9.0, "patch": "front-wall", "coefficient": interval(0.1, 0.0, 0.2)},
+        ],
+    }
+    path = tmp_path / "answers.json"
+    path.write_text(json.dumps(answers))
+    compared = compare(path)
+    assert [(one.name, one.held) for one in compared] == [
+        *(("window-1", True), ("door", False), ("thermal bridge in side-wall, psi", True))
+    ]
+    target = audit_target(compared)
+    assert target.measured == pytest.approx(200 / 3) and not target.met
+    rows = audit_section(compared).tables[0].rows
+    assert rows[1] == ("door", "3.60", "4.00 (3.70 to 4.20)\xa0W/(m²\xa0K)", "no")
+    path.write_text(json.dumps(answers | {"defects": []}))
+    assert audit_section(compare(path)).tables[0].rows[2][2:] == ("not found", "no")
+
+
+def test_the_house_is_audited_with_commands_that_exist():
+    export, audit = (shlex.split(shlex.join(words)) for words in demo.demo_commands(Path("d"), "house-corner")[-2:])
+    assert tyro.cli(ExportThermoxelsMesh, args=export[2:]).patches == Path("d/survey/patches.yaml")
+    options = tyro.cli(cli.Commands, args=audit[1:])
+    assert isinstance(options, Audit) and options.mesh == Path("d/export/mesh.vtu")
+    assert options.conditions == Path("d/survey/conditions.yaml") and options.scene == Path("d/scene")
+    assert len(demo.demo_commands(Path("d"), "sphere")) == 5
+
+
+def test_the_demo_of_the_house_ends_with_its_audit(quick_demo, fake_command, tmp_path, capfd):
+    true = true_u_of_patches(configs_folder() / "house-corner-patches.yaml")
+    u = [{"name": name, "u_w_m2k": {"value": one, "low": 0.9 * one, "high": 1.1 * one}} for name, one in true.items()]
+    psi = {"value": 0.7, "low": 0.6, "high": 0.9}
+    bridge = {"kind": "line", "patch": "side-wall", "not_counted": "", "length_m": 4.0, "coefficient": psi}
+    answers = {"patches": u, "defects": [bridge]}
+    after = "folder = sys.argv[sys.argv.index('--output-dir') + 1]\nos.makedirs(folder)\n"
+    fake_command("thermoxels", after + f"json.dump({answers}, open(f'{{folder}}/answers.json', 'w'))")
+    folder = tmp_path / "demo"
+    assert cli.main(["demo", "--output-dir", str(folder)]) == 0
+    out = capfd.readouterr().out
+    assert out.index("5/7  Export") < out.index("6/7  Audit the house") < out.index("7/7  Compare")
+    page = (folder / "index.html").read_text(encoding="utf-8")
+    assert page.index(">Result<") < page.index("Audit: the truth beside the answer") < page.index("What went in")
+    assert page.count(">yes<") == 5 + len(true) + 1 and "audit/audit.html" in page
+    assert (folder / "survey" / "conditions.yaml").is_file() and (folder / "logs" / "audit.log").is_file()
 
 
 def test_a_missed_target_is_shown_and_fails_after_the_page_is_written(quick_demo, tmp_path, capfd):

@@ -29,7 +29,7 @@ _NARROWEST_ZONE_M = 0.3  # About a wall's thickness, over which heat spreads sid
 _WIDEST_ZONE_M = {"line": 0.5, "point": 0.5, "area": 0.3}
 _FARTHEST_OUT_M = 2.0  # What stands out farther from the surface does not belong to a defect
 _GAP_M = 0.3  # Sets of triangles this near to each other are one defect
-_NEIGHBOURS = 16
+_NEIGHBOURS = 64
 SPOT_M2 = 0.01  # Area over which the coldest or hottest spot is averaged
 
 
@@ -199,8 +199,10 @@ class _Zones:
         near = self._nearest(core, same, distance, (beside <= reach) & (distance <= _FARTHEST_OUT_M))
         near = self._hangs_together(core, same, near)
         zone, reference = same[near], self._calm(same, near, distance, reach)
-        towards = self._reference_normal(zone, reference)
-        base = float(surface.area_m2[zone] @ np.einsum("ij,ij->i", self.normal[zone], towards))
+        # Reconstructed walls wrinkle: what the undisturbed surface has more of than its plane does not stand out.
+        flat = self._base(reference, reference)
+        wrinkled = float(surface.area_m2[reference].sum()) / flat if flat > 0.0 else 1.0
+        base = wrinkled * self._base(zone, reference)
         ranked = core[np.argsort(-away[core], kind="stable")]
         enough = int(np.searchsorted(np.cumsum(surface.area_m2[ranked]), SPOT_M2 * (1.0 - 1e-9))) + 1
         unsupported = float(area @ surface.unsupported[core]) / float(area.sum())
@@ -266,6 +268,11 @@ class _Zones:
         first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
         first /= np.linalg.norm(first)
         return np.stack([first, np.cross(normal, first)], axis=1)
+
+    def _base(self, which: IntArray, reference: IntArray) -> float:
+        """Area of the undisturbed surface that triangles stand on, [m2]."""
+        towards = self._reference_normal(which, reference)
+        return float(self.surface.area_m2[which] @ np.einsum("ij,ij->i", self.normal[which], towards))
 
     def _reference_normal(self, which: IntArray, reference: IntArray) -> FloatArray:
         """Mean normal of the undisturbed surface next to triangles, shape (k, 3); their own where there is none."""

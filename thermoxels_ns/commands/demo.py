@@ -8,7 +8,7 @@ import time
 import webbrowser
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -26,18 +26,22 @@ SceneName = Literal["hot-object", "house-corner", "sphere", "courtyard", "pipes"
 """The synthetic scenes."""
 
 _MARKER = ".thermoxels-demo"
-_WRITTEN = ("index.html", "scene", "outputs", "eval.json", "eval", "renders", "export", "logs")
-_NUM_STEPS = 6
+_WRITTEN = ("index.html", "scene", "outputs", "eval.json", "eval", "renders", "export", "survey", "audit", "logs")
 _TRAIN_VIEWS, _HELD_OUT_VIEWS, _WIDTH, _HEIGHT = 42, 6, 320, 240
 _INPUTS_SHOWN = 6
 _BUILDINGS: tuple[SceneName, ...] = ("house-corner", "courtyard")
+_AUDITED: SceneName = "house-corner"  # The scene whose U-values are known
+_AUDIT_FILES = (
+    ("audit/audit.html", "heat loss, U-values and thermal bridges, as a page to hand over"),
+    ("survey/", "which part of the surface is which element, and the conditions of the survey"),
+)
 _COLOUR_MAP = "inferno"
 _COLOUR_STOPS = 17
 
 
 @dataclass
 class Demo:
-    """Make a synthetic scene, train, evaluate, export and simulate, and compare the result with the exact truth."""
+    """Make a synthetic scene, train, evaluate, export, simulate and audit, and compare all with the exact truth."""
 
     output_dir: Path = Path("demo")
     """Folder for all results; made if it does not exist. An earlier demo in it is replaced."""
@@ -60,12 +64,13 @@ class _Steps:
     """Announces steps and remembers how long each took."""
 
     console: Console
+    count: int
     seconds: list[tuple[str, float]] = field(default_factory=list)
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
         """Announce a step and time what happens in it."""
-        self.console.rule(f"[bold]{len(self.seconds) + 1}/{_NUM_STEPS}  {name}")
+        self.console.rule(f"[bold]{len(self.seconds) + 1}/{self.count}  {name}")
         start = time.monotonic()
         yield
         self.seconds.append((name, time.monotonic() - start))
@@ -73,6 +78,7 @@ class _Steps:
 
 def run_demo(demo: Demo, console: Console) -> None:
     """Run all steps; see `Demo`."""
+    from thermoxels_ns.commands.demo_audit import audit_section, audit_target, compare, write_survey
     from thermoxels_ns.commands.demo_results import read_results
     from thermoxels_ns.commands.installed_commands import command_line, run_command
     from thermoxels_ns.reports.demo_page import build_page
@@ -84,21 +90,30 @@ def run_demo(demo: Demo, console: Console) -> None:
         raise ThermoxelsError("iterations", expected="1 or more", got=demo.iterations, remedy=remedy)
     folder = prepare_folder(demo.output_dir)
     logs = writable_folder(folder / "logs")
-    steps = _Steps(console)
     commands = demo_commands(folder, demo.scene, demo.iterations)
+    steps = _Steps(console, len(commands) + 1)
+    audited = demo.scene == _AUDITED
 
     with steps.step("Photograph the synthetic scene"):
         console.print(f"$ {command_line(commands[0])}", style="bold", markup=False, soft_wrap=True)
         write_scene(make_scene(demo.scene), folder / "scene", _TRAIN_VIEWS, _HELD_OUT_VIEWS, _WIDTH, _HEIGHT)
-    for name, command in zip(("Train", "Evaluate", "Render", "Export the mesh and let heat flow"), commands[1:]):
+        if audited:
+            write_survey(folder)
+    names = ("Train", "Evaluate", "Render", "Export the mesh and let heat flow", "Audit the house")
+    for name, command in zip(names, commands[1:]):
         with steps.step(name):
-            run_command(command, logs / f"{command[0]}.log", console)
+            run_command(command, logs / f"{command[0].replace('thermoxels', 'audit')}.log", console)
     with steps.step("Compare with the truth"):
         results = read_results(folder / "eval.json", folder / "export" / "summary.json")
+        compared = compare(folder / "audit" / "answers.json") if audited else ()
+        if audited:
+            results = replace(results, targets=(*results.targets, audit_target(compared)))
         print_results(results, console)
 
     shown = [command_line(command) for command in commands]
     page = assemble_page(folder, demo.scene, results, steps.seconds, shown)
+    if audited:
+        page = replace(page, sections=(audit_section(compared),), files=(*page.files, *_AUDIT_FILES))
     index = folder / "index.html"
     write_page(index, build_page(page))
     console.print(f"All pictures and figures: {index}", markup=False, soft_wrap=True)
@@ -133,8 +148,14 @@ def prepare_folder(path: Path) -> Path:
 
 
 def demo_commands(folder: Path, scene: str, iterations: int | None = None) -> list[list[str]]:
-    """The commands of the demo in order: synthetic, ns-train, ns-eval, ns-render, ns-export."""
+    """The commands of the demo in order: synthetic, ns-train, ns-eval, ns-render, ns-export, and audit of the house."""
     config = str(folder / "outputs" / "demo" / "thermoxels" / "run" / "config.yml")
+    survey = folder / "survey"
+    patches = ["--patches", str(survey / "patches.yaml")] if scene == _AUDITED else []
+    audit = [
+        *("thermoxels", "audit", str(folder / "export" / "mesh.vtu"), "--conditions", str(survey / "conditions.yaml")),
+        *("--scene", str(folder / "scene"), "--output-dir", str(folder / "audit")),
+    ]
     steps = [] if iterations is None else ["--max-num-iterations", str(iterations)]
     return [
         ["thermoxels", "synthetic", scene, "--output-dir", str(folder / "scene")],
@@ -157,8 +178,9 @@ def demo_commands(folder: Path, scene: str, iterations: int | None = None) -> li
         ],
         [
             *("ns-export", "thermoxels-mesh", "--load-config", config),
-            *("--output-dir", str(folder / "export"), "--metres-per-unit", "1"),
+            *("--output-dir", str(folder / "export"), "--metres-per-unit", "1", *patches),
         ],
+        *([audit] if scene == _AUDITED else []),
     ]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from thermoxels_ns.core.errors import ThermoxelsError
-from thermoxels_ns.reports.page import Picture, Table
+from thermoxels_ns.reports.page import Picture, Section, Table
 from thermoxels_ns.reports.page import build_page as build_html
 
 
@@ -83,6 +83,7 @@ class DemoPage:
     seconds: tuple[tuple[str, float], ...]
     commands: tuple[str, ...]
     files: tuple[tuple[str, str], ...]  # Files and folders relative to the page, and what they hold
+    sections: tuple[Section, ...] = ()  # What else was compared with the truth
 
 
 def build_page(page: DemoPage) -> str:

@@ -19,7 +19,7 @@ from thermoxels_ns.synthetic.box_solid import BoxSolid, distance_to_box
 from thermoxels_ns.synthetic.camera_rings import CameraRing
 from thermoxels_ns.synthetic.courtyard import courtyard
 from thermoxels_ns.synthetic.development_scenes import facade, street, wall_object
-from thermoxels_ns.synthetic.house_corner import house_corner
+from thermoxels_ns.synthetic.house_corner import HOUSE, house_corner
 from thermoxels_ns.synthetic.random_scene import RANDOM_NAMES, random_scene, random_seed
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 from thermoxels_ns.synthetic.solid_union import SolidUnion
@@ -34,7 +34,6 @@ _THICK = Cylinder((-0.55, -0.28, 0.0), radius=0.13, length=1.6, axis=2)
 _MIDDLE = Cylinder((0.05, -0.60, 0.3), radius=0.075, length=2.3, axis=0)
 _THIN = Cylinder((0.5, -0.2, 0.0), radius=0.04, length=1.7, axis=2)
 _ROOM_C = 16.0
-_HOUSE = "house-corner"
 
 
 def pipes() -> SyntheticScene:
@@ -177,11 +176,11 @@ def check_scene_name(name: str) -> str:
     kinds = {variant.split("=")[0] for variant in variants}
     known = base in _BUILDERS or base in _DEVELOPMENT or random_seed(base) is not None
     known &= all(variant in ("white", "street", "room") or _SKY.fullmatch(variant) for variant in variants)
-    if not known or len(kinds) < len(variants) or kinds >= {"street", "room"} or ("white" in kinds and base != _HOUSE):
+    if not known or len(kinds) < len(variants) or kinds >= {"street", "room"} or ("white" in kinds and base != HOUSE):
         every = ", ".join((*_BUILDERS, *_DEVELOPMENT))
         seeded = " or ".join(RANDOM_NAMES)
         expected = f"{seeded} with a whole number N from 0 on, or one of {every}; with {VARIANTS} if you like"
-        remedy = f"Choose one of these names, or write random-17 or {_HOUSE}+sky=0.55,0.57,0.60."
+        remedy = f"Choose one of these names, or write random-17 or {HOUSE}+sky=0.55,0.57,0.60."
         raise SceneError("synthetic scene", expected=expected, got=repr(name), remedy=remedy)
     return name
 

@@ -25,21 +25,27 @@ _RECESS_M = 0.35
 _PANE_M = 0.10
 
 _GLASS, _DOOR = 4, 5
-# Openings: plane's axis, outward sign and position; (along the wall from, to); (z from, to); pane [C]; paint.
+# Openings: plane's axis, outward sign and position; (along the wall from, to); (z from, to); U [W/(m2 K)]; paint.
 _OPENINGS = (
-    (1, -1, _FRONT_Y, (-2.4, -1.2), (0.9, 2.0), 14.0, _GLASS),
-    (1, -1, _FRONT_Y, (0.9, 2.3), (0.9, 2.0), 13.0, _GLASS),
-    (1, -1, _FRONT_Y, (-1.1, 0.0), (2.8, 4.5), 14.5, _GLASS),
-    (1, -1, _FRONT_Y, (1.6, 2.5), (3.3, 4.4), 12.0, _GLASS),
-    (0, +1, _SIDE_X, (-1.7, -0.6), (0.0, 2.1), 9.0, _DOOR),
-    (0, +1, _SIDE_X, (0.5, 1.8), (0.9, 2.0), 13.5, _GLASS),
-    (0, +1, _SIDE_X, (-1.6, 0.2), (3.2, 4.4), 14.0, _GLASS),
-    (0, +1, _SIDE_X, (1.0, 1.9), (3.2, 4.4), 12.5, _GLASS),
+    (1, -1, _FRONT_Y, (-2.4, -1.2), (0.9, 2.0), 5.6, _GLASS),
+    (1, -1, _FRONT_Y, (0.9, 2.3), (0.9, 2.0), 5.2, _GLASS),
+    (1, -1, _FRONT_Y, (-1.1, 0.0), (2.8, 4.5), 5.8, _GLASS),
+    (1, -1, _FRONT_Y, (1.6, 2.5), (3.3, 4.4), 4.8, _GLASS),
+    (0, +1, _SIDE_X, (-1.7, -0.6), (0.0, 2.1), 3.6, _DOOR),
+    (0, +1, _SIDE_X, (0.5, 1.8), (0.9, 2.0), 5.4, _GLASS),
+    (0, +1, _SIDE_X, (-1.6, 0.2), (3.2, 4.4), 5.6, _GLASS),
+    (0, +1, _SIDE_X, (1.0, 1.9), (3.2, 4.4), 5.0, _GLASS),
 )
 
-_WALL_C, _BRIDGE_K = 5.0, 3.0
+HOUSE = "house-corner"
+_AIR_C, _ROOM_C, _SKY_DROP_K = 0.0, 20.0, 20.0
+_COEFFICIENT = 8.0
+"""Between surface and air, [W/(m2 K)]: 5.8 + 3.8054 v (Dall'O, Sarto and Panza 2013) in a wind of 0.578 m/s."""
+_KELVIN_PER_U = (_ROOM_C - _AIR_C) / _COEFFICIENT  # A surface is warmer than the air by U (Ti - Te) / h
+_WALL_C, _BRIDGE_K = _AIR_C + _KELVIN_PER_U * 2.0, _KELVIN_PER_U * 1.2  # U of the wall, and what the slab's band adds
 _BRIDGE_Z, _BRIDGE_WIDTH_M = 0.5 * (_BALCONY[0][2] + _BALCONY[1][2]), 0.35
-_AIR_C, _SKY_DROP_K = 0.0, 20.0
+BRIDGE_PSI_W_MK = _BRIDGE_K / _KELVIN_PER_U * _BRIDGE_WIDTH_M * float(np.sqrt(np.pi))
+"""Extra loss of the band, 1.2 exp(-(z / 0.35 m)^2) W/(m2 K) over the height, per metre and kelvin, [W/(m K)]."""
 _WHITE_SKY = (0.94, 0.94, 0.94)
 
 
@@ -48,12 +54,14 @@ def house_corner(white: bool = False) -> SyntheticScene:
 
     `white`: walls of white plaster without texture, in the even light of a white sky.
 
-    The wall is 5 C, the panes 12 to 14.5 C with a smooth fall over the reveals, the storey slab shows as a band
-    3 K warmer, the balcony cools like a fin towards the air, and the sky falls from 0 C at the horizon to -20 C
-    at the zenith.
+    20 C inside and 0 C outside: walls of U = 2.0, single panes of 4.8 to 5.8 and a door of 3.6 W/(m2 K) are as warm as
+    8 W/(m2 K) between surface and air make them, 5 C and 9 to 14.5 C, with a smooth fall over the reveals. The storey
+    slab shows as a band 3 K warmer, the balcony cools like a fin towards the air, and the sky falls from 0 C at the
+    horizon to -20 C at the zenith.
     """
     cut, panes = recesses(_OPENINGS, _RECESS_M, _PANE_M)
-    panes_c, pane_paints = [opening[5] for opening in _OPENINGS], [opening[6] for opening in _OPENINGS]
+    panes_c = [_AIR_C + _KELVIN_PER_U * opening[5] for opening in _OPENINGS]
+    pane_paints = [opening[6] for opening in _OPENINGS]
     texture = SolidTexture(_BOX, seed=7)
     light = SunLight(towards=(0.75, -0.45, 0.5), ambient=0.88 if white else SunLight.ambient)
     paints = (
@@ -98,7 +106,7 @@ def house_corner(white: bool = False) -> SyntheticScene:
         return np.choose(nearest, [degrees, fin_c, ground_c, roof_c])
 
     return SyntheticScene(
-        name="house-corner",
+        name=HOUSE,
         solid=BoxSolid((_GROUND, _BUILDING, _ROOF, _BALCONY), removed=cut),
         scene_box=_BOX,
         temperature_bounds_c=(_AIR_C - _SKY_DROP_K, 15.0),
@@ -112,3 +120,8 @@ def house_corner(white: bool = False) -> SyntheticScene:
         ),
         focal_share=0.86,
     )
+
+
+def true_u_w_m2k(points: npt.ArrayLike) -> FloatArray:
+    """U-value that the surface temperature of walls and panes follows from at points (n, 3), shape (n,), [W/(m2 K)]."""
+    return (house_corner().surface_temperature_c(points) - _AIR_C) / _KELVIN_PER_U
