@@ -40,6 +40,11 @@ def changed(tmp_path: Path):
     return change
 
 
+def test_air_outside_may_be_unknown_in_a_view_from_inside_alone(changed) -> None:
+    with pytest.raises(AuditError, match=r"outside: air: expected a temperature beside seen from outside, got none"):
+        load_conditions(changed("outside", value={"wind": "1 m/s"}))
+
+
 def test_the_example_is_read_and_lacks_nothing_that_en_13187_asks_for(tmp_path) -> None:
     write_example(tmp_path / "new" / "mine.yaml")
     conditions = load_conditions(tmp_path / "new" / "mine.yaml")

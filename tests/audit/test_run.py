@@ -20,7 +20,7 @@ from tests.support.audited_wall import (
     solve_wall,
     true_draws,
 )
-from thermoxels_ns.audit.conditions import Camera, Film, Limits, Reference, Surface, Surroundings, Year
+from thermoxels_ns.audit.conditions import Camera, Film, Limits, OutsideAir, Reference, Surface, Surroundings, Year
 from thermoxels_ns.audit.draws import Interval
 from thermoxels_ns.audit.heat_flow import radiation_w_m2
 from thermoxels_ns.audit.results import Audit
@@ -377,3 +377,18 @@ def test_wrinkles_of_a_reconstructed_wall_are_no_heat_loss_of_a_bridge() -> None
         assert bridge.kind == "line"
         assert bridge.coefficient.value == pytest.approx(25.0 * 3.0 * 0.25 * np.sqrt(np.pi) / 20.0, rel=0.08)
     assert found.whole.area_m2 > 1.04 * 12.0
+
+
+def test_without_the_air_outside_heat_flow_is_told_and_nothing_that_needs_it() -> None:
+    room = audited_wall(slab=False, window=False, side="inside")
+    truth = solve_wall(room, INSIDE, true_draws(INSIDE, None))
+    unknown = replace(INSIDE, outside=OutsideAir(wind=INSIDE.outside.wind), limits=Limits(u={"*": Measured(0.5)}))
+    known, found = (audit(photographed(truth, one), one, UP) for one in (INSIDE, unknown))
+    assert found.whole.loss_w == known.whole.loss_w
+    assert not np.isfinite(found.whole.u_w_m2k.value) and not np.isfinite(found.f_rsi[0].high)
+    assert [one.verdict for one in found.limits] == ["cannot tell"]
+    assert any("air outside is not known" in one for one in found.check.doubts)
+    assert not any("Taken as exact" in one and "outside air" in one for one in found.check.doubts)
+    assert "air temperature outside" in found.check.missing
+    with pytest.raises(AuditError, match=r"outside: air: expected a temperature beside year"):
+        replace(unknown, year=Year(Measured(3000.0)))

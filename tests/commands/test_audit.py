@@ -110,6 +110,28 @@ def test_pictures_of_a_room_look_into_it() -> None:
         assert coloured.mean() > 0.2
 
 
+def test_the_page_of_a_room_says_what_it_cannot_say(tmp_path) -> None:
+    """Seen from inside, the air outside not known: heat flow is told, and why there is no U-value."""
+    room = audited_wall(slab=False, window=False, side="inside")
+    write_mesh(tmp_path / "mesh.vtu", photographed(solve_wall(room, INSIDE, true_draws(INSIDE, None)), INSIDE))
+    (tmp_path / "c.yaml").write_text("""
+side: inside
+inside: {air: 20 +- 0.5 C}
+surroundings: {reflected: 19.6 +- 0.3 C}
+film: {model: iso-6946, factor: 1.0 +- 0.2}
+camera: {offset: 0 +- 0.2 K, repeatability: 0 +- 0.2 K}
+surfaces: [{emissivity: 0.93 +- 0.02}]
+""")
+    words = ["audit", str(tmp_path / "mesh.vtu"), "--conditions", str(tmp_path / "c.yaml")]
+    assert cli.main([*words, "--output-dir", str(tmp_path / "out")]) == 0
+    answers = json.loads((tmp_path / "out" / "answers.json").read_text())
+    assert answers["whole"]["u_w_m2k"] == {"value": None, "low": None, "high": None}
+    assert answers["whole"]["loss_w"]["low"] > 0.0 and answers["conditions"]["outside"]["air"]["value"] is None
+    page = (tmp_path / "out" / "audit.html").read_text()
+    assert "No U-value, psi or temperature factor can be told, because the air outside is not known." in page
+    assert "outside not known" in page and "Heat flow by the stated values" in page and not re.search(r"\bnan\b", page)
+
+
 def test_what_forbids_a_survey_stands_first(export, tmp_path) -> None:
     text = (export / "conditions.yaml").read_text().replace("wind: 1.0 +- 0.5 m/s", "wind: 7.0 +- 0.5 m/s")
     (tmp_path / "c.yaml").write_text(re.sub(r"  client:.*\n", "", text))

@@ -170,3 +170,19 @@ def test_real_photographs_with_a_thermal_camera_of_its_own(shared_data, tmp_path
     )
     assert result.returncode == 0, result.stdout
     assert (tmp_path / "mesh" / "heat.pvd").exists()
+
+    # What is known of that room: it was photographed from inside, by a camera that may be 2 K off; no air was measured.
+    (tmp_path / "conditions.yaml").write_text(
+        "{side: inside, inside: {air: 14 +- 3 C}, surroundings: {reflected: 14 +- 3 C}, "
+        "film: {model: iso-6946, factor: 1.0 +- 0.3}, camera: {offset: 0 +- 2 K, repeatability: 0 +- 0.5 K}, "
+        "surfaces: [{emissivity: 0.93 +- 0.03}]}"
+    )
+    result = run(
+        *("thermoxels", "audit", str(tmp_path / "mesh" / "mesh.vtu"), "--pictures", "False"),
+        *("--conditions", str(tmp_path / "conditions.yaml"), "--output-dir", str(tmp_path / "audit")),
+    )
+    assert result.returncode == 0, result.stdout
+    page = (tmp_path / "audit" / "audit.html").read_text(encoding="utf-8")
+    assert "No U-value, psi or temperature factor can be told, because the air outside is not known." in page
+    whole = json.loads((tmp_path / "audit" / "answers.json").read_text())["whole"]
+    assert whole["u_w_m2k"]["value"] is None and whole["loss_w"]["low"] <= 0.0  # an upper bound, if anything

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -73,6 +74,8 @@ class InsideAir:
 class OutsideAir(InsideAir):
     """The open air."""
 
+    air: Temperature = field(default_factory=lambda: Measured(math.nan))
+    """[degrees Celsius]; not a number: not known, which only a view from inside may leave out."""
     wind: Annotated[Measured, "m/s"] | None = None  # Wind speed near the surface, [m/s], at least 0
     wind_direction: str = ""
 
@@ -259,13 +262,13 @@ def unknown_name(one: Unknown) -> str:
     return f"{one.property} of {one.of}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Conditions:
     """All that is known beside the photographs."""
 
     side: Side  # From where the surface was seen
     inside: InsideAir
-    outside: OutsideAir
+    outside: OutsideAir = field(default_factory=OutsideAir)  # In a view from inside it may be left out
     surroundings: Surroundings
     film: Film
     camera: Camera
@@ -283,6 +286,7 @@ class Conditions:
     def __post_init__(self) -> None:
         _check_models(self)
         inside, outside = self.inside.air, self.outside.air
+        self._check_outside_air()
         if inside.low <= outside.high:
             expected = "air that is warmer than outside by more than both may be off"
             got = f"{inside.value:g} +- {inside.off_by:g} C inside, {outside.value:g} +- {outside.off_by:g} C outside"
@@ -295,9 +299,23 @@ class Conditions:
             remedy = "Write surroundings: {reflected: 19.5 +- 0.5 C}."
             raise AuditError("surroundings", expected="a reflected temperature inside", got="a sky", remedy=remedy)
 
+    def _check_outside_air(self) -> None:
+        """Refuse what nothing follows from without the air outside."""
+        needed = {"seen from outside": self.side == "outside", "calibrate": self.calibrate is not None}
+        needed["year"] = self.year is not None
+        for name, there in needed.items():
+            if there and not self.outside_known:
+                remedy = "Add air: 0.0 +- 0.5 C, as measured or from a weather station."
+                raise AuditError("outside: air", expected=f"a temperature beside {name}", got="none", remedy=remedy)
+
+    @property
+    def outside_known(self) -> bool:
+        """Whether the air outside is known."""
+        return math.isfinite(self.outside.air.value)
+
     @property
     def difference_k(self) -> float:
-        """Difference of the airs as stated, [K]."""
+        """Difference of the airs as stated, [K]; not a number if that outside is not known."""
         return self.inside.air.value - self.outside.air.value
 
 

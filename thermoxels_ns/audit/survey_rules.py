@@ -59,9 +59,15 @@ def _forbidden(conditions: Conditions) -> tuple[str, ...]:
 
 def _doubts(conditions: Conditions) -> tuple[str, ...]:
     found, difference = [], conditions.difference_k
-    exact = [name for name, what in uncertain(conditions).items() if not what.off_by and name not in _MEANT_AS_EXACT]
+    not_meant = _MEANT_AS_EXACT if conditions.outside_known else (*_MEANT_AS_EXACT, "outside air")
+    exact = [name for name, what in uncertain(conditions).items() if not what.off_by and name not in not_meant]
     if exact:
         found.append(f"Taken as exact, because nothing says how far they may be off: {', '.join(exact)}.")
+    if not conditions.outside_known:
+        found.append(
+            "The air outside is not known. U-values, psi, chi and temperature factors are shares of the difference of "
+            "the airs: none can be told. Heat flow through the surface can: it follows from the room alone."
+        )
     for name, air in (("inside", conditions.inside), ("outside", conditions.outside)):
         if air.lowest_24h is not None and air.highest_24h is not None:
             change = air.highest_24h.value - air.lowest_24h.value
@@ -80,7 +86,7 @@ def _doubts(conditions: Conditions) -> tuple[str, ...]:
             f"Emissivities below 0.7 ({'; '.join(metal)}): such surfaces mirror more than they show; leave_out does "
             "without them."
         )
-    if conditions.side == "inside":
+    if conditions.side == "inside" and conditions.outside_known:
         found.append("U-values hold where the open air is behind the surface; the mesh does not say where that is.")
     return tuple(found)
 
@@ -92,6 +98,8 @@ def _missing(conditions: Conditions) -> tuple[str, ...]:
         for field in fields(survey)
         if getattr(survey, field.name) in (None, "")
     ]
+    if not conditions.outside_known:
+        found.append("air temperature outside")
     for name, air in (("inside", conditions.inside), ("outside", conditions.outside)):
         if air.lowest_24h is None or air.highest_24h is None:
             found.append(f"lowest and highest air temperature {name} during the last 24 hours")

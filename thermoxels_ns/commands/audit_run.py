@@ -77,7 +77,7 @@ def run_audit(options: AuditOptions, say: Say = lambda _: None) -> Audit | None:
     photographs = {}
     if options.scene is not None:
         photographs = photographs_of_defects(options.scene, _metres_per_unit(export), found)
-        say(f"Photographs show {len(photographs)} of them.")
+        say(f"Photographs show {sum(not found.defects[number].not_counted for number in photographs)} of them.")
     _write(folder, options, found, photographs)
     say(f"Written to {folder}: {PAGE}, {ANSWERS}, {SURFACE} ({clock.perf_counter() - begin:.1f} s)")
     return found
@@ -88,7 +88,7 @@ def answers_of(options: AuditOptions, found: Audit) -> dict[str, Any]:
     date = found.conditions.survey.date
     conditions = asdict(replace(found.conditions, survey=replace(found.conditions.survey, date=None)))
     conditions["survey"]["date"] = None if date is None else date.isoformat()
-    return {
+    told = {
         "mesh": options.mesh,
         "conditions": conditions,
         "whole": asdict(found.whole),
@@ -105,18 +105,25 @@ def answers_of(options: AuditOptions, found: Audit) -> dict[str, Any]:
         "loss_moved_by_w": dict(found.budget),
         "not_counted_m2": dict(found.not_counted_m2),
     }
+    return {name: _without_what_is_not_known(one) for name, one in told.items()}
+
+
+def _without_what_is_not_known(value: Any) -> Any:
+    """The same with null for numbers that are not known, or ends of intervals that are not there."""
+    if isinstance(value, Mapping):
+        return {name: _without_what_is_not_known(one) for name, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_what_is_not_known(one) for one in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _calibration(found: Audit) -> dict[str, Any] | None:
-    """What a calibration found; an end that is not known is null."""
+    """What a calibration found."""
     one = found.calibration
     if one is None:
         return None
-    intervals = {name: asdict(value) for name, value in one.found.items()}
-    for ends in intervals.values():
-        ends["high"] = ends["high"] if np.isfinite(ends["high"]) else None
-    told = {"found": intervals, "units": dict(one.units), "refused": one.refused}
-    return {**told, "moved_most_by": dict(one.moved_most_by), "misfit_k": one.misfit_k}
+    told = {"found": {name: asdict(value) for name, value in one.found.items()}, "units": one.units}
+    return {**told, "refused": one.refused, "moved_most_by": one.moved_most_by, "misfit_k": one.misfit_k}
 
 
 def _prepared_folder(output_dir: Path) -> Path:

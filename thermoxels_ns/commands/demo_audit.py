@@ -108,5 +108,5 @@ def audit_section(compared: Sequence[Compared]) -> Section:
         "Drawn by formula, not by heat flow through a wall: reveals, ground, roof and balcony have temperatures that "
         "were made up, and no part of them is compared.",
     )
-    table = Table(("Element", "true", "found, 90 % interval", "in it"), rows)
+    table = Table(("Element", "true", "found, 90 % interval", "in it"), rows, look="narrow")
     return Section("Audit: the truth beside the answer", words=words, tables=(table,))

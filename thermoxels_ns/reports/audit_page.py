@@ -103,8 +103,9 @@ def _summary(audit: Audit) -> str:
         if part
     ]
     seen = f"Seen from {conditions.side}, {area_text(audit.whole.area_m2)} m² observed"
-    inside, outside = conditions.inside.air, conditions.outside.air
-    return f"{', '.join(who)}{'. ' if who else ''}{seen}, {inside.value:g} °C inside and {outside.value:g} °C outside."
+    airs = f"{conditions.inside.air.value:g} °C inside, "
+    airs += f"{conditions.outside.air.value:g} °C outside" if conditions.outside_known else "outside not known"
+    return f"{', '.join(who)}{'. ' if who else ''}{seen}, {airs}."
 
 
 def _figures(audit: Audit) -> tuple[tuple[str, str], ...]:
@@ -132,14 +133,20 @@ def _figures(audit: Audit) -> tuple[tuple[str, str], ...]:
 def _in_short(audit: Audit) -> tuple[str, ...]:
     """What was found, what is worst, what is open, and what would make it surer."""
     words, whole = [], audit.whole
-    difference = f"{audit.conditions.difference_k:.0f} K between inside and outside"
+    conditions = audit.conditions
+    difference = f"{conditions.difference_k:.0f} K between inside and outside"
+    if not conditions.outside_known:
+        difference = f"{conditions.inside.air.value:g} °C inside"
     if whole.loss_w.unknown:
         words.append(
             f"No heat loss can be told from these readings at {difference}: the surface looks too cold for it."
         )
     else:
         loss, u = interval_text(whole.loss_w, "W"), interval_text(whole.u_w_m2k, "W/(m2 K)")
-        words.append(f"At {difference} the {area_text(whole.area_m2)} m² that were observed lose {loss}; U-value {u}.")
+        u_value = f"; U-value {u}" if conditions.outside_known else ""
+        words.append(f"At {difference} the {area_text(whole.area_m2)} m² that were observed lose {loss}{u_value}.")
+    if not conditions.outside_known:
+        words.append("No U-value, psi or temperature factor can be told, because the air outside is not known.")
     counted = [(n, one) for n, one in enumerate(audit.defects, start=1) if not one.not_counted]
     if counted:
         number, worst = max(counted, key=lambda item: item[1].extra_w.value)
@@ -168,7 +175,8 @@ def _overview(audit: Audit, pictures: AuditPictures | None) -> list[Section]:
     shown = [
         Picture(png, "Surface temperature; numbers are those of the defects below.") for png in pictures.temperature
     ]
-    shown += [Picture(png, "U-value by the stated values, triangle by triangle.") for png in pictures.u_value]
+    what = "U-value" if audit.conditions.outside_known else "Heat flow"
+    shown += [Picture(png, f"{what} by the stated values, triangle by triangle.") for png in pictures.u_value]
     words = "Drawn from the model. Grey surface does not count: no thermal image shows it, or it was left out."
     return [Section("What was seen", words=(words,), galleries=(Gallery(tuple(shown)),))]
 
@@ -299,7 +307,7 @@ def _conditions(conditions: Conditions) -> Section:
     rows = [
         ("seen from", conditions.side),
         ("air inside", _measured(conditions.inside.air, "°C")),
-        ("air outside", _measured(conditions.outside.air, "°C")),
+        ("air outside", _measured(conditions.outside.air, "°C") if conditions.outside_known else "not known"),
     ]
     for name, air in (("inside", conditions.inside), ("outside", conditions.outside)):
         if air.lowest_24h is not None and air.highest_24h is not None:
@@ -356,9 +364,9 @@ def _survey(audit: Audit) -> Section:
 
 
 def _certainty(audit: Audit) -> Section:
-    loss = abs(audit.whole.loss_w.value) or 1.0
+    loss, bound = abs(audit.whole.loss_w.value) or 1.0, audit.whole.loss_w.at_most or audit.whole.loss_w.unknown
     rows = tuple(
-        (name, number_text(width, width), f"{100.0 * width / loss:.0f} %")
+        (name, number_text(width, width), "" if bound else f"{100.0 * width / loss:.0f} %")
         for name, width in audit.budget.items()
         if width > 5e-4 * loss
     )
@@ -373,6 +381,7 @@ def _certainty(audit: Audit) -> Section:
         tuple(
             (_MODELS[model], *(f"{one.u_by_model[model]:.2f}" for one in audit.patches), f"{mean:.2f}")
             for model, mean in audit.whole.u_by_model.items()
+            if audit.conditions.outside_known
         ),
         note="U-values in W/(m² K) from the stated values. The first is the one that was chosen; how far models "
         "disagree is in the intervals only as far as the stated factor says so.",

@@ -26,7 +26,7 @@ class AuditPictures:
     """PNG files."""
 
     temperature: tuple[bytes, ...]  # Surface temperature with the numbers of defects, from one or two sides
-    u_value: tuple[bytes, ...]  # U-value, from the same sides
+    u_value: tuple[bytes, ...]  # U-value, from the same sides; heat flow where the air outside is not known
     defects: tuple[bytes, ...]  # Surface temperature of each defect and what is around it
     misfit: tuple[bytes, ...]  # Measured minus computed temperature of a calibration, from the same sides
 
@@ -35,7 +35,9 @@ def draw_audit(audit: Audit) -> AuditPictures:
     """Draw all pictures; colours of all temperatures have one scale, what does not count is grey."""
     surface = audit.surface
     counted = surface.counted
-    surface_c, u = (_at_nodes(audit, values) for values in (audit.triangle_surface_c, audit.triangle_u[:, 0]))
+    known = audit.conditions.outside_known
+    shown, name = audit.triangle_u[:, 0] if known else audit.triangle_flow_w_m2, "U-value" if known else "Heat flow"
+    surface_c, u = (_at_nodes(audit, values) for values in (audit.triangle_surface_c, shown))
     ends = np.quantile(surface_c[np.unique(surface.mesh.facets[counted])], (0.005, 0.995))
     u_ends = np.quantile(u[np.unique(surface.mesh.facets[counted])], (0.02, 0.98))
     same: dict[str, Any] = {"clim": (float(ends[0]), float(ends[1])), "up": surface.selection.up}
@@ -49,8 +51,8 @@ def draw_audit(audit: Audit) -> AuditPictures:
         title = "Surface temperature, corrected for emissivity and reflection"
         temperature.append(_drawn(audit, facing, surface_c, title=title, labels=labels, **same, **view))
         look: dict[str, Any] = {"clim": (float(u_ends[0]), float(u_ends[1])), "colour_map": "viridis"}
-        look |= {"bar_title": "U-value [W/(m² K)]", "up": surface.selection.up}
-        u_value.append(_drawn(audit, facing, u, title="U-value by the stated values", **look, **view))
+        look |= {"bar_title": f"{name} [{'W/(m² K)' if known else 'W/m²'}]", "up": surface.selection.up}
+        u_value.append(_drawn(audit, facing, u, title=f"{name} by the stated values", **look, **view))
         if off_k is not None:
             most = float(np.quantile(np.abs(off_k[np.unique(surface.mesh.facets[counted])]), 0.98)) or 1.0
             look |= {"clim": (-most, most), "colour_map": "coolwarm", "bar_title": "measured - computed [K]"}

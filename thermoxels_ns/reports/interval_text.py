@@ -25,6 +25,8 @@ def interval_text(interval: Interval, unit: str, bounds: bool = True) -> str:
     ('at least 0.20\\xa0m', 'not measurable')
     """
     unit = f"\N{NO-BREAK SPACE}{unit_signs(unit)}" if unit else ""
+    if math.isnan(interval.value):
+        return "not known"
     if bounds and (interval.unknown or (interval.at_most and math.isinf(interval.high))):
         return "not measurable"
     if math.isinf(interval.high):
