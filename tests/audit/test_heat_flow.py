@@ -9,10 +9,11 @@ from thermoxels_ns.audit.heat_flow import (
     madding_w_m2,
     radiation_w_m2,
     reading_k,
+    sky_emissivity,
     surface_temperature_k,
     temperature_factor,
+    view_shares,
 )
-from thermoxels_ns.audit.surroundings import sky_emissivity, view_shares
 
 K = 273.15
 

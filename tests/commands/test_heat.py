@@ -85,6 +85,11 @@ def test_the_u_value_of_an_exported_wall(folder, capsys) -> None:
     ]
     page = (folder / "u" / "report.html").read_text()
     assert f"{u:.3f} W/(m" in page and "Nothing could be left out" in page
+    # What the reader asked stands first, how it was solved last.
+    assert page.index("W, all by convection on exterior-") < page.index("The inner surface is coldest at")
+    assert re.findall(r"<h2>(.*?)</h2>", page) == [
+        *("As a wall", "Answers", "What was asked", "Energy balance", "What was built and left out", "How it was made")
+    ]
     assert "Written to" in capsys.readouterr().out
 
 

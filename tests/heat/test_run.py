@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 
 from tests.support.heat_bodies import CONCRETE
+from tests.support.heat_meshes import box_mesh, planes
 from tests.support.scene_bodies import Z_UP, room, tagged_body, wall
 from thermoxels_ns.fem.problem import TimeSteps
-from thermoxels_ns.heat.run import patch_warnings, unused_settings
+from thermoxels_ns.heat.run import inner_surface_warnings, patch_warnings, run_scene, shell_warnings, unused_settings
 from thermoxels_ns.heat.scene import HeatScene
 from thermoxels_ns.heat.scene_fields import InsideAir, OutsideAir
+from thermoxels_ns.heat.solving import Goals
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 CONCRETE = {"*": CONCRETE}
@@ -51,3 +53,47 @@ def test_a_start_that_a_steady_state_does_not_know_is_named() -> None:
     assert "initial temperature of 15 degrees" in said and "initial changes nothing" in said
     assert unused_settings(HeatScene(CONCRETE, **AIRS)) == ()
     assert unused_settings(HeatScene(CONCRETE, TimeSteps(2, 60.0), initial_c=15.0, **AIRS)) == ()
+
+
+def test_the_rim_of_a_hole_is_no_spot_of_the_inner_surface() -> None:
+    """A plate whose inner and outer patch meet at an edge: the edge is named, and no temperature factor is its."""
+    mesh = box_mesh(planes(0.0, 0.2, step=0.1), planes(0.0, 2.0, step=0.25), planes(0.0, 2.0, step=0.25))
+    airs = {
+        "inside_air": InsideAir(20.0, coefficient_w_m2k=8.0, patches=("x0",)),
+        "outside_air": OutsideAir(0.0, coefficient_w_m2k=25.0, patches=("x1", "y0")),
+    }
+    scene = HeatScene(CONCRETE, adiabatic=("y1", "z0", "z1"), **airs)
+    run = run_scene(scene, mesh, Goals())
+    (warning,) = [one for one in run.warnings if "rims of holes" in one]
+    assert warning.startswith("9 of the 81 nodes of the inner surface")
+    edge = (mesh.points_m[:, 0] == 0.0) & (mesh.points_m[:, 1] == 0.0)
+    assert run.wall is not None and run.wall.coldest.point_m[1] == 0.25
+    assert run.wall.temperature_factor > run.solution.temperature_c[edge].max() / 20.0 + 0.1
+    apart = replace(scene, outside_air=replace(airs["outside_air"], patches=("x1",)), adiabatic=("y*", "z*"))
+    assert inner_surface_warnings(apart, mesh, Z_UP) == ()
+
+
+def test_a_room_without_a_floor_is_named() -> None:
+    scene = HeatScene(CONCRETE, **AIRS)
+    assert inner_surface_warnings(scene, room(), Z_UP) == ()
+    mesh = room()
+    assert mesh.boundary is not None
+    floor = (mesh.boundary.normal[:, 2] > 0.5) & np.char.startswith(names_of(mesh), "interior")
+    names = (*mesh.boundary.patch_names, "floor")
+    patch = np.where(floor, len(names) - 1, mesh.boundary.patch)
+    missing = replace(mesh, boundary=replace(mesh.boundary, patch=patch, patch_names=names))
+    (warning,) = inner_surface_warnings(scene, missing, Z_UP)
+    assert "a floor of 0 m²: most of the floor is missing" in warning
+
+
+def names_of(mesh: TetMesh) -> np.ndarray:
+    """Name of the patch of each boundary triangle."""
+    return np.array(mesh.boundary.patch_names)[mesh.boundary.patch]
+
+
+@pytest.mark.parametrize(("volume", "said"), [(30.0, False), (60.0, True)])
+def test_walls_that_came_out_thicker_than_asked_are_named(volume, said) -> None:
+    """2 V / A of 200 m2 of surface is 0.3 or 0.6 m."""
+    export = {"options": {"wall_thickness": 0.3}, "mesh": {"volume": volume, "area": 200.0}}
+    warnings = shell_warnings(HeatScene(CONCRETE, **AIRS), export)
+    assert [("0.3 m thick" in one and "0.6 m on average" in one) for one in warnings] == [True] * said

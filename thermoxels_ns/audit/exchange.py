@@ -15,10 +15,11 @@ from thermoxels_ns.audit.heat_flow import (
     fourth_power,
     madding_w_m2,
     radiation_w_m2,
+    sky_emissivity,
     surface_temperature_k,
+    view_shares,
 )
 from thermoxels_ns.audit.surface import AlikeTriangles, AuditedSurface
-from thermoxels_ns.audit.surroundings import sky_emissivity, view_shares
 from thermoxels_ns.core.arrays import FloatArray
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin
 from thermoxels_ns.fem.quantities import Places

@@ -363,6 +363,13 @@ def wall_result(
     area, heat = sum(part.area_m2 for part in patches), sum(part.heat_w for part in patches)
     shown = solution_nodes(problem, solution) if nodes is None else nodes
     inner_nodes = np.unique(shown.mesh.facets[shown.of_facets(inner)])
+    # At the rim of a hole both airs touch one node, which is no spot of the inner surface.
+    others = [effect for effect in problem.effects if isinstance(effect, Convection) and effect.air_c != inside_c]
+    outer = np.zeros(len(mesh.facets), dtype=bool)
+    for effect in others:
+        outer[selection.facets(effect.patches)] = True
+    away = np.setdiff1d(inner_nodes, shown.mesh.facets[shown.of_facets(outer & ~inner)])
+    inner_nodes = away if len(away) else inner_nodes
     # The worst spot: the coldest if it is colder outside, else the hottest.
     worst = int(inner_nodes[np.argmin(np.sign(difference_k) * every_c[inner_nodes])])
     spot = describe_spot(Selection(shown.mesh, problem.up), worst, float(every_c[worst]), 0.0)

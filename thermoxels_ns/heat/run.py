@@ -68,7 +68,8 @@ def run_scene(
     problem = scene.problem(mesh, up=up)
     probes = place_probes(mesh, np.array(probes_m, dtype=np.float64).reshape(-1, 3))
     about_patches = patch_warnings(scene, mesh, problem.up)
-    warnings = (*about_patches, *unused_settings(scene), *shell_warnings(scene, export or {}))
+    inner = () if about_patches else inner_surface_warnings(scene, mesh, problem.up)
+    warnings = (*about_patches, *inner, *unused_settings(scene), *shell_warnings(scene, export or {}))
     for warning in warnings:
         say(f"Warning: {warning}")
     found = solve_problem(problem, scene.time, goals, say)
@@ -118,6 +119,8 @@ def mesh_error_in_words(solution: Solution) -> str:
 _COS_45 = float(np.sqrt(0.5))
 _LEAST_OF_A_ROOM = 0.1
 """Share of its surface that a room has on walls and floor at least: of a cube they are five sixths."""
+_LEAST_FLOOR = 0.5  # Share of its ceiling that a room's floor has at least
+_THICKNESS_OFF = 0.2  # Share by which walls may come out thicker or thinner than asked without a word
 _INWARDS = -0.2
 """Mean cosine between the normals of a surface and the directions away from its middle: 0.8 to 1 for a body seen from
 around it, 0 for a plane, -0.8 to -1 for a room seen from within."""
@@ -153,6 +156,33 @@ def patch_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str,
     return tuple(warnings)
 
 
+def inner_surface_warnings(scene: HeatScene, mesh: TetMesh, up: Direction) -> tuple[str, ...]:
+    """Find rims of holes, where the inner surface touches the outer one, and rooms without a floor."""
+    if scene.inside_air is None or scene.outside_air is None:
+        return ()
+    selection = Selection(mesh, up)
+    inside, outside = (_chosen(selection, air.patches) for air in (scene.inside_air, scene.outside_air))
+    inner = np.unique(mesh.facets[inside])
+    shared = np.intersect1d(inner, mesh.facets[outside & ~inside])
+    warnings = []
+    if len(shared):
+        x, y, z = mesh.points_m[shared[0]]
+        warnings.append(
+            f"{len(shared)} of the {len(inner)} nodes of the inner surface lie on the outer one as well, one at "
+            f"({x:.4g}, {y:.4g}, {z:.4g}) m: rims of holes, or walls that end. There both airs touch the body; "
+            "temperature factors leave these nodes out, heat losses do not."
+        )
+    area = selection.facet_area_m2[inside]
+    level = selection.facet_normal[inside] @ np.array(selection.up) / np.linalg.norm(selection.up)
+    floor, ceiling = (float(area[where].sum()) for where in (level > _COS_45, level < -_COS_45))
+    if floor < _LEAST_FLOOR * ceiling:
+        warnings.append(
+            f"The inner surface has a ceiling of {ceiling:.3g} m² and a floor of {floor:.3g} m²: most of the floor is "
+            "missing, and so is the heat that it loses."
+        )
+    return tuple(warnings)
+
+
 def unused_settings(scene: HeatScene) -> tuple[str, ...]:
     """Say what a scene gives and its question does not ask for."""
     if not scene.steady or scene.initial_c is None:
@@ -169,10 +199,18 @@ def shell_warnings(scene: HeatScene, export: Mapping[str, Any]) -> tuple[str, ..
     options, mesh = export.get("options"), export.get("mesh")
     if scene.inside_air is None or not isinstance(options, dict) or not isinstance(mesh, dict):
         return ()
-    if options.get("interior") != "hollow" or options.get("wall_thickness") is not None:
+    asked_m = options.get("wall_thickness")
+    if options.get("interior") != "hollow" and asked_m is None:
         return ()
     try:
         thickness_m = 2.0 * float(mesh["volume"]) / float(mesh["area"])
+        if asked_m is not None:
+            if abs(thickness_m / float(asked_m) - 1.0) <= _THICKNESS_OFF:
+                return ()
+            return (
+                f"Walls were to be {float(asked_m):.2g} m thick (--wall-thickness); volume and surface of the mesh say "
+                f"{thickness_m:.2g} m on average. What is thinner than that or solid, such as slabs, is in this mean.",
+            )
     except (KeyError, TypeError, ValueError, ZeroDivisionError):
         return ()
     return (

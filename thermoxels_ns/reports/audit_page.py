@@ -44,7 +44,6 @@ class DefectCard:
 class AuditPage(Page):
     """A page with cards of defects and a table of what is asked for."""
 
-    in_short: tuple[str, ...] = ()  # What a client wants to know, sentences
     limit_rows: tuple[tuple[str, str, str, str], ...] = ()  # Name, found, limit, verdict
     defects: tuple[DefectCard, ...] = ()
     defects_note: str = ""

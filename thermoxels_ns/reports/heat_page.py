@@ -32,7 +32,7 @@ _LARGE_K = 100.0
 
 def heat_page(run: HeatRun, pictures: Mapping[str, bytes], mesh_name: str, command: str, files: Sequence[str]) -> Page:
     """Put a run into words; `pictures` are PNG files by name, `command` made it, `files` lie beside the page."""
-    sections = [_results(run), *_wall(run), *_probes(run), _balance(run), *_accuracy(run.accuracy)]
+    sections = [*_wall(run), _results(run), *_probes(run)]
     if isinstance(run.solution, HeatSolution):
         plot = plot_over_time(run.solution, run.mean_c, run.probes_c, _probe_names(run))
         words = ("Heat flows are means over each interval between two kept times.",)
@@ -43,14 +43,41 @@ def heat_page(run: HeatRun, pictures: Mapping[str, bytes], mesh_name: str, comma
             for name, png in pictures.items()
         )
         sections.append(Section("Pictures", galleries=(Gallery(captioned),)))
-    sections += [_asked(run, mesh_name), _built(run), _made(run, command, files)]
+    sections += [_asked(run, mesh_name), _balance(run), *_accuracy(run.accuracy), _built(run)]
+    sections.append(_made(run, command, files))
     return Page(
         title=run.scene.description or "Heat flow",
         summary=_summary(run),
+        in_short=_in_short(run),
         figures=_figures(run),
         sections=tuple(sections),
         warnings=run.warnings,
     )
+
+
+def _in_short(run: HeatRun) -> tuple[str, ...]:
+    """Where heat is lost and gained most, and what the inner surface is like."""
+    round_off, words = _round_off(run), []
+    lost = sorted((one for one in run.results.effects if one.heat_w < 0.0), key=lambda one: one.heat_w)
+    whole = sum(one.heat_w for one in lost)
+    often = "" if run.scene.steady else " on average"
+    if round_off.flow(whole) not in ("0", "-0"):
+        most, share = lost[0], 100.0 * lost[0].heat_w / whole
+        by = f"most by {most.effect}: {share:.0f} %" if len(lost) > 1 else f"all by {most.effect}"
+        words.append(f"The body loses {round_off.flow(-whole)} W{often}, {by}.")
+    through = min(run.results.patches, key=lambda one: one.heat_w, default=None)
+    if through is not None and through.heat_w < 0.0 and len(run.results.patches) > 1:
+        per_area = round_off.per_area(-through.heat_w_m2, through.heat_w)
+        words.append(
+            f"Of all patches {through.patch} loses most: {round_off.flow(-through.heat_w)} W, {per_area} W/m² on "
+            f"{figure(through.area_m2)} m²."
+        )
+    if run.wall is not None:
+        words.append(
+            f"The inner surface is coldest at {degrees(run.wall.coldest.temperature_c)} °C "
+            f"{_place(run.wall.coldest)}, at {run.wall.inside_c:g} °C inside and {run.wall.outside_c:g} °C outside."
+        )
+    return tuple(words)
 
 
 def _summary(run: HeatRun) -> str:

@@ -68,6 +68,7 @@ class Page:
     sections: tuple[Section, ...]
     figures: tuple[tuple[str, str], ...] = ()  # The figures that matter most: value with unit, and what it is
     warnings: tuple[str, ...] = ()  # What to know before any figure is believed; stands above the figures
+    in_short: tuple[str, ...] = ()  # What the reader wants to know first, sentences
 
 
 def build_page(page: Any, template: str = "page.html.j2") -> str:
