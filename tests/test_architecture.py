@@ -2,8 +2,6 @@
 
 import ast
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -199,16 +197,6 @@ def test_the_checker_sees_a_forbidden_import(module: str, source: str) -> None:
 )
 def test_the_checker_allows_what_is_allowed(module: str, source: str) -> None:
     assert forbidden_arrows(module, source, MODULES) == []
-
-
-def test_importing_the_configuration_loads_nothing_heavy() -> None:
-    """Every ``ns-*`` command imports it, also where pyvista or open3d cannot be imported."""
-    heavy = ["pyvista", "vtk", "vtkmodules", "skfem", "open3d", "pymeshlab", "pycolmap", "numba"]
-    ours = [f"{NAME}.{name}" for name in ("mesh", "fem", "heat", "commands", "reports", "cli")]
-    code = f"import sys, thermoxels_ns.config; print([m for m in {heavy + ours} if m in sys.modules])"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.splitlines()[-1] == "[]"
 
 
 @pytest.mark.parametrize("path", FILES, ids=_name)

@@ -7,7 +7,7 @@ import pyvista
 import torch
 from PIL import Image
 
-from tests.integration.commands import SHORT_TRAINING, Trained, run
+from tests.integration.commands import SHORT_TRAINING, Trained, run, run_forked
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 
@@ -20,7 +20,7 @@ METRICS = (
 
 def test_training_reports_evaluation_batches(trained: Trained, tmp_path):
     """nerfstudio's own evaluation during training, which is off by default."""
-    result = run(
+    result = run_forked(
         *("ns-train", "thermoxels", "--output-dir", str(tmp_path), *SHORT_TRAINING, "--max-num-iterations", "3"),
         *("--steps-per-eval-batch", "1", "--steps-per-eval-image", "2", "thermal-data", "--data", str(trained.scene)),
     )
@@ -41,7 +41,7 @@ def test_training_refines_prunes_and_saves(trained: Trained):
 def test_eval_reports_every_metric(trained: Trained, tmp_path):
     output = tmp_path / "eval.json"
     pictures = tmp_path / "pictures"
-    result = run(
+    result = run_forked(
         *("ns-eval", "--load-config", str(trained.config), "--output-path", str(output)),
         *("--render-output-path", str(pictures)),
     )
@@ -55,7 +55,7 @@ def test_eval_reports_every_metric(trained: Trained, tmp_path):
 
 def test_render_dataset_writes_thermal_pictures(trained: Trained, tmp_path):
     names = ["rgb", "thermal", "gt-thermal", "depth", "raw-temperature_c"]
-    result = run(
+    result = run_forked(
         *("ns-render", "dataset", "--load-config", str(trained.config), "--output-path", str(tmp_path)),
         *("--split", "test", "--image-format", "png", "--rendered-output-names", *names),
     )
@@ -68,13 +68,13 @@ def test_render_dataset_writes_thermal_pictures(trained: Trained, tmp_path):
 
 
 def test_a_stock_export_still_works(trained: Trained, tmp_path):
-    result = run("ns-export", "cameras", "--load-config", str(trained.config), "--output-dir", str(tmp_path))
+    result = run_forked("ns-export", "cameras", "--load-config", str(trained.config), "--output-dir", str(tmp_path))
     assert result.returncode == 0, result.stdout
     assert len(json.loads((tmp_path / "transforms_train.json").read_text())) == 10
 
 
 def test_a_stock_export_that_renders_still_works(trained: Trained, tmp_path):
-    result = run(
+    result = run_forked(
         *("ns-export", "pointcloud", "--load-config", str(trained.config), "--output-dir", str(tmp_path)),
         *("--num-points", "300", "--remove-outliers", "False", "--normal-method", "open3d"),
     )
@@ -104,13 +104,13 @@ def test_mesh_takes_the_scale_of_the_scene_and_skips_heat_without_one(trained: T
     command += ("--density-percentile", "90", "--pictures", "False", "--steps", "1")
     scene = trained.scene / "transforms.json"
     known = scene.read_text()
-    result = run(*command)
+    result = run_forked(*command)
     assert result.returncode == 0, result.stdout
     assert (tmp_path / "heat.pvd").exists()
     assert json.loads((tmp_path / "summary.json").read_text())["scale"]["metres_per_unit"] == 1.0
     try:
         scene.write_text(json.dumps({key: value for key, value in json.loads(known).items() if "metres" not in key}))
-        result = run(*command)
+        result = run_forked(*command)
     finally:
         scene.write_text(known)
     assert result.returncode == 0, result.stdout
@@ -123,7 +123,7 @@ def test_resume_goes_on_from_the_checkpoint(trained: Trained, tmp_path):
     early = tmp_path / "early"
     early.mkdir()
     shutil.copy(trained.checkpoints / "step-000000020.ckpt", early)
-    result = run(
+    result = run_forked(
         *("ns-train", "thermoxels", "--output-dir", str(tmp_path), "--experiment-name", "again"),
         *("--timestamp", "run", *SHORT_TRAINING, "--max-num-iterations", "19", "--load-dir", str(early)),
         *("thermal-data", "--data", str(trained.scene)),
@@ -140,14 +140,14 @@ def test_resume_goes_on_from_the_checkpoint(trained: Trained, tmp_path):
 
 def test_thermal_images_alone(tiny_scene, tmp_path):
     """The baseline trains, evaluates and exports without colour."""
-    result = run(
+    result = run_forked(
         *("ns-train", "plenoxels-t", "--output-dir", str(tmp_path), "--experiment-name", "t", "--timestamp", "run"),
         *SHORT_TRAINING,
         *("thermal-data", "--data", str(tiny_scene)),
     )
     assert result.returncode == 0, result.stdout
     config = str(tmp_path / "t" / "plenoxels-t" / "run" / "config.yml")
-    result = run("ns-eval", "--load-config", config, "--output-path", str(tmp_path / "eval.json"))
+    result = run_forked("ns-eval", "--load-config", config, "--output-path", str(tmp_path / "eval.json"))
     assert result.returncode == 0, result.stdout
     results = json.loads((tmp_path / "eval.json").read_text())["results"]
     assert np.isfinite(results["thermal_psnr"]) and "psnr" not in results
@@ -155,7 +155,7 @@ def test_thermal_images_alone(tiny_scene, tmp_path):
 
 @pytest.mark.real_data
 def test_real_photographs_with_a_thermal_camera_of_its_own(shared_data, tmp_path):
-    result = run(
+    result = run_forked(
         *("ns-train", "thermoxels-arco", "--output-dir", str(tmp_path), "--experiment-name", "a", "--timestamp", "run"),
         *(*SHORT_TRAINING, "--pipeline.model.prune-threshold", "0"),
         *("thermal-data", "--data", str(shared_data / "arco"), "--downscale-factor", "8"),
@@ -163,7 +163,7 @@ def test_real_photographs_with_a_thermal_camera_of_its_own(shared_data, tmp_path
     assert result.returncode == 0, result.stdout
     assert "35 train" in result.stdout and "thermal cameras of their own" in " ".join(result.stdout.split())
     config = str(tmp_path / "a" / "thermoxels-arco" / "run" / "config.yml")
-    result = run(
+    result = run_forked(
         *("ns-export", "thermoxels-mesh", "--load-config", config),
         *("--output-dir", str(tmp_path / "mesh"), "--metres-per-unit", "1", "--density-percentile", "90"),
         *("--pictures", "False", "--steps", "1"),

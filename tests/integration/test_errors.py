@@ -7,7 +7,7 @@ import pytest
 import yaml
 from nerfstudio.configs.method_configs import all_methods
 
-from tests.integration.commands import SHORT_TRAINING, Trained, run
+from tests.integration.commands import SHORT_TRAINING, Trained, run_forked
 
 
 def lose_partner(scene: Path) -> None:
@@ -25,7 +25,7 @@ def test_damaged_scene(tiny_scene, tmp_path, damage, word):
     scene = tmp_path / "scene"
     shutil.copytree(tiny_scene, scene)
     damage(scene)
-    result = run(
+    result = run_forked(
         *("ns-train", "thermoxels", "--output-dir", str(tmp_path / "out"), *SHORT_TRAINING),
         *("thermal-data", "--data", str(scene)),
     )
@@ -35,7 +35,7 @@ def test_damaged_scene(tiny_scene, tmp_path, damage, word):
 
 
 def export(config: Path, output: Path, *options: str):
-    return run(
+    return run_forked(
         *("ns-export", "thermoxels-mesh", "--load-config", str(config), "--output-dir", str(output)),
         *("--metres-per-unit", "1", "--pictures", "False", *options),
     )
@@ -59,7 +59,7 @@ def test_output_folder_that_cannot_be_written(trained: Trained, tmp_path):
 def test_checkpoint_of_another_method(trained: Trained, tmp_path):
     """The config of the thermal baseline beside a checkpoint of thermoxels."""
     folder = tmp_path / "outputs" / "tiny" / "plenoxels-t" / "run"
-    result = run(
+    result = run_forked(
         *("ns-train", "plenoxels-t", "--output-dir", str(tmp_path / "outputs"), "--experiment-name", "tiny"),
         *("--timestamp", "run", *SHORT_TRAINING, "--max-num-iterations", "2", "--pipeline.model.refine-at", "50"),
         *("thermal-data", "--data", str(trained.scene)),
@@ -69,7 +69,9 @@ def test_checkpoint_of_another_method(trained: Trained, tmp_path):
     result = export(folder / "config.yml", tmp_path / "export")
     assert result.returncode == 1
     assert "checkpoint: expected a voxel grid with" in " ".join(result.stdout.split())
-    result = run("ns-eval", "--load-config", str(folder / "config.yml"), "--output-path", str(tmp_path / "e.json"))
+    result = run_forked(
+        "ns-eval", "--load-config", str(folder / "config.yml"), "--output-path", str(tmp_path / "e.json")
+    )
     assert result.returncode == 1 and "Error: checkpoint:" in result.stdout and "Traceback" not in result.stdout
 
 

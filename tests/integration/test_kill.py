@@ -1,13 +1,9 @@
-import os
-import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import torch
 
-from tests.integration.commands import SHORT_TRAINING, run
+from tests.integration.commands import SHORT_TRAINING, run_forked, started
 
 
 def test_kill_9_while_saving_loses_at_most_the_work_since_the_last_checkpoint(tiny_scene: Path, tmp_path: Path):
@@ -19,27 +15,18 @@ def test_kill_9_while_saving_loses_at_most_the_work_since_the_last_checkpoint(ti
     ]
     scene = ("thermal-data", "--data", str(tiny_scene))
     folder = tmp_path / "killed" / "thermoxels" / "run" / "nerfstudio_models"
-    process = subprocess.Popen(
-        [str(Path(sys.executable).with_name("ns-train")), *words, *scene],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
-    try:
+    with started("ns-train", *words, *scene, log=tmp_path / "log") as process:
         end = time.monotonic() + 200
         while len(list(folder.glob("*.ckpt"))) < 4 or not any(folder.parent.glob(".step-*.part")):
-            assert process.poll() is None and time.monotonic() < end, "no checkpoint was written"
+            assert process.is_alive() and time.monotonic() < end, "no checkpoint was written"
             time.sleep(0.0005)
-    finally:
-        process.send_signal(signal.SIGKILL)
-        process.wait()
     steps = []
     for checkpoint in folder.iterdir():
         steps.append(torch.load(checkpoint, weights_only=False)["step"])
         assert checkpoint.name == f"step-{steps[-1]:09d}.ckpt"
     assert sorted(steps) == list(range(1, max(steps) + 1)) and len(steps) >= 4
     again = [*words, "--load-dir", str(folder), "--max-num-iterations", "3", "--steps-per-save", "1000"]
-    result = run("ns-train", *again, *scene)
+    result = run_forked("ns-train", *again, *scene)
     assert result.returncode == 0, result.stdout
     last = folder / f"step-{max(steps) + 3:09d}.ckpt"
     assert last.is_file(), sorted(path.name for path in folder.iterdir())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -47,7 +48,7 @@ class RigModel:
 
     def changed(self, change: FloatArray) -> tuple[Camera, FloatArray]:
         """Thermal camera and transform with the ten changes applied."""
-        rotation, _ = _rotation(change[:3])
+        rotation, _ = _rotation(*change[:3].tolist())
         transform = self.transform.copy()
         transform[:3, :3] = rotation @ self.transform[:3, :3]
         transform[:3, 3] += change[3:6]
@@ -74,7 +75,7 @@ class RigModel:
         0 where a point does not count. Tangential distortion is taken as constant: it is far below a pixel's worth.
         """
         camera, transform = self.changed(change)
-        _, turned = _rotation(change[:3])
+        _, turned = _rotation(*change[:3].tolist())
         local = points @ transform[:3, :3].T + transform[:3, 3]
         depth = local[:, 2]
         safe = np.where(depth > _SMALLEST_DEPTH_SHARE * np.median(points[:, 2]), depth, np.inf)
@@ -97,10 +98,11 @@ class RigModel:
         return result
 
 
-def _rotation(angles: FloatArray) -> tuple[FloatArray, FloatArray]:
+@lru_cache(maxsize=4)  # all frames ask for the same one
+def _rotation(rx: float, ry: float, rz: float) -> tuple[FloatArray, FloatArray]:
     """Rotation Rz Ry Rx (3, 3) and its derivatives by the three angles (3, 3, 3)."""
     single, slope = [], []
-    for angle, generator in zip(angles, _GENERATORS):
+    for angle, generator in zip((rx, ry, rz), _GENERATORS):
         cosine, sine = np.cos(angle), np.sin(angle)
         square = generator @ generator
         single.append(np.eye(3) + sine * generator + (1.0 - cosine) * square)

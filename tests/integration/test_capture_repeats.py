@@ -1,4 +1,10 @@
+"""A capture of drawn photographs gives the same bytes with any number of threads, and after a kill at any stage."""
+
+import os
+import signal
 import sqlite3
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +19,17 @@ OF_THE_RUN = {"capture.html", "lock", "done.json", "key.txt", "features.db"}
 """They hold times, a process number, the options, and rows in the order in which threads ended."""
 
 
+STOPS = ("features:", "matches:", "4/9 scale", "rig: Comparing", "9/9 page")
+"""What the command says last before it is killed, one after the other."""
+
+
+def command(card: Path, scene: Path) -> list[str]:
+    return ["thermoxels", "capture", str(card), "--output", str(scene), *OPTIONS.split()]
+
+
 def captured(card: Path, scene: Path, threads: int) -> Path:
     """The scene that the command writes where everything may use so many threads."""
-    command = ("thermoxels", "capture", str(card), "--output", str(scene), *OPTIONS.split())
-    result = run(*command, "--threads", str(threads), timeout_s=1200.0, threads=threads)
+    result = run(*command(card, scene), "--threads", str(threads), timeout_s=1200.0, threads=threads)
     assert result.returncode == 0, result.stdout
     return scene
 
@@ -55,3 +68,41 @@ def rows_of(scene: Path) -> dict[str, list[tuple]]:
     with sqlite3.connect(scene / ".capture" / "poses" / "features.db") as opened:
         tables = [row[0] for row in opened.execute("select name from sqlite_master where type = 'table'")]
         return {name: sorted(opened.execute(f"select * from {name}"), key=repr) for name in tables}
+
+
+def kill_after(words: str, arguments: list[str]) -> None:
+    script = str(Path(sys.executable).with_name(arguments[0]))
+    with subprocess.Popen(
+        [script, *arguments[1:]],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1", "TERM": "dumb"},
+    ) as process:
+        assert process.stdout is not None
+        seen = []
+        for line in process.stdout:
+            seen.append(line)
+            if line.startswith(words):
+                process.send_signal(signal.SIGKILL)
+                break
+        assert process.wait() == -signal.SIGKILL, "".join(seen)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="this system has no SIGKILL")
+def test_kill_9_at_any_stage_changes_nothing_in_the_scene(scenes, tmp_path):
+    alone, killed = scenes[0], tmp_path / "killed"
+    words = command(alone.parent / "card", killed)
+    for last in STOPS:
+        kill_after(last, words)
+    again = run(*words)
+    assert again.returncode == 0, again.stdout
+    assert "8/9 scene: as before" in again.stdout and "9/9 page: as before" not in again.stdout
+    assert len(written(killed)) == 2 * COUNT + 3  # json, points, tracks
+    assert written(killed) == written(alone)
+    assert (killed / "capture.html").is_file()
+
+
+def written(scene: Path) -> dict[str, bytes]:
+    """The scene without what the stages keep for another run."""
+    return {name: content for name, content in files_of(scene).items() if not name.startswith(".capture/")}
