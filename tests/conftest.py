@@ -20,6 +20,31 @@ def shared_data() -> Path:
     return folder
 
 
+LONGEST_FIRST = ("tests/integration", "tests/capture", "tests/training", "tests/stability", "tests/multiview")
+"""Whole commands and trainings: a worker that began one at the end would be waited for."""
+
+
+def pytest_collection_modifyitems(items) -> None:
+    """Run the folders with the longest tests first."""
+    items.sort(key=lambda item: not item.nodeid.startswith(LONGEST_FIRST))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Give workers whole files (``--dist loadfile``) in the order above; those that share a training go together."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class ByTraining(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = super()._split_scope(nodeid)
+            return "trained" if file.startswith("tests/integration/") and "capture" not in file else file
+
+    if config.getvalue("dist") != "loadfile":
+        return None
+    config.option.loadscopereorder = False
+    return ByTraining(config, log)
+
+
 def pytest_terminal_summary(terminalreporter) -> None:
     """Say how long each folder of tests took, added up over all processes."""
     seconds: Counter[str] = Counter()

@@ -59,10 +59,17 @@ def pixels_off(poses: np.ndarray, true: np.ndarray, focal: float) -> float:
     return float(np.median(_distances(Tracks(photograph, point, place), poses, np.full(len(true), focal))))
 
 
-def test_poses_that_are_off_are_adjusted_and_said(scenes):
+@pytest.fixture(scope="module")
+def refined(scenes):
+    """What is made of poses that are off, and what is said."""
     said: list[str] = []
+    scene, training, _ = split(scenes["off"])
+    return *refine_poses(scene, training, said.append), said
+
+
+def test_poses_that_are_off_are_adjusted_and_said(scenes, refined):
     scene, training, true = split(scenes["off"])
-    found, fitted = refine_poses(scene, training, said.append)
+    found, fitted, said = refined
     before, after = (np.stack([each.frames[n].pose for n in training]) for each in (scene, found))
     focal = scene.frames[0].intrinsics.fl_x
     assert pixels_off(after, true[training], focal) < 0.35 * pixels_off(before, true[training], focal)
@@ -76,9 +83,9 @@ def test_poses_that_are_off_are_adjusted_and_said(scenes):
     assert pixels_off(every, true, focal) < pixels_off(given, true, focal)
 
 
-def test_thermal_cameras_follow_their_photographs(scenes):
-    scene, training, _ = split(scenes["off"])
-    found, _ = refine_poses(scene, training, lambda _: None)
+def test_thermal_cameras_follow_their_photographs(scenes, refined):
+    scene, _, _ = split(scenes["off"])
+    found = refined[0]
     rigs = [
         [np.linalg.inv(frame.pose) @ frame.thermal_pose for frame in each.frames if frame.thermal_pose is not None]
         for each in (scene, found)
@@ -94,9 +101,9 @@ def test_poses_that_fit_stay(scenes):
     assert found is scene and not fitted and said[0].startswith("poses: kept")
 
 
-def test_held_out_photographs_change_nothing_in_training(scenes):
+def test_held_out_photographs_change_nothing_in_training(scenes, refined):
     scene, training, _ = split(scenes["off"])
-    every, _ = refine_poses(scene, training, lambda _: None)
+    every = refined[0]
     for number in set(range(len(scene.frames))) - set(training):
         scene.frames[number] = scene.frames[training[0]]  # other photographs in their places
     again, _ = refine_poses(scene, training, lambda _: None)
