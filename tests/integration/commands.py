@@ -83,8 +83,8 @@ def _become(command: tuple[str, ...], log: Path) -> None:
     sys.argv = [str(script), *command[1:]]
     try:
         runpy.run_path(str(script), run_name="__main__")
-    except Exception:
-        sys.excepthook(*sys.exc_info())
+    except Exception as problem:
+        sys.excepthook(type(problem), problem, problem.__traceback__)
         sys.exit(1)
 
 
