@@ -7,16 +7,30 @@ import numpy as np
 import pytest
 
 from tests.support.unreadable import forbid
+from thermoxels_ns.capture.folder_scan import identify
 from thermoxels_ns.capture.pairs import read_pair_list
+from thermoxels_ns.capture.photograph import open_photograph, read_mask
+from thermoxels_ns.capture.rig.images import read_photograph
+from thermoxels_ns.capture.rig_types import RigFrame
+from thermoxels_ns.capture.sfm.colmap_conversion import read_colmap
 from thermoxels_ns.commands.cost import read_runs
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.json_values import read_json
 from thermoxels_ns.core.yaml_records import read_yaml
+from thermoxels_ns.data.colmap_model import read_model
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.data.scene_box import _read_ply
 from thermoxels_ns.data.sparse_tracks import read_tracks
 from thermoxels_ns.radiometry.thermogram import read_thermogram
+from thermoxels_ns.training.pipeline import load_checkpoint
+
+
+def read_rig_photograph(path: Path) -> None:
+    frame = RigFrame("a", path, np.zeros((3, 4)), np.eye(4), np.zeros((0, 3)), np.zeros(0, np.int64))
+    read_photograph(frame, Camera(4, 3, 4.0, 4.0, 2.0, 1.5))
+
 
 READERS = {
     "tracks.npz": read_tracks,
@@ -28,6 +42,15 @@ READERS = {
     "thermal.csv": read_thermogram,
     "thermal.jpg": read_thermogram,
     "thermal.tiff": read_thermogram,
+    "thermal.npy": read_thermogram,
+    "card.jpg": lambda path: identify(path, path.parent),
+    "card.png": lambda path: identify(path, path.parent),
+    "photograph.jpg": open_photograph,
+    "rig.jpg": read_rig_photograph,
+    "mask.png": lambda path: read_mask(path, 4, 3),
+    "points3D.bin": lambda path: read_model(path.parent),
+    "images.txt": lambda path: read_colmap(path.parent),
+    "step.ckpt": load_checkpoint,
 }
 
 
@@ -47,15 +70,18 @@ def test_a_file_that_may_not_be_read(tmp_path: Path, monkeypatch, name) -> None:
     refused(lambda: READERS[name](path))
 
 
-@pytest.mark.parametrize("part", ["images", "thermal"])
-@pytest.mark.parametrize("suffix", [".png", ".npy"])
+@pytest.mark.parametrize(
+    ("part", "suffix"), [("images", ".png"), ("thermal", ".png"), ("thermal", ".npy"), ("mask", ".png")]
+)
 def test_images_of_a_scene(scene_folder, monkeypatch, part, suffix) -> None:
     def celsius(number: int, shape: tuple[int, int]) -> np.ndarray:
         return np.full(shape, 20.0 + number, np.float32)
 
     scene = scene_folder(frames=5, suffix=suffix, counts=celsius if suffix == ".npy" else None)
     stem = Path(json.loads((scene.path / "transforms.json").read_text())["frames"][0]["file_path"]).stem
-    forbid(monkeypatch, f"{part}/{stem}{'.png' if part == 'images' else suffix}")
+    if part == "mask":
+        scene.add_masks()
+    forbid(monkeypatch, f"mask_{stem}.png" if part == "mask" else f"{part}/{stem}{suffix}")
 
     def read() -> None:
         outputs = ThermalDataParserConfig(data=scene.path).setup().get_dataparser_outputs("train")

@@ -40,16 +40,27 @@ def camera_to_world(image: Any) -> FloatArray:
 
 
 def check_complete(folder: Path) -> None:
-    """Refuse a model with a file (named) that ends before what it announces: pycolmap would read on behind the end."""
+    """Refuse a model with a file (named) that may not be read, or ends before what it announces.
+
+    Of the one pycolmap would say that it is none, of the other it would read on behind the end.
+    """
     for name in ("cameras", "frames", "images", "points3D"):
-        path = folder / f"{name}.bin"
-        if path.is_file() and not _complete(name, path):
-            raise SceneError(f"it cannot be read, {path.name} ends before its last entry, as after an interrupted copy")
+        for path in (folder / f"{name}.txt", folder / f"{name}.bin"):
+            if not path.is_file():
+                continue
+            try:
+                with path.open("rb") as file:
+                    whole = path.suffix == ".txt" or _complete(name, file.read())
+            except OSError as problem:
+                got = f"{path.name}: {problem.strerror}; check its permissions and the disk"
+                raise SceneError(f"it cannot be read, {got}") from problem
+            if not whole:
+                said = f"{path.name} ends before its last entry, as after an interrupted copy"
+                raise SceneError(f"it cannot be read, {said}")
 
 
-def _complete(name: str, path: Path) -> bool:
+def _complete(name: str, data: bytes) -> bool:
     try:
-        data = path.read_bytes()
         (count,) = struct.unpack_from("<Q", data)
         end = 8
         if name == "cameras":
@@ -57,8 +68,6 @@ def _complete(name: str, path: Path) -> bool:
         behind = {"frames": _behind_frame, "images": _behind_image, "points3D": _behind_point}[name]
         for _ in range(count):
             end = behind(data, end)
-    except OSError as problem:
-        raise SceneError(f"it cannot be read, {path.name}: {problem.strerror}") from problem
     except (struct.error, ValueError):  # a number, or the end of a name, behind the end
         return False
     return end <= len(data)

@@ -16,6 +16,7 @@ from thermoxels_ns.capture.rig_types import RigFrame
 from thermoxels_ns.capture.sfm.sparse_depth import SparseDepth
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
+from thermoxels_ns.radiometry.decoders import errors_name
 
 FloatImage = npt.NDArray[np.float32]
 
@@ -145,7 +146,8 @@ def read_photograph(frame: RigFrame, camera: Camera) -> FloatImage:
     source = frame.photograph
     if isinstance(source, Path):
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        encoded = np.frombuffer(source.read_bytes(), np.uint8)
+        with errors_name(f"{frame.name}: {source.name}", "a readable photograph"):
+            encoded = np.frombuffer(source.read_bytes(), np.uint8)
         image = cv2.imdecode(encoded, flags) if len(encoded) else None
         if image is None:
             remedy, got = "Copy it from the camera again or leave the frame out.", "a file that is damaged or no image"

@@ -11,7 +11,7 @@ import numpy as np
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.errors import SceneError
-from thermoxels_ns.data.colmap_model import camera_to_world
+from thermoxels_ns.data.colmap_model import camera_to_world, read_model
 
 _FIELDS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -77,12 +77,9 @@ def model_of_colmap(
 
 def read_colmap(folder: Path) -> Any:
     """Read a COLMAP model's folder; a `SceneError` where it holds no readable model."""
-    import pycolmap
-
     try:
-        return pycolmap.Reconstruction(str(folder))
-    except Exception as problem:  # pycolmap raises RuntimeError, ValueError, IndexError by version
+        return read_model(folder)
+    except SceneError as problem:
         expected = "a COLMAP model (cameras, images and points3D as .bin or .txt)"
-        got = str(problem).splitlines()[0][:200] if str(problem) else type(problem).__name__
         remedy = "Pass --poses the folder that holds them, such as sparse/0."
-        raise SceneError(str(folder), expected=expected, got=got, remedy=remedy) from problem
+        raise SceneError(str(folder), expected=expected, got=problem, remedy=remedy) from problem
