@@ -9,6 +9,7 @@ from PIL import Image
 from tests.support.camera_card import photograph, write_pairs
 from tests.support.posed_model import ring_model
 from tests.support.textured_room import VISIBLE
+from tests.support.unreadable import files_end_after
 from thermoxels_ns.capture.settings import CaptureSettings
 from thermoxels_ns.capture.sfm.feature_matching import PoseOptions, ReducedPhotographs, fill_database
 from thermoxels_ns.capture.sfm.sfm_model import SfmModel
@@ -123,16 +124,10 @@ def test_a_database_without_its_last_frame_is_begun_again(tmp_path):
 
 def test_a_result_that_does_not_fit_on_the_disk_is_one_error(tmp_path, monkeypatch):
     """Nothing else is printed, not even when what held the half-made file is cleared away."""
-    resource = pytest.importorskip("resource")
     later = []
     monkeypatch.setattr(sys, "unraisablehook", later.append)
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))
-    try:
-        with pytest.raises(OutputError, match=r"model\.npz"):
-            save(tmp_path / "model.npz", ring_model(4))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with files_end_after(2000), pytest.raises(OutputError, match=r"model\.npz"):
+        save(tmp_path / "model.npz", ring_model(4))
     gc.collect()
     assert later == [] and list(tmp_path.iterdir()) == []
     save(tmp_path / "model.npz", ring_model(4))

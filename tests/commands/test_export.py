@@ -1,4 +1,5 @@
 import json
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -14,6 +15,7 @@ from nerfstudio.cameras.cameras import Cameras
 from PIL import Image
 
 from tests.support.looking_cameras import looking_at
+from tests.support.unreadable import files_end_after
 from thermoxels_ns.commands.export import ExportThermoxelsMesh, _check_config, scene_json, viewpoint_of_cameras
 from thermoxels_ns.commands.export_options import ExportOptions, Viewpoint, check_options
 from thermoxels_ns.commands.export_snapshot import export_snapshot
@@ -263,6 +265,29 @@ def test_export_interrupted_while_writing_leaves_no_summary(ball, tmp_path, monk
     with pytest.raises(KeyboardInterrupt):
         export_snapshot(ball, np.eye(4), ExportOptions(**SCALED), tmp_path)
     assert not (tmp_path / "summary.json").exists()
+
+
+@pytest.fixture(scope="module")
+def exported(ball, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("exported")
+    export_snapshot(ball, np.eye(4), ExportOptions(**SCALED), folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("size_bytes", "broken"),
+    [(1000, "quality.json"), (60_000, "mesh.vtu"), (75_000, "step-0001.vtu"), (100_000, r"mesh.*\.png")],
+)
+def test_a_full_disk_is_one_line_and_leaves_no_half_of_a_file(ball, exported, tmp_path, size_bytes, broken) -> None:
+    shutil.copytree(exported, tmp_path, dirs_exist_ok=True)
+    (tmp_path / "mine.txt").write_text("mine")
+    before = contents(tmp_path)
+    with files_end_after(size_bytes), pytest.raises(OutputError, match=rf"{broken}.*space") as caught:
+        export_snapshot(ball, np.eye(4), ExportOptions(**SCALED), tmp_path)
+    assert "\n" not in str(caught.value)
+    after = contents(tmp_path)
+    assert "summary.json" not in after and after["mine.txt"] == before["mine.txt"]
+    assert {name: before[name] for name in after} == after  # the same again, whether they are old or new
 
 
 @pytest.mark.parametrize(("pictures", "scale"), [(False, 1.0), (True, None), (False, None)])

@@ -2,6 +2,7 @@ import csv
 import json
 import re
 import shlex
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pyvista as pv
 import tyro
 
 from tests.support.scene_bodies import room, wall
+from tests.support.unreadable import files_end_after
 from thermoxels_ns import cli
 from thermoxels_ns.commands.heat import Heat
 from thermoxels_ns.commands.heat_run import command_line, compute_heat, run_heat
@@ -43,6 +45,7 @@ steady: true
 inside_air: {air_c: 20.0, coefficient_w_m2k: 7.7}
 outside_air: {air_c: -10.0, coefficient_w_m2k: 25.0}
 """
+PROBES = ["--probes", "0.5", "2", "2", "3.9", "2", "0.1"]
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +64,7 @@ def folder(tmp_path_factory) -> Path:
 def hour(folder) -> Path:
     """Results of the transient scene."""
     words = ["heat", str(folder / "room" / "mesh.vtu"), "--scene", str(folder / "hour.yaml")]
-    probes = ["--probes", "0.5", "2", "2", "3.9", "2", "0.1"]
-    assert cli.main([*words, "--output-dir", str(folder / "hour"), *probes]) == 0
+    assert cli.main([*words, "--output-dir", str(folder / "hour"), *PROBES]) == 0
     return folder / "hour"
 
 
@@ -139,6 +141,29 @@ def test_the_report_is_one_page_that_fetches_nothing(hour) -> None:
     for words in ("What was asked", "What was built and left out", "Energy balance", "exterior-side", "Over time"):
         assert words in page
     assert (hour / PICTURES[3]).stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("size_bytes", "broken"),
+    [(450, "series.csv"), (1000, "step-0000.vtu"), (15_000, "surface-end.png"), (200_000, "report.html")],
+)
+def test_a_full_disk_is_one_line_and_leaves_no_half_of_a_file(folder, hour, tmp_path, capsys, size_bytes, broken):
+    shutil.copytree(hour, tmp_path / "out")
+    (tmp_path / "out" / "mine.txt").write_text("mine")
+    whole = files_of(tmp_path / "out")
+    words = ["heat", str(folder / "room" / "mesh.vtu"), "--scene", str(folder / "hour.yaml"), *PROBES]
+    capsys.readouterr()
+    with files_end_after(size_bytes):
+        assert cli.main([*words, "--output-dir", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and broken in said and "space" in said, said
+    left = files_of(tmp_path / "out")
+    assert left.pop("mine.txt") == b"mine" and set(left) < set(whole) - {"answers.json"}
+    assert {name: whole[name] for name in left} == left  # the same again, whether they are old or new
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_a_second_run_replaces_the_first(folder, hour) -> None:

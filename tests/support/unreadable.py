@@ -1,9 +1,11 @@
-"""Files that may not be read, also for root."""
+"""Files that may not be read, also for root, and a disk that is full."""
 
 import builtins
 import errno
 import io
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -21,3 +23,15 @@ def forbid(monkeypatch: pytest.MonkeyPatch, ending: str) -> None:
     monkeypatch.setattr(builtins, "open", refusing)
     monkeypatch.setattr(io, "open", refusing)
     monkeypatch.setattr(Path, "open", lambda path, *arguments, **options: refusing(path, *arguments, **options))
+
+
+@contextmanager
+def files_end_after(size_bytes: int) -> Iterator[None]:
+    """A disk that takes so much of each file, whoever writes it."""
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

@@ -1,12 +1,11 @@
 import dataclasses
 import re
-import resource
 import shutil
 
 import numpy as np
 import pytest
 
-from tests.support.unreadable import forbid
+from tests.support.unreadable import files_end_after, forbid
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.mesh.files.content import colour_bytes
 from thermoxels_ns.mesh.files.formats import write_mesh
@@ -159,15 +158,9 @@ def test_a_tetrahedron_listed_again_is_refused(tmp_path, box_mesh) -> None:
 def test_a_full_disk_is_one_line_and_the_old_file_stays(tmp_path, box_mesh, capfd) -> None:
     write_mesh(tmp_path / "box.vtu", box_mesh)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))  # a disk that takes a kilobyte of each file
-    try:
-        with pytest.raises(
-            OutputError, match=r"^mesh file: expected to write .*, got (no space|.*too large).* Check the"
-        ):
-            write_vtu(tmp_path / "box.vtu", box_mesh)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    said = r"^mesh file: expected to write .*, got (no space|.*too large).* Check the"
+    with files_end_after(1000), pytest.raises(OutputError, match=said):
+        write_vtu(tmp_path / "box.vtu", box_mesh)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
     assert capfd.readouterr().err == ""
 
