@@ -11,6 +11,7 @@ from thermoxels_ns.core.yaml_records import configs_folder
 from thermoxels_ns.fem.problem import AdaptiveSteps, TimeSteps
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.schemes import BACKWARD_EULER
+from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
@@ -180,3 +181,63 @@ def test_unknown_names_and_paths(tmp_path) -> None:
     binary.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(HeatError, match=r"^binary\.yaml: expected a yaml file"):
         load_heat_scene(binary)
+
+
+def with_series(tmp_path: Path, series: str, time: str = "time: {duration_s: 36000.0}") -> HeatScene:
+    (tmp_path / "outside.csv").write_text(series, encoding="utf-8")
+    text = f"""
+materials: {{"*": concrete}}
+{time}
+initial: {{temperature_c: 10.0}}
+inside_air: {{air_c: 20.0, coefficient_w_m2k: 8.0}}
+outside_air: {{air_c: 0.0, air_series: outside.csv, coefficient_w_m2k: 25.0, patches: [exterior-side, exterior-down]}}
+surfaces: [{{patches: [exterior-up], emissivity: 0.9}}]
+sky: {{below_air_k: 20.0}}
+"""
+    return scene(tmp_path, text)
+
+
+def test_air_follows_the_file_beside_the_scene_and_the_sky_follows_the_air(tmp_path) -> None:
+    mesh = room()
+    found = with_series(tmp_path, "hours,air_c\n0,-4\n2,6.0\n\n10, 6\n")
+    inside, outside, sky = found.effects(mesh)
+    assert isinstance(inside, Convection) and inside.air_c == 20.0
+    assert isinstance(outside, Convection) and isinstance(sky, Radiation)
+    selection = Selection(mesh)
+    places = selection.facet_places(selection.facets(("exterior-up",)))
+    for hours, air_c in ((0.0, -4.0), (1.0, 1.0), (2.0, 6.0), (20.0, 6.0)):
+        assert outside.bounded("air_c").at(places, 3600.0 * hours) == pytest.approx(air_c)
+        assert sky.bounded("surroundings_c").at(places, 3600.0 * hours) == pytest.approx(air_c - 20.0)
+    varying = outside.bounded("air_c")
+    assert varying.in_time and varying.resolution_s == 7200.0  # no step is longer than the file's shortest interval
+    warmer = solve_heat(found.problem(mesh), found.time).temperature_c[-1].mean()
+    still = with_series(tmp_path, "hours,air_c\n0,-4\n10,-4\n")
+    assert warmer > solve_heat(still.problem(mesh), still.time).temperature_c[-1].mean() + 0.1
+
+
+@pytest.mark.parametrize(
+    ("series", "message"),
+    [
+        (
+            "time,air\n0,1\n",
+            r"air_series: .*outside\.csv: expected the first line hours,air_c, got time,air\. W",
+        ),
+        ("", r"expected the first line hours,air_c, got nothing"),
+        ("hours,air_c\n0,cold\n1,2\n", r"expected two numbers in each line, got .*cold.* Write 1\.5,-3\.2"),
+        ("hours,air_c\n0,1,2\n1,2,3\n", r"expected two numbers in each line"),
+        ("hours,air_c\n0,1\n", r"table: expected at least two times, ascending"),
+        ("hours,air_c\n0,1\n1,-300\n", r"air_c: expected a finite number of at least -273\.15"),
+    ],
+)
+def test_a_series_that_cannot_be_used_is_refused(tmp_path, series, message) -> None:
+    with pytest.raises(HeatError, match=message):
+        with_series(tmp_path, series).effects(room())
+
+
+def test_a_series_needs_a_file_and_time(tmp_path) -> None:
+    with pytest.raises(HeatError, match=r"outside_air: air_series: expected time beside it, got steady"):
+        with_series(tmp_path, "hours,air_c\n0,1\n1,2\n", time="steady: true")
+    found = with_series(tmp_path, "hours,air_c\n0,1\n1,2\n")
+    (tmp_path / "outside.csv").unlink()
+    with pytest.raises(HeatError, match=r"air_series: expected a csv file beside the scene, got .*csv: No such"):
+        found.effects(room())

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from fnmatch import fnmatchcase
 from typing import TypeVar
 
 import numpy as np
 
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
-from thermoxels_ns.fem.quantities import Varying
+from thermoxels_ns.fem.quantities import Quantity, Varying
 from thermoxels_ns.heat.effects import (
     AbsorbedSolar,
     Convection,
@@ -156,18 +156,27 @@ class HeatScene:
         lit = patches.of_surfaces(self.surfaces, lambda surface: surface.absorptivity, reached)
         return [AbsorbedSolar(where, absorptivity, irradiance) for where, absorptivity in lit]
 
-    def _sky_c(self, sky: Sky) -> float:
+    def _sky_c(self, sky: Sky) -> Quantity:
         if sky.temperature_c is not None:
             return sky.temperature_c
         assert self.outside_air is not None, "checked when the scene was made"
-        if sky.below_air_k is not None:
-            return self.outside_air.air_c - sky.below_air_k
-        return swinbank_sky_c(self.outside_air.air_c)
+        air, below_k = self.outside_air.temperature, sky.below_air_k
+
+        def above(air_c: float) -> float:
+            return swinbank_sky_c(air_c) if below_k is None else air_c - below_k
+
+        if not isinstance(air, Varying):
+            return above(air)
+        return replace(air, function=lambda places, time_s: above(float(np.max(air.function(places, time_s)))))
 
     def _check_what_belongs_together(self) -> None:
         if self.sky is not None and self.sky.needs_air and self.outside_air is None:
             remedy = "Add outside_air, or give the sky's temperature_c."
             raise unclear("sky", "outside_air beside it, whose temperature it follows", "none", remedy)
+        for key, air in (("inside_air", self.inside_air), ("outside_air", self.outside_air)):
+            if self.steady and air is not None and air.air_series is not None:
+                remedy = "Add time: {duration_s: 86400}, or remove air_series."
+                raise unclear(f"{key}: air_series", "time beside it", "steady", remedy)
         radiates = self.sky is not None or (self.ground is not None and self.ground.surface_c is not None)
         for key, source, there in (
             ("emissivity", "sky, or ground with surface_c", radiates),

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from datetime import datetime
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, TypeAlias, cast, get_args, get_origin, get_type_hints
 
@@ -14,7 +16,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K, celsius_to_kelvin
-from thermoxels_ns.fem.quantities import Bounds, Places, Quantity, Varying
+from thermoxels_ns.fem.quantities import Bounds, Places, Quantity, Varying, tabulated
 from thermoxels_ns.heat.effects import STEFAN_BOLTZMANN_W_M2K4, Convection
 from thermoxels_ns.heat.sky import Vector
 
@@ -129,18 +131,18 @@ class Section:
 
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self))
-        for field in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, field.name)
-            kinds = (hints[field.name], *get_args(hints[field.name]))
+        for own in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, own.name)
+            kinds = (hints[own.name], *get_args(hints[own.name]))
             choices = next((get_args(kind) for kind in kinds if get_origin(kind) is Literal), ())
             if value is None and type(None) in kinds:
                 continue
             if float in kinds:
-                number = field_bounds(field.name).check(cast(Any, value))
-                object.__setattr__(self, field.name, float(number))
+                number = field_bounds(own.name).check(cast(Any, value))
+                object.__setattr__(self, own.name, float(number))
             if choices and value not in choices:
-                raise unclear(field.name, f"one of {', '.join(choices)}", repr(value), "Correct it.")
-            if field.name == "patches" and (not value or isinstance(value, str)):
+                raise unclear(own.name, f"one of {', '.join(choices)}", repr(value), "Correct it.")
+            if own.name == "patches" and (not value or isinstance(value, str)):
                 raise unclear("patches", "a list of names or patterns", repr(value), "Name at least one, in a list.")
         self._check()
 
@@ -149,10 +151,29 @@ class Section:
 
 
 @dataclass(frozen=True)
-class InsideAir(Section):
-    """The air of a room."""
+class _Air(Section):
+    """Air whose temperature is a number, or changes with time as a file says."""
 
     air_c: float  # Temperature of the air, [degrees Celsius], at least -273.15
+    air_series: str | None = field(default=None, kw_only=True)
+    """A csv file beside the scene with the columns hours (since the start) and air_c: the temperature as time goes, in
+    straight lines, held before and after; air_c is then what coefficients are taken at. A sky that follows the air
+    follows it too."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _ = self.temperature  # refuses a file that cannot be read
+
+    @property
+    def temperature(self) -> Quantity:
+        """The temperature as time goes, [degrees Celsius]."""
+        return self.air_c if self.air_series is None else read_air_series(self.air_series)
+
+
+@dataclass(frozen=True)
+class InsideAir(_Air):
+    """The air of a room."""
+
     coefficient: InsideCoefficient | None = None
     """Heat transfer coefficient by the orientation of each surface, after ISO 6946: iso-6946-combined (1 / Rsi,
     convection and radiation together), iso-6946-separate (hci + 4 eps sigma T^3 at the temperature of the air), or
@@ -173,14 +194,13 @@ class InsideAir(Section):
         if self.coefficient is not None:
             coefficient = inside_coefficient(self.coefficient, self.heat_flow, self.air_c, self.emissivity or 0.0)
         assert coefficient is not None, "checked when the section was made"
-        return Convection(self.patches, coefficient, self.air_c)
+        return Convection(self.patches, coefficient, self.temperature)
 
 
 @dataclass(frozen=True)
-class OutsideAir(Section):
+class OutsideAir(_Air):
     """The open air."""
 
-    air_c: float  # Temperature of the air, [degrees Celsius], at least -273.15
     coefficient: OutsideCoefficient | None = None
     """Heat transfer coefficient: iso-6946-combined (1 / Rse = 25, convection and radiation together), iso-6946-separate
     (4 + 4 v, and 4 eps sigma T^3 at the temperature of the air), iso-6946-convection (4 + 4 v alone, for scenes that
@@ -203,7 +223,7 @@ class OutsideAir(Section):
             wind, emissivity = self.wind_m_s or 0.0, self.emissivity or 0.0
             coefficient = outside_coefficient(self.coefficient, wind, self.air_c, emissivity)
         assert coefficient is not None, "checked when the section was made"
-        return Convection(self.patches, coefficient, self.air_c)
+        return Convection(self.patches, coefficient, self.temperature)
 
 
 @dataclass(frozen=True)
@@ -295,6 +315,25 @@ class Sun(Section):
             raise unclear("start", "a date and time with a time zone", self.start.isoformat(), remedy)
         for name in ("north", "towards"):
             check_direction(name, getattr(self, name))
+
+
+def read_air_series(path: str) -> Varying:
+    """Read the temperature of air from a csv file with the columns hours and air_c; raises `HeatError`."""
+    try:
+        rows = [row for row in csv.reader(Path(path).read_text(encoding="utf-8-sig").splitlines()) if any(row)]
+    except (OSError, UnicodeDecodeError, csv.Error) as problem:
+        got = problem.strerror if isinstance(problem, OSError) else str(problem)
+        raise unclear("air_series", "a csv file beside the scene", f"{path}: {got}", "Correct the name.") from problem
+    if not rows or [name.strip() for name in rows[0]] != ["hours", "air_c"]:
+        got = ",".join(rows[0]) if rows else "nothing"
+        raise unclear(f"air_series: {path}", "the first line hours,air_c", got, "Write it so.")
+    try:
+        table = np.array([[float(hours), float(air_c)] for hours, air_c in rows[1:]]).reshape(-1, 2)
+    except ValueError as problem:
+        remedy = "Write 1.5,-3.2, for example."
+        raise unclear(f"air_series: {path}", "two numbers in each line", str(problem), remedy) from problem
+    field_bounds("air_c").check(table[:, 1])
+    return tabulated(3600.0 * table[:, 0], table[:, 1])
 
 
 def check_direction(name: str, vector: Vector | None) -> None:

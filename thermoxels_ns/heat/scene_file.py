@@ -57,6 +57,9 @@ def load_heat_scene(name: Path | str) -> HeatScene:
             raise wrong("heat scene", expected, repr(str(name)), "Correct the name.")
     content = read_yaml(path)
     check_keys(path.name, content, (*_OWN_KEYS, *_FIELDS))
+    for air in (content.get("inside_air"), content.get("outside_air")):
+        if isinstance(air, dict) and isinstance(air.get("air_series"), str):
+            air["air_series"] = str(path.parent / air["air_series"])
     hints = get_type_hints(HeatScene)
     values = {
         key: as_value(f"{path.name}: {key}", value, hints[key])

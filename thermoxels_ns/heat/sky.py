@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
@@ -37,7 +39,7 @@ def ground_view(normals: npt.NDArray[np.float64], up: Vector) -> npt.NDArray[np.
 
 
 def outdoor_radiation(
-    emissivity: float, *, sky_c: float | None = None, ground_c: float | None = None
+    emissivity: float, *, sky_c: Quantity | None = None, ground_c: float | None = None
 ) -> tuple[Quantity, Quantity]:
     """Make the emissivity and the surroundings of a `Radiation` to the sky, the ground or both, [degrees Celsius].
 
@@ -45,13 +47,15 @@ def outdoor_radiation(
     alone, the emissivity is multiplied by its view factor, and the rest of the view exchanges nothing.
     """
     if sky_c is not None and ground_c is not None:
-        sky, ground = celsius_to_kelvin(sky_c) ** 4, celsius_to_kelvin(ground_c) ** 4
+        varying = sky_c if isinstance(sky_c, Varying) else Varying(lambda *_: sky_c, in_time=False)
+        ground = celsius_to_kelvin(ground_c) ** 4
 
         def mean(places: Places, time_s: float) -> npt.NDArray[np.float64]:
             seen = sky_view(places.normals, places.up)
+            sky = celsius_to_kelvin(np.asarray(varying.function(places, time_s), dtype=np.float64)) ** 4
             return kelvin_to_celsius((seen * sky + (1.0 - seen) * ground) ** 0.25)
 
-        return emissivity, Varying(mean, in_time=False)
+        return emissivity, replace(varying, function=mean)
     if sky_c is not None:
         return Varying(lambda places, _: emissivity * sky_view(places.normals, places.up), in_time=False), sky_c
     assert ground_c is not None, "one of the two is given"
