@@ -157,6 +157,10 @@ def test_what_cannot_be_asked_is_said(changes, message) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        (
+            {"conductivity": {"wal": Measured(1.0)}, "unknown": (Unknown("conductivity", "wal"),)},
+            r"calibrate: conductivity: expected regions out of wall, got 'wal'\. Correct the name; regions are those",
+        ),
         ({"behind": ("rom",)}, r"calibrate: behind: expected patches out of .*room.*, got 'rom'"),
         ({"behind": ("room", "facade")}, r"calibrate: behind: expected another side of the body, got nothing that cou"),
         ({"layers": {"x": Layer(("facade",), Measured(0.1), Measured(1.0))}}, r"calibrate: layers: x: expected patch"),
@@ -166,3 +170,10 @@ def test_what_cannot_be_asked_is_said(changes, message) -> None:
 def test_what_does_not_fit_the_mesh_is_said(walls, changes, message) -> None:
     with pytest.raises(AuditError, match=message):
         calibrate(walls["plain"], replace(WALL, **changes))
+
+
+def test_every_region_needs_a_conductivity(walls) -> None:
+    with pytest.raises(
+        AuditError, match=r"calibrate: conductivity: .*got none for glazing\. Add glazing: 0\.8 W/\(m K\)"
+    ):
+        calibrate(walls["window"], WALL)

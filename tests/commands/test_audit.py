@@ -77,7 +77,7 @@ calibrate:
     assert np.array_equal(np.isfinite(off), surface.cell_data["counted"] == 1)
     page = (tmp_path / "out" / "audit.html").read_text()
     assert page.index("element by element") < page.index("<h2>Calibration</h2>") < page.index("Thermal bridges and")
-    assert "conductivity of slab 2.3 ± 0.2" in page and page.count("data:image/png") == 4
+    assert "conductivity of slab 2.3 ± 0.2 W/(m\N{NO-BREAK SPACE}K)" in page and page.count("data:image/png") == 4
 
 
 def test_the_page_is_complete_in_itself_and_escapes_what_users_write(done) -> None:

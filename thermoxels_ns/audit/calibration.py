@@ -51,7 +51,7 @@ def calibrated(
         return None
     fit = _Fit(_Wall(conditions, asked, surface, groups), draws)
     names = fit.names
-    units = {unknown_name(one): _UNITS[one.property] for one in asked.unknown}
+    units = {name: _UNITS[name.split()[0]] for name in asked.stated()}
     refused = fit.what_cannot_be_told(units)
     difference = np.full(len(surface.counted), np.nan)
     difference[fit.wall.counted] = fit.residual_k
@@ -97,6 +97,13 @@ class _Wall:
         self._layers = {
             name: self._on(f"layers: {name}", self.behind, one.patches) for name, one in asked.layers.items()
         }
+        regions = surface.mesh.region_names
+        made_of = _matching("conductivity", regions, tuple(asked.conductivity), "regions")
+        unknown = sorted({regions[n] for n in np.unique(surface.mesh.region)} - made_of)
+        if unknown:
+            remedy = f"Add {unknown[0]}: 0.8 W/(m K), or '*' for all others."
+            expected = "one for every region of the mesh"
+            raise AuditError("calibrate: conductivity", expected=expected, got=f"none for {unknown[0]}", remedy=remedy)
         self._film = {name: self._on("film", self.seen, (name,)) for name in asked.film}
 
     def measured_c(self, draws: Draws) -> FloatArray:
@@ -347,14 +354,14 @@ class _Fit:
         return x
 
 
-def _matching(entry: str, names: tuple[str, ...], patterns: tuple[str, ...]) -> set[str]:
+def _matching(entry: str, names: tuple[str, ...], patterns: tuple[str, ...], what: str = "patches") -> set[str]:
     """Names that match any pattern; raises `AuditError` for one that matches none."""
     found = set[str]()
     for pattern in patterns:
         here = matching_names(names, pattern)
         if not here:
-            remedy = "Correct the name; see the patches in the summary.json of the export."
-            got, expected = repr(pattern), f"patches out of {', '.join(names)}"
+            got, expected = repr(pattern), f"{what} out of {', '.join(names)}"
+            remedy = f"Correct the name; {what} are those of the mesh, see --patches of ns-export thermoxels-mesh."
             raise AuditError(f"calibrate: {entry}", expected=expected, got=got, remedy=remedy)
         found |= set(here)
     return found

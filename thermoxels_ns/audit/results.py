@@ -80,7 +80,7 @@ class Calibration:
     """Properties with which the computed surface temperature meets the measured one."""
 
     found: Mapping[str, Interval]  # By name, such as "conductivity of wall"; empty if refused
-    units: Mapping[str, str]  # Of each unknown
+    units: Mapping[str, str]  # Of each property, known or unknown
     refused: str  # Why no values are given, in sentences; else empty
     moved_most_by: Mapping[str, str]  # Which stated quantity moves each most within its range
     misfit_k: float  # Root mean square of measured minus computed, by area, [K]

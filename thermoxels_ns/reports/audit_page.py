@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
-from thermoxels_ns.audit.conditions import Conditions
+from thermoxels_ns.audit.conditions import Conditions, unknown_name
 from thermoxels_ns.audit.defect_figures import F_RSI_M2K_W, MODERATE_SHARE, SEVERE_SHARE
 from thermoxels_ns.audit.draws import CONFIDENCE
 from thermoxels_ns.audit.results import Audit, Defect, Element, Limit
@@ -209,7 +209,10 @@ def _calibration(audit: Audit, pictures: AuditPictures | None) -> list[Section]:
         (f"{name}\n{unit_signs(found.units[name])}", interval_lines(value), f"{stated[name].value:g}", most)
         for (name, value), most in zip(found.found.items(), found.moved_most_by.values())
     )
-    known = [f"{name} {_measured(one, '')}" for name, one in stated.items() if name not in found.units]
+    unknown = {unknown_name(one) for one in asked.unknown}
+    known = [
+        f"{name} {_measured(one, unit_signs(found.units[name]))}" for name, one in stated.items() if name not in unknown
+    ]
     words = [
         "Which properties make the surface temperature that finite elements compute, in steady heat flow through the "
         "mesh as thick as it is, meet the measured one."

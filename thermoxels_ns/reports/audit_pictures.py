@@ -55,7 +55,7 @@ def draw_audit(audit: Audit) -> AuditPictures:
         u_value.append(_drawn(audit, facing, u, title=f"{name} by the stated values", **look, **view))
         if off_k is not None:
             most = float(np.quantile(np.abs(off_k[np.unique(surface.mesh.facets[counted])]), 0.98)) or 1.0
-            look |= {"clim": (-most, most), "colour_map": "coolwarm", "bar_title": "measured - computed [K]"}
+            look |= {"clim": (-most, most), "colour_map": "coolwarm", "bar_title": "difference [K]"}
             misfit.append(_drawn(audit, facing, off_k, title="Measured minus computed", **look, **view))
     defects = [_defect(audit, number, surface_c, same) for number in range(min(len(audit.defects), MOST_DEFECTS))]
     return AuditPictures(tuple(temperature), tuple(u_value), tuple(defects), tuple(misfit))
