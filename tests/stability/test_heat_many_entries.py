@@ -16,6 +16,7 @@ from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.heat.effects import Convection, HeatFlux
 from thermoxels_ns.heat.scene import HeatScene
+from thermoxels_ns.heat.scene_file import load_heat_scene
 from thermoxels_ns.heat.screening import screen
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
@@ -57,6 +58,7 @@ def entries(count: int, alike: bool = False) -> tuple[tuple[Convection, ...], tu
     return tuple(airs), tuple(HeatFlux(name, 1e-9) for name in names)
 
 
+AIR = "convection: [{patches: ['*'], air_c: 5.0, coefficient_w_m2k: 5.0}]"
 WORK: dict[str, tuple[bool, Callable[[HeatProblem], Any]]] = {
     "labels of effects alike": (True, effect_labels),
     "assembling": (False, HeatSystem),
@@ -82,6 +84,17 @@ def test_twice_the_entries_of_a_scene_are_about_twice_the_work() -> None:
         )
         for airs, fluxes in map(entries, (60, 120))
     )
+    assert many < MOST_RATIO * few, (few, many)
+
+
+def test_twice_the_entries_of_a_file_are_about_twice_the_work(tmp_path) -> None:
+    def lines_of(count: int) -> int:
+        path, rows = tmp_path / f"{count}.yaml", [f"  - {{patches: [p{n}], flux_w_m2: {n}.5}}" for n in range(count)]
+        path.write_text("\n".join(['materials: {"*": concrete}', "steady: true", AIR, "heat_flux:", *rows]))
+        mesh = many_patches(count)
+        return lines_run(lambda: load_heat_scene(path).problem(mesh))
+
+    few, many = map(lines_of, (150, 300))
     assert many < MOST_RATIO * few, (few, many)
 
 
