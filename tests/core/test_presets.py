@@ -29,7 +29,7 @@ METHODS: dict[str, str] = PROJECT["entry-points"]["nerfstudio.method_configs"]
 DATAPARSERS: dict[str, str] = PROJECT["entry-points"]["nerfstudio.dataparser_configs"]
 
 FILES = sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
-OTHERS = ("patches-", "scene-", "conditions-", "materials")
+OTHERS = ("patches-", "scene-", "conditions-", "house-corner-", "materials")
 METHOD_FILES = [name for name in FILES if not name.startswith(OTHERS)]
 
 
