@@ -12,12 +12,10 @@ Behind it stands how the run compares with that of the scene without flaws: F at
 """
 
 import re
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import tyro
-from measuring import train_and_evaluate
+from measuring import run_with_options, train_and_evaluate
 
 from thermoxels_ns.synthetic.imperfections import Imperfections
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
@@ -92,8 +90,4 @@ class ImperfectCameras:
 
 
 if __name__ == "__main__":
-    words, passed_on = sys.argv[1:], []
-    if "--options" in words:
-        at = words.index("--options")
-        words, passed_on = words[:at], words[at + 1 :]
-    tyro.cli(ImperfectCameras, args=words).main(passed_on)
+    run_with_options(ImperfectCameras)

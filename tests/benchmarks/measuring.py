@@ -62,6 +62,17 @@ def train_and_evaluate(scene: Path, folder: Path, options: Sequence[str] = ()) -
     return seconds, {name: float(value) for name, value in figures.items() if value is not None}
 
 
+def run_with_options(benchmark: Callable[[], Any]) -> None:
+    """Run the `main` of a benchmark from its command line; what follows `--options` goes to ns-train as it is."""
+    import tyro
+
+    words, passed_on = sys.argv[1:], []
+    if "--options" in words:
+        at = words.index("--options")
+        words, passed_on = words[:at], words[at + 1 :]
+    tyro.cli(benchmark, args=words).main(passed_on)
+
+
 def write_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with replace_when_done(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:

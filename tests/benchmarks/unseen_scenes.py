@@ -12,15 +12,13 @@ mean anything. F-scores are those at 1.5 voxels of 128 along the exact box.
 
 import json
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import tyro
-from measuring import train_and_evaluate
+from measuring import run_with_options, train_and_evaluate
 
 from thermoxels_ns.synthetic.random_scene import FAMILIES
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
@@ -106,8 +104,4 @@ def _is_written(scene: SyntheticScene, folder: Path) -> bool:
 
 
 if __name__ == "__main__":
-    words, passed_on = sys.argv[1:], []
-    if "--options" in words:
-        at = words.index("--options")
-        words, passed_on = words[:at], words[at + 1 :]
-    tyro.cli(UnseenScenes, args=words).main(passed_on)
+    run_with_options(UnseenScenes)
