@@ -90,7 +90,7 @@ def gathered(pinholes: Sequence[Pinhole], centres: npt.ArrayLike, near: float = 
 
 def _photograph(dataset: Any, cameras: Cameras, index: int, longest_side: int) -> Pinhole:
     picture, mask = dataset.get_image_uint8(index).numpy(), dataset.get_mask(index)
-    camera = _camera(cameras, index)
+    camera = camera_at(cameras, index)
     pose = np.asarray(cameras.camera_to_worlds[index], dtype=np.float64)
     thermal = None
     if dataset.thermal_cameras is None:
@@ -113,7 +113,7 @@ def thermal_at(dataset: Any, photographs: Photographs, depth: npt.NDArray[np.flo
     origins, along = photographs.of_pixels(sure)
     points, number = origins + depth[sure, None] * along, photographs.numbers[sure]
     for place, index in enumerate(photographs.index.tolist()):
-        camera, own = _camera(cameras, index), number == place
+        camera, own = camera_at(cameras, index), number == place
         pixels = camera.project_world(np.asarray(cameras.camera_to_worlds[index], dtype=np.float64), points[own])
         warm, valid = (values.numpy()[..., 0] for values in dataset.get_thermal(index))
         shown = camera.contains(pixels)
@@ -125,7 +125,8 @@ def thermal_at(dataset: Any, photographs: Photographs, depth: npt.NDArray[np.flo
     return found
 
 
-def _camera(cameras: Cameras, index: int) -> Camera:
+def camera_at(cameras: Cameras, index: int) -> Camera:
+    """One of nerfstudio's perspective cameras."""
     distortion = [0.0] * 6 if cameras.distortion_params is None else cameras.distortion_params[index].double().tolist()
     named: dict[str, Any] = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), distortion))
     fx, fy, cx, cy = (float(getattr(cameras, name)[index, 0]) for name in ("fx", "fy", "cx", "cy"))

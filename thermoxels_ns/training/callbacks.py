@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 from threadpoolctl import threadpool_limits
@@ -20,9 +21,10 @@ from thermoxels_ns.field.refine import RowChange, prune, refine
 from thermoxels_ns.field.voxel_grid import VoxelGrid
 from thermoxels_ns.multiview.backdrop import backdrop_without_walls, mean_colours
 from thermoxels_ns.multiview.evidence import PhotographEvidence, evidence_of_photographs, rays_through_backdrop
+from thermoxels_ns.multiview.photographs import camera_at
 from thermoxels_ns.multiview.planes import depths_on_planes
 from thermoxels_ns.multiview.stereo import rays_through
-from thermoxels_ns.training.free_space_carving import carve_free_space
+from thermoxels_ns.training.free_space_carving import View, carve_free_space, clear_cameras
 from thermoxels_ns.training.losses import COARSE_LIGHT, FeatureRaySampler
 from thermoxels_ns.training.model import SurroundingsSampler, ThermoxelsModel
 from thermoxels_ns.training.ray_statistics import (
@@ -61,17 +63,25 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
     decisions = {step for step in steps if end is None or step < end} or {(end or 0) // 3}
 
     def carve(step: int) -> None:
-        """Drop what feature rays show to be air; at the first step of a training, not of a resumed one."""
-        if model.config.carve == "off" or model.feature_rays is None:
+        """Drop what is air; at the first step of a training, not of a resumed one."""
+        if model.config.carve == "off":
             return
-        old = model.grid.row_parameters()
-        change = carve_free_space(model.grid, model.feature_rays)
-        if change is not None:
-            follow(old, change)
+        if model.feature_rays is not None:
+            old = model.grid.row_parameters()
+            follow(old, carve_free_space(model.grid, model.feature_rays))
+        depths = None if evidence is None else evidence.feature_rays
+        for rays in (model.feature_rays, depths):
+            if rays is not None and (views := views_of(attributes)) is not None:
+                old = model.grid.row_parameters()
+                follow(old, clear_cameras(model.grid, rays, views))
 
-    def follow(old: dict[str, Parameter], change: RowChange, grid: VoxelGrid = model.grid, prefix: str = "") -> None:
+    def follow(
+        old: dict[str, Parameter], change: RowChange | None, grid: VoxelGrid = model.grid, prefix: str = ""
+    ) -> None:
         """Point the optimisers to the rows that took the place of `old`; their state changes as the rows did."""
         assert attributes.optimizers is not None
+        if change is None:
+            return
         for name, new in grid.row_parameters().items():
             if new is not old[name]:
                 optimizer: Any = attributes.optimizers.optimizers[prefix + name]
@@ -183,6 +193,17 @@ def follow_depths(model: ThermoxelsModel, attributes: TrainingCallbackAttributes
         points = model.grid.voxels.corner_index() * lattice.voxel_size + np.asarray(lattice.lo)
         model.grid.paint(torch.from_numpy(mean_colours(found.photographs, found.backdrop, points)))
     return found
+
+
+def views_of(attributes: TrainingCallbackAttributes) -> list[View] | None:
+    """Cameras and poses of all photographs that train; None where one is no perspective camera."""
+    assert attributes.pipeline is not None
+    datamanager: Any = attributes.pipeline.datamanager
+    cameras = datamanager.train_dataset.cameras.to("cpu")
+    if not bool((cameras.camera_type == CameraType.PERSPECTIVE.value).all()):
+        return None
+    poses = cameras.camera_to_worlds.double().numpy()
+    return [(camera_at(cameras, number), pose) for number, pose in enumerate(poses)]
 
 
 def follow_walls(model: ThermoxelsModel, evidence: PhotographEvidence, step: int) -> None:

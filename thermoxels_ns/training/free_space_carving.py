@@ -1,13 +1,14 @@
-"""Space carving: drop voxels that feature rays cross on the way to their points."""
+"""Space carving: drop voxels that feature rays cross on the way to their points, and those around cameras."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.feature_rays import FeatureRays, FloatArray, IntArray
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.refine import RowChange, prune
@@ -18,8 +19,13 @@ MARGIN_VOXELS = 1.5  # Voxels before a point that are not judged by the rays to 
 MARGIN_ERRORS = 3.0  # Standard errors of a ray's length that are not judged either
 MOST_RAYS = 500_000
 """Rays that are looked at; of more, those to every second, third, ... point. They say the same many times over."""
+CLEARANCE = 0.5  # Distance from a camera up to which nothing stands, relative to the nearest thing that it shows
+FEWEST_RAYS = 20  # Feature rays of a camera that tell what it shows
+_NEAREST = 1.0  # Percentile of their lengths that is the nearest: a few may be wrong
 _STEPS_PER_VOXEL = 2.0
 _SAMPLES_AT_ONCE = 1 << 20
+
+View = tuple[Camera, FloatArray]  # A photograph's camera and pose (camera to world, OpenGL axes, (3, 4) or (4, 4))
 
 
 def carve_free_space(grid: VoxelGrid, rays: FeatureRays) -> RowChange | None:
@@ -40,6 +46,41 @@ def carve_free_space(grid: VoxelGrid, rays: FeatureRays) -> RowChange | None:
         f"{len(rays.origins):,} feature rays to {believed:,} points{doubted if believed < len(rays.points) else ''}"
     )
     return prune(grid, ~empty)
+
+
+def clear_cameras(grid: VoxelGrid, rays: FeatureRays, views: Sequence[View]) -> RowChange | None:
+    """Drop the kept voxels of a grid where a camera was held, see `around_cameras`, and say how many.
+
+    Returns:
+        How values of rows change; None where nothing changes.
+    """
+    voxels, lattice = grid.voxels, grid.voxels.lattice
+    centres = np.stack(np.unravel_index(voxels.cells, lattice.cell_shape), axis=1) + 0.5
+    empty = around_cameras(np.asarray(lattice.lo) + lattice.voxel_size * centres, rays, views)
+    if not empty.any() or empty.all():
+        return None
+    CONSOLE.log(f"cameras: {empty.sum():,} of {len(empty):,} voxels are where one was held")
+    return prune(grid, ~empty)
+
+
+def around_cameras(points: FloatArray, rays: FeatureRays, views: Sequence[View]) -> npt.NDArray[np.bool_]:
+    """Which points (n, 3) are much nearer to a camera than what it shows, and in view of fewer than two photographs.
+
+    What no second photograph shows, no training ray contradicts, and a lump there hides what stands behind it from
+    views that did not train; but where somebody held a camera is air.
+    """
+    origins, camera_of = np.unique(rays.origins, axis=0, return_inverse=True)
+    lengths = np.linalg.norm(rays.points[rays.point] - rays.origins, axis=1)
+    near = np.zeros(len(points), dtype=bool)
+    for number, origin in enumerate(origins):
+        own = lengths[camera_of.reshape(-1) == number]
+        if len(own) >= FEWEST_RAYS:
+            near |= np.linalg.norm(points - origin, axis=1) < CLEARANCE * np.percentile(own, _NEAREST)
+    shown, (left,) = np.zeros(len(points), dtype=np.int64), np.nonzero(near)
+    for camera, pose in views:
+        shown[left] += camera.contains(camera.project_world(pose, points[left]))
+        left = left[shown[left] < 2]
+    return near & (shown < 2)
 
 
 def empty_voxels(lattice: Lattice, rays: FeatureRays) -> npt.NDArray[np.bool_]:
