@@ -40,7 +40,7 @@ _FEW_IN_VIEW = 0.05  # Points in view relative to the most that one has, below w
 _LEVEL = 0.01  # Height of a level of points, relative to the distance of the cameras from what they look at
 _ABOVE_GROUND = 0.06  # Height above the ground from which on something stands, relative to the same
 _LEAST_GROUND, _LEAST_STANDING = 0.05, 0.06  # Shares of the points on a ground and of those above it
-_MUCH_SMALLER = 1.5  # Box with what lies on the ground, relative to the box without, from which on that is left out
+_MUCH_SMALLER = 1.75  # Box with what lies on the ground, relative to the box without, from which on that is left out
 _CONVERGING = 0.5  # Distance to where cameras look, relative to their spread, below which they look outwards
 # The axes that ns-process-data swapped in old versions, before it wrote applied_transform into the json.
 _LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
