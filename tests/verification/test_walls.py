@@ -52,7 +52,8 @@ def test_u_value_of_a_wall_squashed_in_one_direction(axis, squashed, order) -> N
     try:
         solution = solve_steady(wall, order=order)
     except HeatError as refusal:
-        assert (order == 2 or squashed < 1e-7) and "No steady state was found" in str(refusal)
+        assert order == 2 or squashed < 1e-7
+        assert "No steady state was found" in str(refusal) or "digits of floating point" in str(refusal)
         return
     flow_w = 30.0 * exact * sides[1] * sides[2]
     heat = solution.effects[0]
