@@ -90,9 +90,10 @@ def near_tests(file: Path) -> list[str]:
     found = [p for place in PLACES for p in sorted((ROOT / "tests" / place).glob("test_*.py"))]
     named = [p for p in found if f"{room}.{stem} import" in p.read_text() or p.stem == f"test_{stem}"]
     named = named or [p for p in found if p.parent.name in (room, "reference" if room == "render" else room)]
-    named += [ROOT / "tests/reference/test_fused_rendering.py"] * (room == "render")
     own_first = sorted(named, key=lambda p: (not p.stem.startswith(f"test_{stem}"), p.parent.name != room, p.name))
-    return [str(p.relative_to(ROOT)) for p in own_first[:3]]
+    every = {"render": "reference/test_fused_rendering.py", "fem": "stability/test_no_answer_lies.py"}
+    whole = [ROOT / "tests" / every[room]] if room in every else []
+    return [str(p.relative_to(ROOT)) for p in own_first[:3] + whole]
 
 
 def outcome(copy: Path, tests: list[str], seconds: float) -> str:
