@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from thermoxels_ns.fem.flow_uncertainty import _matrix_energy, _relax
+from tests.support.heat_meshes import box_mesh
+from thermoxels_ns.fem.flow_uncertainty import _matrix_energy, _relax, _tets_energy
+from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.heat.effects import Convection
+from thermoxels_ns.heat.materials import Material
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -39,3 +44,28 @@ def test_resistances_along_a_chain_add_up():
     matrix = chain(conductances)
     _relax(matrix.indptr, matrix.indices, matrix.data, resistance)
     np.testing.assert_allclose(resistance, 0.1 + np.concatenate(([0.0], np.cumsum(1.0 / np.array(conductances)))))
+
+
+def test_energy_of_tetrahedra_is_that_of_their_matrix():
+    side = np.linspace(0.0, 1.0, 4)
+    mesh = box_mesh(side, 2.0 * side, 0.3 * side)
+    system = HeatSystem(HeatProblem(mesh, Material("concrete", 1.7, 2200.0, 880.0)))
+    values = np.random.default_rng(0).normal(0.0, 10.0, len(mesh.points_m))
+    conductivity = np.full(len(mesh.tets), 1.7)
+    wrong, energy, thin = _tets_energy(np.ascontiguousarray(mesh.points_m), mesh.tets, conductivity, values)
+    assert energy == pytest.approx(values @ system.stiffness @ values)
+    assert EPS < wrong / energy < 1e3 * EPS
+    assert EPS <= thin < 100.0 * EPS
+
+
+@pytest.mark.parametrize("coefficient", [1e-3, 10.0, 1e9])
+def test_heat_leaves_through_the_surface_and_the_cells_there_one_behind_the_other(coefficient):
+    side = np.linspace(0.0, 1.0, 4)
+    effects = (Convection(("x0",), coefficient, 20.0),)
+    system = HeatSystem(HeatProblem(box_mesh(side, side, side), Material("m", 2.0, 1e3, 1e3), effects=effects))
+    nodes = np.zeros(system.num_nodes)
+    both, alone = (system.surface_w_k(nodes, 0.0, inside=inside) for inside in (True, False))
+    assert alone == pytest.approx(coefficient)  # 1 m2
+    (held,) = np.nonzero(system.held_w_k(0.0, np.inf))
+    through, behind = system.held_w_k(0.0, np.inf)[held], system.stiffness.diagonal()[held]
+    assert both == pytest.approx(float(np.sum(1.0 / (1.0 / through + 1.0 / behind))))
