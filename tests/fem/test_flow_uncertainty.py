@@ -6,8 +6,9 @@ from scipy import sparse
 
 from tests.support.heat_meshes import box_mesh
 from thermoxels_ns.fem.flow_uncertainty import _matrix_energy, _relax, _tets_energy
-from thermoxels_ns.fem.problem import HeatProblem
+from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.fem.system import HeatSystem
+from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection
 from thermoxels_ns.heat.materials import Material
 
@@ -69,3 +70,13 @@ def test_heat_leaves_through_the_surface_and_the_cells_there_one_behind_the_othe
     (held,) = np.nonzero(system.held_w_k(0.0, np.inf))
     through, behind = system.held_w_k(0.0, np.inf)[held], system.stiffness.diagonal()[held]
     assert both == pytest.approx(float(np.sum(1.0 / (1.0 / through + 1.0 / behind))))
+
+
+def test_what_is_uncertain_grows_from_output_to_output():
+    side = np.linspace(0.0, 1.0, 4)
+    air = (Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, -10.0))
+    body = HeatProblem(box_mesh(side, side, side), Material("concrete", 1.7, 2200.0, 880.0), effects=air)
+    solution = solve_heat(body, TimeSteps(4, 21600.0))
+    for effect in solution.effects:
+        uncertain_j = effect.uncertainty_w * np.diff(solution.times_s)
+        assert np.all(np.diff(uncertain_j) > 0.0)

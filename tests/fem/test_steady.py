@@ -174,3 +174,11 @@ def test_heat_is_sorted_by_effect_in_linear_time() -> None:
     assert Counted.looks == 600
     assert [heat.effect for heat in sorted_heat] == names[::-1]
     assert sorted_heat[0].group_names == ("wall", "roof") and sorted_heat[0].group_heat_w.tolist() == [[598.0, 599.0]]
+
+
+def test_two_temperatures_at_one_node_are_named_as_they_were_given():
+    side = np.linspace(0.0, 1.0, 3)
+    effects = (FixedTemperature(("x0",), 21.5), FixedTemperature(("y0",), 35.25))
+    problem = HeatProblem(box_mesh(side, side, side), STEEL, effects=effects)
+    with pytest.raises(HeatError, match=r"got 21\.5 C from .* and 35\.25 C from .* at node \d+ and 2 more"):
+        solve_steady(problem)
