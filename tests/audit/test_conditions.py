@@ -79,6 +79,11 @@ def test_the_example_is_read_and_lacks_nothing_that_en_13187_asks_for(tmp_path) 
         (("film", "factor"), "0.1 +- 0.2", r"factor: expected a number that is surely at least 0"),
         (("camera", "offset"), None, r"expected the key offset"),
         (("camera", "emissivity"), 0.95, r"reflected: expected a temperature.*Add what the camera was set to"),
+        (
+            ("references",),
+            [{"at": [float("nan"), 0.0, 1.2], "temperature": "1.4 C"}],
+            r"at: expected three finite numbers, got \[nan, 0\.0, 1\.2\]\. Give metres",
+        ),
         (("limits", "u"), {"*": "0.3 W"}, r"limits: u: \*: expected a number with its unit, W/\(m2 K\)"),
     ],
 )

@@ -158,6 +158,9 @@ class Reference:
 
     def __post_init__(self) -> None:
         _check_temperatures(temperature=self.temperature)
+        if not all(map(math.isfinite, self.at)):
+            remedy = "Give metres in the coordinates of the mesh, such as at: [1.0, 0.0, 1.2]."
+            raise AuditError("references: at", expected="three finite numbers", got=list(self.at), remedy=remedy)
 
 
 @dataclass(frozen=True)
