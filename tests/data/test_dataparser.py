@@ -364,6 +364,7 @@ def test_no_json_and_broken_json(scene_folder, tmp_path):
         (lambda f: f.update(thermal_camera=dict(w=13, h=10, fl_x=9, fl_y=9, cx=6, cy=5)), "13 x 10"),
         (lambda f: f.update(mask_path=None), "frame 3.*mask_path.*None"),
         (lambda f: f.update(cx=1e9), "frame 3.*principal point in or near the image.*got cx 1e"),
+        (lambda f: f.update(fl_x=1e308), "frame 3.*focal lengths of a lens.*got fl_x 1e"),
         (lambda f: f.update(k1=1e6), r"frame 3.*where they can be, got k1 1e\+06"),
         (lambda f: f.update(fl_x=True), "frame 3.*numbers as intrinsics.*got true or false"),
         (lambda f: f["transform_matrix"][0].__setitem__(3, 1e30), r"frame 3.*within 1e\+08 units of the origin"),

@@ -15,6 +15,7 @@ from thermoxels_ns.radiometry.decoders import errors_name
 
 _NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
 _ORIENTATION = 0x0112
+_LONGEST_LENS = 1e4  # Focal length, relative to the photograph's side: an angle of view of 0.006 degrees
 _MOST_DISTORTION = 10.0
 """Most that a term of the distortion may move a corner of the image, in distances from the corner to the middle."""
 MOST_UNITS = 1e8  # farthest that a camera may be from the origin of its coordinates: the earth is 6.4e6 m in radius
@@ -100,16 +101,21 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
 
 
 def _refuse_odd(camera: Camera, where: str) -> None:
-    """Refuse a principal point or a distortion that no lens has."""
+    """Refuse a principal point, a focal length or a distortion that no lens has."""
     if camera.lens == "equirectangular":
         return
     corner = min(0.5 * float(np.hypot(camera.width / camera.fl_x, camera.height / camera.fl_y)), 1e30)
     shifts = {"cx": camera.cx / camera.width, "cy": camera.cy / camera.height}
     odd = [name for name, shift in shifts.items() if not -1.0 <= shift <= 2.0]
+    sides = {"fl_x": camera.width, "fl_y": camera.height}
+    odd += [name for name, side in sides.items() if getattr(camera, name) > _LONGEST_LENS * side]
     odd += [f"k{n}" for n in (1, 2, 3, 4) if abs(camera.distortion[n - 1]) * corner ** (2 * n) > _MOST_DISTORTION]
     odd += [name for name in ("p1", "p2") if abs(getattr(camera, name)) * corner > _MOST_DISTORTION]
     if odd:
-        expected = "a principal point in or near the image, and distortion that leaves the corners where they can be"
+        expected = (
+            "a principal point in or near the image, focal lengths of a lens, and distortion that leaves the corners "
+            "where they can be"
+        )
         got = ", ".join(f"{name} {getattr(camera, name):g}" for name in odd)
         remedy = "Correct the json; lengths are in pixels, k1 to k4, p1 and p2 as in OpenCV."
         raise SceneError(where, expected=expected, got=got, remedy=remedy)
