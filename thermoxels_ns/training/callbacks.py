@@ -69,9 +69,8 @@ def coarse_to_fine_callbacks(model: ThermoxelsModel, attributes: TrainingCallbac
         if model.feature_rays is not None:
             old = model.grid.row_parameters()
             follow(old, carve_free_space(model.grid, model.feature_rays))
-        depths = None if evidence is None else evidence.feature_rays
-        for rays in (model.feature_rays, depths):
-            if rays is not None and (views := views_of(attributes)) is not None:
+        for rays in filter(None, (model.feature_rays, evidence and evidence.feature_rays)):
+            if (views := views_of(attributes)) is not None:
                 old = model.grid.row_parameters()
                 follow(old, clear_cameras(model.grid, rays, views))
 
