@@ -16,22 +16,23 @@ def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return 0.5 + 0.3 * np.stack(waves, -1)
 
 
-def photographs(eyes=EYES, gains: np.ndarray | None = None) -> Photographs:
-    """Photographs of the plane from above, all looking straight down."""
+def photographs(eyes=EYES, gains: np.ndarray | None = None, size: int = SIZE, scale: float = 1.0) -> Photographs:
+    """Photographs of the plane from above, all looking straight down; a texture of `scale` 2 is twice as fine."""
+    focal = FOCAL * size / SIZE
     turned = np.diag([1.0, -1.0, -1.0])  # x right, y down, z forward of a camera that looks along -z
-    intrinsics = np.array([[FOCAL, 0.0, SIZE / 2], [0.0, FOCAL, SIZE / 2], [0.0, 0.0, 1.0]])
-    column, row = np.meshgrid(*[(np.arange(SIZE) + 0.5 - SIZE / 2) / FOCAL] * 2)
+    intrinsics = np.array([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
+    column, row = np.meshgrid(*[(np.arange(size) + 0.5 - size / 2) / focal] * 2)
     matrices, pictures = [], []
     for number, eye in enumerate(np.asarray(eyes, dtype=float)):
         height = eye[2] - PLANE
-        picture = texture(eye[0] + column * height, eye[1] - row * height)
+        picture = texture(scale * (eye[0] + column * height), scale * (eye[1] - row * height))
         pictures.append(picture * (1.0 if gains is None else gains[number]))
         matrices.append(intrinsics @ np.column_stack((turned, -turned @ eye)))
     return Photographs(
         np.stack(matrices),
         np.asarray(eyes, dtype=float),
-        np.full((len(eyes), 2), SIZE),
-        np.arange(len(eyes)) * SIZE * SIZE,
+        np.full((len(eyes), 2), size),
+        np.arange(len(eyes)) * size * size,
         np.concatenate(pictures).reshape(-1, 3).astype(np.float32),
-        np.full(len(eyes) * SIZE * SIZE, np.nan, np.float32),
+        np.full(len(eyes) * size * size, np.nan, np.float32),
     )

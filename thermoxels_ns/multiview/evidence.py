@@ -19,6 +19,7 @@ from thermoxels_ns.multiview.stereo import depths_of, feature_rays_to_depths, ra
 FloatArray = npt.NDArray[np.float64]
 
 LEAST_SHARE = 0.01  # Share of the pixels whose depth must be sure; less is chance
+REFINED_SIDE = 640  # Pixels along the longer side of the photographs in which depths are refined
 LEAST_GAIN = 0.01  # Root mean square of the logarithms of gains from which on photographs are corrected
 LEAST_OFFSET_K = 0.1  # The same of offsets of thermal images, [K]
 
@@ -54,7 +55,7 @@ def evidence_of_photographs(
     photographs = read_photographs(dataset, near)
     if photographs is None:
         return None
-    depths = depths_of(photographs, lo, hi)
+    depths = depths_of(photographs, lo, hi, larger=read_photographs(dataset, near, longest_side=REFINED_SIDE))
     few = "" if depths.share >= LEAST_SHARE else ", too few to tell anything"
     span_k = dataset.temperature_range.span_k
     found = photograph_differences(depths, thermal_at(dataset, photographs, depths.depth)) if gains or offsets else None

@@ -11,7 +11,13 @@ import numpy.typing as npt
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.threads import run_ranges
 from thermoxels_ns.multiview.photographs import Photographs
-from thermoxels_ns.multiview.stereo_kernels import OUTSIDE, correlate, other_views, weigh_patches
+from thermoxels_ns.multiview.stereo_kernels import (
+    aggregate,
+    correlate,
+    other_views,
+    refine_depths,
+    weigh_patches,
+)
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -23,13 +29,18 @@ depth, a larger one shows something else."""
 BEST_ANGLE_DEG = 15.0  # Neighbours at about this angle are preferred
 RADIUS = 2  # Pixels from the middle of the square that is compared to its sides
 LIKENESS = 0.025
-"""Difference of a channel, of 1, at which a pixel of the square has 37 % of the weight of the middle one."""
+"""Difference of two pixels, of 1, at which one has 37 % of the weight of the other in its square."""
 SPREAD = 1.0  # The same, relative to how much the pixels around the middle one differ from it, where that is more
 LEAST_WEIGHT = 0.05  # Weight below which it has none
 PLANES = (24, 128)
 """Planes per photograph: such that the picture moves by about a pixel from one to the next, within these limits."""
-SMALLEST_CONTRAST = 1.5 / 255.0  # Standard deviation of brightness within a patch that is noise
-LEAST_CORRELATION = 0.6  # Correlation below which photographs do not agree
+NOISE = (1.5 / 255.0, 1.0 / 255.0)
+"""Standard deviations within a patch that are noise: of brightness, of 1, and of temperature, of the scene's range."""
+STEP, JUMP = 0.05, 0.6
+"""Cost of a step of one plane from a pixel to the next, and of a longer one, as half of one minus a correlation. Steps
+of 0.02 and jumps of 0.3 to 1.2 gave the same on four drawn scenes."""
+EDGE = 0.02  # Difference of two pixels, of 1, at which a jump costs half
+MARGIN = 0.05  # By how much the best plane must beat the best one that is not its neighbour
 TOLERANCE = 0.3
 """Share of the distance between planes, of both photographs together, by which depths that agree may differ."""
 FEWEST_VIEWS = 2  # Photographs whose own depths must lie where a sure one does
@@ -37,6 +48,10 @@ VIEWS_PER_CONTRADICTION = 2  # As many must do so for each photograph that looks
 VIEWS_TO_CONTRADICT = 3  # Photographs that must agree with a depth behind the point, which is else likely to be wrong
 FEWEST_AROUND = 6
 """Of the eight pixels around a sure one, those whose depths agree with its own too: outlines and noise have fewer."""
+REFINED_RADIUS, REFINED_LIKENESS = 3, 0.06
+"""The same of refinement in larger photographs. Radii of 2 to 4 and a likeness of 0.025 to 10 tried on house-corner and
+courtyard: the median error falls from 0.34 and 0.36 % to 0.28 and 0.22 %."""
+LEAST_CORRELATION = 0.6  # Correlation below which that does not move a depth, and nothing is as far as the last plane
 ERROR_PLANES = 0.25  # Standard error of a depth, in planes of the sweep
 _NEAREST = 0.1  # Distance of the nearest plane in the box relative to the farthest
 _OUTSIDE = -100.0
@@ -67,20 +82,25 @@ def depths_of(
     lo: npt.ArrayLike | None = None,
     hi: npt.ArrayLike | None = None,
     views_to_contradict: int = VIEWS_TO_CONTRADICT,
+    larger: Photographs | None = None,
 ) -> Depths:
     """Find the depths of photographs: in a box and behind it, or wherever they see the same from different directions.
 
     For each photograph, its neighbours are drawn onto planes parallel to it, one behind the other, and compared with it
-    patch by patch (plane sweep, Collins 1996; normalised cross-correlation). The plane on which they agree best is the
-    depth of a pixel. It counts where depths of other photographs, found on their own, lie in the same place, and not
-    too many that others confirm lie behind it. Within a patch only pixels of the middle one's colour count: else an
-    outline gives its depth to all that lies beside it.
+    patch by patch (plane sweep, Collins 1996; normalised cross-correlation), by brightness and, where the same camera
+    measured it, temperature. How little they agree is a cost, which is added up along paths through the photograph
+    (semi-global matching, Hirschmueller 2008), so that a plain area takes its depth from what surrounds it. The plane
+    of least cost is the depth of a pixel if it beats all but its neighbours by `MARGIN`. It counts where depths of
+    other photographs, found on their own, lie in the same place, and not too many that others confirm lie behind it.
+    Within a patch only pixels that look like the middle one count: else an outline gives its depth to all that lies
+    beside it.
 
     Args:
         photographs: Pinhole photographs, best some 160 pixels wide: cost grows with the third power of their size.
         lo: Lower corner of the box, [world units]. None: no box.
         hi: Upper corner.
         views_to_contradict: Photographs that must agree with a depth for it to contradict others.
+        larger: The same photographs with more pixels, in which depths are refined.
 
     Returns:
         Depths; not known anywhere where no photograph has a neighbour.
@@ -88,20 +108,23 @@ def depths_of(
     corners = None if lo is None or hi is None else (np.asarray(lo, np.float64), np.asarray(hi, np.float64))
     views = [_View.of(photographs, number) for number in range(len(photographs))]
     total = len(photographs.colours)
-    depth, correlation, error = (np.full(total, value, np.float32) for value in (np.nan, -1.0, np.nan))
+    depth, error = (np.full(total, np.nan, np.float32) for _ in range(2))
+    neighbours: list[list[int]] = [[] for _ in views]
 
     def work(begin: int, end: int) -> None:
         for number in range(begin, end):
             view = views[number]
             span = _overlap(number, views) if corners is None else _span(view, *corners, photographs.near)
-            near = [] if span is None else _neighbours(number, views, *span)
-            if span is not None and near:
+            if span is None:
+                continue
+            neighbours[number] = _neighbours(number, views, *span)
+            if neighbours[number]:
                 first = int(photographs.firsts[number])
-                pixels = slice(first, first + view.brightness.size)
-                depth[pixels], correlation[pixels], error[pixels] = _sweep(view, near, *span, corners is not None)
+                pixels = slice(first, first + view.shape[0] * view.shape[1])
+                near = [views[other] for other in neighbours[number]]
+                depth[pixels], error[pixels] = _sweep(view, near, *span, corners is not None)
 
     run_ranges(work, len(views), 1)
-    depth[~(correlation >= LEAST_CORRELATION)] = np.nan
     agreeing, behind = (np.zeros(total, dtype=np.int32) for _ in range(2))
     matrices, inverses = photographs.matrices, np.stack([view.inverse for view in views])
     cameras = (matrices, inverses, photographs.centres, photographs.sizes, photographs.firsts)
@@ -116,18 +139,64 @@ def depths_of(
     sure = (agreeing >= FEWEST_VIEWS) & (agreeing >= VIEWS_PER_CONTRADICTION * behind)
     depth[~sure] = np.nan
     for view, first in zip(views, photographs.firsts):
-        shape = view.brightness.shape
-        pixels = slice(first, first + view.brightness.size)
-        depth[pixels][~_backed(depth[pixels].reshape(shape), error[pixels].reshape(shape)).ravel()] = np.nan
+        pixels = slice(first, first + view.shape[0] * view.shape[1])
+        backed = _backed(depth[pixels].reshape(view.shape), error[pixels].reshape(view.shape))
+        depth[pixels][~backed.ravel()] = np.nan
+    if larger is not None:
+        _refine(photographs, larger, neighbours, depth, error)
     return Depths(photographs, depth, error)
+
+
+def _refine(
+    photographs: Photographs,
+    larger: Photographs,
+    neighbours: list[list[int]],
+    depth: npt.NDArray[np.float32],
+    error: npt.NDArray[np.float32],
+) -> None:
+    """Refine depths (pixels,) and their errors in `larger` photographs: surfaces are as exact as depths are."""
+    views = [_View.of(larger, number) for number in range(len(larger))]
+
+    def work(begin: int, end: int) -> None:
+        for number in range(begin, end):
+            (width, height), first = photographs.sizes[number], photographs.firsts[number]
+            pixels = slice(first, first + width * height)
+            view = views[number]
+            ratio = view.shape[1] / width
+            near = [views[other] for other in neighbours[number] if views[other].shape == view.shape]
+            if ratio <= 1.0 or not near or np.isnan(depth[pixels]).all():
+                continue
+            coarse, planes = depth[pixels].copy(), error[pixels].copy()
+            refine_depths(
+                0,
+                len(coarse),
+                width,
+                coarse,
+                planes,
+                ratio,
+                view.features,
+                view.channels[0],
+                np.stack([other.channels[0] for other in near]),
+                np.stack([other.matrix[:, :3] @ view.inverse for other in near]),
+                np.stack([other.matrix[:, :3] @ view.centre + other.matrix[:, 3] for other in near]),
+                (REFINED_RADIUS, REFINED_LIKENESS, SPREAD, LEAST_WEIGHT, int(np.ceil(2.0 * ratio)), LEAST_CORRELATION),
+                float(view.noise[0]),
+                depth[pixels],
+                error[pixels],
+            )
+
+    run_ranges(work, len(views), 1)
 
 
 @dataclass(frozen=True, eq=False)
 class _View:
     """One photograph."""
 
-    brightness: npt.NDArray[np.float32]  # Shape (h, w); `_OUTSIDE` where masked
-    colours: npt.NDArray[np.float32]  # Shape (h, w, 3)
+    channels: npt.NDArray[np.float32]
+    """Brightness and, where the same camera measured it, temperature, shape (1 or 2, h, w); `_OUTSIDE` where masked."""
+    features: npt.NDArray[np.float32]
+    """What tells which pixels belong together, shape (h, w, 3 or 4): a third of each colour, and temperature, as skies
+    are cold."""
     matrix: FloatArray  # World to homogeneous pixels, (3, 4)
     inverse: FloatArray  # Homogeneous pixels to directions of depth 1 in the world, (3, 3)
     centre: FloatArray
@@ -135,18 +204,25 @@ class _View:
     @classmethod
     def of(cls, photographs: Photographs, number: int) -> _View:
         width, height = photographs.sizes[number]
-        first = photographs.firsts[number]
-        colours = np.ascontiguousarray(photographs.colours[first : first + width * height], dtype=np.float32)
-        brightness = np.where(np.isnan(colours[:, 0]), np.float32(_OUTSIDE), colours.mean(1))
+        pixels = slice(photographs.firsts[number], photographs.firsts[number] + width * height)
+        colours, warm = photographs.colours[pixels], photographs.thermal[pixels, None]
+        channels = [colours.mean(1, keepdims=True)] + [warm] * bool(np.isfinite(warm).any())
+        features = np.nan_to_num(np.concatenate([colours / 3.0, *channels[1:]], axis=1))
+        channels = np.nan_to_num(np.concatenate(channels, axis=1), nan=_OUTSIDE)
         matrix = photographs.matrices[number]
-        picture = np.ascontiguousarray(brightness.reshape(height, width), dtype=np.float32)
-        return cls(
-            picture,
-            colours.reshape(height, width, 3),
-            matrix,
-            np.linalg.inv(matrix[:, :3]),
-            photographs.centres[number],
-        )
+        features = np.ascontiguousarray(features.reshape(height, width, -1), dtype=np.float32)
+        channels = np.ascontiguousarray(channels.T.reshape(-1, height, width), dtype=np.float32)
+        return cls(channels, features, matrix, np.linalg.inv(matrix[:, :3]), photographs.centres[number])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.channels.shape[1], self.channels.shape[2]
+
+    @property
+    def noise(self) -> npt.NDArray[np.float32]:
+        """Variance of each channel that is noise."""
+        return np.square(np.array(NOISE[: len(self.channels)], dtype=np.float32))
 
     def points(self, pixels: FloatArray, depth: FloatArray) -> FloatArray:
         """World points of pixels (n, 2), whose centres lie at halves, at depths (n,)."""
@@ -160,7 +236,7 @@ class _View:
         return seen[:, :2] / np.where(depth > 0.0, depth, np.nan)[:, None], depth
 
     def shows(self, pixels: FloatArray, depth: FloatArray) -> npt.NDArray[np.bool_]:
-        height, width = self.brightness.shape
+        height, width = self.shape
         with np.errstate(invalid="ignore"):
             return (depth > 0.0) & (pixels >= 0.0).all(1) & (pixels[:, 0] <= width) & (pixels[:, 1] <= height)
 
@@ -190,7 +266,7 @@ def _overlap(number: int, views: list[_View]) -> tuple[float, float] | None:
 
 def _probes(view: _View, depths: FloatArray) -> FloatArray:
     """Points that a photograph sees, spread over it at each of the depths."""
-    height, width = view.brightness.shape
+    height, width = view.shape
     columns, rows = ((np.arange(_PROBES[0]) + 0.5) * side / _PROBES[0] for side in (width, height))
     pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
     return np.concatenate([view.points(pixels, np.full(len(pixels), depth)) for depth in depths])
@@ -205,7 +281,7 @@ def _usefully_seen(view: _View, seen: _View, points: FloatArray) -> tuple[npt.ND
     return seen.shows(*seen.pixels(points)) & (angle > ANGLES_DEG[0]) & (angle < ANGLES_DEG[1]), angle
 
 
-def _neighbours(number: int, views: list[_View], near: float, far: float) -> list[_View]:
+def _neighbours(number: int, views: list[_View], near: float, far: float) -> list[int]:
     """Photographs that see most of what one sees, from directions that tell how far it is."""
     points = _probes(views[number], 1.0 / np.linspace(1.0 / far, 1.0 / near, _PROBES[1] + 2)[1:-1])
     worth = np.zeros(len(views))
@@ -216,38 +292,67 @@ def _neighbours(number: int, views: list[_View], near: float, far: float) -> lis
         if useful.mean() >= _FEWEST_PROBES:
             worth[other] = np.sum(useful * np.exp(-0.5 * (np.log(np.maximum(angle, 1e-3) / BEST_ANGLE_DEG)) ** 2))
     best = np.argsort(-worth, kind="stable")[:NEIGHBOURS]
-    return [views[other] for other in best if worth[other] > 0.0]
+    return [int(other) for other in best if worth[other] > 0.0]
 
 
-def _sweep(
-    view: _View, others: list[_View], near: float, far: float, endless: bool
-) -> tuple[npt.NDArray[np.float32], ...]:
-    """Depth, correlation and distance of planes for every pixel; if `endless`, on planes behind `far` too."""
+def _sweep(view: _View, others: list[_View], near: float, far: float, endless: bool) -> tuple[FloatArray, ...]:
+    """Depth of every pixel, NaN where not sure, and distance of planes; if `endless`, on planes behind `far` too."""
     inverse_depths = np.linspace(1.0 / far, 1.0 / near, _num_planes(view, others, near, far))
     beyond = min(len(inverse_depths), int(inverse_depths[0] / (inverse_depths[1] - inverse_depths[0]))) * endless
     farthest = 0.5 * inverse_depths[0] / max(1, beyond)
     inverse_depths = np.concatenate((np.linspace(farthest, inverse_depths[0], beyond, endpoint=False), inverse_depths))
-    shape, noise = view.brightness.shape, np.float32(SMALLEST_CONTRAST**2)
-    weights = np.empty((*shape, (2 * RADIUS + 1) ** 2), dtype=np.float32)
-    means, variances = (np.empty(shape, dtype=np.float32) for _ in range(2))
-    weigh_patches(
-        view.colours, view.brightness, RADIUS, LIKENESS, SPREAD, LEAST_WEIGHT, noise, weights, means, variances
-    )
-    agreement = np.empty((len(inverse_depths), *shape), dtype=np.float32)
-    moved = np.empty((len(others), *shape), dtype=np.float32)
+    patches = _Patches.of(view)
+    agreement = np.empty((*view.shape, len(inverse_depths)), dtype=np.float32)
+    moved = np.empty((len(others), *view.channels.shape), dtype=np.float32)
     for plane, inverse_depth in enumerate(inverse_depths):
         for number, other in enumerate(others):
-            moved[number] = _drawn(other, view, 1.0 / inverse_depth)
+            _drawn(other, view, 1.0 / inverse_depth, moved[number])
         half = -(-len(others) // 2)
-        correlate(view.brightness, moved, RADIUS, weights, means, variances, noise, half, agreement[plane])
-    best = agreement.argmax(0)
+        correlate(
+            view.channels,
+            moved,
+            RADIUS,
+            patches.weights,
+            patches.means,
+            patches.variances,
+            view.noise,
+            half,
+            plane,
+            agreement,
+        )
+    plain = (patches.variances == 0.0).all(axis=0)
+    agreement *= -0.5
+    agreement += 0.5
+    agreement[plain] = 0.5  # nothing but noise: no plane is better than another
+    total = np.empty_like(agreement)
+    aggregate(agreement, view.features, *(np.float32(value) for value in (STEP, JUMP, EDGE)), total)
+    best = total.argmin(-1)
+    away = np.abs(np.arange(total.shape[-1]) - best[..., None]) > 2
+    elsewhere = np.where(away, total, np.inf).min(-1)
+    sure = elsewhere - np.take_along_axis(total, best[..., None], -1)[..., 0] >= MARGIN
+    sure &= (best < total.shape[-1] - 1) & (view.channels[0] >= 0.0)
+    # Nothing is farther than the last plane: only what agrees well there is that far.
+    sure &= (best > 0) | ((beyond > 0) & (agreement[..., 0] <= 0.5 * (1.0 - LEAST_CORRELATION)))
     apart = np.diff(inverse_depths, append=2.0 * inverse_depths[-1] - inverse_depths[-2])[best]
-    found = np.maximum(inverse_depths[best] + _between(agreement, best) * apart, inverse_depths[0])
-    depth = (1.0 / found).astype(np.float32).ravel()
-    error = (depth * depth * apart.ravel()).astype(np.float32)
-    reached = np.take_along_axis(agreement, best[None], 0)[0]
-    reached[(best == len(agreement) - 1) | ((best == 0) & (beyond == 0))] = OUTSIDE
-    return depth, reached.ravel(), error
+    found = 1.0 / np.maximum(inverse_depths[best] + _between(total, best) * apart, inverse_depths[0])
+    return np.where(sure, found, np.nan).ravel(), (found * found * apart).ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class _Patches:
+    """Who belongs to the patch around each pixel of a photograph, and how much the patch varies."""
+
+    weights: npt.NDArray[np.float32]  # Shape (pixels of a patch, h, w)
+    means: npt.NDArray[np.float32]  # Shape (channels, h, w)
+    variances: npt.NDArray[np.float32]  # Shape (channels, h, w)
+
+    @classmethod
+    def of(cls, view: _View) -> _Patches:
+        weights = np.empty(((2 * RADIUS + 1) ** 2, *view.shape), dtype=np.float32)
+        means, variances = (np.empty(view.channels.shape, dtype=np.float32) for _ in range(2))
+        limits = LIKENESS, SPREAD, LEAST_WEIGHT, view.noise
+        weigh_patches(view.features, view.channels, RADIUS, *limits, weights, means, variances)
+        return cls(weights, means, variances)
 
 
 def _backed(depth: npt.NDArray[np.float32], error: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
@@ -262,7 +367,7 @@ def _backed(depth: npt.NDArray[np.float32], error: npt.NDArray[np.float32]) -> n
 
 def _num_planes(view: _View, others: list[_View], near: float, far: float) -> int:
     """Planes such that the middle of the picture moves by a pixel in the neighbour where it moves most."""
-    height, width = view.brightness.shape
+    height, width = view.shape
     middle = view.points(np.array([[0.5 * width, 0.5 * height]] * 2), np.array([near, far]))
     most = 0.0
     for other in others:
@@ -272,36 +377,34 @@ def _num_planes(view: _View, others: list[_View], near: float, far: float) -> in
     return int(np.clip(np.ceil(most) + 1, *PLANES)) if most > 0.0 else PLANES[1]
 
 
-def _drawn(other: _View, view: _View, depth: float) -> npt.NDArray[np.float32]:
-    """What a photograph shows of the plane at a depth of another, drawn as the latter would see it."""
+def _drawn(other: _View, view: _View, depth: float, drawn: npt.NDArray[np.float32]) -> None:
+    """Fill `drawn`, (channels, h, w), with what a photograph shows of the plane at a depth of another.
+
+    It is drawn as the other would see it.
+    """
     turn = depth * (other.matrix[:, :3] @ view.inverse)
     turn[:, 2] += other.matrix[:, :3] @ view.centre + other.matrix[:, 3]
     half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # pixel centres lie at halves, OpenCV's not
-    height, width = view.brightness.shape
-    drawn = cv2.warpPerspective(
-        other.brightness,
-        np.linalg.inv(half) @ turn @ half,
-        (width, height),
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=(_OUTSIDE,),
-    )
+    height, width = view.shape
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    to_other = np.linalg.inv(half) @ turn @ half
+    for channel, picture in zip(drawn, other.channels):
+        cv2.warpPerspective(picture, to_other, (width, height), channel, flags, cv2.BORDER_CONSTANT, (_OUTSIDE,))
     # What lies behind the other photograph would be drawn upside down. Depth in it is linear over the picture.
     if min(turn[2] @ (column, row, 1.0) for column in (0, width) for row in (0, height)) <= 0.0:
         columns, rows = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
-        drawn[turn[2, 0] * columns + turn[2, 1] * rows + turn[2, 2] <= 0.0] = _OUTSIDE
-    return np.asarray(drawn, dtype=np.float32)
+        drawn[:, turn[2, 0] * columns + turn[2, 1] * rows + turn[2, 2] <= 0.0] = _OUTSIDE
 
 
-def _between(agreement: npt.NDArray[np.float32], best: npt.NDArray[np.int64]) -> FloatArray:
-    """Where between planes the agreement is best: the top of a parabola, in -1/2 to 1/2 planes."""
-    inner = np.clip(best, 1, len(agreement) - 2)
+def _between(cost: npt.NDArray[np.float32], best: npt.NDArray[np.int64]) -> FloatArray:
+    """Where between planes, the last axis, the cost is least: the bottom of a parabola, in -1/2 to 1/2 planes."""
+    inner = np.clip(best, 1, cost.shape[-1] - 2)
     before, at, behind = (
-        np.take_along_axis(agreement, inner[None] + step, 0)[0].astype(np.float64) for step in (-1, 0, 1)
+        np.take_along_axis(cost, inner[..., None] + step, -1)[..., 0].astype(np.float64) for step in (-1, 0, 1)
     )
     bend = before - 2.0 * at + behind
-    top = np.clip(0.5 * (before - behind) / np.where(bend < -1e-6, bend, -np.inf), -0.5, 0.5)
-    return np.where(best == inner, top, 0.0)
+    bottom = np.clip(0.5 * (before - behind) / np.where(bend > 1e-6, bend, np.inf), -0.5, 0.5)
+    return np.where(best == inner, bottom, 0.0)
 
 
 def feature_rays_to_depths(depths: Depths) -> FeatureRays:

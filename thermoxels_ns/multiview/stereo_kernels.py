@@ -1,4 +1,4 @@
-"""Compiled loops over photographs that are compared with each other: patches, and where depths agree."""
+"""Compiled loops over photographs that are compared: patches, costs along paths, and where depths agree."""
 
 from __future__ import annotations
 
@@ -10,105 +10,296 @@ OUTSIDE = -1.0  # Correlation that stands for none
 
 
 @kernel
-def _difference(colours, row, column, i, j):
-    """Mean difference of the channels of two pixels."""
+def _difference(features, row, column, i, j):
+    """Sum of the differences of the features of two pixels."""
     off = 0.0
-    for channel in range(3):
-        off += abs(colours[i, j, channel] - colours[row, column, channel])
-    return off / 3.0
+    for n in range(features.shape[2]):
+        off += abs(features[i, j, n] - features[row, column, n])
+    return off
 
 
 @kernel
-def weigh_patches(
-    colours, brightness, radius, likeness, spread, least_weight, least_variance, weights, means, variances
-):
-    """Fill weights, mean and variance of the patch around each pixel: who has the pixel's colour belongs to it.
+def weigh_patches(features, channels, radius, likeness, spread, least_weight, noise, weights, means, variances):
+    """Fill weights, means and variances of the patch around each pixel: who looks like the pixel belongs to it.
 
-    A neighbour's weight is exp(-(d / s)^2) with d the mean difference of its three channels from the pixel's, and
+    A neighbour's weight is exp(-(d / s)^2) with d the difference of its `features` (h, w, f) from the pixel's, and
     nothing below `least_weight` (adaptive support weights, Yoon and Kweon 2006, without distance). s is the fifth
     smallest d of the eight pixels around, which an outline leaves small and a texture does not, times `spread`, but at
-    least `likeness`. The weights of a patch sum to 1. A pixel's variance is 0 where its patch reaches beyond the
-    photograph, holds a masked pixel (brightness below 0), or varies by less than `least_variance` among what belongs to
-    it.
+    least `likeness`. The `weights` of a patch, (patch, h, w), sum to 1. The variance of one of the `channels` (c, h, w)
+    is 0 where the patch reaches beyond the photograph, holds a masked pixel (below 0), or varies by less than its
+    `noise` (c,), a variance, among what belongs to it. Means and variances are (c, h, w).
     """
-    height, width = brightness.shape
+    count, height, width = channels.shape
     around = np.empty(9, np.float64)
-    for row in range(height):
-        for column in range(width):
-            variances[row, column] = 0.0
-            if row < radius or column < radius or row >= height - radius or column >= width - radius:
-                continue
+    weights[:] = 0.0
+    means[:] = 0.0
+    variances[:] = 0.0
+    for row in range(radius, height - radius):
+        for column in range(radius, width - radius):
             k = 0
             for i in range(row - 1, row + 2):
                 for j in range(column - 1, column + 2):
-                    around[k] = _difference(colours, row, column, i, j)
+                    around[k] = _difference(features, row, column, i, j)
                     k += 1
             scale = max(likeness, spread * np.sort(around)[5])  # the first is the pixel itself
-            total, mean, hidden, k = 0.0, 0.0, False, 0
+            total, k = 0.0, 0
             for i in range(row - radius, row + radius + 1):
                 for j in range(column - radius, column + radius + 1):
-                    hidden |= brightness[i, j] < 0.0
-                    weight = np.exp(-((_difference(colours, row, column, i, j) / scale) ** 2))
-                    if not weight >= least_weight:
-                        weight = 0.0
-                    weights[row, column, k] = weight
-                    total += weight
-                    mean += weight * brightness[i, j]
+                    weight = np.exp(-((_difference(features, row, column, i, j) / scale) ** 2))
+                    if weight >= least_weight:
+                        weights[k, row, column] = weight
+                        total += weight
                     k += 1
-            if hidden:
-                continue
-            mean /= total
-            variance, k = 0.0, 0
-            for i in range(row - radius, row + radius + 1):
-                for j in range(column - radius, column + radius + 1):
-                    weights[row, column, k] /= total
-                    variance += weights[row, column, k] * (brightness[i, j] - mean) ** 2
-                    k += 1
-            means[row, column] = mean
-            if variance >= least_variance:
-                variances[row, column] = variance
-
-
-@kernel(fastmath=True)
-def correlate(brightness, others, radius, weights, means, variances, noise, count, result):
-    """Fill ``result[row, column]`` with how well the patch of a pixel is met by others drawn onto the same pixels.
-
-    Weighted, normalised cross-correlation; the mean of the best `count` of `others` (photographs, rows, columns), and
-    `OUTSIDE` where the pixel has no variance. `noise` [brightness^2] is added to both variances. A photograph whose
-    patch is masked (below 0) at a corner or in the middle counts as `OUTSIDE`.
-    """
-    height, width = brightness.shape
-    best = np.empty(count, np.float32)
-    for row in range(height):
-        for column in range(width):
-            result[row, column] = OUTSIDE
-            if variances[row, column] == 0.0:
-                continue
-            best[:] = OUTSIDE
-            middle, own = means[row, column], variances[row, column] + noise
-            up, down, left, right = row - radius, row + radius, column - radius, column + radius
-            for number in range(len(others)):
-                other = others[number]
-                if (
-                    min(other[up, left], other[up, right], other[down, left], other[down, right]) < 0.0
-                    or other[row, column] < 0.0
-                ):
-                    continue
-                first, second, both = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-                k = 0
-                for i in range(up, down + 1):
-                    for j in range(left, right + 1):
-                        weight = weights[row, column, k]
-                        value = other[i, j] - middle
-                        first += weight * value
-                        second += weight * value * value
-                        both += weight * value * (brightness[i, j] - middle)
+            weights[:, row, column] /= total
+            for channel in range(count):
+                mean, square, hidden, k = 0.0, 0.0, False, 0
+                for i in range(row - radius, row + radius + 1):
+                    for j in range(column - radius, column + radius + 1):
+                        hidden |= channels[channel, i, j] < 0.0
+                        mean += weights[k, row, column] * channels[channel, i, j]
                         k += 1
-                score = both / np.sqrt(own * (max(second - first * first, np.float32(0.0)) + noise))
-                for place in range(count):
+                if hidden:
+                    continue
+                k = 0
+                for i in range(row - radius, row + radius + 1):
+                    for j in range(column - radius, column + radius + 1):
+                        square += weights[k, row, column] * (channels[channel, i, j] - mean) ** 2
+                        k += 1
+                means[channel, row, column] = mean
+                if square >= noise[channel]:
+                    variances[channel, row, column] = square
+
+
+@kernel(fastmath={"contract"})
+def correlate(channels, others, radius, weights, means, variances, noise, count, plane, result):
+    """Fill ``result[row, column, plane]`` with how well the patch of a pixel is met by others drawn onto its pixels.
+
+    Weighted, normalised cross-correlation of each of the `channels` (c, h, w), `noise` (c,) added to both variances;
+    they count by their signal to noise. The mean of the best `count` of `others` (photographs, c, h, w), and `OUTSIDE`
+    where no channel has a variance. A photograph whose patch is masked (below 0) at a corner or in the middle has
+    nothing to say about the channel; if that holds for all channels, it counts as `OUTSIDE`.
+    """
+    kinds, height, width = channels.shape
+    inner = width - 2 * radius
+    scores, known = np.empty((len(others), inner), np.float32), np.empty((len(others), inner), np.bool_)
+    first, second, both = np.empty(inner, np.float32), np.empty(inner, np.float32), np.empty(inner, np.float32)
+    signal, best = np.empty(inner, np.float32), np.empty(count, np.float32)
+    result[:radius, :, plane] = OUTSIDE
+    result[height - radius :, :, plane] = OUTSIDE
+    result[:, :radius, plane] = OUTSIDE
+    result[:, width - radius :, plane] = OUTSIDE
+    for row in range(radius, height - radius):
+        scores[:] = 0.0
+        known[:] = False
+        signal[:] = 0.0
+        for channel in range(kinds):
+            own, mean = variances[channel, row, radius:], means[channel, row, radius:]
+            for x in range(inner):
+                signal[x] += own[x] / noise[channel]
+        for channel in range(kinds):
+            own, mean = variances[channel, row, radius:], means[channel, row, radius:]
+            if own[:inner].max() == 0.0:
+                continue
+            for number in range(len(others)):
+                other = others[number, channel]
+                first[:] = 0.0
+                second[:] = 0.0
+                both[:] = 0.0
+                k = 0
+                for i in range(row - radius, row + radius + 1):
+                    for j in range(2 * radius + 1):
+                        weight, line, here = weights[k, row, radius:], other[i, j:], channels[channel, i, j:]
+                        for x in range(inner):  # one instruction for several pixels
+                            value = line[x] - mean[x]
+                            share = weight[x] * value
+                            first[x] += share
+                            second[x] += share * value
+                            both[x] += share * (here[x] - mean[x])
+                        k += 1
+                above, middle, below = other[row - radius], other[row], other[row + radius]
+                for x in range(inner):
+                    least = min(above[x], above[x + 2 * radius], below[x], below[x + 2 * radius], middle[x + radius])
+                    if own[x] > 0.0 and least >= 0.0:
+                        spread = max(second[x] - first[x] * first[x], np.float32(0.0)) + noise[channel]
+                        share = own[x] / noise[channel] / signal[x]
+                        scores[number, x] += share * both[x] / np.sqrt((own[x] + noise[channel]) * spread)
+                        known[number, x] = True
+        for x in range(inner):
+            best[:] = OUTSIDE
+            for number in range(len(others)):
+                score = scores[number, x]
+                for place in range(count if known[number, x] else 0):
                     if score > best[place]:
                         best[place], score = score, best[place]
-            result[row, column] = best.sum() / count
+            result[row, x + radius, plane] = best.sum() / count
+
+
+@kernel(fastmath={"contract"})
+def aggregate(cost, features, small, large, edge, total):
+    """Add up costs along the paths that lead to each pixel from eight directions (Hirschmueller 2008, eq. 13).
+
+    From one pixel of a path to the next, a step to the next plane costs `small` and one to any other `large`, but less
+    where the pixels differ: half of it at a difference of `edge` of their `features` (h, w, f). `cost` and `total`,
+    which is filled with the mean over the directions, are (h, w, planes).
+    """
+    rows, columns, planes = cost.shape
+    total[:] = 0.0
+    path = np.empty((2, columns, planes), np.float32)
+    for dy, dx in ((0, 1), (0, -1), (1, 0), (1, 1), (1, -1), (-1, 0), (-1, 1), (-1, -1)):
+        for r in range(rows):
+            y = r if dy >= 0 else rows - 1 - r
+            for c in range(columns):
+                x = c if dx >= 0 else columns - 1 - c
+                py, px = y - dy, x - dx
+                here = path[r % 2, x]
+                if py < 0 or py >= rows or px < 0 or px >= columns:
+                    here[:] = cost[y, x]
+                else:
+                    before = path[r % 2, px] if dy == 0 else path[(r + 1) % 2, px]
+                    least = before[0]
+                    for k in range(1, planes):
+                        least = min(least, before[k])
+                    jump = least + max(small, large / (1 + np.float32(_difference(features, y, x, py, px)) / edge))
+                    here[0] = cost[y, x, 0] + min(before[0], before[1] + small, jump) - least
+                    for k in range(1, planes - 1):
+                        step = min(before[k - 1], before[k + 1]) + small
+                        here[k] = cost[y, x, k] + min(before[k], step, jump) - least
+                    last = planes - 1
+                    here[last] = cost[y, x, last] + min(before[last], before[last - 1] + small, jump) - least
+                for k in range(planes):
+                    total[y, x, k] += here[k]
+    total /= np.float32(8)
+
+
+@kernel(fastmath={"contract"})
+def refine_depths(
+    begin, end, width, depth, error, ratio, features, picture, others, turns, shifts, options, noise, refined, spacing
+):
+    """Move the depths of pixels `begin` to `end` to where larger pictures agree best, and say how far steps are apart.
+
+    Of a pixel of the small photograph, the patch around its middle is taken from the larger one, weighted as in
+    `weigh_patches`, and laid on the plane that the depths around it say. It is tried at some inverse depths before and
+    behind, between which the larger pictures of `others` move by half a pixel; the top of a parabola through the best
+    counts. What has no texture, agrees badly, or agrees best at an end stays as it is.
+
+    Args:
+        begin: First pixel.
+        end: Behind the last pixel.
+        width: Columns of the small photograph.
+        depth: Depth of its pixels, (pixels,), [world units]; NaN: not known.
+        error: Distance of the planes on which these were found.
+        ratio: Columns of the larger photograph per column of the small one.
+        features: Features of the larger photograph, (h, w, f).
+        picture: Its brightness, (h, w).
+        others: Brightness of the photographs that it is compared with, (photographs, h, w); below 0 where unknown.
+        turns: Homogeneous pixels of the larger photograph to homogeneous pixels of each other, at infinity, (n, 3, 3).
+        shifts: What is added per inverse depth, (n, 3).
+        options: Radius, likeness, spread, least weight, steps and least correlation.
+        noise: Variance of brightness that is noise.
+        refined: Depths, (pixels,); filled.
+        spacing: Distance of steps that move a picture by a pixel, [world units], (pixels,); filled where refined.
+    """
+    radius, likeness, spread, least_weight, steps, least = options
+    height, columns = picture.shape
+    side, count, half = 2 * radius + 1, len(others), (len(others) + 1) // 2
+    weights, own = np.empty(side * side), np.empty(side * side)
+    around, scores, best = np.empty(9), np.empty(2 * steps + 1), np.empty(half)
+    for n in range(begin, end):
+        if np.isnan(depth[n]):
+            continue
+        u, v = (n % width + 0.5) * ratio, (n // width + 0.5) * ratio
+        column, row = int(u), int(v)
+        if min(row, column) < radius or row >= height - radius or column >= columns - radius:
+            continue
+        inverse = 1.0 / depth[n]
+        slope_u, slope_v = 0.0, 0.0
+        for axis in range(2):
+            step = 1 if axis == 0 else width
+            if n >= step and n + step < len(depth):
+                before, behind = depth[n - step], depth[n + step]
+                if abs(before - depth[n]) <= 2.0 * error[n] and abs(behind - depth[n]) <= 2.0 * error[n]:
+                    slope = 0.5 * (1.0 / behind - 1.0 / before) / ratio
+                    slope_u, slope_v = (slope, slope_v) if axis == 0 else (slope_u, slope)
+        k = 0
+        for i in range(row - 1, row + 2):
+            for j in range(column - 1, column + 2):
+                around[k] = _difference(features, row, column, i, j)
+                k += 1
+        scale, total, mean, variance, k = max(likeness, spread * np.sort(around)[5]), 0.0, 0.0, 0.0, 0
+        for i in range(row - radius, row + radius + 1):
+            for j in range(column - radius, column + radius + 1):
+                weight = np.exp(-((_difference(features, row, column, i, j) / scale) ** 2))
+                weights[k] = weight if weight >= least_weight and picture[i, j] >= 0.0 else 0.0
+                own[k] = picture[i, j]
+                total += weights[k]
+                mean += weights[k] * own[k]
+                k += 1
+        if total <= 0.0:
+            continue
+        mean /= total
+        for k in range(side * side):
+            weights[k] /= total
+            own[k] -= mean
+            variance += weights[k] * own[k] * own[k]
+        if variance < 4.0 * noise:
+            continue
+        apart = 0.0  # inverse depth by which the picture that moves most moves by a pixel
+        for o in range(count):
+            t, s = turns[o], shifts[o]
+            w = t[2, 0] * u + t[2, 1] * v + t[2, 2]
+            x, y = t[0, 0] * u + t[0, 1] * v + t[0, 2], t[1, 0] * u + t[1, 1] * v + t[1, 2]
+            far = w + inverse * s[2]
+            if far > 0.0:
+                moved = np.hypot(s[0] * w - s[2] * x, s[1] * w - s[2] * y) / (far * far)
+                apart = max(apart, moved)
+        if apart <= 0.0:
+            continue
+        apart = 1.0 / apart
+        for number in range(2 * steps + 1):
+            middle = inverse + 0.5 * (number - steps) * apart
+            best[:] = OUTSIDE
+            for o in range(count if middle > 0.0 else 0):
+                t, s = turns[o], shifts[o]
+                first, second, both, reached, k = 0.0, 0.0, 0.0, 0.0, 0
+                for i in range(-radius, radius + 1):
+                    for j in range(-radius, radius + 1):
+                        weight = weights[k]
+                        if weight > 0.0:
+                            x, y = column + j + 0.5, row + i + 0.5
+                            w = middle + slope_u * (x - u) + slope_v * (y - v)
+                            far = t[2, 0] * x + t[2, 1] * y + t[2, 2] + w * s[2]
+                            if far > 0.0:
+                                a = (t[0, 0] * x + t[0, 1] * y + t[0, 2] + w * s[0]) / far - 0.5
+                                b = (t[1, 0] * x + t[1, 1] * y + t[1, 2] + w * s[1]) / far - 0.5
+                                if a >= 0.0 and b >= 0.0 and a < others.shape[2] - 1 and b < others.shape[1] - 1:
+                                    left, top = int(a), int(b)
+                                    a, b = a - left, b - top
+                                    here = (1.0 - b) * (
+                                        (1.0 - a) * others[o, top, left] + a * others[o, top, left + 1]
+                                    ) + b * ((1.0 - a) * others[o, top + 1, left] + a * others[o, top + 1, left + 1])
+                                    if here >= 0.0:
+                                        here -= mean
+                                        first += weight * here
+                                        second += weight * here * here
+                                        both += weight * here * own[k]
+                                        reached += weight
+                        k += 1
+                if reached < 0.999:
+                    continue
+                score = both / np.sqrt((variance + noise) * (max(second - first * first, 0.0) + noise))
+                for place in range(half):
+                    if score > best[place]:
+                        best[place], score = score, best[place]
+            scores[number] = best.sum() / half
+        top = scores.argmax()
+        if scores[top] < least or top == 0 or top == 2 * steps:
+            continue
+        bend = scores[top - 1] - 2.0 * scores[top] + scores[top + 1]
+        if not bend < 0.0:
+            continue
+        place = top - steps + 0.5 * (scores[top - 1] - scores[top + 1]) / bend
+        found = 1.0 / (inverse + 0.5 * place * apart)
+        refined[n], spacing[n] = found, found * found * apart
 
 
 @kernel
