@@ -22,7 +22,7 @@ from thermoxels_ns.training.trainer import LOCAL_HOST, ThermoxelsTrainerConfig
 nerfstudio_bridge.install()
 ThermoxelsPipeline.compare_with_truth = nerfstudio_bridge.compare_with_truth
 
-ITERATIONS = QUALITIES["standard"][1]
+_, ITERATIONS, VOXEL_PIXELS = QUALITIES["standard"]
 
 
 def _group(lr: float, lr_final: float, optimizer: type[OptimizerConfig]) -> dict:
@@ -49,7 +49,7 @@ def _trainer(
             datamanager=ThermalDataManagerConfig(
                 dataparser=ThermalDataParserConfig(), train_num_rays_per_batch=4096, thermal_num_rays_per_batch=2048
             ),
-            model=ThermoxelsModelConfig(),
+            model=ThermoxelsModelConfig(voxel_pixels=VOXEL_PIXELS),
         ),
         optimizers={
             "density": _group(0.3, 0.03, optimizer),

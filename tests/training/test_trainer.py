@@ -44,6 +44,7 @@ def configured(scene: Path, folder: Path, *options: str) -> Any:
     settings = (tyro.conf.FlagConversionOff,)
     config = tyro.cli(type(before), default=before, args=[*fixed, *options], config=settings)
     config.pipeline.datamanager.data = config.data
+    config.pipeline.model.voxel_pixels = 0.0  # photographs as small as these ask for a few voxels
     return config
 
 
@@ -137,8 +138,9 @@ def test_a_schedule_is_one_that_a_model_accepts(resolution, steps):
 def test_a_quality_sets_resolution_and_length_and_leaves_the_defaults_alone(quality):
     before = deepcopy(thermoxels.config)
     config = tyro.cli(type(before), default=before, args=["--quality", quality])
-    resolution, steps = QUALITIES[quality]
+    resolution, steps, pixels = QUALITIES[quality]
     assert config.max_num_iterations == steps and config.pipeline.model.resolutions[-1] == resolution
+    assert config.pipeline.model.voxel_pixels == pixels
     assert {group["scheduler"].max_steps for group in config.optimizers.values()} == {steps}
     assert config.pipeline.model.thin_at == schedule_for(resolution, steps).thin_at
     assert thermoxels.config.max_num_iterations == QUALITIES["standard"][1]

@@ -124,6 +124,7 @@ class _Scene:
     survey: ThermalSurvey
     world: _World
     box: SceneBox
+    pixel_size: float  # width of a photograph's pixel where most of what is seen stands, in nerfstudio's world
     feature_rays: FeatureRays | None  # what the training photographs see of the tracks; nerfstudio's world
     adjusted: bool  # whether the poses of training photographs are others than the json's
     fitted: dict[int, npt.NDArray[np.float64]]
@@ -135,10 +136,11 @@ class ThermalDataParser(DataParser):
 
     The outputs' metadata hold: ``temperature_range`` (`TemperatureRange`), ``thermal_filenames``, ``thermal_cameras``
     (`Cameras` of the split, or None where a pair shares camera and resolution), ``thermal_unit``, ``valid_range_c``,
-    ``thermal_dead_pixels`` (a mask per resolution), ``image_scale`` (1 / downscale_factor), ``scene_name`` and, for
-    train, ``feature_rays`` (`FeatureRays`, or None where the scene has no tracks). ``fitted_poses`` (n, 3, 4) say where
-    held-out photographs themselves say that they were taken, and ``adjusted_poses`` (camera to world in input
-    coordinates, by the photograph's name) those of training, both None where no pose was adjusted.
+    ``thermal_dead_pixels`` (a mask per resolution), ``image_scale`` (1 / downscale_factor), ``pixel_size`` (width of a
+    pixel where most of what is seen stands, in the world), ``scene_name`` and, for train, ``feature_rays``
+    (`FeatureRays`, or None where the scene has no tracks). ``fitted_poses`` (n, 3, 4) say where held-out photographs
+    themselves say that they were taken, and ``adjusted_poses`` (camera to world in input coordinates, by the
+    photograph's name) those of training, both None where no pose was adjusted.
     """
 
     config: ThermalDataParserConfig
@@ -180,6 +182,7 @@ class ThermalDataParser(DataParser):
                 "thermal_unit": scene.file.unit,
                 "valid_range_c": tuple(self.config.valid_range_c),
                 "thermal_dead_pixels": scene.survey.dead_pixels,
+                "pixel_size": scene.pixel_size / factor,
                 "scene_name": scene.file.folder.resolve().name,
                 "feature_rays": scene.feature_rays if split == "train" else None,
                 "fitted_poses": self._fitted_poses(scene, chosen),
@@ -238,7 +241,8 @@ class ThermalDataParser(DataParser):
             CONSOLE.print(f"Left out, no pair: {', '.join(file.left_out)}", style="bold yellow")
         if rays is not None:
             rays = rays.moved(world.rotation, world.translation, world.scale)
-        return _Scene(file, split, survey, world, box, rays, file is not given, fitted)
+        pixel_size = world.scale * evidence.pixel_size(world.rotation)
+        return _Scene(file, split, survey, world, box, pixel_size, rays, file is not given, fitted)
 
     def _oriented(self, poses: npt.NDArray[np.float64]) -> torch.Tensor:
         """nerfstudio's choice of rotation and shift for these poses (n, 4, 4), shape (3, 4) float32."""

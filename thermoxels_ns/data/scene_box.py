@@ -28,6 +28,7 @@ _MARGIN = 0.08
 _ROUNDED = 2.0**-8
 _MOST_POINTS = 20_000
 _MOST_PHOTOGRAPHS = 64  # Photographs in which points are looked at
+_PROBES = 8  # Points along each side of a box of which no points are known
 _STEREO_PHOTOGRAPHS, _STEREO_SIDE = 32, 96
 """Photographs whose depths are compared, and pixels along their longer side: some seconds."""
 _FEWEST_POINTS = 10
@@ -37,10 +38,7 @@ _LEAST_SHOWN, _MOST_WITHOUT = 0.15, 0.1
 _WORTH_LEAVING_OUT = 1.5  # Points per length that a box without the distant points must gain
 _NEARLY_BEST = 0.9
 _FEW_IN_VIEW = 0.05  # Points in view relative to the most that one has, below which a photograph tells nothing
-_LEVEL = 0.01  # Height of a level of points, relative to the distance of the cameras from what they look at
-_ABOVE_GROUND = 0.06  # Height above the ground from which on something stands, relative to the same
-_LEAST_GROUND, _LEAST_STANDING = 0.05, 0.06  # Shares of the points on a ground and of those above it
-_MUCH_SMALLER = 1.75  # Box with what lies on the ground, relative to the box without, from which on that is left out
+_NEARER_HALF = 0.25  # Quantile of the depths in a box at which its surface is taken to stand, where no points are known
 _CONVERGING = 0.5  # Distance to where cameras look, relative to their spread, below which they look outwards
 # The axes that ns-process-data swapped in old versions, before it wrote applied_transform into the json.
 _LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
@@ -67,6 +65,27 @@ class BoxEvidence:
         if self.points is not None:
             return box_of_points(self.points, self.frames, rotation, self.tail)
         return box_of_cameras(self.frames, rotation)
+
+    def pixel_size(self, rotation: FloatArray) -> float:
+        """Width of a photograph's pixel where most of what is seen in the box stands, in input units.
+
+        The median over what photographs see of the points in the box; without points, what a pixel covers in the nearer
+        half of the box. Infinite where no photograph of a perspective camera looks at it.
+        """
+        low, high = self.box(rotation)
+        if self.points is not None:
+            inside = ((self.points @ rotation.T >= low) & (self.points @ rotation.T <= high)).all(axis=1)
+            points, quantile = self.points[inside], 0.5
+        else:
+            steps = (np.arange(_PROBES) + 0.5) / _PROBES
+            grid = np.stack(np.meshgrid(*3 * [steps], indexing="ij"), axis=-1).reshape(-1, 3)
+            points, quantile = (low + grid * (high - low)) @ rotation, _NEARER_HALF
+        frames = [f for f in _spread(self.frames, _MOST_PHOTOGRAPHS) if f.intrinsics.lens == "perspective"]
+        if not frames or not len(points):
+            return float("inf")
+        depth = _depths_in_view(points[:: max(len(points) // _MOST_POINTS, 1)], frames)
+        sizes = depth / np.array([[f.intrinsics.fl_x] for f in frames])
+        return float(np.quantile(sizes[np.isfinite(sizes)], quantile)) if np.isfinite(sizes).any() else float("inf")
 
 
 def find_scene_box(scene: SceneFile, option: Sequence[Sequence[float]] | None, training: Sequence[int]) -> BoxEvidence:
@@ -130,9 +149,8 @@ def box_of_points(
     Per axis of the rotated world all but `tail` [%] of them at either end, and 8 % of the longest extent more on every
     side (parts without texture have no points, and a flat scene keeps some depth). Points that are not finite or in no
     photograph's view do not count; nor do those that lie far behind others, or that few photographs have in view, where
-    they cost too much, see `_worth_keeping`; nor a ground that runs on, see `_standing`, if the box is much
-    smaller without it: the slab on which a house stands stays. A photograph with hardly any
-    of what is left in view, as of a plain wall, is taken to show something as far away as in the others.
+    they cost too much, see `_worth_keeping`. A ground that runs on belongs to what is seen. A photograph with hardly
+    any of what is left in view, as of a plain wall, is taken to show something as far away as in the others.
     """
     points = points[np.isfinite(points).all(axis=1)]
     points, frames = points[:: max(len(points) // _MOST_POINTS, 1)], _spread(frames, _MOST_PHOTOGRAPHS)
@@ -146,9 +164,6 @@ def box_of_points(
         expected = f"at least {_FEWEST_POINTS} points in front of the cameras to find the scene box"
         raise SceneError("sparse points", expected=expected, got=len(points), remedy=_REMEDY)
     low, high = np.percentile(points, (tail, 100.0 - tail), axis=0)
-    standing = _standing(points, frames, rotation)
-    if standing is not None and (high - low).max() >= _MUCH_SMALLER * (standing[1] - standing[0]).max():
-        low, high = standing
     margin = _MARGIN * (high - low).max()
     shown = np.isfinite(depth).sum(axis=1)
     few = shown < _FEW_IN_VIEW * shown.max()
@@ -255,36 +270,6 @@ def _looked_at(frames: Sequence[Frame], rotation: FloatArray) -> tuple[FloatArra
 
 def _cube(centre: FloatArray, half: float) -> Box:
     return np.stack([centre - half, centre + half])
-
-
-def _standing(points: FloatArray, frames: Sequence[Frame], rotation: FloatArray) -> FloatArray | None:
-    """What stands on a ground that runs on, where cameras outside look at one place; None without such a ground.
-
-    Ground is as close and as dense as the body itself. It is the lowest level with many points; what is farther from
-    the place looked at than cameras are stands behind. Of the rest, what is far from the middle goes where it costs too
-    much, see `_worth_keeping`. Points are those of the rotated world. Returns the lowest and the highest corner.
-    """
-    looked_at = _looked_at(frames, rotation)
-    if looked_at is None or looked_at[1] <= 0.0:
-        return None
-    origins = np.stack([rotation @ frame.pose[:3, 3] for frame in frames])
-    reach = float(np.median(np.linalg.norm(origins - looked_at[0], axis=1)))
-    near = points[np.linalg.norm(points - looked_at[0], axis=1) < reach]
-    if len(near) < _FEWEST_POINTS:
-        return None
-    lowest = near[:, 2].min()
-    levels = np.bincount(((near[:, 2] - lowest) / (_LEVEL * reach)).astype(np.int64))
-    grounds = np.flatnonzero(levels + np.append(levels[1:], 0) >= _LEAST_GROUND * len(near))
-    if len(grounds) == 0:
-        return None
-    ground = lowest + grounds[0] * _LEVEL * reach
-    above = near[near[:, 2] > ground + _ABOVE_GROUND * reach]
-    if len(above) < max(_LEAST_STANDING * len(near), _FEWEST_POINTS):
-        return None
-    away = np.abs(above - np.median(above, axis=0))[:, :2].max(axis=1).astype(np.float32)
-    above = above[_worth_keeping(above, away[None], away, _TAIL_OF_POINTS)]
-    low, high = np.percentile(above, (_TAIL_OF_POINTS, 100.0 - _TAIL_OF_POINTS), axis=0)
-    return np.stack([[*low[:2], ground], high])
 
 
 def _checked(corners: Any, name: str) -> Box:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -66,9 +67,12 @@ class ThermoxelsModel(Model):
     def populate_modules(self) -> None:
         """Build the field, the background and what belongs to single images."""
         super().populate_modules()
-        config = self.config
+        self.config.check()
+        box = self.scene_box.aabb.double().numpy()
+        voxel = self.config.voxel_pixels * (self.kwargs.get("metadata") or {}).get("pixel_size", math.inf)
+        longest = float((box[1] - box[0]).max())
+        self.config = config = self.config.suited_to(longest / voxel if voxel else math.inf)
         torch.manual_seed(config.seed)
-        config.check()
         self.loss_weights = config.loss_weights()
         temperature_range = (self.kwargs.get("metadata") or {}).get("temperature_range")
         if not isinstance(temperature_range, TemperatureRange):
@@ -78,9 +82,14 @@ class ThermoxelsModel(Model):
             "temperature_bounds_c",
             torch.tensor([temperature_range.min_c, temperature_range.max_c], dtype=torch.float64),
         )
-        box = self.scene_box.aabb.double().numpy()
+        if 0.0 < voxel < math.inf:
+            pixels = config.voxel_pixels * longest / config.resolutions[-1] / voxel
+            CONSOLE.log(
+                f"voxels: {config.resolutions[-1]} along the longest side of the box, each {pixels:.1f} pixels wide "
+                "where most of what photographs show stands"
+            )
         # Densities, distances and learning rates are made for a box 2 long; other sizes are converted.
-        self.unit = float((box[1] - box[0]).max()) / 2.0
+        self.unit = longest / 2.0
         lattice = Lattice.covering(box[0], box[1], config.resolutions[0])
         channels, budget = config.row_channels(config.resolutions[0]), config.memory_budget_gb
         need = check_memory(lattice, int(np.prod(lattice.cell_shape)), channels, budget)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
 from nerfstudio.models.base_model import ModelConfig
@@ -17,6 +17,8 @@ from thermoxels_ns.render.renderers import Backend
 from thermoxels_ns.training.schedule import QUALITIES, schedule_for
 
 _STANDARD = schedule_for(*QUALITIES["standard"])
+MOST_VOXELS = 1.5  # Voxels along the longest side that a scene may ask for, relative to the last of the resolutions
+STEP_OF_COARSEST = 4  # Of so many voxels the coarsest resolution is a multiple
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,11 @@ class ThermoxelsModelConfig(ModelConfig):
     """Rays rendered at once for a whole image."""
 
     resolutions: tuple[int, ...] = _STANDARD.resolutions
-    """Voxels along the longest side of the scene box, coarse to fine; each a multiple of the one before."""
+    """Voxels along the longest side of the scene box, coarse to fine; each a multiple of the one before. Unless they
+    are typed, voxel-pixels replaces them by up to one and a half times as many."""
+    voxel_pixels: float = 0.0
+    """Width of the finest voxels in pixels of the photographs, where most of what they show stands. Finer ones follow
+    noise, coarser ones cannot hold the shape. 0: as resolutions says."""
     refine_at: tuple[int, ...] = _STANDARD.refine_at
     """Steps at which the next resolution begins; one fewer than resolutions."""
     prune_at: tuple[int, ...] = _STANDARD.prune_at
@@ -180,6 +186,7 @@ class ThermoxelsModelConfig(ModelConfig):
             "early_stop": (0.0, 0.1, "from 0 to 0.1"),
             "memory_budget_gb": (1e-6, 1e6, "a number above 0"),
             "background_height": (2, 100_000, "at least 2"),
+            "voxel_pixels": (0.0, 1000.0, "0 or more, at most 1000"),
             "thermal_l2_share": (0.0, 1.0, "from 0 to 1"),
             "tv_share": (1e-6, 1.0, "above 0, at most 1"),
         }
@@ -210,6 +217,18 @@ class ThermoxelsModelConfig(ModelConfig):
             remedy = "For example --pipeline.model.resolutions 32 64 128 --pipeline.model.refine-at 400 800."
             raise ThermoxelsError("resolutions and refine_at", expected=expected, got=got, remedy=remedy)
         return {step: b // a for step, (a, b) in zip(self.refine_at, pairs)}
+
+    def suited_to(self, voxels: float) -> ThermoxelsModelConfig:
+        """The settings for a scene along whose longest side that many voxels of `voxel_pixels` stand.
+
+        All resolutions grow or shrink alike, and at most to `MOST_VOXELS` times as many.
+        """
+        if not self.voxel_pixels or not math.isfinite(voxels):
+            return self
+        first, last = self.resolutions[0], self.resolutions[-1]
+        wanted = min(voxels, MOST_VOXELS * last) * first / last
+        coarsest = max(STEP_OF_COARSEST, STEP_OF_COARSEST * round(wanted / STEP_OF_COARSEST))
+        return replace(self, resolutions=tuple(coarsest * each // first for each in self.resolutions))
 
     def first_sh_degree(self) -> int | None:
         """Degree of colour that a training stores at its beginning: 0 until colour depends on the direction."""

@@ -25,7 +25,15 @@ from thermoxels_ns.training.schedule import QUALITIES, Quality, Schedule, schedu
 LOCAL_HOST = "127.0.0.1"
 _HELD: list[FileLock] = []
 """Locks of the folders of this process's trainings."""
-_SCHEDULE = ("resolutions", "refine_at", "prune_at", "thin_at", "distortion_ramp", "view_dependence_from")
+_SCHEDULE = (
+    "resolutions",
+    "refine_at",
+    "prune_at",
+    "thin_at",
+    "distortion_ramp",
+    "view_dependence_from",
+    "voxel_pixels",
+)
 """Options of the model that depend on the resolution and the number of steps."""
 
 
@@ -35,11 +43,11 @@ class ThermoxelsTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: ThermoxelsTrainer)
     quality: Quality | None = None
-    """Named setting of resolution and length: draft (64 voxels along the longest side, 800 steps: a first look, half
-    a minute on two cores), standard (128 voxels, 1500 steps, the default: one to two minutes) or fine (256 voxels,
-    4000 steps: some minutes); `thermoxels cost` measures what they give. It replaces max-num-iterations, the lengths
-    of the learning rate schedules, and the model's resolutions, refine-at, prune-at, thin-at, distortion-ramp and
-    view-dependence-from."""
+    """Named setting of resolution and length: draft (voxels of 4 pixels, up to 96 along the longest side, 800 steps: a
+    first look, half a minute on two cores), standard (2 pixels, up to 192, 1500 steps, the default: one to two minutes)
+    or fine (2 pixels, up to 384, 4000 steps: some minutes); `thermoxels cost` measures what they give. It replaces
+    max-num-iterations, the lengths of the learning rate schedules, and the model's resolutions, voxel-pixels,
+    refine-at, prune-at, thin-at, distortion-ramp and view-dependence-from."""
     replaced: tyro.conf.Suppress[str] = ""
     """What the quality replaced, for the log."""
 
@@ -63,8 +71,10 @@ class ThermoxelsTrainerConfig(TrainerConfig):
             ThermoxelsError: An option is out of range, the folder cannot be written to, or another training is in it.
         """
         self.follow_checkpoint()
-        self.check()
         model: Any = self.pipeline.model
+        if typed("--pipeline.model.resolutions") and not typed("--pipeline.model.voxel-pixels"):
+            model.voxel_pixels = 0.0
+        self.check()
         first = (model.resolutions[0] + 1) ** 3 * 4 * model.row_channels(model.resolutions[0])
         with plain_os_errors(self.output_dir):
             # Values and two moments of the first lattice, in the last checkpoint and in the one that replaces it.
@@ -140,7 +150,7 @@ class ThermoxelsTrainer(Trainer):
         """
         quality, replaced = self.config.quality, self.config.replaced
         if quality is not None:
-            resolution, steps = QUALITIES[quality]
+            resolution, steps, _ = QUALITIES[quality]
             said = f"{resolution} voxels and {steps} steps"
             CONSOLE.log(
                 f"quality {quality}: {said}" + (f", in place of {replaced}" if replaced not in ("", said) else "")

@@ -1,0 +1,45 @@
+import math
+
+import numpy as np
+import pytest
+
+from thermoxels_ns.data.dataparser import ThermalDataParserConfig
+from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.training.model_config import MOST_VOXELS, ThermoxelsModelConfig
+
+
+@pytest.mark.parametrize(
+    ("voxels", "expected"),
+    [
+        (113.0, (28, 56, 112)),
+        (128.0, (32, 64, 128)),
+        (170.0, (44, 88, 176)),
+        (5000.0, (48, 96, 192)),
+        (1.0, (4, 8, 16)),
+    ],
+)
+def test_resolutions_grow_and_shrink_alike_and_up_to_a_limit(voxels, expected):
+    config = ThermoxelsModelConfig(voxel_pixels=2.0).suited_to(voxels)
+    assert config.resolutions == expected
+    config.check()
+    assert config.resolutions[-1] <= MOST_VOXELS * 128
+
+
+@pytest.mark.parametrize(("pixels", "voxels"), [(0.0, 50.0), (2.0, math.inf)])
+def test_resolutions_stay_where_nothing_is_asked_or_known(pixels, voxels):
+    assert ThermoxelsModelConfig(voxel_pixels=pixels).suited_to(voxels).resolutions == (32, 64, 128)
+
+
+@pytest.mark.parametrize("given", [False, True])
+@pytest.mark.parametrize("factor", [None, 2])
+def test_a_pixel_is_as_wide_as_it_is_where_the_body_stands(tmp_path, factor, given):
+    scene = make_scene("sphere")
+    write_scene(scene, tmp_path, 12, 2, width=160, height=120, progress=False)
+    box = tuple(tuple(corner) for corner in np.asarray(scene.scene_box).tolist()) if given else None
+    config = ThermalDataParserConfig(data=tmp_path, scene_box=box, downscale_factor=factor)
+    outputs = config.setup().get_dataparser_outputs()
+    away = np.linalg.norm(np.concatenate(scene.poses(12, 2))[:, :3, 3], axis=1)
+    focal = float(outputs.cameras.fx[0])
+    size = outputs.metadata["pixel_size"] / outputs.dataparser_scale
+    radius = 0.5 * np.ptp(np.asarray(scene.scene_box), axis=0).max()
+    assert (away.mean() - radius) / focal < size < away.mean() / focal
