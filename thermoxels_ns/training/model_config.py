@@ -100,9 +100,9 @@ class ThermoxelsModelConfig(ModelConfig):
     start_density: float = 0.1
     """Density everywhere at the start, per world unit in a scene of size 2: near-transparent, or floaters form."""
     carve: Literal["auto", "off"] = "auto"
-    """Drop voxels that are air, at the start and after every refinement. auto: where structure from motion saw points
-    through them (tracks of thermoxels capture or of a COLMAP model, see the dataparser's tracks), and around cameras:
-    nearer than half of what a camera shows, where no two photographs look."""
+    """auto: at the start and after every refinement, drop voxels that rays cross on the way to what photographs see:
+    points of structure from motion (tracks of thermoxels capture or of a COLMAP model, see the dataparser's tracks),
+    and depths on which photographs agree."""
     photo_depth: Literal["auto", "off", "on"] = "auto"
     """Depth supervision: find depths by comparing each photograph with its neighbours (multi-view stereo, plane sweep),
     and ask rays to end there, as at points of structure from motion. It keeps opaque floaters from forming before walls

@@ -1,0 +1,93 @@
+"""Which voxels are air: votes of rays that cross them on the way to what photographs see."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from thermoxels_ns.core.feature_rays import FeatureRays
+from thermoxels_ns.core.kernel_cache import kernel
+from thermoxels_ns.core.lattice import Lattice
+
+BoolArray = npt.NDArray[np.bool_]
+CountArray = npt.NDArray[np.int32]
+
+FEWEST_POINTS = 2  # Different points whose rays must cross a voxel: a single one may be wrong
+MARGIN_VOXELS = 1.5  # Voxels before a point that are not judged by the rays to it
+MARGIN_ERRORS = 3.0  # Standard errors of a ray's length that are not judged either
+
+
+def air_voxels(lattice: Lattice, rays: FeatureRays) -> BoolArray:
+    """Find the voxels that are air: one boolean per voxel, shape of the lattice's voxels.
+
+    A voxel is free if the rays to at least `FEWEST_POINTS` points cross it and leave it `MARGIN_VOXELS` voxels and
+    `MARGIN_ERRORS` standard errors before their points, and no point lies in it, with rays or without. It is air if its
+    six neighbours are free too: a ray that grazes a surface crosses voxels that hold a part of it. (Of a white house
+    and a courtyard, drawn, with 32 and 128 voxels, 1 to 6 % of the voxels on the surface are free and at most 0.04 %
+    are air, and so are 50 to 75 % of the voxels that it should be.)
+    """
+    crossing, points = votes(lattice, rays)
+    free = (crossing >= FEWEST_POINTS) & (points == 0)
+    return np.asarray(ndimage.binary_erosion(free, border_value=1))
+
+
+def votes(lattice: Lattice, rays: FeatureRays) -> tuple[CountArray, CountArray]:
+    """Count the points to which rays cross each voxel, and the points in it, both of the shape of the voxels."""
+    shape = np.asarray(lattice.cell_shape)
+    origins, ends = lattice.world_to_index(rays.origins), lattice.world_to_index(rays.points)
+    margin = MARGIN_VOXELS + MARGIN_ERRORS * rays.uncertainty / lattice.voxel_size
+    crossing, last = np.zeros(shape.prod(), np.int32), np.full(shape.prod(), -1, np.int64)
+    _walk(origins, rays.point, ends, margin, shape, crossing, last)
+    place = np.floor(ends).astype(np.int64)
+    place = place[((place >= 0) & (place < shape)).all(axis=1)]
+    points = np.bincount(np.ravel_multi_index(tuple(place.T), tuple(shape)), minlength=shape.prod()).astype(np.int32)
+    return crossing.reshape(shape), points.reshape(shape)
+
+
+@kernel
+def _walk(origins, point, ends, margin, shape, crossing, last):
+    """Walk each ray from voxel to voxel (Amanatides and Woo 1987); coordinates are those of the lattice.
+
+    Rays to one point stand together: each point counts once per voxel. A voxel counts that a ray leaves `margin`
+    before its end.
+    """
+    voxel, step = np.empty(3, np.int64), np.empty(3, np.int64)
+    leaves, across = np.empty(3), np.empty(3)
+    for n in range(len(origins)):
+        along = ends[point[n]] - origins[n]
+        length = np.sqrt((along * along).sum())
+        if not length > margin[n]:
+            continue
+        first, stop = 0.0, length - margin[n]
+        for axis in range(3):
+            speed = along[axis] / length
+            if speed != 0.0:
+                low, high = -origins[n, axis] / speed, (shape[axis] - origins[n, axis]) / speed
+                first, stop = max(first, min(low, high)), min(stop, max(low, high))
+            elif not 0.0 <= origins[n, axis] < shape[axis]:
+                stop = -1.0
+        if first >= stop:
+            continue
+        for axis in range(3):
+            speed = along[axis] / length
+            at = origins[n, axis] + first * speed
+            voxel[axis] = min(max(int(np.floor(at)), 0), shape[axis] - 1)
+            step[axis] = 1 if speed > 0.0 else -1
+            across[axis] = 1.0 / abs(speed) if speed != 0.0 else np.inf
+            face = voxel[axis] + (1 if speed > 0.0 else 0)
+            leaves[axis] = (face - origins[n, axis]) / speed if speed != 0.0 else np.inf
+        while True:
+            axis = 0 if leaves[0] <= leaves[1] else 1
+            if leaves[2] < leaves[axis]:
+                axis = 2
+            if leaves[axis] > length - margin[n]:
+                break
+            cell = (voxel[0] * shape[1] + voxel[1]) * shape[2] + voxel[2]
+            if last[cell] != point[n]:
+                last[cell] = point[n]
+                crossing[cell] += 1
+            voxel[axis] += step[axis]
+            if not 0 <= voxel[axis] < shape[axis]:
+                break
+            leaves[axis] += across[axis]
