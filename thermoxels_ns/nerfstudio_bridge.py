@@ -6,7 +6,7 @@ import dataclasses
 import re
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from types import ModuleType, TracebackType
@@ -24,6 +24,7 @@ from thermoxels_ns.core.module_with import ModuleWith
 from thermoxels_ns.core.option_help import join_help_lines
 
 if TYPE_CHECKING:
+    from thermoxels_ns.evaluation.truth_comparison import RenderedRays
     from thermoxels_ns.training.pipeline import ThermoxelsPipeline
 
 _EXPORTER, _TRAIN = "nerfstudio.scripts.exporter", "nerfstudio.scripts.train"
@@ -165,23 +166,41 @@ def _with_mesh_export(commands: Any) -> Any:
 
 
 def compare_with_truth(pipeline: ThermoxelsPipeline) -> dict[str, float]:
-    """How well a trained surface agrees with the exact scene, see `geometry_metrics`; empty if unknown.
+    """How well a trained surface agrees with the exact scene, see `geometry_metrics`, and where held-out rays end.
 
-    It stands here because `training` knows no evaluation.
+    Empty if the scene is not known exactly. It stands here because `training` knows no evaluation.
     """
     from nerfstudio.utils.rich_utils import CONSOLE
     from rich.markup import escape
 
     from thermoxels_ns.core.lattice import input_from_world
-    from thermoxels_ns.evaluation.truth_comparison import geometry_metrics, has_truth
+    from thermoxels_ns.evaluation.truth_comparison import depth_metrics, geometry_metrics, has_truth, load_known_truth
 
     def say(line: str) -> None:
         CONSOLE.print(escape(line))
 
     datamanager: Any = pipeline.datamanager
-    if not has_truth(datamanager.get_datapath(), say):
+    known = load_known_truth(datamanager.get_datapath()) if has_truth(datamanager.get_datapath(), say) else None
+    if known is None:
         return {}
     outputs = datamanager.train_dataparser_outputs
     world_to_input = input_from_world(outputs.dataparser_transform.numpy(), float(outputs.dataparser_scale))
     # With the rays' evidence and the cameras, as an export has them: they decide what is solid.
-    return geometry_metrics(pipeline.grid_snapshot(), world_to_input, datamanager.get_datapath(), say)
+    figures = geometry_metrics(pipeline.grid_snapshot(), world_to_input, known, say)
+    return figures | depth_metrics(_held_out_rays(pipeline), pipeline.model.grid.lattice, world_to_input, known.scene)
+
+
+def _held_out_rays(pipeline: ThermoxelsPipeline) -> Iterator[RenderedRays]:
+    """Render the rays of each held-out photograph as it is given."""
+    from thermoxels_ns.evaluation.truth_comparison import RenderedRays
+
+    datamanager: Any = pipeline.datamanager
+    cameras = datamanager.eval_dataset.cameras.to(pipeline.device)
+    for number in range(len(cameras)):
+        rays = cameras.generate_rays(camera_indices=number, keep_shape=True)
+        seen = pipeline.model.get_outputs_for_camera_ray_bundle(rays)
+        columns = (rays.origins, rays.directions, seen["depth"], seen["accumulation"], seen["in_box"])
+        origins, directions, depth, accumulation, in_box = (
+            column.reshape(-1, column.shape[-1]).double().cpu().numpy() for column in columns
+        )
+        yield RenderedRays(origins, directions, depth[:, 0], accumulation[:, 0] > 0.5, in_box[:, 0] > 0)

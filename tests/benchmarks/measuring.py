@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import sys
 import time
 import types
@@ -10,7 +11,15 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from thermoxels_ns.core.checks import replace_when_done
+from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
+from thermoxels_ns.synthetic.scene_truth import SyntheticScene
+
+SHARED_DATA = Path(os.environ.get("THERMOXELS_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
+"""Folder of real photographs beside the checkout."""
+VIEWS = (42, 6)  # Photographs of a synthetic scene that train, and that are held out
 
 if "tests" not in sys.modules:  # Another distribution may have installed a package of this name.
     sys.modules["tests"] = types.ModuleType("tests")
@@ -32,8 +41,39 @@ def take_turns(
     return seconds, results
 
 
-def train_and_evaluate(scene: Path, folder: Path, options: Sequence[str] = ()) -> tuple[float, dict[str, float]]:
+def synthetic_scene(name: str, folder: Path) -> SyntheticScene:
+    """Make a synthetic scene and write it, as benchmarks photograph it, unless the folder holds it already.
+
+    A folder that holds it with other cameras or another box than it has now is written again.
+    """
+    scene = make_scene(name)
+    path = folder / "transforms.json"  # written last
+    if path.is_file():
+        content, truth = (json.loads((folder / file).read_text(encoding="utf-8")) for file in (path.name, "truth.json"))
+        poses = np.array([frame["transform_matrix"] for frame in content["frames"]])
+        wanted = np.concatenate(scene.poses(*VIEWS))
+        same = poses.shape == wanted.shape and np.allclose(poses, wanted)
+        if same and np.allclose(truth["scene_box"], scene.scene_box):
+            return scene
+    write_scene(scene, folder, *VIEWS, progress=False)
+    return scene
+
+
+def run_of(folder: Path, method: str = "thermoxels") -> Path:
+    """Folder of the run that `train_and_evaluate` leaves, with its config.yml."""
+    return folder / "outputs" / "scene" / method / "run"
+
+
+def train_and_evaluate(
+    scene: Path,
+    folder: Path,
+    options: Sequence[str] = (),
+    method: str = "thermoxels",
+    launcher: Sequence[str] = (),
+) -> tuple[float, dict[str, float]]:
     """Train and evaluate a scene by the commands that a user types, with `options` for ns-train; logs stay in `folder`.
+
+    The words of a `launcher`, a command of this installation, stand before both commands.
 
     Returns:
         Seconds of the whole `ns-train`, and what `ns-eval` reports.
@@ -42,12 +82,13 @@ def train_and_evaluate(scene: Path, folder: Path, options: Sequence[str] = ()) -
 
     from thermoxels_ns.commands.installed_commands import run_command
 
-    run, results = folder / "outputs" / "scene" / "thermoxels" / "run", folder / "eval.json"
+    config, results = run_of(folder, method) / "config.yml", folder / "eval.json"
     quiet = Console(file=StringIO(), width=200)
+    folder.mkdir(parents=True, exist_ok=True)
     began = time.perf_counter()
     run_command(
         [
-            *("ns-train", "thermoxels", "--output-dir", str(folder / "outputs"), "--experiment-name", "scene"),
+            *(*launcher, "ns-train", method, "--output-dir", str(folder / "outputs"), "--experiment-name", "scene"),
             *("--timestamp", "run", "--vis", "tensorboard", "--logging.steps-per-log", "100"),
             *("--logging.local-writer.max-log-size", "0", *options),
             *("thermal-data", "--data", str(scene)),
@@ -56,7 +97,7 @@ def train_and_evaluate(scene: Path, folder: Path, options: Sequence[str] = ()) -
         quiet,
     )
     seconds = time.perf_counter() - began
-    command = ["ns-eval", "--load-config", str(run / "config.yml"), "--output-path", str(results)]
+    command = [*launcher, "ns-eval", "--load-config", str(config), "--output-path", str(results)]
     run_command(command, folder / "eval.log", quiet)
     figures = json.loads(results.read_text(encoding="utf-8"))["results"]
     return seconds, {name: float(value) for name, value in figures.items() if value is not None}

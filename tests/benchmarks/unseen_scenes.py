@@ -10,22 +10,18 @@ results stay in the output folder. Seconds are those of the whole `ns-train`, wh
 mean anything. F-scores are those at 1.5 voxels of 128 along the exact box.
 """
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-from measuring import run_with_options, train_and_evaluate
+from measuring import run_with_options, synthetic_scene, train_and_evaluate
 
 from thermoxels_ns.synthetic.random_scene import FAMILIES
-from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 _TARGETS = {"psnr_box": (">=", 30.0), "thermal_mae_box_c": ("<=", 0.4), "fscore_128": (">=", 0.85)}
-_VIEWS = (42, 6)
 
 
 @dataclass(frozen=True)
@@ -81,26 +77,12 @@ class UnseenScenes:
         print(f"all three: {sum(all(map(one.met, _TARGETS)) for one in outcomes)} of {len(outcomes)}")
 
     def measure(self, seed: int, options: Sequence[str]) -> Outcome:
-        scene, folder = make_scene(f"{self.family}-{seed}"), self.output / f"{self.family}-{seed}"
-        if not _is_written(scene, folder / "scene"):
-            write_scene(scene, folder / "scene", *_VIEWS, progress=False)
+        folder = self.output / f"{self.family}-{seed}"
+        scene = synthetic_scene(folder.name, folder / "scene")
         seconds, figures = train_and_evaluate(folder / "scene", folder, options)
         for name, whole in (("psnr_box", "psnr"), ("thermal_mae_box_c", "thermal_mae_c")):
             figures.setdefault(name, figures.get(whole, math.nan))
         return Outcome(scene, FAMILIES[seed % len(FAMILIES)].name, seconds, figures)
-
-
-def _is_written(scene: SyntheticScene, folder: Path) -> bool:
-    """Whether a folder holds this scene, with the cameras it has now; the json is written last."""
-    path = folder / "transforms.json"
-    if not path.is_file():
-        return False
-    content, truth = (json.loads((folder / name).read_text(encoding="utf-8")) for name in (path.name, "truth.json"))
-    poses = np.array([frame["transform_matrix"] for frame in content["frames"]])
-    wanted = np.concatenate(scene.poses(*_VIEWS))
-    return (
-        poses.shape == wanted.shape and np.allclose(poses, wanted) and np.allclose(truth["scene_box"], scene.scene_box)
-    )
 
 
 if __name__ == "__main__":

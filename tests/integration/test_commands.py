@@ -12,9 +12,10 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.field.kept_voxels import KeptVoxels
 
 METRICS = (
-    *("psnr", "ssim", "thermal_psnr", "thermal_ssim", "thermal_hssim"),
+    *("psnr", "psnr_8", "ssim", "thermal_psnr", "thermal_ssim", "thermal_hssim"),
     *("thermal_mae_c", "thermal_mae_hit_c", "thermal_mae_roi_c", "thermal_mae_debiased_c"),
     *("psnr_box", "thermal_mae_box_c", "half_transparent", "fscore", "precision", "recall", "fscore_128"),
+    *("depth_error", "depth_off_share", "sky_filled"),
 )
 
 

@@ -70,6 +70,28 @@ def test_psnr_of_a_known_error():
     assert metrics.psnr(target + 0.1, target) == pytest.approx(20.0, abs=1e-4)
 
 
+def test_blocks_tell_wrong_colours_from_soft_ones():
+    """Noise goes, an offset stays; sides that are no multiple of 8 end in smaller blocks."""
+    generator = torch.Generator().manual_seed(3)
+    target = torch.rand(45, 61, 3, generator=generator)
+    soft = torch.empty_like(target)
+    for rows, seen in zip(target.split(8), soft.split(8)):
+        for block, flat in zip(rows.split(8, dim=1), seen.split(8, dim=1)):
+            flat[:] = block.mean((0, 1))
+    assert metrics.psnr(soft, target) < 12.0 and metrics.psnr_of_blocks(soft, target) == pytest.approx(100.0)
+    assert metrics.psnr_of_blocks(soft + 0.1, target) == pytest.approx(20.0, abs=1e-3)
+
+
+def test_blocks_are_means_of_their_valid_pixels():
+    target, valid = torch.full((16, 16, 3), 0.5), torch.ones(16, 16, 1, dtype=torch.bool)
+    predicted = target.clone()
+    predicted[:8, :8] += 0.2
+    predicted[0, 0], predicted[12:, 8:] = math.nan, 1.0  # not measured
+    valid[0, 0], valid[8:, 8:] = False, False
+    assert metrics.psnr_of_blocks(predicted, target, valid) == pytest.approx(-10 * math.log10(0.04 / 3), abs=1e-3)
+    assert math.isnan(metrics.psnr_of_blocks(predicted, target, ~torch.ones_like(valid)))
+
+
 @pytest.mark.parametrize("size", [(3, 5), (10, 64), (11, 11)])
 def test_ssim_of_small_images(size):
     image = torch.rand(*size, 3)

@@ -297,6 +297,7 @@ def test_masked_pixels_do_not_count_in_evaluation():
     batch["thermal"][:, 16:] = 1.4  # above the range, and masked
     metrics, images = model.get_image_metrics_and_images(outputs, batch)
     assert metrics["psnr"] == pytest.approx(100.0) and metrics["thermal_mae_c"] == 0.0
+    assert metrics["psnr_8"] == pytest.approx(100.0)
     assert metrics["psnr_box"] == pytest.approx(100.0) and metrics["thermal_mae_box_c"] == 0.0
     assert metrics["ssim"] == pytest.approx(1.0) and metrics["thermal_ssim"] == pytest.approx(1.0)
     assert float(images["thermal"].max()) <= 1.0
@@ -304,6 +305,7 @@ def test_masked_pixels_do_not_count_in_evaluation():
     outputs["in_box"][:, 8:] = 0.0  # wrong are half of the pixels that the box covers, a quarter of all
     metrics, _ = model.get_image_metrics_and_images(outputs, batch)
     assert metrics["psnr_box"] == pytest.approx(23.01, abs=0.01) and metrics["psnr"] == pytest.approx(26.02, abs=0.01)
+    assert metrics["psnr_8"] == pytest.approx(29.03, abs=0.01)  # half of each of the blocks there is off by 0.1
     assert metrics["thermal_mae_box_c"] == pytest.approx(1.0) and metrics["thermal_mae_c"] == pytest.approx(0.5)
 
 

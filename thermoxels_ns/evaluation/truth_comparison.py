@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,10 +23,12 @@ from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.morphology import fill_enclosed
 from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, TetMesh
+from thermoxels_ns.synthetic.raycast import first_surface
 from thermoxels_ns.synthetic.scene_folder import load_truth, visible_surface_points
 from thermoxels_ns.synthetic.scene_truth import SyntheticScene
 
 TOLERANCE_VOXELS = 1.5  # Surfaces closer than this agree, [voxels]
+DEPTH_TOLERANCE = 0.02  # Depths that differ by more, relative to the true one, are off
 COMMON_RESOLUTION = 128  # Voxels along the longest side of the exact box whose size `fscore_128` is measured with
 
 _SURFACE_POINTS = 20_000
@@ -306,6 +308,50 @@ def geometry_metrics(
         result["surface_distance_voxels"] = own.mean_distance / voxel_m
         result["surface_distance_m"] = own.mean_distance
     return result
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedRays:
+    """Rays of a held-out frame, and where a model has them end, [world units]."""
+
+    origins: FloatArray  # Shape (n, 3)
+    directions: FloatArray  # Unit vectors, shape (n, 3)
+    depth: FloatArray  # Distance along each ray at which it ends, shape (n,)
+    ends: BoolArray  # Whether it loses more than half of its light in the lattice's box, shape (n,)
+    in_box: BoolArray  # Whether it meets that box, shape (n,)
+
+
+def depth_metrics(
+    frames: Iterable[RenderedRays], lattice: Lattice, world_to_input: FloatArray, scene: SyntheticScene
+) -> dict[str, float]:
+    """Compare where rays end with where they meet the exact scene, pixel by pixel.
+
+    `world_to_input` is that of `geometry_metrics`.
+
+    Returns:
+        Of the rays that truly end on the scene's solid and meet the lattice's box: ``depth_error``, the median relative
+        error of their depth, and ``depth_off_share``, the share that is off by more than `DEPTH_TOLERANCE`. Of those
+        that truly end outside the box, on what stands around the scene or nowhere: ``sky_filled``, the share that ends
+        in the box. Figures without a ray are left out.
+    """
+    transform = check_similarity("world_to_input", world_to_input)
+    scale = float(np.cbrt(abs(np.linalg.det(transform[:3, :3]))))
+    errors, filled = [np.zeros(0)], [np.zeros(0, dtype=bool)]
+    for rays in frames:
+        origins = rays.origins @ transform[:3, :3].T + transform[:3, 3]
+        distance, own = first_surface(scene, origins, rays.directions @ transform[:3, :3].T / scale)
+        distance /= scale
+        met = own & rays.in_box
+        errors.append(np.abs(rays.depth[met] / distance[met] - 1.0))
+        with np.errstate(invalid="ignore"):  # at infinity along an axis
+            index = lattice.world_to_index(rays.origins + distance[:, None] * rays.directions)
+            outside = ~((index >= 0) & (index <= lattice.cell_shape)).all(axis=1)
+        filled.append(rays.ends[~own & outside])
+    error, sky = np.concatenate(errors), np.concatenate(filled)
+    result = {}
+    if len(error):
+        result = {"depth_error": float(np.median(error)), "depth_off_share": float((error > DEPTH_TOLERANCE).mean())}
+    return result | ({"sky_filled": float(sky.mean())} if len(sky) else {})
 
 
 def _scaled(name: str, value: Any, metres_per_unit: float) -> Any:

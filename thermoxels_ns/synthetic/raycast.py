@@ -46,10 +46,22 @@ def render_view(scene: SyntheticScene, pose: npt.ArrayLike, camera: Camera, samp
     shape = (camera.height, camera.width)
     directions = camera.directions(pose, samples_per_axis)
     rgb, temperature_c = _look(scene, origin, directions.reshape(-1, 3))
-    hits, first = _first_hits(scene, origin, camera.directions(pose).reshape(-1, 3))
-    depth = np.where(first == 0, hits[0].distance, np.inf).reshape(shape)
+    distance, own = first_surface(scene, origin, camera.directions(pose).reshape(-1, 3))
+    depth = np.where(own, distance, np.inf).reshape(shape)
     rgb, temperature_c = rgb.reshape(*shape, -1, 3).mean(axis=2), temperature_c.reshape(*shape, -1).mean(axis=2)
     return RenderedView(rgb, temperature_c, depth, np.isfinite(depth))
+
+
+def first_surface(
+    scene: SyntheticScene, origins: FloatArray, directions: FloatArray
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Find what rays meet first, in the scene or around it, from origins (n, 3) or (3,) [m] along unit vectors (n, 3).
+
+    Returns:
+        Distances (n,) [m], infinite where nothing is met, and whether it is the scene's own solid (n,).
+    """
+    hits, first = _first_hits(scene, origins, directions)
+    return np.min([one.distance for one in hits], axis=0), first == 0
 
 
 def visible_surface_points(

@@ -40,6 +40,7 @@ from thermoxels_ns.training.image_metrics import (
     lpips,
     lpips_available,
     psnr,
+    psnr_of_blocks,
     ssim,
     thermal_metrics,
 )
@@ -449,6 +450,7 @@ class ThermoxelsModel(Model):
             mask = batch["mask"].to(self.device).bool() if "mask" in batch else None
             whole = None if mask is None else mask.expand_as(target)
             metrics |= {"psnr": psnr(predicted, target, whole), "ssim": ssim(predicted, target, mask)}
+            metrics["psnr_8"] = psnr_of_blocks(predicted, target, mask)
             in_box = outputs["in_box"] > 0 if mask is None else (outputs["in_box"] > 0) & mask
             metrics["psnr_box"] = psnr(predicted, target, in_box.expand_as(target))
             if lpips_available():
