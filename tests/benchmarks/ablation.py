@@ -84,19 +84,19 @@ MECHANISMS: Mapping[str, Without] = {
     "photo-depth": Without((f"{_MODEL}photo-depth", "off")),
     "backdrop-rays": Without((_LOSS, "backdrop", "0")),
     "plain-backdrop": Without(
-        replaced=(("thermoxels_ns.multiview.evidence", "plain_backdrop", lambda _, depth: np.zeros(len(depth), bool)),)
+        replaced=(
+            ("thermoxels_ns.multiview.stereo", "plain_backdrop", lambda _, depth: 2 * (np.zeros(len(depth), bool),)),
+        )
     ),
     "walls-in-training": Without(replaced=(_NO_PLANES, _WHOLE_BACKDROP)),
     "walls-and-backdrop-rays": Without(replaced=((_CALLBACKS, "follow_walls", _nothing),)),
     "planes": Without(replaced=(_NO_PLANES,)),
     "backdrop-without-walls": Without(replaced=(_WHOLE_BACKDROP,)),
     "carve": Without((f"{_MODEL}carve", "off")),
-    "clear-cameras": Without(replaced=((_CALLBACKS, "clear_cameras", _nothing),)),
     "opened-rays": Without(replaced=((_CALLBACKS, "MOST_OPENED_RAYS", 1.0),)),
     "opaque-neighbours": Without(replaced=((_CALLBACKS, "OPAQUE_DEPTH", math.inf),)),
     "keep-ends": Without(replaced=((_CALLBACKS, "voxel_weights", _without_ends),)),
     "thinning": Without((f"{_MODEL}thin-threshold", "0")),
-    "box-ground": Without(replaced=((_BOX, "_standing", _nothing),)),
     "box-distant-points": Without(replaced=((_BOX, "_worth_keeping", lambda points, *_: np.ones(len(points), bool)),)),
     "surroundings": Without((f"{_MODEL}surroundings", "off")),
     "distortion": Without((_LOSS, "distortion", "0")),

@@ -50,7 +50,7 @@ def house(sky=SKY, wall=WALL, wall_warmth=np.nan, turns: int = 0) -> tuple[Photo
 
 
 def found(seen: Photographs) -> np.ndarray:
-    return plain_backdrop(seen, np.full(len(seen.colours), np.nan, np.float32))
+    return plain_backdrop(seen, np.full(len(seen.colours), np.nan, np.float32))[0]
 
 
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
@@ -82,7 +82,19 @@ def test_a_pixel_whose_depth_is_known_is_none():
     seen, _ = house()
     depth = np.full(len(seen.colours), np.nan, np.float32)
     depth[: WIDTH * 6] = 2.0  # the upper rows of the first photograph
-    assert not plain_backdrop(seen, depth)[: WIDTH * 6].any()
+    assert not plain_backdrop(seen, depth)[0][: WIDTH * 6].any()
+
+
+def test_what_looks_like_the_sky_beside_it_has_no_depth_of_its_own():
+    """An outline that is a pixel too wide: its depths on the sky go, and those on the wall stay."""
+    seen, is_sky = house()
+    outline = np.zeros((6, HEIGHT, WIDTH), bool)
+    sky = is_sky.reshape(6, HEIGHT, WIDTH)
+    outline[:, :-1] |= sky[:, :-1] & ~sky[:, 1:]
+    depth = np.where(outline.ravel() | ~is_sky, np.float32(2.0), np.float32(np.nan))
+    backdrop, beside = plain_backdrop(seen, depth)
+    assert beside[outline.ravel()].mean() > 0.9 and not beside[~is_sky].any()
+    assert not (backdrop & beside).any()
 
 
 def test_points_get_the_colour_that_photographs_show_there_and_not_that_of_the_sky():

@@ -11,11 +11,11 @@ from thermoxels_ns.training.model_config import MOST_VOXELS, ThermoxelsModelConf
 @pytest.mark.parametrize(
     ("voxels", "expected"),
     [
-        (113.0, (28, 56, 112)),
+        (113.0, (32, 64, 128)),
         (128.0, (32, 64, 128)),
-        (170.0, (44, 88, 176)),
+        (170.0, (40, 80, 160)),
         (5000.0, (48, 96, 192)),
-        (1.0, (4, 8, 16)),
+        (1.0, (8, 16, 32)),
     ],
 )
 def test_resolutions_grow_and_shrink_alike_and_up_to_a_limit(voxels, expected):

@@ -138,6 +138,7 @@ def _points_of_photographs(frames: Sequence[Frame]) -> tuple[FloatArray, int]:
         pinholes.append(photographs.pinhole(picture, mask, camera, frame.pose, _STEREO_SIDE))
     seen = photographs.gathered(pinholes, [frame.pose[:3, 3] for frame in frames])
     depths = stereo.depths_of(seen, views_to_contradict=0)  # a stray costs the box more than a depth that is lacking
+    depths = stereo.depths_before_backdrop(depths)[0]
     return stereo.feature_rays_to_depths(depths).points, len(frames)
 
 

@@ -19,14 +19,17 @@ _WIDEST, _ROUNDS = 0.3, 8
 """Difference up to which colours count in the first of some fits; it shrinks to the tolerance."""
 
 
-def plain_backdrop(photographs: Photographs, depth: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
-    """Which pixels show nothing but a plain backdrop, shape (pixels,).
+def plain_backdrop(
+    photographs: Photographs, depth: npt.NDArray[np.float32]
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """Which pixels show nothing but a plain backdrop, and which beside these look like it, both (pixels,).
 
     No photograph tells how far away a plain area is. It is taken for a backdrop if plain pixels lead up from it to the
     edge of the photograph (a wall ends at a roof, at windows, at the ground), and if its colour and temperature are
     those that most such pixels have, as a function of direction (harmonics of degree 2, fitted to the pixels that agree
     with it); and so are plain pixels that look the same and touch it, those below an object among them.
-    `depth`, (pixels,), is NaN where unknown.
+    `depth`, (pixels,), is NaN where unknown. What looks like the backdrop beside it has no depth of its own either: it
+    took that of an outline (drawn courtyard: 2.6 % of all depths lie on the sky, 0.6 % without those).
     """
     open_above, plain = (np.zeros(len(photographs.colours), dtype=bool) for _ in range(2))
     directions = np.empty((len(open_above), 3))
@@ -43,9 +46,10 @@ def plain_backdrop(photographs: Photographs, depth: npt.NDArray[np.float32]) -> 
         if turns is not None:
             open_above[pixels] = np.rot90(np.logical_and.accumulate(np.rot90(even, turns), axis=0), -turns).ravel()
     if open_above.mean() < 1e-3:
-        return np.zeros_like(open_above)
+        return np.zeros_like(open_above), np.zeros_like(open_above)
     values = np.column_stack((photographs.colours, photographs.thermal))
-    alike = plain & _alike(values, directions, open_above, photographs.saturated)
+    beside = _alike(values, directions, open_above, photographs.saturated)
+    alike = plain & beside
     open_above &= alike
     for (width, height), first in zip(photographs.sizes, photographs.firsts):
         pixels = slice(first, first + width * height)
@@ -53,7 +57,9 @@ def plain_backdrop(photographs: Photographs, depth: npt.NDArray[np.float32]) -> 
         label = np.asarray(cv2.connectedComponents(picture, connectivity=4)[1], dtype=np.int64).ravel()
         touched = np.bincount(label, open_above[pixels], label.max() + 1) > 0
         alike[pixels] &= touched[label]
-    return alike
+        around = cv2.dilate(alike[pixels].reshape(height, width).astype(np.uint8), np.ones((3, 3), np.uint8)).ravel()
+        beside[pixels] &= (around > 0) & ~alike[pixels]
+    return alike, beside
 
 
 def backdrop_without_walls(

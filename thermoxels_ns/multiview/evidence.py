@@ -14,7 +14,7 @@ from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.multiview.backdrop import plain_backdrop
 from thermoxels_ns.multiview.differences import matters, photograph_differences
 from thermoxels_ns.multiview.photographs import Photographs, read_photographs, thermal_at
-from thermoxels_ns.multiview.stereo import depths_of, feature_rays_to_depths, rays_through
+from thermoxels_ns.multiview.stereo import depths_before_backdrop, depths_of, feature_rays_to_depths, rays_through
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -55,7 +55,8 @@ def evidence_of_photographs(
     photographs = read_photographs(dataset, near)
     if photographs is None:
         return None
-    depths = depths_of(photographs, lo, hi, larger=read_photographs(dataset, near, longest_side=REFINED_SIDE))
+    larger = read_photographs(dataset, near, longest_side=REFINED_SIDE)
+    depths, backdrop = depths_before_backdrop(depths_of(photographs, lo, hi, larger=larger))
     few = "" if depths.share >= LEAST_SHARE else ", too few to tell anything"
     span_k = dataset.temperature_range.span_k
     found = photograph_differences(depths, thermal_at(dataset, photographs, depths.depth)) if gains or offsets else None
@@ -66,7 +67,8 @@ def evidence_of_photographs(
     if offsets and found is not None and matters(found.offset, found.offset_error, LEAST_OFFSET_K / span_k):
         offset, photographs = found.offset, found.without_offsets(photographs)
         say(f"thermal images are offset against each other by {np.std(offset) * span_k:.2f} K: corrected")
-    backdrop = plain_backdrop(photographs, depths.depth)
+    if log_gain is not None or offset is not None:
+        backdrop = plain_backdrop(photographs, depths.depth)[0]
     say(
         f"depths: {len(photographs)} photographs agree about {depths.share:.1%} of their pixels{few}; "
         f"a plain backdrop fills {backdrop.mean():.1%}; {time.perf_counter() - began:.1f} s"

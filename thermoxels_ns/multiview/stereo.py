@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.threads import run_ranges
+from thermoxels_ns.multiview.backdrop import plain_backdrop
 from thermoxels_ns.multiview.photographs import Photographs
 from thermoxels_ns.multiview.stereo_kernels import (
     aggregate,
@@ -75,6 +76,12 @@ class Depths:
     def share(self) -> float:
         """Share of the pixels whose depth is known."""
         return float(np.mean(np.isfinite(self.depth)))
+
+
+def depths_before_backdrop(depths: Depths) -> tuple[Depths, npt.NDArray[np.bool_]]:
+    """Depths without those that an outline gave to the backdrop beside it, and the backdrop's pixels, (pixels,)."""
+    backdrop, beside = plain_backdrop(depths.photographs, depths.depth)
+    return replace(depths, depth=np.where(beside, np.float32(np.nan), depths.depth)), backdrop
 
 
 def depths_of(

@@ -18,7 +18,7 @@ from thermoxels_ns.training.schedule import QUALITIES, schedule_for
 
 _STANDARD = schedule_for(*QUALITIES["standard"])
 MOST_VOXELS = 1.5  # Voxels along the longest side that a scene may ask for, relative to the last of the resolutions
-STEP_OF_COARSEST = 4  # Of so many voxels the coarsest resolution is a multiple
+STEP_OF_COARSEST = 8  # Of so many voxels the coarsest resolution is a multiple
 
 
 @dataclass(frozen=True)
