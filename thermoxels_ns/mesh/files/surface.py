@@ -35,13 +35,13 @@ def write_stl(path: Path | str, mesh: TetMesh) -> None:
 
     Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
     """
-    import trimesh
+    from trimesh import Trimesh
+    from trimesh.exchange.stl import export_stl
 
     path = check_suffix(path, ".stl")
     content = file_content(mesh)
     check_stl(mesh)
-    surface = trimesh.Trimesh(content.points_m, content.facets, process=False)
-    write_bytes(path, [trimesh.exchange.stl.export_stl(surface)])
+    write_bytes(path, [export_stl(Trimesh(content.points_m, content.facets, process=False))])
 
 
 def check_stl(mesh: TetMesh) -> None:
@@ -123,6 +123,7 @@ def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.
     Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
     """
     import trimesh
+    from trimesh.exchange.gltf import export_glb
 
     path = check_suffix(path, ".glb")
     content = file_content(mesh)
@@ -150,7 +151,7 @@ def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.
     )
     scene = trimesh.Scene()
     scene.add_geometry(triangles, node_name="surface", geom_name="surface", transform=turn)
-    write_bytes(path, [trimesh.exchange.gltf.export_glb(scene, tree_postprocessor=_finish)])
+    write_bytes(path, [export_glb(scene, tree_postprocessor=_finish)])
 
 
 def _light(colours: FloatArray) -> np.ndarray:
