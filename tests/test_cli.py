@@ -1,4 +1,5 @@
 import json
+import shlex
 import subprocess
 import sys
 import warnings
@@ -106,3 +107,9 @@ def test_the_entry_point_hands_the_status_to_the_shell(tmp_path):
     assert done.returncode == 1
     assert done.stderr.startswith("Error: output folder: expected a folder that can be written to")
     assert "Traceback" not in done.stderr
+
+
+def test_a_reader_that_has_seen_enough_ends_the_help_without_a_traceback():
+    command = f"{shlex.quote(sys.executable)} -m thermoxels_ns.cli synthetic --help | head -1"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
+    assert done.stdout.startswith("usage: thermoxels synthetic") and done.stderr == ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 # Only light imports at the top, so that ``--help`` answers at once.
+import os
 import shlex
 import sys
 import warnings
@@ -123,7 +124,15 @@ def entrypoint() -> None:
     """Entry point of the console script."""
     if not sys.warnoptions:  # whoever sets filters wants to see what they let through
         warnings.filterwarnings("ignore", _NEWS_FOR_PROGRAMMERS, FutureWarning)
-    sys.exit(main())
+    try:
+        try:
+            status = main()
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:  # who read the output has seen enough, as head has
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        status = 1
+    sys.exit(status)
 
 
 def _complain(heading: str, message: str = "") -> None:

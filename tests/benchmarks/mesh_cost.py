@@ -37,7 +37,8 @@ from thermoxels_ns.core.lattice import CORNER_OFFSETS, Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, Views
 from thermoxels_ns.evaluation.truth_comparison import sample_facets
 from thermoxels_ns.mesh.build import BuiltMesh, MeshOptions, build_mesh
-from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas
+from thermoxels_ns.mesh.quality.checks import facet_areas
+from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
 from thermoxels_ns.mesh.voxel_tets import KUHN_PATTERN
@@ -144,8 +145,8 @@ def measure(name: str, voxels: int, mode: Mode, repeats: int) -> dict[str, Any]:
         "mean_distance_voxels": float(distance.mean()) / snapshot.lattice.voxel_size,
         "hausdorff_voxels": float(distance.max()) / snapshot.lattice.voxel_size,
         "iou": inside / (quality.volume_m3 + body.volume - inside),
-        "dihedral_min": quality.min_dihedral_deg,
-        "dihedral_max": quality.max_dihedral_deg,
+        "dihedral_min": quality.dihedral_range_deg[0],
+        "dihedral_max": quality.dihedral_range_deg[1],
     }
 
 

@@ -13,10 +13,10 @@ from thermoxels_ns.capture.scene_writer import TRACKS_NAME, Scene, scene_names, 
 from thermoxels_ns.capture.sfm.gravity import Up
 from thermoxels_ns.capture.sfm.metric_scale import MetricScale
 from thermoxels_ns.capture.stage_cache import prepare_output
-from thermoxels_ns.commands.scene_scale import scale_from_scene_file, up_from_scene_file
 from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.scene_file import read_scene_file
+from thermoxels_ns.data.scene_scale import scale_from_scene_file, up_from_scene_file
 from thermoxels_ns.data.sparse_tracks import read_tracks
 from thermoxels_ns.radiometry.thermal_pixels import read_thermal_file
 

@@ -7,7 +7,7 @@ from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, centres
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.build import build_mesh
-from thermoxels_ns.mesh.quality.checks import check_mesh
+from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 
 BODIES = ("sphere", "torus", "cylinder", "slab at 30 degrees", "slab at 45 degrees")
@@ -33,7 +33,7 @@ def errors(name: str, cells: int, offset: tuple[float, float, float], kind: str 
     field = GridSnapshot(lattice, at_corners, 20.0 * seen, seen, density(centres(*(voxels,) * 3)))
     built = build_mesh(field, SolidSelection(density_threshold=threshold, close_gaps=0), np.eye(4))
     quality = check_mesh(built.mesh)
-    angles = quality.min_dihedral_deg, quality.max_dihedral_deg
+    angles = quality.dihedral_range_deg[0], quality.dihedral_range_deg[1]
     return quality.area_m2 / shape.area - 1.0, quality.volume_m3 / shape.volume - 1.0, *angles
 
 

@@ -6,7 +6,8 @@ from scipy import sparse
 from scipy.sparse.linalg import cg
 
 from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, stiffness, tet_mesh
-from thermoxels_ns.mesh.quality.checks import MeshQuality, check_mesh, facet_areas, facet_normals
+from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
+from thermoxels_ns.mesh.quality.report import QualityReport, check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 
@@ -15,7 +16,7 @@ SHARP = tuple(name for name in SHAPES if SHAPES[name].sharp_edges)
 
 
 @cache
-def quality(name: str, cells: int, voxels_to_one: float = 1.5) -> MeshQuality:
+def quality(name: str, cells: int, voxels_to_one: float = 1.5) -> QualityReport:
     return check_mesh(tet_mesh(stuff(SHAPES[name].level(cells, voxels_to_one)), 2.0 / cells))
 
 
@@ -62,7 +63,7 @@ def test_bodies_in_48_voxels(name):
     chamfers = 0.40 * shape.sharp_edges * (2.0 / 48)
     assert shape.area * 0.99 - chamfers <= found.area_m2 <= shape.area * 1.01
     assert found.num_non_manifold_edges == 0
-    assert ANGLE_BOUNDS_DEG[0] <= found.min_dihedral_deg <= found.max_dihedral_deg <= ANGLE_BOUNDS_DEG[1]
+    assert ANGLE_BOUNDS_DEG[0] <= found.dihedral_range_deg[0] <= found.dihedral_range_deg[1] <= ANGLE_BOUNDS_DEG[1]
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,14 @@ import torch
 import tyro
 from PIL import Image
 
+from tests.support.scene_folders import write_counts
 from thermoxels_ns.core.errors import SceneError, ThermalFileError
 from thermoxels_ns.core.lattice import input_from_world
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.data.dataparser import ThermalDataParserConfig
 from thermoxels_ns.data.dataset import ThermalDataset
 from thermoxels_ns.data.scene_box import box_of_cameras, box_of_points
-from thermoxels_ns.data.scene_file import read_scene_file
+from thermoxels_ns.data.scene_file import BOUNDS_NAME, read_scene_file
 from thermoxels_ns.mesh.build import apply_transform
 
 
@@ -137,12 +138,17 @@ def test_train_and_eval_share_world_and_range(scene_folder):
     assert train.metadata["temperature_range"] == evaluate.metadata["temperature_range"] == TemperatureRange(10, 20)
 
 
-def test_temperature_range_from_bounds_even_if_swapped(scene_folder):
+def test_temperature_range_from_bounds_even_if_swapped(scene_folder, capsys):
     scene = scene_folder()
     assert parse(scene.path).metadata["temperature_range"] == TemperatureRange(10.0, 30.0)
-    swapped = {"absolute_min_temperature": 30.0, "absolute_max_temperature": 10.0}
-    (scene.path / "temperature_bounds.json").write_text(json.dumps(swapped))
+    write_bounds(30.0, 10.0)(scene)
     assert parse(scene.path).metadata["temperature_range"] == TemperatureRange(10.0, 30.0)
+    assert "read as 10 to 30 C" in " ".join(capsys.readouterr().out.split())
+
+
+def write_bounds(low, high):
+    names = ("absolute_min_temperature", "absolute_max_temperature")
+    return lambda scene: (scene.path / BOUNDS_NAME).write_text(json.dumps(dict(zip(names, (low, high)))))
 
 
 # --- Boxes that are not given ---
@@ -353,7 +359,7 @@ def test_no_json_and_broken_json(scene_folder, tmp_path):
         (lambda f: f.pop("transform_matrix"), "frame 3.*transform_matrix"),
         (lambda f: f["transform_matrix"][1].__setitem__(3, float("nan")), "frame 3.*NaN"),
         (lambda f: f.update(transform_matrix=[[1, 2], [3, 4]]), "frame 3.*4 x 4"),
-        (lambda f: f.update(transform_matrix=(2 * np.eye(4)).tolist()), "frame 3.*rotation"),
+        (lambda f: f.update(transform_matrix=np.diag([2.0, 2.0, 2.0, 1.0]).tolist()), "frame 3.*rotation"),
         (lambda f: f.update(thermal_transform_matrix=np.eye(4).tolist()), "frame 3.*thermal_camera"),
         (lambda f: f.update(file_path="images/gone.png"), r"frame 3.*gone\.png"),
         (lambda f: f.pop("file_path"), "frame 3.*file_path"),
@@ -492,6 +498,73 @@ def test_bad_bounds_and_units(scene_folder):
     (scene.path / "temperature_bounds.json").unlink()
     with pytest.raises(SceneError, match="thermal_unit"):
         parse(scene.path)
+
+
+def frame_3(change):
+    return lambda scene: change(scene.meta["frames"][3])
+
+
+def bounds_that_are_a_folder(scene) -> None:
+    (scene.path / BOUNDS_NAME).unlink()
+    (scene.path / BOUNDS_NAME).mkdir()
+
+
+def one_of_another_size(scene) -> None:
+    Image.fromarray(np.arange(12 * 9, dtype=np.uint16).reshape(9, 12)).save(
+        scene.path / "thermal" / "frame_train_003.png"
+    )
+
+
+def all_in(suffix: str, values: np.ndarray):
+    def change(scene) -> None:
+        for frame in scene.meta["frames"]:
+            frame["thermal_file_path"] = f"thermal/{Path(frame['file_path']).stem}{suffix}"
+            write_counts(scene.path / frame["thermal_file_path"], values)
+
+    return change
+
+
+def a_name_of_two_lines(scene) -> None:
+    scene.meta["frames"][3]["file_path"] = "images/two\nlines.png"
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (write_bounds(-300.0, 20.0), BOUNDS_NAME),
+        (write_bounds(10.0, math.inf), BOUNDS_NAME),
+        (write_bounds("10", 20.0), BOUNDS_NAME),
+        (bounds_that_are_a_folder, f"{BOUNDS_NAME}: .* a folder"),
+        (lambda scene: scene.meta.update(metres_per_unit=-1), "metres_per_unit"),
+        (lambda scene: scene.meta.update(metres_per_unit="x"), "metres_per_unit"),
+        (lambda scene: scene.meta.update(up=[0, 0, 0]), "up"),
+        (lambda scene: scene.meta.update(up="z"), "up"),
+        (
+            lambda scene: scene.meta.update(thermal_unit={"celsius_per_count": True, "celsius_offset": 0}),
+            "thermal_unit",
+        ),
+        (frame_3(lambda f: f["transform_matrix"].__setitem__(3, [0, 0, 0, 2])), "frame 3.*last row"),
+        (frame_3(lambda f: f["transform_matrix"][0].__setitem__(3, True)), "frame 3.*True"),
+        (frame_3(lambda f: f["transform_matrix"][0].__setitem__(3, "abc")), "frame 3.*'abc'"),
+        (frame_3(lambda f: f.update(w=24.5)), r"frame 3.*24\.5"),
+        (one_of_another_size, "frame_train_003.*12 x 9"),
+        (all_in(".tiff", np.eye(18, 24, dtype=np.uint16)), "thermal_unit"),
+        (all_in(".npy", np.eye(18, 24) + 293.15), f"{BOUNDS_NAME}.*293.15 C"),
+        (all_in(".png", np.full((18, 24), 65535, np.uint16)), "frame_eval_002.png: .*65535"),
+        (lambda scene: scene.meta.update(test_filenames=[]), "test_filenames"),
+        (lambda scene: scene.meta.update(test_filenames=["images/gone.png"]), r"test_filenames: .*gone\.png"),
+        (a_name_of_two_lines, r"frame 3 \(images/two\\nlines\.png\)"),
+    ],
+)
+def test_what_no_scene_means_is_refused(scene_folder, change, named):
+    scene = (
+        scene_folder(names=[f"frame_{number:03d}" for number in range(10)]) if "filenames" in named else scene_folder()
+    )
+    change(scene)
+    scene.rewrite()
+    with pytest.raises(SceneError, match=named) as caught:
+        parse(scene.path)
+    assert "\n" not in str(caught.value)
 
 
 def test_bad_options(scene_folder):

@@ -28,8 +28,8 @@ with XDMFFile(MPI.COMM_WORLD, folder + "/house.xdmf", "r") as file:
 one = fem.Constant(mesh, PETSc.ScalarType(1.0))
 dx = ufl.Measure("dx", domain=mesh, subdomain_data=regions)
 ds = ufl.Measure("ds", domain=mesh, subdomain_data=patches)
-volumes = [fem.assemble_scalar(fem.form(one * dx(number))) for number in range(num_regions)]
-areas = [fem.assemble_scalar(fem.form(one * ds(number))) for number in range(num_patches)]
+volumes = [fem.assemble_scalar(fem.form(one * dx(number + 1))) for number in range(num_regions)]
+areas = [fem.assemble_scalar(fem.form(one * ds(number + 1))) for number in range(num_patches)]
 
 space = fem.FunctionSpace(mesh, ("CG", 1))
 points = space.tabulate_dof_coordinates()

@@ -5,7 +5,8 @@ import pytest
 
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh, check_similarity
-from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas
+from thermoxels_ns.mesh.quality.checks import facet_areas
+from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 
 DENSE = SolidSelection(close_gaps=0, density_threshold=0.5)
@@ -40,7 +41,7 @@ def test_rotated_scaled_and_mirrored_meshes_stay_valid(snapshot_of, seed, mirror
     mesh, solid = built.mesh, built.solid
     quality = check_mesh(mesh)  # positive volumes, facets outwards
     assert quality.volume_m3 == pytest.approx(solid.cells.sum() * (0.25 * 3.0) ** 3, rel=1e-12)
-    assert quality.min_tet_volume_m3 == pytest.approx((0.25 * 3.0) ** 3 / 6, rel=1e-9)
+    assert quality.criteria[0].figure == pytest.approx((0.25 * 3.0) ** 3 / 6, rel=1e-9)
 
 
 def test_points_are_transformed_lattice_corners(snapshot_of):
@@ -187,7 +188,7 @@ def test_conforming_mesh_follows_the_level_set(snapshot_of, mirror):
     radius = 5.3 * 0.5 * 3.0
     assert quality.area_m2 == pytest.approx(4 * np.pi * radius**2, rel=0.03)
     assert quality.volume_m3 == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.03)
-    assert quality.min_dihedral_deg > 10.7 and quality.max_dihedral_deg < 164.8
+    assert quality.dihedral_range_deg[0] > 10.7 and quality.dihedral_range_deg[1] < 164.8
 
 
 @pytest.mark.parametrize("mode", MODES)

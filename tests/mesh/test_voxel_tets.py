@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
-from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas
+from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.quality.face_count import boundary_facets
+from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE
 from thermoxels_ns.mesh.voxel_tets import boundary_tags, kuhn_tets, lattice_edges, voxel_facets
@@ -47,8 +48,8 @@ def test_volume_area_and_validity(mesh_of_cells, name):
     assert quality.volume_m3 == pytest.approx(cells.sum() * 0.5**3, rel=1e-14)
     assert quality.num_facets == 2 * exposed_faces(cells)
     assert quality.area_m2 == pytest.approx(exposed_faces(cells) * 0.5**2, rel=1e-14)
-    assert quality.min_tet_volume_m3 == pytest.approx(0.5**3 / 6, rel=1e-14)
-    assert (quality.min_dihedral_deg, quality.max_dihedral_deg) == pytest.approx((45.0, 90.0))
+    assert quality.criteria[0].figure == pytest.approx(0.5**3 / 6, rel=1e-14)
+    assert (quality.dihedral_range_deg[0], quality.dihedral_range_deg[1]) == pytest.approx((45.0, 90.0))
 
 
 @pytest.mark.parametrize("seed", range(25))

@@ -1,3 +1,4 @@
+import struct
 from pathlib import Path
 
 import cv2
@@ -5,10 +6,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from thermoxels_ns.capture.folder_scan import identify
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.data.dataparser import survey_thermal_files
 from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
 from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, read_thermal_file
+from thermoxels_ns.radiometry.thermogram import read_thermogram
 
 BOUNDS = ThermalUnit.bounds(-10.0, 40.0)
 COUNTS = ThermalUnit.linear(0.025, -100.0)
@@ -20,7 +23,7 @@ def save(path: Path, pixels: np.ndarray) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("suffix", "kind"), [(".png", np.uint16), (".tiff", np.uint16), (".png", np.uint8)])
+@pytest.mark.parametrize(("suffix", "kind"), [(".png", np.uint16), (".png", np.uint8)])
 def test_bounds_keep_every_step_of_eight_and_sixteen_bits(tmp_path, suffix, kind):
     counts = np.arange(np.iinfo(kind).max + 1, dtype=kind).reshape(16, -1)
     got = read_thermal_file(save(tmp_path / f"a{suffix}", counts), BOUNDS).temperature_c
@@ -38,18 +41,17 @@ def test_equal_channels_count_as_grey_and_keep_sixteen_bits(tmp_path):
     counts = np.array([[0, 1, 65535], [40000, 40001, 3]], np.uint16)
     for name in ("deep.png", "deep.tiff"):
         assert cv2.imwrite(str(tmp_path / name), np.repeat(counts[..., None], 3, axis=2))
-        np.testing.assert_allclose(
-            read_thermal_file(tmp_path / name, BOUNDS).temperature_c, -10 + counts / 65535.0 * 50, atol=4e-6
-        )
         unsaturated = read_thermal_file(tmp_path / name, COUNTS).temperature_c[1]
         np.testing.assert_allclose(unsaturated, 0.025 * counts[1] - 100.0, atol=4e-5)
+    spanned = read_thermal_file(tmp_path / "deep.png", BOUNDS).temperature_c
+    np.testing.assert_allclose(spanned, -10 + counts / 65535.0 * 50, atol=4e-6)
     eight = np.array([[1, 2], [3, 255]], np.uint8)
     path = save(tmp_path / "grey.png", np.repeat(eight[..., None], 3, axis=2))
     np.testing.assert_allclose(read_thermal_file(path, BOUNDS).temperature_c, -10 + eight / 255.0 * 50, atol=4e-6)
 
 
 def test_transparent_pixels_are_no_data(tmp_path):
-    pixels = np.full((2, 2, 4), 255, np.uint8)
+    pixels = np.full((2, 2, 4), 200, np.uint8)
     pixels[0, 1, 3] = 0
     read = read_thermal_file(save(tmp_path / "a.png", pixels), BOUNDS)
     assert np.isnan(read.temperature_c[0, 1]) and read.report.nan == 1
@@ -192,3 +194,49 @@ def test_real_counts(shared_data):
     read = read_thermal_file(sorted((shared_data / "arco" / "thermal").glob("*.tiff"))[0], COUNTS)
     assert read.temperature_c.shape == (512, 640) and read.report.masked == 0
     assert 0 < read.temperature_c.min() < np.median(read.temperature_c) < 25
+
+
+@pytest.mark.parametrize("big_endian", [False, True])
+def test_a_tiff_of_64_bit_numbers_is_celsius(tmp_path, big_endian):
+    values = np.array([[1.25, -3.5, 20.0], [np.nan, 7.0, 8.0]])
+    path = tmp_path / "a.tiff"
+    if big_endian:
+        write_big_endian_tiff(path, values)
+    else:
+        assert cv2.imwrite(str(path), values)
+    for got in (read_thermal_file(path, BOUNDS).temperature_c, read_thermogram(path).temperature_c):
+        np.testing.assert_array_equal(got, values.astype(np.float32))
+    assert identify(path, tmp_path).role == "thermal"
+
+
+def write_big_endian_tiff(path: Path, values: np.ndarray) -> None:
+    """One strip without compression."""
+    height, width = values.shape
+    tags = {256: width, 257: height, 258: 64, 259: 1, 262: 1, 273: 0, 277: 1, 278: height, 279: values.nbytes, 339: 3}
+    tags[273] = 8 + 2 + 12 * len(tags) + 4
+    entries = b"".join(struct.pack(">HHII", tag, 4, 1, value) for tag, value in tags.items())
+    head = b"MM\0*" + struct.pack(">IH", 8, len(tags))
+    path.write_bytes(head + entries + bytes(4) + values.astype(">f8").tobytes())
+
+
+@pytest.mark.parametrize(
+    ("name", "pixels", "named"),
+    [
+        ("a.tiff", np.full((3, 3), 9, np.int32), "thermal_unit"),
+        ("a.tiff", np.full((3, 3), 9, np.uint16), "thermal_unit"),
+        ("a.png", np.full((3, 3), 65535, np.uint16), "65535"),
+        ("a.png", np.full((3, 3), 255, np.uint8), "255"),
+    ],
+)
+def test_counts_that_bounds_do_not_explain_are_refused(tmp_path, name, pixels, named):
+    with pytest.raises(ThermalFileError, match=rf"{name}: .*{named}"):
+        read_thermal_file(save(tmp_path / name, pixels), BOUNDS)
+
+
+def test_a_damaged_header_of_an_array_is_not_quoted(tmp_path):
+    np.save(tmp_path / "a.npy", np.ones((3, 3)))
+    whole = (tmp_path / "a.npy").read_bytes()
+    (tmp_path / "a.npy").write_bytes(whole.replace(b"descr", b"d\n\xffcr"))
+    with pytest.raises(ThermalFileError, match=r"a\.npy: ") as caught:
+        read_thermal_file(tmp_path / "a.npy", CELSIUS)
+    assert "fortran_order" not in str(caught.value)

@@ -14,7 +14,7 @@ from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.effects import Convection, Effect, FixedTemperature, Radiation
 from thermoxels_ns.heat.materials import Material
-from thermoxels_ns.mesh.quality.checks import check_mesh
+from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 
 
@@ -30,7 +30,7 @@ def test_these_meshes_do_have_obtuse_angles() -> None:
 def test_one_of_them_is_as_bad_as_is_promised() -> None:
     quality = check_mesh(body(AT_THE_BOUNDS))
     low, high = ANGLE_BOUNDS_DEG
-    assert low <= quality.min_dihedral_deg <= low + 0.2 and high - 0.2 <= quality.max_dihedral_deg <= high
+    assert low <= quality.dihedral_range_deg[0] <= low + 0.2 and high - 0.2 <= quality.dihedral_range_deg[1] <= high
 
 
 @pytest.mark.parametrize("shape", [*BLOCKS, "sphere", "slab at 30 degrees", AT_THE_BOUNDS])

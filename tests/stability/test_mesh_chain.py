@@ -9,7 +9,8 @@ from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot, RayEvidence
 from thermoxels_ns.mesh.boundary.tags import LEAST_AREA_FACTOR
 from thermoxels_ns.mesh.build import BuiltMesh, MeshOptions, build_mesh
-from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas, facet_normals
+from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
+from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 
 MODES = ["conforming", "voxel"]
@@ -79,7 +80,7 @@ def assert_sound(built: BuiltMesh, mode: str) -> None:
     quality = check_mesh(mesh)  # volumes above 0, conforming, closed
     assert boundary is not None and mesh.colour is not None
     low, high = (10.7, 164.8) if mode == "conforming" else (45.0 - 1e-6, 90.0 + 1e-6)
-    assert low <= quality.min_dihedral_deg and quality.max_dihedral_deg <= high
+    assert low <= quality.dihedral_range_deg[0] and quality.dihedral_range_deg[1] <= high
     assert mesh.observed.any()
     assert mesh.temperature_c.min() >= 20.0 - 1e-6 and mesh.temperature_c.max() <= 21.0 + 1e-6
     assert np.linalg.norm(boundary.normal, axis=1) == pytest.approx(np.ones(len(mesh.facets)))

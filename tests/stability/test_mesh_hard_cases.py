@@ -7,7 +7,7 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.lattice import Lattice
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.build import MeshOptions, build_mesh
-from thermoxels_ns.mesh.quality.checks import check_mesh
+from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.solid.voxels import SolidSelection, select_solid
 
 VOXEL = MeshOptions("voxel")

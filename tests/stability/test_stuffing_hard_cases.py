@@ -10,14 +10,15 @@ from tests.support.stuffed_shapes import (
     tet_mesh,
     turn,
 )
-from thermoxels_ns.mesh.quality.checks import MeshQuality, check_mesh, facet_areas
+from thermoxels_ns.mesh.quality.checks import facet_areas
+from thermoxels_ns.mesh.quality.report import QualityReport, check_mesh
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
 
 
-def sound(solid: StuffedSolid) -> MeshQuality:
+def sound(solid: StuffedSolid) -> QualityReport:
     """Measures of a mesh that is conforming, closed and within the promised angles."""
     quality = check_mesh(tet_mesh(solid))
-    assert ANGLE_BOUNDS_DEG[0] <= quality.min_dihedral_deg <= quality.max_dihedral_deg <= ANGLE_BOUNDS_DEG[1]
+    assert ANGLE_BOUNDS_DEG[0] <= quality.dihedral_range_deg[0] <= quality.dihedral_range_deg[1] <= ANGLE_BOUNDS_DEG[1]
     return quality
 
 

@@ -7,9 +7,8 @@ import numpy as np
 
 from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_meshes import Nodal, box_mesh
-from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, tet_mesh
+from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, tet_mesh, volumes_and_angles
 from thermoxels_ns.fem.solution import HeatSolution
-from thermoxels_ns.mesh.quality.checks import volumes_and_angles
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 from thermoxels_ns.mesh.tetrahedra import Boundary, TetMesh
 

@@ -7,6 +7,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from thermoxels_ns.core.arrays import FloatArray, IntArray
+from thermoxels_ns.mesh.quality.tet_shapes import shapes_in_chunks
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid
 from thermoxels_ns.mesh.tetrahedra import FACET_BOX, FACET_SURFACE, TetMesh
 
@@ -110,3 +112,14 @@ SHAPES: dict[str, Shape] = {
     "slab at 30 degrees": _slab(30.0),
     "slab at 45 degrees": _slab(45.0),
 }
+
+
+def volumes_and_angles(points: FloatArray, tets: IntArray) -> tuple[FloatArray, float, float]:
+    """Signed volumes (t,), [m^3], smallest and largest dihedral angle, [degrees]; 0 at a face without area."""
+    volumes = np.empty(len(tets))
+    low, high = 1.0, -1.0
+    for which, shapes in shapes_in_chunks(points, tets):
+        volumes[which] = shapes.volumes
+        cosines = shapes.dihedral_cosines()
+        low, high = min(low, float(cosines.min())), max(high, float(cosines.max()))
+    return volumes, float(np.degrees(np.arccos(high))), float(np.degrees(np.arccos(low)))

@@ -222,7 +222,8 @@ def test_an_interrupted_write_leaves_no_scene_that_loads(tmp_path: Path) -> None
         ({"imperfections": Imperfections(noise_k=-1.0)}, "noise_k"),
         ({"imperfections": Imperfections(drift_k=float("nan"))}, "drift_k"),
         ({"num_train": 0}, "number of views"),
-        ({"width": 0}, "width.*at least 1"),
+        ({"width": 0}, "^width: "),
+        ({"height": 1_000_000}, "^height: "),
     ],
 )
 def test_bad_options_say_what_is_wrong_and_write_nothing(tmp_path: Path, options: dict, match: str) -> None:

@@ -1,10 +1,12 @@
 import time
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import tyro
+import yaml
 from nerfstudio.configs.base_config import ViewerConfig
 from numba import njit
 
@@ -153,11 +155,48 @@ def test_a_quality_sets_resolution_and_length_and_leaves_the_defaults_alone(qual
 )
 def test_the_viewer_listens_on_this_machine_unless_told_otherwise(monkeypatch, words, host):
     """ns-viewer replaces the viewer of a training by that of its own command line."""
-    monkeypatch.setattr("sys.argv", ["ns-viewer", *words])
     config = deepcopy(thermoxels.config)
+    monkeypatch.setattr("sys.argv", ["ns-viewer", *words])
     assert config.viewer.websocket_host == "127.0.0.1"
     config.viewer = ViewerConfig()
     assert config.viewer.websocket_host == host
+
+
+@pytest.mark.parametrize(
+    ("words", "host"),
+    [
+        ((), "127.0.0.1"),
+        (("--viewer.websocket-host", "192.168.0.1"), "192.168.0.1"),
+        (("--viewer.websocket_host=192.168.0.1",), "192.168.0.1"),
+    ],
+)
+def test_a_config_does_not_open_the_viewer(monkeypatch, words, host):
+    monkeypatch.setattr("sys.argv", ["ns-train", "--load-config", "config.yml", *words])
+    text = yaml.dump(thermoxels.config).replace("websocket_host: 127.0.0.1", "websocket_host: 0.0.0.0")
+    config = yaml.load(text, Loader=yaml.Loader)
+    assert "0.0.0.0" in text and config.viewer.websocket_host == host
+    assert replace(config, viewer=thermoxels.config.viewer) == replace(
+        thermoxels.config, viewer=thermoxels.config.viewer
+    )
+
+
+@pytest.mark.parametrize("name", ["experiment_name", "timestamp", "method_name", "relative_model_dir"])
+@pytest.mark.parametrize("text", ["../../out", "..", "a/b", "/tmp", "a\\b"])
+def test_a_run_stays_in_the_output_folder(name, text):
+    """Typed options and a config.yml set the same fields."""
+    config = deepcopy(thermoxels.config)
+    setattr(config, name, Path(text) if name == "relative_model_dir" else text)
+    with pytest.raises(OutputError, match=f"^{name}: "):
+        config.get_checkpoint_dir()
+
+
+@pytest.mark.parametrize(("data", "name"), [(".", "scene"), ("../scene", "scene"), ("..", "above")])
+def test_a_run_is_named_by_the_folder_of_its_scene(tmp_path, monkeypatch, data, name):
+    (tmp_path / "above" / "scene").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "above" / "scene")
+    config = deepcopy(thermoxels.config)
+    config.pipeline.datamanager.data = Path(data)
+    assert config.get_base_dir().parts[:3] == ("outputs", name, "thermoxels")
 
 
 @pytest.mark.parametrize(

@@ -14,11 +14,12 @@ from typing import Literal
 from PIL import Image
 
 from thermoxels_ns.capture.photograph import read_photograph_facts
-from thermoxels_ns.core.errors import SceneError, ThermoxelsError
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError, printable
 from thermoxels_ns.radiometry.decoders import check_file_size, check_thermal_size, errors_name
 from thermoxels_ns.radiometry.dji_rjpeg import is_dji_rjpeg
 from thermoxels_ns.radiometry.exif import read_exif_facts
 from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
+from thermoxels_ns.radiometry.thermal_pixels import size_of_double_tiff
 
 Role = Literal["photograph", "thermal", "both", "thermal picture"]
 """thermal picture: its name says thermal, but it holds colours and no temperatures."""
@@ -31,7 +32,6 @@ _THERMAL_WORDS = frozenset({"thermal", "radiometric", "temperature", "temperatur
 _PHOTOGRAPH_WORDS = frozenset({"visible", "vis", "rgb", "colour", "color", "photo", "photos", "optical"})
 _OTHER_WORDS = frozenset({"image", "images", "raw"})
 ROLE_WORDS = _THERMAL_WORDS | _PHOTOGRAPH_WORDS | _OTHER_WORDS
-_UNPRINTED = ("Cc", "Cs")  # kinds of characters that break a line or a terminal, or are bytes that no encoding explains
 
 
 @dataclass(frozen=True)
@@ -134,22 +134,14 @@ def files_below(folder: Path, without: Sequence[Path] = ()) -> tuple[list[Path],
 
 
 def shown_name(path: Path) -> str:
-    """Name of a file as it can be printed and written: what is no letter in any alphabet is escaped.
-
-    >>> shown_name(Path("two\\nlines.jpg"))
-    'two\\\\nlines.jpg'
-    """
-    return "".join(
-        each.encode("unicode_escape").decode("ascii") if unicodedata.category(each) in _UNPRINTED else each
-        for each in path.name
-    )
+    """Name of a file as it can be printed and written."""
+    return printable(path.name)
 
 
 def _check_name(name: Path) -> None:
-    if any(unicodedata.category(each) in _UNPRINTED for each in str(name)):
-        shown = "/".join(shown_name(Path(part)) for part in name.parts)
+    if printable(str(name)) != str(name):
         got = "one with line breaks, control characters or bytes of no encoding"
-        raise SceneError(shown, expected="a name that can be printed", got=got, remedy="Rename the file.")
+        raise SceneError(str(name), expected="a name that can be printed", got=got, remedy="Rename the file.")
 
 
 def identify(path: Path, folder: Path) -> CameraFile:
@@ -173,6 +165,8 @@ def _identify(path: Path, folder: Path) -> CameraFile:
             head = stream.read(2**18)
         if is_dji_rjpeg(head) or is_dji_rjpeg(path.read_bytes()):
             return CameraFile(path, "thermal", read_photograph_facts(path).taken_at, dji=True)
+    elif size_of_double_tiff(path) is not None:
+        return CameraFile(path, "thermal", None)
     else:
         with errors_name(path, "a TIFF or PNG that can be decoded"), Image.open(path) as image:
             # One channel of more than 8 bits, which no photograph is.

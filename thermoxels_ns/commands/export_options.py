@@ -8,14 +8,14 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
-from thermoxels_ns.commands.scene_scale import (
+from thermoxels_ns.core.errors import HeatError, MeshError
+from thermoxels_ns.data.scene_scale import (
     SceneScale,
     choose_scale,
     scale_from_known_distance,
     scale_from_option,
     up_from_scene_file,
 )
-from thermoxels_ns.core.errors import HeatError, MeshError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -90,9 +90,8 @@ def export_snapshot(
     from thermoxels_ns.mesh.files.abaqus import HeatStep
     from thermoxels_ns.mesh.files.formats import MESH_FORMATS, check_format, write_mesh
     from thermoxels_ns.mesh.files.vtu import summary_text, write_summary
-    from thermoxels_ns.mesh.quality.checks import check_mesh
     from thermoxels_ns.mesh.quality.picture import picture_of_quality
-    from thermoxels_ns.mesh.quality.report import quality_report
+    from thermoxels_ns.mesh.quality.report import check_mesh
     from thermoxels_ns.reports.mesh_pictures import add_support, draw_heat, draw_mesh
 
     checked = check_options(options)
@@ -110,9 +109,8 @@ def export_snapshot(
     for suffix in suffixes:
         check_format(f"{_MESH_STEM}{suffix}", mesh)
     voxel_size = snapshot.lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(to_mesh[:3, :3]))))
-    check_mesh(mesh)
     unit = "input unit" if scale is None else "m"
-    report = quality_report(mesh, options.boundary, built.observed_range_c, length_unit=unit)
+    report = check_mesh(mesh, options.boundary, built.observed_range_c, length_unit=unit)
     say(f"Up: {', '.join(f'{value:.3g}' for value in up)}. {up_source}")
     _tell(built, report.volume_m3, unit, None if scale is None else voxel_size, say)
 

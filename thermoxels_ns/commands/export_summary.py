@@ -15,7 +15,7 @@ from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 
 if TYPE_CHECKING:
-    from thermoxels_ns.commands.scene_scale import SceneScale
+    from thermoxels_ns.data.scene_scale import SceneScale
     from thermoxels_ns.fem.problem import TimeSteps
     from thermoxels_ns.fem.solution import HeatSolution
     from thermoxels_ns.heat.materials import Material

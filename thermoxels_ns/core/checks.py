@@ -7,11 +7,12 @@ import math
 import os
 import re
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
@@ -20,10 +21,19 @@ from filelock import FileLock, Timeout
 from thermoxels_ns.core.errors import OutputError, ThermoxelsError
 
 
+def is_number(value: object) -> TypeGuard[float]:
+    """Whether a value is a number that a float can hold: NaN is one, True is none.
+
+    >>> [is_number(value) for value in (1, 2.5, True, "3", 10**400)]
+    [True, True, False, False, False]
+    """
+    number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+    return number and not (isinstance(value, int) and abs(value) > sys.float_info.max)
+
+
 def check_positive(name: str, value: float, remedy: str, error: type[ThermoxelsError] = ThermoxelsError) -> float:
     """Return `value` if it is a finite number above zero (True is no number), else raise `error`."""
-    number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
-    if not (number and math.isfinite(value) and value > 0):
+    if not (is_number(value) and math.isfinite(value) and value > 0):
         raise error(name, expected="a finite number above 0", got=repr(value), remedy=remedy)
     return float(value)
 

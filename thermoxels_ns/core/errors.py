@@ -1,5 +1,9 @@
 """Errors a user can act on: name, expected, got and remedy."""
 
+import unicodedata
+
+_UNPRINTED = ("Cc", "Cs")  # kinds of characters that break a line or a terminal, or are bytes that no encoding explains
+
 
 class ThermoxelsError(Exception):
     """Base of all errors that are the input's, not the program's: what is wrong, or the whole sentence alone."""
@@ -50,4 +54,16 @@ def explain(name: str, *, expected: str, got: object, remedy: str) -> str:
     >>> explain("metres_per_unit", expected="a number above 0", got=-1, remedy="Pass --metres-per-unit 1.")
     'metres_per_unit: expected a number above 0, got -1. Pass --metres-per-unit 1.'
     """
-    return f"{name}: expected {expected}, got {got}. {remedy}"
+    return f"{printable(name)}: expected {expected}, got {printable(str(got))}. {remedy}"
+
+
+def printable(text: str) -> str:
+    """Escape what is no letter in any alphabet: line breaks, control characters, bytes of no encoding.
+
+    >>> printable("two\\nlines.jpg")
+    'two\\\\nlines.jpg'
+    """
+    return "".join(
+        each.encode("unicode_escape").decode("ascii") if unicodedata.category(each) in _UNPRINTED else each
+        for each in text
+    )

@@ -34,6 +34,16 @@ def typed(option: str) -> bool:
     return any(word.replace("_", "-").startswith(start) for word in sys.argv[1:])
 
 
+def typed_value(option: str) -> str | None:
+    """Return the value that this process was started with for an option, the last one; None where it was not typed."""
+    found = None
+    for word, following in zip(sys.argv[1:], [*sys.argv[2:], None]):
+        name, equals, value = word.partition("=")
+        if name.replace("_", "-") == option:
+            found = value if equals else following
+    return found
+
+
 def joined_lines(text: str) -> str:
     r"""Join the lines of each paragraph; empty lines stay between paragraphs.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +24,7 @@ from thermoxels_ns.core.units import ZERO_CELSIUS_K, TemperatureRange
 from thermoxels_ns.data.colmap_tracks import TrackSource, find_feature_rays
 from thermoxels_ns.data.pose_refinement import PoseSource, refine_poses
 from thermoxels_ns.data.scene_box import BoxEvidence, find_scene_box
-from thermoxels_ns.data.scene_file import Frame, SceneFile, read_scene_file
+from thermoxels_ns.data.scene_file import BOUNDS_NAME, Frame, SceneFile, read_scene_file
 from thermoxels_ns.data.splits import Split, split_frames
 from thermoxels_ns.radiometry.dead_pixels import find_dead_pixels
 from thermoxels_ns.radiometry.thermal_pixels import ThermalUnit, read_thermal_file
@@ -226,17 +227,21 @@ class ThermalDataParser(DataParser):
         world, box = self._place(file, evidence)
         paths, training = [f.thermal for f in file.frames], {file.frames[index].thermal for index in split.train}
         survey = survey_thermal_files(paths, file.unit, config.valid_range_c, file.bounds_c, training)
+        _refuse_several_sizes(file.frames, survey.shapes)
         met = _share_that_meets([file.frames[index] for index in split.train], world, box, evidence.source)
         evaluation = set(split.val) | set(split.test)
         metres = file.meta.get("metres_per_unit")
-        unit, scale = ("m", float(metres)) if isinstance(metres, (int, float)) else ("units", 1.0)
-        sides = (box.aabb[1] - box.aabb[0]).double() * scale / world.scale
-        size = f"{' x '.join(f'{side:.3g}' for side in sides.tolist())} {unit}"
+        sides = (box.aabb[1] - box.aabb[0]).double() * (metres or 1.0) / world.scale
+        size = f"{' x '.join(f'{side:.3g}' for side in sides.tolist())} {'m' if metres else 'units'}"
         CONSOLE.print(
             f"Scene {file.folder.resolve().name}: {len(names)} frames, {len(split.train)} train, {len(evaluation)} "
             f"evaluate ({split.how}); box from {evidence.source}, {size}, which {met:.0%} of the rays meet; "
             f"{survey.temperature_range.min_c:.2f} to {survey.temperature_range.max_c:.2f} C."
         )
+        if file.bounds_swapped:
+            low, high = file.bounds_c or (0.0, 0.0)
+            said = f"{BOUNDS_NAME} has its lowest temperature above its highest; read as {low:g} to {high:g} C."
+            CONSOLE.print(said, style="bold yellow")
         if file.left_out:
             CONSOLE.print(f"Left out, no pair: {', '.join(file.left_out)}", style="bold yellow")
         if rays is not None:
@@ -313,6 +318,32 @@ def _share_that_meets(frames: list[Frame], world: _World, box: SceneBox, source:
     return share
 
 
+def _refuse_several_sizes(frames: list[Frame], shapes: dict[Path, tuple[int, int]]) -> None:
+    """Refuse thermal images of several sizes beside photographs of one, unless each has a camera of its own."""
+    sizes: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    shared = [frame for frame in frames if frame.thermal_intrinsics is None]
+    for frame in shared:
+        sizes.setdefault((frame.intrinsics.height, frame.intrinsics.width), []).append(shapes[frame.thermal])
+    usual = {photograph: Counter(each).most_common(1)[0][0] for photograph, each in sizes.items()}
+    for frame in shared:
+        (height, width), found = usual[frame.intrinsics.height, frame.intrinsics.width], shapes[frame.thermal]
+        if found != (height, width):
+            expected = f"thermal images of one size, {width} x {height} pixels as most have"
+            remedy = "Remove the frame, or give it a 'thermal_camera' of its own in the json."
+            raise SceneError(frame.thermal.name, expected=expected, got=f"{found[1]} x {found[0]}", remedy=remedy)
+
+
+def _refuse_beyond_bounds(middles_c: dict[Path, float], bounds_c: tuple[float, float]) -> None:
+    """Refuse files whose median is further from the declared bounds than these are wide: they have another unit."""
+    margin = max(bounds_c[1] - bounds_c[0], _SAME_PLACE_K)
+    for path, middle in middles_c.items():
+        if not bounds_c[0] - margin <= middle <= bounds_c[1] + margin:
+            expected = f"temperatures near {bounds_c[0]:g} to {bounds_c[1]:g} C, as {BOUNDS_NAME} says"
+            got = f"{middle:.2f} C in the middle"
+            remedy = f"Subtract 273.15 if the file holds kelvins; else correct {BOUNDS_NAME}, or remove it."
+            raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
+
+
 def _refuse_mixed_units(middles_c: dict[Path, float]) -> None:
     """Refuse files that read 273 K more than the others, by their medians: they hold kelvins."""
     usual = [middle for middle in middles_c.values() if middle < _LEAST_OF_KELVINS]
@@ -364,6 +395,8 @@ def survey_thermal_files(
             kept.setdefault((height, width), []).append(temperature_c)
         extremes[path] = (float(np.nanmin(temperature_c)), float(np.nanmax(temperature_c)))
         middles[path] = float(np.nanmedian(temperature_c))
+    if bounds_c is not None:
+        _refuse_beyond_bounds(middles, bounds_c)
     if tuple(valid_range_c) == ThermalDataParserConfig.valid_range_c:
         _refuse_mixed_units(middles)
     dead = {shape: find_dead_pixels(np.stack(frames)) for shape, frames in kept.items()}

@@ -11,14 +11,17 @@ import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.camera import Camera
-from thermoxels_ns.core.checks import plain_os_errors
+from thermoxels_ns.core.checks import is_number, plain_os_errors
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.core.json_values import read_json_object
+from thermoxels_ns.core.units import ZERO_CELSIUS_K
+from thermoxels_ns.data.scene_scale import scale_from_scene_file, up_from_scene_file
 from thermoxels_ns.data.transforms_json import read_intrinsics, read_pose
 from thermoxels_ns.radiometry.thermal_pixels import THERMAL_SUFFIXES, ThermalUnit
 
 JSON_NAMES = ("transforms.json", "transforms_thermal.json")
 BOUNDS_NAME = "temperature_bounds.json"
+_HOTTEST_C = 10_000  # no thermal camera says more
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,7 @@ class SceneFile:
     bounds_c: tuple[float, float] | None  # lowest and highest temperature of temperature_bounds.json, [degrees Celsius]
     meta: dict[str, Any]  # the json as it is (split lists, scene_box, ply_file_path, applied_transform)
     left_out: list[str] = field(default_factory=list)  # names of frames and files that missing_thermal="skip" left out
+    bounds_swapped: bool = False  # whether temperature_bounds.json has its lowest temperature above its highest
 
 
 @plain_os_errors("scene folder", "a file or folder that can be read", "Check permissions and names.", SceneError)
@@ -99,9 +103,14 @@ def read_scene_file(data: Path, missing_thermal: Literal["error", "skip"] = "err
         raise SceneError(json_path.name, expected="at least one frame with a thermal partner", got=got, remedy=remedy)
     _refuse_duplicates(json_path, frames)
     _refuse_half_masks(json_path, frames)
-    bounds = _read_bounds(folder)
+    scale_from_scene_file(meta)
+    up_from_scene_file(meta)
+    bounds, swapped = _read_bounds(folder), False
+    if bounds is not None and bounds[0] > bounds[1]:  # published scenes exist with the two names swapped
+        bounds, swapped = (bounds[1], bounds[0]), True
     frames.sort(key=lambda frame: frame.name)
-    return SceneFile(folder, json_path, frames, _unit(meta, json_path, bounds), bounds, meta, left_out + orphans)
+    unit = _unit(meta, json_path, bounds)
+    return SceneFile(folder, json_path, frames, unit, bounds, meta, left_out + orphans, swapped)
 
 
 class _ThermalPartners:
@@ -155,27 +164,31 @@ def _find_json(data: Path) -> Path:
 
 def _read_bounds(folder: Path) -> tuple[float, float] | None:
     path = folder / BOUNDS_NAME
-    if not path.is_file():
+    if not path.exists():
         return None
+    if not path.is_file():
+        remedy = "Move it away; bounds are a json file of this name."
+        raise SceneError(str(path), expected="a file", got="a folder", remedy=remedy)
     content = read_json_object(path, "Write the file again.", SceneError)
     keys = ("absolute_min_temperature", "absolute_max_temperature")
-    try:
-        first, second = (float(content[key]) for key in keys)
-    except (KeyError, TypeError, ValueError):
-        first = second = float("nan")
-    if not (np.isfinite(first) and np.isfinite(second)):
-        expected = f"finite numbers {keys[0]} and {keys[1]} in degrees Celsius"
+    given = [content.get(key) for key in keys]
+    bounds = [float(value) for value in given if is_number(value) and -ZERO_CELSIUS_K <= value <= _HOTTEST_C]
+    if len(bounds) < 2:
+        expected = f"{keys[0]} and {keys[1]}, degrees Celsius from absolute zero to {_HOTTEST_C:.0f}"
         remedy = "Correct the file, or remove it if the thermal files hold degrees Celsius."
-        raise SceneError(str(path), expected=expected, got={key: content.get(key) for key in keys}, remedy=remedy)
-    return min(first, second), max(first, second)  # published scenes exist with the two names swapped
+        raise SceneError(str(path), expected=expected, got=dict(zip(keys, given)), remedy=remedy)
+    return bounds[0], bounds[1]
 
 
 def _unit(meta: dict[str, Any], json_path: Path, bounds: tuple[float, float] | None) -> ThermalUnit:
     if "thermal_unit" in meta:
         unit = meta["thermal_unit"]
         try:
-            return ThermalUnit.linear(float(unit["celsius_per_count"]), float(unit["celsius_offset"]))
-        except (KeyError, TypeError, ValueError) as problem:
+            numbers = [unit["celsius_per_count"], unit["celsius_offset"]]
+            if not all(map(is_number, numbers)):
+                raise ValueError("text, or true or false")
+            return ThermalUnit.linear(*map(float, numbers))
+        except (KeyError, TypeError, ValueError, OverflowError) as problem:
             expected, where = "numbers celsius_per_count (not 0) and celsius_offset", f"{json_path.name}: thermal_unit"
             raise SceneError(where, expected=expected, got=unit, remedy="Correct the json.") from problem
     return ThermalUnit.bounds(*bounds) if bounds else ThermalUnit.celsius()

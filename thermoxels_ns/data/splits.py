@@ -95,7 +95,7 @@ def _by_lists(names: Sequence[str], meta: Mapping[str, Any], left_out: Sequence[
         train = [i for i in range(len(names)) if i not in held]
     if val is None or test is None:
         val = test = [i for i in range(len(names)) if i not in set(train)]
-    return Split(train, val, test, "by the lists in the json")
+    return Split(train, val, test, f"by {', '.join(key for key in _KEYS.values() if key in meta)} in the json")
 
 
 def _by_interval(names: Sequence[str], interval: int, offset: int | None) -> Split:

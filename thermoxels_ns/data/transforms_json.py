@@ -10,6 +10,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from thermoxels_ns.core.camera import Camera, Lens
+from thermoxels_ns.core.checks import is_number
 from thermoxels_ns.core.errors import SceneError
 from thermoxels_ns.radiometry.decoders import errors_name
 
@@ -35,14 +36,17 @@ _LENS_OF_MODEL: dict[str, Lens] = {
 def read_pose(values: Any, where: str, turned: bool = True) -> npt.NDArray[np.float64]:
     """Check a camera-to-world matrix (3 x 4 or 4 x 4): finite, within `MOST_UNITS`, a rotation in its upper left.
 
-    With `turned` False it may be any linear map there.
+    With `turned` False it may be any linear map there. A fourth row is 0, 0, 0, 1.
     """
     try:
-        matrix = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        matrix = np.zeros(0)
-    if matrix.shape not in ((3, 4), (4, 4)):
-        raise SceneError(where, expected="4 x 4 numbers", got=f"shape {matrix.shape}", remedy="Correct the json.")
+        entries = np.array(values, dtype=object)
+    except ValueError:  # rows of several lengths
+        entries = np.zeros(0, dtype=object)
+    odd = [repr(entry)[:80] for entry in entries.ravel() if not is_number(entry)]
+    if odd or entries.shape not in ((3, 4), (4, 4)):
+        got = f"{odd[0]} among them" if odd else f"shape {entries.shape}"
+        raise SceneError(where, expected="4 x 4 numbers", got=got, remedy="Correct the json.")
+    matrix = entries.astype(np.float64)
     pose = np.eye(4)
     pose[:3] = matrix[:3]
     remedy = "Remove the frame or run structure from motion again."
@@ -51,6 +55,9 @@ def read_pose(values: Any, where: str, turned: bool = True) -> npt.NDArray[np.fl
     if np.abs(pose[:3, 3]).max() > MOST_UNITS:
         expected = f"coordinates within {MOST_UNITS:.0e} units of the origin"
         raise SceneError(where, expected=expected, got=pose[:3, 3].tolist(), remedy=remedy)
+    if len(matrix) == 4 and not np.allclose(matrix[3], pose[3], rtol=0.0, atol=1e-6):
+        got, remedy = matrix[3].tolist(), "Write camera to world, with the camera's place in the last column."
+        raise SceneError(where, expected="0, 0, 0, 1 in the last row", got=got, remedy=remedy)
     rotation = pose[:3, :3]
     if turned and (np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-2 or np.linalg.det(rotation) < 0):
         raise SceneError(where, expected="a rotation in the upper left 3 x 3", got=rotation.tolist(), remedy=remedy)
@@ -73,6 +80,8 @@ def read_intrinsics(meta: dict[str, Any], entry: dict[str, Any], image: Path | N
             raise ValueError("true or false")
         own = values if size is None else dict(zip("wh", size)) | values
         width, height = int(own["w"]), int(own["h"])
+        if any(isinstance(side, float) and not side.is_integer() for side in (own["w"], own["h"])):
+            raise ValueError(f"{own['w']} x {own['h']}, where w and h are whole numbers of pixels")
         numbers: dict[str, Any] = {key: float(values[key]) for key in ("fl_x", "fl_y", "cx", "cy")}
         names = ("k1", "k2", "k3", "k4", "p1", "p2")
         listed = values.get("distortion_params", [values.get(key, 0.0) for key in names])

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 
-import numpy as np
-
+from thermoxels_ns.core.checks import is_number
 from thermoxels_ns.core.errors import ThermoxelsError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
 
@@ -100,7 +99,6 @@ def conditions_text(conditions: Conditions) -> str:
 
 def check_between(name: str, value: float, low: float, high: float, expected: str, *, zero: bool = True) -> None:
     """Raise a `ThermoxelsError` that names the setting if it is no number from `low` to `high` (0 only if `zero`)."""
-    number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
-    if not (number and low <= value <= high and (zero or value > 0)):
+    if not (is_number(value) and low <= value <= high and (zero or value > 0)):
         remedy = f"Pass a right --{name.replace('_', '-')}."
         raise ThermoxelsError(name, expected=expected, got=repr(value), remedy=remedy)

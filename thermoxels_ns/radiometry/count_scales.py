@@ -13,7 +13,7 @@ from PIL import Image
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.radiometry.decoders import check_thermal_size, errors_name
 from thermoxels_ns.radiometry.exif import ExifFacts, read_exif_facts
-from thermoxels_ns.radiometry.thermal_pixels import ThermalImage, ThermalUnit, read_thermal_file
+from thermoxels_ns.radiometry.thermal_pixels import ThermalImage, ThermalUnit, read_thermal_file, size_of_double_tiff
 
 CameraName = Literal["workswell", "flir-high-gain", "flir-low-gain", "flir-duo", "sensefly"]
 _SAMPLE_BITS = 258
@@ -78,6 +78,11 @@ def read_count_image(
     Raises:
         ThermalFileError: The file is damaged, too large, of 8 bits or in colour, or its counts have no known unit.
     """
+    with errors_name(path, "a readable TIFF or PNG", error=ThermalFileError):
+        doubles = size_of_double_tiff(path) is not None
+    if doubles:
+        unit = unit or ThermalUnit.celsius()
+        return read_thermal_file(path, unit, valid_range_c, suffix), ExifFacts(None, None, None, None), None
     with (
         errors_name(path, "a readable TIFF or PNG", error=ThermalFileError),
         Image.open(path, formats=("TIFF", "PNG")) as image,

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
+from PIL import Image, TiffImagePlugin
 
 from thermoxels_ns.core.errors import ThermalFileError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
@@ -21,13 +21,18 @@ from thermoxels_ns.radiometry.flir_rjpeg import is_flir_jpeg, read_flir_jpeg
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 THERMAL_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".csv")  # file types that `read_thermal_file` knows
 
+_WIDTH, _HEIGHT, _SAMPLE_BITS, _SAMPLE_FORMAT = 256, 257, 258, 339  # tags of TIFF
+_SIGNED, _FLOATING = 2, 3  # sample formats
 _LONGEST_LINE = 2**20
 """More characters in a line are no row of a thermal image: 8192 numbers of 30 characters are a quarter of it."""
 _EXPECTED = "a readable thermal file"
 _REMEDY = "The file is damaged or not what its suffix says; copy it again or remove its frame."
-_UNIT_REMEDY = (
-    "Give temperature_bounds.json (absolute_min_temperature, absolute_max_temperature) or, in transforms.json, "
-    '"thermal_unit": {"celsius_per_count": ..., "celsius_offset": ...}.'
+_TIFF_SUFFIXES = (".tif", ".tiff")
+_LINEAR_UNIT = 'in transforms.json "thermal_unit": {"celsius_per_count": ..., "celsius_offset": ...}'
+_UNIT_REMEDY = f"Give temperature_bounds.json (absolute_min_temperature, absolute_max_temperature) or, {_LINEAR_UNIT}."
+_COUNTS_REMEDY = (
+    f"Give {_LINEAR_UNIT}, as the camera's manual has them; counts from 0 to 65535 that span the bounds have "
+    "(highest - lowest) / 65535 per count and an offset of the lowest."
 )
 
 
@@ -110,8 +115,8 @@ def read_thermal_file(
 ) -> ThermalImage:
     """Read a thermal file: PNG, JPG or TIFF counts, float TIFF, FLIR R-JPEG, ``.npy`` or ``.csv``.
 
-    A FLIR R-JPEG is read by the calibration and the settings in it, whatever the unit. Counts need a unit of kind
-    bounds or linear. Floating-point TIFF is in degrees Celsius unless the unit is linear.
+    A FLIR R-JPEG is read by the calibration and the settings in it, whatever the unit. Counts need a unit: bounds or
+    linear for PNG and JPG, linear for TIFF. Floating-point TIFF is in degrees Celsius unless the unit is linear.
     ``.csv`` and floating-point ``.npy`` are always in degrees Celsius; an integer ``.npy`` is counts if the unit is
     linear. The conversion runs in float64, so 16-bit steps survive. `suffix` reads the file as if its name ended so.
 
@@ -134,19 +139,26 @@ def _to_celsius(
     values = raw.values
     plain = raw.celsius or values.dtype.kind == "f" or suffix in (".npy", ".csv")
     saturated = np.zeros(values.shape, dtype=bool)
-    if unit.kind == "linear" and not raw.celsius and (values.dtype.kind in "ui" or suffix in (".tif", ".tiff")):
+    if unit.kind == "linear" and not raw.celsius and (values.dtype.kind in "ui" or suffix in _TIFF_SUFFIXES):
         if values.dtype.kind in "ui":
             ends = np.iinfo(values.dtype)
             saturated = (values == ends.min) | (values == ends.max)
         celsius = values.astype(np.float64) * unit.scale + unit.offset_c
     elif plain:
         celsius = values.astype(np.float64)
-    elif unit.kind == "bounds" and values.dtype in (np.uint8, np.uint16):
-        celsius = values.astype(np.float64) / np.iinfo(values.dtype).max * unit.scale + unit.offset_c
+    elif unit.kind == "bounds" and suffix not in _TIFF_SUFFIXES and values.dtype in (np.uint8, np.uint16):
+        most = np.iinfo(values.dtype).max
+        if (values == most).all():
+            expected, got = "temperatures below the highest of the bounds", f"count {most} in every pixel"
+            remedy = "The sensor saw more than the bounds can say, or the file is no measurement; remove the frame."
+            raise ThermalFileError(str(path), expected=expected, got=got, remedy=remedy)
+        celsius = values.astype(np.float64) / most * unit.scale + unit.offset_c
     else:
-        expected = "counts with a known unit (bounds need unsigned 8 or 16 bit)"
-        got = f"{values.dtype} counts and the unit '{unit.kind}'"
-        raise ThermalFileError(str(path), expected=expected, got=got, remedy=_UNIT_REMEDY)
+        # Of a TIFF's counts cameras mean steps of a fixed size, which bounds do not tell.
+        got, remedy = f"{values.dtype} counts and no unit", _UNIT_REMEDY
+        if unit.kind == "bounds":
+            got, remedy = f"{values.dtype} counts of a TIFF and temperature_bounds.json", _COUNTS_REMEDY
+        raise ThermalFileError(str(path), expected="counts with a known unit", got=got, remedy=remedy)
     if raw.no_data is not None:
         celsius[raw.no_data] = np.nan
     saturated &= np.isfinite(celsius)
@@ -177,7 +189,10 @@ def _read_raw(path: Path, suffix: str) -> _RawPixels:
     if path.stat().st_size == 0:
         raise _damaged(path, "a file of zero bytes")
     if suffix == ".npy":
-        values = np.load(path, mmap_mode="r", allow_pickle=False)  # mapped: its size is checked before it is read
+        try:
+            values = np.load(path, mmap_mode="r", allow_pickle=False)  # mapped: its size is checked before it is read
+        except ValueError as problem:  # whose text is the header itself
+            raise _damaged(path, "a header that is no array's, or fewer numbers than it says") from problem
         if not isinstance(values, np.ndarray) or values.dtype.kind not in "fui":
             raise _damaged(path, f"an array of type {getattr(values, 'dtype', type(values))}")
         if values.ndim >= 2 and values.size:
@@ -226,6 +241,13 @@ def _number(cell: str) -> float:
 
 
 def _read_image(path: Path) -> _RawPixels:
+    size = size_of_double_tiff(path)
+    if size is not None:
+        check_thermal_size(path, *size)
+        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # Pillow knows no numbers of 64 bits
+        if pixels is None or pixels.dtype != np.float64:
+            raise _damaged(path, "an image of 64-bit numbers that cannot be decoded")
+        return _RawPixels(pixels)
     with Image.open(path) as image:
         check_thermal_size(path, *image.size)
         if getattr(image, "n_frames", 1) != 1:
@@ -262,6 +284,19 @@ def _read_image(path: Path) -> _RawPixels:
     raise ThermalFileError(str(path), expected="a grey or floating-point image", got=got, remedy=remedy)
 
 
+def size_of_double_tiff(path: Path) -> tuple[int, int] | None:
+    """Width and height of a TIFF of one channel of 64-bit floating-point numbers; None for other files."""
+    with path.open("rb") as stream:
+        head = stream.read(8)
+        if not head.startswith((b"II*\0", b"MM\0*")):
+            return None
+        tags = TiffImagePlugin.ImageFileDirectory_v2(head)
+        stream.seek(tags.next)
+        tags.load(stream)
+    kind = [tags.get(tag, (0,)) for tag in (_SAMPLE_BITS, _SAMPLE_FORMAT)]
+    return (tags.get(_WIDTH, 0), tags.get(_HEIGHT, 0)) if kind == [(64,), (_FLOATING,)] else None
+
+
 def _integer_type(path: Path, image: Image.Image) -> npt.DTypeLike:
     """Type of the file's counts, which Pillow's modes do not always tell (mode I holds 16-bit files too)."""
     if image.format == "PNG":
@@ -270,10 +305,10 @@ def _integer_type(path: Path, image: Image.Image) -> npt.DTypeLike:
         return np.uint16 if depth == 16 else np.uint8
     if image.format == "TIFF":
         tags: Any = getattr(image, "tag_v2", {})
-        width = tags.get(258, (8,))
+        width = tags.get(_SAMPLE_BITS, (8,))
         width = int(width[0] if isinstance(width, tuple) else width)
-        signed = tags.get(339, (1,))
-        signed = int(signed[0] if isinstance(signed, tuple) else signed) == 2
+        signed = tags.get(_SAMPLE_FORMAT, (1,))
+        signed = int(signed[0] if isinstance(signed, tuple) else signed) == _SIGNED
         length = 1 if width <= 8 else 2 if width <= 16 else 4
         return np.dtype(f"{'i' if signed else 'u'}{length}")
     return np.uint8

@@ -40,6 +40,7 @@ _SUFFIXES = {"png16": ".png", "tiff": ".tiff", "npy": ".npy"}
 _PHOTO_SUFFIXES: dict[str, str] = {"jpeg": ".jpg", "png": ".png"}
 TRUTH = "truth.json"
 _LARGEST_COUNT = 65535
+_MOST_SIDE = 4096  # pixels of an image along a side; all rays of an image are in memory at once
 _CENTIKELVIN = {"celsius_per_count": 0.01, "celsius_offset": -273.15}
 # The second camera: what its lens and mounting differ by from the first. About 1 degree and a few centimetres.
 _THERMAL_ASPECT, _THERMAL_ZOOM, _THERMAL_CENTRE_SHIFT = 0.8, 0.95, (-0.012, 0.008)
@@ -160,8 +161,9 @@ def load_truth(scene_folder: Path | str) -> SyntheticScene | None:
 def _thermal_size(width: int, height: int, thermal_width: int | None, own_camera: bool) -> tuple[int, int]:
     """Width and height of the thermal images; one camera for both bands needs the same aspect exactly."""
     for name, value in (("width", width), ("height", height), ("thermal_width", thermal_width)):
-        if value is not None and value < 1:
-            raise SceneError(name, expected="at least 1 pixel", got=value, remedy=f"Raise {name}.")
+        if value is not None and not 1 <= value <= _MOST_SIDE:
+            remedy = f"Pass --{name.replace('_', '-')} 320."
+            raise SceneError(name, expected=f"1 to {_MOST_SIDE} pixels", got=value, remedy=remedy)
     if own_camera:
         chosen = thermal_width or max(width // 2, 1)
         return chosen, max(round(chosen * _THERMAL_ASPECT), 1)

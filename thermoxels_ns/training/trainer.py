@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -19,7 +20,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from thermoxels_ns.core.checks import check_ranges, hold_folder, plain_os_errors, writable_folder
 from thermoxels_ns.core.config_loader import ConfigLoader
 from thermoxels_ns.core.errors import CheckpointError, OutputError, ThermoxelsError
-from thermoxels_ns.core.option_help import typed
+from thermoxels_ns.core.option_help import typed, typed_value
 from thermoxels_ns.training.schedule import QUALITIES, Quality, Schedule, schedule_for
 
 LOCAL_HOST = "127.0.0.1"
@@ -52,10 +53,17 @@ class ThermoxelsTrainerConfig(TrainerConfig):
     """What the quality replaced, for the log."""
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Keep the viewer on this machine where ns-viewer replaces it by its own default; what was typed stays."""
-        if name == "viewer" and not typed("--viewer.websocket-host"):
-            value = replace(value, websocket_host=LOCAL_HOST)
+        """Keep the viewer on this machine, whatever the default of ns-viewer, unless another host was typed."""
+        if name == "viewer":
+            value = replace(value, websocket_host=typed_value("--viewer.websocket-host") or LOCAL_HOST)
         super().__setattr__(name, value)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take what a config.yml says, but for the viewer's host: only a typed option opens it to the network."""
+        known = {each.name for each in fields(self)}
+        self.__dict__.update({name: value for name, value in state.items() if name in known})
+        if "viewer" in state:
+            self.viewer = state["viewer"]
 
     def __post_init__(self) -> None:
         if self.quality is None:
@@ -63,6 +71,28 @@ class ThermoxelsTrainerConfig(TrainerConfig):
         model: Any = self.pipeline.model
         self.replaced = f"{max(model.resolutions)} voxels and {self.max_num_iterations} steps"
         self.follow_schedule(schedule_for(*QUALITIES[self.quality]))
+
+    def set_experiment_name(self) -> None:
+        """Name the run by the folder of its scene where no name is given, for ``--data ..`` too."""
+        data = self.pipeline.datamanager.data
+        if self.experiment_name is None and data is not None:
+            self.experiment_name = Path(os.path.abspath(data.parent if data.is_file() else data)).stem
+        super().set_experiment_name()
+
+    def get_base_dir(self) -> Path:
+        """Return the folder of the run, which is inside `output_dir` whatever the names say.
+
+        Raises:
+            OutputError: A name that the folder is made of has a separator, or is ``.`` or ``..``.
+        """
+        self.set_experiment_name()
+        names = {name: str(getattr(self, name)) for name in ("experiment_name", "method_name", "timestamp")}
+        names |= {"relative_model_dir": Path(self.relative_model_dir).as_posix()}
+        for name, text in names.items():
+            if text in (".", "..") or set(text) & {"/", "\\", "\0"}:
+                expected, remedy = "one name of a folder", f"Pass --{name.replace('_', '-')} with a plain name."
+                raise OutputError(name, expected=expected, got=repr(text), remedy=remedy)
+        return super().get_base_dir()
 
     def save_config(self) -> None:
         """Check what can be checked, hold the run's folder while this process lives, and write config.yml.

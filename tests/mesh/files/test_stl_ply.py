@@ -8,7 +8,7 @@ import trimesh
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.content import surface_of
 from thermoxels_ns.mesh.files.formats import check_format, write_mesh
-from thermoxels_ns.mesh.files.stl_ply import write_ply, write_stl
+from thermoxels_ns.mesh.files.surface import write_ply, write_stl
 from thermoxels_ns.mesh.quality.checks import facet_normals
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 

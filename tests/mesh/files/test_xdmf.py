@@ -30,8 +30,8 @@ def test_vtk_reads_body_and_boundary(tmp_path, tagged_mesh):
     assert np.array_equal(body.points, tagged_mesh.points_m)
     assert np.array_equal(body.cells_dict[pv.CellType.TETRA], tagged_mesh.tets)
     assert np.array_equal(boundary.cells_dict[pv.CellType.TRIANGLE], tagged_mesh.facets)
-    assert np.array_equal(body.cell_data["region"], tagged_mesh.region)
-    assert np.array_equal(boundary.cell_data["patch"], tagged_mesh.boundary.patch)
+    assert np.array_equal(body.cell_data["region"], tagged_mesh.region + 1)
+    assert np.array_equal(boundary.cell_data["patch"], tagged_mesh.boundary.patch + 1)
     for grid in grids.values():
         assert np.array_equal(grid.point_data["temperature_c"], tagged_mesh.temperature_c)
         assert np.array_equal(grid.point_data["temperature_k"], tagged_mesh.temperature_c + 273.15)
@@ -45,8 +45,8 @@ def test_tags_come_first_and_their_names_are_in_the_file(tmp_path, tagged_mesh):
     grids = {grid.get("Name"): grid for grid in ElementTree.parse(tmp_path / "house.xdmf").iter("Grid")}
     assert grids[BODY_GRID].find("Attribute").get("Name") == "region"
     assert grids[FACET_GRID].find("Attribute").get("Name") == "patch"
-    assert grids[BODY_GRID].find("Information").get("Value") == "0 = walls; 1 = floor slab; 2 = roof"
-    names = "0 = up; 1 = down; 2 = inside; 3 = façade 1; 4 = cut by the box"
+    assert grids[BODY_GRID].find("Information").get("Value") == "1 = walls; 2 = floor slab; 3 = roof"
+    names = "1 = up; 2 = down; 3 = inside; 4 = façade 1; 5 = cut by the box"
     assert grids[FACET_GRID].find("Information").get("Value") == names
 
 

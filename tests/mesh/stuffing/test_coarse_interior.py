@@ -6,9 +6,17 @@ import pytest
 from scipy import ndimage
 from scipy.sparse.linalg import spsolve
 
-from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, box_distance, centres, stiffness, tet_mesh, turn
+from tests.support.stuffed_shapes import (
+    ANGLE_BOUNDS_DEG,
+    box_distance,
+    centres,
+    stiffness,
+    tet_mesh,
+    turn,
+    volumes_and_angles,
+)
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.quality.checks import check_mesh, volumes_and_angles
+from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.stuffing.bcc_lattice import bcc_lattice
 from thermoxels_ns.mesh.stuffing.coarse_interior import balanced_octree, coarse_interior, split_in_eight
@@ -71,7 +79,9 @@ def test_the_inside_changes_and_the_surface_does_not(kind, seed):
         quality = check_mesh(tet_mesh(graded))
         assert same_surface(graded, uniform)
         assert quality.volume_m3 == pytest.approx(volume, rel=1e-13)
-        assert ANGLE_BOUNDS_DEG[0] <= quality.min_dihedral_deg <= quality.max_dihedral_deg <= ANGLE_BOUNDS_DEG[1]
+        assert (
+            ANGLE_BOUNDS_DEG[0] <= quality.dihedral_range_deg[0] <= quality.dihedral_range_deg[1] <= ANGLE_BOUNDS_DEG[1]
+        )
         assert quality.num_tets <= count
         count = quality.num_tets
     assert count < 0.9 * len(uniform.tets)

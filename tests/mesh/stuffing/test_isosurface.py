@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, centres, tet_mesh
+from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, centres, tet_mesh, volumes_and_angles
 from thermoxels_ns.core.errors import MeshError
-from thermoxels_ns.mesh.quality.checks import check_mesh, volumes_and_angles
+from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.stuffing.bcc_lattice import DIRECTIONS, bcc_lattice
 from thermoxels_ns.mesh.stuffing.isosurface import stuff
 from thermoxels_ns.mesh.stuffing.stencils import BUNDLE_EDGES, BUNDLE_POINTS, CODE_WEIGHTS, stencil_table
@@ -22,7 +22,7 @@ def test_full_lattice_is_a_box_to_the_last_bit(shape):
     assert quality.area_m2 == pytest.approx(2 * (a * b + b * c + a * c), rel=1e-14)
     assert solid.on_box.all()
     assert np.array_equal(solid.points.min(axis=0), [0, 0, 0]) and np.array_equal(solid.points.max(axis=0), shape)
-    assert (quality.min_dihedral_deg, quality.max_dihedral_deg) == pytest.approx((45.0, 90.0))
+    assert (quality.dihedral_range_deg[0], quality.dihedral_range_deg[1]) == pytest.approx((45.0, 90.0))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -102,8 +102,8 @@ def test_any_levels_give_a_sound_mesh(kind, seed):
     level = RANDOM_LEVELS[kind](random, tuple(random.integers(9, 14, size=3)))
     solid = stuff(level)
     quality = check_mesh(tet_mesh(solid))
-    assert ANGLE_BOUNDS_DEG[0] <= quality.min_dihedral_deg
-    assert quality.max_dihedral_deg <= ANGLE_BOUNDS_DEG[1]
+    assert ANGLE_BOUNDS_DEG[0] <= quality.dihedral_range_deg[0]
+    assert quality.dihedral_range_deg[1] <= ANGLE_BOUNDS_DEG[1]
     assert np.all((solid.points >= 0.0) & (solid.points <= level.shape))
 
 

@@ -2,8 +2,18 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from tests.support.stuffed_shapes import ANGLE_BOUNDS_DEG, SHAPES, Shape, box_distance, centres, tet_mesh, turn
-from thermoxels_ns.mesh.quality.checks import check_mesh, facet_areas, facet_normals, volumes_and_angles
+from tests.support.stuffed_shapes import (
+    ANGLE_BOUNDS_DEG,
+    SHAPES,
+    Shape,
+    box_distance,
+    centres,
+    tet_mesh,
+    turn,
+    volumes_and_angles,
+)
+from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
+from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.quality.tet_shapes import signed_volumes
 from thermoxels_ns.mesh.stuffing.edge_planes import Surface
 from thermoxels_ns.mesh.stuffing.isosurface import StuffedSolid, stuff
@@ -95,7 +105,7 @@ def test_boxes_at_any_angle(seed, noise):
     # Noise adds area of its own, everywhere.
     assert abs(area) < 0.005 + 0.03 * noise and abs(volume) < 0.004
     assert area > old_area + 0.015 and abs(volume) < 0.7 * abs(old_volume)
-    assert check_mesh(tet_mesh(sharp)).min_tet_volume_m3 > 5e-4
+    assert check_mesh(tet_mesh(sharp)).criteria[0].figure > 5e-4
 
 
 @pytest.mark.parametrize("seed", [5, 6])
@@ -158,7 +168,9 @@ def test_any_levels_keep_the_angles(seed):
     for level in (random.normal(size=(10, 9, 11)), np.clip(waves, -0.3, 0.3), np.sign(waves)):
         sharp = sharpened(level)[1]
         quality = check_mesh(tet_mesh(sharp))
-        assert ANGLE_BOUNDS_DEG[0] <= quality.min_dihedral_deg <= quality.max_dihedral_deg <= ANGLE_BOUNDS_DEG[1]
+        assert (
+            ANGLE_BOUNDS_DEG[0] <= quality.dihedral_range_deg[0] <= quality.dihedral_range_deg[1] <= ANGLE_BOUNDS_DEG[1]
+        )
         assert np.all((sharp.points >= 0.0) & (sharp.points <= level.shape))
 
 

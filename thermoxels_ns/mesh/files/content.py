@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from thermoxels_ns.core.arrays import FloatArray, IntArray
-from thermoxels_ns.core.checks import check_finite, check_shape, replace_when_done, writable_folder
-from thermoxels_ns.core.errors import MeshError, OutputError
+from thermoxels_ns.core.checks import replace_when_done, writable_folder
+from thermoxels_ns.core.errors import OutputError
 from thermoxels_ns.core.units import celsius_to_kelvin
 from thermoxels_ns.mesh.quality.checks import facet_normals
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 UNTAGGED_PATCH = "boundary"  # name of the one patch that a mesh without tags is written with
-_REMEDY = "Build the mesh with thermoxels_ns.mesh.build."
 COLOUR_MAP = "inferno"  # colour map of temperatures: perceptually uniform, readable in grey
 _DARKEST = 0.1  # share of the colour map left out at its dark end, where shading could not be told from cold
 _FAR_SIZES = 16.0
@@ -41,51 +40,35 @@ class FileContent:
 
 
 def file_content(mesh: TetMesh, temperature_c: npt.NDArray[np.floating] | None = None) -> FileContent:
-    """Check what is to be written; a mesh without boundary tags gets one patch, `UNTAGGED_PATCH`, of all triangles.
+    """Check the mesh; one without boundary tags gets one patch, `UNTAGGED_PATCH`, of all triangles.
 
     `temperature_c` takes the place of the mesh's own, shape (n,), [degrees Celsius].
 
     Raises:
-        MeshError: An array has another shape than the mesh asks for, is not finite or points at what is not there,
-            or two patches or regions have one name.
+        MeshError: What `TetMesh.check` raises.
     """
-    points = _finite("points_m", mesh.points_m, (None, 3), _REMEDY)
-    tets = check_shape("tets", np.asarray(mesh.tets), (None, 4), _REMEDY, MeshError)
-    facets = check_shape("facets", np.asarray(mesh.facets), (None, 3), _REMEDY, MeshError)
-    check_shape("facet_tags", np.asarray(mesh.facet_tags), (len(facets),), _REMEDY, MeshError)
-    remedy = "Pass one finite value per mesh node."
-    temperature = mesh.temperature_c if temperature_c is None else temperature_c
-    temperature = _finite("temperature_c", temperature, (len(points),), remedy)
-    check_shape("observed", np.asarray(mesh.observed), (len(points),), remedy, MeshError)
-    if mesh.colour is not None:
-        _finite("colour", mesh.colour, (len(points), 3), remedy)
-    if not len(tets):
-        raise MeshError("tets", expected="at least one tetrahedron", got="none", remedy=_REMEDY)
-    _check_indices("tets", tets, len(points))
-    _check_indices("facets", facets, len(points))
-
-    region = check_shape("region", np.asarray(mesh.region), (len(tets),), _REMEDY, MeshError)
-    _check_names("region_names", mesh.region_names)
-    _check_indices("region", region, len(mesh.region_names))
-    if mesh.boundary is None:
-        patch, patch_names = np.zeros(len(facets), dtype=np.int64), (UNTAGGED_PATCH,)
-        normal, factor = facet_normals(points, facets), np.ones(len(facets))
+    if temperature_c is not None:
+        mesh = replace(mesh, temperature_c=temperature_c)
+    mesh.check()
+    points, tags = np.asarray(mesh.points_m, dtype=np.float64), mesh.boundary
+    if tags is None:
+        count = len(mesh.facets)
+        patch, names = np.zeros(count, dtype=np.int64), (UNTAGGED_PATCH,)
+        normal, factor = facet_normals(points, mesh.facets), np.ones(count)
     else:
-        remedy = "Give every boundary triangle a finite value."
-        normal = _finite("boundary.normal", mesh.boundary.normal, (len(facets), 3), remedy)
-        factor = _finite("boundary.area_factor", mesh.boundary.area_factor, (len(facets),), remedy)
-        patch, patch_names = np.asarray(mesh.boundary.patch), mesh.boundary.patch_names
-        check_shape("boundary.patch", patch, (len(facets),), _REMEDY, MeshError)
-        _check_names("boundary.patch_names", patch_names)
-        _check_indices("boundary.patch", patch, len(patch_names))
+        patch, names, normal, factor = tags.patch, tuple(tags.patch_names), tags.normal, tags.area_factor
     return FileContent(
-        points, tets, temperature, region, tuple(mesh.region_names), facets, patch, tuple(patch_names), normal, factor
+        points_m=points,
+        tets=mesh.tets,
+        temperature_c=np.asarray(mesh.temperature_c, dtype=np.float64),
+        region=mesh.region,
+        region_names=tuple(mesh.region_names),
+        facets=mesh.facets,
+        patch=patch,
+        patch_names=names,
+        normal=normal,
+        area_factor=factor,
     )
-
-
-def _finite(name: str, values: npt.ArrayLike, shape: tuple[int | None, ...], remedy: str) -> FloatArray:
-    array = check_shape(name, np.asarray(values, dtype=np.float64), shape, remedy, MeshError)
-    return check_finite(name, array, remedy, MeshError)
 
 
 def node_arrays(mesh: TetMesh, content: FileContent) -> dict[str, npt.NDArray]:
@@ -123,21 +106,6 @@ def colour_bytes(colour: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
     [[0, 128, 255]]
     """
     return np.floor(np.clip(colour, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
-
-
-def _check_indices(name: str, values: npt.NDArray, count: int) -> None:
-    if not np.issubdtype(values.dtype, np.integer) or (len(values) and (values.min() < 0 or values.max() >= count)):
-        got = f"{values.min()} to {values.max()} ({values.dtype})" if len(values) else f"nothing ({values.dtype})"
-        raise MeshError(name, expected=f"whole numbers from 0 to {count - 1}", got=got, remedy=_REMEDY)
-
-
-def _check_names(name: str, names: Sequence[str]) -> None:
-    for entry in names:
-        if not (isinstance(entry, str) and entry.strip() and entry.isprintable() and '"' not in entry):
-            expected = "names of printable characters without a double quote"
-            raise MeshError(name, expected=expected, got=repr(entry), remedy="Rename it.")
-    if len(set(names)) != len(names) or not names:
-        raise MeshError(name, expected="at least one name, all different", got=list(names), remedy="Rename them.")
 
 
 @dataclass(frozen=True)

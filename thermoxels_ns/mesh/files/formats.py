@@ -8,9 +8,8 @@ from pathlib import Path
 
 from thermoxels_ns.core.errors import OutputError
 from thermoxels_ns.mesh.files.abaqus import HeatStep, write_inp
-from thermoxels_ns.mesh.files.gltf import write_glb
 from thermoxels_ns.mesh.files.gmsh import write_msh
-from thermoxels_ns.mesh.files.stl_ply import check_stl, write_ply, write_stl
+from thermoxels_ns.mesh.files.surface import check_stl, write_glb, write_ply, write_stl
 from thermoxels_ns.mesh.files.vtu import boundary_path, write_boundary_vtp, write_vtu
 from thermoxels_ns.mesh.files.xdmf import heavy_data_path, write_xdmf
 from thermoxels_ns.mesh.tetrahedra import TetMesh

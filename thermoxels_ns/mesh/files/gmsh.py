@@ -34,7 +34,8 @@ def write_msh(path: Path | str, mesh: TetMesh) -> None:
     Tetrahedron k of the mesh has the tag k + 1, and the boundary triangles follow. Nodes are numbered anew: Gmsh wants
     them sorted by the patch or region they lie on, and meshio takes a node's place in the file for its number.
 
-    Layout: "MSH file format", Gmsh reference manual, version 4.1 of the format.
+    Layout: "MSH file format", Gmsh reference manual, version 4.1 of the format. meshio's own writer is no help: it has
+    one group to a name, and a patch may have a region's; it writes boxes of zeros around entities and tags of its own.
 
     Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
     """

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.checks import check_shape, replace_when_done, writable_folder
+from thermoxels_ns.core.checks import replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.core.json_values import plain_values
 from thermoxels_ns.mesh.files.content import check_suffix, colour_bytes, file_content, node_arrays, surface_of
@@ -139,12 +139,9 @@ def write_boundary_vtp(path: Path | str, mesh: TetMesh) -> None:
         "patch": content.patch,
     }
     if mesh.boundary is not None:
-        remedy = "Give every boundary triangle a value."
-        seen = check_shape("boundary.seen", mesh.boundary.seen, (len(content.facets),), remedy, MeshError)
-        arrays["seen"] = seen.astype(np.uint8)
+        arrays["seen"] = mesh.boundary.seen.astype(np.uint8)
         if mesh.boundary.photographs is not None:
-            count = check_shape("boundary.photographs", mesh.boundary.photographs, (len(seen), 2), remedy, MeshError)
-            arrays["photographs_seen"], arrays["photographs_supporting"] = count.T.astype(np.int32)
+            arrays["photographs_seen"], arrays["photographs_supporting"] = mesh.boundary.photographs.T.astype(np.int32)
 
     data = pv.PolyData.from_regular_faces(surface.points_m, surface.triangles)
     data.point_data["temperature_c"] = content.temperature_c[surface.nodes]

@@ -34,8 +34,8 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
     The grid "mesh" holds the tetrahedra with `region` per cell and `temperature_c`, `temperature_k`, `observed` and,
     if the mesh has them, `colour` per node; the grid "facets" holds the boundary triangles with `patch`, `area_factor`
     (true area over the triangle's own, other than 1 in voxel meshes) and `normal` (of the true surface) per triangle.
-    Region and patch are numbers from 0; the file says their names in ``Information`` elements of their grids. In
-    FEniCSx::
+    Region and patch are numbers from 1, as in .msh files, where 0 stands for none; ``Information`` elements of their
+    grids say their names. In FEniCSx::
 
         with dolfinx.io.XDMFFile(comm, "mesh.xdmf", "r") as file:
             mesh = file.read_mesh(name="mesh")
@@ -54,9 +54,9 @@ def write_xdmf(path: Path | str, mesh: TetMesh) -> None:
     arrays: dict[str, npt.NDArray] = {
         "points_m": content.points_m,
         "tets": content.tets.astype(np.int64),
-        "region": content.region.astype(np.int32),
+        "region": (content.region + 1).astype(np.int32),
         "facets": content.facets.astype(np.int64),
-        "patch": content.patch.astype(np.int32),
+        "patch": (content.patch + 1).astype(np.int32),
         "area_factor": content.area_factor,
         "normal": content.normal,
         **node_arrays(mesh, content),
@@ -90,7 +90,7 @@ def _index(content: FileContent, arrays: dict[str, npt.NDArray], data_file: str)
 
     def add_grid(name: str, cells: str, kind: str, names_of: str, names: Sequence[str]) -> ElementTree.Element:
         grid = add(domain, "Grid", Name=name, GridType="Uniform")
-        numbered = "; ".join(f"{number} = {entry}" for number, entry in enumerate(names))
+        numbered = "; ".join(f"{number} = {entry}" for number, entry in enumerate(names, 1))
         add(grid, "Information", Name=names_of, Value=numbered)
         count, per_cell = map(str, arrays[cells].shape)
         topology = add(grid, "Topology", TopologyType=kind, NumberOfElements=count, NodesPerElement=per_cell)

@@ -16,6 +16,9 @@ _BINS_WITHIN_BOUNDS: dict[BoundaryMode, int] = {"voxel": 10, "conforming": 30}
 TEMPERATURE_TOLERANCE_K = 1e-6  # what rounding may add to a temperature, [K]
 
 
+SOLVABLE = ("volumes_positive", "conforming", "boundary_closed")  # criteria without which no solver takes a mesh
+
+
 @dataclass(frozen=True)
 class Criterion:
     """One quality criterion, and whether a mesh meets it."""
@@ -34,7 +37,7 @@ class Figures:
     min_volume_m3: float  # smallest signed volume of a tetrahedron, [m^3]
     num_non_positive: int  # tetrahedra whose volume is not above 0
     num_mismatches: int
-    """Faces with more than two owners, pairs of boundary triangles upon each other, and nodes at one place."""
+    """Faces with more than two owners, pairs of boundary triangles upon each other, nodes at one place or in none."""
     num_open_edges: int  # edges that the boundary's triangles do not pass equally often in both directions
     num_wrong_facets: int  # boundary triangles that are missing, too many or turned over
     dihedral_range_deg: tuple[float, float]  # smallest and largest angle between two faces of a tetrahedron, [degrees]
@@ -91,7 +94,7 @@ def judge(figures: Figures, boundary_mode: BoundaryMode, length_unit: str = "m")
         ),
         Criterion(
             "conforming",
-            "Neighbours share whole faces: no crack, no face with three owners, no nodes at one place.",
+            "Neighbours share whole faces: no crack, no face with three owners, no twin or unused node.",
             figures.num_mismatches == 0,
             float(figures.num_mismatches),
             f"{figures.num_mismatches:,} mismatches",

@@ -10,13 +10,20 @@ import numpy as np
 from thermoxels_ns.core.arrays import FloatArray, IntArray
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.quality.checks import (
-    check_arrays,
     count_overlaps,
     count_twin_nodes,
     count_wrong_facets,
     facet_areas,
 )
-from thermoxels_ns.mesh.quality.criteria import AngleBins, BoundaryMode, Criterion, Figures, angle_bins, judge
+from thermoxels_ns.mesh.quality.criteria import (
+    SOLVABLE,
+    AngleBins,
+    BoundaryMode,
+    Criterion,
+    Figures,
+    angle_bins,
+    judge,
+)
 from thermoxels_ns.mesh.quality.face_count import edges_of_rows, group_edges, group_faces
 from thermoxels_ns.mesh.quality.tet_shapes import angle_rounding, node_rounding, shapes_in_chunks
 from thermoxels_ns.mesh.quality.topology import (
@@ -106,6 +113,27 @@ class QualityReport:
         return mapping
 
 
+def check_mesh(
+    mesh: TetMesh,
+    boundary_mode: BoundaryMode = "conforming",
+    observed_range_c: tuple[float, float] | None = None,
+    length_unit: str = "m",
+) -> QualityReport:
+    """Measure a mesh as `quality_report` does, and refuse what no finite-element solver can take.
+
+    Raises:
+        MeshError: A volume is not above 0, neighbours do not share whole faces, a node belongs to no tetrahedron or
+            lies where another is, or the boundary is not closed; or what `quality_report` raises.
+    """
+    report = quality_report(mesh, boundary_mode, observed_range_c, length_unit)
+    for criterion in report.criteria:
+        if criterion.name in SOLVABLE and not criterion.kept:
+            remedy = "The mesh is damaged: build it again, and report this if it persists."
+            expected, got = criterion.sentence.rstrip("."), criterion.found
+            raise MeshError(f"mesh {criterion.name}", expected=expected, got=got, remedy=remedy)
+    return report
+
+
 def quality_report(
     mesh: TetMesh,
     boundary_mode: BoundaryMode,
@@ -117,20 +145,19 @@ def quality_report(
     Args:
         mesh: The mesh, damaged or not.
         boundary_mode: How its boundary was made.
-        observed_range_c: Lowest and highest observed temperature, [degrees Celsius]; the observed nodes' if left out.
+        observed_range_c: Lowest and highest observed temperature, [degrees Celsius]; the observed nodes' if left out,
+            all nodes' if none was observed.
         length_unit: Name of the unit of the nodes' positions.
 
     Raises:
-        MeshError: The arrays do not fit each other or are not finite, or no temperature was observed.
+        MeshError: The arrays do not fit each other or are not finite.
     """
     if boundary_mode not in get_args(BoundaryMode):
         modes = " or ".join(get_args(BoundaryMode))
         raise MeshError("boundary_mode", expected=modes, got=repr(boundary_mode), remedy="Pass one of these.")
-    check_arrays(mesh)
-    observed_c = mesh.temperature_c[np.asarray(mesh.observed, dtype=bool)]
-    if observed_range_c is None and len(observed_c) == 0:
-        remedy = "Pass observed_range_c, the lowest and the highest observed temperature."
-        raise MeshError("mesh observed", expected="at least one node that a thermal ray saw", got="none", remedy=remedy)
+    mesh.check()
+    seen = np.asarray(mesh.observed, dtype=bool)
+    observed_c = mesh.temperature_c[seen] if seen.any() else mesh.temperature_c
     low_c, high_c = observed_range_c or (float(observed_c.min()), float(observed_c.max()))
     shapes, volumes, stiffness = _measure_shapes(mesh, angle_bins(boundary_mode))
     edges = group_edges(mesh.tets)
@@ -146,12 +173,11 @@ def quality_report(
     areas = facet_areas(mesh.points_m, mesh.facets)
     overlaps = count_overlaps(mesh.points_m, mesh.facets, sides)
     temperature = mesh.temperature_c
-    used = np.zeros(int(mesh.tets.max()) + 1, dtype=bool)
-    used[mesh.tets.ravel()] = True
+    unused = len(mesh.points_m) - np.count_nonzero(np.bincount(mesh.tets.ravel()))
     figures = Figures(
         min_volume_m3=float(volumes.min()),
         num_non_positive=int(np.count_nonzero(~(volumes > 0.0))),
-        num_mismatches=int(np.count_nonzero(faces.sizes > 2)) + overlaps + count_twin_nodes(mesh.points_m),
+        num_mismatches=int(np.count_nonzero(faces.sizes > 2)) + overlaps + count_twin_nodes(mesh.points_m) + unused,
         num_open_edges=surface.num_open_edges,
         num_wrong_facets=count_wrong_facets(mesh, faces),
         dihedral_range_deg=shapes["dihedral_range_deg"],
@@ -173,8 +199,7 @@ def quality_report(
         edge_length_m=(float(lengths.min()), float(lengths.mean()), float(lengths.max())),
         **shapes,
         share_positive_edges=share_positive,
-        # Nodes without a tetrahedron are none.
-        bodies_by_node=count_bodies(len(used), ends) - int(np.count_nonzero(~used)),
+        bodies_by_node=count_bodies(len(mesh.points_m), ends) - unused,  # nodes without a tetrahedron are none
         bodies_by_face=count_bodies(len(mesh.tets), tets_across_faces(faces)),
         euler_characteristic=surface.euler_characteristic,
         genus=None if None in genera else sum(genus for genus in genera if genus is not None),

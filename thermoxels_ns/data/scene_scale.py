@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.checks import check_finite, check_positive, check_shape
+from thermoxels_ns.core.checks import check_finite, check_positive, check_shape, is_number
 from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 
 Vector = tuple[float, float, float]
@@ -110,7 +110,7 @@ def up_from_scene_file(meta: Mapping[str, Any]) -> Vector | None:
     value = meta.get(_UP_KEY)
     if value is None:
         return None
-    numbers = isinstance(value, list | tuple) and all(_is_number(v) and math.isfinite(v) for v in value)
+    numbers = isinstance(value, list | tuple) and all(is_number(v) and math.isfinite(v) for v in value)
     length = math.hypot(*value) if numbers else 0.0
     if not numbers or len(value) != 3 or not 0.0 < length < math.inf:
         remedy = "Correct the json, for instance to [0, 0, 1], or remove the key."
@@ -151,12 +151,8 @@ def _point(name: str, value: npt.ArrayLike) -> npt.NDArray[np.float64]:
     return check_finite(name, check_shape(name, point, (3,), remedy), remedy)
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def _check_not_negative(name: str, value: object, remedy: str, error: type[ThermoxelsError]) -> None:
-    if not (isinstance(value, int | float) and _is_number(value) and math.isfinite(value) and value >= 0.0):
+    if not (isinstance(value, int | float) and is_number(value) and math.isfinite(value) and value >= 0.0):
         raise error(name, expected="a finite number of at least 0", got=repr(value), remedy=remedy)
 
 

@@ -4,14 +4,14 @@ import math
 import numpy as np
 import pytest
 
-from thermoxels_ns.commands.scene_scale import (
+from thermoxels_ns.core.errors import SceneError, ThermoxelsError
+from thermoxels_ns.data.scene_scale import (
     choose_scale,
     scale_from_known_distance,
     scale_from_option,
     scale_from_scene_file,
     up_from_scene_file,
 )
-from thermoxels_ns.core.errors import SceneError, ThermoxelsError
 from thermoxels_ns.synthetic.scene_folder import make_scene, write_scene
 
 

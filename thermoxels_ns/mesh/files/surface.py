@@ -1,28 +1,33 @@
-"""The surface of a mesh as .stl (shape only) and .ply (shape, colours and temperatures)."""
+"""The surface of a mesh: .stl (shape only), .ply (shape, colours, temperatures) and .glb (for browsers and phones)."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from thermoxels_ns.core.arrays import FloatArray
+from thermoxels_ns.core.checks import check_direction
 from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.mesh.files.content import (
     COLOUR_MAP,
     check_suffix,
     colour_bytes,
+    far_origin,
     file_content,
     surface_of,
     surface_range_c,
     temperature_colours,
     write_bytes,
 )
-from thermoxels_ns.mesh.quality.checks import facet_areas, facet_normals
+from thermoxels_ns.mesh.quality.checks import facet_areas
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-_STL_HEADER = b"Surface of a tetrahedral mesh, metres".ljust(80)
 _ROUNDING_NOTICED = 0.01  # share of a triangle's side by which rounding may move its corners
-_STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_UNLIT = "KHR_materials_unlit"
 
 
 def write_stl(path: Path | str, mesh: TetMesh) -> None:
@@ -30,13 +35,13 @@ def write_stl(path: Path | str, mesh: TetMesh) -> None:
 
     Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
     """
+    from trimesh import Trimesh
+    from trimesh.exchange.stl import export_stl
+
     path = check_suffix(path, ".stl")
     content = file_content(mesh)
     check_stl(mesh)
-    triangles = np.zeros(len(content.facets), dtype=_STL_TRIANGLE)
-    triangles["normal"] = facet_normals(content.points_m, content.facets)
-    triangles["corners"] = content.points_m[content.facets]
-    write_bytes(path, [_STL_HEADER, np.array(len(triangles), "<u4").tobytes(), triangles.tobytes()])
+    write_bytes(path, [export_stl(Trimesh(content.points_m, content.facets, process=False))])
 
 
 def check_stl(mesh: TetMesh) -> None:
@@ -62,6 +67,7 @@ def write_ply(path: Path | str, mesh: TetMesh) -> None:
 
     Vertex properties: x, y, z [m], red, green, blue, `temperature_c` [degrees Celsius] and `observed` (1: measured,
     0: extended). Colours are those of the photographs, of temperatures where the mesh has none; a comment says which.
+    trimesh and VTK write positions in single precision, and meshio the time of day, so the few lines are our own.
 
     Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
     """
@@ -103,3 +109,64 @@ def write_ply(path: Path | str, mesh: TetMesh) -> None:
         "end_header\n",
     ]
     write_bytes(path, ["\n".join(header).encode("ascii"), vertices.tobytes(), faces.tobytes()])
+
+
+def write_glb(path: Path | str, mesh: TetMesh, *, up: Sequence[float] = (0.0, 0.0, 1.0)) -> None:
+    """Write the boundary as binary glTF 2.0 with a colour per node; lengths are metres.
+
+    glTF's up is +y: the file holds mesh coordinates and a matrix that turns `up` to it. Colours are stored as light
+    intensities (linear), as glTF asks for, and shown as they are, without lamps (``KHR_materials_unlit``), so that a
+    colour stands for one temperature. Positions are in single precision; those of a mesh far from the origin count from
+    its middle, and the matrix brings it back. The vertex attribute ``_TEMPERATURE_C`` holds the temperatures
+    themselves, and the ends of the colour map are in the mesh's ``extras``.
+
+    Arguments and errors are those of `thermoxels_ns.mesh.files.formats.write_mesh`.
+    """
+    import trimesh
+    from trimesh.exchange.gltf import export_glb
+
+    path = check_suffix(path, ".glb")
+    content = file_content(mesh)
+    surface = surface_of(content.points_m, content.facets)
+    if not len(surface.triangles):
+        remedy = "Build the mesh with its boundary."
+        raise MeshError("facets", expected="at least one triangle", got="none", remedy=remedy)
+    x, y, z = check_direction("up", up, "Pass for instance (0, 0, 1).", MeshError).tolist()
+    # The smallest turn to +y: about up x y, or any level axis where up is +y or -y itself.
+    level = math.hypot(x, z)
+    turn = trimesh.transformations.rotation_matrix(math.atan2(level, y), (-z, 0.0, x) if level else (1.0, 0.0, 0.0))
+    origin = far_origin(surface.points_m)
+    if origin is not None:
+        turn = turn @ trimesh.transformations.translation_matrix(origin)
+    low, high = surface_range_c(surface, content.temperature_c)
+    triangles = trimesh.Trimesh(
+        surface.points_m if origin is None else surface.points_m - origin,
+        surface.triangles,
+        process=False,
+        metadata={"colours": "temperature", "lowest_c": low, "highest_c": high},
+        vertex_attributes={
+            "_COLOR_0": _light(temperature_colours(surface, content.temperature_c)),
+            "_TEMPERATURE_C": content.temperature_c[surface.nodes].astype(np.float32),
+        },
+    )
+    scene = trimesh.Scene()
+    scene.add_geometry(triangles, node_name="surface", geom_name="surface", transform=turn)
+    write_bytes(path, [export_glb(scene, tree_postprocessor=_finish)])
+
+
+def _light(colours: FloatArray) -> np.ndarray:
+    """Light intensities of screen colours (IEC 61966-2-1, sRGB) from 0 to 65535, and full opacity, shape (m, 4)."""
+    light = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    return np.pad(np.floor(light * 65535.0 + 0.5), ((0, 0), (0, 1)), constant_values=65535.0).astype("<u2")
+
+
+def _finish(tree: dict[str, Any]) -> None:
+    """Show the colours of 16 bits, for which trimesh has no name, without lamps."""
+    (primitive,) = tree["meshes"][0]["primitives"]
+    primitive["attributes"]["COLOR_0"] = number = primitive["attributes"].pop("_COLOR_0")
+    tree["accessors"][number]["normalized"] = True
+    primitive["material"] = 0
+    dull = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    tree["materials"] = [{"name": "temperature", "pbrMetallicRoughness": dull, "extensions": {_UNLIT: {}}}]
+    tree["extensionsUsed"] = [_UNLIT]
+    tree["asset"]["generator"] = "thermoxels"
