@@ -13,7 +13,7 @@ from thermoxels_ns.training.model_config import MOST_VOXELS, ThermoxelsModelConf
     [
         (113.0, (32, 64, 128)),
         (128.0, (32, 64, 128)),
-        (170.0, (40, 80, 160)),
+        (160.0, (40, 80, 160)),
         (5000.0, (48, 96, 192)),
         (1.0, (8, 16, 32)),
     ],

@@ -27,10 +27,6 @@ if TYPE_CHECKING:
     from thermoxels_ns.mesh.solid.voxels import SolidCells
     from thermoxels_ns.mesh.tetrahedra import TetMesh
 
-MOST_PHOTOGRAPHS, LONGEST_SIDE = 128, 400
-"""Photographs that are asked whether they support the mesh, taken evenly from their list, and the longer side to which
-they are averaged down for it, [pixels]."""
-
 
 @dataclass(frozen=True)
 class TrainedScene:
@@ -90,7 +86,7 @@ class ExportThermoxelsMesh(ExportOptions):
                 up_of(self, content, Viewpoint())
 
         scene = load_trained_scene(self.load_config, check_scale)
-        from thermoxels_ns.multiview.photographs import read_photographs
+        from thermoxels_ns.multiview.evidence import depths_of_dataset
 
         def compare(solid: SolidCells, mesh: TetMesh, scale: float) -> dict[str, Any] | None:
             from thermoxels_ns.evaluation.truth_comparison import compare_with_truth
@@ -107,7 +103,7 @@ class ExportThermoxelsMesh(ExportOptions):
             scene.viewpoint,
             compare,
             scene_json(scene.scene_folder),
-            read_photographs(scene.dataset, most=MOST_PHOTOGRAPHS, longest_side=LONGEST_SIDE),
+            depths_of_dataset(scene.dataset, 0.0, scene.snapshot.lattice.lo, scene.snapshot.lattice.hi),
             scene.tracks,
             scene.corrections,
         )

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from thermoxels_ns.mesh.build import BuiltMesh
     from thermoxels_ns.mesh.solid.voxels import SolidCells
     from thermoxels_ns.mesh.tetrahedra import TetMesh
-    from thermoxels_ns.multiview.photographs import Photographs
+    from thermoxels_ns.multiview.stereo import Depths
 
 Say = Callable[[str], None]
 
@@ -65,7 +65,7 @@ def export_snapshot(
     viewpoint: Viewpoint = OBLIQUE,
     compare: Callable[[SolidCells, TetMesh, float], dict[str, Any] | None] | None = None,
     scene_file: Mapping[str, Any] | None = None,
-    photographs: Photographs | None = None,
+    depths: Depths | None = None,
     tracks: FeatureRays | None = None,
     corrections: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
@@ -78,8 +78,8 @@ def export_snapshot(
     `world_to_input`, shape (4, 4), takes the trained scene to the input poses; the up of `viewpoint` is the mesh's
     unless the scene's json has one. If the scale is known, `compare` compares solid voxels and mesh in metres (last:
     metres per unit) with a known truth; its `ThermoxelsError` goes into the summary. All other errors are raised.
-    `photographs` and `tracks`, lines from them to points that they see, say which boundary triangles are supported.
-    `corrections` are what training corrected in photographs; they go into the summary.
+    `depths` of photographs and `tracks`, lines from them to points that they see, say which boundary triangles are
+    supported. `corrections` are what training corrected in photographs; they go into the summary.
     """
     from thermoxels_ns.commands.export_summary import HEAT_SKIPPED, heat_summary, mesh_summary, versions
     from thermoxels_ns.fem.solution import HeatSolution
@@ -102,8 +102,8 @@ def export_snapshot(
     to_mesh = np.diag([metres, metres, metres, 1.0]) @ world_to_input
     mesh_options = MeshOptions(options.boundary, options.coarsest_cell, up=up, rules=checked.rules)
     built = build_mesh(snapshot, checked.selection, to_mesh, mesh_options)
-    if photographs is not None:
-        built = _with_support(built, photographs, tracks, snapshot.lattice, to_mesh)
+    if depths is not None:
+        built = _with_support(built, depths, tracks, snapshot.lattice, to_mesh)
     mesh = built.mesh
     suffixes = [f".{name}" for name in options.formats]
     for suffix in suffixes:
@@ -196,7 +196,7 @@ def volume_in_words(volume_m3: float) -> str:
 
 def _with_support(
     built: BuiltMesh,
-    photographs: Photographs,
+    depths: Depths,
     tracks: FeatureRays | None,
     lattice: Lattice,
     to_mesh: npt.NDArray[np.float64],
@@ -207,15 +207,16 @@ def _with_support(
     """
     from thermoxels_ns.mesh.boundary.visibility import facet_views
     from thermoxels_ns.mesh.build import apply_transform
-    from thermoxels_ns.multiview.surface_support import supporting_photographs
+    from thermoxels_ns.multiview.support import supporting_photographs
 
     mesh = built.mesh
     assert mesh.boundary is not None
     middle = apply_transform(np.linalg.inv(to_mesh), mesh.points_m[mesh.facets].mean(axis=1))
     normal = mesh.boundary.normal @ to_mesh[:3, :3] / np.cbrt(abs(np.linalg.det(to_mesh[:3, :3])))
+    photographs = depths.photographs
     cameras = photographs.matrices, photographs.centres, photographs.sizes
     views = facet_views(built.solid.cells, lattice, *cameras, middle, normal)
-    found = supporting_photographs(photographs, views.middle, views.normal, views.seen, lattice.voxel_size, tracks)
+    found = supporting_photographs(depths, views.middle, views.seen, lattice.voxel_size, tracks)
     count = np.stack((views.seen.sum(axis=1), found.sum(axis=1)), axis=1)[views.group]
     return replace(built, mesh=replace(mesh, boundary=replace(mesh.boundary, photographs=count)))
 

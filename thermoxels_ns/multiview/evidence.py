@@ -14,7 +14,13 @@ from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.multiview.backdrop import plain_backdrop
 from thermoxels_ns.multiview.differences import matters, photograph_differences
 from thermoxels_ns.multiview.photographs import Photographs, read_photographs, thermal_at
-from thermoxels_ns.multiview.stereo import depths_before_backdrop, depths_of, feature_rays_to_depths, rays_through
+from thermoxels_ns.multiview.stereo import (
+    Depths,
+    depths_before_backdrop,
+    depths_of,
+    feature_rays_to_depths,
+    rays_through,
+)
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -37,6 +43,17 @@ class PhotographEvidence:
     offset: FloatArray | None  # Offset of each thermal image, of the temperature range, (photographs,), or None
 
 
+def depths_of_dataset(dataset: Any, near: float, lo: npt.ArrayLike, hi: npt.ArrayLike) -> Depths | None:
+    """Depths of a `ThermalDataset`'s photographs behind `near`, in the box from `lo` to `hi` and behind it.
+
+    All in world units; None without perspective photographs.
+    """
+    photographs = read_photographs(dataset, near)
+    if photographs is None:
+        return None
+    return depths_of(photographs, lo, hi, larger=read_photographs(dataset, near, longest_side=REFINED_SIDE))
+
+
 def evidence_of_photographs(
     dataset: Any,
     near: float,
@@ -52,11 +69,11 @@ def evidence_of_photographs(
     `offsets` say which differences between photographs are looked for.
     """
     began = time.perf_counter()
-    photographs = read_photographs(dataset, near)
-    if photographs is None:
+    depths = depths_of_dataset(dataset, near, lo, hi)
+    if depths is None:
         return None
-    larger = read_photographs(dataset, near, longest_side=REFINED_SIDE)
-    depths, backdrop = depths_before_backdrop(depths_of(photographs, lo, hi, larger=larger))
+    depths, backdrop = depths_before_backdrop(depths)
+    photographs = depths.photographs
     few = "" if depths.share >= LEAST_SHARE else ", too few to tell anything"
     span_k = dataset.temperature_range.span_k
     found = photograph_differences(depths, thermal_at(dataset, photographs, depths.depth)) if gains or offsets else None

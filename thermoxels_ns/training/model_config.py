@@ -221,13 +221,15 @@ class ThermoxelsModelConfig(ModelConfig):
     def suited_to(self, voxels: float) -> ThermoxelsModelConfig:
         """The settings for a scene along whose longest side that many voxels of `voxel_pixels` stand.
 
-        All resolutions grow or shrink alike, and at most to `MOST_VOXELS` times as many.
+        All resolutions grow or shrink alike, and at most to `MOST_VOXELS` times as many. They are rounded up, unless a
+        quarter of a step is all that is missing: fewer voxels cost more than they save (courtyard: F 0.81, 0.86 and
+        0.89 of what is seen with 96, 112 and 128 voxels).
         """
         if not self.voxel_pixels or not math.isfinite(voxels):
             return self
         first, last = self.resolutions[0], self.resolutions[-1]
         wanted = min(voxels, MOST_VOXELS * last) * first / last
-        coarsest = max(STEP_OF_COARSEST, STEP_OF_COARSEST * round(wanted / STEP_OF_COARSEST))
+        coarsest = STEP_OF_COARSEST * max(1, math.ceil(wanted / STEP_OF_COARSEST - 0.25))
         return replace(self, resolutions=tuple(coarsest * each // first for each in self.resolutions))
 
     def first_sh_degree(self) -> int | None:

@@ -11,7 +11,8 @@ from thermoxels_ns.mesh.boundary.visibility import FacetViews, facet_views
 from thermoxels_ns.mesh.quality.checks import facet_normals
 from thermoxels_ns.mesh.voxel_tets import kuhn_tets, voxel_facets
 from thermoxels_ns.multiview.photographs import Photographs
-from thermoxels_ns.multiview.surface_support import supporting_photographs
+from thermoxels_ns.multiview.stereo import Depths, depths_of
+from thermoxels_ns.multiview.support import supporting_photographs
 from thermoxels_ns.synthetic.box_solid import BoxSolid
 
 VOXEL = 0.05
@@ -53,12 +54,17 @@ def photographs() -> Photographs:
     return Photographs(matrices, centres, views.size, firsts, shown, np.full(len(shown), np.nan, np.float32))
 
 
+@cache
+def depths() -> Depths:
+    return depths_of(photographs(), (-1.6, -1.6, -0.4), (1.6, 1.6, 2.8))
+
+
 def support(cells: np.ndarray, tracks: FeatureRays | None = None) -> tuple[FacetViews, np.ndarray]:
     """Views of the surface of voxels, and how many photographs support it."""
     points, facets, photos = LATTICE.index_to_world(kuhn_tets(cells)[0]), voxel_facets(cells), photographs()
     middle, normals = points[facets].mean(axis=1), facet_normals(points, facets)
     views = facet_views(cells, LATTICE, photos.matrices, photos.centres, photos.sizes, middle, normals)
-    found = supporting_photographs(photos, views.middle, views.normal, views.seen, VOXEL, tracks)
+    found = supporting_photographs(depths(), views.middle, views.seen, VOXEL, tracks)
     return views, found.sum(axis=1)
 
 
