@@ -110,7 +110,7 @@ def test_small_changes_fill_their_own_symmetric_scale(ball, tmp_path, monkeypatc
 
     monkeypatch.setattr("thermoxels_ns.reports.mesh_pictures.picture_of_mesh", draw)
     export_snapshot(ball, np.eye(4), ExportOptions(metres_per_unit=1.0, steps=1, step_seconds=60.0), tmp_path)
-    (before, first), (after, last), (change, look) = drawn[2:]
+    (before, first), (after, last), (change, look) = drawn[3:]
     assert first["clim"] == last["clim"]
     np.testing.assert_array_equal(change, after - before)
     low, high = look["clim"]
@@ -171,6 +171,9 @@ def test_impossible_dataparser_transforms_are_refused(transform, scale) -> None:
     [
         ("metres_per_unit", -1.0, ThermoxelsError, "metres_per_unit"),
         ("coarsest_cell", 3, MeshError, "coarsest_cell"),
+        ("region", "some", MeshError, "region: expected auto or all"),
+        ("region_box", (0.0, 0.0, 0.0, 1.0, float("nan"), 1.0), MeshError, "region_box: expected .* nan"),
+        ("region_near", (0.0, 0.0, 0.0, -1.0), MeshError, "region_near: .* radius above 0, got 0 0 0 -1"),
         ("formats", ("vtu", "vtu"), MeshError, "formats"),
         ("formats", ("inp",), MeshError, "scale: expected .* --formats inp"),
         ("wall_thickness", 0.3, MeshError, "scale: .* --wall-thickness"),
@@ -192,6 +195,39 @@ def test_plain_command_line_takes_the_preset() -> None:
     checked = check_options(parsed)
     assert checked.selection == SolidSelection() and checked.distance is None
     assert (checked.material.name, checked.time) == ("concrete", TimeSteps(10, 60.0))
+
+
+def test_a_region_is_exported_said_and_drawn(ball, tmp_path, monkeypatch) -> None:
+    """Half of the ball, in the coordinates of input poses that are twice as far apart."""
+    drawn = {}
+
+    def draw(path, mesh, *_, **how):
+        drawn[Path(path).name] = how
+        Image.new("RGB", (8, 6)).save(path)
+
+    monkeypatch.setattr("thermoxels_ns.reports.mesh_pictures.picture_of_mesh", draw)
+    lines: list[str] = []
+    options = ExportOptions(metres_per_unit=0.5, region_box=(0.0, -2.0, -2.0, 2.0, 2.0, 2.0), steps=1)
+    summary = export_snapshot(ball, np.diag([2.0, 2.0, 2.0, 1.0]), options, tmp_path, lines.append)
+    region = summary["region"]
+    assert region["asked_for"] == "a box" and region["share_of_solid_taken"] == pytest.approx(0.5)
+    assert region["voxels_taken"] == region["voxels_left_out"] > 0
+    assert region["size"] == pytest.approx([0.5, 1.0, 1.0], abs=0.15)
+    assert sum(line.startswith("Region, a box: 0.") and "50.0% of the solid" in line for line in lines) == 1
+    assert "region.png" in summary["files"] and summary["options"]["region_box"][3] == 2.0
+    points, triangles = drawn["region.png"]["ghost"]
+    assert points[triangles].mean(axis=1)[:, 0].max() <= 1e-9 and len(triangles) > 0
+    assert summary["mesh"]["patches"]["cut"] == pytest.approx(np.pi * 0.5**2, rel=0.2)
+
+
+def test_the_command_line_takes_regions_with_negative_numbers() -> None:
+    paths = ["--load-config", "c", "--output-dir", "o"]
+    for args, name, value in (
+        (["--region-box", "-1", "-2.5", "-0.001", "1", "2", "3"], "region_box", (-1.0, -2.5, -0.001, 1.0, 2.0, 3.0)),
+        (["--region-near", "-1", "0", "-3e-5", "2"], "region_near", (-1.0, 0.0, -3e-5, 2.0)),
+        (["--region", "all"], "region", "all"),
+    ):
+        assert getattr(check_options(tyro.cli(ExportThermoxelsMesh, args=[*paths, *args])).selection, name) == value
 
 
 def test_truth_and_viewpoint_reach_the_summary_and_the_pictures(ball, tmp_path, monkeypatch) -> None:

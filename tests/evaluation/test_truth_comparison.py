@@ -52,7 +52,7 @@ def exact_mesh(
         np.full(lattice.shape, observed, dtype=np.float32),
         cells.astype(np.float32) if just_inside else None,
     )
-    selection = SolidSelection(close_gaps=0, density_threshold=1e-6, largest_component=False)
+    selection = SolidSelection(close_gaps=0, density_threshold=1e-6, region="all")
     return build_mesh(snapshot, selection, world_to_metres, MeshOptions("voxel")).mesh, cells, lattice
 
 

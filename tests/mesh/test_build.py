@@ -118,7 +118,7 @@ def test_part_no_thermal_ray_saw_is_left_out(snapshot_of):
     weight = np.zeros((8, 5, 5))
     weight[0] = 1.0
     field = replace(snapshot_of(np.ones(weight.shape), 20.0, weight), voxel_density=cells.astype(np.float32))
-    every = SolidSelection(close_gaps=0, density_threshold=0.5, largest_component=False)
+    every = SolidSelection(close_gaps=0, density_threshold=0.5, region="all")
     built = build_mesh(field, every, np.eye(4), VOXEL)
     mesh, solid = built.mesh, built.solid
     assert (built.unobserved_parts, built.unobserved_voxels) == (1, 6)

@@ -14,7 +14,7 @@ from thermoxels_ns.mesh.quality.report import check_mesh
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 
 MODES = ["conforming", "voxel"]
-AS_IT_IS = SolidSelection(density_threshold=0.5, close_gaps=0, smallest_body=0.0, interior="hollow")
+AS_IT_IS = SolidSelection(density_threshold=0.5, close_gaps=0, region="all", interior="hollow")
 
 
 def trained(cells: np.ndarray) -> GridSnapshot:

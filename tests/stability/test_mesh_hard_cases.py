@@ -77,16 +77,14 @@ def test_opaque_body_is_seen_on_its_skin_only():
     seed=st.integers(0, 2**32 - 1),
     fill=st.floats(0.05, 1.0),
     percentile=st.floats(0.0, 99.0),
-    largest=st.booleans(),
+    region=st.sampled_from(["auto", "all"]),
     interior=st.sampled_from(["solid", "hollow"]),
     mirror=st.booleans(),
 )
-def test_every_mesh_that_is_built_is_valid(shape, seed, fill, percentile, largest, interior, mirror):
+def test_every_mesh_that_is_built_is_valid(shape, seed, fill, percentile, region, interior, mirror):
     random = np.random.default_rng(seed)
     density = random.random(shape) * (random.random(shape) < fill)
-    selection = SolidSelection(
-        close_gaps=0, density_percentile=percentile, largest_component=largest, interior=interior
-    )
+    selection = SolidSelection(close_gaps=0, density_percentile=percentile, region=region, interior=interior)
     field = snapshot(density)
     try:
         solid = select_solid(field, selection)

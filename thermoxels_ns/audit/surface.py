@@ -18,7 +18,7 @@ _STEP_K, _STEP_COSINE = 0.05, 0.05
 """Widths of the bins of readings, [K], and of normals, within which triangles are alike."""
 
 WHY_NOT = {
-    "cut": "that the scene box cuts",
+    "cut": "that the scene box or the region of the export cuts",
     "unseen": "that no photograph shows",
     "no reading": "that no thermal ray measured, or not on all of a triangle",
     "left out": "that the conditions leave out",

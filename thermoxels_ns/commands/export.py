@@ -92,7 +92,8 @@ class ExportThermoxelsMesh(ExportOptions):
             from thermoxels_ns.evaluation.truth_comparison import compare_with_truth
 
             lattice = scene.snapshot.lattice
-            return compare_with_truth(solid.cells, lattice, scene.world_to_input, scene.scene_folder, mesh, scale)
+            truth = scene.world_to_input, scene.scene_folder
+            return compare_with_truth(solid.cells, lattice, *truth, mesh, scale, within=solid.within)
 
         return export_snapshot(
             scene.snapshot,

@@ -50,10 +50,14 @@ class ExportOptions:
     """Voxels at least this dense are solid, [1 / world unit]. Takes the place of both."""
     close_gaps: int = 1
     """Fill gaps and pinholes up to twice this many voxels wide; thin walls are not continuous without it. 0: none."""
-    smallest_body: float = 0.01
-    """Drop bodies (voxels that touch, if only by corners) of less than this share of the largest; mostly floaters."""
-    largest_component: bool = False
-    """Keep only the largest body of voxels that touch by faces."""
+    region: Literal["auto", "all"] = "auto"
+    """Which part is exported. auto: what photographs show about as well as what they were taken of, an object with its
+    table, a house with the ground around it, a room with its walls; without bodies below 1 % of the largest, which are
+    mostly floaters. all: everything that was reconstructed."""
+    region_box: tuple[float, float, float, float, float, float] | None = None
+    """In place of auto, what lies in a box in the coordinates of the input poses, xmin ymin zmin xmax ymax zmax."""
+    region_near: tuple[float, float, float, float] | None = None
+    """In place of auto, what lies near a point in the coordinates of the input poses, x y z radius."""
     interior: Literal["solid", "hollow"] = "solid"
     """What becomes of the inside of a body of which photographs only show the shell. solid: it is filled; a cavity with
     a camera in it is a room and stays empty. hollow: the shell alone, as thick as the photographs happened to make

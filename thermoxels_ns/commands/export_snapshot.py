@@ -36,7 +36,7 @@ OBLIQUE = Viewpoint()  # Obliquely from above, z up
 
 _SUMMARY, _HEAT, _QUALITY = "summary.json", "heat.pvd", "quality.json"
 _MESH_STEM = "mesh"
-_MESH_PICTURES = ("mesh.png", "mesh-measured.png", "quality.png")
+_MESH_PICTURES = ("mesh.png", "mesh-measured.png", "quality.png", "region.png")
 _HEAT_PICTURE = "heat.png"
 
 
@@ -81,7 +81,13 @@ def export_snapshot(
     `depths` of photographs and `tracks`, lines from them to points that they see, say which boundary triangles are
     supported. `corrections` are what training corrected in photographs; they go into the summary.
     """
-    from thermoxels_ns.commands.export_summary import HEAT_SKIPPED, heat_summary, mesh_summary, versions
+    from thermoxels_ns.commands.export_summary import (
+        HEAT_SKIPPED,
+        heat_summary,
+        mesh_summary,
+        region_summary,
+        versions,
+    )
     from thermoxels_ns.fem.solution import HeatSolution
     from thermoxels_ns.heat.solving import Goals, solve_problem
     from thermoxels_ns.heat.vtk_series import heat_series_paths, remove_heat_series, write_heat_series
@@ -92,7 +98,7 @@ def export_snapshot(
     from thermoxels_ns.mesh.files.vtu import summary_text, write_summary
     from thermoxels_ns.mesh.quality.picture import picture_of_quality
     from thermoxels_ns.mesh.quality.report import check_mesh
-    from thermoxels_ns.reports.mesh_pictures import add_support, draw_heat, draw_mesh
+    from thermoxels_ns.reports.mesh_pictures import add_support, draw_heat, draw_mesh, draw_region
 
     checked = check_options(options)
     scale = scale_of(options, checked, scene_file)
@@ -101,7 +107,7 @@ def export_snapshot(
     folder = prepare_folder(output_dir, heat=scale is not None)
     to_mesh = np.diag([metres, metres, metres, 1.0]) @ world_to_input
     mesh_options = MeshOptions(options.boundary, options.coarsest_cell, up=up, rules=checked.rules)
-    built = build_mesh(snapshot, checked.selection, to_mesh, mesh_options)
+    built = build_mesh(snapshot, checked.selection, to_mesh, mesh_options, metres)
     if depths is not None:
         built = _with_support(built, depths, tracks, snapshot.lattice, to_mesh)
     mesh = built.mesh
@@ -112,7 +118,8 @@ def export_snapshot(
     unit = "input unit" if scale is None else "m"
     report = check_mesh(mesh, options.boundary, built.observed_range_c, length_unit=unit)
     say(f"Up: {', '.join(f'{value:.3g}' for value in up)}. {up_source}")
-    _tell(built, report.volume_m3, unit, None if scale is None else voxel_size, say)
+    region = region_summary(built, checked.selection)
+    _tell(built, region, report.volume_m3, unit, None if scale is None else voxel_size, say)
 
     scene, material, time = checked.scene, checked.material, checked.time
     solution: HeatSolution | None = None
@@ -142,6 +149,7 @@ def export_snapshot(
         "scale": None if scale is None else scale.as_mapping(),
         "up": up,
         "up_source": up_source,
+        "region": region,
         "mesh": mesh_summary(built, report, checked.selection, scale, voxel_size),
         "heat": skipped if solution is None else heat_summary(material, time, solution),
         "corrections": dict(corrections or {}),
@@ -169,6 +177,7 @@ def export_snapshot(
         picture_of_quality(folder / _MESH_PICTURES[2], report)
         if support_of_facets(mesh) is not None:
             add_support(folder / _MESH_PICTURES[2], mesh, look)
+        draw_region(folder / _MESH_PICTURES[3], mesh, look, unit, *_left_out(built, snapshot.lattice, to_mesh))
         if solution is not None:
             draw_heat(folder / _HEAT_PICTURE, mesh, solution, look)
     write_summary(folder / _SUMMARY, summary)
@@ -221,7 +230,20 @@ def _with_support(
     return replace(built, mesh=replace(mesh, boundary=replace(mesh.boundary, photographs=count)))
 
 
-def _tell(built: BuiltMesh, volume: float, unit: str, voxel_size: float | None, say: Say) -> None:
+def _left_out(
+    built: BuiltMesh, lattice: Lattice, to_mesh: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+    """Corners, in the mesh's coordinates, and triangles of the voxel faces around what is not exported."""
+    from thermoxels_ns.mesh.build import apply_transform
+    from thermoxels_ns.mesh.voxel_tets import used_corners, voxel_facets
+
+    left_out = built.solid.left_out
+    return apply_transform(to_mesh, lattice.index_to_world(used_corners(left_out))), voxel_facets(left_out)
+
+
+def _tell(
+    built: BuiltMesh, region: Mapping[str, Any], volume: float, unit: str, voxel_size: float | None, say: Say
+) -> None:
     """Say how the solid was found, step by step, and what the mesh has."""
     from thermoxels_ns.commands.export_summary import support_shares
 
@@ -233,6 +255,10 @@ def _tell(built: BuiltMesh, volume: float, unit: str, voxel_size: float | None, 
                 amounts.append(f"{sign}{voxels} voxels{size}")
         say(f"Solid, {step.name}: {', '.join(amounts) or 'nothing changed'}. {step.remark}")
     mesh = built.mesh
+    say(
+        f"Region, {region['asked_for']}: {' x '.join(f'{side:.3g}' for side in region['size'])} {unit}, "
+        f"{region['share_of_solid_taken']:.1%} of the solid; {region['voxels_left_out']} of its voxels are left out."
+    )
     say(f"Mesh: {len(mesh.tets)} tetrahedra, {len(mesh.points_m)} nodes, volume {volume:.6g} {unit}^3")
     if built.unobserved_parts:
         say(

@@ -105,6 +105,24 @@ def mesh_summary(
     }
 
 
+def region_summary(built: BuiltMesh, selection: SolidSelection) -> dict[str, Any]:
+    """Which part is exported, how large the mesh is [unit], and what share of the solid it was made from."""
+    near, box, points = selection.region_near, selection.region_box, built.mesh.points_m
+    left_out, found = int(built.solid.left_out.sum()), _voxels_found(built.solid)
+    return {
+        "asked_for": "near a point" if near else "a box" if box else selection.region,
+        "size": points.max(axis=0) - points.min(axis=0),
+        "voxels_taken": found - left_out,
+        "voxels_left_out": left_out,
+        "share_of_solid_taken": 1.0 - left_out / found,
+    }
+
+
+def _voxels_found(solid: SolidCells) -> int:
+    """Voxels that are solid in the whole lattice, before anything is left out or filled."""
+    return sum(step.added for step in solid.steps if step.name in ("threshold", "close gaps"))
+
+
 def patch_areas(mesh: TetMesh) -> dict[str, float]:
     """True area of each patch that has a triangle, [unit^2]."""
     boundary = mesh.boundary
@@ -135,12 +153,12 @@ def support_shares(mesh: TetMesh) -> dict[str, float] | None:
 
 
 def _percentile_summary(solid: SolidCells, selection: SolidSelection) -> dict[str, float]:
-    """What a percentile asked for, and got before small bodies were dropped (what has no density never counts)."""
+    """What a percentile asked for, and got before a region was chosen (what has no density never counts)."""
     if selection.density_percentile is None or selection.density_threshold is not None:
         return {}
     return {
         "share_of_voxels_asked_for": 1.0 - selection.density_percentile / 100.0,
-        "share_of_voxels_kept": float(solid.component_sizes.sum()) / solid.cells.size,
+        "share_of_voxels_kept": _voxels_found(solid) / solid.cells.size,
     }
 
 

@@ -173,14 +173,16 @@ def compare_with_truth(
     truth: Path | str | KnownTruth,
     mesh: TetMesh | None = None,
     metres_per_unit: float = 1.0,
+    within: BoolArray | None = None,
 ) -> dict[str, Any] | None:
     """Compare solid voxels, and the temperatures of a mesh made from them, with the exact scene.
 
     Precision is the share of the reconstructed boundary within `TOLERANCE_VOXELS` of the true surface; recall the
     share of the true surface that at least `MIN_VIEWS` training cameras see and that lies within the tolerance of
     the reconstructed boundary; the F-score is their harmonic mean. Enclosed cavities are filled first, and the
-    boundary is not counted for precision where the scene box cuts it. Beside them stand the same figures for the part
-    of the boundary that at least `MIN_VIEWS` training cameras see: no photograph shows the rest, which is a guess.
+    boundary is not counted for precision where the scene box, or the region `within` that is exported, cuts it. Beside
+    them stand the same figures for the part of the boundary that at least `MIN_VIEWS` training cameras see: no
+    photograph shows the rest, which is a guess.
 
     `cells` has the shape `lattice.cell_shape`; `world_to_truth` (4, 4) is the similarity from the lattice's world to
     the input poses' coordinates, in which a synthetic scene is written in metres; without `mesh` no temperatures are
@@ -212,7 +214,9 @@ def compare_with_truth(
     seen = points_seen(known)
     views = _training_views(known, transform)
     score = surface_fscore(
-        cells, lattice, known.scene, seen, tolerance_m, transform, views, surroundings=known.surroundings
+        *(cells, lattice, known.scene, seen, tolerance_m, transform, views),
+        surroundings=known.surroundings,
+        within=within,
     )
     assert score.seen is not None
     solid = np.asarray(cells, dtype=bool)
@@ -278,7 +282,7 @@ def geometry_metrics(
         say(f"Geometry is not compared with the truth: {problem}")
         return {}
     try:
-        cells = select_solid(snapshot, SolidSelection(), makes_up_volume=False).cells
+        solid = select_solid(snapshot, SolidSelection(), makes_up_volume=False)
     except MeshError as problem:
         say(f"The geometry scores 0: {problem}")
         return dict.fromkeys(("fscore", "precision", "recall", "fscore_128"), 0.0)
@@ -290,8 +294,9 @@ def geometry_metrics(
     views = _training_views(known, transform)
     own, common = (
         surface_fscore(
-            *(cells, lattice, known.scene, seen, TOLERANCE_VOXELS * size_m, transform, views),
+            *(solid.cells, lattice, known.scene, seen, TOLERANCE_VOXELS * size_m, transform, views),
             surroundings=known.surroundings,
+            within=solid.within,
         )
         for size_m in (voxel_m, common_voxel_m)
     )

@@ -68,11 +68,12 @@ def surface_fscore(
     world_to_truth: FloatArray | None = None,
     views: Views | None = None,
     surroundings: TrueShape | None = None,
+    within: BoolArray | None = None,
 ) -> SurfaceScore:
     """Compare the boundary of the solid voxels with the true surface.
 
     Enclosed cavities are filled first: no camera sees what is inside. The boundary is sampled at four points per voxel
-    face. Faces on the border of the lattice, where the box cuts the scene, do not count for precision. Distances for
+    face. Faces where the lattice or the region ends, which cut the scene, do not count for precision. Distances for
     recall go to the nearest sample, at most 0.36 voxels beyond the face itself.
 
     A voxel face is seen if `MIN_VIEWS` cameras have a free line, past the solid voxels, to the empty voxel before it.
@@ -88,6 +89,7 @@ def surface_fscore(
             too, which takes a few passes over the lattice per camera.
         surroundings: What truly stands beside the body. Boundary in it, or within the tolerance of it, is neither right
             nor wrong: photographs do not say where the body ends and its surroundings begin.
+        within: The region that was taken, shape `lattice.cell_shape`; None: all.
     """
     cells = check_shape("cells", cells, lattice.cell_shape, "Pass the solid voxels of this lattice.", MeshError)
     seen = np.asarray(true_points_seen, dtype=np.float64)
@@ -95,7 +97,7 @@ def surface_fscore(
     transform = check_similarity("world_to_truth", np.eye(4) if world_to_truth is None else world_to_truth)
 
     solid = fill_enclosed(cells)
-    faces = _boundary_faces(solid)
+    faces = _boundary_faces(solid, np.ones_like(solid) if within is None else within)
     samples, on_border = _samples(faces)
     of_seen = None if views is None else SeenScore(share=0.0, precision=0.0, recall=0.0, fscore=0.0)
     if len(samples) == 0:
@@ -146,11 +148,11 @@ class _Faces:
     axis: int
     corner: IntArray  # Corner index of each face's first corner, shape (n, 3)
     empty: IntArray  # The empty voxel beside each face, shape (n, 3); outside the lattice for some faces on its border
-    on_border: BoolArray  # Faces on the border of the lattice, shape (n,)
+    on_border: BoolArray  # Faces on the border of the lattice or of the region, shape (n,)
 
 
-def _boundary_faces(cells: BoolArray) -> tuple[_Faces, ...]:
-    faces = []
+def _boundary_faces(cells: BoolArray, within: BoolArray) -> tuple[_Faces, ...]:
+    faces, within = [], np.pad(within, 1)
     for axis in range(3):
         width = [(0, 0)] * 3
         width[axis] = (1, 1)
@@ -158,13 +160,12 @@ def _boundary_faces(cells: BoolArray) -> tuple[_Faces, ...]:
         corner = np.argwhere(rise != 0)
         empty = corner.copy()
         empty[:, axis] -= rise[tuple(corner.T)] > 0
-        on_border = (corner[:, axis] == 0) | (corner[:, axis] == cells.shape[axis])
-        faces.append(_Faces(axis, corner, empty, on_border))
+        faces.append(_Faces(axis, corner, empty, on_border=~within[tuple((empty + 1).T)]))
     return tuple(faces)
 
 
 def _samples(faces: tuple[_Faces, ...]) -> tuple[FloatArray, BoolArray]:
-    """Corner indices of `_PER_SIDE`^2 points on a regular grid of each face, and which lie on the lattice's border."""
+    """Corner indices of `_PER_SIDE`^2 points on a regular grid of each face, and which lie on a border."""
     steps = (np.arange(_PER_SIDE) + 0.5) / _PER_SIDE
     points, borders = [], []
     for face in faces:

@@ -80,7 +80,11 @@ class _Shape:
 
 
 def build_mesh(
-    snapshot: GridSnapshot, selection: SolidSelection, world_to_metres: FloatArray, options: MeshOptions = MeshOptions()
+    snapshot: GridSnapshot,
+    selection: SolidSelection,
+    world_to_metres: FloatArray,
+    options: MeshOptions = MeshOptions(),
+    metres_per_unit: float = 1.0,
 ) -> BuiltMesh:
     """Cut the solid part of a trained field into tetrahedra with nodal temperatures and boundary tags.
 
@@ -93,6 +97,7 @@ def build_mesh(
             column vectors of the trained scene to metres. A reflection turns the tetrahedra over, so that their
             volumes stay positive.
         options: Kind of boundary, tags, and what counts as measured.
+        metres_per_unit: Length of a unit of the input poses, [m], in which a region is given.
 
     Raises:
         MeshError: Nothing is solid, the 4x4 is no similarity, or no node of the mesh was measured.
@@ -100,7 +105,13 @@ def build_mesh(
     transform = check_similarity("world_to_metres", world_to_metres)
     least = max(options.min_observed_weight, float(np.finfo(np.float32).tiny))
     scale = float(np.cbrt(abs(np.linalg.det(transform[:3, :3]))))
-    solid = select_solid(snapshot, selection, scale, makes_up_volume=options.boundary == "conforming")
+    solid = select_solid(
+        snapshot,
+        selection,
+        scale,
+        world_to_input=transform[:3] / metres_per_unit,
+        makes_up_volume=options.boundary == "conforming",
+    )
     solid, num_parts, num_voxels = _without_unobserved(solid, snapshot.observed_weight >= least)
 
     if options.boundary == "voxel":
@@ -123,6 +134,7 @@ def build_mesh(
     observed = weight >= least
     temperature_c = extend_harmonically(edges, temperature_c, observed, edge_weights=conductance)
 
+    shape = replace(shape, facet_tags=np.where(_cut(shape, solid.within), FACET_BOX, shape.facet_tags))
     tets, facets = shape.tets, shape.facets
     if np.linalg.det(transform[:3, :3]) < 0.0:
         tets, facets = tets[:, [0, 2, 1, 3]], facets[:, ::-1]
@@ -151,6 +163,19 @@ def build_mesh(
     return BuiltMesh(
         replace(mesh, boundary=boundary), solid, num_parts, num_voxels, observed_range_c, (*idle_patches, *idle_regions)
     )
+
+
+def _cut(shape: _Shape, within: BoolArray) -> BoolArray:
+    """Boundary triangles that look out of the region: the solid may go on behind them, as it may behind the box."""
+    corners = shape.points[shape.facets]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    # A smoothed surface between two voxels lies at most half a voxel before their common face.
+    beside = np.floor(corners.mean(axis=1) + 0.75 * normal).astype(np.int64)
+    inside = np.all((beside >= 0) & (beside < within.shape), axis=1)
+    cut = np.zeros(len(beside), dtype=bool)
+    cut[inside] = ~within[tuple(beside[inside].T)]
+    return cut
 
 
 def _measured(snapshot: GridSnapshot, points: FloatArray, least: float) -> tuple[FloatArray, FloatArray]:

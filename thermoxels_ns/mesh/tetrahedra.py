@@ -103,4 +103,4 @@ def _check_names(name: str, names: Sequence[str]) -> None:
 
 
 FACET_SURFACE = 0  # boundary between solid and empty space
-FACET_BOX = 1  # boundary where the scene box cuts the solid
+FACET_BOX = 1  # boundary where the scene box or the region of an export cuts the solid

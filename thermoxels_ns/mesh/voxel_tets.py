@@ -41,6 +41,12 @@ def kuhn_tets(cells: BoolArray) -> tuple[IntArray, IntArray]:
     return np.argwhere(number >= 0) + first, tets
 
 
+def used_corners(cells: BoolArray) -> IntArray:
+    """Lattice indices (n, 3) of the corners that solid voxels touch, in C order: the nodes of `voxel_facets`."""
+    cells, first = _cropped(cells)
+    return np.argwhere(_node_numbers(cells) >= 0) + first
+
+
 def lattice_edges(cells: BoolArray) -> tuple[IntArray, IntArray]:
     """Edges of the solid voxels (e, 2) between nodes of `kuhn_tets`; how many solid voxels are around each, 1 to 4.
 

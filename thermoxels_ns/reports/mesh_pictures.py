@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from thermoxels_ns.core.arrays import BoolArray, FloatArray
+from thermoxels_ns.core.arrays import BoolArray, FloatArray, IntArray
 from thermoxels_ns.core.checks import check_direction, replace_when_done, writable_folder
 from thermoxels_ns.core.errors import MeshError, OutputError
 from thermoxels_ns.mesh.boundary.tags import SUPPORT, support_of_facets
@@ -52,6 +52,7 @@ def picture_of_mesh(
     note: str = "",
     labels: Sequence[tuple[str, Sequence[float]]] = (),
     size: bool = True,
+    ghost: tuple[FloatArray, IntArray] | None = None,
     window_size: tuple[int, int] = (1200, 900),
 ) -> None:
     """Draw the surface of a mesh, coloured by temperature, as a PNG: all of it, in parallel projection.
@@ -75,6 +76,7 @@ def picture_of_mesh(
         note: Words below the size of the mesh.
         labels: Short words and the points of the mesh that they stand at, in front of everything.
         size: Write the size of the mesh below the picture.
+        ghost: Points (n, 3) and triangles (m, 3) of something else, drawn in a grey that one looks through.
         window_size: Width and height, [pixels].
     """
     # Without a screen VTK draws through Mesa, which loads the system's LLVM. A triton (torch's compiler) that is loaded
@@ -127,10 +129,14 @@ def picture_of_mesh(
                     plotter.add_mesh(surface, color=colour, **matter)
             words = "; ".join(f"{colour}: {what}" for what, colour, which in painted if which.any())
             about = _size_of(mesh, length_unit) if size else ""
+            in_sight = mesh.points_m[np.unique(mesh.facets)]
+            if ghost is not None and len(ghost[1]):
+                plotter.add_mesh(pv.PolyData.from_regular_faces(*ghost), color="grey", opacity=0.35, **matter)
+                in_sight = np.concatenate((in_sight, ghost[0]))
             _add_words(plotter, title, font, about, note, words, None if plain.all() else extremes)
             if labels:
                 _add_labels(plotter, font, labels)
-            _frame(plotter, mesh.points_m[np.unique(mesh.facets)], right, true_up, towards_camera)
+            _frame(plotter, in_sight, right, true_up, towards_camera)
             plotter.screenshot(str(temporary), return_img=False)
         finally:
             plotter.close()
@@ -319,6 +325,18 @@ def draw_mesh(paths: Sequence[Path], mesh: TetMesh, look: Mapping[str, Any], len
     picture_of_mesh(measured, mesh, title=title, painted=painted, length_unit=length_unit, **look)
 
 
+def draw_region(
+    path: Path, mesh: TetMesh, look: Mapping[str, Any], length_unit: str, points: FloatArray, triangles: IntArray
+) -> None:
+    """Draw what is exported, and in grey the surface, given by its points and triangles, of what is left out.
+
+    `look` are the arguments `up` and `view_direction` of `picture_of_mesh`.
+    """
+    note = "grey: left out of the region" if len(triangles) else "nothing is left out"
+    ghost = points, triangles
+    picture_of_mesh(path, mesh, title="Region", note=note, ghost=ghost, length_unit=length_unit, **look)
+
+
 def draw_heat(path: Path, mesh: TetMesh, solution: HeatSolution, look: Mapping[str, Any]) -> None:
     """Draw the temperatures before and after in one range of colours, and beside them the change in its own.
 
@@ -355,7 +373,7 @@ def add_support(path: Path, mesh: TetMesh, look: Mapping[str, Any]) -> None:
     support = support_of_facets(mesh)
     assert support is not None
     painted = [(*of, support == number) for number, of in enumerate(zip(SUPPORT.values(), _SUPPORT_COLOURS))]
-    painted.append(("cut by the scene box", "white", support < 0))
+    painted.append(("cut by the scene box or the region", "white", support < 0))
     with Image.open(path) as image:
         above = np.asarray(image.convert("RGB"))
     width, up = above.shape[1], _unit("up", look["up"])

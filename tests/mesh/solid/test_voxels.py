@@ -36,7 +36,7 @@ def test_density_of_a_voxel_is_the_mean_of_its_corners(snapshot_of):
 def test_percentile_keeps_the_densest_share_of_all_voxels(snapshot_of, percentile):
     density = np.random.default_rng(0).random((11, 11, 11))
     snapshot = snapshot_of(density)
-    solid = select_solid(snapshot, SolidSelection(close_gaps=0, density_percentile=percentile, smallest_body=0.0))
+    solid = select_solid(snapshot, SolidSelection(close_gaps=0, density_percentile=percentile, region="all"))
     centre = snapshot.lattice.corner_to_cell_mean(snapshot.density)
     assert solid.cells.sum() == pytest.approx(1000 * (1 - percentile / 100), abs=1)
     assert centre[solid.cells].min() > centre[~solid.cells].max()
@@ -56,20 +56,19 @@ def test_empty_names_threshold_maximum_and_remedy(snapshot_of):
         select_solid(snapshot_of(np.zeros((3, 3, 3))), SolidSelection(close_gaps=0, density_percentile=90.0))
 
 
-def test_largest_component_and_what_was_removed(snapshot_of):
-    snapshot = snapshot_of(cells_along_x([5, 0, 5, 5, 5, 0, 5, 5]))
-    largest = SolidSelection(close_gaps=0, density_threshold=1.0, largest_component=True)
-    solid = select_solid(snapshot, largest)
-    assert np.flatnonzero(solid.cells).tolist() == [2, 3, 4]
-    assert solid.component_sizes.tolist() == [3, 2, 1]
-    assert (step_of(solid, "largest body").removed, step_of(solid, "largest body").added) == (3, 0)
-    every = select_solid(snapshot, SolidSelection(close_gaps=0, density_threshold=1.0, largest_component=False))
-    assert np.flatnonzero(every.cells).tolist() == [0, 2, 3, 4, 6, 7]
-    assert step_of(every, "small bodies").removed == 0
-    not_small = select_solid(snapshot, SolidSelection(close_gaps=0, density_threshold=1.0, smallest_body=0.5))
-    assert (
-        np.flatnonzero(not_small.cells).tolist() == [2, 3, 4, 6, 7] and step_of(not_small, "small bodies").removed == 1
-    )
+def test_floaters_go_unless_all_is_asked_for(snapshot_of, corner_density):
+    cells = np.zeros((14, 10, 10), dtype=bool)
+    cells[:10] = True
+    cells[12, 3, 3] = True
+    snapshot = snapshot_of(corner_density(cells))
+    solid = select_solid(snapshot, SolidSelection(close_gaps=0, density_threshold=1.0))
+    assert np.array_equal(solid.cells, cells & (np.arange(14) < 10)[:, None, None])
+    assert solid.component_sizes.tolist() == [1000, 1]
+    region = step_of(solid, "region")
+    assert (region.removed, region.added) == (1, 0) and "1 of 2 bodies in it have less than 1%" in region.remark
+    assert np.array_equal(solid.left_out, cells & ~solid.cells) and solid.within.all()
+    every = select_solid(snapshot, SolidSelection(close_gaps=0, density_threshold=1.0, region="all"))
+    assert np.array_equal(every.cells, cells) and step_of(every, "region").removed == 0 and not every.left_out.any()
 
 
 def test_gaps_are_closed_and_wide_ones_are_not(snapshot_of):
@@ -85,17 +84,6 @@ def test_gaps_are_closed_and_wide_ones_are_not(snapshot_of):
     assert kept[2:7, 2:7, 2:7].sum() < 125 and not kept[3:6, 3:6, 3:6].any() and (kept >= room).all()
 
 
-def test_voxels_that_touch_by_edge_or_corner_only_are_different_bodies(snapshot_of, corner_density):
-    # At threshold 1 only voxels with all eight corners set are solid.
-    for offset in ([1, 1, 0], [1, 1, 1]):
-        cells = np.zeros((2, 2, 2), dtype=bool)
-        cells[0, 0, 0] = cells[tuple(offset)] = True
-        largest = SolidSelection(close_gaps=0, density_threshold=1.0, largest_component=True)
-        solid = select_solid(snapshot_of(corner_density(cells)), largest)
-        assert solid.component_sizes.tolist() == [1, 1]
-        assert np.argwhere(solid.cells).tolist() == [[0, 0, 0]]
-
-
 def test_cavities_are_filled_unless_the_body_is_to_stay_hollow(snapshot_of):
     density = np.ones((8, 8, 8))
     density[3:5, 3:5, 3:5] = 0.0
@@ -107,7 +95,7 @@ def test_cavities_are_filled_unless_the_body_is_to_stay_hollow(snapshot_of):
     assert filled.cells.all()
     assert step_of(filled, "interior").added == missing
     assert f"{missing} voxels of enclosed cavities are filled; the cameras" in step_of(filled, "interior").remark
-    assert [step.name for step in hollow.steps] == ["threshold", "small bodies"]
+    assert [step.name for step in hollow.steps] == ["threshold", "region"]
 
 
 @pytest.fixture
@@ -124,7 +112,7 @@ def test_a_wall_thickness_is_in_metres_and_takes_the_place_of_filling(facade):
     assert thin.cells.sum(axis=0).max() == 1
     thick = select_solid(facade, SolidSelection(close_gaps=0, density_threshold=15.0, wall_thickness=0.4), 0.2)
     assert (thick.cells[:, 6:10, 6:10].sum(axis=0) == 4).all() and thick.cells[6:10, 8, 8].all()  # 0.4 m = 4 voxels
-    assert [step.name for step in thick.steps] == ["threshold", "small bodies", "wall"]
+    assert [step.name for step in thick.steps] == ["threshold", "region", "wall"]
     wall = step_of(thick, "wall")
     assert wall.added == thick.cells.sum() - thin.cells.sum() and "0.4 m thick (4 voxels)" in wall.remark
 
@@ -173,8 +161,8 @@ def test_what_the_cameras_cannot_look_into_is_filled(snapshot_of):
 def test_the_steps_lead_from_nothing_to_the_result(snapshot_of):
     random = np.random.default_rng(3)
     field = snapshot_of(random.random((14, 13, 12)) ** 3)
-    solid = select_solid(field, SolidSelection(density_percentile=85.0, smallest_body=0.5))
-    assert [step.name for step in solid.steps] == ["threshold", "close gaps", "small bodies", "interior"]
+    solid = select_solid(field, SolidSelection(density_percentile=85.0))
+    assert [step.name for step in solid.steps] == ["threshold", "close gaps", "region", "interior"]
     assert sum(step.added - step.removed for step in solid.steps) == solid.cells.sum()
     assert step_of(solid, "threshold").remark == solid.explanation and solid.explanation.startswith("The densest 15 %")
     assert all(step.remark.endswith(".") and step.added >= 0 <= step.removed for step in solid.steps)
@@ -191,7 +179,7 @@ def test_the_level_has_the_sign_of_the_choice_in_hard_cases(snapshot_of, corner_
         "one voxel wide": np.random.default_rng(1).random(shape) < 0.5,
     }[case]
     field = replace(snapshot_of(corner_density(cells)), voxel_density=50.0 * cells.astype(np.float32))
-    for options in ({}, {"close_gaps": 0, "interior": "hollow", "smallest_body": 0.0}):
+    for options in ({}, {"close_gaps": 0, "interior": "hollow", "region": "all"}):
         solid = select_solid(field, SolidSelection(density_threshold=1.0, **options))
         assert np.array_equal(solid.level > 0, solid.cells) and np.array_equal(solid.level < 0, ~solid.cells)
     assert np.array_equal(solid.cells, cells)
@@ -205,7 +193,11 @@ def test_the_level_has_the_sign_of_the_choice_in_hard_cases(snapshot_of, corner_
         {"voxel_optical_depth": 0.0},
         {"close_gaps": -1},
         {"seal_openings": -1},
-        {"smallest_body": 1.1},
+        {"region": "some"},
+        {"region_box": (0.0, 0.0, 0.0, 1.0, 0.0, 1.0)},
+        {"region_box": (0.0, 0.0, float("nan"), 1.0, 1.0, 1.0)},
+        {"region_near": (0.0, 0.0, 0.0, 0.0)},
+        {"region_near": (0.0, 0.0, float("inf"), 1.0)},
         {"interior": "filled"},
         {"wall_thickness": 0.0},
     ],

@@ -93,7 +93,7 @@ def _size_lines(report: QualityReport) -> list[tuple[str, str]]:
     true_area = "not known" if report.true_area_m2 is None else f"{report.true_area_m2:.6g} {unit}²"
     return [
         ("nodes, tetrahedra", f"{report.num_nodes:,}, {report.num_tets:,}"),
-        ("boundary triangles", f"{report.num_facets:,} ({report.num_box_facets:,} cut by the scene box)"),
+        ("boundary triangles", f"{report.num_facets:,} ({report.num_box_facets:,} cut by the box or the region)"),
         ("volume", f"{report.volume_m3:.6g} {unit}³"),
         ("area of triangles", f"{report.area_m2:.6g} {unit}²"),
         ("area of the surface they stand for", true_area),

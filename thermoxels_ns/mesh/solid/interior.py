@@ -42,8 +42,12 @@ class Interior:
     rooms: int  # cavities left empty because a camera stands in them
 
 
-def interior(cells: BoolArray, lattice: Lattice, views: Views | None, seal: int) -> Interior:
+def interior(
+    cells: BoolArray, lattice: Lattice, views: Views | None, seal: int, within: BoolArray | None = None
+) -> Interior:
     """Find the inside, apart from `cells`, of bodies of which only a shell was reconstructed.
+
+    Only what lies `within` a region is filled, and bodies end where it does; what stands beside it still hides.
 
     A body is what touches once openings of up to twice `seal` voxels are closed. Its inside are cavities of the sealed
     shell and, if the cameras are known, the space within its convex hull that they should see but do not, because the
@@ -54,15 +58,15 @@ def interior(cells: BoolArray, lattice: Lattice, views: Views | None, seal: int)
     where that begins, and the cameras are asked again: crevices between shell and inside are hidden now. They are
     filled where surfaces surround them well.
     """
-    sealed = close_gaps(cells, seal)
+    sealed, within = close_gaps(cells, seal), np.ones_like(cells) if within is None else within
     enclosed, room = _enclosed(cells, sealed, lattice, views, seal)
     rooms = int(face_connected(room).max()) if room.any() else 0
     if views is None or len(views.focal) == 0:
-        return Interior(enclosed, np.zeros_like(cells), rooms)
-    hidden = _hidden(sealed, lattice, views, seal) & ~cells & ~enclosed
+        return Interior(enclosed & within, np.zeros_like(cells), rooms)
+    hidden = _hidden(sealed, within, lattice, views, seal) & ~cells & ~enclosed
     # What the filled space now encloses is as much inside as the rest.
     cavity, _ = _cavities(cells | enclosed | hidden, room | _camera_voxels(cells, lattice, views))
-    return Interior(enclosed, hidden | cavity, rooms)
+    return Interior(enclosed & within, (hidden | cavity) & within, rooms)
 
 
 def _enclosed(
@@ -106,15 +110,15 @@ def _cavities(shell: BoolArray, cameras: BoolArray) -> tuple[BoolArray, BoolArra
     return (kept & ~rooms)[labels], rooms[labels]
 
 
-def _hidden(sealed: BoolArray, lattice: Lattice, views: Views, seal: int) -> BoolArray:
+def _hidden(sealed: BoolArray, within: BoolArray, lattice: Lattice, views: Views, seal: int) -> BoolArray:
     """Voxels that are not seen, behind the surface and within the convex hull of a body."""
     block = 1
     while sealed.size > LARGEST_PASS * block**3:
         block *= 2
     if block > 1:
-        return _hidden_in_blocks(sealed, lattice, views, seal, block)
+        return _hidden_in_blocks(sealed, within, lattice, views, seal, block)
     # The convex hull of every body, strays of which do not count.
-    labels, hull = connected(sealed), np.zeros_like(sealed)
+    labels, hull = connected(sealed & within), np.zeros_like(sealed)
     for number, box in enumerate(ndimage.find_objects(labels), start=1):
         hull[box] |= convex_hull(_without_strays(labels[box] == number), of_centres=True)
     if not (hull & ~sealed).any():
@@ -130,14 +134,20 @@ def _behind(cells: BoolArray, lattice: Lattice, views: Views, surrounded: float)
     return counts.hidden & (winding_number(cells, counts.seen & ~cells) >= surrounded)
 
 
-def _hidden_in_blocks(sealed: BoolArray, lattice: Lattice, views: Views, seal: int, block: int) -> BoolArray:
+def _hidden_in_blocks(
+    sealed: BoolArray, within: BoolArray, lattice: Lattice, views: Views, seal: int, block: int
+) -> BoolArray:
     """The same, where a block of voxels has one answer."""
     shape = sealed.shape
-    padded = np.pad(sealed, [(0, -n % block) for n in shape])
-    cx, cy, cz = (n // block for n in padded.shape)
-    coarse = padded.reshape(cx, block, cy, block, cz, block).any(axis=(1, 3, 5))
+    cx, cy, cz = (-(-n // block) for n in shape)
+
+    def coarser(flags: BoolArray) -> BoolArray:
+        padded = np.pad(flags, [(0, -n % block) for n in shape])
+        return padded.reshape(cx, block, cy, block, cz, block).any(axis=(1, 3, 5))
+
+    coarse = coarser(sealed)
     coarse_lattice = Lattice(lattice.lo, lattice.voxel_size * block, (cx + 1, cy + 1, cz + 1))
-    hidden = _hidden(coarse, coarse_lattice, views, seal // block)
+    hidden = _hidden(coarse, coarser(within), coarse_lattice, views, seal // block)
 
     # A block that holds a piece of the shell has an inner and an outer side; its empty voxels go with what they touch.
     inside = tuple(slice(n) for n in shape)

@@ -1,4 +1,4 @@
-"""Which voxels are solid: dense enough, gaps closed, floaters dropped, walls thickened, interiors filled."""
+"""Which voxels are solid: dense enough, gaps closed, in the region, no floaters, walls thick, interiors filled."""
 
 from __future__ import annotations
 
@@ -14,7 +14,15 @@ from thermoxels_ns.core.errors import MeshError
 from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.solid.interior import THINNEST_GROWN, interior, wall_behind
 from thermoxels_ns.mesh.solid.level_set import level_of
-from thermoxels_ns.mesh.solid.morphology import close_gaps, connected, face_connected
+from thermoxels_ns.mesh.solid.morphology import close_gaps, connected
+from thermoxels_ns.mesh.solid.region import (
+    Ball,
+    Box,
+    RegionKind,
+    asked_region,
+    check_region,
+    where_cameras_look,
+)
 from thermoxels_ns.mesh.solid.threshold import (
     Threshold,
     automatic_threshold,
@@ -24,6 +32,9 @@ from thermoxels_ns.mesh.solid.threshold import (
 )
 
 InteriorKind = Literal["solid", "hollow"]
+
+SMALLEST_BODY = 0.01
+"""Bodies (voxels that touch, if only by corners) of less than this share of the largest are mostly floaters."""
 
 _WIDEST = 100
 
@@ -45,9 +56,13 @@ class SolidSelection:
     close_gaps: int = 1
     """Fill gaps and pinholes up to twice this many voxels wide (a morphological closing); thin walls are not
     continuous without it. 0: none."""
-    smallest_body: float = 0.01
-    """Drop bodies (voxels that touch, if only by corners) of less than this share of the largest; mostly floaters."""
-    largest_component: bool = False  # Keep only the largest body of voxels that touch by faces
+    region: RegionKind = "auto"
+    """Which part is taken. auto: what photographs show about as well as what they were taken of, without bodies below
+    1 % of the largest (floaters). all: everything."""
+    region_box: Box | None = None
+    """In place of auto, what lies in a box: xmin ymin zmin xmax ymax zmax in the coordinates of the input poses."""
+    region_near: Ball | None = None
+    """In place of auto, what lies near a point: x y z radius in the coordinates of the input poses."""
     interior: InteriorKind = "solid"
     """What becomes of the inside of a body of which photographs only show the shell. solid: it is filled, namely
     cavities that the shell encloses, and space within the body's convex hull that the training cameras would see if
@@ -75,6 +90,7 @@ class SolidSelection:
             value = getattr(self, name)
             if value is not None:
                 check_positive(name, value, f"Leave --{name.replace('_', '-')} out.", MeshError)
+        check_region(self.region, self.region_box, self.region_near)
         if self.interior not in get_args(InteriorKind):
             kinds = " or ".join(get_args(InteriorKind))
             raise MeshError("interior", expected=kinds, got=repr(self.interior), remedy="Pass --interior solid.")
@@ -89,7 +105,6 @@ _BOUNDS: dict[str, tuple[Any, float, float, float | None]] = {
     "density_threshold": ((int, float), 0.0, math.inf, None),
     "close_gaps": (int, 0, _WIDEST, 1),
     "seal_openings": (int, 0, _WIDEST, 2),
-    "smallest_body": ((int, float), 0.0, 1.0, 0.01),
 }
 """Type, least and most of options; what to pass instead, None for those that may be None."""
 
@@ -98,7 +113,7 @@ _BOUNDS: dict[str, tuple[Any, float, float, float | None]] = {
 class SolidStep:
     """What one step on the way from density to solid did."""
 
-    name: str  # threshold, close gaps, small bodies, largest body, wall or interior
+    name: str  # threshold, close gaps, region, wall or interior
     added: int  # voxels that it made solid
     removed: int  # voxels that it made empty
     remark: str  # how and why, in a sentence or two
@@ -115,9 +130,10 @@ class SolidCells:
     threshold: float  # density at voxel centres from which on a voxel counted as solid, [1 / world unit]
     explanation: str  # which rule chose the threshold, and why
     steps: tuple[SolidStep, ...]  # what each step did, in order; the first is the threshold
-    component_sizes: IntArray
-    """Voxels in each body once gaps are closed, largest first; they touch by nothing, or (`largest_component`) by no
-    face."""
+    component_sizes: IntArray  # Voxels in each body of the region once gaps are closed, largest first
+    within: BoolArray
+    """The region, solid or not. Where it ends the solid is cut, as it is where the lattice ends."""
+    left_out: BoolArray  # Voxels that are solid, but not in the region or too small a body
 
 
 def select_solid(
@@ -125,17 +141,18 @@ def select_solid(
     selection: SolidSelection,
     metres_per_world_unit: float | None = None,
     *,
+    world_to_input: FloatArray | None = None,
     makes_up_volume: bool = True,
 ) -> SolidCells:
     """Choose the solid voxels of a trained field, by the density at their centres.
 
     A voxel without density is solid only if a step after the threshold makes it so. Only a wall thickness needs
-    `metres_per_world_unit`; `makes_up_volume` as in `level_of`.
-
+    `metres_per_world_unit`; `world_to_input`, shape (3, 4), which leads to the coordinates of the region's box or
+    point, is the identity if left out; `makes_up_volume` as in `level_of`.
 
     Raises:
-        MeshError: No voxel is solid, density does not tell solid from empty, or a wall thickness is asked for but the
-            scale or the cameras are not known.
+        MeshError: No voxel is solid, or none in the region; density does not tell solid from empty; or a wall thickness
+            is asked for but the scale or the cameras are not known.
     """
     thickness = _wall_voxels(snapshot, selection, metres_per_world_unit)
     density = snapshot.centre_density()
@@ -155,18 +172,24 @@ def select_solid(
     if selection.close_gaps:
         remark = f"Gaps up to {2 * selection.close_gaps} voxels wide are filled."
         cells = step("close gaps", close_gaps(cells, selection.close_gaps), remark)
-    kept, sizes, remark = _bodies(cells, selection)
-    cells = step("largest body" if selection.largest_component else "small bodies", kept, remark)
+    everything = cells
+    within, where = _region(cells, snapshot, selection, world_to_input)
+    kept, sizes, small = _without_floaters(cells & within, 0.0 if selection.region == "all" else SMALLEST_BODY)
+    cells = step("region", kept, f"{where} {small}")
+    left_out = everything & ~cells
+    # What is left out still stands between cameras and what is taken; floaters never stood anywhere.
+    standing = cells | (everything & ~within)
     if thickness is not None:
         assert snapshot.views is not None
-        wall = cells | wall_behind(cells, snapshot.lattice, snapshot.views, thickness)
+        wall = cells | (wall_behind(standing, snapshot.lattice, snapshot.views, thickness) & within)
         asked = f"{selection.wall_thickness:g} m thick ({thickness:.3g} voxels)"
         remark = f"The seen surface is made {asked}."
         if thickness < THINNEST_GROWN:
             remark = f"A wall {asked} is thinner than one and a half voxels; the seen surface stays as thick as it is."
         cells = step("wall", wall, remark)
     elif selection.interior == "solid":
-        cells = step("interior", *_filled(cells, snapshot, selection))
+        inside, remark = _inside(standing, within, snapshot, selection)
+        cells = step("interior", cells | inside, remark)
     return SolidCells(
         cells=cells,
         level=level_of(density, chosen.density, chosen.cells, cells, makes_up_volume=makes_up_volume),
@@ -174,6 +197,8 @@ def select_solid(
         explanation=chosen.explanation,
         steps=tuple(steps),
         component_sizes=np.sort(sizes)[::-1].astype(np.int64),
+        within=within,
+        left_out=left_out,
     )
 
 
@@ -187,25 +212,39 @@ def _threshold(snapshot: GridSnapshot, density: FloatArray, selection: SolidSele
     return automatic_threshold(snapshot, density)
 
 
-def _bodies(cells: BoolArray, selection: SolidSelection) -> tuple[BoolArray, IntArray, str]:
-    """Drop bodies that are too small; sizes of all of them, and what was done."""
-    labels = face_connected(cells) if selection.largest_component else connected(cells)
-    sizes = np.bincount(labels.ravel())[1:]
-    if selection.largest_component:
-        keep = np.zeros(len(sizes), dtype=bool)
-        keep[np.argmax(sizes)] = True
-        remark = f"The largest of {len(sizes)} bodies is kept."
-    else:
-        keep = sizes >= selection.smallest_body * sizes.max()
-        remark = (
-            f"{len(sizes) - int(keep.sum())} of {len(sizes)} bodies have less than "
-            f"{selection.smallest_body:.2%} of the largest one's voxels and go."
+def _region(
+    cells: BoolArray, snapshot: GridSnapshot, selection: SolidSelection, world_to_input: FloatArray | None
+) -> tuple[BoolArray, str]:
+    """The voxels, solid or not, that belong to what is asked for, and which these are."""
+    box, near, views = selection.region_box, selection.region_near, snapshot.views
+    if box is not None or near is not None:
+        to_input = np.eye(4)[:3] if world_to_input is None else world_to_input
+        what = (
+            "What lies in the box is taken." if near is None else f"What lies within {near[3]:g} of a point is taken."
         )
+        return asked_region(cells, snapshot.lattice, box, near, to_input), what
+    if selection.region == "all":
+        return np.ones_like(cells), "All is taken."
+    if views is None or len(views.focal) == 0:
+        return np.ones_like(cells), "The cameras are not known, so all is taken."
+    what = "What photographs show about as well as what they were taken of is taken."
+    return where_cameras_look(cells, snapshot.lattice, views), what
+
+
+def _without_floaters(cells: BoolArray, smallest: float) -> tuple[BoolArray, IntArray, str]:
+    """Drop bodies below this share of the largest; sizes of all of them, and what was done."""
+    labels = connected(cells)
+    sizes = np.bincount(labels.ravel())[1:]
+    keep = sizes >= smallest * sizes.max()
+    gone = f"{len(sizes) - int(keep.sum())} of {len(sizes)} bodies in it"
+    remark = f"{gone} have less than {smallest:.0%} of the largest one's voxels and go."
     return np.concatenate(([False], keep))[labels], sizes, remark
 
 
-def _filled(cells: BoolArray, snapshot: GridSnapshot, selection: SolidSelection) -> tuple[BoolArray, str]:
-    inside = interior(cells, snapshot.lattice, snapshot.views, selection.seal_openings)
+def _inside(
+    cells: BoolArray, within: BoolArray, snapshot: GridSnapshot, selection: SolidSelection
+) -> tuple[BoolArray, str]:
+    inside = interior(cells, snapshot.lattice, snapshot.views, selection.seal_openings, within)
     remark = f"{int(inside.enclosed.sum())} voxels of enclosed cavities are filled"
     if snapshot.views is None:
         remark += "; the cameras are not known, so nothing is known to be hidden from them."
@@ -214,7 +253,7 @@ def _filled(cells: BoolArray, snapshot: GridSnapshot, selection: SolidSelection)
         remark += f", and {hidden} voxels that cameras cannot look into, within the hull of their body."
     if inside.rooms:
         remark += f" {inside.rooms} cavities with a camera in them stay empty."
-    return cells | inside.enclosed | inside.hidden, remark
+    return inside.enclosed | inside.hidden, remark
 
 
 def _wall_voxels(
