@@ -20,7 +20,7 @@ from measuring import take_turns
 from scipy import sparse
 
 from tests.support.scene_bodies import tagged_body
-from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients
+from thermoxels_ns.fem.linear_solver import LinearSolver
 from thermoxels_ns.fem.p1_kernels import lumped_mass, stiffness_matrix
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.time_loop import solve_heat
@@ -103,7 +103,7 @@ def plainly(problem: HeatProblem, steps: TimeSteps) -> np.ndarray:
     """Backward Euler with the assembled matrices, conjugate gradients and nothing else."""
     stiffness, mass = stiffness_and_mass(problem)
     system = sparse.csr_matrix(stiffness + sparse.diags(mass / steps.step_seconds, format="csr"))
-    solver = ConjugateGradients(system, relative_tolerance=TOLERANCE)
+    solver = LinearSolver(system, relative_tolerance=TOLERANCE)
     states = np.empty((steps.steps + 1, len(problem.start_c)))
     states[0] = problem.start_c
     for number in range(steps.steps):

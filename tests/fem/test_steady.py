@@ -1,12 +1,10 @@
 import numpy as np
 import pytest
-from scipy import sparse
 
 from tests.support.heat_bodies import STEEL
 from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem import implicit_equation
-from thermoxels_ns.fem.conjugate_gradients import PATIENCE, LinearSolver
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.solution import heat_by_effect
@@ -121,25 +119,6 @@ def test_conductivity_contrast(contrast, order) -> None:
     solution = solve_steady(HeatProblem(mesh, materials, effects=effects), order=order)
     assert solution.converged and solution.energy_residual < 1e-9
     assert order == 2 or (solution.temperature_c.min() >= -1e-9 and solution.temperature_c.max() <= 20.0 + 1e-9)
-
-
-def chain(nodes: int) -> sparse.csr_matrix:
-    """Numbered at random: sweeps along it would solve it at once."""
-    line = sparse.diags([-np.ones(nodes - 1), np.full(nodes, 2.0), -np.ones(nodes - 1)], [-1, 0, 1], format="csr")
-    order = np.random.default_rng(0).permutation(nodes)
-    return sparse.csr_matrix(line[order][:, order]).sorted_indices()
-
-
-def test_multigrid_takes_over_where_plain_iterations_are_slow() -> None:
-    """A chain of n nodes takes n plain iterations: beyond the patience, multigrid ends it in a few."""
-    nodes = 3 * PATIENCE
-    matrix = chain(nodes)
-    exact = np.cos(np.arange(nodes) * 0.01)
-    solver = LinearSolver(matrix)
-    solution = solver.solve(matrix @ exact)
-    assert solution.converged and "multigrid" in solution.status and solver.name == "multigrid"
-    assert solution.iterations < 60
-    np.testing.assert_allclose(solution.x, exact, atol=1e-5)
 
 
 def test_the_residual_is_round_off_also_where_nothing_flows_or_flows_cancel() -> None:

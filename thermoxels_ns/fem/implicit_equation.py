@@ -11,9 +11,9 @@ import numpy.typing as npt
 from scipy import sparse
 
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.conjugate_gradients import LinearSolution
 from thermoxels_ns.fem.forms import COLDEST_SLOPE_K
-from thermoxels_ns.fem.system import NOTHING, HeatSystem, SystemSolver
+from thermoxels_ns.fem.linear_solver import LinearSolution, LinearSolver
+from thermoxels_ns.fem.system import NOTHING, HeatSystem
 
 Vector = npt.NDArray[np.float64]
 
@@ -122,7 +122,7 @@ class ImplicitEquation:
         """M / step + K + R between free nodes."""
         self.floating: npt.NDArray[np.bool_] = ~system.pieces.touched(system.fixed.nodes)
         """Pieces without fixed nodes, shape (p,)."""
-        self._rough_solver: SystemSolver | None = None
+        self._rough_solver: LinearSolver | None = None
 
     def solve(self, start_k: Vector, time_s: float, given_w: Vector | None = None) -> ImplicitSolution:
         """Find the temperatures at the end from T_0, shape (n,), [K]; earlier stages give `given_w`, shape (n,), [W].
@@ -169,11 +169,11 @@ class ImplicitEquation:
         row_sums_w_k = self.row_sums_w_k
         if self.system.nonlinear:
             slope = self.system.radiation_slope(relative_k, time_s)
-            solver = self.system.linear_solver(self.matrix + self._free_block(slope), _ESTIMATE_TOLERANCE)
+            solver = LinearSolver(self.matrix + self._free_block(slope), relative_tolerance=_ESTIMATE_TOLERANCE)
             row_sums_w_k = row_sums_w_k + slope @ np.ones(self.system.num_nodes)
         else:
             if self._rough_solver is None:
-                self._rough_solver = self.system.linear_solver(self.matrix, _ESTIMATE_TOLERANCE)
+                self._rough_solver = LinearSolver(self.matrix, relative_tolerance=_ESTIMATE_TOLERANCE)
             solver = self._rough_solver
         return self._correction(solver, row_sums_w_k, heat_w, piece_w)[0]
 
@@ -182,15 +182,15 @@ class ImplicitEquation:
             return self._correction(self._own_solver, self.row_sums_w_k, rest.heat_w, rest.piece_w)
         slope = balance.radiation_slope(change_k)
         row_sums_w_k = self.row_sums_w_k + slope @ np.ones(self.system.num_nodes)
-        solver = self.system.linear_solver(self.matrix + self._free_block(slope), _NEWTON_TOLERANCE)
+        solver = LinearSolver(self.matrix + self._free_block(slope), relative_tolerance=_NEWTON_TOLERANCE)
         return self._correction(solver, row_sums_w_k, rest.heat_w, rest.piece_w)
 
     @cached_property
-    def _own_solver(self) -> SystemSolver:
-        return self.system.linear_solver(self.matrix, self._relative_tolerance)
+    def _own_solver(self) -> LinearSolver:
+        return LinearSolver(self.matrix, relative_tolerance=self._relative_tolerance)
 
     def _correction(
-        self, solver: SystemSolver, row_sums_w_k: Vector, heat_w: Vector, piece_w: Vector
+        self, solver: LinearSolver, row_sums_w_k: Vector, heat_w: Vector, piece_w: Vector
     ) -> tuple[Vector, LinearSolution]:
         """Solve for a change, shape (n,), [K], that takes up heat; arguments as in `Residual`."""
         if not self.floating.any():

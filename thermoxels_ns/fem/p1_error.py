@@ -7,6 +7,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from thermoxels_ns.core.kernel_cache import kernel
+from thermoxels_ns.fem.linear_solver import LinearSolver
 from thermoxels_ns.fem.p1_kernels import TET_EDGES, _cross, _dot, _sides
 from thermoxels_ns.fem.solution import ErrorSize, SteadySolution, share_of_heat
 from thermoxels_ns.fem.space import sums_by_number
@@ -70,7 +71,7 @@ def p1_error(system: HeatSystem, solution: SteadySolution, time_s: float) -> Err
         free, error_k = fixed.free, np.zeros(num_nodes)
         rest_w = system.net_heat(relative_k, time_s) - bent_w
         inner = matrix if len(free) == num_nodes else sparse.csr_matrix(matrix[free][:, free])
-        error_k[free] = system.linear_solver(inner, _TOLERANCE).solve(rest_w[free]).x
+        error_k[free] = LinearSolver(inner, relative_tolerance=_TOLERANCE).solve(rest_w[free]).x
         missed_w = {heat.effect: 0.0 for heat in solution.effects}
         for effect, nodes, strength, bubble_k in surfaces:
             missed_w[effect] -= float(np.sum(strength * (error_k[nodes] + bubble_k).mean(axis=1)))

@@ -133,17 +133,6 @@ def refuse_flat_tets(points_m: npt.NDArray[np.float64], tets: npt.NDArray[np.int
     _refuse_flat(_count_flat(points_m, tets, 1.0 / unit_m), len(tets))
 
 
-def product_and_bound(matrix: sparse.csr_matrix, vector: Vector) -> tuple[Vector, Vector]:
-    """Compute A x and |A| |x|: the round-off in the first is a few eps of the second.
-
-    >>> product_and_bound(sparse.csr_matrix([[2.0, -1.0], [-1.0, 2.0]]), np.array([3.0, 3.0]))
-    (array([3., 3.]), array([9., 9.]))
-    """
-    product, bound = np.empty(len(vector)), np.empty(len(vector))
-    _product_and_bound(matrix.indptr, matrix.indices, matrix.data, vector, product, bound)
-    return product, bound
-
-
 def _capacities(points_m, tets, heat_capacity_j_m3k, edges: MeshEdges) -> tuple[npt.NDArray, npt.NDArray]:
     points_m, tets, unit_m = _checked(points_m, tets)
     capacity = _per_tet("heat_capacity_j_m3k", heat_capacity_j_m3k, len(tets))
@@ -347,14 +336,3 @@ def _unique_edges(tets, end, other, first, mark):
         begin = end[node]
         first[node + 1] = kept
     return kept
-
-
-@kernel
-def _product_and_bound(indptr, indices, data, vector, product, bound):
-    for row in range(len(vector)):
-        total = size = 0.0
-        for k in range(np.uint64(indptr[row]), np.uint64(indptr[row + 1])):
-            term = data[k] * vector[np.uint64(indices[k])]  # unsigned: no test for negative numbers
-            total += term
-            size += abs(term)
-        product[row], bound[row] = total, size

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from copy import copy
-from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +11,6 @@ from scipy.sparse.csgraph import connected_components
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients, LinearSolver, TwoLevel
 from thermoxels_ns.fem.forms import ConvectionForm, FixedNodes, RadiationForm, SourceForm, at_time, effect_forms
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
@@ -20,9 +18,6 @@ from thermoxels_ns.fem.solution import Assembled
 from thermoxels_ns.fem.space import Space
 
 Vector = npt.NDArray[np.float64]
-
-SystemSolver: TypeAlias = LinearSolver | ConjugateGradients
-"""What solves the equations of a system, by the order of its tetrahedra."""
 
 MOST_TIMES_CONDUCTION = 1e8
 """Largest convection at a node over what the cells around it conduct: more is a given temperature in all but name, and
@@ -120,7 +115,6 @@ class HeatSystem:
         self._kept_ambient: dict[float, Vector] = {}
         self._fixed_rows: sparse.csr_matrix | None = None
         self._kept_ranges: dict[float, tuple[float, float]] = {}
-        self._prolongation: sparse.csr_matrix | None = None
 
     @property
     def num_nodes(self) -> int:
@@ -212,17 +206,6 @@ class HeatSystem:
         if mass is None:
             return sparse.csr_matrix(matrix + sparse.diags(nodal / step_s, format="csr"))
         return sparse.csr_matrix(matrix + mass / step_s)
-
-    def linear_solver(self, matrix: sparse.csr_matrix, relative_tolerance: float) -> SystemSolver:
-        """Make the solver for a matrix between the free nodes that suits the tetrahedra."""
-        if self._space.order == 1:
-            return LinearSolver(matrix, relative_tolerance=relative_tolerance)
-        if self._prolongation is None:
-            free, num_mesh_nodes = self.fixed.free, len(self.problem.mesh.points_m)
-            rows = sparse.csr_matrix(self._space.prolongation()[free])
-            self._prolongation = sparse.csr_matrix(rows[:, free[free < num_mesh_nodes]])
-        given = TwoLevel(matrix, self._prolongation)
-        return ConjugateGradients(matrix, given, relative_tolerance=relative_tolerance, max_iterations=500)
 
     def load(self, time_s: float) -> Vector:
         """Heat that does not depend on the temperature, fluxes and sources, shape (n,), [W]."""
