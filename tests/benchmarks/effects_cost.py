@@ -6,16 +6,13 @@ Run it on an otherwise idle machine:
 
 A room of concrete with the scene of configs/scene-all-effects.yaml takes equal steps, so that all rows take the same
 number of them. Times are medians; all problems take turns in one process, and compiled kernels are loaded before the
-first. The last table compares conduction alone, without any effect, with assembly and steps called directly:
-the same matrices, steps and tolerance and the same arithmetic, but no problem, patches, forms, effects or report. Below
-it stands what plain conjugate gradients cost on the same matrices, without what keeps the mean of a body exact and says
-how much of a heat flow is round-off.
+first. The last table compares conduction alone, without any effect, with plain conjugate gradients on the same
+matrices, without what keeps the mean of a body exact and says how much heat is unbalanced.
 """
 
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 import tyro
@@ -23,13 +20,9 @@ from measuring import take_turns
 from scipy import sparse
 
 from tests.support.scene_bodies import tagged_body
-from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients, LinearSolver
-from thermoxels_ns.fem.forms import FixedNodes
-from thermoxels_ns.fem.p1_kernels import lumped_mass, product_and_bound, stiffness_matrix
+from thermoxels_ns.fem.linear_solver import LinearSolver
+from thermoxels_ns.fem.p1_kernels import lumped_mass, stiffness_matrix
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps, effect_labels
-from thermoxels_ns.fem.runge_kutta import RungeKutta
-from thermoxels_ns.fem.schemes import BACKWARD_EULER
-from thermoxels_ns.fem.system import HeatSystem, Pieces
 from thermoxels_ns.fem.time_loop import solve_heat
 from thermoxels_ns.heat.scene_file import load_heat_scene
 from thermoxels_ns.heat.screening import screen
@@ -80,10 +73,9 @@ class EffectsCost:
         print(f"\nScreening all effects at 0.01 K: {statistics.median(taken['screen']):.3f} s")
 
     def conduction_only(self, problem: HeatProblem, steps: TimeSteps) -> None:
-        """Conduction alone, through the effects layer and without it."""
+        """Conduction alone, through the effects layer and by hand."""
         sides: dict[str, Callable[[], np.ndarray]] = {
             "through effects": lambda: solve_heat(problem, steps, relative_tolerance=TOLERANCE).temperature_c,
-            "runge_kutta directly": lambda: directly(problem, steps),
             "plain conjugate gradients": lambda: plainly(problem, steps),
         }
         runs = 5 * self.repeats
@@ -101,56 +93,17 @@ class EffectsCost:
             )
 
 
-class Conduction:
-    """What the runge_kutta asks of a body's matrices when there is nothing else."""
-
-    nonlinear = matrix_in_time = exchanges = False
-    groups = ()
-
-    def __init__(self, problem: HeatProblem) -> None:
-        self._stiffness, self._mass = stiffness_and_mass(problem)
-        self.num_nodes = len(self._mass)
-        self.pieces, self.fixed = Pieces(self._stiffness), FixedNodes((), self.num_nodes)
-
-    def matrix(self, _: float, step_s: float) -> sparse.csr_matrix:
-        return sparse.csr_matrix(self._stiffness + sparse.diags(self._mass / step_s, format="csr"))
-
-    def held_w_k(self, _: float, step_s: float) -> np.ndarray:
-        return self._mass / step_s
-
-    def conducted_heat(self, relative_k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """K T and what its round-off is a share of."""
-        return product_and_bound(self._stiffness, relative_k)
-
-    def linear_solver(self, matrix: sparse.csr_matrix, relative_tolerance: float) -> LinearSolver:
-        return LinearSolver(matrix, relative_tolerance=relative_tolerance)
-
-
 def stiffness_and_mass(problem: HeatProblem) -> tuple[sparse.csr_matrix, np.ndarray]:
     points, tets = problem.mesh.points_m, problem.mesh.tets
     stiffness = stiffness_matrix(points, tets, problem.conductivity_w_mk)
     return stiffness, lumped_mass(points, tets, problem.heat_capacity_j_m3k)
 
 
-def directly(problem: HeatProblem, steps: TimeSteps) -> np.ndarray:
-    """Backward Euler by the assembly and the runge_kutta, with no effects between."""
-    start, reference = problem.start_c, 0.5 * (problem.start_c.min() + problem.start_c.max())
-    runge_kutta = RungeKutta(cast(HeatSystem, Conduction(problem)), BACKWARD_EULER, relative_tolerance=TOLERANCE)
-    states = np.empty((steps.steps + 1, len(start)))
-    states[0] = start - reference
-    for number in range(steps.steps):
-        step = runge_kutta.step(states[number], float(steps.times_s[number]), steps.step_seconds)
-        assert step.converged, step.status
-        states[number + 1] = step.relative_k
-    states += reference
-    return states
-
-
 def plainly(problem: HeatProblem, steps: TimeSteps) -> np.ndarray:
     """Backward Euler with the assembled matrices, conjugate gradients and nothing else."""
     stiffness, mass = stiffness_and_mass(problem)
     system = sparse.csr_matrix(stiffness + sparse.diags(mass / steps.step_seconds, format="csr"))
-    solver = ConjugateGradients(system, relative_tolerance=TOLERANCE)
+    solver = LinearSolver(system, relative_tolerance=TOLERANCE)
     states = np.empty((steps.steps + 1, len(problem.start_c)))
     states[0] = problem.start_c
     for number in range(steps.steps):

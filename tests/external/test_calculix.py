@@ -7,7 +7,7 @@ import pytest
 
 from tests.support.heat_bodies import CONCRETE
 from tests.support.heat_matrices import HeatMatrices, assemble
-from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients
+from thermoxels_ns.fem.linear_solver import LinearSolver
 from thermoxels_ns.fem.problem import HeatProblem, TimeSteps
 from thermoxels_ns.mesh.files.abaqus import HeatStep, write_inp
 from thermoxels_ns.mesh.quality.checks import facet_areas
@@ -39,7 +39,7 @@ def capacities(problem: HeatProblem) -> dict[str, HeatMatrices]:
 def our_steps(matrices: HeatMatrices, start_c: npt.NDArray[np.float64], time: TimeSteps) -> npt.NDArray[np.float64]:
     """Backward Euler with given matrices and our linear solver, shape (steps, n)."""
     matrix = (matrices.mass_j_k / time.step_seconds + matrices.stiffness_w_k).tocsr()
-    solver = ConjugateGradients(matrix)
+    solver = LinearSolver(matrix)
     states = [start_c]
     for _ in range(time.steps):
         change = solver.solve(-(matrices.stiffness_w_k @ states[-1]))

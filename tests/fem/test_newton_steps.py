@@ -8,8 +8,7 @@ from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, CRANK_NICOLSON, SDIRK2
 from thermoxels_ns.fem.steady import solve_steady
 from thermoxels_ns.fem.time_loop import solve_heat
-from thermoxels_ns.heat.effects import Convection, HeatFlux, Radiation
-from thermoxels_ns.heat.materials import Material
+from thermoxels_ns.heat.effects import Convection, Radiation
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
 
@@ -58,22 +57,3 @@ def test_newton_ends_near_a_steady_state_and_after_it(concrete) -> None:
         for time in (AdaptiveSteps(1e5, 1e-4, outputs=3), TimeSteps(3, 1e-6), TimeSteps(3, 1e7)):
             solution = solve_heat(near, time)
             assert np.abs(solution.temperature_c[-1] - steady).max() < max(10.0 * away, 1e-8)
-
-
-def test_the_error_estimate_does_not_see_round_off_in_long_steps() -> None:
-    """Next to no heat capacity: steps that are long for conduction and short for what a weak flux warms."""
-    empty = Material("nearly nothing", 1.7, 1e-9, 1e-6)
-    axis = np.arange(4) * 0.0085
-    mesh = box_mesh(axis, axis, axis[:3], temperature_c=lambda p: -200.0 + 27.0 * np.sin(700.0 * p[:, 0]))
-    problem = HeatProblem(mesh, empty, effects=(Radiation(("x0",), 1e-6, -200.0), HeatFlux(("y1",), 21.0)))
-    solution = solve_heat(problem, AdaptiveSteps(4.2e-6, 0.0167, outputs=1))
-    assert solution.converged and solution.steps < 600
-
-
-def test_the_first_step_is_as_short_as_a_body_without_capacity_needs() -> None:
-    empty = Material("nearly nothing", 1.7, 1e-9, 1e-6)
-    mesh = box_mesh(*[np.arange(4) * 0.05] * 3, temperature_c=lambda p: 10.0 * np.sin(30.0 * p[:, 0]))
-    problem = HeatProblem(mesh, empty, effects=(Radiation(("x0",), 0.9, -50.0),))
-    solution = solve_heat(problem, AdaptiveSteps(100.0, 0.1, outputs=2))
-    assert solution.converged
-    np.testing.assert_allclose(solution.temperature_c[-1], -50.0, atol=0.1)

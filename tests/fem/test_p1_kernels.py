@@ -202,7 +202,7 @@ FLAT = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 1e-13]])
         (TET, np.array([[0, 1, 2, 4]]), 1.0, "mesh tets: expected node numbers from 0 to 3, got 0 to 4"),
         (TET, ONE[:, :3], 1.0, "mesh tets: expected shape"),
         (TET[:, :2], ONE, 1.0, "mesh points: expected shape"),
-        (TET, ONE[:, [1, 0, 2, 3]], 1.0, "mesh tets: expected volumes above 0, got 1 of 1 flat or inverted"),
+        (TET, ONE[:, [1, 0, 2, 3]], 1.0, "mesh tets: expected volumes above 0.*, got 1 of 1 flat or inverted"),
         (FLAT, ONE, 1.0, "1 of 1 flat"),
         (np.where(TET == 1.0, np.nan, TET), ONE, 1.0, "mesh points: expected finite numbers only, got 3 of 12"),
         (TET, ONE, 0.0, "expected finite numbers above 0"),

@@ -1,17 +1,14 @@
 import numpy as np
 import pytest
-from scipy import sparse
 
 from tests.support.heat_bodies import STEEL
 from tests.support.heat_meshes import SIDES, box_mesh, planes
 from thermoxels_ns.core.errors import HeatError
-from thermoxels_ns.fem import implicit_equation, steady
-from thermoxels_ns.fem.conjugate_gradients import PATIENCE, LinearSolver
+from thermoxels_ns.fem import implicit_equation
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.quantities import Varying
 from thermoxels_ns.fem.solution import heat_by_effect
 from thermoxels_ns.fem.steady import solve_steady
-from thermoxels_ns.fem.system import HeatSystem
 from thermoxels_ns.heat.effects import Convection, FixedTemperature, HeatFlux, InternalHeat, Radiation
 from thermoxels_ns.heat.materials import Material
 
@@ -124,25 +121,6 @@ def test_conductivity_contrast(contrast, order) -> None:
     assert order == 2 or (solution.temperature_c.min() >= -1e-9 and solution.temperature_c.max() <= 20.0 + 1e-9)
 
 
-def chain(nodes: int) -> sparse.csr_matrix:
-    """Numbered at random: sweeps along it would solve it at once."""
-    line = sparse.diags([-np.ones(nodes - 1), np.full(nodes, 2.0), -np.ones(nodes - 1)], [-1, 0, 1], format="csr")
-    order = np.random.default_rng(0).permutation(nodes)
-    return sparse.csr_matrix(line[order][:, order]).sorted_indices()
-
-
-def test_multigrid_takes_over_where_plain_iterations_are_slow() -> None:
-    """A chain of n nodes takes n plain iterations: beyond the patience, multigrid ends it in a few."""
-    nodes = 3 * PATIENCE
-    matrix = chain(nodes)
-    exact = np.cos(np.arange(nodes) * 0.01)
-    solver = LinearSolver(matrix)
-    solution = solver.solve(matrix @ exact)
-    assert solution.converged and "multigrid" in solution.status and solver.name == "multigrid"
-    assert solution.iterations < 60
-    np.testing.assert_allclose(solution.x, exact, atol=1e-5)
-
-
 def test_the_residual_is_round_off_also_where_nothing_flows_or_flows_cancel() -> None:
     mesh = box_mesh(*(planes(0.0, 0.4, step=0.1) for _ in range(3)))
     still = HeatProblem(mesh, STEEL, effects=(Convection(SIDES[:1], 8.0, 20.0), Convection(SIDES[1:], 25.0, 20.0)))
@@ -151,10 +129,6 @@ def test_the_residual_is_round_off_also_where_nothing_flows_or_flows_cancel() ->
     air = Varying(lambda places, _: np.where(places.points_m[:, 1] > 0.2, 30.0, -10.0), in_time=False)
     through = solve_steady(HeatProblem(mesh, STEEL, effects=(Convection(SIDES[:1], 8.0, air),)))
     assert abs(through.effects[0].heat_w[0]) < 1e-6 and through.energy_residual < 1e-9
-    # Heat that does come in and stays is not called round-off.
-    system = HeatSystem(still)
-    warm = np.full(len(mesh.points_m), 21.0 - system.reference_c)
-    assert steady._residual(system, warm, 0.0, steady.heat_of_groups_w(system, warm, 0.0)) == pytest.approx(1.0)
 
 
 def test_heat_is_sorted_by_effect_in_linear_time() -> None:

@@ -21,7 +21,8 @@ SWING_C = 20.0, 10.0
 """Middle and size of an air temperature that swings."""
 REASONS = (
     "steady heat problem: expected convection",
-    "heat problem: expected heat capacity",
+    "heat capacity: expected at least 1 J",
+    "convection coefficient: expected at most 1e+08 times",
     "below absolute zero",
     "fixed temperature: expected one temperature at each node",
 )

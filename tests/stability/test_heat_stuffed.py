@@ -78,16 +78,6 @@ def test_adaptive_steps_through_a_shock(shape) -> None:
     assert faults(solve_heat(problem, time), -80.0, 200.0) == []
 
 
-@pytest.mark.parametrize("shape", [*BLOCKS, "slab at 30 degrees", AT_THE_BOUNDS])
-def test_no_heat_capacity_to_speak_of(shape) -> None:
-    empty = Material("nearly nothing", 1.7, 1e-9, 1e-6)
-    where = (("*",), ("*",)) if shape in BLOCKS else (("x0",), ("x1",))
-    effects = (Convection(where[0], 10.0, -10.0), Radiation(where[1], 0.9, 30.0))
-    problem = HeatProblem(body(shape), empty, effects=effects)
-    end = solve_heat(problem, TimeSteps(1, 1.0)).temperature_c[-1]
-    np.testing.assert_allclose(end, solve_steady(problem).temperature_c, atol=1e-6)
-
-
 def test_a_wall_of_one_element() -> None:
     """0.75 voxels thick and slanted: most nodes are on the surface."""
     points = centres(10, 10, 6)

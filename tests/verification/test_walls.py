@@ -41,40 +41,43 @@ def test_u_value_of_a_wall(lumped_boundary) -> None:
 
 
 @pytest.mark.parametrize("order", [1, 2])
-@pytest.mark.parametrize(("axis", "squashed"), [(0, 1e-7), (1, 1e-6), (1, 1e-7), (2, 1e-8)])
+@pytest.mark.parametrize(("axis", "squashed"), [(0, 1e-4), (1, 1e-4), (1, 1e-5), (2, 1e-8)])
 def test_u_value_of_a_wall_squashed_in_one_direction(axis, squashed, order) -> None:
-    """U = 1 / (1 / 8 + d / k + 1 / 25), or a sentence that says that the digits do not suffice."""
+    """U = 1 / (1 / 8 + d / k + 1 / 25), or a sentence that says that cells are too flat."""
     sides = [0.3, 0.5, 1.0]
     sides[axis] *= squashed
     mesh = wall_mesh(*sides)
-    wall = HeatProblem(mesh, CONCRETE, effects=(Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, -10.0)))
-    exact = 1.0 / (1.0 / 8.0 + sides[0] / CONCRETE.conductivity_w_mk + 1.0 / 25.0)
-    try:
-        solution = solve_steady(wall, order=order)
-    except HeatError as refusal:
-        assert order == 2 or squashed < 1e-7
-        assert "No steady state was found" in str(refusal) or "digits of floating point" in str(refusal)
+    effects = (Convection(("x0",), 8.0, 20.0), Convection(("x1",), 25.0, -10.0))
+    if squashed < 1e-6:
+        with pytest.raises(HeatError, match=r"heights of at least 1e-06 of the longest side, got .* flat or inverted"):
+            HeatProblem(mesh, CONCRETE, effects=effects)
         return
+    wall = HeatProblem(mesh, CONCRETE, effects=effects)
+    exact = 1.0 / (1.0 / 8.0 + sides[0] / CONCRETE.conductivity_w_mk + 1.0 / 25.0)
+    solution = solve_steady(wall, order=order)
     flow_w = 30.0 * exact * sides[1] * sides[2]
-    heat = solution.effects[0]
-    assert heat.heat_w[0] == pytest.approx(flow_w, rel=1e-6)
-    assert heat.uncertainty_w[0] < 0.01 * flow_w
+    assert solution.effects[0].heat_w[0] == pytest.approx(flow_w, rel=1e-6)
+    assert solution.unbalanced_w < 1e-3 * flow_w
 
 
-@pytest.mark.parametrize("coefficient", [1e13, 1e15, 1e17])
+@pytest.mark.parametrize("coefficient", [1e6, 1e8, 1e17])
 @pytest.mark.parametrize("order", [1, 2])
 def test_u_value_of_a_wall_with_next_to_perfect_convection(coefficient, order) -> None:
-    """U = k / d where h is next to infinite: T_air - T is far below the round-off of either."""
+    """U = k / d where h is next to infinite, or a sentence that asks for a given temperature."""
     wall = HeatProblem(
         wall_mesh(0.3, 0.5, 1.0),
         CONCRETE,
         effects=(Convection(("x0",), coefficient, 20.0), Convection(("x1",), coefficient, -10.0)),
     )
+    if coefficient > 1e9:
+        with pytest.raises(HeatError, match=r"convection coefficient: expected at most 1e.08 times"):
+            solve_steady(wall, order=order)
+        return
     solution = solve_steady(wall, order=order)
-    exact = CONCRETE.conductivity_w_mk / 0.3
-    assert wall_result(wall, solution, ("x0",), 20.0, -10.0).u_value_w_m2k == pytest.approx(exact, rel=1e-9)
+    exact = 1.0 / (2.0 / coefficient + 0.3 / CONCRETE.conductivity_w_mk)
+    assert wall_result(wall, solution, ("x0",), 20.0, -10.0).u_value_w_m2k == pytest.approx(exact, rel=1e-6)
     for heat, sign in zip(solution.effects, (1.0, -1.0)):
-        assert heat.heat_w[0] == pytest.approx(sign * 30.0 * exact * 0.5, rel=1e-9)
+        assert heat.heat_w[0] == pytest.approx(sign * 30.0 * exact * 0.5, rel=1e-6)
 
 
 def wall_mesh(x: float, y: float, z: float, **options) -> TetMesh:

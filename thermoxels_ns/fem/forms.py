@@ -53,13 +53,12 @@ class Form(Protocol):
 
     Temperatures come as differences from a reference, which keeps round-off relative to the differences. Every form
     also gives its heat flow per patch or region, evaluated as the equations do, so that balances close to round-off.
-    Temperatures T + rest, where the rest is below the round-off of T, hold digits that strong convection needs.
     """
 
     effect: str  # Label of the effect that it comes from
     groups: tuple[str, ...]  # Names of the patches or regions that it acts on
 
-    def group_heat_w(self, relative_k: Vector, time_s: float, rest_k: Vector | None = None) -> Vector:
+    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat flow into the body through each group, shape (g,), [W]."""
         ...
 
@@ -87,10 +86,7 @@ class _Boundary:
 
     def surface_k(self, relative_k: Vector) -> Vector:
         """Temperature at the points of integration, shape (k, q)."""
-        return self.at_points(relative_k[self.nodes])
-
-    def at_points(self, nodal: Vector) -> Vector:
-        """Values at the points of integration from those at the nodes of each triangle, shape (k, m); shape (k, q)."""
+        nodal = relative_k[self.nodes]
         return nodal if self._space.lumped_boundary else np.einsum("ka,aq->kq", nodal, self._shapes)
 
     def vector(self, flux_w_m2: Vector) -> Vector:
@@ -131,23 +127,9 @@ class ConvectionForm(_Boundary):
         """Entries integral(h phi_i phi_j), [W / K]."""
         return self.matrix(self.at(self.term.coefficient_w_m2k, time_s))
 
-    def load(self, around_k: Vector, time_s: float) -> Vector:
-        """Entries integral(h (T_ambient - T) phi_i) at temperatures around the body, shape (n,), [W]."""
-        return self.vector(self.at(self.term.coefficient_w_m2k, time_s) * self._apart_k(around_k, time_s))
-
-    def ambient_sums(self, time_s: float) -> tuple[Vector, Vector]:
-        """Sums of h and h T_ambient over the area around each node, relative to the reference, [W / K] and [W]."""
-        weight = self.at(self.term.coefficient_w_m2k, time_s) * self.basis.dx.sum(axis=1, keepdims=True)
-        of_nodes = (np.broadcast_to(part, self.nodes.shape) for part in (weight, weight * self.ambient_k(time_s)))
-        first, second = (sums_by_number(self.nodes.ravel(), part.ravel(), self._space.num_nodes) for part in of_nodes)
-        return first, second
-
-    def _apart_k(self, relative_k: Vector, time_s: float, rest_k: Vector | None = None) -> Vector:
-        """T_ambient - T at the points of integration, shape (k, q), [K]; the difference is taken first."""
-        apart_k = self.ambient_k(time_s) - relative_k[self.nodes]
-        if rest_k is not None:
-            apart_k -= rest_k[self.nodes]
-        return self.at_points(apart_k)
+    def load(self, time_s: float) -> Vector:
+        """Entries integral(h T_ambient phi_i), relative to the reference, shape (n,), [W]."""
+        return self.vector(self.at(self.term.coefficient_w_m2k, time_s) * self.ambient_k(time_s))
 
     def ambient_k(self, time_s: float) -> Vector:
         """T_ambient at each triangle, relative to the reference, shape (k, 1), [K]."""
@@ -161,9 +143,10 @@ class ConvectionForm(_Boundary):
         """h of each triangle, shape (k, 1), [W / (m2 K)]."""
         return self.at(self.term.coefficient_w_m2k, time_s)
 
-    def group_heat_w(self, relative_k: Vector, time_s: float, rest_k: Vector | None = None) -> Vector:
+    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat flow into the body through each patch, [W]."""
-        return self.sums(self.at(self.term.coefficient_w_m2k, time_s) * self._apart_k(relative_k, time_s, rest_k))
+        apart_k = self.ambient_k(time_s) - self.surface_k(relative_k)
+        return self.sums(self.at(self.term.coefficient_w_m2k, time_s) * apart_k)
 
 
 class FluxForm(_Boundary):
@@ -180,7 +163,7 @@ class FluxForm(_Boundary):
         """Entries integral(q phi_i), [W]."""
         return self.vector(self._flux_w_m2(time_s))
 
-    def group_heat_w(self, relative_k: Vector, time_s: float, rest_k: Vector | None = None) -> Vector:
+    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat flow into the body through each patch, [W]."""
         return self.sums(self._flux_w_m2(time_s))
 
@@ -215,7 +198,7 @@ class SourceForm:
         """Entries integral(s phi_i), [W]."""
         return self._space.source_load(self.term.tets, self._heat_w(time_s))
 
-    def group_heat_w(self, relative_k: Vector, time_s: float, rest_k: Vector | None = None) -> Vector:
+    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat set free in each region, [W]."""
         return sums_by_number(self._group, self._heat_w(time_s), len(self.groups))
 
@@ -258,15 +241,6 @@ class RadiationForm(_Boundary):
         kelvin = np.maximum(np.abs(self.surface_k(relative_k) + self._reference_k), COLDEST_SLOPE_K)
         return 4.0 * self._strength(time_s) * (kelvin * kelvin * kelvin)
 
-    def magnitude(self, relative_k: Vector, time_s: float) -> Vector:
-        """Sum of the absolute values of the load's terms, [W]: the load's round-off is a few eps of this."""
-        size = 0.0
-        for part in (self.surface_k(relative_k), self.surroundings_k(time_s)):
-            kelvin = np.abs(part + self._reference_k)
-            # Products, because powers of arrays take many times as long.
-            size = size + kelvin * kelvin * kelvin * (kelvin + 4.0 * np.abs(part))
-        return self.vector(self._strength(time_s) * size)
-
     def surroundings_k(self, time_s: float) -> Vector:
         """T_s at each triangle, relative to the reference, shape (k, 1), [K]."""
         return self.at(self.term.surroundings_c, time_s) - self._reference_c
@@ -275,7 +249,7 @@ class RadiationForm(_Boundary):
         """Nodes whose temperature its surroundings pull on: the coefficient is above 0 there."""
         return np.unique(self.nodes[self._strength(time_s)[:, 0] > 0.0])
 
-    def group_heat_w(self, relative_k: Vector, time_s: float, rest_k: Vector | None = None) -> Vector:
+    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat flow into the body through each patch, [W]."""
         return self.sums(self._flux_w_m2(relative_k, time_s))
 

@@ -17,7 +17,7 @@ _RIGHT = 1e-9  # Cosine up to which an angle between faces counts as right
 _VECTORS = 15  # Vectors of the nodes that are alive at the peak, besides the temperatures that are kept
 _FRAGMENTS = 1.15  # What the allocator and what lives shortly add, by measurement
 _BYTES_PER_FACET = 400.0  # What an effect needs per boundary triangle
-_BYTES_PER_TET_OF_ORDER_2, _BYTES_PER_UNKNOWN_OF_ORDER_2 = 850.0, 480.0
+_BYTES_PER_TET_OF_ORDER_2, _BYTES_PER_UNKNOWN_OF_ORDER_2 = 850.0, 680.0
 """Element matrices that are being added up; matrices and vectors."""
 
 
@@ -46,9 +46,9 @@ def peak_bytes(
         matrices = _BYTES_PER_TET_OF_ORDER_2 * len(mesh.tets) + _BYTES_PER_UNKNOWN_OF_ORDER_2 * (nodes + edges)
         return finer * (matrices + states)
     couplings = edges * _coupled_share(mesh)
-    matrix, half = 24.0 * couplings + 16.0 * nodes, 12.0 * couplings
+    matrix, half = 24.0 * couplings + 16.0 * nodes, 16.0 * couplings
     radiates = any(effect.kind == "radiation" for effect in problem.effects)
-    # K, the matrix of a step and its upper half; what radiation adds; the same for a second length and for estimates.
+    # K, the matrix of a step and its scaled entries; what radiation adds; a second length and estimates again.
     matrices = 2.0 * matrix + half + radiates * 1.3 * matrix + 2.0 * adaptive * (matrix + half)
     surfaces = _BYTES_PER_FACET * len(mesh.facets) * sum(hasattr(effect, "patches") for effect in problem.effects)
     return finer * (_FRAGMENTS * (matrices + 8.0 * _VECTORS * nodes) + states) + 4.0**refinements * surfaces

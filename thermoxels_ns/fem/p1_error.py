@@ -7,6 +7,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from thermoxels_ns.core.kernel_cache import kernel
+from thermoxels_ns.fem.linear_solver import LinearSolver
 from thermoxels_ns.fem.p1_kernels import TET_EDGES, _cross, _dot, _sides
 from thermoxels_ns.fem.solution import ErrorSize, SteadySolution, share_of_heat
 from thermoxels_ns.fem.space import sums_by_number
@@ -68,9 +69,9 @@ def p1_error(system: HeatSystem, solution: SteadySolution, time_s: float) -> Err
         if system.nonlinear:
             matrix = sparse.csr_matrix(matrix + system.radiation_slope(relative_k, time_s))
         free, error_k = fixed.free, np.zeros(num_nodes)
-        rest_w = system.net_heat(relative_k, time_s)[0] - bent_w
+        rest_w = system.net_heat(relative_k, time_s) - bent_w
         inner = matrix if len(free) == num_nodes else sparse.csr_matrix(matrix[free][:, free])
-        error_k[free] = system.linear_solver(inner, _TOLERANCE).solve(rest_w[free]).x
+        error_k[free] = LinearSolver(inner, relative_tolerance=_TOLERANCE).solve(rest_w[free]).x
         missed_w = {heat.effect: 0.0 for heat in solution.effects}
         for effect, nodes, strength, bubble_k in surfaces:
             missed_w[effect] -= float(np.sum(strength * (error_k[nodes] + bubble_k).mean(axis=1)))
@@ -79,7 +80,7 @@ def p1_error(system: HeatSystem, solution: SteadySolution, time_s: float) -> Err
             missed_w[effect] += float(heat_w)
         largest_w = max(map(abs, missed_w.values()), default=0.0) / (1.0 - _LEFT)
         largest_k = float(np.max(np.abs(error_k)))
-        kept_w = np.abs(system.exchanged_heat(relative_k, time_s)[0]) if system.sources else np.zeros(0)
+        kept_w = np.abs(system.exchanged_heat(relative_k, time_s)) if system.sources else np.zeros(0)
         for form in system.sources:
             inside, slope = tets[form.term.tets], mean[tets[form.term.tets]].mean(axis=1)
             along = np.square(np.ptp(relative_k[inside], axis=1)) / np.sum(np.square(slope), axis=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,9 @@ Vector = npt.NDArray[np.float64]
 Numbers = npt.NDArray[np.int64]
 
 _REMEDY = "Build the mesh with thermoxels_ns.mesh."
-_FLAT = 6e-12  # Six volumes over the cube of the size, up to which a tetrahedron is flat: it cannot carry gradients
+FLATTEST = 1e-6
+"""Least height of a tetrahedron over its size: what flatter ones conduct across is lost to round-off beside what they
+conduct through, which is the square of it times as much."""
 _ANGLE_ROUND_OFF = 16.0 * np.finfo(np.float64).eps
 """Round-off of the cosine of an angle per largest coordinate over the tetrahedron's size; an estimate from above."""
 TET_EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
@@ -130,43 +133,6 @@ def refuse_flat_tets(points_m: npt.NDArray[np.float64], tets: npt.NDArray[np.int
     _refuse_flat(_count_flat(points_m, tets, 1.0 / unit_m), len(tets))
 
 
-def product_and_bound(matrix: sparse.csr_matrix, vector: Vector) -> tuple[Vector, Vector]:
-    """Compute A x and |A| |x|: the round-off in the first is a few eps of the second.
-
-    >>> product_and_bound(sparse.csr_matrix([[2.0, -1.0], [-1.0, 2.0]]), np.array([3.0, 3.0]))
-    (array([3., 3.]), array([9., 9.]))
-    """
-    product, bound = np.empty(len(vector)), np.empty(len(vector))
-    _product_and_bound(matrix.indptr, matrix.indices, matrix.data, vector, product, bound)
-    return product, bound
-
-
-def conducted_and_bound(stiffness: sparse.csr_matrix, vector: Vector, own: Vector) -> tuple[Vector, Vector]:
-    """Compute K T as sums of K_ij (T_j - T_i), and the same of sizes, because the rows of K sum to 0.
-
-    A large constant in T then does not cancel, and the round-off of K's diagonal does not count. `own` is T at the
-    nodes of the rows, which may be some of all.
-
-    >>> values = np.array([1e16, 1e16 + 2.0])
-    >>> conducted_and_bound(sparse.csr_matrix([[3.0, -3.0], [-3.0, 3.0]]), values, values)
-    (array([-6.,  6.]), array([6., 6.]))
-    """
-    product, bound = np.empty(len(own)), np.empty(len(own))
-    _conducted_and_bound(stiffness.indptr, stiffness.indices, stiffness.data, vector, own, product, bound)
-    return product, bound
-
-
-def exact_sum(first: Vector, second: Vector) -> tuple[Vector, Vector]:
-    """Add up to a sum and what it lost to round-off (Knuth, The Art of Computer Programming 2, section 4.2.2).
-
-    >>> exact_sum(np.array([1.0]), np.array([1e-20]))
-    (array([1.]), array([1.e-20]))
-    """
-    total, lost = np.empty_like(first), np.empty_like(first)
-    _exact_sum(first, second, total, lost)
-    return total, lost
-
-
 def _capacities(points_m, tets, heat_capacity_j_m3k, edges: MeshEdges) -> tuple[npt.NDArray, npt.NDArray]:
     points_m, tets, unit_m = _checked(points_m, tets)
     capacity = _per_tet("heat_capacity_j_m3k", heat_capacity_j_m3k, len(tets))
@@ -216,8 +182,9 @@ def _per_tet(name: str, value: float | npt.NDArray[np.float64], num_tets: int) -
 
 def _refuse_flat(num_flat: int, num_tets: int) -> None:
     if num_flat:
+        expected = f"volumes above 0 and heights of at least {FLATTEST:g} of the longest side"
         got = f"{num_flat} of {num_tets} flat or inverted"
-        raise HeatError("mesh tets", expected="volumes above 0", got=got, remedy=_REMEDY)
+        raise HeatError("mesh tets", expected=expected, got=got, remedy=_REMEDY)
 
 
 @kernel
@@ -248,6 +215,15 @@ def _size(a, b, c):
 
 
 @kernel
+def _is_flat(a, b, c):
+    """Whether a tetrahedron of these sides is inverted, or its least height no more than `FLATTEST` of its size."""
+    n1, n2, n3 = _cross(b, c), _cross(c, a), _cross(a, b)
+    n0 = (n1[0] + n2[0] + n3[0], n1[1] + n2[1] + n3[1], n1[2] + n2[2] + n3[2])
+    largest = math.sqrt(max(_dot(n0, n0), _dot(n1, n1), _dot(n2, n2), _dot(n3, n3)))  # twice the area of a face
+    return not _dot(a, n1) > FLATTEST * largest * _size(a, b, c)
+
+
+@kernel
 def _place(first, other, node, neighbour):
     """Number of the edge between two nodes, by bisection."""
     low, high = np.uint64(min(node, neighbour)), max(node, neighbour)
@@ -273,7 +249,7 @@ def _count_flat(points, tets, scale):
     flat = 0
     for t in range(len(tets)):
         a, b, c = _sides(points, tets[t], scale)
-        flat += not _dot(a, _cross(b, c)) > _FLAT * _size(a, b, c) ** 3
+        flat += _is_flat(a, b, c)
     return flat
 
 
@@ -290,7 +266,7 @@ def _add_couplings(points, tets, conductivity, scale, first, other, coupling):
         n0 = (-n1[0] - n2[0] - n3[0], -n1[1] - n2[1] - n3[1], -n1[2] - n2[2] - n3[2])
         normals = (n0, n1, n2, n3)
         six_volumes = _dot(a, n1)
-        if not six_volumes > _FLAT * _size(a, b, c) ** 3:
+        if _is_flat(a, b, c):
             flat += 1
             continue
         right = _ANGLE_ROUND_OFF / _size(a, b, c)
@@ -313,7 +289,7 @@ def _add_capacities(points, tets, capacity, scale, nodal, first, other, edge):
         tet = tets[t]
         a, b, c = _sides(points, tet, scale)
         six_volumes = _dot(a, _cross(b, c))
-        if not six_volumes > _FLAT * _size(a, b, c) ** 3:
+        if _is_flat(a, b, c):
             flat += 1
             continue
         share = capacity[each * t] * six_volumes
@@ -360,74 +336,3 @@ def _unique_edges(tets, end, other, first, mark):
         begin = end[node]
         first[node + 1] = kept
     return kept
-
-
-@kernel
-def _product_and_bound(indptr, indices, data, vector, product, bound):
-    for row in range(len(vector)):
-        total = size = 0.0
-        for k in range(np.uint64(indptr[row]), np.uint64(indptr[row + 1])):
-            term = data[k] * vector[np.uint64(indices[k])]  # unsigned: no test for negative numbers
-            total += term
-            size += abs(term)
-        product[row], bound[row] = total, size
-
-
-@kernel(fastmath={"reassoc"})
-def size_of(values):
-    """Sum of the sizes of values.
-
-    >>> size_of(np.array([3.0, -4.0]))
-    7.0
-    """
-    total = 0.0
-    for i in range(len(values)):
-        total += abs(values[i])
-    return total
-
-
-@kernel(fastmath={"reassoc"})
-def weighted_size_of(weights, values):
-    """Sum of weights times sizes of values.
-
-    >>> weighted_size_of(np.array([1.0, 2.0]), np.array([3.0, -4.0]))
-    11.0
-    """
-    total = 0.0
-    for i in range(len(weights)):
-        total += weights[i] * abs(values[i])
-    return total
-
-
-@kernel
-def add_sizes(bound, weights, values):
-    """Add weights times sizes of values to a bound, in place.
-
-    >>> bound = np.ones(2)
-    >>> add_sizes(bound, np.array([1.0, 2.0]), np.array([3.0, -4.0]))
-    >>> bound
-    array([4., 9.])
-    """
-    for i in range(len(bound)):
-        bound[i] += weights[i] * abs(values[i])
-
-
-@kernel
-def _exact_sum(first, second, total, lost):
-    for i in range(len(first)):
-        a, b = first[i], second[i]
-        both = a + b
-        taken = both - a
-        total[i], lost[i] = both, (a - (both - taken)) + (b - taken)
-
-
-@kernel
-def _conducted_and_bound(indptr, indices, data, vector, own, product, bound):
-    for row in range(len(own)):
-        total = size = 0.0
-        here = own[row]
-        for k in range(np.uint64(indptr[row]), np.uint64(indptr[row + 1])):
-            term = data[k] * (vector[np.uint64(indices[k])] - here)
-            total += term
-            size += abs(term)
-        product[row], bound[row] = total, size

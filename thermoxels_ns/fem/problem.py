@@ -19,6 +19,8 @@ from thermoxels_ns.fem.p1_kernels import refuse_flat_tets
 from thermoxels_ns.fem.terms import Effect
 from thermoxels_ns.mesh.tetrahedra import TetMesh
 
+MOST_CONTRAST = 1e9
+"""Largest conductivity over the smallest of a body; beyond, what the worse one conducts is lost to round-off."""
 _MOST = 10_000_000  # Steps or kept times; a minute each for nineteen years
 
 
@@ -220,6 +222,13 @@ class HeatProblem:
             faults = (("none for", missing), ("unknown", unknown), ("no Material for", wrong))
             got = "; ".join(f"{what}: {', '.join(sorted(names))}" for what, names in faults if names)
             expected = f"a Material for each of the regions {', '.join(sorted(used))}"
+            raise HeatError("material", expected=expected, got=got, remedy=remedy)
+        conductivities = {name: self.material[name].conductivity_w_mk for name in used}
+        least, most = (choose(conductivities, key=conductivities.__getitem__) for choose in (min, max))
+        if conductivities[most] > MOST_CONTRAST * conductivities[least]:
+            got = f"{conductivities[least]:g} W/(m K) in {least} and {conductivities[most]:g} in {most}"
+            expected = f"conductivities no more than {MOST_CONTRAST:g} times apart"
+            remedy = "Leave out what conducts next to nothing, or correct the unit of one."
             raise HeatError("material", expected=expected, got=got, remedy=remedy)
 
     def _check_effects(self) -> None:

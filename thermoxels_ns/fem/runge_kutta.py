@@ -15,7 +15,6 @@ from thermoxels_ns.fem.system import HeatSystem
 Vector = npt.NDArray[np.float64]
 
 _KEPT_EQUATIONS = 2  # Implicit equations, one for each length of a stage, whose matrices are kept
-_ROUND_OFF = 4.0 * float(np.finfo(np.float64).eps)  # Of heat flows from temperatures that are rounded
 _SAME_LENGTH = 1e-12  # Relative difference up to which two lengths are one
 
 
@@ -31,7 +30,7 @@ class Step:
     """Estimated largest error that the step made, [K]; NaN if the scheme has no estimate or none was asked for."""
     converged: bool
     status: str
-    uncertain_w: float = 0.0  # Bound of what is unbalanced at all nodes, [W]
+    unbalanced_w: float = 0.0  # Heat that is unbalanced at all nodes in its stages, [W]
     limited: bool = False  # Whether the maximum-principle limiter changed the equations
     in_range: bool = True  # Whether all temperatures are in the range of the start and of the surroundings
 
@@ -46,73 +45,59 @@ class RungeKutta:
     def step(self, start_k: Vector, time_s: float, step_s: float, *, estimate: bool = False) -> Step:
         """Take one step from `start_k`, shape (n,), [K], relative to the reference; estimate its error if asked."""
         system, scheme = self._system, self.scheme
-        states: list[tuple[Vector, Vector | None]] = []
-        uncertain_w = 0.0
+        states: list[Vector] = []
         inner_w: list[Vector] = []
-        pieces_w: list[Vector] = []
         iterations = newton_iterations = 0
-        status = ""
+        unbalanced_w, status = 0.0, ""
         for number, (row, node) in enumerate(zip(scheme.weights, scheme.nodes)):
             now_s, implicit = time_s + node * step_s, row[number]
             if implicit == 0.0:
-                states.append((start_k, None))
-                uncertain_w += _ROUND_OFF * float(np.sum(self._diagonal_w_k(now_s) * np.abs(start_k)))
-                inner_w.append(system.net_heat(start_k, now_s)[0])
-                pieces_w.append(system.pieces.sums(system.exchanged_heat(start_k, now_s)[0]))
+                states.append(start_k)
+                inner_w.append(system.net_heat(start_k, now_s))
                 continue
-            shares = [weight / implicit for weight in row[:number]]
-            given_w = _weighted(shares, inner_w)
-            equation = self._equation(now_s, implicit * step_s)
-            solution = equation.solve(start_k, now_s, given_w, _weighted(shares, pieces_w))
+            given_w = _weighted([weight / implicit for weight in row[:number]], inner_w)
+            solution = self._equation(now_s, implicit * step_s).solve(start_k, now_s, given_w)
             iterations += solution.iterations
             newton_iterations += solution.newton_iterations
+            unbalanced_w += solution.unbalanced_w
             status = solution.status
-            states.append((solution.relative_k, solution.rest_k))
-            uncertain_w += solution.uncertain_w
+            states.append(solution.relative_k)
             if not solution.converged:
                 unknown = np.full(len(system.groups), np.nan)
                 return Step(solution.relative_k, unknown, iterations, newton_iterations, np.nan, False, status)
             if estimate or number + 1 < len(scheme.nodes):
                 stored_w = system.mass_product(solution.change_k) / (implicit * step_s)
                 inner_w.append(stored_w if given_w is None else stored_w - given_w)
-                pieces_w.append(system.pieces.sums(system.exchanged_heat(solution.relative_k, now_s)[0]))
         heat_w = self._heat(start_k, states, time_s, step_s)
-        error_k = self._error(start_k, inner_w, pieces_w, time_s, step_s) if estimate and scheme.estimate else np.nan
-        return Step(states[-1][0], heat_w, iterations, newton_iterations, error_k, True, status, uncertain_w)
+        error_k = self._error(start_k, inner_w, time_s, step_s) if estimate and scheme.estimate else np.nan
+        return Step(states[-1], heat_w, iterations, newton_iterations, error_k, True, status, unbalanced_w)
 
-    def _diagonal_w_k(self, time_s: float) -> Vector:
-        return self._system.matrix(time_s, np.inf).diagonal()
-
-    def _heat(
-        self, start_k: Vector, states: list[tuple[Vector, Vector | None]], time_s: float, step_s: float
-    ) -> Vector:
+    def _heat(self, start_k: Vector, states: list[Vector], time_s: float, step_s: float) -> Vector:
         """Mean heat flow of each group: the stages' flows, and what the balance of the fixed nodes leaves."""
         system, scheme = self._system, self.scheme
         if not system.groups:
             return np.zeros(0)
         flows, fixed = np.zeros(len(system.groups) - len(system.fixed.groups)), system.fixed
-        kept_w = system.mass_product(states[-1][0] - start_k)[fixed.nodes] / step_s if len(fixed.nodes) else np.zeros(0)
-        for weight, node, (state, rest_k) in zip(scheme.ends, scheme.nodes, states):
+        kept_w = system.mass_product(states[-1] - start_k)[fixed.nodes] / step_s if len(fixed.nodes) else np.zeros(0)
+        for weight, node, state in zip(scheme.ends, scheme.nodes, states):
             if weight != 0.0:
-                flows += weight * system.group_heat_w(state, time_s + node * step_s, rest_k)
-                kept_w -= weight * system.net_heat_at_fixed(state, time_s + node * step_s, rest_k)
+                flows += weight * system.group_heat_w(state, time_s + node * step_s)
+                kept_w -= weight * system.net_heat_at_fixed(state, time_s + node * step_s)
         return np.concatenate([flows, fixed.shares @ kept_w])
 
-    def _error(
-        self, start_k: Vector, inner_w: list[Vector], pieces_w: list[Vector], time_s: float, step_s: float
-    ) -> float:
+    def _error(self, start_k: Vector, inner_w: list[Vector], time_s: float, step_s: float) -> float:
         """Largest error by the scheme of the next order; sums over pieces come from what they exchange."""
         system, scheme = self._system, self.scheme
         assert scheme.estimate is not None
         implicit = scheme.weights[-1][-1]
         more = [float(part) / implicit for part in np.array(scheme.estimate) - np.array([0.0, *scheme.ends])]
-        exchanged_w = system.exchanged_heat(start_k, time_s)[0]
-        difference_w = _weighted(more, [exchanged_w - system.conducted_heat(start_k)[0], *inner_w])
-        pieces_difference_w = _weighted(more, [system.pieces.sums(exchanged_w), *pieces_w])
-        assert difference_w is not None and pieces_difference_w is not None
+        exchanged_w = system.exchanged_heat(start_k, time_s)
+        exchange_w = _weighted(more, [exchanged_w, *inner_w])
+        assert exchange_w is not None
+        difference_w = exchange_w - more[0] * system.conducted_heat(start_k)
         end_s = time_s + scheme.nodes[-1] * step_s
         equation = self._equation(end_s, implicit * step_s)
-        error = equation.damped(difference_w, pieces_difference_w, start_k, end_s)
+        error = equation.damped(difference_w, system.pieces.sums(exchange_w), start_k, end_s)
         return float(np.max(np.abs(error)))
 
     def _equation(self, time_s: float, step_s: float) -> ImplicitEquation:

@@ -61,8 +61,6 @@ class EffectHeat:
     heat leaves. A steady state has one interval."""
     group_names: tuple[str, ...]  # Names of the patches, or for a source of the regions, that it acts on
     group_heat_w: npt.NDArray[np.float64]  # The same for each of them, shape (s, g), [W]
-    uncertainty_w: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    """What round-off and unbalanced heat may have changed in it at most, shape (s,), [W]; empty where not known."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +106,7 @@ class HeatSolution:
     step_lengths_s: tuple[npt.NDArray[np.float64], ...] = ()  # Lengths of the steps in each interval, [s]
     time_error_k: float = float("nan")
     """Estimated largest error of the steps at any temperature, their estimates added up, [K]; NaN for fixed steps."""
-    uncertainty_k: float = 0.0  # What round-off and unbalanced heat may have changed in any temperature, [K]
+    unbalanced_w: float = 0.0  # Most heat that a step left unbalanced at all nodes, round-off included, [W]
     assembled: Assembled = field(default_factory=Assembled)
 
 
@@ -128,33 +126,24 @@ class SteadySolution:
     edge_temperature_c: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     """Temperatures of the middles of the mesh's edges, in the order of `mesh_edges`, shape (e,), [degrees Celsius];
     empty with linear tetrahedra."""
-    rest_k: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    """Digits of all temperatures below their round-off, those of edges last, shape (n + e,), [K]; heat flows by strong
-    convection need them."""
-    uncertainty_k: float = 0.0  # What round-off and unbalanced heat may have changed in any temperature, [K]
+    unbalanced_w: float = 0.0
+    """Heat that is unbalanced at all nodes, round-off included, [W]; heat flows are uncertain by no more."""
     error: ErrorSize | None = None
     """Estimated errors of linear tetrahedra on this mesh, see `p1_error`; None if there is no estimate."""
 
 
 def heat_by_effect(
-    effects: Sequence[str],
-    groups: Iterable[tuple[str, str]],
-    group_heat_w: npt.NDArray[np.float64],
-    uncertainty_w: npt.NDArray[np.float64] | None = None,
+    effects: Sequence[str], groups: Iterable[tuple[str, str]], group_heat_w: npt.NDArray[np.float64]
 ) -> tuple[EffectHeat, ...]:
-    """Sort heat flows, shape (s, g), [W], of groups, each an effect and a patch or region, by effect.
-
-    The uncertainty, shape (s,), [W], is that of each effect.
-    """
+    """Sort heat flows, shape (s, g), [W], of groups, each an effect and a patch or region, by effect."""
     columns: dict[str, list[int]] = {effect: [] for effect in effects}
     names: dict[str, list[str]] = {effect: [] for effect in effects}
     for number, (owner, name) in enumerate(groups):
         if owner in columns:
             columns[owner].append(number)
             names[owner].append(name)
-    known = np.zeros(0) if uncertainty_w is None else uncertainty_w
     parts = ((effect, group_heat_w[:, columns[effect]]) for effect in effects)
-    return tuple(EffectHeat(effect, heat.sum(axis=1), tuple(names[effect]), heat, known) for effect, heat in parts)
+    return tuple(EffectHeat(effect, heat.sum(axis=1), tuple(names[effect]), heat) for effect, heat in parts)
 
 
 def left_out(kinds: Sequence[str]) -> tuple[str, ...]:

@@ -93,14 +93,6 @@ class Space:
         """Give unknowns what is linear between the mesh's nodes, shape (n, ...)."""
         return nodal if self.order == 1 else np.concatenate([nodal, self.edges.midpoints(nodal)])
 
-    def prolongation(self) -> sparse.csr_matrix:
-        """Give `from_mesh_nodes` as a matrix, shape (n, v)."""
-        corners = len(self.selection.mesh.points_m)
-        ends = np.stack([self.edges.smaller_nodes(), self.edges.other], axis=1)
-        halves = (np.full(ends.size, 0.5), ends.ravel(), 2 * np.arange(len(ends) + 1))
-        edges = sparse.csr_matrix(halves, shape=(len(ends), corners))
-        return sparse.csr_matrix(sparse.vstack([sparse.identity(corners, format="csr"), edges]))
-
     def tet_nodes(self) -> Numbers:
         """Nodes of each tetrahedron, corners first, then the middles of `TET_EDGES`, shape (t, m)."""
         return self._element_nodes(self.selection.mesh.tets, TET_EDGES)

@@ -9,22 +9,15 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.flow_uncertainty import steady_uncertainty
 from thermoxels_ns.fem.implicit_equation import ImplicitEquation, ImplicitSolution
 from thermoxels_ns.fem.limiter import LEVEL_ROUND_OFF, MOST_SLACK, RANGE_ROUND_OFF, PositiveOffDiagonals, solve_in_range
 from thermoxels_ns.fem.p1_error import p1_error
-from thermoxels_ns.fem.p1_kernels import exact_sum
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.solution import SteadySolution, heat_by_effect
 from thermoxels_ns.fem.system import HeatSystem
 
-_SUSPICIOUS = 1e-12  # Residual from which on it is worth to look whether it is a share of nothing
 _ERROR_OVER_TOLERANCE = 1e3
 """Error of a temperature that the linear solver's tolerance may leave, as a share of the range over the tolerance."""
-MOST_RISE_K = 1e6
-"""Change of a temperature beyond which a piece without heat capacity does not hold what flows into it, [K]."""
-LEAST_CAPACITY_J_M3K = 1.0
-"""Heat capacity per volume below which there is none to speak of: a thousandth of that of air, [J / (m3 K)]."""
 
 
 def solve_steady(
@@ -64,26 +57,23 @@ def solve_steady(
     failure = too_cold(system, solution.relative_k)
     if not solution.converged:
         failure = f"No steady state was found. {solution.status} Check the mesh's quality and the effects."
-    relative_k, rest_k = solution.relative_k, solution.rest_k
-    group_heat = heat_of_groups_w(system, relative_k, time_s, rest_k)
-    uncertain = steady_uncertainty(system, relative_k, rest_k, time_s, 0.5 * float(np.abs(group_heat).sum()))
-    failure = failure or uncertain.refusal
     if failure and not allow_unconverged:
         raise HeatError(failure)
-    num_mesh_nodes, uncertain_w = len(problem.mesh.points_m), np.array([uncertain.heat_w])
-    temperature_c, lost_k = exact_sum(relative_k, np.full_like(relative_k, system.reference_c))
+    relative_k, num_mesh_nodes = solution.relative_k, len(problem.mesh.points_m)
+    group_heat = heat_of_groups_w(system, relative_k, time_s)
+    flows_w = 0.0 if system.is_still(relative_k, time_s) else max(solution.flows_w, 0.5 * np.abs(group_heat).sum())
+    temperature_c = relative_k + system.reference_c
     found = SteadySolution(
         temperature_c=temperature_c[:num_mesh_nodes],
-        effects=heat_by_effect(effect_labels(problem), system.groups, group_heat[None], uncertain_w),
-        energy_residual=_residual(system, relative_k, time_s, group_heat, relative_tolerance),
+        effects=heat_by_effect(effect_labels(problem), system.groups, group_heat[None]),
+        energy_residual=0.5 * abs(float(group_heat.sum())) / flows_w if flows_w > 0.0 else 0.0,
         status=failure or f"The steady state was found. {solution.status}{state.describe()}",
         converged=not failure,
         iterations=solution.iterations,
         newton_iterations=solution.newton_iterations,
         assembled=system.assembled,
         edge_temperature_c=temperature_c[num_mesh_nodes:],
-        rest_k=lost_k if rest_k is None else lost_k + rest_k,
-        uncertainty_k=uncertain.temperature_k,
+        unbalanced_w=solution.unbalanced_w,
     )
     estimated = order == 1 and given.lumped and not failure
     return replace(found, error=p1_error(given, found, time_s)) if estimated else found
@@ -155,31 +145,10 @@ def _slack_k(system: HeatSystem, low: float, high: float, relative_tolerance: fl
     return max(share * (max(ends) - min(ends)), LEVEL_ROUND_OFF * level_k)
 
 
-def _residual(
-    system: HeatSystem,
-    relative_k: np.ndarray,
-    time_s: float,
-    group_heat_w: np.ndarray,
-    relative_tolerance: float = 1e-12,
-) -> float:
-    """Heat that comes in and does not go out, as a share of what flows through the nodes, or of terms that cancel."""
-    exchanged_w, terms_w = system.exchanged_heat(relative_k, time_s)
-    flows_w = float(np.abs(exchanged_w).sum() + np.abs(system.net_heat_at_fixed(relative_k, time_s)).sum())
-    surplus_w = abs(float(group_heat_w.sum()))
-    if surplus_w > _SUSPICIOUS * flows_w and system.is_still(relative_k, time_s, relative_tolerance):
-        level_k = np.abs(relative_k) + abs(system.reference_c + ZERO_CELSIUS_K)
-        per_kelvin_w = system.held_w_k(time_s, np.inf)
-        per_kelvin_w[system.fixed.nodes] += system.stiffness.diagonal()[system.fixed.nodes]
-        flows_w = max(flows_w, float(np.sum(terms_w + per_kelvin_w * level_k)))
-    return surplus_w / flows_w if flows_w > 0.0 else 0.0
-
-
-def heat_of_groups_w(
-    system: HeatSystem, relative_k: np.ndarray, time_s: float, rest_k: np.ndarray | None = None
-) -> np.ndarray:
+def heat_of_groups_w(system: HeatSystem, relative_k: np.ndarray, time_s: float) -> np.ndarray:
     """Heat flow into the body of each group in a steady state, fixed nodes included, shape (g,), [W]."""
-    kept = -system.net_heat_at_fixed(relative_k, time_s, rest_k)
-    return np.concatenate([system.group_heat_w(relative_k, time_s, rest_k), system.fixed.shares @ kept])
+    kept_w = -system.net_heat_at_fixed(relative_k, time_s)
+    return np.concatenate([system.group_heat_w(relative_k, time_s), system.fixed.shares @ kept_w])
 
 
 def too_cold(system: HeatSystem, relative_k: np.ndarray) -> str:
@@ -202,32 +171,6 @@ def check_held(system: HeatSystem, time_s: float) -> None:
         got = f"none on {len(loose)} of {system.pieces.count} pieces; {_largest(system, loose)}"
         expected = "convection, radiation, ground contact or a fixed temperature on every connected piece of a body"
         raise HeatError("steady heat problem", expected=expected, got=got, remedy=remedy)
-
-
-def check_stored(system: HeatSystem, duration_s: float) -> None:
-    """Raise `HeatError` if more flows into a piece without heat capacity at the start than it passes on."""
-    given_w = system.load(0.0)
-    if not given_w.any():
-        return
-    alone = ~system.exchanging_pieces(0.0)
-    if not alone.any():
-        return
-    rise_k = np.abs(system.pieces.sums(given_w)) * duration_s / system.pieces.sums(system.nodal_mass_j_k)
-    runaway = np.flatnonzero(alone & (rise_k > MOST_RISE_K) & (_largest_capacity(system) < LEAST_CAPACITY_J_M3K))
-    if len(runaway):
-        got = f"{len(runaway)} of {system.pieces.count} pieces that would change by up to {rise_k[runaway].max():.2g} K"
-        got += f" in {duration_s:g} s; {_largest(system, runaway)}"
-        expected = "heat capacity, or exchange of heat, that takes up given fluxes and sources in every connected piece"
-        remedy = "Remove the piece, correct its material, or give it convection, radiation or a fixed temperature."
-        raise HeatError("heat problem", expected=expected, got=got, remedy=remedy)
-
-
-def _largest_capacity(system: HeatSystem) -> npt.NDArray[np.float64]:
-    """Largest heat capacity per volume in each piece, shape (p,), [J / (m3 K)]."""
-    largest = np.zeros(system.pieces.count)
-    piece = system.pieces.number[system.problem.mesh.tets[:, 0]]
-    np.maximum.at(largest, piece, system.problem.heat_capacity_j_m3k)
-    return largest
 
 
 def _largest(system: HeatSystem, chosen: npt.NDArray[np.int64]) -> str:

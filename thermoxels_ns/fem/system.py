@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from copy import copy
-from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients, LinearSolver, TwoLevel
 from thermoxels_ns.fem.forms import ConvectionForm, FixedNodes, RadiationForm, SourceForm, at_time, effect_forms
-from thermoxels_ns.fem.p1_kernels import conducted_and_bound, product_and_bound
 from thermoxels_ns.fem.problem import HeatProblem
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import Assembled
@@ -21,13 +19,11 @@ from thermoxels_ns.fem.space import Space
 
 Vector = npt.NDArray[np.float64]
 
-SystemSolver: TypeAlias = LinearSolver | ConjugateGradients
-"""What solves the equations of a system, by the order of its tetrahedra."""
-
-_ROUND_OFF = 64.0 * float(np.finfo(np.float64).eps)
-"""Share of the absolute temperature below which a difference is round-off."""
-_LEVEL = 1e-10
-"""Share of the terms of a sum below which a level temperature balances them, if the linear solver allows it."""
+MOST_TIMES_CONDUCTION = 1e8
+"""Largest convection at a node over what the cells around it conduct: more is a given temperature in all but name, and
+the difference from the air, by which heat flows, would be lost to round-off."""
+NOTHING = 1e-9
+"""Differences below this share of the absolute temperature let no heat flow to speak of."""
 _LEAST = float(np.finfo(np.float64).tiny)
 _KEPT_RANGES = 64  # Times at which the range of the surroundings is kept
 
@@ -41,13 +37,13 @@ class Pieces:
     """
 
     def __init__(self, stiffness: sparse.csr_matrix) -> None:
-        """Find the pieces of a matrix whose links go both ways."""
-        # Links go both ways, so that strong connection is connection; for the undirected kind scipy would transpose.
-        count, number = connected_components(stiffness, directed=True, connection="strong")
+        """Find the pieces between which a symmetric matrix has no entry."""
+        count, number = connected_components(stiffness, directed=False)
         self.count = int(count)
         """How many there are."""
         self.number: npt.NDArray[np.int32] = number
         """Number of each node's piece, shape (n,)."""
+        self._sizes = np.bincount(number, minlength=self.count)
 
     def sums(self, nodal: Vector) -> Vector:
         """Add up over each piece, shape (p,)."""
@@ -59,17 +55,15 @@ class Pieces:
         """Values of the pieces where their nodes are; one value for all nodes if there is one piece."""
         return values[self.number] if self.count > 1 else values
 
+    def without_means(self, nodal: Vector) -> Vector:
+        """Subtract the mean of each piece, shape (n,)."""
+        return nodal - self.at_nodes(self.sums(nodal) / self._sizes)
+
     def touched(self, nodes: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
         """Mark the pieces that have any of the nodes, shape (p,)."""
         marks = np.zeros(self.count, dtype=bool)
         marks[self.number[nodes]] = True
         return marks
-
-    def without_sums(self, floating: npt.NDArray[np.bool_], nodal: Vector, held: Vector, sums: Vector) -> Vector:
-        """Subtract multiples of `held`, whose sums over the pieces are `sums`, until floating pieces sum to 0."""
-        for _ in range(2):
-            nodal = nodal - self.at_nodes(np.where(floating, self.sums(nodal) / sums, 0.0)) * held
-        return nodal
 
 
 class HeatSystem:
@@ -118,10 +112,9 @@ class HeatSystem:
         self._kept_matrix: sparse.csr_matrix | None = None
         self._kept_load: Vector | None = None
         self._kept_loads: dict[float, Vector] = {}
-        self._kept_outside: dict[float, tuple[Vector, Vector, Vector]] = {}
+        self._kept_ambient: dict[float, Vector] = {}
         self._fixed_rows: sparse.csr_matrix | None = None
         self._kept_ranges: dict[float, tuple[float, float]] = {}
-        self._prolongation: sparse.csr_matrix | None = None
 
     @property
     def num_nodes(self) -> int:
@@ -175,13 +168,29 @@ class HeatSystem:
         return nodal * relative_k if matrix is None else matrix @ relative_k
 
     def convection_matrix(self, time_s: float) -> sparse.csr_matrix | None:
-        """R, heat that convection takes from each node per kelvin, shape (n, n), [W / K]; None without convection."""
+        """R, heat that convection takes from each node per kelvin, shape (n, n), [W / K]; None without convection.
+
+        Raises `HeatError` if it is more than `MOST_TIMES_CONDUCTION` of what the cells conduct.
+        """
         if self._kept_convection is None:
-            self._kept_convection = self._sum_of_convection(False, 0.0)
+            self._kept_convection = self._checked(self._sum_of_convection(False, 0.0))
         if not self.matrix_in_time:
             return self._kept_convection
         constant = self._kept_convection
-        return at_time(self._convection_at, time_s, lambda t: _sum_of(constant, self._sum_of_convection(True, t)))
+        return at_time(
+            self._convection_at, time_s, lambda t: self._checked(_sum_of(constant, self._sum_of_convection(True, t)))
+        )
+
+    def _checked(self, convection: sparse.csr_matrix | None) -> sparse.csr_matrix | None:
+        if convection is not None:
+            most = float(np.max(convection.diagonal() / np.maximum(self._stiffness.diagonal(), _LEAST)))
+            if not most <= MOST_TIMES_CONDUCTION:
+                remedy = "Give the surface the temperature of the air instead, or a smaller coefficient."
+                expected = (
+                    f"at most {MOST_TIMES_CONDUCTION:g} times as much heat per kelvin as the cells behind conduct"
+                )
+                raise HeatError("convection coefficient", expected=expected, got=f"{most:.1e} times", remedy=remedy)
+        return convection
 
     def matrix(self, time_s: float, step_s: float) -> sparse.csr_matrix:
         """M / step + K + R, shape (n, n), [W / K]; without M for a step without end."""
@@ -198,23 +207,6 @@ class HeatSystem:
             return sparse.csr_matrix(matrix + sparse.diags(nodal / step_s, format="csr"))
         return sparse.csr_matrix(matrix + mass / step_s)
 
-    def linear_solver(self, matrix: sparse.csr_matrix, relative_tolerance: float) -> SystemSolver:
-        """Make the solver for a matrix between the free nodes that suits the tetrahedra."""
-        if self._space.order == 1:
-            return LinearSolver(matrix, relative_tolerance=relative_tolerance)
-        if self._prolongation is None:
-            free, num_mesh_nodes = self.fixed.free, len(self.problem.mesh.points_m)
-            rows = sparse.csr_matrix(self._space.prolongation()[free])
-            self._prolongation = sparse.csr_matrix(rows[:, free[free < num_mesh_nodes]])
-        given = TwoLevel(matrix, self._prolongation)
-        return ConjugateGradients(matrix, given, relative_tolerance=relative_tolerance, max_iterations=500)
-
-    def held_w_k(self, time_s: float, step_s: float) -> Vector:
-        """Row sums of M / step + R, shape (n,), [W / K]: of the matrix too, because those of K are 0, but exact."""
-        held = self.nodal_mass_j_k / step_s if np.isfinite(step_s) else np.zeros(self.num_nodes)
-        convection = self.convection_matrix(time_s)
-        return held if convection is None else held + convection @ np.ones(self.num_nodes)
-
     def load(self, time_s: float) -> Vector:
         """Heat that does not depend on the temperature, fluxes and sources, shape (n,), [W]."""
         if self._kept_load is None:
@@ -223,15 +215,6 @@ class HeatSystem:
             return self._kept_load
         constant = self._kept_load
         return at_time(self._kept_loads, time_s, lambda t: constant + self._sum_of_loads(True, t))
-
-    def _outside(self, time_s: float) -> tuple[Vector, Vector, Vector]:
-        """Mean temperature of the air at each node, what comes in if the body has it, and the sum of sizes added up.
-
-        Shapes (n,), [K], [W] and [W]; 0 where there is no air. Convection is R times a difference from this
-        temperature, and what different airs at one node leave.
-        """
-        in_time = any(form.load_in_time for form in (*self._convection, *self._loads))
-        return at_time(self._kept_outside, time_s if in_time else 0.0, self._outside_at)
 
     def radiation_load(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat radiated into the body, shape (n,), [W]."""
@@ -249,68 +232,46 @@ class HeatSystem:
                 total = sparse.csr_matrix(total + form.slope(relative_k, time_s))
         return total
 
-    def exchanged_heat(self, relative_k: Vector, time_s: float, rest_k: Vector | None = None) -> tuple[Vector, Vector]:
-        """Heat from outside into each node, load + R (T_air - T) + radiation(T), and the sum of sizes added up, [W].
-
-        Round-off in the first is a few eps of the second. The temperatures are T + `rest_k`.
-        """
-        around_k, heat, bound = self._outside(time_s)
-        convection = self.convection_matrix(time_s)
-        if convection is None:
-            heat, bound = heat.copy(), bound.copy()
-        else:
-            apart_k = relative_k - around_k
-            if rest_k is not None:
-                apart_k += rest_k
-            lost, size = product_and_bound(convection, apart_k)
-            heat, bound = np.subtract(heat, lost, out=lost), np.add(bound, size, out=size)
+    def exchange_parts(self, relative_k: Vector, time_s: float) -> list[Vector]:
+        """Heat from outside into each node: load, R (T_air - T) and radiation(T), each of shape (n,), [W]."""
+        parts, convection = [self.load(time_s)], self.convection_matrix(time_s)
+        if convection is not None:
+            parts.append(self._ambient_load(time_s) - convection @ relative_k)
         if self.nonlinear:
-            heat += self.radiation_load(relative_k, time_s)
-            bound += self.radiation_magnitude(relative_k, time_s)
-        return heat, bound
+            parts.append(self.radiation_load(relative_k, time_s))
+        return parts
 
-    def net_heat(self, relative_k: Vector, time_s: float) -> tuple[Vector, Vector]:
-        """Heat into each node from outside and from its neighbours, `exchanged_heat` - K T, and its bound, [W].
+    def exchanged_heat(self, relative_k: Vector, time_s: float) -> Vector:
+        """Sum of the `exchange_parts`, shape (n,), [W]."""
+        return np.sum(self.exchange_parts(relative_k, time_s), axis=0)
+
+    def conducted_heat(self, relative_k: Vector) -> Vector:
+        """Heat that flows from each node to its neighbours, K T, shape (n,), [W].
+
+        The mean of each piece, which conducts nothing, is taken from T first, so that it leaves no round-off.
+        """
+        return self._stiffness @ self.pieces.without_means(relative_k)
+
+    def net_heat(self, relative_k: Vector, time_s: float) -> Vector:
+        """Heat into each node from outside and from its neighbours, shape (n,), [W].
 
         What keeps fixed nodes fixed is not in it.
         """
-        heat, bound = self.exchanged_heat(relative_k, time_s)
-        conducted, size = self.conducted_heat(relative_k)
-        return heat - conducted, bound + size
+        return self.exchanged_heat(relative_k, time_s) - self.conducted_heat(relative_k)
 
-    def conducted_heat(self, relative_k: Vector, rest_k: Vector | None = None) -> tuple[Vector, Vector]:
-        """Heat that flows from each node to its neighbours, K T, and its bound as in `exchanged_heat`."""
-        heat, bound = conducted_and_bound(self._stiffness, relative_k, relative_k)
-        if rest_k is not None:
-            more, size = conducted_and_bound(self._stiffness, rest_k, rest_k)
-            heat += more
-            bound += size
-        return heat, bound
-
-    def net_heat_at_fixed(self, relative_k: Vector, time_s: float, rest_k: Vector | None = None) -> Vector:
+    def net_heat_at_fixed(self, relative_k: Vector, time_s: float) -> Vector:
         """`net_heat` at the fixed nodes only, shape (d,), [W]."""
         nodes = self.fixed.nodes
         if len(nodes) == 0:
             return np.zeros(0)
         if self._fixed_rows is None:
             self._fixed_rows = sparse.csr_matrix(self._stiffness[nodes])
-        rows, parts = self._fixed_rows, (relative_k,) if rest_k is None else (relative_k, rest_k)
-        from_nodes_w = sum((conducted_and_bound(rows, part, part[nodes])[0] for part in parts), np.zeros(len(nodes)))
-        if not self.exchanges:
-            return -from_nodes_w
-        return self.exchanged_heat(relative_k, time_s, rest_k)[0][nodes] - from_nodes_w
+        return self.exchanged_heat(relative_k, time_s)[nodes] - self._fixed_rows @ self.pieces.without_means(relative_k)
 
-    def radiation_magnitude(self, relative_k: Vector, time_s: float) -> Vector:
-        """Sum of the sizes of what `radiation_load` adds up, shape (n,), [W]."""
-        total = np.zeros(self.num_nodes)
-        for form in self._radiation:
-            total += form.magnitude(relative_k, time_s)
-        return total
-
-    def group_heat_w(self, relative_k: Vector, time_s: float, rest_k: Vector | None = None) -> Vector:
+    def group_heat_w(self, relative_k: Vector, time_s: float) -> Vector:
         """Heat flow into the body of each group but those of fixed nodes, [W]."""
         forms = (*self._convection, *self._loads, *self._radiation)
-        return np.concatenate([np.zeros(0), *(form.group_heat_w(relative_k, time_s, rest_k) for form in forms)])
+        return np.concatenate([np.zeros(0), *(form.group_heat_w(relative_k, time_s) for form in forms)])
 
     def exchanging_pieces(self, time_s: float) -> npt.NDArray[np.bool_]:
         """Mark the pieces whose temperature convection, radiation or fixed nodes hold, shape (p,)."""
@@ -319,30 +280,12 @@ class HeatSystem:
             marks |= self.pieces.touched(form.exchanging_nodes(time_s))
         return marks
 
-    def level_k(self, relative_k: Vector) -> Vector:
-        """Mean temperature of each connected piece at its nodes, shape (n,), [K]."""
-        mean_k = self.pieces.sums(relative_k) / self.pieces.sums(np.ones_like(relative_k))
-        return np.zeros_like(relative_k) + self.pieces.at_nodes(mean_k)
-
-    def is_still(self, relative_k: Vector, time_s: float, relative_tolerance: float = 1e-12) -> bool:
-        """Whether nothing makes heat flow: each connected piece, at one temperature, balances what acts on it."""
-        fixed, level_k, held_w_k = self.fixed.nodes, self.level_k(relative_k), self.held_w_k(time_s, np.inf)
-        round_off_k = _ROUND_OFF * (np.abs(level_k).max() + abs(self.reference_c + ZERO_CELSIUS_K))
-        share = max(_LEVEL, 100.0 * relative_tolerance)
-        heat_w, terms_w = self.exchanged_heat(level_k, time_s)
-        allowed_w = share * (terms_w + 2.0 * held_w_k * np.abs(level_k)) + round_off_k * held_w_k
-        apart_k = np.abs(relative_k[fixed] - level_k[fixed])
-        allowed_k = share * np.abs(level_k[fixed]) + round_off_k
-        return bool(np.all(apart_k <= allowed_k) and np.all(np.abs(heat_w) <= allowed_w))
-
-    def surface_w_k(self, relative_k: Vector, time_s: float, *, inside: bool = True) -> float:
-        """Heat that leaves the body per kelvin through its surface, and through the cells there if asked, [W / K]."""
-        held_w_k, inside_w_k = self.held_w_k(time_s, np.inf), np.maximum(self._stiffness.diagonal(), _LEAST)
-        if self.nonlinear:
-            held_w_k = held_w_k + self.radiation_slope(relative_k, time_s) @ np.ones(self.num_nodes)
-        through_w_k = held_w_k / (1.0 + held_w_k / inside_w_k) if inside else held_w_k.copy()
-        through_w_k[self.fixed.nodes] = inside_w_k[self.fixed.nodes]
-        return float(np.sum(through_w_k))
+    def is_still(self, relative_k: Vector, time_s: float) -> bool:
+        """Whether all temperatures, those around included, differ by no more than `NOTHING` of the absolute one."""
+        ends = np.array([*self.surroundings_k(time_s), relative_k.min(), relative_k.max()])
+        ends = ends[np.isfinite(ends)]
+        level_k = float(np.abs(ends).max()) + abs(self.reference_c + ZERO_CELSIUS_K)
+        return float(np.ptp(ends)) <= NOTHING * level_k
 
     def allowed_range_k(self, start_k: tuple[float, float], times_s: tuple[float, ...]) -> tuple[float, float]:
         """Range that temperatures cannot leave in a step: from the start's and all surroundings' at these times.
@@ -390,18 +333,17 @@ class HeatSystem:
                     total += form.load(time_s)
         return total
 
-    def _outside_at(self, time_s: float) -> tuple[Vector, Vector, Vector]:
-        weight, weighted, heat = (np.zeros(self.num_nodes) for _ in range(3))
-        given = self.load(time_s)
-        for form in self._convection:
-            sums = form.ambient_sums(time_s)
-            weight += sums[0]
-            weighted += sums[1]
-        around_k = np.divide(weighted, weight, out=np.zeros_like(weight), where=weight > 0.0)
+    def _ambient_load(self, time_s: float) -> Vector:
+        """R T_air, shape (n,), [W]."""
+        in_time = any(form.load_in_time for form in self._convection)
+        return at_time(self._kept_ambient, time_s if in_time else 0.0, self._sum_of_ambients)
+
+    def _sum_of_ambients(self, time_s: float) -> Vector:
+        total = np.zeros(self.num_nodes)
         for form in self._convection:
             with self.assembled.form(form.kind):
-                heat += form.load(around_k, time_s)
-        return around_k, given + heat, np.add(np.abs(given), np.abs(heat))
+                total += form.load(time_s)
+        return total
 
 
 def _sum_of(first: sparse.csr_matrix | None, second: sparse.csr_matrix | None) -> sparse.csr_matrix | None:

@@ -10,13 +10,12 @@ import numpy.typing as npt
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import celsius_to_kelvin
-from thermoxels_ns.fem.flow_uncertainty import MOST_UNCERTAIN, TimeUncertainty, describe
 from thermoxels_ns.fem.limiter import AllowedRange, Limiter, is_in_range
 from thermoxels_ns.fem.problem import AdaptiveSteps, GivenSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.runge_kutta import RungeKutta, Step
 from thermoxels_ns.fem.schemes import BACKWARD_EULER, SDIRK2, Scheme
 from thermoxels_ns.fem.solution import HeatSolution, heat_by_effect, left_out
-from thermoxels_ns.fem.steady import check_stored, too_cold
+from thermoxels_ns.fem.steady import too_cold
 from thermoxels_ns.fem.system import HeatSystem
 
 Vector = npt.NDArray[np.float64]
@@ -33,12 +32,10 @@ _SAFETY = 0.9  # Share of the longest step that meets the tolerance, by its esti
 _SHRINK, _GROW = 0.2, 5.0
 """Least and most that one step changes the length of the next."""
 _KEEP_BELOW = 1.25  # Factor below which a step is not lengthened, so that its matrices serve again
-_SHORTEST = 1e-60
-"""Shortest step as a share of the duration; bodies with next to no heat capacity begin with such short ones."""
-_ROUND_OFF = 64.0 * float(np.finfo(np.float64).eps)  # Share of the terms of a sum that round-off leaves of it at most
+_SHORTEST = 1e-15  # Shortest step as a share of the duration
+LEAST_CAPACITY_J_M3K = 1.0
+"""Heat capacity per volume below which a body stores nothing to speak of: a thousandth of that of air, [J / (m3 K)]."""
 _NOTHING = 1e-9  # Share of the heat content above absolute zero that is no exchange of heat to speak of
-_LEAST_K = 1.0  # Absolute temperature below which such shares are no smaller, [K]
-_SUSPICIOUS = 1e-12  # Energy residual above which it is checked whether round-off explains it
 
 
 def solve_heat(
@@ -70,16 +67,15 @@ def solve_heat(
         progress: Called after every step with the share of the duration that is done and the number of steps.
 
     Raises:
-        HeatError: If the temperatures of all times do not fit into memory, an effect does not fit the mesh, heat flows
-            into a component that neither stores nor passes it on, a step's solver does not converge, or the temperature
-            falls below absolute zero.
+        HeatError: If the temperatures of all times do not fit into memory, an effect does not fit the mesh, a material
+            stores next to no heat, a step's solver does not converge, or the temperature falls below absolute zero.
     """
+    _check_stores(problem)
     states = _room_for_states(time.num_times, len(problem.mesh.points_m))
     system = HeatSystem(problem, lumped=lumped, lumped_boundary=lumped_boundary)
     states[0] = problem.start_c - system.reference_c
     if len(system.fixed.nodes):
         states[0, system.fixed.nodes] = system.fixed.temperature_k(0.0)
-    check_stored(system, time.duration_s)
     balance, adaptive = HeatBalance(system, states, time.times_s), isinstance(time, AdaptiveSteps)
     if adaptive and scheme is not None and scheme.estimate is None:
         expected = "one with an error estimate for adaptive steps"
@@ -95,7 +91,6 @@ def solve_heat(
         balance.add(taken.step, taken.step_s, ends_interval=taken.ends_interval)
         if progress is not None:
             progress(balance.followed_s / time.duration_s, balance.steps)
-    failure = failure or balance.refusal()
     if failure and not allow_unconverged:
         raise HeatError(failure)
     status = failure or balance.success(loop.describe()) + _skips(problem, time)
@@ -198,7 +193,7 @@ class _TimeLoop:
 
     def _first_length(self, start_k: Vector, time: AdaptiveSteps) -> float:
         system = self._system
-        rate = system.net_heat(start_k, 0.0)[0] / system.nodal_mass_j_k
+        rate = system.net_heat(start_k, 0.0) / system.nodal_mass_j_k
         fastest = float(np.max(np.abs(rate[system.fixed.free]), initial=0.0))
         interval_s = time.duration_s / time.outputs
         if fastest == 0.0:
@@ -257,7 +252,7 @@ class HeatBalance:
         self._error_k = 0.0
         self._lengths_s: list[list[float]] = [[] for _ in times_s[1:]]
         self._limited = self._out_of_range = 0
-        self._uncertain, self._uncertain_j = TimeUncertainty(), np.zeros(1)
+        self._unbalanced_w = 0.0
 
     @property
     def steps(self) -> int:
@@ -274,42 +269,13 @@ class HeatBalance:
         self._most_iterations = max(self._most_iterations, step.iterations)
         self._error_k += step.error_k
         self._steps += 1
-        exchanged_j = step_s * float(np.abs(step.group_heat_w).sum())
-        self._exchanged_j[row] += exchanged_j
-        self._uncertain.add(self._system, step.relative_k, step.uncertain_w, exchanged_j, step_s)
+        self._exchanged_j[row] += step_s * float(np.abs(step.group_heat_w).sum())
+        self._unbalanced_w = max(self._unbalanced_w, step.unbalanced_w)
         self._limited += step.limited
         self._out_of_range += not step.in_range
         if ends_interval:
             self._done += 1
             self._states[self._done] = step.relative_k
-
-    def refusal(self) -> str:
-        """Say that heat flows are too uncertain, or nothing; where next to no heat was exchanged, that is no matter."""
-        end_k, exchanged_j = self._states[self._done], float(self._exchanged_j.sum())
-        if self._steps:
-            self._uncertain_j = self._uncertain.heat_j(self._system, end_k)
-        if not self._system.groups:
-            return ""
-        if self._uncertain_j[-1] <= MOST_UNCERTAIN * exchanged_j:
-            return ""
-        # Heat may come in and leave through one patch.
-        at_nodes_w = np.abs(self._system.exchanged_heat(end_k, self.followed_s)[0]).sum()
-        exchanged_j = max(exchanged_j, self.followed_s * float(at_nodes_w))
-        # What is unbalanced inside leaves no faster than its temperatures let it.
-        held_j_k = self.followed_s * self._system.surface_w_k(end_k, self.followed_s, inside=False)
-        uncertain_k = self._uncertain.temperature_k(self._system, float(np.abs(end_k).max()))
-        self._uncertain_j = np.minimum(self._uncertain_j, held_j_k * uncertain_k)
-        uncertain_j = float(self._uncertain_j[-1])
-        if uncertain_j <= MOST_UNCERTAIN * exchanged_j:
-            return ""
-        level_k = abs(celsius_to_kelvin(self._system.reference_c)) + float(np.abs(end_k).max())
-        # By a difference that is round-off of an absolute temperature, a body stores and exchanges:
-        per_kelvin_j = self._system.total_mass_j_k + self.followed_s * self._system.surface_w_k(end_k, self.followed_s)
-        return (
-            ""
-            if uncertain_j <= _NOTHING * max(level_k, _LEAST_K) * per_kelvin_j
-            else describe(uncertain_j, exchanged_j, "J")
-        )
 
     def success(self, of_steps: str) -> str:
         """Say that all went well, and how; `of_steps` is what is to be said about other steps."""
@@ -340,16 +306,9 @@ class HeatBalance:
         mean = relative_content[0] / total_mass
         # Not by BLAS, whose sum depends on the number of its threads.
         spread = float(np.sum(mass * np.abs(states_k[0] - mean)))
-        scale, spread_scale = max(float(content[0]), exchanged), spread + exchanged
-        if unexplained > _SUSPICIOUS * min(scale, spread_scale):
-            terms = self._terms_j(states_k, times_s, unexplained / _ROUND_OFF)
-            if unexplained <= _ROUND_OFF * terms:
-                scale, spread_scale = max(scale, terms), max(spread_scale, terms)
+        scale = max(float(content[0]), exchanged)
+        spread_scale = max(spread + exchanged, _NOTHING * float(content[0]))
         lengths = np.diff(times_s)
-        ends = np.cumsum([len(lengths_s) for lengths_s in self._lengths_s[:done]]) - 1
-        uncertain_w = np.broadcast_to(self._uncertain_j, self._steps)[ends] / lengths if done else np.zeros(0)
-        highest_k = max(abs(float(states_k.min())), abs(float(states_k.max())))
-        uncertain_k = self._uncertain.temperature_k(system, highest_k) if done else 0.0
         states_k += system.reference_c
         kinds = [effect.kind for effect in system.problem.effects]
         return HeatSolution(
@@ -363,41 +322,14 @@ class HeatBalance:
             converged=converged,
             iterations=self._iterations[:done, 0],
             skipped_effects=left_out(kinds),
-            effects=heat_by_effect(
-                effect_labels(system.problem), system.groups, heat_j / lengths[:, None], uncertain_w
-            ),
+            effects=heat_by_effect(effect_labels(system.problem), system.groups, heat_j / lengths[:, None]),
             newton_iterations=self._iterations[:done, 1],
             steps=self._steps,
             step_lengths_s=tuple(np.array(lengths) for lengths in self._lengths_s[:done]),
             time_error_k=self._error_k if adaptive else float("nan"),
-            uncertainty_k=uncertain_k,
+            unbalanced_w=self._unbalanced_w,
             assembled=system.assembled,
         )
-
-    def _terms_j(self, states_k: Vector, times_s: Vector, least_j: float) -> float:
-        """Sizes of all that is added up to the heat that flows in where nothing makes heat flow, [J].
-
-        If no more than `least_j` can come of it, no state is looked at.
-        """
-        system, fixed, lengths_s = self._system, self._system.fixed.nodes, np.diff(times_s)
-        most_w = np.zeros(len(lengths_s))
-        if len(fixed):
-            around_w_k = float(system.conducted_heat(np.ones(system.num_nodes))[1][fixed].sum())
-            most_w += around_w_k * np.abs(states_k[1:]).max(axis=1)
-        states = list(zip(states_k[1:], times_s[1:].tolist()))
-        if system.exchanges:
-            most_w += [float(system.exchanged_heat(state_k, time_s)[1].sum()) for state_k, time_s in states]
-        if float(lengths_s @ most_w) < least_j:
-            return 0.0
-        total_j = 0.0
-        for (state_k, time_s), length_s in zip(states, lengths_s.tolist()):
-            if not system.is_still(state_k, time_s):
-                continue
-            terms_w = float(system.exchanged_heat(state_k, time_s)[1].sum())
-            if len(fixed):
-                terms_w += float(system.conducted_heat(state_k)[1][fixed].sum())
-            total_j += length_s * terms_w
-        return total_j
 
 
 def _share(part: float, whole: float) -> float:
@@ -433,6 +365,14 @@ def _skips(problem: HeatProblem, time: Steps) -> str:
         f" Steps of {time.step_seconds:g} s are longer than the {problem.resolution_s:g} s by which effects that "
         "change with time can be followed; what happens in between is missed."
     )
+
+
+def _check_stores(problem: HeatProblem) -> None:
+    least = float(np.min(problem.heat_capacity_j_m3k))
+    if least < LEAST_CAPACITY_J_M3K:
+        expected = f"at least {LEAST_CAPACITY_J_M3K:g} J/(m3 K) to follow a body through time (air has 1200)"
+        remedy = "Correct density and specific heat of the material, or ask for the steady state."
+        raise HeatError("heat capacity", expected=expected, got=f"{least:g} J/(m3 K)", remedy=remedy)
 
 
 def _room_for_states(num_times: int, num_nodes: int) -> Vector:

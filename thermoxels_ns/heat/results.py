@@ -13,7 +13,6 @@ import numpy.typing as npt
 from thermoxels_ns.core.checks import check_shape
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.fem.forms import FixedNodes, SourceForm, effect_forms
-from thermoxels_ns.fem.p1_kernels import exact_sum
 from thermoxels_ns.fem.problem import HeatProblem, effect_labels
 from thermoxels_ns.fem.selection import Selection
 from thermoxels_ns.fem.solution import (
@@ -98,8 +97,9 @@ class EnergyBalance:
     residual: float  # Stored - in + out: what nothing accounts for
     relative_residual: float
     """The solver's own measure of it: its largest size relative to the heat content or to all heat exchanged."""
-    uncertainty_w: float  # What round-off and unbalanced heat may have changed in any heat flow at most, [W]
-    uncertainty_k: float  # The same of any temperature, [K]
+    unbalanced_w: float
+    """Heat that the solver left unbalanced at all nodes, round-off included, [W]: no heat flow is uncertain by more.
+    Through time that of the worst step."""
 
 
 @dataclass(frozen=True)
@@ -221,8 +221,7 @@ def _regions(
 ) -> tuple[RegionResult, ...]:
     mesh, names, last_c = selection.mesh, selection.mesh.region_names, nodes.states_c[-1]
     behind, made_of = region_behind_facets(problem.mesh), materials_by_region(problem)
-    rest_k = solution.rest_k if isinstance(solution, SteadySolution) else None
-    by_region = heat_by_part(problem, end_state_c(solution), float(nodes.times_s[-1]), behind, names, rest_k)
+    by_region = heat_by_part(problem, end_state_c(solution), float(nodes.times_s[-1]), behind, names)
     heat = heat_through_parts(by_region, names)[0]
     area = np.bincount(nodes.of_facets(behind), selection.facet_area_m2, len(names))
     volume = _volumes_m3(mesh)
@@ -268,8 +267,7 @@ def _balance(solution: Solution, lengths: Vector) -> EnergyBalance:
         stored=stored,
         residual=stored - into + out,
         relative_residual=solution.energy_residual,
-        uncertainty_w=max((float(heat.uncertainty_w.max()) for heat in solution.effects), default=0.0),
-        uncertainty_k=solution.uncertainty_k,
+        unbalanced_w=solution.unbalanced_w,
     )
 
 
@@ -351,7 +349,7 @@ def wall_result(
     def parts(numbers: npt.NDArray[np.int64], names: tuple[str, ...]) -> tuple[WallPart, ...]:
         number = np.where(inner, numbers, len(names))
         listed = (*names, "\0rest")
-        flows = heat_by_part(problem, every_c, 0.0, number, listed, solution.rest_k)
+        flows = heat_by_part(problem, every_c, 0.0, number, listed)
         heat = heat_through_parts(flows, listed)[0]
         area = np.bincount(number, selection.facet_area_m2, len(listed))
         return tuple(
@@ -400,7 +398,6 @@ def heat_by_part(
     time_s: float,
     part: npt.NDArray[np.int64],
     part_names: Sequence[str],
-    rest_k: Vector | None = None,
 ) -> tuple[EffectHeat, ...]:
     """Evaluate the heat flow into the body of each effect, but sources, through parts of the surface at one moment.
 
@@ -408,8 +405,7 @@ def heat_by_part(
     Convection and radiation are evaluated as the solvers do by default: at the nodes of linear tetrahedra, and
     integrated over each triangle if they are quadratic. `temperature_c`, shape (n,), is that of the mesh's nodes and,
     if tetrahedra are quadratic, of the middles of `mesh_edges` after them; `part` is the index into `part_names` of
-    each boundary triangle, shape (f,); `rest_k` are digits below the round-off of temperatures, shape (n,), [K]. Raises
-    `HeatError` if one has another shape.
+    each boundary triangle, shape (f,). Raises `HeatError` if one has another shape.
     """
     remedy = "Give every boundary triangle of the mesh a part."
     part = check_shape("part", np.asarray(part), (len(problem.mesh.facets),), remedy, HeatError)
@@ -421,17 +417,15 @@ def heat_by_part(
     remedy = "Give the temperatures of the problem that was solved."
     check_shape("temperature_c", temperature_c, (space.num_nodes,), remedy, HeatError)
     reference_c = 0.5 * (float(temperature_c.min()) + float(temperature_c.max()))
-    rest_k = np.zeros_like(temperature_c) if rest_k is None or not len(rest_k) else rest_k
-    relative_k, lost_k = exact_sum(temperature_c, np.full_like(temperature_c, -reference_c))
+    relative_k = temperature_c - reference_c
     acting = effect_forms(problem, space, reference_c, where=selection)
     forms = [form for form in acting.exchanging if not isinstance(form, SourceForm)]
     groups = [(form.effect, group) for form in forms for group in form.groups]
-    flows = [form.group_heat_w(relative_k, time_s, rest_k + lost_k) for form in forms]
+    flows = [form.group_heat_w(relative_k, time_s) for form in forms]
     if acting.fixed:
         held, system = FixedNodes(acting.fixed, space.num_nodes), HeatSystem(problem, lumped=order == 1, order=order)
         groups += held.groups
-        relative_k, lost_k = exact_sum(temperature_c, np.full_like(temperature_c, -system.reference_c))
-        kept_w = -system.net_heat_at_fixed(relative_k, time_s, rest_k + lost_k)
+        kept_w = -system.net_heat_at_fixed(temperature_c - system.reference_c, time_s)
         flows.append(held.shares @ kept_w)
     owners = {owner for owner, _ in groups}
     named = [label for label in effect_labels(problem) if label in owners]

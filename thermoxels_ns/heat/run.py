@@ -77,9 +77,8 @@ def run_scene(
     done = clock.perf_counter()
     seconds = {"screen": found.screening.seconds, "solve": done - start - found.screening.seconds}
     say(f"Heat: {solution.status} ({seconds['solve']:.1f} s)")
-    uncertain_w = max((float(heat.uncertainty_w.max()) for heat in solution.effects), default=0.0)
     closed = f"Energy balance closed to {solution.energy_residual:.1e}"
-    say(f"{closed}; what is unbalanced, round-off included, changes no heat flow by more than {uncertain_w:.1e} W.")
+    say(f"{closed}; what is unbalanced changes no heat flow by more than {solution.unbalanced_w:.1e} W.")
     if found.accuracy is None:
         say(f"Error of the mesh: {mesh_error_in_words(solution)}.")
     elif not found.accuracy.met:

@@ -12,8 +12,8 @@ from scipy import sparse
 
 from thermoxels_ns.core.errors import HeatError
 from thermoxels_ns.core.units import ZERO_CELSIUS_K
-from thermoxels_ns.fem.conjugate_gradients import ConjugateGradients
 from thermoxels_ns.fem.limiter import holds_maximum_principle
+from thermoxels_ns.fem.linear_solver import LinearSolver
 from thermoxels_ns.fem.p1_kernels import lumped_mass
 from thermoxels_ns.fem.problem import AdaptiveSteps, HeatProblem, TimeSteps, effect_labels
 from thermoxels_ns.fem.quantities import Bounded, Places
@@ -427,7 +427,7 @@ class _Screener:
         """The bound from one implicit step over the whole duration."""
         assert self._stiffness is not None
         matrix = sparse.csr_matrix(self._stiffness + sparse.diags(self._mass / self._duration_s, format="csr"))
-        solver = ConjugateGradients(matrix, relative_tolerance=_STEP_TOLERANCE)
+        solver = LinearSolver(matrix, relative_tolerance=_STEP_TOLERANCE)
         v = np.maximum(solver.solve(np.where(self._free, heat_w, 0.0)).x, 0.0)
         if not np.all(np.isfinite(v)):
             return _Bound(np.inf, "")
