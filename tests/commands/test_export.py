@@ -25,6 +25,7 @@ from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.fem.problem import TimeSteps
 from thermoxels_ns.mesh.solid.voxels import SolidSelection
 from thermoxels_ns.multiview.photographs import Photographs
+from thermoxels_ns.multiview.stereo import depths_of
 
 UNSEEN = 0.35
 
@@ -626,7 +627,8 @@ def test_surfaces_that_photographs_do_not_support_say_so(ball, tmp_path) -> None
     thermal = np.full(len(grey), np.nan, np.float32)
     photographs = Photographs(views.matrices(), centres, views.size, np.arange(3) * 1600, grey, thermal)
     lines: list[str] = []
-    summary = export_snapshot(ball, np.eye(4), ExportOptions(), tmp_path, lines.append, photographs=photographs)
+    depths = depths_of(photographs, ball.lattice.lo, ball.lattice.hi)
+    summary = export_snapshot(ball, np.eye(4), ExportOptions(), tmp_path, lines.append, depths=depths)
     shares = summary["mesh"]["share_of_area_by_support"]
     assert shares["supported"] == shares["weak"] == 0.0
     assert shares["smooth"] + shares["filled"] == pytest.approx(1.0) and 0.3 < shares["smooth"] < 0.6

@@ -19,7 +19,7 @@ from thermoxels_ns.fem.space import Space
 
 Vector = npt.NDArray[np.float64]
 
-MOST_TIMES_CONDUCTION = 1e8
+MOST_TIMES_CONDUCTION = 1e10
 """Largest convection at a node over what the cells around it conduct: more is a given temperature in all but name, and
 the difference from the air, by which heat flows, would be lost to round-off."""
 NOTHING = 1e-9
