@@ -29,7 +29,7 @@ def air_voxels(lattice: Lattice, rays: FeatureRays) -> BoolArray:
     """
     crossing, points = votes(lattice, rays)
     free = (crossing >= FEWEST_POINTS) & (points == 0)
-    return np.asarray(ndimage.binary_erosion(free, border_value=1))
+    return np.asarray(ndimage.binary_erosion(free, border_value=1), dtype=np.bool_)
 
 
 def votes(lattice: Lattice, rays: FeatureRays) -> tuple[CountArray, CountArray]:
