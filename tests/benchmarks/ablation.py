@@ -127,7 +127,7 @@ FIGURES = {
 }
 """Figures of the table and how they are written; those of depth_off_share and what follows are better if smaller."""
 _KEPT = (
-    *("fscore_128_seen", "fscore_128", "fscore_seen", "fscore", "precision_seen", "psnr", "psnr_8", "psnr_box"),
+    *("fscore_128_seen", "fscore_128", "fscore", "precision", "recall", "psnr", "psnr_8", "psnr_box"),
     *("psnr_fitted", "thermal_psnr", "thermal_mae_c", "half_transparent", "surface_distance_m"),
     *("depth_error", "depth_off_share", "opaque_share", "sky_filled", "seconds"),
 )
