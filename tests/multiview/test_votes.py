@@ -1,9 +1,11 @@
 import numpy as np
 import pytest
 
+from thermoxels_ns.core.camera import Camera
 from thermoxels_ns.core.feature_rays import FeatureRays, agrees_with_neighbours
 from thermoxels_ns.core.lattice import Lattice
-from thermoxels_ns.multiview.votes import FEWEST_POINTS, MARGIN_VOXELS, air_voxels, votes
+from thermoxels_ns.multiview.votes import FEWEST_POINTS, MARGIN_VOXELS, air_voxels, around_cameras, votes
+from thermoxels_ns.synthetic.camera_rings import look_at
 
 
 def empty_voxels(lattice: Lattice, rays: FeatureRays) -> np.ndarray:
@@ -128,3 +130,34 @@ def test_a_walk_meets_every_voxel_on_a_ray_and_no_other() -> None:
         left = np.argwhere(expected & ~met)
         # The last voxel is not left before the margin; a corner may be cut between two samples.
         assert (met & ~expected).sum() <= 1 and len(left) <= 2, left
+
+
+def two_cameras(apart: float = 0.4, wall: float = 2.0, points: int = 200):
+    """Side by side before a wall at x = `wall`, and what they see of it."""
+    eyes = [np.array([0.0, y, 0.0]) for y in (-0.5 * apart, 0.5 * apart)]
+    camera = Camera(100, 100, 100.0, 100.0, 50.0, 50.0)  # 53 degrees wide
+    shown = np.random.default_rng(0).uniform(-0.5, 0.5, (points, 3))
+    shown[:, 0] = wall
+    return lines(eyes, shown), [(camera, look_at(eye, (1.0, eye[1], 0.0))) for eye in eyes]
+
+
+def test_where_a_camera_was_held_is_air_but_where_two_photographs_look():
+    rays, views = two_cameras()
+    at = {
+        "behind": (-0.3, 0.2, 0.0),
+        "before one alone": (0.2, 0.2, 0.0),
+        "before both": (0.7, 0.0, 0.0),
+        "far behind": (-1.5, 0.0, 0.0),
+        "beside the wall": (2.0, 1.5, 0.0),
+    }
+    found = around_cameras(np.array(list(at.values())), rays, views)
+    assert dict(zip(at, found.tolist())) == {name: name in ("behind", "before one alone") for name in at}
+
+
+def test_a_few_wrong_rays_and_cameras_that_show_hardly_anything_tell_nothing():
+    behind = np.array([[-0.3, 0.2, 0.0]])
+    assert not around_cameras(behind, *two_cameras(points=19)).any()
+    assert not around_cameras(behind, *two_cameras(wall=0.5)).any()
+    rays, views = two_cameras()
+    rays.points[0] = (0.01, 0.0, 0.0)
+    assert around_cameras(behind, rays, views).all()

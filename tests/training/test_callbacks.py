@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
@@ -14,6 +15,7 @@ from thermoxels_ns.core.feature_rays import FeatureRays
 from thermoxels_ns.core.units import TemperatureRange
 from thermoxels_ns.multiview.votes import air_voxels
 from thermoxels_ns.render.ray_render import RayRequest, RenderOptions
+from thermoxels_ns.synthetic.camera_rings import look_at
 from thermoxels_ns.training.callbacks import coarse_to_fine_callbacks, prune_by_rays
 from thermoxels_ns.training.model import ThermoxelsModel
 from thermoxels_ns.training.model_config import ThermoxelsModelConfig
@@ -33,10 +35,16 @@ def model_of(**options) -> ThermoxelsModel:
 
 
 class Rays:
-    """Stands for the data manager: rays along -x onto the slab."""
+    """Stands for the data manager: rays along -x onto the slab, and two cameras that have the box in view."""
 
     def __init__(self, width: float = 0.97):
         self.width = width
+        pose = torch.from_numpy(look_at((3.0, 0.0, 0.0), (0.0, 0.0, 0.0))[:3]).float()
+        cameras = Cameras(torch.stack((pose, pose)), fx=50.0, fy=50.0, cx=50.0, cy=50.0, width=100, height=100)
+        self.train_dataset = SimpleNamespace(cameras=cameras)
+
+    def look_away(self) -> None:
+        self.train_dataset.cameras.camera_to_worlds[:, :, [0, 2]] *= -1.0
 
     def training_rays(self, stream: int, most: int) -> Iterator[RayBundle]:
         y, z = torch.meshgrid(*[torch.linspace(-self.width, self.width, 30)] * 2, indexing="ij")
@@ -186,6 +194,24 @@ def test_air_is_carved_at_the_start_and_after_a_refinement_and_optimisers_follow
         for name, parameter in model.grid.row_parameters().items():
             assert given.optimizers.parameters[name] == [parameter]
             assert len(parameter) == model.grid.voxels.num_rows
+
+
+def test_where_a_camera_was_held_is_air_unless_photographs_look_there():
+    """Lines from the middle of the box to points at its sides."""
+    points = np.array([[x, y, z] for x in (-0.9, 0.9) for y in (-0.9, 0.0, 0.9) for z in np.linspace(-0.9, 0.9, 6)])
+    count = len(points)
+    for looking_there in (True, False):
+        model = model_of(resolutions=(8,), prune_at=(), thin_at=(), prune_threshold=0.0)
+        model.feature_rays = FeatureRays(np.zeros((count, 3)), np.arange(count), points, np.full(count, 1.0))
+        given = attributes(model, 10)
+        if not looking_there:
+            given.pipeline.datamanager.look_away()
+        callbacks = coarse_to_fine_callbacks(model, given)
+        for callback in callbacks:
+            callback.run_callback(0)
+        far = np.linalg.norm(model.grid.lattice.cell_centres(), axis=-1)
+        assert bool(model.grid.kept[torch.from_numpy(far < 0.45)].all()) == looking_there
+        assert bool(model.grid.kept[torch.from_numpy(far > 0.5)].all())
 
 
 def test_a_refinement_beyond_the_budget_leaves_the_lattice_as_it_is():

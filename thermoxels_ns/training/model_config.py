@@ -103,7 +103,8 @@ class ThermoxelsModelConfig(ModelConfig):
     carve: Literal["auto", "off"] = "auto"
     """auto: at the start and after every refinement, drop voxels that rays cross on the way to what photographs see:
     points of structure from motion (tracks of thermoxels capture or of a COLMAP model, see the dataparser's tracks),
-    and depths on which photographs agree."""
+    and depths on which photographs agree. So go voxels around cameras: nearer than half of what one shows, where no two
+    photographs look."""
     photo_depth: Literal["auto", "off", "on"] = "auto"
     """Depth supervision: find depths by comparing each photograph with its neighbours (multi-view stereo, plane sweep),
     and ask rays to end there, as at points of structure from motion. It keeps opaque floaters from forming before walls
