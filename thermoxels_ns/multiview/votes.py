@@ -44,7 +44,7 @@ def around_cameras(points: FloatArray, rays: FeatureRays, views: Sequence[View])
     """Which points (n, 3) are much nearer to a camera than what it shows, and in view of fewer than two photographs.
 
     What no second photograph shows, no training ray contradicts, and a lump there hides what stands behind it from
-    views that did not train; but where somebody held a camera is air. (A real room: 21.5 dB without, 22.9 dB with.)
+    views that did not train; but where somebody held a camera is air. (A real room: 21.5 dB without, 23.6 dB with.)
     """
     origins, camera_of = np.unique(rays.origins, axis=0, return_inverse=True)
     lengths = np.linalg.norm(rays.points[rays.point] - rays.origins, axis=1)
