@@ -253,12 +253,14 @@ def _tell(
             size = "" if voxel_size is None else f" ({volume_in_words(voxels * voxel_size**3)})"
             if voxels:
                 amounts.append(f"{sign}{voxels} voxels{size}")
-        say(f"Solid, {step.name}: {', '.join(amounts) or 'nothing changed'}. {step.remark}")
+        changed = ", ".join(amounts) or "nothing changed"
+        if step.name == "region":
+            size = " x ".join(f"{side:.3g}" for side in region["size"])
+            share, name = region["share_of_solid_taken"], region["asked_for"]
+            say(f"Region, {name}: {size} {unit}, {share:.1%} of the solid ({changed}). {step.remark}")
+        else:
+            say(f"Solid, {step.name}: {changed}. {step.remark}")
     mesh = built.mesh
-    say(
-        f"Region, {region['asked_for']}: {' x '.join(f'{side:.3g}' for side in region['size'])} {unit}, "
-        f"{region['share_of_solid_taken']:.1%} of the solid; {region['voxels_left_out']} of its voxels are left out."
-    )
     say(f"Mesh: {len(mesh.tets)} tetrahedra, {len(mesh.points_m)} nodes, volume {volume:.6g} {unit}^3")
     if built.unobserved_parts:
         say(
