@@ -81,13 +81,7 @@ def export_snapshot(
     `depths` of photographs and `tracks`, lines from them to points that they see, say which boundary triangles are
     supported. `corrections` are what training corrected in photographs; they go into the summary.
     """
-    from thermoxels_ns.commands.export_summary import (
-        HEAT_SKIPPED,
-        heat_summary,
-        mesh_summary,
-        region_summary,
-        versions,
-    )
+    from thermoxels_ns.commands.export_summary import HEAT_SKIPPED, heat_summary, mesh_summary, region_summary, versions
     from thermoxels_ns.fem.solution import HeatSolution
     from thermoxels_ns.heat.solving import Goals, solve_problem
     from thermoxels_ns.heat.vtk_series import heat_series_paths, remove_heat_series, write_heat_series
@@ -98,7 +92,7 @@ def export_snapshot(
     from thermoxels_ns.mesh.files.vtu import summary_text, write_summary
     from thermoxels_ns.mesh.quality.picture import picture_of_quality
     from thermoxels_ns.mesh.quality.report import check_mesh
-    from thermoxels_ns.reports.mesh_pictures import add_support, draw_heat, draw_mesh, draw_region
+    from thermoxels_ns.reports.mesh_pictures import add_support, draw_heat, draw_mesh, picture_of_mesh
 
     checked = check_options(options)
     scale = scale_of(options, checked, scene_file)
@@ -177,7 +171,8 @@ def export_snapshot(
         picture_of_quality(folder / _MESH_PICTURES[2], report)
         if support_of_facets(mesh) is not None:
             add_support(folder / _MESH_PICTURES[2], mesh, look)
-        draw_region(folder / _MESH_PICTURES[3], mesh, look, unit, *_left_out(built, snapshot.lattice, to_mesh))
+        beside: Any = {"title": "Region", "length_unit": unit, **_left_out(built, snapshot.lattice, to_mesh)}
+        picture_of_mesh(folder / _MESH_PICTURES[3], mesh, **beside, **look)
         if solution is not None:
             draw_heat(folder / _HEAT_PICTURE, mesh, solution, look)
     write_summary(folder / _SUMMARY, summary)
@@ -230,15 +225,14 @@ def _with_support(
     return replace(built, mesh=replace(mesh, boundary=replace(mesh.boundary, photographs=count)))
 
 
-def _left_out(
-    built: BuiltMesh, lattice: Lattice, to_mesh: npt.NDArray[np.float64]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
-    """Corners, in the mesh's coordinates, and triangles of the voxel faces around what is not exported."""
+def _left_out(built: BuiltMesh, lattice: Lattice, to_mesh: npt.NDArray[np.float64]) -> dict[str, Any]:
+    """What the picture of the region shows in grey: the voxel faces around what is not exported."""
     from thermoxels_ns.mesh.build import apply_transform
     from thermoxels_ns.mesh.voxel_tets import used_corners, voxel_facets
 
-    left_out = built.solid.left_out
-    return apply_transform(to_mesh, lattice.index_to_world(used_corners(left_out))), voxel_facets(left_out)
+    points = apply_transform(to_mesh, lattice.index_to_world(used_corners(built.solid.left_out)))
+    note = "grey: left out of the region" if len(points) else "nothing is left out"
+    return {"ghost": (points, voxel_facets(built.solid.left_out)), "note": note}
 
 
 def _tell(
@@ -257,7 +251,7 @@ def _tell(
         if step.name == "region":
             size = " x ".join(f"{side:.3g}" for side in region["size"])
             share, name = region["share_of_solid_taken"], region["asked_for"]
-            say(f"Region, {name}: {size} {unit}, {share:.1%} of the solid ({changed}). {step.remark}")
+            say(f"Region, {name}: {size} {unit}, {share:.1%} of the solid; {changed}. {step.remark}")
         else:
             say(f"Solid, {step.name}: {changed}. {step.remark}")
     mesh = built.mesh

@@ -105,13 +105,8 @@ def build_mesh(
     transform = check_similarity("world_to_metres", world_to_metres)
     least = max(options.min_observed_weight, float(np.finfo(np.float32).tiny))
     scale = float(np.cbrt(abs(np.linalg.det(transform[:3, :3]))))
-    solid = select_solid(
-        snapshot,
-        selection,
-        scale,
-        world_to_input=transform[:3] / metres_per_unit,
-        makes_up_volume=options.boundary == "conforming",
-    )
+    of_scene = scale, transform[:3] / metres_per_unit
+    solid = select_solid(snapshot, selection, *of_scene, makes_up_volume=options.boundary == "conforming")
     solid, num_parts, num_voxels = _without_unobserved(solid, snapshot.observed_weight >= least)
 
     if options.boundary == "voxel":

@@ -76,7 +76,7 @@ def picture_of_mesh(
         note: Words below the size of the mesh.
         labels: Short words and the points of the mesh that they stand at, in front of everything.
         size: Write the size of the mesh below the picture.
-        ghost: Points (n, 3) and triangles (m, 3) of something else, drawn in a grey that one looks through.
+        ghost: Points (n, 3) and triangles (m, 3) of something beside the mesh, in a grey that one looks through.
         window_size: Width and height, [pixels].
     """
     # Without a screen VTK draws through Mesa, which loads the system's LLVM. A triton (torch's compiler) that is loaded
@@ -323,18 +323,6 @@ def draw_mesh(paths: Sequence[Path], mesh: TetMesh, look: Mapping[str, Any], len
     painted = [("no thermal ray", "grey", ~mesh.observed[mesh.facets].all(axis=1))]
     title = "Measured surface temperature"
     picture_of_mesh(measured, mesh, title=title, painted=painted, length_unit=length_unit, **look)
-
-
-def draw_region(
-    path: Path, mesh: TetMesh, look: Mapping[str, Any], length_unit: str, points: FloatArray, triangles: IntArray
-) -> None:
-    """Draw what is exported, and in grey the surface, given by its points and triangles, of what is left out.
-
-    `look` are the arguments `up` and `view_direction` of `picture_of_mesh`.
-    """
-    note = "grey: left out of the region" if len(triangles) else "nothing is left out"
-    ghost = points, triangles
-    picture_of_mesh(path, mesh, title="Region", note=note, ghost=ghost, length_unit=length_unit, **look)
 
 
 def draw_heat(path: Path, mesh: TetMesh, solution: HeatSolution, look: Mapping[str, Any]) -> None:

@@ -114,10 +114,9 @@ def test_a_region_without_solid_says_where_it_lies_and_the_remedy_works(asked):
         MeshError, match=f"^{next(iter(asked))}: expected .* from 9.2.* to .*, got none in 0 0 0 1"
     ) as found:
         select_solid(snapshot, replace(AS_IT_IS, **asked), world_to_input=TURNED)
-    (name,) = asked
-    remedy = str(found.value).split(f"--{name.replace('_', '-')} ")[1].split(",")[0]
+    remedy = str(found.value).split("--region-box ")[1].split(",")[0]
     values = tuple(float(word) for word in remedy.split())
-    solid = select_solid(snapshot, replace(AS_IT_IS, **{name: values}), world_to_input=TURNED)
+    solid = select_solid(snapshot, replace(AS_IT_IS, region_box=values), world_to_input=TURNED)
     assert np.array_equal(solid.cells, OBJECT)
 
 

@@ -139,15 +139,11 @@ def _hidden_in_blocks(
 ) -> BoolArray:
     """The same, where a block of voxels has one answer."""
     shape = sealed.shape
-    cx, cy, cz = (-(-n // block) for n in shape)
-
-    def coarser(flags: BoolArray) -> BoolArray:
-        padded = np.pad(flags, [(0, -n % block) for n in shape])
-        return padded.reshape(cx, block, cy, block, cz, block).any(axis=(1, 3, 5))
-
-    coarse = coarser(sealed)
+    padded = np.pad((sealed, within), [(0, 0), *((0, -n % block) for n in shape)])
+    cx, cy, cz = (n // block for n in padded.shape[1:])
+    coarse, coarse_within = padded.reshape(2, cx, block, cy, block, cz, block).any(axis=(2, 4, 6))
     coarse_lattice = Lattice(lattice.lo, lattice.voxel_size * block, (cx + 1, cy + 1, cz + 1))
-    hidden = _hidden(coarse, coarser(within), coarse_lattice, views, seal // block)
+    hidden = _hidden(coarse, coarse_within, coarse_lattice, views, seal // block)
 
     # A block that holds a piece of the shell has an inner and an outer side; its empty voxels go with what they touch.
     inside = tuple(slice(n) for n in shape)

@@ -100,14 +100,16 @@ def check_region(region: str, box: Box | None, near: Ball | None) -> None:
     if sum(asked.values()) > 1:
         got = " and ".join(name for name, given in asked.items() if given)
         raise MeshError("region", expected="one of them", got=got, remedy="Leave all but one of these options out.")
-    if box is not None and not (np.isfinite(box).all() and np.less(box[:3], box[3:]).all()):
-        expected = "finite numbers xmin ymin zmin xmax ymax zmax, each minimum below its maximum"
-        remedy = "Pass --region-box -2 -2 0 2 2 3, for example, in units of the input poses."
-        raise MeshError("region_box", expected=expected, got=_typed(box), remedy=remedy)
-    if near is not None and not (np.isfinite(near).all() and near[3] > 0.0):
-        expected = "finite numbers x y z radius, the radius above 0"
-        remedy = "Pass --region-near 0 0 1 2.5, for example, in units of the input poses."
-        raise MeshError("region_near", expected=expected, got=_typed(near), remedy=remedy)
+    box_is_good = box is None or (np.isfinite(box).all() and np.less(box[:3], box[3:]).all())
+    if not box_is_good or not (near is None or (np.isfinite(near).all() and near[3] > 0.0)):
+        name, values, example = (
+            ("region_near", near, "0 0 1 2.5") if box_is_good else ("region_box", box, "0 0 0 4 3 2")
+        )
+        low = (
+            "x y z radius, the radius above 0" if box_is_good else "xmin ymin zmin xmax ymax zmax, minima below maxima"
+        )
+        remedy = f"Pass --{name.replace('_', '-')} {example}, for example, in units of the input poses."
+        raise MeshError(name, expected=f"finite numbers {low}", got=_typed(values or ()), remedy=remedy)
 
 
 def asked_region(
@@ -135,18 +137,11 @@ def asked_region(
         return within
     size = lattice.voxel_size * float(np.cbrt(abs(np.linalg.det(world_to_input[:, :3]))))
     digits = max(0, 1 - math.floor(math.log10(size)))
-    lower = np.array([place[cells].min() - size for place in places])
-    upper = np.array([place[cells].max() + size for place in places])
-    name, got, every = "region_box", _typed(box or ()), np.concatenate((lower, upper))
-    if near is not None:
-        radius = 0.5 * float(np.linalg.norm(upper - lower))
-        name, got, every = "region_near", _typed(near), np.append(0.5 * (lower + upper), radius)
-    raise MeshError(
-        name,
-        expected=f"some of the solid in it, which lies from {_typed(lower, digits)} to {_typed(upper, digits)}",
-        got=f"none in {got}",
-        remedy=f"Pass --{name.replace('_', '-')} {_typed(every, digits)}, or less.",
-    )
+    ends = (place[cells] for place in places)
+    lower, upper = (_typed(end, digits) for end in np.array([(end.min() - size, end.max() + size) for end in ends]).T)
+    expected = f"some of the solid in it, which lies from {lower} to {upper}"
+    got, remedy = f"none in {_typed(box or near or ())}", f"Pass --region-box {lower} {upper}, or less."
+    raise MeshError("region_near" if box is None else "region_box", expected=expected, got=got, remedy=remedy)
 
 
 def _typed(values: tuple[float, ...] | FloatArray, digits: int | None = None) -> str:

@@ -15,14 +15,7 @@ from thermoxels_ns.core.snapshot import GridSnapshot
 from thermoxels_ns.mesh.solid.interior import THINNEST_GROWN, interior, wall_behind
 from thermoxels_ns.mesh.solid.level_set import level_of
 from thermoxels_ns.mesh.solid.morphology import close_gaps, connected
-from thermoxels_ns.mesh.solid.region import (
-    Ball,
-    Box,
-    RegionKind,
-    asked_region,
-    check_region,
-    where_cameras_look,
-)
+from thermoxels_ns.mesh.solid.region import Ball, Box, RegionKind, asked_region, check_region, where_cameras_look
 from thermoxels_ns.mesh.solid.threshold import (
     Threshold,
     automatic_threshold,
@@ -140,8 +133,8 @@ def select_solid(
     snapshot: GridSnapshot,
     selection: SolidSelection,
     metres_per_world_unit: float | None = None,
-    *,
     world_to_input: FloatArray | None = None,
+    *,
     makes_up_volume: bool = True,
 ) -> SolidCells:
     """Choose the solid voxels of a trained field, by the density at their centres.
